@@ -1,0 +1,6 @@
+"""The compiled kernels. Private: the public functions of `g2ard` check and document what goes in here."""
+
+__version__: str
+
+def set_num_threads(threads: int) -> None: ...
+def num_threads() -> int: ...

@@ -1,0 +1,163 @@
+"""Pinhole cameras, OpenCV axes (x right, y down, z forward), and what evaluation needs to name them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard.errors import InputError
+
+__all__ = ["Cameras", "look_at"]
+
+
+@dataclass(frozen=True, eq=False)
+class Cameras:
+    """C views.
+
+    Args:
+        viewmats: (C, 4, 4) float64, camera_from_world, rigid.
+        Ks: (C, 3, 3) float64 pinhole intrinsics in pixels; pixel centres at +0.5.
+        widths: (C,) int64 pixels.
+        heights: (C,) int64 pixels.
+        names: C unique names (of photos, or of poses).
+        image_paths: C paths, None where a view has no photo.
+        distortions: (C, 5) float64, OpenCV k1 k2 p1 p2 k3 of the *photo*; `g2ard.images` undistorts on
+            loading, to these very Ks. Zero for a pinhole photo.
+
+    Raises:
+        InputError: shapes that do not fit, a non-finite pose, or an empty image.
+    """
+
+    viewmats: NDArray[np.float64]
+    Ks: NDArray[np.float64]
+    widths: NDArray[np.int64]
+    heights: NDArray[np.int64]
+    names: tuple[str, ...]
+    image_paths: tuple[Path | None, ...] = ()
+    distortions: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 5)))
+
+    def __post_init__(self) -> None:
+        n = len(self.viewmats)
+        if not self.image_paths:
+            object.__setattr__(self, "image_paths", (None,) * n)
+        if not len(self.distortions):
+            object.__setattr__(self, "distortions", np.zeros((n, 5)))
+        for name, shape in (
+            ("viewmats", (n, 4, 4)),
+            ("Ks", (n, 3, 3)),
+            ("widths", (n,)),
+            ("heights", (n,)),
+            ("distortions", (n, 5)),
+        ):
+            got = getattr(self, name).shape
+            if got != shape:
+                raise InputError(f"{name}: expected shape {shape}, got {got}")
+        for name in ("names", "image_paths"):
+            if len(getattr(self, name)) != n:
+                raise InputError(f"{name}: expected {n}, got {len(getattr(self, name))}")
+        for i in range(n):
+            if not (np.isfinite(self.viewmats[i]).all() and np.isfinite(self.Ks[i]).all()):
+                raise InputError(f"view {i} ({self.names[i]}): its pose or intrinsics are not finite")
+            if self.widths[i] < 1 or self.heights[i] < 1:
+                raise InputError(
+                    f"view {i} ({self.names[i]}): empty image {self.widths[i]}×{self.heights[i]}"
+                )
+            if self.Ks[i, 0, 0] <= 0 or self.Ks[i, 1, 1] <= 0:
+                raise InputError(f"view {i} ({self.names[i]}): focal length must be positive")
+
+    def __len__(self) -> int:
+        return len(self.viewmats)
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """(C, 3) camera centres in the world."""
+        R, t = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
+        return -np.einsum("cji,cj->ci", R, t)
+
+    @property
+    def forwards(self) -> NDArray[np.float64]:
+        """(C, 3) unit viewing directions in the world."""
+        return self.viewmats[:, 2, :3]
+
+    def take(self, index: ArrayLike) -> Cameras:
+        """The views `index` selects (a mask or indices), in its order."""
+        index = np.asarray(index)
+        rows = np.flatnonzero(index) if index.dtype == bool else index.astype(int).reshape(-1)
+        return replace(
+            self,
+            viewmats=self.viewmats[rows],
+            Ks=self.Ks[rows],
+            widths=self.widths[rows],
+            heights=self.heights[rows],
+            names=tuple(self.names[i] for i in rows),
+            image_paths=tuple(self.image_paths[i] for i in rows),
+            distortions=self.distortions[rows],
+        )
+
+    def resized(self, longest: int | None) -> Cameras:
+        """The same views with their longer side shrunk to at most `longest` pixels (None keeps them)."""
+        if longest is None:
+            return self
+        factor = np.minimum(1.0, longest / np.maximum(self.widths, self.heights))
+        widths = np.maximum(1, np.rint(self.widths * factor)).astype(np.int64)
+        heights = np.maximum(1, np.rint(self.heights * factor)).astype(np.int64)
+        Ks = self.Ks.copy()
+        Ks[:, 0] *= (widths / self.widths)[:, None]
+        Ks[:, 1] *= (heights / self.heights)[:, None]
+        return replace(self, Ks=Ks, widths=widths, heights=heights)
+
+    def recentred(self, offset: ArrayLike) -> Cameras:
+        """The same views in coordinates whose origin is the world point `offset` (see `Splats.offset`)."""
+        shift = np.asarray(offset, np.float64)
+        viewmats = self.viewmats.copy()
+        viewmats[:, :3, 3] += viewmats[:, :3, :3] @ shift
+        return replace(self, viewmats=viewmats)
+
+    @classmethod
+    def from_lists(
+        cls,
+        viewmats: Sequence[Any],
+        Ks: Sequence[Any],
+        sizes: Sequence[tuple[int, int]],
+        names: Sequence[str],
+        image_paths: Sequence[Path | None] = (),
+        distortions: Sequence[Any] = (),
+    ) -> Cameras:
+        """Stack per-view lists; `sizes` holds (width, height)."""
+        n = len(viewmats)
+        return cls(
+            viewmats=np.asarray(viewmats, np.float64).reshape(n, 4, 4),
+            Ks=np.asarray(Ks, np.float64).reshape(n, 3, 3),
+            widths=np.asarray([w for w, _ in sizes], np.int64),
+            heights=np.asarray([h for _, h in sizes], np.int64),
+            names=tuple(names),
+            image_paths=tuple(image_paths),
+            distortions=np.asarray(distortions, np.float64).reshape(-1, 5),
+        )
+
+
+def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
+    """(4, 4) camera_from_world of a camera at `position` facing `target`, image top towards `up`.
+
+    >>> look_at([0, 0, -2], [0, 0, 0], up=[0, -1, 0]).tolist()[2]
+    [0.0, 0.0, 1.0, 2.0]
+    """
+    eye = np.asarray(position, np.float64)
+    forward = np.asarray(target, np.float64) - eye
+    length = np.linalg.norm(forward)
+    if not length > 0:
+        raise InputError("look_at: position and target coincide")
+    z = forward / length
+    x = np.cross(z, np.asarray(up, np.float64))
+    if np.linalg.norm(x) < 1e-9 * np.linalg.norm(up):  # looking along `up`: any right axis will do
+        x = np.cross(z, np.roll(np.asarray(up, np.float64), 1))
+    x /= np.linalg.norm(x)
+    R = np.stack([x, np.cross(z, x), z])
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = R, -R @ eye
+    return view

@@ -1,0 +1,30 @@
+"""One way to report progress: a callback. Only the command line draws bars."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+__all__ = ["Progress", "counter", "silent"]
+
+
+class Progress(Protocol):
+    """Called with the stage's name, units done, units in all (0 if unknown) and figures worth showing."""
+
+    def __call__(self, stage: str, done: int, total: int, info: Mapping[str, Any] = ...) -> None: ...
+
+
+def silent(stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
+    """Report nothing."""
+
+
+def counter(progress: Progress, stage: str) -> Callable[[int, int], None]:
+    """The `(done, total)` callback that Rust kernels take, bound to one stage.
+
+    >>> seen = []
+    >>> tell = counter(lambda *a: seen.append(a), "simplify")
+    >>> tell(3, 10)
+    >>> seen
+    [('simplify', 3, 10)]
+    """
+    return lambda done, total: progress(stage, done, total)

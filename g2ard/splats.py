@@ -1,0 +1,170 @@
+"""The scene type that every stage passes on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard.errors import InputError
+
+__all__ = ["SH_C0", "Splats"]
+
+SH_C0 = 0.28209479177387814
+"""Band-0 spherical harmonic: colour = 0.5 + SH_C0 · sh0."""
+
+_DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """N Gaussians, structure of arrays, each name saying its space.
+
+    Args:
+        means: (N, 3) float32 or float64, scene units, relative to `offset`.
+        quats: (N, 4) float32 wxyz; need not be normalised.
+        scales: (N, 3) float32, linear standard deviations along the rotated axes.
+        logit_opacities: (N,) float32; opacity = sigmoid(logit).
+        sh0: (N, 1, 3) float32, band-0 coefficients; colour = 0.5 + SH_C0·sh0 + higher bands.
+        shN: (N, K−1, 3) float32, K−1 in {0, 3, 8, 15}: SH degree 0–3.
+        offset: (3,) float64, world = means + offset. Large map coordinates (UTM) live here.
+
+    Raises:
+        InputError: an array's shape does not fit the others.
+
+    >>> s = Splats.create(means=np.zeros((2, 3)), scales=np.ones((2, 3)))
+    >>> len(s), s.sh_degree, s.opacities
+    (2, 0, array([0.5, 0.5], dtype=float32))
+    """
+
+    means: NDArray[Any]
+    quats: NDArray[np.float32]
+    scales: NDArray[np.float32]
+    logit_opacities: NDArray[np.float32]
+    sh0: NDArray[np.float32]
+    shN: NDArray[np.float32]
+    offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        if self.means.ndim != 2 or self.means.shape[1] != 3:
+            raise InputError(f"means: expected shape (N, 3), got {self.means.shape}")
+        n = len(self.means)
+        rest = self.shN.shape[1] if self.shN.ndim == 3 else -1
+        for name, shape in (
+            ("quats", (n, 4)),
+            ("scales", (n, 3)),
+            ("logit_opacities", (n,)),
+            ("sh0", (n, 1, 3)),
+            ("shN", (n, rest, 3)),
+        ):
+            got = getattr(self, name).shape
+            if got != shape:
+                raise InputError(f"{name}: expected shape {shape}, got {got}")
+        if rest not in _DEGREE_OF_REST:
+            raise InputError(f"shN: expected 0, 3, 8 or 15 coefficients, got {rest}")
+
+    @classmethod
+    def create(
+        cls,
+        means: ArrayLike,
+        *,
+        quats: ArrayLike | None = None,
+        scales: ArrayLike,
+        logit_opacities: ArrayLike | None = None,
+        sh0: ArrayLike | None = None,
+        shN: ArrayLike | None = None,
+        offset: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> Splats:
+        """Build from anything array-like; defaults: no rotation, opacity 0.5, mid grey, SH degree 0."""
+        points = np.asarray(means)
+        if points.dtype != np.float64:
+            points = points.astype(np.float32)
+        points = np.ascontiguousarray(points)
+        n = len(points)
+
+        def rows(value: ArrayLike | None, default: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
+            if value is None:
+                return np.ascontiguousarray(np.broadcast_to(np.asarray(default, np.float32), shape))
+            return np.ascontiguousarray(value, dtype=np.float32)
+
+        return cls(
+            means=points,
+            quats=rows(quats, [1, 0, 0, 0], (n, 4)),
+            scales=rows(scales, 1, (n, 3)),
+            logit_opacities=rows(logit_opacities, 0, (n,)),
+            sh0=rows(sh0, 0, (n, 1, 3)),
+            shN=rows(shN, 0, (n, 0, 3)),
+            offset=np.array(offset, dtype=np.float64),
+        )
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """0, 1, 2 or 3."""
+        return _DEGREE_OF_REST[self.shN.shape[1]]
+
+    @property
+    def opacities(self) -> NDArray[np.float32]:
+        """(N,) in [0, 1]: sigmoid of `logit_opacities`, without overflow."""
+        x = self.logit_opacities.astype(np.float64)
+        e = np.exp(-np.abs(x))
+        return np.where(x >= 0, 1 / (1 + e), e / (1 + e)).astype(np.float32)
+
+    @property
+    def log_scales(self) -> NDArray[np.float32]:
+        """(N, 3) natural logarithms of `scales`, as files store them."""
+        return np.log(self.scales.astype(np.float64)).astype(np.float32)
+
+    @property
+    def colors(self) -> NDArray[np.float32]:
+        """(N, 3) base colours 0.5 + SH_C0·sh0, not clamped."""
+        return (0.5 + SH_C0 * self.sh0[:, 0]).astype(np.float32)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays in float32, the form a .ply holds."""
+        return 4 * len(self) * (14 + 3 * self.shN.shape[1])
+
+    def take(self, index: Any) -> Splats:
+        """The rows `index` selects (a mask, a slice or indices), in its order."""
+        return replace(
+            self,
+            means=self.means[index],
+            quats=self.quats[index],
+            scales=self.scales[index],
+            logit_opacities=self.logit_opacities[index],
+            sh0=self.sh0[index],
+            shN=self.shN[index],
+        )
+
+    def with_sh_degree(self, degree: int) -> Splats:
+        """The same scene with higher bands cut off, or padded with zeros.
+
+        Raises:
+            InputError: the degree is not 0–3.
+        """
+        if degree not in range(4):
+            raise InputError(f"SH degree: expected 0 to 3, got {degree}")
+        rest = (degree + 1) ** 2 - 1
+        shN = np.zeros((len(self), rest, 3), np.float32)
+        keep = min(rest, self.shN.shape[1])
+        shN[:, :keep] = self.shN[:, :keep]
+        return replace(self, shN=shN)
+
+    def recentred(self, offset: ArrayLike) -> Splats:
+        """The same world scene with means relative to another offset (subtracted in float64)."""
+        target = np.asarray(offset, np.float64)
+        shift = self.offset - target
+        means = self.means if not shift.any() else (self.means.astype(np.float64) + shift)
+        return replace(self, means=means.astype(self.means.dtype), offset=target)
+
+    def finite_rows(self) -> NDArray[np.bool_]:
+        """(N,) whether every value of the row is finite; an infinite logit counts as finite (α = 0 or 1)."""
+        ok = np.isfinite(self.means).all(1) & ~np.isnan(self.logit_opacities)
+        for name in ("quats", "scales", "sh0", "shN"):
+            ok &= np.isfinite(getattr(self, name)).reshape(len(self), -1).all(1)
+        return ok

@@ -1,0 +1,37 @@
+//! The one error type of the core.
+
+/// What can go wrong in a kernel. Messages are one line and name the field, what was expected and what came.
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum Error {
+    #[error("{name}: expected {expected}, got {got}")]
+    InvalidInput {
+        name: &'static str,
+        expected: String,
+        got: String,
+    },
+    #[error("{field}: {count} non-finite value(s), the first in row {first_index}")]
+    NonFinite {
+        field: &'static str,
+        count: usize,
+        first_index: usize,
+    },
+    /// The caller asked to stop (see [`crate::Control`]).
+    #[error("interrupted")]
+    Interrupted,
+}
+
+impl Error {
+    pub fn invalid(
+        name: &'static str,
+        expected: impl Into<String>,
+        got: impl std::fmt::Display,
+    ) -> Self {
+        Self::InvalidInput {
+            name,
+            expected: expected.into(),
+            got: got.to_string(),
+        }
+    }
+}
+
+pub type Result<T> = std::result::Result<T, Error>;

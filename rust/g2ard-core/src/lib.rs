@@ -1,0 +1,18 @@
+//! Geometry kernels of g2ard, in pure Rust.
+//!
+//! Data flows one way: points → [`lift`] → [`splats`] → [`simplify`] → [`raster`] and [`ssim`].
+//! Results never depend on the number of threads: every reduction has a fixed order.
+
+pub mod control;
+pub mod error;
+pub mod lift;
+pub mod linalg;
+pub mod raster;
+pub mod simplify;
+pub mod spatial;
+pub mod splats;
+pub mod ssim;
+
+pub use control::Control;
+pub use error::{Error, Result};
+pub use splats::Splats;

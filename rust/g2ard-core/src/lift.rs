@@ -1,0 +1,1 @@
+//! Coloured points → surface-aligned discs (supplement, "Dense Prior Construction").

@@ -1,0 +1,1 @@
+//! The tiled differentiable rasteriser: one room per pass.

@@ -1,0 +1,1 @@
+//! Simplification: shared parts (moments, residual flags, guards, trim) and the policies over them.

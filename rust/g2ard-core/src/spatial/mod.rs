@@ -1,0 +1,1 @@
+//! Spatial structures: Morton order, adaptive voxel cells, nearest neighbours.

@@ -1,0 +1,1 @@
+//! Fused L1 + SSIM, forward and backward.

@@ -1,0 +1,13 @@
+//! `g2ard._core`: registration only; one small file per stage.
+
+use pyo3::prelude::*;
+
+mod error;
+mod work;
+
+#[pymodule]
+fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    work::register(m)?;
+    Ok(())
+}

@@ -1,0 +1,106 @@
+//! Running kernels away from the GIL, on a pool whose size the caller chose, with Ctrl-C and progress.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::sync::{Arc, RwLock};
+use std::time::Duration;
+
+use g2ard_core::{Control, Result};
+use pyo3::exceptions::PyRuntimeError;
+use pyo3::prelude::*;
+use rayon::{ThreadPool, ThreadPoolBuilder};
+
+use crate::error::to_py;
+
+static POOL: RwLock<Option<Arc<ThreadPool>>> = RwLock::new(None);
+
+/// How often long work looks for Ctrl-C and reports progress.
+const POLL: Duration = Duration::from_millis(50);
+
+fn pool() -> PyResult<Arc<ThreadPool>> {
+    if let Some(pool) = POOL.read().map_err(poisoned)?.as_ref() {
+        return Ok(pool.clone());
+    }
+    set_num_threads(0)?;
+    pool()
+}
+
+fn poisoned<T>(_: T) -> PyErr {
+    PyRuntimeError::new_err("the thread pool's lock was poisoned by an earlier panic")
+}
+
+fn panicked() -> PyErr {
+    PyRuntimeError::new_err("a kernel panicked: this is a bug in g2ard; its message is above")
+}
+
+/// Sets how many threads every kernel uses from now on; 0 means all cores.
+#[pyfunction]
+fn set_num_threads(threads: usize) -> PyResult<()> {
+    let built = ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build()
+        .map_err(|e| PyRuntimeError::new_err(e.to_string()))?;
+    *POOL.write().map_err(poisoned)? = Some(Arc::new(built));
+    Ok(())
+}
+
+#[pyfunction]
+fn num_threads() -> PyResult<usize> {
+    Ok(pool()?.current_num_threads())
+}
+
+/// Runs a kernel of a few milliseconds: GIL released, no Ctrl-C check.
+pub fn quick<R: Send>(py: Python<'_>, f: impl FnOnce() -> Result<R> + Send) -> PyResult<R> {
+    let pool = pool()?;
+    match py.detach(|| catch_unwind(AssertUnwindSafe(|| pool.install(f)))) {
+        Ok(result) => result.map_err(to_py),
+        Err(_) => Err(panicked()),
+    }
+}
+
+/// Runs long work: GIL released; every 50 ms Ctrl-C is looked for and `progress(done, total)` is called.
+pub fn long<R: Send>(
+    py: Python<'_>,
+    progress: Option<&Bound<'_, PyAny>>,
+    f: impl FnOnce(&Control) -> Result<R> + Send,
+) -> PyResult<R> {
+    let pool = pool()?;
+    let control = Control::default();
+    let mut failure: Option<PyErr> = None;
+    let outcome = std::thread::scope(|scope| {
+        let (send, mut receive) = channel();
+        let control = &control;
+        scope.spawn(move || {
+            let result = catch_unwind(AssertUnwindSafe(|| pool.install(|| f(control))));
+            let _ = send.send(result); // the receiver outlives the scope: it cannot fail
+        });
+        loop {
+            // A Receiver is Send but not Sync: it goes along and comes back.
+            let (received, back) = py.detach(move || (receive.recv_timeout(POLL), receive));
+            receive = back;
+            match received {
+                Ok(result) => break result.ok(),
+                Err(RecvTimeoutError::Disconnected) => break None,
+                Err(RecvTimeoutError::Timeout) if failure.is_none() => {
+                    let (done, total) = control.progress();
+                    let told = progress.map_or(Ok(()), |p| p.call1((done, total)).map(|_| ()));
+                    if let Err(e) = py.check_signals().and(told) {
+                        control.cancel();
+                        failure = Some(e);
+                    }
+                }
+                Err(RecvTimeoutError::Timeout) => {}
+            }
+        }
+    });
+    match (failure, outcome) {
+        (Some(e), _) => Err(e),
+        (None, Some(result)) => result.map_err(to_py),
+        (None, None) => Err(panicked()),
+    }
+}
+
+pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_function(wrap_pyfunction!(set_num_threads, m)?)?;
+    m.add_function(wrap_pyfunction!(num_threads, m)?)
+}
