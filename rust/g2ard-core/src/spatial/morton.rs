@@ -6,9 +6,12 @@ use super::Frame;
 
 /// Bits per axis of a code.
 pub const BITS: u32 = 21;
-/// Lattice coordinate of the frame's origin.
-pub const MIDDLE: f64 = (1u32 << (BITS - 1)) as f64;
 const LAST: f64 = ((1u32 << BITS) - 1) as f64;
+
+/// The finest cell: the frame's cube is 2²¹ of them wide.
+pub fn unit(frame: &Frame) -> f64 {
+    2.0 * frame.radius / (1u64 << BITS) as f64
+}
 
 /// Every third bit of the result is a bit of `v`.
 fn spread(v: u64) -> u64 {
@@ -37,23 +40,23 @@ pub fn decode(code: u64) -> [u64; 3] {
     [gather(code), gather(code >> 1), gather(code >> 2)]
 }
 
-/// The code of `p` on a lattice of cells of size `unit` through `origin`; None where it lies outside.
-pub fn code_inside(p: [f64; 3], origin: [f64; 3], unit: f64) -> Option<u64> {
-    let cell = [0, 1, 2].map(|k| ((p[k] - origin[k]) / unit).floor() + MIDDLE);
+/// Lattice coordinates of `p`, cells of `size` counted from the lower corner of the frame's cube.
+fn cell(p: [f64; 3], frame: &Frame, size: f64) -> [f64; 3] {
+    [0, 1, 2].map(|k| ((p[k] - frame.origin[k] + frame.radius) / size).floor())
+}
+
+/// The code of the cell that holds `p`; None where it lies outside the lattice.
+pub fn code_inside(p: [f64; 3], frame: &Frame, size: f64) -> Option<u64> {
+    let cell = cell(p, frame, size);
     let inside = cell.iter().all(|&c| (0.0..=LAST).contains(&c));
     inside.then(|| encode(cell.map(|c| c as u64)))
 }
 
-/// 63-bit codes; points beyond the frame are clamped onto its faces.
+/// 63-bit codes of the finest cells; points beyond the frame are clamped onto its faces.
 pub fn codes(points: &[[f64; 3]], frame: &Frame) -> Vec<u64> {
-    let unit = frame.radius / MIDDLE;
-    points
-        .par_iter()
-        .map(|p| {
-            let cell = [0, 1, 2].map(|k| ((p[k] - frame.origin[k]) / unit).floor() + MIDDLE);
-            encode(cell.map(|c| c.clamp(0.0, LAST) as u64))
-        })
-        .collect()
+    let unit = unit(frame);
+    let code = |&p: &[f64; 3]| encode(cell(p, frame, unit).map(|c| c.clamp(0.0, LAST) as u64));
+    points.par_iter().map(code).collect()
 }
 
 /// The rows in the order of their codes, ties by row.
@@ -89,6 +92,6 @@ mod tests {
             radius: 1.0,
         };
         assert_eq!(order(&codes(&points, &frame)), [2, 0, 3, 1]);
-        assert_eq!(code_inside(points[1], [0.0; 3], 1e-6), None);
+        assert_eq!(code_inside(points[1], &frame, 1e-6), None);
     }
 }

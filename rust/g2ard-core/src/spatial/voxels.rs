@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::morton::{BITS, MIDDLE, code_inside, decode, encode};
+use super::morton::{BITS, code_inside, decode, encode, unit};
 use super::{Frame, codes};
 
 /// How far the count of occupied cells may be off, and how often the size is changed to get there.
@@ -34,12 +34,7 @@ impl Cells {
         let mut keyed: Vec<(u64, u32)> = points
             .par_iter()
             .enumerate()
-            .map(|(i, &p)| {
-                (
-                    code_inside(p, frame.origin, size).unwrap_or(u64::MAX),
-                    i as u32,
-                )
-            })
+            .map(|(i, &p)| (code_inside(p, frame, size).unwrap_or(u64::MAX), i as u32))
             .collect();
         keyed.par_sort_unstable();
         let (mut starts, mut keys) = (Vec::new(), Vec::new());
@@ -93,7 +88,7 @@ impl Cells {
 fn count(points: &[[f64; 3]], frame: &Frame, size: f64) -> usize {
     let mut keys: Vec<u64> = points
         .par_iter()
-        .map(|&p| code_inside(p, frame.origin, size).unwrap_or(u64::MAX))
+        .map(|&p| code_inside(p, frame, size).unwrap_or(u64::MAX))
         .collect();
     keys.par_sort_unstable();
     let distinct = keys
@@ -127,7 +122,7 @@ fn counts_by_octave(points: &[[f64; 3]], frame: &Frame) -> Vec<usize> {
 }
 
 fn search_size(points: &[[f64; 3]], frame: &Frame, target: usize) -> f64 {
-    let unit = frame.radius / MIDDLE;
+    let unit = unit(frame);
     if points.is_empty() {
         return frame.radius;
     }
@@ -191,10 +186,13 @@ mod tests {
         let frame = Frame::of(&points);
         let counts = counts_by_octave(&points, &frame);
         for b in [0, 12, 15, 17, 18, 20] {
-            let size = frame.radius / MIDDLE * (1u64 << b) as f64;
+            let size = unit(&frame) * (1u64 << b) as f64;
             let set: HashSet<_> = points
                 .iter()
-                .map(|p| [0, 1, 2].map(|k| ((p[k] - frame.origin[k]) / size).floor() as i64))
+                .map(|p| {
+                    [0, 1, 2]
+                        .map(|k| ((p[k] - frame.origin[k] + frame.radius) / size).floor() as i64)
+                })
                 .collect();
             assert_eq!(counts[b], set.len(), "{b}");
             assert_eq!(count(&points, &frame, size), set.len());
@@ -210,6 +208,10 @@ mod tests {
             let cells = Cells::adaptive(&points, &frame, target);
             let off = (cells.len() as f64 / target as f64).ln().abs();
             assert!(off <= 0.0199 || target < 100, "{target}: {}", cells.len());
+            assert!(
+                target > 1 || cells.len() == 2,
+                "one cell, and the floater's own"
+            );
         }
     }
 
@@ -223,7 +225,7 @@ mod tests {
         assert_eq!(seen, (0..2000).collect::<Vec<u32>>());
         let at = |c: usize| {
             let p = points[cells.members_of(c)[0] as usize];
-            [0, 1, 2].map(|k| ((p[k] - frame.origin[k]) / cells.size).floor() as i64)
+            [0, 1, 2].map(|k| ((p[k] - frame.origin[k] + frame.radius) / cells.size).floor() as i64)
         };
         for c in 0..cells.len() {
             let got: HashSet<_> = cells.face_neighbors(c).collect();
