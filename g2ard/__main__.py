@@ -1,0 +1,5 @@
+"""`python -m g2ard`."""
+
+from g2ard.cli import main
+
+main()

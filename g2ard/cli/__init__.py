@@ -1,0 +1,27 @@
+"""The command line. Only this package prints; stages, numpy and torch load when a command runs."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from g2ard.cli import commands  # importing it registers every command on the app
+from g2ard.cli.frame import app
+
+__all__ = ["app", "commands", "main"]
+
+
+def main() -> None:
+    """Entry point of the `g2ard` program: usage errors are one line and exit status 2, as all errors are."""
+    try:
+        status = app(prog_name="g2ard", standalone_mode=False)
+    except typer.Abort:
+        status = 130
+    except typer.TyperException as e:
+        message = " ".join(e.format_message().split())
+        where = getattr(getattr(e, "ctx", None), "command_path", "g2ard")
+        if message:  # empty when a group without arguments has already shown its help
+            print(f"{where}: {message} (see {where} --help)", file=sys.stderr)
+        status = e.exit_code
+    sys.exit(status)

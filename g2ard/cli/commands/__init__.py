@@ -1,0 +1,1 @@
+"""One module per command, in the order `g2ard --help` lists them."""

@@ -1,0 +1,132 @@
+"""Status on stderr: bars with ETA on a terminal, plain lines elsewhere, nothing when quiet."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+__all__ = ["Console", "duration"]
+
+_PLAIN_PERIOD = 10.0
+"""Seconds between two progress lines of one stage when stderr is no terminal."""
+
+
+def duration(seconds: float) -> str:
+    """Seconds as people read them.
+
+    >>> duration(3.14159), duration(75), duration(4000)
+    ('3.1 s', '1 min 15 s', '1 h 06 min')
+    """
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    if seconds < 3600:
+        return f"{int(seconds // 60)} min {int(seconds % 60):02d} s"
+    return f"{int(seconds // 3600)} h {int(seconds % 3600 // 60):02d} min"
+
+
+class Console:
+    """A progress callback (see `g2ard.progress`) that draws; used as a context so that bars end cleanly."""
+
+    def __init__(self, *, quiet: bool = False, verbose: bool = False) -> None:
+        self.quiet = quiet
+        self.verbose = verbose
+        self._bars: Progress | None = None
+        self._tasks: dict[str, TaskID] = {}
+        self._plain: dict[str, tuple[float, float]] = {}  # stage → (began, last line)
+
+    def __enter__(self) -> Console:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end_bars()
+
+    def say(self, text: str) -> None:
+        if self.quiet:
+            return
+        if self._bars is not None:
+            self._bars.console.print(text, markup=False, highlight=False)
+        else:
+            print(text, file=sys.stderr, flush=True)
+
+    def error(self, text: str) -> None:
+        self._end_bars()
+        print(f"g2ard: {text}", file=sys.stderr, flush=True)
+
+    def table(self, title: str, columns: list[str], rows: list[list[str]]) -> None:
+        """A table on stderr; the first column is left-aligned, figures right-aligned."""
+        if self.quiet:
+            return
+        self._end_bars()
+        from rich.console import Console as Rich
+        from rich.table import Table
+
+        table = Table(title=title, title_justify="left")
+        for i, name in enumerate(columns):
+            table.add_column(name, justify="left" if i == 0 else "right")
+        for row in rows:
+            table.add_row(*row)
+        Rich(stderr=True).print(table)
+
+    def __call__(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
+        if self.quiet:
+            return
+        figures = "  ".join(f"{k} {v}" for k, v in (info or {}).items())
+        if sys.stderr.isatty():
+            self._draw(stage, done, total, figures)
+        else:
+            self._print(stage, done, total, figures)
+
+    def _draw(self, stage: str, done: int, total: int, figures: str) -> None:
+        if self._bars is None:
+            from rich.console import Console as Rich
+            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+            self._bars = Progress(
+                TextColumn("{task.description:<12}"),
+                BarColumn(),
+                TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+                TimeElapsedColumn(),
+                TextColumn("ETA"),
+                TimeRemainingColumn(),
+                TextColumn("{task.fields[figures]}"),
+                console=Rich(stderr=True),
+            )
+            self._bars.start()
+        if stage not in self._tasks:
+            self._tasks[stage] = self._bars.add_task(stage, total=total or None, figures="")
+        self._bars.update(self._tasks[stage], completed=done, total=total or None, figures=figures)
+
+    def _print(self, stage: str, done: int, total: int, figures: str) -> None:
+        now = time.monotonic()
+        began, last = self._plain.setdefault(stage, (now, now))
+        finished = bool(total) and done >= total
+        if now - last < _PLAIN_PERIOD and not finished:
+            return
+        if finished and now - began < 1.0 and not self.verbose:
+            del self._plain[stage]  # too short to be worth a line
+            return
+        elapsed = now - began
+        parts = [f"{stage}: {done}/{total}" if total else f"{stage}: {done}", duration(elapsed)]
+        if total and 0 < done < total:
+            parts.append(f"ETA {duration(elapsed / done * (total - done))}")
+        if figures:
+            parts.append(figures)
+        print("  ".join(parts), file=sys.stderr, flush=True)
+        if finished:
+            del self._plain[stage]
+        else:
+            self._plain[stage] = (began, now)
+
+    def _end_bars(self) -> None:
+        if self._bars is not None:
+            self._bars.stop()
+            self._bars = None
+            self._tasks.clear()

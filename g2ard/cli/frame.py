@@ -1,0 +1,202 @@
+"""What every command shares: common options, one-line errors, exit statuses, the JSON result.
+
+A command is a function `fn(run: Run, ...)`; `@command` adds the common options to its signature.
+Exit status: 0 done · 1 failed · 2 usage · 3 a stated requirement was not met · 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from g2ard import __version__
+from g2ard.cli.console import Console
+from g2ard.errors import G2ardError
+
+__all__ = ["Run", "app", "command", "group"]
+
+app = typer.Typer(
+    help="Distil a dense 3D Gaussian scene into a compact, standard 3DGS model at an exact budget.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _version(show: bool) -> None:
+    if show:
+        typer.echo(f"g2ard {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+def _load_config(ctx: typer.Context, path: Path | None) -> Path | None:
+    """Make a TOML file's values the defaults: its table of this command's name, else its top level."""
+    if path is None:
+        return None
+    import tomllib
+
+    try:
+        values = tomllib.loads(path.read_text())
+    except (OSError, tomllib.TOMLDecodeError) as e:
+        raise typer.BadParameter(f"{path}: {e}") from None
+    table = values.get(str(ctx.info_name), {k: v for k, v in values.items() if not isinstance(v, dict)})
+    table = {key.replace("-", "_"): value for key, value in table.items()}
+    unknown = sorted(set(table) - {p.name for p in ctx.command.params})
+    if unknown:
+        raise typer.BadParameter(f"{path}: no option of `{ctx.info_name}` is called {', '.join(unknown)}")
+    ctx.default_map = {**(ctx.default_map or {}), **table}
+    return path
+
+
+_COMMON: dict[str, tuple[Any, Any]] = {
+    "quiet": (Annotated[bool, typer.Option("-q", "--quiet", help="Print errors only.")], False),
+    "verbose": (Annotated[bool, typer.Option("-v", "--verbose", help="Say more.")], False),
+    "overwrite": (
+        Annotated[bool, typer.Option("-w", "--overwrite", help="Replace existing outputs.")],
+        False,
+    ),
+    "json": (
+        Annotated[str | None, typer.Option("--json", metavar="FILE|-", help="Write the result as JSON.")],
+        None,
+    ),
+    "seed": (Annotated[int, typer.Option(help="Seed of everything random.")], 0),
+    "threads": (Annotated[int, typer.Option(min=0, help="Threads to use; 0 means every core.")], 0),
+    "device": (Annotated[str, typer.Option(metavar="auto|cpu|gpu|cuda", help="Where to compute.")], "auto"),
+    "config": (
+        Annotated[
+            Path | None,
+            typer.Option(
+                metavar="FILE.toml", callback=_load_config, is_eager=True, help="Defaults; flags win."
+            ),
+        ],
+        None,
+    ),
+}
+
+
+class Run:
+    """One invocation of a command: its common options, its console and its result."""
+
+    def __init__(self, name: str, common: dict[str, Any], options: dict[str, Any]) -> None:
+        self.name = name
+        self.overwrite: bool = common["overwrite"]
+        self.seed: int = common["seed"]
+        self.threads: int = common["threads"]
+        self.device: str = common["device"]
+        self.verbose: bool = common["verbose"]
+        self.json: str | None = common["json"]
+        self.console = Console(quiet=common["quiet"], verbose=self.verbose)
+        self.config = {**options, "seed": self.seed, "threads": self.threads, "device": self.device}
+
+    @property
+    def progress(self) -> Console:
+        """The callback that stages report to."""
+        return self.console
+
+    def say(self, text: str) -> None:
+        """A line of status on stderr, unless --quiet."""
+        self.console.say(text)
+
+    def result(self, data: dict[str, Any]) -> None:
+        """Write the machine-readable result to where --json says; the resolved options go with it."""
+        if self.json is None:
+            return
+        import json
+
+        text = json.dumps({**data, "config": self.config}, indent=2, default=_plain)
+        if self.json == "-":
+            sys.stdout.write(text + "\n")
+            return
+        from g2ard.io.atomic import atomic_output
+
+        with atomic_output(Path(self.json), overwrite=self.overwrite) as temporary:
+            temporary.write_text(text + "\n")
+
+    def unmet(self, requirement: str) -> NoReturn:
+        """End with status 3: all is written, but a stated requirement was not met."""
+        self.console.error(requirement)
+        raise typer.Exit(3)
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def group(name: str, text: str) -> typer.Typer:
+    """A command with subcommands, such as `g2ard synth`."""
+    sub = typer.Typer(help=text, no_args_is_help=True)
+    app.add_typer(sub, name=name)
+    return sub
+
+
+def command(name: str, *, example: str, parent: typer.Typer = app) -> Callable[[Any], Any]:
+    """Register `fn(run, **options)` as a command; `example` ends its help."""
+
+    def register(fn: Callable[..., None]) -> Callable[..., None]:
+        own = list(inspect.signature(fn, eval_str=True).parameters.values())[1:]
+        common = [
+            inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+            for key, (kind, default) in _COMMON.items()
+        ]
+
+        def call(**values: Any) -> None:
+            shared = {key: values.pop(key) for key in _COMMON}
+            _execute(Run(name, shared, dict(values)), fn, values)
+
+        parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own] + common
+        call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        call.__annotations__ = {p.name: p.annotation for p in parameters}
+        call.__doc__ = fn.__doc__
+        parent.command(name, epilog=f"Example: {example}")(call)
+        return fn
+
+    return register
+
+
+def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None:
+    if run.device not in ("auto", "cpu", "gpu", "cuda"):
+        raise typer.BadParameter(f"--device: auto, cpu, gpu or cuda, not {run.device!r}")
+    try:
+        if run.threads:
+            from g2ard import _core
+
+            _core.set_num_threads(run.threads)
+        with run.console:
+            fn(run, **options)
+    except KeyboardInterrupt:
+        run.console.error("interrupted")
+        raise typer.Exit(130) from None
+    except (G2ardError, OSError, MemoryError) as e:
+        run.console.error(_one_line(e))
+        raise typer.Exit(1) from None
+    except (typer.Exit, typer.BadParameter):
+        raise
+    except Exception as e:
+        if run.verbose:
+            traceback.print_exc()
+        run.console.error(f"internal error, please report it: {type(e).__name__}: {e} (-v shows where)")
+        raise typer.Exit(1) from None
+
+
+def _one_line(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, MemoryError):
+        return f"out of memory{f': {error}' if str(error) else ''}"
+    return " ".join(str(error).split())

@@ -1,0 +1,106 @@
+"""Option types that several commands share, and the parsers of counts and ratios."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = [
+    "Count",
+    "CountOption",
+    "OutputOption",
+    "RatioOption",
+    "SceneArgument",
+    "ViewsOption",
+    "budget_of",
+    "one_budget",
+]
+
+_COUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmM%]?)")
+
+
+@dataclass(frozen=True)
+class Count:
+    """A count as typed: absolute, or a share of what there is."""
+
+    value: float
+    is_share: bool
+    text: str
+
+    @classmethod
+    def parse(cls, text: str) -> Count:
+        """Read 250000, 250k, 1.5M or 25%.
+
+        >>> Count.parse("250k").of(10**6), Count.parse("25%").of(10), Count.parse("1.5M").of(10**7)
+        (250000, 3, 1500000)
+        """
+        match = _COUNT.fullmatch(text.strip())
+        if match is None or not float(match[1]) > 0:
+            raise typer.BadParameter(f"a positive count such as 250000, 250k, 1.5M or 25%, not {text!r}")
+        number, unit = float(match[1]), match[2].lower()
+        if unit == "%":
+            if number > 100:
+                raise typer.BadParameter(f"a share is at most 100%, not {text!r}")
+            return cls(number / 100, True, text)
+        number *= {"": 1, "k": 1_000, "m": 1_000_000}[unit]
+        if number != round(number):
+            raise typer.BadParameter(f"a whole number, not {text!r}")
+        return cls(round(number), False, text)
+
+    def of(self, total: int) -> int:
+        """The count out of `total`; a share is rounded up and at least 1."""
+        return max(1, math.ceil(self.value * total - 1e-9)) if self.is_share else int(self.value)
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def _ratio(text: str) -> float:
+    try:
+        value = float(text.strip().rstrip("xX×"))
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value >= 1):
+        raise typer.BadParameter(f"a ratio of at least 1, such as 10, not {text!r}")
+    return value
+
+
+CountOption = Annotated[
+    Count | None,
+    typer.Option(
+        "-n", "--count", parser=Count.parse, metavar="COUNT", help="Budget: 250000, 250k, 1.5M or 25%."
+    ),
+]
+RatioOption = Annotated[
+    float | None,
+    typer.Option(
+        "-r", "--ratio", parser=_ratio, metavar="RATIO", help="Budget as a ratio: 10 keeps a tenth."
+    ),
+]
+SceneArgument = Annotated[
+    Path, typer.Argument(metavar="SCENE", help="A .ply (3DGS), SOG, .spz, .splat or .compressed.ply.")
+]
+ViewsOption = Annotated[
+    Path | None,
+    typer.Option("--views", metavar="VIEWS", help="A COLMAP folder, a transforms.json or g2ard's own .json."),
+]
+OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Where the result goes.")]
+
+
+def one_budget(count: Count | None, ratio: float | None) -> None:
+    """Usage check, before anything is read: exactly one of -n and -r."""
+    if (count is None) == (ratio is None):
+        raise typer.BadParameter("give the budget as either -n COUNT or -r RATIO")
+
+
+def budget_of(count: Count | None, ratio: float | None, total: int) -> int:
+    """The exact budget out of `total` Gaussians; N/RATIO is rounded to the nearest and at least 1."""
+    if count is not None:
+        return count.of(total)
+    assert ratio is not None  # one_budget has seen to it
+    return max(1, math.floor(total / ratio + 0.5))
