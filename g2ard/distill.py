@@ -102,7 +102,7 @@ def distill(
 
 
 class _Rounds:
-    """The scene as it shrinks, its protection flags, and the log; saved after every stage if `work` is given."""
+    """The scene as it shrinks, its protection flags, and the log; each stage is saved if `work` is given."""
 
     def __init__(
         self,

@@ -32,17 +32,14 @@ def load_views(run: Run, path: Path, split: str, size: int | None, offset: objec
     """
     import numpy as np
 
-    from g2ard.errors import InputError
     from g2ard.io import read_view_set
-    from g2ard.splits import split_names
+    from g2ard.splits import split_mask
 
     found = read_view_set(path)
     for note in found.notes:
         run.say(f"{path}: {note}")
-    chosen = set(split_names(path, found.cameras.names, split))
-    cameras = found.cameras.take(np.array([name in chosen for name in found.cameras.names]))
-    if not len(cameras):
-        raise InputError(f"{path}: no views in split {split!r}")
+    mask = split_mask(path, found.cameras.names, split, stated=found.splits)
+    cameras = found.cameras.take(mask)
     cameras = cameras.resized(size)
     return cameras if offset is None else cameras.recentred(np.asarray(offset))
 
