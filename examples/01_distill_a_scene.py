@@ -1,7 +1,7 @@
 """Distil a scene ten times smaller and see how good it is.
 
-Takes the real scene playbot (CC-BY-4.0, "PLAYBOT" by Stephane Agullo) where G2ARD_DATA has it, else a small procedural
-city: its coloured point cloud is lifted, and its photos are what recovery looks at.
+Takes the real scene playbot (CC-BY-4.0, "PLAYBOT" by Stephane Agullo) where G2ARD_DATA has it, else a small
+procedural city: its coloured point cloud is lifted, and its photos are what recovery looks at.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def g2ard(*arguments: str) -> None:
 def main() -> None:
     playbot = Path(os.environ.get("G2ARD_DATA", "")) / "playbot" / "0_0"
     if os.environ.get("G2ARD_DATA") and playbot.is_dir():
-        # 500,000 trained Gaussians without photos: a pool of poses is made, and the scene itself is the teacher.
+        # Trained, without photos: a pool of poses is made, and the scene itself is the teacher.
         g2ard("distill", str(playbot), "--ratio", "10", "--output", str(OUT / "playbot"), "--overwrite")
     else:
         # A LiDAR-like cloud has geometry but no appearance: its photos are the targets.

@@ -124,9 +124,8 @@ class _Distillation:
         against = "photos" if use_photos else "teacher renders"
         targets, held_out = self._targets(train, teacher, colour), self._targets(test, teacher, colour)
         regularizers, why = preset_for("lift" if preset == "auto" and lifted else preset, prior)
-        run.say(
-            f"{len(prior):,} → {budget:,} Gaussians; {len(train)} views against {against}; regularisers: {why}"
-        )
+        run.say(f"{len(prior):,} → {budget:,} Gaussians; {len(train)} views against {against}")
+        run.say(f"regularisers: {why}")
         config = DistillConfig(
             method=method,
             schedule=schedule_named(schedule),
