@@ -105,7 +105,7 @@ def flag(
         splats: the raw prior, never a recovered scene: fitting hides the residual.
         budget: the final count N_S, which sets the cell size.
         config: `flag_threshold` is read.
-        progress: told of cells done.
+        progress: told when done.
 
     Returns:
         (N,) bool; False for rows that are not finite.
@@ -152,7 +152,7 @@ def simplify(
         method: the policy.
         protected: (N,) bool flags to inherit; None computes them (see `flag`).
         config: the constants.
-        progress: told of groups done in each round.
+        progress: told of Gaussians shed, round by round.
 
     Returns:
         The scene, where each row went, the inherited flags and a report.
@@ -187,7 +187,7 @@ def simplify_round(
         budget: this round's count N_r.
         protected: (N,) bool flags, from `flag` on the raw prior and then from the round before.
         config: the constants.
-        progress: told of groups done.
+        progress: told of Gaussians shed.
 
     Returns:
         As `simplify`.

@@ -1,4 +1,4 @@
-"""What tests of several stages share."""
+"""Where real data is, and what tests share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,16 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+_ROOT = Path(__file__).resolve().parents[1]
+_DATA = Path(os.environ.get("G2ARD_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The folder of real scenes; a test that needs it is skipped where there is none."""
+    if not _DATA.is_dir():
+        pytest.skip(f"no real data at {_DATA} (set G2ARD_DATA)")
+    return _DATA
 
 
 @pytest.fixture
@@ -17,7 +26,7 @@ def command_line():
     """Runs `g2ard …` as a program: (exit status, stdout, stderr)."""
 
     def run(*arguments, cwd):
-        path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+        path = os.pathsep.join(filter(None, [str(_ROOT), os.environ.get("PYTHONPATH")]))
         done = subprocess.run(
             [sys.executable, "-m", "g2ard", *map(str, arguments)],
             cwd=cwd,

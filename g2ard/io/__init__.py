@@ -19,6 +19,11 @@ from g2ard.io.atomic import atomic_folder, atomic_output, check_output
 from g2ard.io.detect import kind
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike
+
+    from g2ard.cameras import Cameras
     from g2ard.io.types import Cloud, Note, Points, Scene, ViewSet
     from g2ard.splats import Splats
 
@@ -36,8 +41,11 @@ __all__ = [
     "read_points",
     "read_scene",
     "read_splats",
+    "read_view_set",
+    "read_views",
     "write_points",
     "write_splats",
+    "write_views",
 ]
 
 
@@ -181,3 +189,80 @@ def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -
     if path.suffix != ".ply":
         raise OutputError(f"{path}: clouds are written as .ply")
     cloud_ply.write(path, points, overwrite=overwrite)
+
+
+def read_views(path: str | Path, *, images: str | Path | None = None, split: str = "all") -> Cameras:
+    """Read views; `read_view_set` also says what was noticed, and per view its split and weight.
+
+    Args:
+        path: a COLMAP folder, a transforms.json or its folder, or a .json that g2ard wrote.
+        images: the folder of the photos, where they are not where the file says.
+        split: "train", "test", or "all"; see `g2ard.splits.split_mask`.
+
+    Returns:
+        The views in OpenCV axes, COLMAP's sorted by name, others in file order. Views whose photo is
+        missing are left out, unless none has one.
+
+    Raises:
+        InputError: the file is absent, broken or holds no views, or the split has none.
+    """
+    return read_view_set(path, images=images, split=split).cameras
+
+
+def read_view_set(path: str | Path, *, images: str | Path | None = None, split: str = "all") -> ViewSet:
+    """Read views and what their file says beside the cameras.
+
+    Args:
+        path: as for `read_views`.
+        images: as for `read_views`.
+        split: as for `read_views`.
+
+    Returns:
+        A `ViewSet` of cameras, notes, splits and weights.
+
+    Raises:
+        InputError: as for `read_views`.
+    """
+    from importlib import import_module
+
+    from g2ard.errors import InputError
+    from g2ard.io.detect import file_format
+    from g2ard.splits import split_mask
+
+    path, found = Path(path), file_format(path)
+    if found not in ("colmap", "transforms", "views"):
+        raise InputError(f"{path}: views are needed (a COLMAP folder, transforms.json, g2ard's .json)")
+    if images is not None and not Path(images).is_dir():
+        raise InputError(f"{images}: no such folder of photos")
+    views = import_module(f"g2ard.io.{found}").read(path, Path(images) if images else None)
+    return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
+
+
+def write_views(
+    path: str | Path,
+    cameras: Cameras,
+    *,
+    splits: Sequence[str | None] = (),
+    weights: ArrayLike | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write views as g2ard's own .json, which `read_views` gives back bit by bit.
+
+    Args:
+        path: the .json to write; photos are named relative to it.
+        cameras: C views.
+        splits: per view "train", "test" or None; () for none.
+        weights: (C,) how often each view should be drawn; None for none.
+        overwrite: whether an existing file may be replaced.
+
+    Raises:
+        OutputError: it exists, cannot be written, or is not a .json.
+        InputError: no views, or splits or weights of another length.
+    """
+    from g2ard.errors import OutputError
+    from g2ard.io import views
+
+    path = Path(path)
+    if path.suffix != ".json":
+        raise OutputError(f"{path}: views are written as .json")
+    views.write(path, cameras, splits=splits, weights=weights, overwrite=overwrite)

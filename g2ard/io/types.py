@@ -91,3 +91,10 @@ class ViewSet:
     notes: tuple[Note, ...] = ()
     splits: tuple[str | None, ...] = ()
     weights: NDArray[np.float64] | None = None
+
+    def take(self, mask: NDArray[np.bool_]) -> ViewSet:
+        """The views that `mask` (C,) selects, with all that belongs to them."""
+        rows = np.flatnonzero(mask)
+        splits = tuple(self.splits[i] for i in rows) if self.splits else ()
+        weights = None if self.weights is None else self.weights[rows]
+        return ViewSet(self.cameras.take(rows), self.notes, splits, weights)

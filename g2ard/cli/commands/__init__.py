@@ -1,4 +1,9 @@
 """One module per command, in the order `g2ard --help` lists them."""
 
-from g2ard.cli.commands import lift as lift
-from g2ard.cli.commands import simplify as simplify
+from g2ard.cli.commands import lift  # isort: skip
+from g2ard.cli.commands import simplify  # isort: skip
+from g2ard.cli.commands import recover  # isort: skip
+from g2ard.cli.commands import render  # isort: skip
+from g2ard.cli.commands import evaluate  # isort: skip
+
+__all__ = ["evaluate", "lift", "recover", "render", "simplify"]

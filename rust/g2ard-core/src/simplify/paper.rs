@@ -107,9 +107,12 @@ impl Paper {
         };
         let mut trail = Trail::start(splats, flags);
         let mut rounds = Vec::new();
+        let shed = |budget: usize| ordered.rows.len().saturating_sub(budget) as u64;
+        control.begin(shed(schedule.last().copied().unwrap_or(usize::MAX)));
         for &budget in schedule {
             let Step { splats, flags, .. } = &trail.step;
             let (step, report) = self.round(splats, flags, budget, ordered.grid, control)?;
+            control.advance((report.before - report.after) as u64);
             trail.then(step);
             rounds.push(report);
         }
@@ -221,12 +224,10 @@ impl Paper {
         report: &mut PaperRound,
         control: &Control,
     ) -> Result<Vec<Option<Box<Candidate>>>> {
-        control.begin(groups.len() as u64);
         let verdicts: Vec<Vec<Option<Verdict>>> = groups
             .par_chunks(CHUNK)
             .map(|chunk| {
                 control.check()?;
-                control.advance(chunk.len() as u64);
                 Ok(chunk
                     .iter()
                     .map(|g| (g.len() > 1).then(|| self.verdict(splats, g)))
