@@ -77,11 +77,12 @@ const CHUNK: usize = 256;
 
 impl Paper {
     /// Rounds down to each count of `schedule`. Without `flags` they are computed first, on the raw
-    /// scene over as many cells as the last count.
+    /// scene over about `flag_cells` cells.
     pub fn run(
         &self,
         scene: &SceneRef,
         flags: Option<&[bool]>,
+        flag_cells: usize,
         schedule: &[usize],
         control: &Control,
     ) -> Result<Outcome<PaperRound>> {
@@ -100,10 +101,7 @@ impl Paper {
                     flags.len(),
                 ));
             }
-            None => {
-                let cells = schedule.last().copied().unwrap_or(splats.len());
-                residual::flags(&splats, cells, self.flag_threshold, control)?
-            }
+            None => residual::flags(&splats, flag_cells, self.flag_threshold, control)?,
         };
         let mut trail = Trail::start(splats, flags);
         let mut rounds = Vec::new();
