@@ -20,7 +20,7 @@ def simplify(
     output: OutputOption,
     count: CountOption = None,
     ratio: RatioOption = None,
-    method: Annotated[str, typer.Option(metavar="default|paper", help="The policy.")] = "default",
+    method: Annotated[str, typer.Option(metavar="default|fast|paper", help="The policy.")] = "default",
     retention: Annotated[
         float | None,
         typer.Option(help="Share of the Gaussians that a round keeps; the method's own if absent."),
