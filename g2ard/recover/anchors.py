@@ -1,4 +1,4 @@
-"""Construction-time anchors, the two regularisers that hold a Gaussian to its surface, and their diagnostics."""
+"""Construction-time anchors, weights of the two terms that hold a Gaussian to its surface, diagnostics."""
 
 from __future__ import annotations
 

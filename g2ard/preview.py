@@ -1,0 +1,47 @@
+"""A before/after picture: held-out views, what they should show and what scenes render."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from g2ard.splats import Splats
+from g2ard.targets import Targets
+
+__all__ = ["preview"]
+
+_ROWS = 3
+
+
+def preview(
+    path: Path,
+    targets: Targets,
+    scenes: list[tuple[str, Splats]],
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> None:
+    """Write a PNG with a row for each of three evenly spaced views: target, then each scene with its PSNR.
+
+    Args:
+        path: where the PNG goes.
+        targets: photos or teacher renders with their cameras.
+        scenes: (label, scene), left to right.
+        background: RGB behind the scenes.
+    """
+    from g2ard.evaluate import psnr
+    from g2ard.images import contact_sheet
+    from g2ard.render import render
+
+    count = len(targets.cameras)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _ROWS)).round().astype(int))
+    rows, labels = [], []
+    for view in map(int, chosen):
+        target = targets[view]
+        row, captions = [target], [f"target ({targets.cameras.names[view]})"]
+        for name, splats in scenes:
+            image = np.clip(render(splats, targets.cameras, view, background=background).image, 0, 1)
+            row.append(image)
+            captions.append(f"{name} ({len(splats):,}): {psnr(image, target):.2f} dB")
+        rows.append(row)
+        labels.append(captions)
+    contact_sheet(path, rows, labels)
