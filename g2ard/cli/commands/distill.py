@@ -185,8 +185,7 @@ def _write(
     from g2ard.preview import preview
 
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
-    with atomic_output(output / "preview.png", overwrite=True) as temporary:
-        preview(temporary, held_out, scenes, colour)
+    preview(output / "preview.png", held_out, scenes, colour)
     with atomic_output(output / "report.json", overwrite=True) as temporary:
         temporary.write_text(json.dumps({**report, "config": run.config}, indent=2, default=str) + "\n")
     write_splats(output / "scene.ply", result.splats, overwrite=True)
