@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from g2ard.cli.commands import COMMANDS
+from g2ard.cli.console import Console
 
 CommandLine = Callable[..., tuple[int, str, str]]
 
@@ -65,6 +66,30 @@ def test_config_file_gives_defaults_and_refuses_unknown_names(
     assert status == 2
     assert "backgruond" in error
     assert "abacus" in command_line(*render, "good.toml", cwd=tmp_path)[2]  # the file's value is used …
-    assert (
-        "abacus" not in command_line(*render, "good.toml", "--device", "cpu", cwd=tmp_path)[2]
-    )  # … a flag wins
+    flagged = command_line(*render, "good.toml", "--device", "cpu", cwd=tmp_path)[2]
+    assert "abacus" not in flagged  # … a flag wins
+
+
+def test_progress_lines_are_rare_and_tell_eta(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter(range(100))
+    monkeypatch.setattr("g2ard.cli.console.time.monotonic", lambda: next(clock))
+    console = Console()
+    for done in range(1, 41):
+        console("recover", done, 40, {"loss": 0.5})
+    console("short", 1, 1)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 4  # every 10 s, and the end
+    assert "ETA" in lines[0]
+    assert "loss 0.5" in lines[0]
+    assert lines[-1].startswith("recover: 40/40")
+
+
+def test_quiet_says_errors_only(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console(quiet=True)
+    console.say("hello")
+    console("stage", 1, 1)
+    console.table("t", ["a"], [["1"]])
+    console.error("bad")
+    assert capsys.readouterr().err == "g2ard: bad\n"
