@@ -87,7 +87,7 @@ def distill(
     if not resume:
         shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True, exist_ok=True)
-    train, test, use_photos = _views(run, prior, views or _pool(run, prior, output), size, photos, lifted)
+    train, test, use_photos = _views(run, views or _pool(run, prior, output), size, photos, lifted)
     teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
     colour = background or (0.0, 0.0, 0.0)
     regularizers, why = preset_for("lift" if preset == "auto" and lifted else preset, prior)
@@ -151,10 +151,10 @@ def _pool(run: Run, prior: Splats, output: Path) -> Path:
 
 
 def _views(
-    run: Run, prior: Splats, path: Path, size: int | None, photos: bool | None, lifted: bool
+    run: Run, path: Path, size: int | None, photos: bool | None, lifted: bool
 ) -> tuple[Cameras, Cameras, bool]:
     """Training views, held-out views, and whether their photos are the targets."""
-    train, test = (load_views(run, path, split, size, prior.offset) for split in ("train", "test"))
+    train, test = (load_views(run, path, split, size) for split in ("train", "test"))
     pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
     return train, test, lifted or (pictured if photos is None else photos)
 
