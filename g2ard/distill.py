@@ -76,7 +76,7 @@ def distill(
     shot.
 
     Args:
-        prior: a trained model, or a lift; in the coordinates of the targets' cameras.
+        prior: a trained model, or a lift; its offset counts, cameras are in world coordinates.
         budget: N_S, at most the prior's count.
         targets: photos, or the prior's own renders.
         config: see `DistillConfig`.
