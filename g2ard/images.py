@@ -197,45 +197,49 @@ def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) ->
 
 
 def contact_sheet(
-    path: str | Path,
     rows: Sequence[Sequence[ArrayLike]],
-    labels: Sequence[Sequence[str]],
+    labels: Sequence[str],
     *,
+    row_labels: Sequence[str] = (),
     cell_width: int | None = None,
-    overwrite: bool = False,
-) -> None:
-    """Write a PNG of images in a grid, each under its caption: one row a view, one column a kind.
+) -> NDArray[np.uint8]:
+    """Images in a grid: one row a view, one column a kind (photo, simplified, recovered…).
 
     Args:
-        path: the file.
         rows: rows of images (H, W, 3), floats in [0, 1] or bytes, of any sizes; rows may be short.
-        labels: a caption for each image.
+        labels: a caption above each column.
+        row_labels: a caption under each row; () for none.
         cell_width: resize every image to this width; None keeps sizes.
-        overwrite: whether an existing file may be replaced.
+
+    Returns:
+        (H, W, 3) bytes, on a dark ground.
 
     Raises:
-        InputError: no images, or captions that do not fit them.
-        OutputError: see `atomic_output`.
+        InputError: no images.
     """
     grid = [[_cell(image, cell_width) for image in row] for row in rows]
-    if not any(grid) or [len(row) for row in grid] != [len(captions) for captions in labels]:
-        raise InputError(f"{path}: a contact sheet needs images, and a caption for each")
+    if not any(grid):
+        raise InputError("a contact sheet needs images")
     columns = max(map(len, grid))
     widths = [max(row[c].width for row in grid if c < len(row)) for c in range(columns)]
     heights = [max((cell.height for cell in row), default=0) for row in grid]
     text = max(11, min(28, max(widths) // 20))
     font, line = ImageFont.load_default(text), round(1.6 * text)
+    foot = line if row_labels else 0
     lefts = [_GAP + sum(widths[:c]) + _GAP * c for c in range(columns)]
-    size = sum(widths) + _GAP * (columns + 1), sum(heights) + (line + _GAP) * len(grid) + _GAP
+    size = sum(widths) + _GAP * (columns + 1), line + sum(heights) + (foot + _GAP) * len(grid) + _GAP
     sheet = Image.new("RGB", size, (24, 24, 24))
     draw = ImageDraw.Draw(sheet)
-    top = _GAP
-    for row, captions, height in zip(grid, labels, heights, strict=True):
-        for left, cell, caption in zip(lefts, row, captions, strict=False):
-            draw.text((left, top), caption, fill=(235, 235, 235), font=font)
-            sheet.paste(cell, (left, top + line))
-        top += line + height + _GAP
-    write_png(path, np.asarray(sheet), overwrite=overwrite)
+    for left, label in zip(lefts, labels, strict=False):
+        draw.text((left, _GAP), label, fill=(235, 235, 235), font=font)
+    top = _GAP + line
+    for r, (row, height) in enumerate(zip(grid, heights, strict=True)):
+        for left, cell in zip(lefts, row, strict=False):
+            sheet.paste(cell, (left, top))
+        if r < len(row_labels):
+            draw.text((_GAP, top + height), row_labels[r], fill=(200, 200, 200), font=font)
+        top += height + foot + _GAP
+    return np.asarray(sheet)
 
 
 def _cell(image: ArrayLike, width: int | None) -> Image.Image:

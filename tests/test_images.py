@@ -129,7 +129,7 @@ def test_undistorted_photo_is_the_pinhole_picture(tmp_path: Path, scale: int) ->
     inside = (slice(14, -14), slice(14, -14))  # the edge is repeated where the lens saw no more
     np.testing.assert_allclose(image[inside], expected[inside], atol=0.5 / 255 + 1.5e-3)
     undone = np.asarray(Image.open(photo), np.float32)[::scale, ::scale] / 255
-    assert np.abs(undone[inside] - expected[inside]).max() > 0.05  # it was distorted
+    assert np.abs(undone[inside] - expected[inside]).max() > 0.02  # it was distorted
 
 
 def test_what_cannot_be_loaded_is_named(tmp_path: Path) -> None:
@@ -171,17 +171,16 @@ def test_png_round_trip(tmp_path: Path) -> None:
         write_png(tmp_path / "b.png", np.zeros((2, 3, 5)))
 
 
-def test_contact_sheet_holds_its_images(tmp_path: Path) -> None:
+def test_contact_sheet_holds_its_images() -> None:
     rng = np.random.default_rng(0)
     rows = [[rng.random((20, 30, 3)) for _ in range(3)], [rng.random((10, 30, 3))]]
-    labels = [["photo", "simplified", "recovered"], ["photo"]]
-    contact_sheet(tmp_path / "a.png", rows, labels)
-    sheet = np.asarray(Image.open(tmp_path / "a.png"))
+    labels = ["photo", "simplified", "recovered"]
+    sheet = contact_sheet(rows, labels, row_labels=["one", "two"])
+    assert sheet.dtype == np.uint8
     for image in (*rows[0], *rows[1]):
         windows = np.lib.stride_tricks.sliding_window_view(sheet, image.shape)[:, :, 0]
         assert (windows == to_bytes(image)).all((2, 3, 4)).sum() == 1
-    contact_sheet(tmp_path / "small.png", rows, labels, cell_width=15)
-    assert Image.open(tmp_path / "small.png").width < sheet.shape[1]
-    for bad in ([], [["photo"], ["photo"]]):
-        with pytest.raises(InputError, match="a caption for each"):
-            contact_sheet(tmp_path / "b.png", rows if bad else [], bad)
+    assert contact_sheet(rows, labels).shape[0] < sheet.shape[0]
+    assert contact_sheet(rows, labels, cell_width=15).shape[1] < sheet.shape[1]
+    with pytest.raises(InputError, match="needs images"):
+        contact_sheet([], ["photo"])
