@@ -3,11 +3,13 @@
 use pyo3::prelude::*;
 
 mod error;
+mod raster;
 mod work;
 
 #[pymodule]
 fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("__version__", env!("CARGO_PKG_VERSION"))?;
     work::register(m)?;
+    raster::register(m)?;
     Ok(())
 }
