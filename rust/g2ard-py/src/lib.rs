@@ -5,6 +5,7 @@ use pyo3::prelude::*;
 mod arrays;
 mod error;
 mod lift;
+mod raster;
 mod simplify;
 mod work;
 
@@ -14,5 +15,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     work::register(m)?;
     lift::register(m)?;
     simplify::register(m)?;
+    raster::register(m)?;
     Ok(())
 }
