@@ -30,6 +30,7 @@ def simplify_flags(
 def simplify_paper(
     scene: Splats,
     schedule: list[int],
+    flag_cells: int,
     *,
     protected: NDArray[np.bool_] | None,
     min_opacity: float,
