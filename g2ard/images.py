@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,9 @@ __all__ = ["contact_sheet", "load_image", "load_images", "to_bytes", "write_png"
 
 _ASPECT_SLACK = 0.02
 """Relative difference of aspect ratio that rounding a resized photo may cause; more is another photo."""
+
+_GAP = 6
+"""Pixels between the images of a sheet."""
 
 
 def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
@@ -136,14 +139,28 @@ def _lookup(width: int, height: int, K: tuple[float, ...], distortion: tuple[flo
 
 
 def _resized(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """Each pixel the mean of the area it covers; bilinear where it grows."""
+    """Each pixel the mean of the area it covers; bilinear along an axis that grows."""
+    for axis, length in ((0, size[1]), (1, size[0])):
+        if length < image.shape[axis]:
+            image = _averaged(image, length, axis)
     height, width = image.shape[:2]
-    if (width, height) == size:
-        return np.ascontiguousarray(image)
-    shrinks = size[0] <= width and size[1] <= height
-    how = Image.Resampling.BOX if shrinks else Image.Resampling.BILINEAR
-    planes = [Image.fromarray(np.ascontiguousarray(image[..., c])).resize(size, how) for c in range(3)]
-    return np.stack([np.asarray(plane, np.float32) for plane in planes], axis=2)
+    if (width, height) != size:
+        planes = [Image.fromarray(np.ascontiguousarray(image[..., c])) for c in range(3)]
+        grown = [np.asarray(plane.resize(size, Image.Resampling.BILINEAR), np.float32) for plane in planes]
+        image = np.stack(grown, axis=2)
+    return np.ascontiguousarray(image)
+
+
+def _averaged(image: NDArray[np.float32], length: int, axis: int) -> NDArray[np.float32]:
+    """Exact means over `length` equal stretches of an axis, from differences of its running sum."""
+    count = image.shape[axis]
+    pad = [(1, 0) if i == axis else (0, 0) for i in range(3)]
+    sums = np.pad(np.cumsum(image, axis=axis, dtype=np.float64), pad)
+    edges = np.linspace(0, count, length + 1)
+    below = np.minimum(edges.astype(int), count - 1)
+    share = np.expand_dims(edges - below, [i for i in range(3) if i != axis])
+    low, high = sums.take(below, axis), sums.take(below + 1, axis)
+    return (np.diff(low + share * (high - low), axis=axis) * (length / count)).astype(np.float32)
 
 
 def to_bytes(image: ArrayLike) -> NDArray[np.uint8]:
@@ -180,22 +197,22 @@ def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) ->
 
 
 def contact_sheet(
-    rows: Iterable[Sequence[ArrayLike]],
+    rows: Sequence[Sequence[ArrayLike]],
     labels: Sequence[str],
     *,
     row_labels: Sequence[str] = (),
     cell_width: int | None = None,
 ) -> NDArray[np.uint8]:
-    """Images in a grid: one row a view, one column a kind (photo, teacher, simplified, recovered…).
+    """Images in a grid: one row a view, one column a kind (photo, simplified, recovered…).
 
     Args:
-        rows: rows of images (H, W, 3), floats in [0, 1] or bytes; a short row leaves cells empty.
+        rows: rows of images (H, W, 3), floats in [0, 1] or bytes, of any sizes; rows may be short.
         labels: a caption above each column.
         row_labels: a caption under each row; () for none.
         cell_width: resize every image to this width; None keeps sizes.
 
     Returns:
-        (H, W, 3) bytes, dark background.
+        (H, W, 3) bytes, on a dark ground.
 
     Raises:
         InputError: no images.
@@ -203,27 +220,25 @@ def contact_sheet(
     grid = [[_cell(image, cell_width) for image in row] for row in rows]
     if not any(grid):
         raise InputError("a contact sheet needs images")
-    columns = max(len(labels), *(len(row) for row in grid))
-    widths = [max((row[c].width for row in grid if c < len(row)), default=1) for c in range(columns)]
-    heights = [max((cell.height for cell in row), default=1) for row in grid]
-    gap = 6
-    text = max(12, min(28, max(widths) // 16))
-    font = ImageFont.load_default(text)
-    line = round(1.5 * text)
+    columns = max(map(len, grid))
+    widths = [max(row[c].width for row in grid if c < len(row)) for c in range(columns)]
+    heights = [max((cell.height for cell in row), default=0) for row in grid]
+    text = max(11, min(28, max(widths) // 20))
+    font, line = ImageFont.load_default(text), round(1.6 * text)
     foot = line if row_labels else 0
-    size = sum(widths) + gap * (columns + 1), line + sum(h + foot + gap for h in heights) + gap
+    lefts = [_GAP + sum(widths[:c]) + _GAP * c for c in range(columns)]
+    size = sum(widths) + _GAP * (columns + 1), line + sum(heights) + (foot + _GAP) * len(grid) + _GAP
     sheet = Image.new("RGB", size, (24, 24, 24))
     draw = ImageDraw.Draw(sheet)
-    lefts = [gap + sum(widths[:c]) + gap * c for c in range(columns)]
     for left, label in zip(lefts, labels, strict=False):
-        draw.text((left, line // 6), label, fill=(235, 235, 235), font=font)
-    top = line
-    for r, row in enumerate(grid):
+        draw.text((left, _GAP), label, fill=(235, 235, 235), font=font)
+    top = _GAP + line
+    for r, (row, height) in enumerate(zip(grid, heights, strict=True)):
         for left, cell in zip(lefts, row, strict=False):
             sheet.paste(cell, (left, top))
         if r < len(row_labels):
-            draw.text((gap, top + heights[r]), row_labels[r], fill=(180, 180, 180), font=font)
-        top += heights[r] + foot + gap
+            draw.text((_GAP, top + height), row_labels[r], fill=(200, 200, 200), font=font)
+        top += height + foot + _GAP
     return np.asarray(sheet)
 
 
@@ -232,5 +247,4 @@ def _cell(image: ArrayLike, width: int | None) -> Image.Image:
     if width is None or cell.width == width:
         return cell
     height = max(1, round(cell.height * width / cell.width))
-    how = Image.Resampling.BOX if width < cell.width else Image.Resampling.BICUBIC
-    return cell.resize((width, height), how)
+    return cell.resize((width, height), Image.Resampling.LANCZOS)

@@ -2,7 +2,7 @@
 
 from importlib import import_module
 
-COMMANDS = ("distill", "lift", "simplify", "recover", "render", "evaluate")
+COMMANDS = ("distill", "lift", "simplify", "recover", "render", "evaluate", "info")
 
 for _name in COMMANDS:
     import_module(f"{__name__}.{_name}")
