@@ -4,6 +4,7 @@ use pyo3::prelude::*;
 
 mod error;
 mod raster;
+mod ssim;
 mod work;
 
 #[pymodule]
@@ -11,5 +12,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("__version__", env!("CARGO_PKG_VERSION"))?;
     work::register(m)?;
     raster::register(m)?;
+    ssim::register(m)?;
     Ok(())
 }
