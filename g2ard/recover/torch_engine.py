@@ -84,7 +84,7 @@ class TorchEngine:
                 means, p["quats"], p["log_scales"], self._anchors, self._regularizers
             )
         self._adam.zero_grad(set_to_none=True)
-        total.backward()
+        torch.autograd.backward(total)
         lively = [name for name in _NAMES if p[name].numel()]
         for group, name in zip(self._adam.param_groups, lively, strict=True):
             group["lr"] = getattr(rates, name)

@@ -7,6 +7,7 @@ mod error;
 mod lift;
 mod raster;
 mod simplify;
+mod ssim;
 mod work;
 
 #[pymodule]
@@ -16,5 +17,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     lift::register(m)?;
     simplify::register(m)?;
     raster::register(m)?;
+    ssim::register(m)?;
     Ok(())
 }
