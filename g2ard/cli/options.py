@@ -104,3 +104,32 @@ def budget_of(count: Count | None, ratio: float | None, total: int) -> int:
         return count.of(total)
     assert ratio is not None  # one_budget has seen to it
     return max(1, math.floor(total / ratio + 0.5))
+
+
+def _colour(text: str) -> tuple[float, float, float]:
+    named = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+    if text in named:
+        return named[text]
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 3 or not all(0 <= v <= 1 for v in values):
+        raise typer.BadParameter(f"black, white or three numbers in [0, 1] such as 0.2,0.3,0.4, not {text!r}")
+    return (values[0], values[1], values[2])
+
+
+SplitOption = Annotated[
+    str, typer.Option(metavar="train|test|all", help="By the views' split file, else every 8th name is test.")
+]
+SizeOption = Annotated[
+    int | None, typer.Option(min=16, metavar="PIXELS", help="Shrink views to this longer side.")
+]
+BackgroundOption = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option(parser=_colour, metavar="COLOUR", help="black (the default), white or R,G,B in [0, 1]."),
+]
+TeacherOption = Annotated[
+    Path | None,
+    typer.Option("--teacher", metavar="SCENE", help="Its renders are the targets; without it, the photos."),
+]

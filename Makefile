@@ -1,0 +1,39 @@
+# Each target sets up what it needs by itself and is quick the second time.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+G2ARD_DATA ?= $(abspath ../shared/data)
+export G2ARD_DATA
+export PIP_DISABLE_PIP_VERSION_CHECK = 1
+
+RUST := $(shell find rust -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml) Cargo.toml Cargo.lock
+
+.PHONY: demo test lint wheel setup clean
+
+setup: $(VENV)/.built
+
+# One stamp for both halves: Python dependencies by pyproject.toml, the extension by cargo.
+$(VENV)/.built: pyproject.toml $(RUST)
+	test -x $(BIN)/maturin || { $(PYTHON) -m venv $(VENV) && $(BIN)/pip install --quiet "maturin>=1.9,<2"; }
+	$(BIN)/maturin develop --release --extras dev --quiet
+	touch $@
+
+demo: setup
+	$(BIN)/python examples/01_distill_a_scene.py
+
+test: setup
+	cargo test --quiet --workspace
+	$(BIN)/python -m pytest
+
+lint: setup
+	cargo fmt --all --check
+	cargo clippy --workspace --all-targets --quiet -- -D warnings
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+wheel: setup
+	$(BIN)/maturin build --release --out dist
+
+clean:
+	rm -rf $(VENV) target dist demo

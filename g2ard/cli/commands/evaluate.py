@@ -1,0 +1,69 @@
+"""`g2ard evaluate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from g2ard.cli.frame import Run, command
+from g2ard.cli.options import BackgroundOption, SizeOption, SplitOption, TeacherOption
+
+
+@command("evaluate", example="g2ard evaluate small.ply --views poses.json --teacher scene.ply --json -")
+def evaluate(
+    run: Run,
+    scenes: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scenes to score.")],
+    views: Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")],
+    teacher: TeacherOption = None,
+    anchors: Annotated[
+        Path | None,
+        typer.Option(metavar="SCENE", help="The same Gaussians before recovery: adds Drift95 and its kin."),
+    ] = None,
+    split: SplitOption = "test",
+    size: SizeOption = None,
+    background: BackgroundOption = None,
+) -> None:
+    """PSNR, SSIM, size and needle share of scenes, against photos or a teacher's renders."""
+    from g2ard.cli.scenes import load_scene, load_views, make_targets
+    from g2ard.errors import InputError
+    from g2ard.evaluate import evaluate as score
+    from g2ard.recover.anchors import Anchors, drift95, needle
+
+    colour = background or (0.0, 0.0, 0.0)
+    dense = load_scene(run, teacher) if teacher else None
+    frozen = load_scene(run, anchors) if anchors else None
+    rows: list[dict[str, Any]] = []
+    targets = None
+    for path in scenes:
+        splats = load_scene(run, path)
+        origin = dense.offset if dense is not None else splats.offset
+        if targets is None:
+            cameras = load_views(run, views, split, size, origin)
+            targets = make_targets(run, cameras, dense, colour)
+        splats = splats.recentred(origin) if (splats.offset != origin).any() else splats
+        scored = score(splats, targets, background=colour, progress=run.progress, stage=path.name)
+        row = {"scene": str(path), **scored.as_dict(), "drift95": None, "needle": needle(splats.scales)}
+        row["file_bytes"] = path.stat().st_size if path.is_file() else None
+        if frozen is not None:
+            if len(frozen) != len(splats):
+                raise InputError(f"{anchors}: {len(frozen)} Gaussians, {path} has {len(splats)}")
+            row["drift95"] = drift95(Anchors.of(frozen), splats.means)
+        rows.append(row)
+    run.console.table(
+        f"{len(targets.cameras) if targets else 0} views, against {'the teacher' if dense else 'photos'}",
+        ["scene", "Gaussians", "MB", "PSNR", "SSIM", "needle"],
+        [
+            [
+                Path(r["scene"]).name,
+                f"{r['count']:,}",
+                f"{r['bytes'] / 1e6:.2f}",
+                f"{r['psnr']:.2f}",
+                f"{r['ssim']:.4f}",
+                f"{r['needle']:.1%}",
+            ]
+            for r in rows
+        ],
+    )
+    run.result({"against": "teacher" if dense else "photos", "scenes": rows})

@@ -1,0 +1,85 @@
+"""`g2ard recover`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from g2ard.cli.frame import Run, command
+from g2ard.cli.options import BackgroundOption, OutputOption, SizeOption, SplitOption, TeacherOption
+
+
+@command("recover", example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply")
+def recover(
+    run: Run,
+    student: Annotated[Path, typer.Argument(metavar="STUDENT", help="The compact scene to recover.")],
+    views: Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")],
+    output: OutputOption,
+    teacher: TeacherOption = None,
+    preset: Annotated[
+        str, typer.Option(metavar="auto|trained|lift|noisy", help="Which regularisers hold the geometry.")
+    ] = "auto",
+    schedule: Annotated[
+        str, typer.Option(metavar="fast|default|best|paper", help="Rates, decay and horizon.")
+    ] = "default",
+    steps: Annotated[int | None, typer.Option(min=1, help="Overrides the schedule's horizon.")] = None,
+    sh_degree: Annotated[
+        int | None,
+        typer.Option("--sh-degree", min=0, max=3, help="Of the result; the student's if not given."),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the checkpoint of a stopped run.")
+    ] = False,
+    split: SplitOption = "train",
+    size: SizeOption = None,
+    background: BackgroundOption = None,
+) -> None:
+    """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
+    from g2ard.cli.scenes import load_scene, load_views, make_targets
+    from g2ard.io import write_splats
+    from g2ard.io.atomic import check_output
+    from g2ard.recover import RecoverConfig
+    from g2ard.recover import recover as optimize
+    from g2ard.recover.presets import preset_for
+    from g2ard.recover.schedule import schedule_named
+
+    check_output(output, run.overwrite)
+    colour = background or (0.0, 0.0, 0.0)
+    splats = load_scene(run, student)
+    dense = load_scene(run, teacher) if teacher else None
+    if dense is not None and (dense.offset != splats.offset).any():
+        dense = dense.recentred(splats.offset)
+    cameras = load_views(run, views, split, size, splats.offset)
+    regularizers, why = preset_for(preset, splats)
+    run.say(f"regularisers: {why}")
+    config = RecoverConfig(
+        schedule=schedule_named(schedule),
+        steps=steps,
+        regularizers=regularizers,
+        sh_degree=sh_degree,
+        background=colour,
+        seed=run.seed,
+    )
+    checkpoint = output.with_name(f".{output.name}.checkpoint.npz")
+    if not resume:
+        checkpoint.unlink(missing_ok=True)
+    try:
+        result = optimize(
+            splats,
+            make_targets(run, cameras, dense, colour),
+            config,
+            checkpoint=checkpoint,
+            progress=run.progress,
+        )
+    except KeyboardInterrupt:
+        run.say(f"stopped; the same command with --resume goes on from {checkpoint}")
+        raise
+    write_splats(output, result.splats, overwrite=run.overwrite)
+    checkpoint.unlink(missing_ok=True)
+    gain = result.report["psnr"]
+    run.say(
+        f"{output}: {len(splats):,} Gaussians, training views {gain['before']:.2f} → {gain['after']:.2f} dB"
+    )
+    run.result({**result.report, "preset": why, "output": str(output)})

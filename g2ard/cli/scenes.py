@@ -1,0 +1,58 @@
+"""Reading what commands take: scenes, views and targets, with a line for all that was noticed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from g2ard.cameras import Cameras
+    from g2ard.cli.frame import Run
+    from g2ard.splats import Splats
+    from g2ard.targets import Targets
+
+__all__ = ["load_scene", "load_views", "make_targets"]
+
+
+def load_scene(run: Run, path: Path) -> Splats:
+    """Read a scene and say what was noticed."""
+    from g2ard.io import read_scene
+
+    scene = read_scene(path)
+    for note in scene.notes:
+        run.say(f"{path}: {note}")
+    return scene.splats
+
+
+def load_views(run: Run, path: Path, split: str, size: int | None, offset: object = None) -> Cameras:
+    """Read views, pick a split, shrink them, and bring them into the scene's coordinates.
+
+    Raises:
+        InputError: the file has no views, or the split is empty.
+    """
+    import numpy as np
+
+    from g2ard.errors import InputError
+    from g2ard.io import read_view_set
+    from g2ard.splits import split_names
+
+    found = read_view_set(path)
+    for note in found.notes:
+        run.say(f"{path}: {note}")
+    chosen = set(split_names(path, found.cameras.names, split))
+    cameras = found.cameras.take(np.array([name in chosen for name in found.cameras.names]))
+    if not len(cameras):
+        raise InputError(f"{path}: no views in split {split!r}")
+    cameras = cameras.resized(size)
+    return cameras if offset is None else cameras.recentred(np.asarray(offset))
+
+
+def make_targets(
+    run: Run, cameras: Cameras, teacher: Splats | None, background: tuple[float, float, float]
+) -> Targets:
+    """The teacher's renders, or the views' photos where no teacher is given."""
+    from g2ard.targets import Photos, TeacherRenders
+
+    if teacher is None:
+        return Photos(cameras)
+    return TeacherRenders(teacher, cameras, background=background, progress=run.progress)

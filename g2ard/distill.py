@@ -1,0 +1,227 @@
+"""The whole pipeline: simplify, freeze anchors, recover, by rounds; the only module that joins the stages."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from g2ard.errors import InputError
+from g2ard.io.atomic import atomic_output
+from g2ard.progress import Progress, silent
+from g2ard.recover.anchors import PRESETS, Regularizers
+from g2ard.recover.schedule import TUNED, Schedule
+from g2ard.splats import Splats
+from g2ard.targets import Targets
+
+__all__ = ["DistillConfig", "Distilled", "distill"]
+
+
+@dataclass(frozen=True)
+class DistillConfig:
+    """How a scene is distilled.
+
+    Args:
+        method: simplification's: default, fast or paper.
+        schedule: recovery's; one with `round_steps` recovers after every round of 75 % (the paper), without
+            them the reduction is one shot and all recovery happens at the target count.
+        steps: overrides the schedule's final horizon.
+        regularizers: weights of L_anchor and L_shape.
+        sh_degree: of the result; None keeps the prior's.
+        background: RGB behind the scene.
+        seed: of the order of views.
+    """
+
+    method: str = "default"
+    schedule: Schedule = TUNED
+    steps: int | None = None
+    regularizers: Regularizers = PRESETS["trained"]
+    sh_degree: int | None = None
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Distilled:
+    """A compact scene and how it came about.
+
+    Args:
+        splats: exactly `budget` Gaussians.
+        simplified: the same Gaussians before their last recovery: its anchors.
+        report: rounds [{simplify, recover}], seconds {simplify, recover}.
+    """
+
+    splats: Splats
+    simplified: Splats
+    report: dict[str, Any] = field(default_factory=dict)
+
+
+def distill(
+    prior: Splats,
+    budget: int,
+    targets: Targets,
+    config: DistillConfig | None = None,
+    *,
+    work: Path | None = None,
+    progress: Progress = silent,
+) -> Distilled:
+    """Distil a dense prior into exactly `budget` Gaussians.
+
+    N_r = max(N_S, ⌈0.75·N_{r−1}⌉) with recovery after each round where the schedule asks for it, else one
+    shot.
+
+    Args:
+        prior: a trained model, or a lift; in the coordinates of the targets' cameras.
+        budget: N_S, at most the prior's count.
+        targets: photos, or the prior's own renders.
+        config: see `DistillConfig`.
+        work: a folder for finished rounds and checkpoints; a second call with the same inputs goes on there.
+        progress: told of all stages.
+
+    Returns:
+        A `Distilled`.
+
+    Raises:
+        InputError: the budget does not fit, or `work` belongs to another run.
+        KeyboardInterrupt: after Ctrl-C, with `work` ready for a resume.
+    """
+    from g2ard.simplify import schedule as counts_of
+
+    config = config or DistillConfig()
+    many = config.schedule.round_steps > 0
+    counts = counts_of(len(prior), budget) if many else [budget]
+    rounds = _Rounds(prior, budget, targets, config, work, progress)
+    for number, count in enumerate(counts, start=1):
+        rounds.advance(number, count, final=number == len(counts))
+    return Distilled(rounds.state, rounds.simplified, {"rounds": rounds.log, "seconds": rounds.seconds})
+
+
+class _Rounds:
+    """The scene as it shrinks, its protection flags, and the log; saved after every stage if `work` is given."""
+
+    def __init__(
+        self,
+        prior: Splats,
+        budget: int,
+        targets: Targets,
+        config: DistillConfig,
+        work: Path | None,
+        progress: Progress,
+    ) -> None:
+        self.prior, self.budget, self.targets, self.config = prior, budget, targets, config
+        self.work, self.progress = work, progress
+        self.state = self.simplified = prior
+        self.protected: Any = None
+        self.log: list[dict[str, Any]] = []
+        self.seconds = {"simplify": 0.0, "recover": 0.0}
+        self.key = _fingerprint(prior, budget, config)
+
+    def advance(self, number: int, count: int, *, final: bool) -> None:
+        """One round: simplify to `count`, recover; the final one recovers for the final horizon as well."""
+        entry: dict[str, Any] = {"count": count}
+        self._simplify(number, count, entry)
+        if self.config.schedule.round_steps > 0:
+            self._recover(f"round-{number}", entry, final=False)
+        if final:
+            self._recover("final", entry, final=True)
+        self.log.append(entry)
+
+    def _simplify(self, number: int, count: int, entry: dict[str, Any]) -> None:
+        from g2ard.simplify import simplify
+
+        name = f"simplified-{number}"
+        if not self._restore(name, entry):
+            began = time.monotonic()
+            done = simplify(
+                self.state,
+                count,
+                method=self.config.method,
+                protected=self.protected,
+                flag_budget=self.budget,
+                progress=self.progress,
+            )
+            self.state, self.protected = done.splats, done.protected
+            entry["simplify"] = {**done.report, "seconds": time.monotonic() - began}
+            self._save(name, entry)
+        self.seconds["simplify"] += entry["simplify"]["seconds"]
+        if self.config.sh_degree is not None:
+            self.state = self.state.with_sh_degree(self.config.sh_degree)
+        self.simplified = self.state
+
+    def _recover(self, name: str, entry: dict[str, Any], *, final: bool) -> None:
+        from g2ard.recover import RecoverConfig, recover
+
+        if not self._restore(name, entry):
+            config = RecoverConfig(
+                schedule=self.config.schedule,
+                steps=self.config.steps if final else None,
+                regularizers=self.config.regularizers,
+                background=self.config.background,
+                final=final,
+                seed=self.config.seed,
+            )
+            checkpoint = self.work / f"{name}.checkpoint.npz" if self.work else None
+            done = recover(
+                self.state,
+                self.targets,
+                config,
+                checkpoint=checkpoint,
+                progress=self.progress,
+                stage="recover" if final else f"recover {name}",
+            )
+            self.state = done.splats
+            entry.setdefault("recover", []).append(done.report)
+            self._save(name, entry)
+            if checkpoint is not None:
+                checkpoint.unlink(missing_ok=True)
+        self.seconds["recover"] += entry["recover"][-1]["seconds"]
+
+    def _save(self, name: str, entry: dict[str, Any]) -> None:
+        if self.work is None:
+            return
+        s = self.state
+        with atomic_output(self.work / f"{name}.npz", overwrite=True) as temporary:
+            np.savez(
+                temporary,
+                meta=np.array(json.dumps({"key": self.key, "entry": entry}, default=_plain)),
+                protected=np.asarray(self.protected),
+                means=s.means,
+                quats=s.quats,
+                scales=s.scales,
+                logit_opacities=s.logit_opacities,
+                sh0=s.sh0,
+                shN=s.shN,
+            )
+
+    def _restore(self, name: str, entry: dict[str, Any]) -> bool:
+        """Take up a finished stage of an earlier run; False where there is none."""
+        path = self.work / f"{name}.npz" if self.work else None
+        if path is None or not path.exists():
+            return False
+        with np.load(path) as data:
+            meta = json.loads(str(data["meta"]))
+            if meta["key"] != self.key:
+                raise InputError(
+                    f"{self.work}: holds another run (other input or options); give -w to start anew"
+                )
+            arrays = {key: data[key] for key in data.files if key not in ("meta", "protected")}
+            self.protected = data["protected"]
+        self.state = replace(self.prior, **arrays)
+        entry.update(meta["entry"])
+        return True
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def _fingerprint(prior: Splats, budget: int, config: DistillConfig) -> str:
+    digest = hashlib.sha256(repr((budget, config)).encode())
+    for array in (prior.means, prior.scales, prior.sh0, prior.logit_opacities):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()

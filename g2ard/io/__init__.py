@@ -1,0 +1,268 @@
+"""Files: Gaussian scenes, coloured clouds and views, read and written by extension or by content.
+
+| reads | from |
+|---|---|
+| `read_splats`, `read_scene` | 3DGS .ply, .compressed.ply, SOG folder or .sog, .spz, .splat |
+| `read_points`, `read_cloud` | .ply, .las, .laz, COLMAP points3D |
+| `read_views`, `read_view_set` | COLMAP folder, transforms.json, g2ard's own .json |
+
+The short forms return the data; the long ones also say what was noticed (`Note`). Nothing heavy is imported
+until a function is called.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from g2ard.io.atomic import atomic_folder, atomic_output, check_output
+from g2ard.io.detect import kind
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike
+
+    from g2ard.cameras import Cameras
+    from g2ard.io.types import Cloud, Note, Points, Scene, ViewSet
+    from g2ard.splats import Splats
+
+__all__ = [
+    "Cloud",
+    "Note",
+    "Points",
+    "Scene",
+    "ViewSet",
+    "atomic_folder",
+    "atomic_output",
+    "check_output",
+    "kind",
+    "read_cloud",
+    "read_points",
+    "read_scene",
+    "read_splats",
+    "read_view_set",
+    "read_views",
+    "write_points",
+    "write_splats",
+    "write_views",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in ("Cloud", "Note", "Points", "Scene", "ViewSet"):
+        from g2ard.io import types
+
+        return getattr(types, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def read_splats(path: str | Path) -> Splats:
+    """Read a Gaussian scene; `read_scene` also says what was noticed.
+
+    Args:
+        path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .splat.
+
+    Returns:
+        The scene: linear scales, logit opacities, means relative to `offset`.
+
+    Raises:
+        InputError: the file is absent, broken, truncated, not a scene, or has no finite row; the message
+            names the file and what is wrong.
+
+    >>> import tempfile
+    >>> from g2ard.splats import Splats
+    >>> path = Path(tempfile.mkdtemp()) / "two.ply"
+    >>> write_splats(path, Splats.create([[0, 0, 0], [1, 0, 0]], scales=[[1, 1, 1], [1, 2, 3]]))
+    >>> read_splats(path).scales.round(5).tolist()
+    [[1.0, 1.0, 1.0], [1.0, 2.0, 3.0]]
+    """
+    return read_scene(path).splats
+
+
+def read_scene(path: str | Path) -> Scene:
+    """Read a Gaussian scene and what was noticed on the way: rows dropped, values clamped, extra properties.
+
+    Args:
+        path: as for `read_splats`.
+
+    Returns:
+        A `Scene` of splats and notes.
+
+    Raises:
+        InputError: as for `read_splats`.
+    """
+    from importlib import import_module
+
+    from g2ard.errors import InputError
+    from g2ard.io.detect import file_format
+
+    path, found = Path(path), file_format(path)
+    if found not in ("ply", "compressed_ply", "sog", "spz", "splat"):
+        what = {"cloud_ply": "a point cloud (no f_dc, scale, rot)", "las": "a point cloud"}.get(found, found)
+        raise InputError(f"{path}: a Gaussian scene is needed, this is {what}")
+    return import_module(f"g2ard.io.{found}").read(path)
+
+
+def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, **options: Any) -> None:
+    """Write a Gaussian scene, whole or not at all.
+
+    Args:
+        path: .ply (3DGS) or .splat.
+        splats: the scene.
+        overwrite: whether an existing file may be replaced.
+        **options: of the format; `normals=True` adds nx ny nz to a .ply.
+
+    Raises:
+        OutputError: the file exists, its folder is absent or not writable, or the extension is no format that
+            g2ard writes.
+        InputError: the scene is empty, or has a value that is not finite.
+    """
+    from importlib import import_module
+
+    from g2ard.errors import OutputError
+
+    path = Path(path)
+    if path.suffix not in (".ply", ".splat") or path.name.endswith(".compressed.ply"):
+        raise OutputError(f"{path}: scenes are written as .ply or .splat")
+    import_module(f"g2ard.io.{path.suffix[1:]}").write(path, splats, overwrite=overwrite, **options)
+
+
+def read_points(path: str | Path) -> Points:
+    """Read a coloured cloud; `read_cloud` also says what was noticed.
+
+    Args:
+        path: .ply with x y z red green blue, .las, .laz, COLMAP's points3D.bin or .txt, or a COLMAP folder.
+
+    Returns:
+        Positions in float64, world units; colours in [0, 1].
+
+    Raises:
+        InputError: the file is absent, broken, has no colour, or no finite point.
+        MissingDependencyError: .las or .laz without `pip install g2ard[las]`.
+    """
+    return read_cloud(path).points
+
+
+def read_cloud(path: str | Path) -> Cloud:
+    """Read a coloured cloud and what was noticed on the way.
+
+    Args:
+        path: as for `read_points`.
+
+    Returns:
+        A `Cloud` of points and notes.
+
+    Raises:
+        InputError: as for `read_points`.
+        MissingDependencyError: as for `read_points`.
+    """
+    from importlib import import_module
+
+    from g2ard.errors import InputError
+    from g2ard.io.detect import file_format
+
+    path, found = Path(path), file_format(path)
+    modules = {"cloud_ply": "cloud_ply", "las": "las", "points3d": "points3d", "colmap": "points3d"}
+    if found not in modules:
+        what = "a Gaussian scene" if kind(path) == "splats" else found
+        raise InputError(f"{path}: a coloured point cloud is needed, this is {what}")
+    return import_module(f"g2ard.io.{modules[found]}").read(path)
+
+
+def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -> None:
+    """Write a coloured cloud as .ply (float64 positions, 8-bit colours), whole or not at all.
+
+    Args:
+        path: the .ply to write.
+        points: the cloud.
+        overwrite: whether an existing file may be replaced.
+
+    Raises:
+        OutputError: it exists, cannot be written, or is not a .ply.
+        InputError: the cloud is empty or has a value that is not finite.
+    """
+    from g2ard.errors import OutputError
+    from g2ard.io import cloud_ply
+
+    path = Path(path)
+    if path.suffix != ".ply":
+        raise OutputError(f"{path}: clouds are written as .ply")
+    cloud_ply.write(path, points, overwrite=overwrite)
+
+
+def read_views(path: str | Path, *, images: str | Path | None = None, split: str = "all") -> Cameras:
+    """Read views; `read_view_set` also says what was noticed, and per view its split and weight.
+
+    Args:
+        path: a COLMAP folder, a transforms.json or its folder, or a .json that g2ard wrote.
+        images: the folder of the photos, where they are not where the file says.
+        split: "train", "test", or "all"; see `g2ard.splits.split_mask`.
+
+    Returns:
+        The views in OpenCV axes, COLMAP's sorted by name, others in file order. Views whose photo is
+        missing are left out, unless none has one.
+
+    Raises:
+        InputError: the file is absent, broken or holds no views, or the split has none.
+    """
+    return read_view_set(path, images=images, split=split).cameras
+
+
+def read_view_set(path: str | Path, *, images: str | Path | None = None, split: str = "all") -> ViewSet:
+    """Read views and what their file says beside the cameras.
+
+    Args:
+        path: as for `read_views`.
+        images: as for `read_views`.
+        split: as for `read_views`.
+
+    Returns:
+        A `ViewSet` of cameras, notes, splits and weights.
+
+    Raises:
+        InputError: as for `read_views`.
+    """
+    from importlib import import_module
+
+    from g2ard.errors import InputError
+    from g2ard.io.detect import file_format
+    from g2ard.splits import split_mask
+
+    path, found = Path(path), file_format(path)
+    if found not in ("colmap", "transforms", "views"):
+        raise InputError(f"{path}: views are needed (a COLMAP folder, transforms.json, g2ard's .json)")
+    if images is not None and not Path(images).is_dir():
+        raise InputError(f"{images}: no such folder of photos")
+    views = import_module(f"g2ard.io.{found}").read(path, Path(images) if images else None)
+    return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
+
+
+def write_views(
+    path: str | Path,
+    cameras: Cameras,
+    *,
+    splits: Sequence[str | None] = (),
+    weights: ArrayLike | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write views as g2ard's own .json, which `read_views` gives back bit by bit.
+
+    Args:
+        path: the .json to write; photos are named relative to it.
+        cameras: C views.
+        splits: per view "train", "test" or None; () for none.
+        weights: (C,) how often each view should be drawn; None for none.
+        overwrite: whether an existing file may be replaced.
+
+    Raises:
+        OutputError: it exists, cannot be written, or is not a .json.
+        InputError: no views, or splits or weights of another length.
+    """
+    from g2ard.errors import OutputError
+    from g2ard.io import views
+
+    path = Path(path)
+    if path.suffix != ".json":
+        raise OutputError(f"{path}: views are written as .json")
+    views.write(path, cameras, splits=splits, weights=weights, overwrite=overwrite)

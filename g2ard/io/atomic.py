@@ -1,0 +1,133 @@
+"""Outputs that are there whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from uuid import uuid4
+
+from g2ard.errors import OutputError
+
+__all__ = ["atomic_folder", "atomic_output", "check_output"]
+
+
+def check_output(path: str | Path, overwrite: bool = False, *, folder: bool = False) -> Path:
+    """Refuse an output that cannot be written, before hours of work rather than after.
+
+    Args:
+        path: where the output is to go.
+        overwrite: whether a file, or a folder that is not empty, may be replaced.
+        folder: whether the output is a folder.
+
+    Returns:
+        `path` as a Path.
+
+    Raises:
+        OutputError: it exists and may not be overwritten, is of the other kind, or its folder is absent or
+            not writable.
+    """
+    path = Path(path)
+    try:
+        _refuse_existing(path, overwrite, folder)
+        if not path.parent.is_dir():
+            raise OutputError(f"{path}: the folder {path.parent} does not exist")
+        probe = _beside(path)
+        probe.mkdir()
+        probe.rmdir()
+    except OutputError:
+        raise
+    except OSError as error:
+        raise OutputError(f"{path}: cannot write there: {error.strerror}") from error
+    return path
+
+
+def _refuse_existing(path: Path, overwrite: bool, folder: bool) -> None:
+    if not path.exists():
+        return
+    if path.is_dir() and not folder:
+        raise OutputError(f"{path}: is a folder; a file is to be written there")
+    if folder and not path.is_dir():
+        raise OutputError(f"{path}: is a file; a folder is to be written there")
+    if not overwrite and (not folder or any(path.iterdir())):
+        raise OutputError(f"{path}: exists; give -w (--overwrite) to replace it")
+
+
+def _beside(path: Path) -> Path:
+    """A hidden name in the same folder, so that the rename stays on one disk; the suffix is kept for
+    writers that choose a format by it."""
+    return path.with_name(f".{path.stem}.{uuid4().hex[:12]}{path.suffix}")
+
+
+@contextmanager
+def atomic_output(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
+    """Yield a temporary path to write to; on success it becomes `path` in one step.
+
+    On any failure, Ctrl-C included, the temporary file goes and what was at `path` stays.
+
+    Args:
+        path: the file to write.
+        overwrite: whether an existing file may be replaced.
+
+    Yields:
+        A path in the same folder, with the same suffix, where nothing exists yet.
+
+    Raises:
+        OutputError: see `check_output`; or the disk refuses while writing.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> with atomic_output(folder / "a.txt") as temporary:
+    ...     _ = temporary.write_text("whole")
+    >>> [p.name for p in folder.iterdir()]
+    ['a.txt']
+    """
+    path = check_output(path, overwrite)
+    temporary = _beside(path)
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        if isinstance(error, OutputError) or error.filename not in (None, str(temporary), temporary):
+            raise
+        raise OutputError(f"{path}: cannot write: {error.strerror or error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
+    """Yield a temporary folder to fill; on success it becomes `path`.
+
+    Where `path` already is a folder (and `overwrite` allows it) files of the same name are replaced one by
+    one and others are left alone: a mistyped output folder loses nothing of its own.
+
+    Raises:
+        OutputError: see `check_output`; or the disk refuses while writing.
+    """
+    path = check_output(path, overwrite, folder=True)
+    temporary = _beside(path)
+    try:
+        temporary.mkdir()
+        yield temporary
+        if path.is_dir():
+            _move_into(temporary, path)
+        else:
+            os.replace(temporary, path)
+    except OSError as error:
+        if isinstance(error, OutputError) or not str(error.filename or "").startswith(str(temporary)):
+            raise
+        raise OutputError(f"{path}: cannot write: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _move_into(source: Path, target: Path) -> None:
+    for item in sorted(source.rglob("*")):
+        place = target / item.relative_to(source)
+        if item.is_dir():
+            place.mkdir(exist_ok=True)
+        else:
+            os.replace(item, place)

@@ -1,0 +1,89 @@
+"""Coloured point clouds in .ply files, through plyfile."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.io.atomic import atomic_output
+from g2ard.io.clean import plural
+from g2ard.io.plyfiles import read_element, read_header, require
+from g2ard.io.types import Cloud, Note, Points
+
+__all__ = ["finite_cloud", "read", "write"]
+
+_POSITION = ["x", "y", "z"]
+_COLOR_NAMES = (["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"])
+
+
+def read(path: Path) -> Cloud:
+    """Read x y z and red green blue (integers scaled by their range, floats taken as they are, in [0, 1]).
+
+    Raises:
+        InputError: not a PLY, truncated, a position or colour property is missing, nothing finite in it.
+    """
+    header = read_header(path)
+    properties = header.properties.get("vertex", [])
+    require(path, properties, _POSITION, "a point cloud")
+    names = next((n for n in _COLOR_NAMES if set(n) <= set(properties)), _COLOR_NAMES[0])
+    require(path, properties, names, "a coloured point cloud")
+    (rows,) = read_element(path, header, "vertex")
+    rows = np.asarray(rows)
+    positions = np.stack([rows[name].astype(np.float64) for name in _POSITION], axis=1)
+    colors = np.stack([_unit(path, rows[name], name) for name in names], axis=1)
+    return finite_cloud(path, positions, colors)
+
+
+def _unit(path: Path, values: NDArray[Any], name: str) -> NDArray[np.float32]:
+    if values.dtype.kind in "iu":
+        return (values / np.float32(np.iinfo(values.dtype).max)).astype(np.float32)
+    top = float(np.nanmax(values, initial=0.0))
+    if np.isfinite(top) and top > 1.5:
+        raise InputError(f"{path}: float colour {name!r} reaches {top:g}; expected values in [0, 1]")
+    return values.astype(np.float32)
+
+
+def finite_cloud(
+    path: Path, positions: NDArray[np.float64], colors: NDArray[np.float32], notes: tuple[Note, ...] = ()
+) -> Cloud:
+    """Drop and count the non-finite points; clip colours to [0, 1].
+
+    Raises:
+        InputError: no point is left.
+    """
+    if not len(positions):
+        raise InputError(f"{path}: holds no points")
+    good = np.all(np.isfinite(positions), axis=1) & np.all(np.isfinite(colors), axis=1)
+    dropped = len(good) - int(np.count_nonzero(good))
+    if dropped == len(good):
+        raise InputError(f"{path}: none of its {plural(dropped, 'point')} is finite")
+    if dropped:
+        text = f"{plural(dropped, 'non-finite point')} dropped (the first is row {int(np.argmin(good))})"
+        notes = (*notes, Note("dropped_rows", dropped, text))
+        positions, colors = positions[good], colors[good]
+    return Cloud(Points(positions, np.clip(colors, 0, 1)), notes)
+
+
+def write(path: Path, points: Points, *, overwrite: bool = False) -> None:
+    """Write a binary .ply: x y z as float64, red green blue as bytes.
+
+    Raises:
+        OutputError: see `atomic_output`.
+        InputError: the cloud is empty or has a non-finite value.
+    """
+    from plyfile import PlyData, PlyElement
+
+    finite_rows = np.isfinite(points.positions).all(1) & np.isfinite(points.colors).all(1)
+    if not len(points) or not finite_rows.all():
+        raise InputError(f"{path}: not written: an empty cloud or a non-finite point")
+    names = [(n, "<f8") for n in _POSITION] + [(n, "u1") for n in _COLOR_NAMES[0]]
+    rows = np.empty(len(points), names)
+    for axis in range(3):
+        rows[_POSITION[axis]] = points.positions[:, axis]
+        rows[_COLOR_NAMES[0][axis]] = np.rint(np.clip(points.colors[:, axis], 0, 1) * 255)
+    with atomic_output(path, overwrite) as temporary:
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))

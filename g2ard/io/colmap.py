@@ -1,0 +1,203 @@
+"""COLMAP models: cameras and images, binary or text. Rigs and frames (COLMAP 4) add nothing to poses here."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from g2ard.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from g2ard.io.types import ViewSet
+
+__all__ = ["model_folder", "parsing", "read", "text_lines"]
+
+_MODELS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
+    *("FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
+)
+_PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
+
+
+class _Camera(NamedTuple):
+    """One camera's size, pinhole matrix and OpenCV distortion k1 k2 p1 p2 k3."""
+
+    size: tuple[int, int]
+    K: NDArray[np.float64]
+    distortion: tuple[float, ...]
+
+
+class _Image(NamedTuple):
+    name: str
+    camera: int
+    quat: tuple[float, ...]
+    translation: tuple[float, ...]
+
+
+def model_folder(path: Path) -> Path | None:
+    """The folder that holds cameras and images of the model at `path`, or None.
+
+    Looks at `path` itself, then sparse/0, sparse, colmap/sparse/0 in it.
+    """
+    path = path.parent if path.is_file() else path
+    for folder in (path, path / "sparse" / "0", path / "sparse", path / "colmap" / "sparse" / "0"):
+        if _table(folder, "cameras") and _table(folder, "images"):
+            return folder
+    return None
+
+
+def _table(folder: Path, name: str) -> Path | None:
+    """`name`.bin, else `name`.txt, else None."""
+    return next((p for s in (".bin", ".txt") if (p := folder / f"{name}{s}").is_file()), None)
+
+
+@contextmanager
+def parsing(path: Path) -> Iterator[None]:
+    """Turn what a broken table causes into one line that names the file."""
+    try:
+        yield
+    except InputError:
+        raise
+    except struct.error as error:
+        raise InputError(f"{path}: truncated") from error
+    except (ValueError, IndexError, KeyError) as error:
+        raise InputError(f"{path}: malformed ({error})") from error
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from error
+
+
+def read(path: Path, images: Path | None = None) -> ViewSet:
+    """Read the registered images of a COLMAP model as views, sorted by name.
+
+    Args:
+        path: the project folder, the model's folder, or one of its files.
+        images: the folder of the photos; None looks for `images` beside the model or above it.
+
+    Raises:
+        InputError: no model there, a truncated file, a camera model that is not pinhole with OpenCV
+            distortion, or no registered image.
+    """
+    from g2ard.io.photos import Frame, view_set
+
+    folder = model_folder(path)
+    if folder is None:
+        raise InputError(f"{path}: no COLMAP model there (cameras and images, .bin or .txt)")
+    cameras_path, images_path = _table(folder, "cameras"), _table(folder, "images")
+    assert cameras_path is not None
+    assert images_path is not None
+    with parsing(cameras_path):
+        binary = cameras_path.suffix == ".bin"
+        cameras = (_cameras_bin if binary else _cameras_txt)(cameras_path)
+    with parsing(images_path):
+        found = (_images_bin if images_path.suffix == ".bin" else _images_txt)(images_path)
+    photos = images or _photo_folder(path, folder)
+    frames = []
+    for image in sorted(found, key=lambda i: i.name):
+        if image.camera not in cameras:
+            raise InputError(f"{images_path}: {image.name} names camera {image.camera}, which is absent")
+        camera = cameras[image.camera]
+        photo = photos / image.name if photos else None
+        frames.append(Frame(image.name, _viewmat(image), camera.K, camera.size, photo, camera.distortion))
+    return view_set(folder, frames)
+
+
+def _photo_folder(path: Path, model: Path) -> Path | None:
+    roots = (path, model, model.parent, model.parent.parent, model.parent.parent.parent)
+    return next((root / "images" for root in roots if (root / "images").is_dir()), None)
+
+
+def _viewmat(image: _Image) -> NDArray[np.float64]:
+    import numpy as np
+
+    q = np.array(image.quat)
+    if not np.linalg.norm(q) > 0:
+        raise InputError(f"{image.name}: its quaternion is zero")
+    w, x, y, z = q / np.linalg.norm(q)
+    view = np.eye(4)
+    view[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    view[:3, 3] = image.translation
+    return view
+
+
+def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...]) -> _Camera:
+    import numpy as np
+
+    if model not in _PARAMETERS:
+        known = ", ".join(_PARAMETERS)
+        raise InputError(
+            f"{path}: camera model {model} is not supported ({known} are); undistort with COLMAP"
+        )
+    if len(p) != _PARAMETERS[model]:
+        raise InputError(f"{path}: {model} takes {_PARAMETERS[model]} parameters, got {len(p)}")
+    single_focal = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+    fx, fy, cx, cy, *k = (p[0], *p) if single_focal else p
+    k1, k2, p1, p2 = (*k, 0.0, 0.0, 0.0, 0.0)[:4]
+    return _Camera(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), (k1, k2, p1, p2, 0.0))
+
+
+def _cameras_bin(path: Path) -> dict[int, _Camera]:
+    data = path.read_bytes()
+    (count,) = struct.unpack_from("<Q", data)
+    cameras, at = {}, 8
+    for _ in range(count):
+        key, model, width, height = struct.unpack_from("<iiQQ", data, at)
+        name = _MODELS[model] if 0 <= model < len(_MODELS) else f"number {model}"
+        parameters = struct.unpack_from(f"<{_PARAMETERS.get(name, 0)}d", data, at + 24)
+        cameras[key] = _camera(path, name, (width, height), parameters)
+        at += 24 + 8 * len(parameters)
+    return cameras
+
+
+def _images_bin(path: Path) -> list[_Image]:
+    data = path.read_bytes()
+    (count,) = struct.unpack_from("<Q", data)
+    images: list[_Image] = []
+    at = 8
+    for _ in range(count):
+        _key, *pose, camera = struct.unpack_from("<I7dI", data, at)
+        end = data.find(b"\0", at + 64)
+        if end < 0:
+            raise InputError(f"{path}: truncated in the name of image {len(images)}")
+        (points,) = struct.unpack_from("<Q", data, end + 1)
+        images.append(_Image(data[at + 64 : end].decode(), camera, tuple(pose[:4]), tuple(pose[4:])))
+        at = end + 9 + 24 * points
+        if at > len(data):
+            raise InputError(f"{path}: truncated in the points of {images[-1].name}")
+    return images
+
+
+def text_lines(path: Path) -> list[str]:
+    """The lines of a COLMAP text table that are no comments; empty ones stay, they may be a row."""
+    return [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+
+
+def _cameras_txt(path: Path) -> dict[int, _Camera]:
+    cameras = {}
+    for line in text_lines(path):
+        if words := line.split():
+            size = (int(words[2]), int(words[3]))
+            cameras[int(words[0])] = _camera(path, words[1], size, tuple(map(float, words[4:])))
+    return cameras
+
+
+def _images_txt(path: Path) -> list[_Image]:
+    lines = text_lines(path)
+    while lines and not lines[0].strip():
+        lines.pop(0)
+    images = []
+    for line in lines[::2]:  # each second line lists the image's points, and may be empty
+        words: list[Any] = line.split(maxsplit=9)
+        if words:
+            pose = tuple(map(float, words[1:8]))
+            images.append(_Image(words[9].strip(), int(words[8]), pose[:4], pose[4:]))
+    return images

@@ -1,0 +1,100 @@
+"""SuperSplat's .compressed.ply: 16 bytes a Gaussian, quantised within chunks of 256."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.io.clean import Raw, cleaned
+from g2ard.io.plyfiles import read_element, read_header, require
+from g2ard.io.types import Scene
+from g2ard.splats import SH_C0
+
+__all__ = ["read"]
+
+_CHUNK = 256
+_PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
+
+
+def read(path: Path) -> Scene:
+    """Read a .compressed.ply, with its spherical harmonics where it has them.
+
+    Raises:
+        InputError: a property is missing, the file is truncated, or nothing in it is finite.
+    """
+    header = read_header(path)
+    require(path, header.properties.get("vertex", []), _PACKED, "a compressed scene")
+    chunk_properties = header.properties.get("chunk", [])
+    bounds = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
+    bounds += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
+    missing = [name for name in bounds if name not in chunk_properties]
+    if missing:
+        raise InputError(f"{path}: its 'chunk' element lacks {', '.join(map(repr, missing))}")
+    rest = [p for p in header.properties.get("sh", []) if re.fullmatch(r"f_rest_\d+", p)]
+    if len(rest) not in (0, 9, 24, 45):
+        raise InputError(f"{path}: its 'sh' element has {len(rest)} coefficients; expected 9, 24 or 45")
+
+    names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")
+    vertex, chunk, *sh = (np.asarray(rows) for rows in read_element(path, header, *names))
+    if len(chunk) * _CHUNK < len(vertex) or (sh and len(sh[0]) != len(vertex)):
+        raise InputError(f"{path}: {len(chunk)} chunks and {len(vertex):,} Gaussians do not fit")
+    raw = Raw.empty(len(vertex), len(rest) // 3)
+    of = np.arange(len(vertex)) // _CHUNK
+    raw.means[:] = _between(chunk, of, "{}_{}", "xyz", _three(vertex["packed_position"]))
+    raw.log_scales[:] = _between(chunk, of, "{}_scale_{}", "xyz", _three(vertex["packed_scale"]))
+    raw.quats[:] = _quats(vertex["packed_rotation"])
+    color = np.stack([_unit(vertex["packed_color"], shift, 8) for shift in (24, 16, 8, 0)], axis=1)
+    rgb = color[:, :3]
+    if "min_r" in chunk_properties:  # older files quantise colour over [0, 1] instead
+        rgb = _between(chunk, of, "{}_{}", "rgb", rgb)
+    raw.sh0[:, 0] = (rgb - 0.5) / SH_C0
+    with np.errstate(divide="ignore"):
+        raw.logit_opacities[:] = np.log(color[:, 3]) - np.log1p(-color[:, 3])
+    for k in range(len(rest) // 3):
+        for channel in range(3):
+            raw.shN[:, k, channel] = _coefficient(sh[0][f"f_rest_{channel * (len(rest) // 3) + k}"])
+    return cleaned(path, raw)
+
+
+def _unit(packed: NDArray[Any], shift: int, bits: int) -> NDArray[np.float64]:
+    top = (1 << bits) - 1
+    return ((packed >> np.uint32(shift)) & np.uint32(top)) / top
+
+
+def _three(packed: NDArray[Any]) -> NDArray[np.float64]:
+    """(N, 3) in [0, 1] from 11, 10 and 11 bits."""
+    return np.stack([_unit(packed, 21, 11), _unit(packed, 11, 10), _unit(packed, 0, 11)], axis=1)
+
+
+def _between(
+    chunk: NDArray[Any], of: NDArray[Any], pattern: str, axes: str, t: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Where `t` lies between the bounds of each Gaussian's chunk."""
+    low, high = (
+        np.stack([chunk[pattern.format(end, axis)][of].astype(np.float64) for axis in axes], axis=1)
+        for end in ("min", "max")
+    )
+    return low * (1 - t) + high * t
+
+
+def _quats(packed: NDArray[Any]) -> NDArray[np.float64]:
+    """(N, 4) wxyz: 2 bits name the largest component, 10 bits each hold the others in ±1/√2."""
+    three = (np.stack([_unit(packed, shift, 10) for shift in (20, 10, 0)], axis=1) - 0.5) * np.sqrt(2)
+    largest = np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))
+    quats = np.empty((len(packed), 4))
+    for mode in range(4):
+        rows = packed >> np.uint32(30) == mode
+        quats[rows, mode] = largest[rows]
+        quats[np.ix_(rows, [i for i in range(4) if i != mode])] = three[rows]
+    return quats
+
+
+def _coefficient(codes: NDArray[Any]) -> NDArray[np.float64]:
+    """Bytes to [−4, 4]: bucket centres, but the first and last bucket mean the ends."""
+    t = (codes.astype(np.float64) + 0.5) / 256
+    return (np.select([codes == 0, codes == 255], [0.0, 1.0], t) - 0.5) * 8

@@ -1,0 +1,119 @@
+"""Which format a path holds, by extension and then by content."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from g2ard.errors import InputError
+
+__all__ = ["Format", "Kind", "file_format", "kind"]
+
+Format = Literal[
+    "ply",
+    "compressed_ply",
+    "sog",
+    "spz",
+    "splat",
+    "cloud_ply",
+    "las",
+    "points3d",
+    "colmap",
+    "transforms",
+    "views",
+]
+Kind = Literal["splats", "points", "views"]
+
+_KINDS: dict[str, Kind] = {
+    **dict.fromkeys(("ply", "compressed_ply", "sog", "spz", "splat"), "splats"),
+    **dict.fromkeys(("cloud_ply", "las", "points3d"), "points"),
+    **dict.fromkeys(("colmap", "transforms", "views"), "views"),
+}
+
+
+def kind(path: str | Path) -> Kind:
+    """What `path` holds: "splats" (a Gaussian scene), "points" (a coloured cloud) or "views".
+
+    A COLMAP folder is "views", though `read_points` takes its sparse points too.
+
+    Raises:
+        InputError: nothing is there, or it is nothing g2ard reads.
+    """
+    return _KINDS[file_format(path)]
+
+
+def file_format(path: str | Path) -> Format:
+    """The format of a file or folder.
+
+    Raises:
+        InputError: nothing is there, or it is nothing g2ard reads.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _folder_format(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder")
+    name, suffix = path.name.lower(), path.suffix.lower()
+    if name in ("meta.json", "lod-meta.json"):
+        return "sog"
+    if name in ("points3d.bin", "points3d.txt"):
+        return "points3d"
+    if name in ("cameras.bin", "cameras.txt", "images.bin", "images.txt"):
+        return "colmap"
+    by_suffix: dict[str, Format] = {
+        ".sog": "sog",
+        ".spz": "spz",
+        ".splat": "splat",
+        ".las": "las",
+        ".laz": "las",
+    }
+    if suffix in by_suffix:
+        return by_suffix[suffix]
+    if suffix == ".ply":
+        return _ply_format(path)
+    if suffix == ".json":
+        return _json_format(path)
+    raise InputError(
+        f"{path}: unknown format {path.suffix!r} (scenes: .ply .sog .spz .splat; clouds: .ply .las .laz; "
+        "views: a COLMAP folder or a .json)"
+    )
+
+
+def _folder_format(path: Path) -> Format:
+    from g2ard.io.colmap import model_folder
+    from g2ard.io.sog import chunks_of
+
+    if chunks_of(path):
+        return "sog"
+    if model_folder(path) is not None:
+        return "colmap"
+    if (path / "transforms.json").is_file():
+        return "transforms"
+    raise InputError(
+        f"{path}: nothing known in this folder "
+        "(looked for SOG's meta.json, a COLMAP sparse/0, transforms.json)"
+    )
+
+
+def _ply_format(path: Path) -> Format:
+    from g2ard.io.plyfiles import read_header
+
+    header = read_header(path)
+    properties = header.properties.get("vertex")
+    if properties is None:
+        raise InputError(f"{path}: the PLY has no 'vertex' element")
+    if "packed_position" in properties:
+        return "compressed_ply"
+    scene_words = ("f_dc_", "rot_", "scale_", "opacity")
+    return "ply" if any(name.startswith(scene_words) for name in properties) else "cloud_ply"
+
+
+def _json_format(path: Path) -> Format:
+    from g2ard.io.jsonfile import read_json
+
+    content = read_json(path)
+    if "views" in content:
+        return "views"
+    if "frames" in content:
+        return "transforms"
+    raise InputError(f"{path}: neither a transforms.json ('frames') nor g2ard's views ('views')")

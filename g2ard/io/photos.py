@@ -1,0 +1,104 @@
+"""What every reader of views shares: which frames have a photo, and how frames become Cameras."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.cameras import Cameras
+from g2ard.errors import InputError
+from g2ard.io.clean import plural
+from g2ard.io.types import Note, ViewSet
+
+__all__ = ["Frame", "find_photo", "rigid", "view_set"]
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
+
+
+class Frame(NamedTuple):
+    """One view as a file lists it; `photo` need not exist."""
+
+    name: str
+    viewmat: NDArray[np.float64]
+    K: NDArray[np.float64]
+    size: tuple[int, int]
+    photo: Path | None
+    distortion: tuple[float, ...] = (0.0,) * 5
+    split: str | None = None
+    weight: float | None = None
+
+
+def find_photo(path: Path) -> Path:
+    """`path`, or the photo that a name without suffix means (as NeRF's synthetic scenes write it)."""
+    if path.is_file() or path.suffix in _SUFFIXES:
+        return path
+    tried = (path.with_name(path.name + suffix) for suffix in _SUFFIXES)
+    return next((p for p in tried if p.is_file()), path)
+
+
+def rigid(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rigid transform nearest to a (4, 4) or (3, 4) pose, which may carry rounding or a uniform scale.
+
+    Raises:
+        InputError: it is not finite, mirrored, or further than 1 % from a rotation.
+    """
+    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
+        raise InputError(f"{where}: its pose is not a finite 4×4 matrix")
+    U, s, Vt = np.linalg.svd(matrix[:3, :3])
+    R = U @ Vt
+    if not s[0] > 0 or s[2] < 0.99 * s[0] or np.linalg.det(R) < 0:
+        raise InputError(f"{where}: its pose is not a rotation and a translation")
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = R, matrix[:3, 3]
+    return out
+
+
+def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
+    """Stack frames; those whose photo is missing are skipped and counted.
+
+    Where not one photo is there, the file is taken as poses alone and all frames stay.
+
+    Raises:
+        InputError: no frame, or two of one name.
+    """
+    if not frames:
+        raise InputError(f"{path}: no views found")
+    name, times = Counter(frame.name for frame in frames).most_common(1)[0]
+    if times > 1:
+        raise InputError(f"{path}: {times} views are named {name!r}; names must be unique")
+    listed = [frame for frame in frames if frame.photo is not None]
+    present = [frame for frame in frames if frame.photo is not None and frame.photo.is_file()]
+    notes = []
+    if present and len(present) < len(frames):
+        missing = len(frames) - len(present)
+        there = {frame.name for frame in present}
+        first = next(frame.name for frame in frames if frame.name not in there)
+        text = f"{plural(missing, 'view')} of {len(frames)} skipped: no photo (the first is {first})"
+        notes.append(Note("missing_photos", missing, text))
+        frames = present
+    elif not present and listed:
+        notes.append(
+            Note("no_photos", len(listed), f"none of {plural(len(listed), 'photo')} found: poses only")
+        )
+        frames = [frame._replace(photo=None) for frame in frames]
+    cameras = Cameras.from_lists(
+        [f.viewmat for f in frames],
+        [f.K for f in frames],
+        [f.size for f in frames],
+        [f.name for f in frames],
+        [f.photo for f in frames],
+        [f.distortion for f in frames],
+    )
+    splits = tuple(f.split for f in frames)
+    weights = [f.weight for f in frames]
+    return ViewSet(
+        cameras,
+        tuple(notes),
+        splits if any(splits) else (),
+        None if set(weights) == {None} else np.array([1.0 if w is None else w for w in weights]),
+    )

@@ -1,0 +1,179 @@
+"""Standard 3DGS .ply files (the layout of INRIA's trainer), through plyfile."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.io.atomic import atomic_output
+from g2ard.io.clean import BLOCK, LOG_SCALE_LIMIT, Raw, cleaned, plural
+from g2ard.io.plyfiles import PlyHeader, read_element, read_header, require
+from g2ard.io.types import Note, Scene
+from g2ard.splats import Splats
+
+__all__ = ["read", "write"]
+
+_MEANS = ["x", "y", "z"]
+_DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
+_SCALES = ["scale_0", "scale_1", "scale_2"]
+_QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
+_NEEDED = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
+_NORMALS = ["nx", "ny", "nz"]
+_REST_OF_BANDS = (0, 3, 8, 15)
+_OFFSET = re.compile(r"g2ard offset (\S+) (\S+) (\S+)$")
+
+
+def read(path: Path) -> Scene:
+    """Read a 3DGS .ply: any SH degree, property order, scalar type, byte order, or ascii.
+
+    Positions stored as float64 that float32 cannot hold are recentred and the shift kept in `offset`.
+
+    Raises:
+        InputError: not a PLY, a property is missing, the file is truncated, nothing finite in it.
+    """
+    header = read_header(path)
+    properties = header.properties.get("vertex", [])
+    require(path, properties, _NEEDED, "a 3DGS scene")
+    rest = sorted((p for p in properties if re.fullmatch(r"f_rest_\d+", p)), key=lambda p: int(p[7:]))
+    stored, kept = _bands(path, rest)
+    (rows,) = read_element(path, header, "vertex")
+    rows = np.asarray(rows)
+    raw = Raw.empty(len(rows), kept)
+    raw.offset, notes = _offset(path, header), _ignored(properties, rest, stored, kept)
+    shift = _recentre(rows) if rows.dtype["x"].itemsize == 8 else np.zeros(3)
+    raw.offset = raw.offset + shift
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # float64 past float32 becomes inf: such a row is dropped
+        for start in range(0, len(rows), BLOCK):
+            _read_block(rows[start : start + BLOCK], raw, slice(start, start + BLOCK), rest, stored, shift)
+    return cleaned(path, raw, notes)
+
+
+def _bands(path: Path, rest: list[str]) -> tuple[int, int]:
+    """How many higher-band coefficients a channel are stored, and how many of them are kept."""
+    if [int(p[7:]) for p in rest] != list(range(len(rest))) or len(rest) not in (0, 9, 24, 45, 72):
+        raise InputError(
+            f"{path}: expected f_rest_0 to f_rest_n with 0, 9, 24 or 45 of them, got {len(rest)}"
+        )
+    return len(rest) // 3, min(len(rest) // 3, 15)
+
+
+def _offset(path: Path, header: PlyHeader) -> NDArray[np.float64]:
+    for comment in header.comments:
+        if match := _OFFSET.match(comment):
+            try:
+                return np.array([float(word) for word in match.groups()])
+            except ValueError as error:
+                raise InputError(f"{path}: broken comment {comment!r}") from error
+    return np.zeros(3)
+
+
+def _ignored(properties: list[str], rest: list[str], stored: int, kept: int) -> list[Note]:
+    extra = [p for p in properties if p not in _NEEDED and p not in _NORMALS and p not in rest]
+    notes = []
+    if extra:
+        names = ", ".join(extra[:4]) + (", …" if len(extra) > 4 else "")
+        text = f"{plural(len(extra), 'extra property', 'extra properties')} ignored ({names})"
+        notes.append(Note("ignored_properties", len(extra), text))
+    if stored > kept:
+        notes.append(Note("ignored_bands", 1, "spherical harmonics past degree 3 ignored"))
+    return notes
+
+
+def _recentre(rows: NDArray[Any]) -> NDArray[np.float64]:
+    """The whole-unit shift that lets float32 hold float64 positions; zero where it holds them anyway.
+
+    Judged on percentiles of at most 100,000 rows, so that a stray floater decides nothing.
+    """
+    sample = rows[:: max(1, len(rows) // 100_000)]
+    positions = np.stack([sample[name] for name in _MEANS], axis=1)
+    positions = positions[np.isfinite(positions).all(1)]
+    if not len(positions):
+        return np.zeros(3)
+    low, middle, high = np.percentile(positions, (1, 50, 99), axis=0)
+    far = np.abs(middle) > 16 * np.linalg.norm(high - low)
+    return np.where(far.any(), np.rint(middle), 0.0)
+
+
+def _read_block(
+    block: NDArray[Any], raw: Raw, at: slice, rest: list[str], stored: int, shift: NDArray[np.float64]
+) -> None:
+    for axis, name in enumerate(_MEANS):
+        raw.means[at, axis] = block[name] - shift[axis] if shift.any() else block[name]
+    for axis, name in enumerate(_DC):
+        raw.sh0[at, 0, axis] = block[name]
+    for axis, name in enumerate(_SCALES):
+        raw.log_scales[at, axis] = block[name]
+    for axis, name in enumerate(_QUATS):
+        raw.quats[at, axis] = block[name]
+    raw.logit_opacities[at] = block["opacity"]
+    kept = raw.shN.shape[1]
+    for channel in range(3):  # channel-major: all of red's coefficients, then green's, then blue's
+        for k in range(kept):
+            raw.shN[at, k, channel] = block[rest[channel * stored + k]]
+
+
+def write(path: Path, splats: Splats, *, overwrite: bool = False, normals: bool = False) -> None:
+    """Write a binary little-endian 3DGS .ply: x y z, f_dc, f_rest, opacity, scale, rot.
+
+    An `offset` other than zero goes into a comment, which `read` restores.
+
+    Args:
+        path: the file to write.
+        splats: the scene.
+        overwrite: whether an existing file may be replaced.
+        normals: also write nx ny nz, all zero: 12 bytes a Gaussian that only programs with a fixed
+            layout, such as INRIA's SIBR viewer (which wants SH degree 3 too), ask for.
+
+    Raises:
+        OutputError: see `atomic_output`.
+        InputError: the scene is empty or has a non-finite value; nothing is written.
+    """
+    from plyfile import PlyData, PlyElement
+
+    if not len(splats):
+        raise InputError(f"{path}: a scene without Gaussians is not written")
+    names = [*_MEANS, *(_NORMALS if normals else []), *_DC]
+    names += [f"f_rest_{k}" for k in range(3 * splats.shN.shape[1])] + ["opacity", *_SCALES, *_QUATS]
+    one_row = np.zeros(1, [(name, "<f4") for name in names])
+    rows = PlyElement.describe(np.broadcast_to(one_row, len(splats)), "vertex")  # costs no memory
+    comments = ["generated by g2ard"]
+    if splats.offset.any():
+        comments.append("g2ard offset " + " ".join(repr(float(v)) for v in splats.offset))
+    header = PlyData([rows], byte_order="<", comments=comments).header
+    with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
+        file.write(header.encode("ascii") + b"\n")
+        for block in _blocks(path, splats, names, normals):
+            file.write(block.data)
+
+
+def _blocks(path: Path, splats: Splats, names: list[str], normals: bool) -> Iterator[NDArray[np.float32]]:
+    for start in range(0, len(splats), BLOCK):
+        part = splats.take(slice(start, start + BLOCK))
+        n = len(part)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logs = np.clip(np.log(part.scales, dtype=np.float64), -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
+        columns = [
+            part.means,
+            np.zeros((n, 3 if normals else 0)),
+            part.sh0[:, 0],
+            part.shN.transpose(0, 2, 1).reshape(n, -1),
+            part.logit_opacities[:, None],
+            logs,
+            part.quats,
+        ]
+        block = np.concatenate(columns, axis=1, dtype="<f4", casting="same_kind")
+        finite = np.isfinite(block)
+        if not finite.all():
+            row, column = np.argwhere(~finite)[0]
+            raise InputError(
+                f"{path}: not written: {names[column]!r} of Gaussian {start + row} is not finite"
+            )
+        yield block

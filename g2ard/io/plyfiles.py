@@ -1,0 +1,110 @@
+"""What every PLY reader shares: a look at the header, and plyfile with errors that name the file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from g2ard.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["PlyHeader", "read_element", "read_header", "require"]
+
+_HEADER_LIMIT = 1 << 20
+"""No sane header is longer; a file without `end_header` by then is not a PLY."""
+
+
+@dataclass
+class PlyHeader:
+    """A PLY header: per element its row count and its properties in file order; and the comments."""
+
+    counts: dict[str, int] = field(default_factory=dict)
+    properties: dict[str, list[str]] = field(default_factory=dict)
+    lists: dict[str, list[str]] = field(default_factory=dict)
+    comments: list[str] = field(default_factory=list)
+
+
+def read_header(path: Path) -> PlyHeader:
+    """Read the header alone, without touching the data.
+
+    Raises:
+        InputError: the file is absent, empty, not a PLY, or its header is broken.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEADER_LIMIT)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from error
+    if not head:
+        raise InputError(f"{path}: the file is empty")
+    if head[:3] != b"ply" or head[3:4] not in b"\r\n":
+        raise InputError(f"{path}: not a PLY file (begins with {head[:8]!r}, expected 'ply')")
+    end = head.find(b"end_header")
+    if end < 0:
+        raise InputError(f"{path}: broken PLY: its header has no end_header line")
+    header = PlyHeader()
+    for number, line in enumerate(head[:end].decode("latin-1").splitlines(), 1):
+        try:
+            _header_line(header, line.split())
+        except (IndexError, ValueError, KeyError) as error:
+            raise InputError(f"{path}: broken PLY header, line {number}: {line.strip()!r}") from error
+    return header
+
+
+def _header_line(header: PlyHeader, words: list[str]) -> None:
+    if not words:
+        return
+    if words[0] == "comment":
+        header.comments.append(" ".join(words[1:]))
+    elif words[0] == "element":
+        if int(words[2]) < 0:
+            raise ValueError("negative count")
+        header.counts[words[1]] = int(words[2])
+        header.properties[words[1]], header.lists[words[1]] = [], []
+    elif words[0] == "property":
+        owner = list(header.properties)[-1]
+        (header.lists if words[1] == "list" else header.properties)[owner].append(words[-1])
+
+
+def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any]]:
+    """The rows of the elements `names`, mapped from the file where it is binary.
+
+    Raises:
+        InputError: the file ends before all promised rows, or plyfile cannot parse it.
+    """
+    from plyfile import PlyData, PlyElementParseError, PlyParseError
+
+    triangles = {name: dict.fromkeys(lists, 3) for name, lists in header.lists.items() if lists}
+    try:
+        try:
+            ply = PlyData.read(path, mmap="r", known_list_len=triangles)
+        except PlyElementParseError as error:
+            if error.message != "unexpected list length":
+                raise
+            ply = PlyData.read(path, mmap="r")  # a mesh of polygons: slow, but its vertices are wanted
+    except PlyElementParseError as error:
+        raise InputError(_parse_failure(path, header, error)) from error
+    except (PlyParseError, ValueError, OSError) as error:
+        raise InputError(f"{path}: cannot be read as a PLY: {error}") from error
+    return [ply[name].data for name in names]
+
+
+def _parse_failure(path: Path, header: PlyHeader, error: Any) -> str:
+    name = error.element.name
+    if error.message.startswith("early end-of-file"):
+        return (
+            f"{path}: truncated: the header promises {header.counts.get(name, 0):,} rows of {name!r}, "
+            f"the file ends after row {error.row:,}"
+        )
+    where = f", property {error.prop.name!r}" if error.prop is not None else ""
+    return f"{path}: {error.message} in {name!r}, row {error.row:,}{where}"
+
+
+def require(path: Path, present: list[str], wanted: list[str], what: str) -> None:
+    """Raise InputError naming the `wanted` properties that are not `present`."""
+    missing = [name for name in wanted if name not in present]
+    if missing:
+        raise InputError(f"{path}: {what} needs the vertex property {', '.join(map(repr, missing))}")

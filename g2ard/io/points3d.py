@@ -1,0 +1,56 @@
+"""COLMAP's sparse points as a coloured cloud."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.io.cloud_ply import finite_cloud
+from g2ard.io.colmap import model_folder, parsing, text_lines
+from g2ard.io.types import Cloud
+
+__all__ = ["read"]
+
+
+def read(path: Path) -> Cloud:
+    """Read points3D.bin or .txt, or that of the model in a COLMAP folder.
+
+    Raises:
+        InputError: no such file in the folder, it is truncated or malformed, or holds no finite point.
+    """
+    if path.is_dir() or path.stem.lower() != "points3d":
+        folder = model_folder(path) or path
+        found = next((p for s in (".bin", ".txt") if (p := folder / f"points3D{s}").is_file()), None)
+        if found is None:
+            raise InputError(f"{folder}: no points3D.bin or points3D.txt")
+        path = found
+    with parsing(path):
+        positions, rgb = (_binary if path.suffix == ".bin" else _text)(path)
+    return finite_cloud(path, positions, (rgb / 255).astype(np.float32))
+
+
+def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Rows of id, x y z, r g b, error, and a track of varying length: walked, since no stride is fixed."""
+    data = path.read_bytes()
+    (count,) = struct.unpack_from("<Q", data)
+    row = struct.Struct("<Q3d3BdQ")
+    if count * row.size > len(data):
+        raise InputError(f"{path}: truncated: {count:,} points promised")
+    positions, rgb, at = np.empty((count, 3)), np.empty((count, 3), np.uint8), 8
+    for i in range(count):
+        _key, x, y, z, r, g, b, _error, track = row.unpack_from(data, at)
+        positions[i], rgb[i] = (x, y, z), (r, g, b)
+        at += row.size + 8 * track
+        if at > len(data):
+            raise InputError(f"{path}: truncated in point {i:,} of {count:,}")
+    return positions, rgb
+
+
+def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    rows = [line.split(maxsplit=7)[1:7] for line in text_lines(path) if line.strip()]
+    values = np.array(rows, np.float64).reshape(-1, 6)
+    return values[:, :3], values[:, 3:].astype(np.uint8)

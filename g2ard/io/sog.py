@@ -1,0 +1,282 @@
+"""SOG scenes (PlayCanvas): a meta.json and lossless images, in a folder, in several, or zipped as .sog.
+
+A folder may hold one scene as spatial chunks, named `{lod}_{chunk}` or listed by a lod-meta.json. Levels of
+detail are alternatives, not parts: only the finest is read.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from g2ard.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from g2ard.io.clean import Raw
+    from g2ard.io.types import Note, Scene
+
+__all__ = ["chunks_of", "read"]
+
+_CHUNK_NAME = re.compile(r"(\d+)_(\d+)")
+_COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
+_PALETTE_COLUMNS = 64
+"""Entries of the SH palette beside each other in one row of its image."""
+
+
+class _Chunk(NamedTuple):
+    """One meta.json, and how to get at the files beside it."""
+
+    name: str
+    meta: dict[str, Any]
+    load: Callable[[str], bytes]
+
+
+def chunks_of(path: Path) -> list[Path]:
+    """The folders whose meta.json together are the scene at `path`, finest level only; [] if there are none.
+
+    Raises:
+        InputError: lod-meta.json is broken or names a chunk that is absent.
+    """
+    if path.is_file():
+        path = path.parent if path.name == "meta.json" else path
+    if (path / "meta.json").is_file():
+        return [path]
+    if path.name == "lod-meta.json" or (path / "lod-meta.json").is_file():
+        return _listed(path if path.is_file() else path / "lod-meta.json")
+    if not path.is_dir():
+        return []
+    folders = sorted(p.parent for p in path.glob("*/meta.json"))
+    named = [(folder, match) for folder in folders if (match := _CHUNK_NAME.fullmatch(folder.name))]
+    if not named:
+        return folders
+    finest = min(int(match[1]) for _, match in named)
+    numbered = sorted((int(match[2]), folder) for folder, match in named if int(match[1]) == finest)
+    return [folder for _, folder in numbered]
+
+
+def _listed(index: Path) -> list[Path]:
+    """The chunks that lod-meta.json's tree uses at level 0, in the order of its list."""
+    from g2ard.io.jsonfile import read_json
+
+    content = read_json(index)
+    try:
+        files = [index.parent / Path(name).parent for name in content["filenames"]]
+        used: set[int] = set()
+        nodes = [content["tree"]]
+        while nodes:
+            node = nodes.pop()
+            nodes.extend(node.get("children", ()))
+            if "0" in node.get("lods", {}):
+                used.add(int(node["lods"]["0"]["file"]))
+        chunks = [files[i] for i in sorted(used)]
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        raise InputError(f"{index}: not a valid lod-meta.json ({error!r})") from error
+    for chunk in chunks:
+        if not (chunk / "meta.json").is_file():
+            raise InputError(f"{index}: names {chunk.name}/meta.json, which is absent")
+    return chunks
+
+
+def read(path: Path) -> Scene:
+    """Read a SOG scene, version 1 or 2: a .sog, a meta.json or its folder, or a folder of chunks.
+
+    Chunks of different SH degrees are padded with zeros to the highest.
+
+    Raises:
+        InputError: a part is missing or broken, or nothing in it is finite.
+    """
+    from g2ard.io.clean import Raw, cleaned
+
+    with _opened(path) as chunks:
+        counts = [_count(chunk) for chunk in chunks]
+        decoded_rest = [_rest_coefficients(chunk) for chunk in chunks]
+        raw = Raw.empty(sum(counts), max(decoded_rest, default=0))
+        start = 0
+        for chunk, count in zip(chunks, counts, strict=True):
+            _decode(chunk, raw, slice(start, start + count))
+            start += count
+    return cleaned(path, raw, _left_out(path, len(chunks)))
+
+
+def _left_out(path: Path, read_count: int) -> list[Note]:
+    """Say that coarser levels, or an environment, lie beside the chunks that were read."""
+    from g2ard.io.types import Note
+
+    folder = path if path.is_dir() else path.parent
+    if path.suffix.lower() == ".sog" or (folder / "meta.json").is_file():
+        return []
+    others = len(list(folder.glob("*/meta.json"))) - read_count
+    text = f"{others} other SOG folder(s) left out (coarser levels of detail, environment)"
+    return [Note("ignored_chunks", others, text)] if others > 0 else []
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[list[_Chunk]]:
+    from g2ard.io.jsonfile import read_json
+
+    if path.suffix.lower() != ".sog":
+        yield [_Chunk(str(f), read_json(f / "meta.json"), _folder_loader(f)) for f in chunks_of(path)]
+        return
+    try:
+        with zipfile.ZipFile(path) as bundle:
+            inside = [name for name in bundle.namelist() if name.rpartition("/")[2] == "meta.json"]
+            if not inside:
+                raise InputError(f"{path}: no meta.json in it")
+            prefix = min(inside, key=len).removesuffix("meta.json")
+            meta = json.loads(bundle.read(prefix + "meta.json"))
+            yield [_Chunk(str(path), meta, lambda name: bundle.read(prefix + name))]
+    except (zipfile.BadZipFile, json.JSONDecodeError, EOFError) as error:
+        raise InputError(f"{path}: not a whole .sog archive ({error})") from error
+
+
+def _folder_loader(folder: Path) -> Callable[[str], bytes]:
+    return lambda name: (folder / name).read_bytes()
+
+
+@contextmanager
+def _meta_errors(chunk: _Chunk) -> Iterator[None]:
+    """Turn what a malformed meta.json causes into one line that names it."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{chunk.name}: malformed meta.json ({error!r})") from error
+
+
+def _count(chunk: _Chunk) -> int:
+    with _meta_errors(chunk):
+        version = chunk.meta.get("version", 1)
+        if version not in (1, 2):
+            raise InputError(f"{chunk.name}: SOG version {version!r} is not known (1 and 2 are)")
+        count = chunk.meta["count"] if version == 2 else chunk.meta["means"]["shape"][0]
+        if not isinstance(count, int) or count < 0:
+            raise InputError(f"{chunk.name}: malformed meta.json (count is {count!r})")
+        return count
+
+
+def _rest_coefficients(chunk: _Chunk) -> int:
+    """How many coefficients past band 0; version 1 tells only by the width of its palette image."""
+    with _meta_errors(chunk):
+        if "shN" not in chunk.meta:
+            return 0
+        if "bands" in chunk.meta["shN"]:
+            return _COEFFICIENTS[chunk.meta["shN"]["bands"]]
+        width = _image(chunk, _sh_files(chunk)[0]).shape[1]
+        return {_PALETTE_COLUMNS * k: k for k in (3, 8, 15)}[width]
+
+
+def _sh_files(chunk: _Chunk) -> tuple[str, str]:
+    files = chunk.meta["shN"]["files"]
+    centroids = next((f for f in files if "centroids" in f), files[0])
+    return centroids, next((f for f in files if f != centroids), files[1])
+
+
+def _image(chunk: _Chunk, name: str) -> NDArray[np.uint8]:
+    """(height, width, 4) bytes."""
+    import numpy as np
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(io.BytesIO(chunk.load(name))) as image:
+            return np.asarray(image.convert("RGBA"))
+    except (KeyError, FileNotFoundError) as error:
+        raise InputError(f"{chunk.name}: {name} is missing") from error
+    except (UnidentifiedImageError, OSError, ValueError) as error:
+        raise InputError(f"{chunk.name}: {name} is not a whole image ({error})") from error
+
+
+def _rows(chunk: _Chunk, name: str, count: int) -> NDArray[np.uint8]:
+    """(count, 4) bytes, one pixel a Gaussian."""
+    pixels = _image(chunk, name).reshape(-1, 4)
+    if len(pixels) < count:
+        raise InputError(f"{chunk.name}: {name} has {len(pixels):,} pixels for {count:,} Gaussians")
+    return pixels[:count]
+
+
+def _decode(chunk: _Chunk, raw: Raw, at: slice) -> None:
+    import numpy as np
+
+    meta, count = chunk.meta, at.stop - at.start
+    with _meta_errors(chunk):
+        low, high = (_rows(chunk, name, count)[:, :3].astype(np.float64) for name in meta["means"]["files"])
+        logs = _lerp(meta["means"], (high * 256 + low) / 65535, slice(3))
+        raw.means[at] = np.sign(logs) * np.expm1(np.abs(logs))  # stored as sign(x)·ln(|x| + 1)
+        raw.quats[at] = _quats(_rows(chunk, meta["quats"]["files"][0], count))
+        scales = _rows(chunk, meta["scales"]["files"][0], count)[:, :3]
+        raw.log_scales[at] = _values(meta["scales"], scales, slice(3))
+        base = _rows(chunk, meta["sh0"]["files"][0], count)
+        raw.sh0[at, 0] = _values(meta["sh0"], base[:, :3], slice(3))
+        if "codebook" in meta["sh0"]:
+            alpha = base[:, 3] / 255
+            with np.errstate(divide="ignore"):
+                raw.logit_opacities[at] = np.log(alpha) - np.log1p(-alpha)
+        else:
+            raw.logit_opacities[at] = _lerp(meta["sh0"], base[:, 3] / 255, 3)
+        _decode_rest(chunk, raw.shN[at])
+
+
+def _values(part: dict[str, Any], codes: NDArray[np.uint8], channels: slice) -> NDArray[Any]:
+    """Bytes to values: by codebook (version 2), or between mins and maxs (version 1)."""
+    import numpy as np
+
+    if "codebook" in part:
+        return np.asarray(part["codebook"], np.float64)[codes]
+    return _lerp(part, codes / 255, channels)
+
+
+def _lerp(part: dict[str, Any], t: NDArray[Any], channels: slice | int) -> NDArray[Any]:
+    import numpy as np
+
+    low, high = np.asarray(part["mins"], np.float64), np.asarray(part["maxs"], np.float64)
+    if low.ndim:
+        low, high = low[channels], high[channels]
+    return low + (high - low) * t
+
+
+def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:
+    """(N, 4) wxyz: three components in ±1/√2; the fourth byte − 252 says which is left out, the largest.
+
+    Any other fourth byte gives a zero quaternion, which is counted and made the identity later.
+    """
+    import numpy as np
+
+    three = (codes[:, :3] / 255 - 0.5) * np.sqrt(2)
+    largest = np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))
+    quats = np.zeros((len(codes), 4))
+    for mode in range(4):
+        rows = codes[:, 3] == 252 + mode
+        others = [i for i in range(4) if i != mode]
+        quats[rows, mode] = largest[rows]
+        quats[np.ix_(rows, others)] = three[rows]
+    return quats
+
+
+def _decode_rest(chunk: _Chunk, out: NDArray[np.float32]) -> None:
+    """Fill (n, K−1, 3): each Gaussian's label picks a palette entry, whose bytes pick values."""
+    import numpy as np
+
+    out[:] = 0
+    rest = _rest_coefficients(chunk)
+    if not rest:
+        return
+    centroids, labels = _sh_files(chunk)
+    image = _image(chunk, centroids)
+    if image.shape[1] != _PALETTE_COLUMNS * rest:
+        raise InputError(f"{chunk.name}: {centroids} is {image.shape[1]} wide, not {_PALETTE_COLUMNS * rest}")
+    palette = _values(chunk.meta["shN"], image[:, :, :3].reshape(-1, rest, 3), slice(3)).astype(np.float32)
+    codes = _rows(chunk, labels, len(out)).astype(np.int64)
+    index = codes[:, 0] + (codes[:, 1] << 8)
+    if len(index) and index.max() >= len(palette):
+        row = int(np.argmax(index >= len(palette)))
+        raise InputError(f"{chunk.name}: {labels}: Gaussian {row} names entry {index[row]} of {len(palette)}")
+    out[:, :rest] = palette[index]

@@ -1,0 +1,71 @@
+"""antimatter15's .splat: 32 bytes a Gaussian, no header, no harmonics past band 0."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.io.atomic import atomic_output
+from g2ard.io.clean import Raw, cleaned
+from g2ard.io.types import Scene
+from g2ard.splats import SH_C0, Splats
+
+__all__ = ["read", "write"]
+
+_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+
+
+def read(path: Path) -> Scene:
+    """Read a .splat: linear scales, 8-bit colour and opacity, quaternions as bytes around 128.
+
+    Raises:
+        InputError: the size is not a multiple of 32, or nothing in it is finite.
+    """
+    data = path.read_bytes()
+    if not data or len(data) % _ROW.itemsize:
+        raise InputError(f"{path}: not a whole .splat: {len(data):,} bytes are not a multiple of 32")
+    rows = np.frombuffer(data, _ROW)
+    raw = Raw.empty(len(rows), 0)
+    raw.means[:] = rows["mean"]
+    with np.errstate(divide="ignore", invalid="ignore"):  # a negative scale becomes NaN: the row is dropped
+        raw.log_scales[:] = np.log(rows["scale"].astype(np.float64))
+        alphas = rows["rgba"][:, 3] / 255
+        raw.logit_opacities[:] = np.log(alphas) - np.log1p(-alphas)
+    raw.sh0[:, 0] = (rows["rgba"][:, :3] / 255 - 0.5) / SH_C0
+    raw.quats[:] = (rows["quat"].astype(np.float32) - 128) / 128
+    return cleaned(path, raw)
+
+
+def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
+    """Write a .splat, biggest and most opaque first as its viewers expect; bands past 0 are lost.
+
+    Raises:
+        OutputError: see `atomic_output`.
+        InputError: the scene is empty or has a non-finite value.
+    """
+    if not len(splats):
+        raise InputError(f"{path}: a scene without Gaussians is not written")
+    bad = np.flatnonzero(~splats.finite_rows())
+    if len(bad):
+        raise InputError(f"{path}: not written: Gaussian {bad[0]} is not finite")
+    weight = splats.scales.astype(np.float64).prod(1) * splats.opacities
+    splats = splats.take(np.argsort(-weight, kind="stable"))
+    rows = np.empty(len(splats), _ROW)
+    rows["mean"] = splats.means + splats.offset
+    rows["scale"] = splats.scales
+    rows["rgba"][:, :3] = _bytes(splats.colors * 255)
+    rows["rgba"][:, 3] = _bytes(splats.opacities * 255)
+    quats = splats.quats / np.maximum(np.abs(splats.quats).max(1, keepdims=True), np.float32(1e-38))
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    quats = np.where(norms > 0, quats / np.maximum(norms, 1e-6), np.array([1, 0, 0, 0], np.float32))
+    rows["quat"] = _bytes(quats * 128 + 128)
+    with atomic_output(path, overwrite) as temporary:
+        temporary.write_bytes(rows.tobytes())
+
+
+def _bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)

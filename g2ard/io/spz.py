@@ -1,0 +1,159 @@
+"""Niantic's .spz: 8-bit attributes in streams, gzipped whole (versions 2, 3) or Zstandard each (version 4).
+
+SPZ stores right-up-back axes; a 3DGS .ply is right-down-forward. Both y and z change sign, and with them the
+quaternion's y and z and every harmonic odd in them.
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError, MissingDependencyError
+from g2ard.io.clean import Raw, cleaned
+from g2ard.io.types import Note, Scene
+
+__all__ = ["read"]
+
+_MAGIC = b"NGSP"
+_COEFFICIENTS = (0, 3, 8, 15, 24)
+_HAS_EXTENSIONS = 0x2
+_COLOR_SCALE = 0.15
+"""SPZ's own factor for band 0, wider than the harmonic's so that colours past [0, 1] survive."""
+
+_FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+"""Sign of each harmonic of bands 1–3 when y and z change sign (PLY order: y z x | xy yz z² xz x²−y² | …)."""
+
+
+def read(path: Path) -> Scene:
+    """Read an .spz of version 2, 3 or 4; bands past degree 3 are ignored and noted.
+
+    Raises:
+        InputError: not an SPZ, an unknown version, truncated, or nothing in it finite.
+        MissingDependencyError: version 4 before Python 3.14 without `pip install g2ard[spz]`.
+    """
+    data = path.read_bytes()
+    if data[:2] == b"\x1f\x8b":
+        data = _gunzip(path, data)
+    if data[:4] != _MAGIC or len(data) < 16:
+        raise InputError(f"{path}: not an SPZ file (begins with {data[:4]!r})")
+    version, count, degree, fraction_bits, flags, stream_count = struct.unpack_from("<IIBBBB", data, 4)
+    if version not in (2, 3, 4):
+        raise InputError(f"{path}: SPZ version {version} is not known (2, 3 and 4 are)")
+    if degree >= len(_COEFFICIENTS):
+        raise InputError(f"{path}: SH degree {degree} is not known (0 to 4 are)")
+    stored = _COEFFICIENTS[degree]
+    sizes = [9 * count, count, 3 * count, 3 * count, (3 if version == 2 else 4) * count, 3 * stored * count]
+    streams = _zstd_streams(path, data, stream_count, sizes) if version == 4 else _slices(path, data, sizes)
+    positions, alphas, colors, scales, rotations, sh = (np.frombuffer(s, np.uint8) for s in streams)
+
+    kept = min(stored, 15)
+    raw = Raw.empty(count, kept)
+    raw.means[:] = _fixed24(positions.reshape(-1, 3)).reshape(-1, 3) / (1 << fraction_bits) * (1, -1, -1)
+    raw.log_scales[:] = scales.reshape(-1, 3) / 16 - 10
+    raw.quats[:] = (_quats_xyz if version == 2 else _quats_packed)(rotations) * (1, 1, -1, -1)
+    with np.errstate(divide="ignore"):
+        raw.logit_opacities[:] = np.log(alphas / 255) - np.log1p(-(alphas / 255))
+    raw.sh0[:, 0] = (colors.reshape(-1, 3) / 255 - 0.5) / _COLOR_SCALE
+    bands = sh.reshape(count, stored, 3)[:, :kept]
+    raw.shN[:] = (bands.astype(np.float32) - 128) / 128 * _FLIPS[:kept, None]
+    notes = []
+    if stored > kept:
+        notes.append(Note("ignored_bands", 1, "spherical harmonics past degree 3 ignored"))
+    if flags & _HAS_EXTENSIONS:
+        notes.append(Note("ignored_extensions", 1, "SPZ extensions ignored"))
+    return cleaned(path, raw, notes)
+
+
+def _gunzip(path: Path, data: bytes) -> bytes:
+    try:
+        return zlib.decompress(data, 16 + zlib.MAX_WBITS)
+    except zlib.error as error:
+        raise InputError(f"{path}: truncated or broken gzip stream ({error})") from error
+
+
+def _slices(path: Path, data: bytes, sizes: list[int]) -> list[bytes]:
+    """Versions 2 and 3: the attributes follow the 16-byte header one after the other."""
+    ends = 16 + np.cumsum(sizes)
+    if len(data) < ends[-1]:
+        raise InputError(f"{path}: truncated: {ends[-1]:,} bytes promised, {len(data):,} there")
+    return [data[end - size : end] for end, size in zip(ends, sizes, strict=True)]
+
+
+def _zstd_streams(path: Path, data: bytes, stream_count: int, sizes: list[int]) -> list[bytes]:
+    """Version 4: a table of (packed, unpacked) sizes where the header says, then one frame a stream."""
+    decompress = _zstd(path)
+    try:
+        (table,) = struct.unpack_from("<I", data, 16)
+        entries = [struct.unpack_from("<QQ", data, table + 16 * i) for i in range(stream_count)]
+    except struct.error as error:
+        raise InputError(f"{path}: truncated: its table of streams is cut off") from error
+    streams, start = [], table + 16 * stream_count
+    for i, size in enumerate(sizes):
+        packed, unpacked = entries[i] if i < stream_count else (0, 0)
+        if unpacked != size:
+            raise InputError(f"{path}: stream {i} holds {unpacked:,} bytes, expected {size:,}")
+        if start + packed > len(data):
+            raise InputError(f"{path}: truncated in stream {i}")
+        streams.append(decompress(data[start : start + packed]) if size else b"")
+        start += packed
+    for i, (stream, size) in enumerate(zip(streams, sizes, strict=True)):
+        if len(stream) != size:
+            raise InputError(f"{path}: stream {i} unpacks to {len(stream):,} bytes, expected {size:,}")
+    return streams
+
+
+def _zstd(path: Path) -> Callable[[bytes], bytes]:
+    try:
+        if sys.version_info >= (3, 14):
+            from compression import zstd
+        else:
+            from backports import zstd
+    except ImportError as error:
+        raise MissingDependencyError(f"{path}: SPZ version 4 needs `pip install g2ard[spz]`") from error
+
+    def decompress(frame: bytes) -> bytes:
+        try:
+            return bytes(zstd.decompress(frame))
+        except zstd.ZstdError as error:
+            raise InputError(f"{path}: broken Zstandard stream ({error})") from error
+
+    return decompress
+
+
+def _fixed24(triples: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """Signed 24-bit little-endian integers: shifted to the top of 32 bits, and back with their sign."""
+    wide = np.zeros((len(triples), 4), np.uint8)
+    wide[:, 1:] = triples
+    return wide.view("<i4")[:, 0] >> 8
+
+
+def _quats_xyz(codes: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Version 2: x y z as bytes over [−1, 1]; w ≥ 0 follows."""
+    xyz = codes.reshape(-1, 3) / 127.5 - 1
+    w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1)))
+    return np.concatenate([w[:, None], xyz], axis=1)
+
+
+def _quats_packed(codes: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Versions 3, 4: 2 bits name the largest of x y z w; the others are a sign and 9 bits of |q|·√2."""
+    packed = codes.view("<u4").astype(np.uint32)
+    largest = packed >> np.uint32(30)
+    xyzw = np.zeros((len(packed), 4))
+    left = packed.copy()
+    for i in (3, 2, 1, 0):  # the last component written lies lowest
+        rows = largest != i
+        part: NDArray[Any] = left[rows]
+        magnitude = (part & np.uint32(511)) / (511 * np.sqrt(2))
+        xyzw[rows, i] = np.where(part & np.uint32(512), -magnitude, magnitude)
+        left[rows] = part >> np.uint32(10)
+    rest = np.sqrt(np.maximum(0, 1 - (xyzw**2).sum(1)))
+    xyzw[np.arange(len(packed)), largest] = rest
+    return xyzw[:, [3, 0, 1, 2]]

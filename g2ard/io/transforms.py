@@ -1,0 +1,110 @@
+"""transforms.json, as instant-ngp, nerfstudio and NeRF's synthetic scenes write it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.io.jsonfile import read_json
+from g2ard.io.photos import Frame, find_photo, rigid, view_set
+from g2ard.io.types import ViewSet
+
+__all__ = ["read"]
+
+_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""OpenGL camera axes (y up, looking along −z) to OpenCV's (y down, looking along z)."""
+
+
+def read(path: Path, images: Path | None = None) -> ViewSet:
+    """Read frames, their intrinsics (a frame's own win over the file's) and photos.
+
+    Args:
+        path: the JSON, or the folder that holds transforms.json.
+        images: a folder to look for photos in, by their file names; None takes paths as written, relative
+            to the JSON.
+
+    Raises:
+        InputError: no frames, a pose or intrinsics that make no sense, or a fisheye lens.
+    """
+    path = path / "transforms.json" if path.is_dir() else path
+    content = read_json(path)
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"{path}: no views found ('frames' is empty)")
+    return view_set(path, [_frame(path, i, content, frame, images) for i, frame in enumerate(frames)])
+
+
+def _frame(path: Path, index: int, content: dict[str, Any], frame: Any, images: Path | None) -> Frame:
+    where = f"{path}: frame {index}"
+    try:
+        file_path = str(frame["file_path"])
+        world_from_camera = np.array(frame["transform_matrix"], np.float64)
+        photo = find_photo(images / Path(file_path).name if images else path.parent / file_path)
+        return Frame(
+            name=file_path.removeprefix("./").removeprefix("images/"),
+            viewmat=_camera_from_world(rigid(where, world_from_camera)),
+            photo=photo,
+            **_intrinsics(where, {**content, **frame}, photo),
+        )
+    except KeyError as error:
+        raise InputError(f"{where}: lacks {error}") from error
+    except (TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{where}: malformed ({error})") from error
+
+
+def _camera_from_world(world_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    world_from_opencv = world_from_camera @ _FLIP
+    R, centre = world_from_opencv[:3, :3], world_from_opencv[:3, 3]
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = R.T, -R.T @ centre
+    return view
+
+
+def _intrinsics(where: str, values: dict[str, Any], photo: Path) -> dict[str, Any]:
+    model = str(values.get("camera_model", "OPENCV"))
+    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") or values.get(
+        "is_fisheye"
+    ):
+        raise InputError(
+            f"{where}: camera model {model} is not supported (a pinhole with OPENCV distortion is)"
+        )
+    width, height = _size(where, values, photo)
+    fx = _focal(values, "x", width)
+    fy = _focal(values, "y", height) or fx
+    if fx is None or fy is None:
+        raise InputError(f"{where}: no focal length (fl_x or camera_angle_x)")
+    cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
+    return {
+        "K": np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
+        "size": (width, height),
+        "distortion": tuple(float(values.get(key, 0)) for key in ("k1", "k2", "p1", "p2", "k3")),
+    }
+
+
+def _focal(values: dict[str, Any], axis: str, pixels: int) -> float | None:
+    if f"fl_{axis}" in values:
+        return float(values[f"fl_{axis}"])
+    if axis == "y" and "fl_x" in values:
+        return None  # square pixels, rather than an angle of another camera
+    angle = values.get(f"camera_angle_{axis}")
+    return None if angle is None else 0.5 * pixels / math.tan(0.5 * float(angle))
+
+
+def _size(where: str, values: dict[str, Any], photo: Path) -> tuple[int, int]:
+    if "w" in values and "h" in values:
+        return round(float(values["w"])), round(float(values["h"]))
+    if photo.is_file():
+        from PIL import Image
+
+        with Image.open(photo) as image:
+            return image.size
+    raise InputError(f"{where}: neither w and h nor its photo is there to tell the size")

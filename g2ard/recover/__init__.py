@@ -1,0 +1,18 @@
+"""Recovery: appearance and shape of a fixed set of Gaussians against photos or a teacher's renders."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from g2ard.recover.optimize import RecoverConfig, Recovered, recover
+
+__all__ = ["RecoverConfig", "Recovered", "recover"]
+
+
+def __getattr__(name: str) -> Any:  # torch loads when recovery is first asked for, not at import
+    if name in __all__:
+        from g2ard.recover import optimize
+
+        return getattr(optimize, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

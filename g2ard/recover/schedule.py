@@ -1,0 +1,125 @@
+"""How fast each attribute learns, and for how long."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from g2ard.errors import InputError
+
+__all__ = ["PAPER", "SCHEDULES", "TUNED", "Rates", "Schedule", "schedule_named"]
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's learning rate of each attribute, in the space it is optimised in.
+
+    Args:
+        means: of the Gaussian's own largest scale when the schedule says `means_in_scales`, else scene units.
+        log_scales: natural-log units.
+        quats: components of the unnormalised quaternion.
+        logit_opacities: logits.
+        sh0: band-0 coefficients.
+        shN: higher-band coefficients.
+    """
+
+    means: float
+    log_scales: float
+    quats: float
+    logit_opacities: float
+    sh0: float
+    shN: float
+
+    def scaled(self, geometry: float, appearance: float) -> Rates:
+        """Means, scales and rotations times `geometry`; opacity and SH times `appearance`."""
+        return Rates(
+            self.means * geometry,
+            self.log_scales * geometry,
+            self.quats * geometry,
+            self.logit_opacities * appearance,
+            self.sh0 * appearance,
+            self.shN * appearance,
+        )
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Rates and their decay over a horizon fixed in advance.
+
+    Args:
+        rates: at the first step.
+        steps: the horizon of the final (or only) recovery.
+        round_steps: recovery steps of each intermediate round; 0 recovers at the final count only.
+        means_in_scales: `rates.means` is a share of each Gaussian's largest scale, so that the step does not
+            depend on the scene's unit.
+        cosine_floor: every rate follows a cosine down to this share of itself; None keeps geometry constant.
+        appearance_decay: (rounds, final) share that appearance rates decay to exponentially; 1 keeps them.
+        multiplier: of all rates; None chooses it from the starting error (see `multiplier_for`).
+    """
+
+    rates: Rates
+    steps: int
+    round_steps: int = 0
+    means_in_scales: bool = True
+    cosine_floor: float | None = 0.01
+    appearance_decay: tuple[float, float] = (1.0, 1.0)
+    multiplier: float | None = None
+
+    def at(self, step: int, steps: int, *, final: bool, multiplier: float = 1.0) -> Rates:
+        """The rates of step `step` (from 0) out of `steps`."""
+        t = step / max(1, steps)
+        cosine = 1.0
+        if self.cosine_floor is not None:
+            cosine = self.cosine_floor + (1 - self.cosine_floor) * 0.5 * (1 + math.cos(math.pi * t))
+        decay = self.appearance_decay[1 if final else 0] ** t
+        return self.rates.scaled(cosine * multiplier, cosine * decay * multiplier)
+
+
+TUNED = Schedule(
+    rates=Rates(means=0.05, log_scales=3e-2, quats=1.5e-2, logit_opacities=7e-2, sh0=3e-2, shN=3e-3),
+    steps=1000,
+)
+"""Rates in the Gaussian's own unit and a cosine to 1 %; `docs/decisions.md` holds the figures behind it."""
+
+PAPER = Schedule(
+    rates=Rates(means=9.2e-4, log_scales=5e-3, quats=1e-3, logit_opacities=5e-3, sh0=2.5e-3, shN=1.25e-4),
+    steps=30_000,
+    round_steps=8_000,
+    means_in_scales=False,
+    cosine_floor=None,
+    appearance_decay=(0.36, 0.1),
+    multiplier=1.0,
+)
+"""The supplement's `tab:s_config`; the rates it leaves out are 3DGS's own."""
+
+SCHEDULES = {
+    "fast": replace(TUNED, steps=300),
+    "default": TUNED,
+    "best": replace(TUNED, steps=6000),
+    "paper": PAPER,
+}
+
+
+def schedule_named(name: str) -> Schedule:
+    """A schedule of `SCHEDULES`.
+
+    Raises:
+        InputError: there is none of that name.
+
+    >>> schedule_named("default").steps
+    1000
+    """
+    if name not in SCHEDULES:
+        raise InputError(f"schedule: expected one of {', '.join(SCHEDULES)}, got {name!r}")
+    return SCHEDULES[name]
+
+
+def multiplier_for(start_rmse: float) -> float:
+    """A rate multiplier from the RMSE before recovery: 1 from 0.039 up, a third from 0.013 down.
+
+    The better a start already is, the smaller the steps that improve it.
+
+    >>> multiplier_for(0.05), round(multiplier_for(0.026), 3), round(multiplier_for(0.001), 3)
+    (1.0, 0.667, 0.333)
+    """
+    return min(1.0, max(1 / 3, start_rmse / 0.039))

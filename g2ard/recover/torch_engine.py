@@ -1,0 +1,126 @@
+"""Recovery steps in torch: autograd over the Rust rasteriser and loss, torch's Adam."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from g2ard.cameras import Cameras
+from g2ard.recover.anchors import Anchors, Regularizers
+from g2ard.recover.losses import l1_ssim
+from g2ard.recover.rasterize import rasterize
+from g2ard.recover.regularize import TorchAnchors, regularization
+from g2ard.recover.schedule import Rates
+from g2ard.splats import Splats
+
+__all__ = ["TorchEngine"]
+
+_NAMES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
+
+
+class TorchEngine:
+    """Holds the parameters and Adam's moments; one `step` a view.
+
+    With `means_in_scales` the means are optimised as multiples of each Gaussian's largest initial scale: Adam
+    is indifferent to the scale of a gradient, so a rate of 0.05 moves a Gaussian by 5 % of its own size.
+    """
+
+    def __init__(
+        self,
+        splats: Splats,
+        cameras: Cameras,
+        *,
+        anchors: Anchors,
+        regularizers: Regularizers,
+        means_in_scales: bool,
+        ssim_weight: float,
+        background: tuple[float, float, float],
+    ) -> None:
+        self._template = splats
+        self._cameras = cameras
+        self._anchors = TorchAnchors(anchors)
+        self._regularizers = regularizers
+        self._ssim_weight = ssim_weight
+        self._background = background
+        self._base = torch.from_numpy(splats.means.astype(np.float32))
+        unit = (
+            splats.scales.max(1, keepdims=True) if means_in_scales else np.ones((len(splats), 1), np.float32)
+        )
+        self._unit = torch.from_numpy(np.ascontiguousarray(unit))
+        start = {
+            "means": np.zeros((len(splats), 3), np.float32),
+            "log_scales": splats.log_scales,
+            "quats": splats.quats,
+            "logit_opacities": splats.logit_opacities,
+            "sh0": splats.sh0,
+            "shN": splats.shN,
+        }
+        self._parameters = {name: torch.from_numpy(start[name].copy()).requires_grad_() for name in _NAMES}
+        groups = [{"params": [p], "lr": 0.0} for p in self._parameters.values() if p.numel()]
+        self._adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, fused=True)
+
+    def step(self, view: int, target: NDArray[np.float32], rates: Rates, *, regularize: bool) -> float:
+        """One optimiser step on one view; returns its photometric loss."""
+        p = self._parameters
+        means = self._base + self._unit * p["means"]
+        image, _, _ = rasterize(
+            means,
+            p["quats"],
+            p["log_scales"],
+            p["logit_opacities"],
+            p["sh0"],
+            p["shN"],
+            self._cameras,
+            view,
+            background=self._background,
+        )
+        loss = l1_ssim(image, torch.from_numpy(target), self._ssim_weight)
+        total = loss
+        if regularize and self._regularizers.active:
+            total = loss + regularization(
+                means, p["quats"], p["log_scales"], self._anchors, self._regularizers
+            )
+        self._adam.zero_grad(set_to_none=True)
+        total.backward()  # type: ignore[no-untyped-call]
+        lively = [name for name in _NAMES if p[name].numel()]
+        for group, name in zip(self._adam.param_groups, lively, strict=True):
+            group["lr"] = getattr(rates, name)
+        self._adam.step()
+        return float(loss.detach())
+
+    def splats(self) -> Splats:
+        """The scene as it stands, quaternions normalised."""
+        p = {name: value.detach() for name, value in self._parameters.items()}
+        return Splats(
+            means=(self._base + self._unit * p["means"]).numpy().copy(),
+            quats=torch.nn.functional.normalize(p["quats"], dim=1).numpy().copy(),
+            scales=p["log_scales"].double().exp().float().numpy(),
+            logit_opacities=p["logit_opacities"].numpy().copy(),
+            sh0=p["sh0"].numpy().copy(),
+            shN=p["shN"].numpy().copy(),
+            offset=self._template.offset,
+        )
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Everything a bitwise resume needs."""
+        arrays = {f"p.{name}": value.detach().numpy() for name, value in self._parameters.items()}
+        arrays["base"], arrays["unit"] = self._base.numpy(), self._unit.numpy()
+        for i, entry in self._adam.state_dict()["state"].items():
+            arrays.update({f"adam.{i}.{key}": value.numpy() for key, value in entry.items()})
+        return arrays
+
+    def load(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take up a `state` again."""
+        with torch.no_grad():
+            for name, value in self._parameters.items():
+                value.copy_(torch.from_numpy(state[f"p.{name}"]))
+        self._base, self._unit = torch.from_numpy(state["base"]), torch.from_numpy(state["unit"])
+        adam = self._adam.state_dict()
+        for key, value in state.items():
+            if key.startswith("adam."):
+                _, i, name = key.split(".")
+                adam["state"].setdefault(int(i), {})[name] = torch.from_numpy(np.asarray(value).copy())
+        self._adam.load_state_dict(adam)

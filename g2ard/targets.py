@@ -1,0 +1,103 @@
+"""What recovery and evaluation compare renders with: photos, or the teacher's renders of the same views."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.cameras import Cameras
+from g2ard.errors import InputError
+from g2ard.progress import Progress, silent
+from g2ard.splats import Splats
+
+__all__ = ["CACHE_BYTES", "Photos", "Targets", "TeacherRenders"]
+
+CACHE_BYTES = 2_000_000_000
+"""Targets are kept in memory up to this many bytes; beyond it they are made again when they are asked for."""
+
+
+class Targets(Protocol):
+    """One (H, W, 3) float32 image in [0, 1] for each view of `cameras`."""
+
+    cameras: Cameras
+
+    def __getitem__(self, view: int) -> NDArray[np.float32]: ...
+
+
+class _Cached:
+    """Keeps what `_make` returns, first come first kept, within `limit` bytes."""
+
+    def __init__(self, cameras: Cameras, limit: int) -> None:
+        self.cameras = cameras
+        self._limit = limit
+        self._kept: dict[int, NDArray[Any]] = {}
+        self._bytes = 0
+
+    def _make(self, view: int) -> NDArray[Any]:
+        raise NotImplementedError
+
+    def _stored(self, view: int) -> NDArray[Any]:
+        image = self._kept.get(view)
+        if image is None:
+            image = self._make(view)
+            if self._bytes + image.nbytes <= self._limit:
+                self._kept[view] = image
+                self._bytes += image.nbytes
+        return image
+
+    def fill(self, progress: Progress, stage: str) -> None:
+        """Make every target now, as far as memory allows, so that later steps take equal time."""
+        for view in range(len(self.cameras)):
+            self._stored(view)
+            progress(stage, view + 1, len(self.cameras))
+            if self._bytes >= self._limit:
+                break
+
+
+class Photos(_Cached):
+    """The photos of `cameras`, undistorted and at each camera's size; kept as 8-bit."""
+
+    def __init__(self, cameras: Cameras, *, limit: int = CACHE_BYTES) -> None:
+        missing = next(
+            (n for n, p in zip(cameras.names, cameras.image_paths, strict=True) if p is None), None
+        )
+        if missing is not None:
+            raise InputError(f"view {missing}: has no photo; give --teacher to render targets instead")
+        super().__init__(cameras, limit)
+
+    def _make(self, view: int) -> NDArray[np.uint8]:
+        from g2ard.images import load_image
+
+        return np.rint(load_image(self.cameras, view) * 255).astype(np.uint8)
+
+    def __getitem__(self, view: int) -> NDArray[np.float32]:
+        return self._stored(view).astype(np.float32) / np.float32(255)
+
+
+class TeacherRenders(_Cached):
+    """The dense scene rendered into each view, clamped to [0, 1], in float32."""
+
+    def __init__(
+        self,
+        teacher: Splats,
+        cameras: Cameras,
+        *,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        limit: int = CACHE_BYTES,
+        progress: Progress = silent,
+    ) -> None:
+        super().__init__(cameras, limit)
+        self._teacher = teacher
+        self._background = background
+        self.fill(progress, "teacher")
+
+    def _make(self, view: int) -> NDArray[np.float32]:
+        from g2ard.render import render
+
+        image = render(self._teacher, self.cameras, view, background=self._background).image
+        return np.clip(image, 0, 1)
+
+    def __getitem__(self, view: int) -> NDArray[np.float32]:
+        return self._stored(view)
