@@ -15,7 +15,7 @@ from g2ard.synth.paint import Painter
 from g2ard.synth.shapes import Float, cast
 from g2ard.synth.trajectories import trajectories
 
-__all__ = ["City", "CityConfig", "Cloud", "Hits", "city"]
+__all__ = ["City", "CityConfig", "Hits", "Scan", "city"]
 
 _TILE = 32
 _BEAM = 0.01, 4e-4
@@ -36,14 +36,14 @@ class CityConfig:
         noise: standard deviation of the laser's range, metres; that of a good survey scanner.
         fov: horizontal field of view of the photos, degrees.
         supersample: samples a pixel along each axis; two suffice, for textures are averaged in closed form.
-        sky: (3,) colour in [0, 1] where a ray meets nothing.
+        sky: colour in [0, 1] where a ray meets nothing; the default is exact in eight bits.
         offset: (3,) world coordinates of the city's middle; map coordinates are large (UTM).
 
     Raises:
         InputError: a value no city can be built from.
     """
 
-    points: int = 300_000
+    points: int = 500_000
     views: int = 120
     size: tuple[int, int] = (800, 600)
     blocks: int = 3
@@ -51,7 +51,7 @@ class CityConfig:
     noise: float = 0.015
     fov: float = 65.0
     supersample: int = 2
-    sky: tuple[float, float, float] = (0.62, 0.76, 0.90)
+    sky: tuple[float, float, float] = (0.6, 0.8, 1.0)
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -75,17 +75,17 @@ class CityConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class Scan:
     """n laser returns.
 
     Args:
-        points: (n, 3) float64 world coordinates, range noise included.
-        colors: (n, 3) uint8.
+        positions: (n, 3) float64 world coordinates, range noise included.
+        colors: (n, 3) float32 in [0, 1].
         primitives: (n,) which surface each one was returned from.
     """
 
-    points: Float
-    colors: NDArray[np.uint8]
+    positions: Float
+    colors: NDArray[np.float32]
     primitives: NDArray[np.int64]
 
 
@@ -117,8 +117,8 @@ class City:
         local = trajectories(self.layout, config.views, config.size, config.fov)
         self.views: dict[str, Cameras] = {k: v.recentred(-self._offset) for k, v in local.items()}
 
-    def points(self, count: int | None = None) -> Cloud:
-        """A laser scan of `count` returns (default: the configuration's), coloured by the light that photos see."""
+    def points(self, count: int | None = None) -> Scan:
+        """A laser scan of `count` returns (default: the configuration's), coloured as photos are."""
         config = self.config
         rng = np.random.default_rng([config.seed, 2])
         points, colors, primitives = [], [], []
@@ -129,9 +129,9 @@ class City:
                 color = self._shade(o, d, t, part.primitives, _BEAM[0] + _BEAM[1] * t)
                 noisy = o + d * (t + config.noise * rng.standard_normal(len(t)))
                 points.append(noisy.T + self._offset)
-                colors.append(_to_bytes(color.T))
+                colors.append(color.T)
                 primitives.append(part.primitives)
-        return Cloud(np.concatenate(points), np.concatenate(colors), np.concatenate(primitives))
+        return Scan(np.concatenate(points), np.concatenate(colors), np.concatenate(primitives))
 
     def cast(self, origins: ArrayLike, directions: ArrayLike, width: float = 0.01) -> Hits:
         """Exact first hits of any rays, in world coordinates.
@@ -147,7 +147,9 @@ class City:
         d = np.asarray(directions, np.float64)
         o = np.atleast_2d(np.asarray(origins, np.float64)) - self._offset
         if d.ndim != 2 or d.shape[1] != 3 or o.shape not in {(1, 3), d.shape}:
-            raise InputError(f"cast: expected directions (n, 3) and origins (n, 3) or (3,), got {d.shape}, {o.shape}")
+            raise InputError(
+                f"cast: expected directions (n, 3) and origins (n, 3) or (3,), got {d.shape}, {o.shape}"
+            )
         length = np.linalg.norm(d, axis=1)
         if not (np.isfinite(o).all() and np.isfinite(length).all() and (length > 0).all()):
             raise InputError("cast: origins and directions must be finite, directions not zero")
@@ -172,16 +174,15 @@ class City:
     def photo(self, cameras: Cameras, index: int) -> NDArray[np.float32]:
         """(H, W, 3) colours in [0, 1] of one view: the mean of supersample² rays a pixel."""
         view = self._local(cameras, index)
-        s = self.config.supersample
         width, height = int(view.widths[0]), int(view.heights[0])
         image = np.empty((height, width, 3), np.float32)
         for row in range(0, height, _TILE):
             rows = min(_TILE, height - row)
-            order, o, d, scale = _pixel_rays(view, row, rows, s)
+            order, o, d, scale = _pixel_rays(view, row, rows, self.config.supersample)
             t, hit = cast(self.layout.shapes, o, d)
-            color = np.empty((s * s * rows * width, 3), np.float32)
-            color[order] = self._color(o, d, t, hit, scale / s * t).T
-            image[row : row + rows] = color.reshape(rows, s, width, s, 3).mean((1, 3))
+            flat = np.empty((rows * width, 3), np.float32)
+            flat[order] = self._pixels(o, d, t, hit, scale, len(order))
+            image[row : row + rows] = flat.reshape(rows, width, 3)
         return image
 
     def depth(self, cameras: Cameras, index: int) -> Float:
@@ -201,14 +202,43 @@ class City:
     def _local(self, cameras: Cameras, index: int) -> Cameras:
         return cameras.take([index]).recentred(self._offset)
 
+    def _pixels(
+        self, o: Float, d: Float, t: Float, hit: NDArray[np.int64], scale: float, count: int
+    ) -> NDArray[np.float32]:
+        """(count, 3) colours of pixels, each seen along n/count consecutive rays.
+
+        Patterns are averaged in closed form: a pixel all of whose rays meet one face is painted once, at
+        the rays' mean; only pixels on edges are painted ray by ray.
+        """
+        each = d.shape[1] // count
+        hits = hit.reshape(count, each)
+        one = (hits == hits[:, :1]).all(1) & (hits[:, 0] >= 0)
+        one[one] = self._flat(o, d, t, hit, np.flatnonzero(one) * each, each)
+        color = np.empty((count, 3), np.float32)
+        mean = (d * np.where(hit >= 0, t, 0.0)).reshape(3, count, each)[:, one].mean(2)
+        depth = np.linalg.norm(mean, axis=0)
+        color[one] = self._shade(o, mean / depth, depth, hits[one, 0], scale * depth).T
+        rays = np.repeat(~one, each)
+        rest = self._color(o, d[:, rays], t[rays], hit[rays], scale / np.sqrt(each))
+        color[~one] = rest.T.reshape(-1, each, 3).mean(1)
+        return color
+
+    def _flat(
+        self, o: Float, d: Float, t: Float, hit: NDArray[np.int64], first: NDArray[np.int64], each: int
+    ) -> NDArray[np.bool_]:
+        """Whether the first and last of the `each` rays from `first` on meet one face of their primitive."""
+        last = first + each - 1
+        normals = [self.layout.shapes.normals(o + d[:, i] * t[i], hit[i]) for i in (first, last)]
+        return (normals[0] * normals[1]).sum(0) > 0.9
+
     def _color(
-        self, o: Float, d: Float, t: Float, hit: NDArray[np.int64], width: Float
+        self, o: Float, d: Float, t: Float, hit: NDArray[np.int64], scale: float
     ) -> NDArray[np.float32]:
         color = np.empty(d.shape, np.float32)
         color[:] = np.asarray(self.config.sky, np.float32)[:, None]
         found = np.flatnonzero(hit >= 0)
         if len(found):
-            color[:, found] = self._shade(o, d[:, found], t[found], hit[found], width[found])
+            color[:, found] = self._shade(o, d[:, found], t[found], hit[found], scale * t[found])
         return color
 
     def _shade(
@@ -233,14 +263,10 @@ def city(config: CityConfig | None = None, **options: object) -> City:
         InputError: a value no city can be built from.
 
     >>> town = city(blocks=1, points=1000, views=8, size=(32, 24))
-    >>> town.points().points.shape, town.photo(town.views["train"], 0).shape
+    >>> town.points().positions.shape, town.photo(town.views["train"], 0).shape
     ((1000, 3), (24, 32, 3))
     """
     return City(replace(config or CityConfig(), **options))  # type: ignore[arg-type]
-
-
-def _to_bytes(color: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return np.rint(np.clip(color, 0.0, 1.0) * 255).astype(np.uint8)
 
 
 def _coherent(o: Float, d: Float) -> NDArray[np.int64]:
@@ -252,21 +278,21 @@ def _coherent(o: Float, d: Float) -> NDArray[np.int64]:
     return np.argsort(key + (facing[:, 0] * 12 + facing[:, 1]) * 12 + facing[:, 2], kind="stable")
 
 
-def _pixel_rays(view: Cameras, row: int, rows: int, s: int) -> tuple[NDArray[np.int64], Float, Float, Float]:
-    """Rays through s × s samples of each pixel in `rows` rows from `row`, tile after tile.
+def _pixel_rays(view: Cameras, row: int, rows: int, s: int) -> tuple[NDArray[np.int64], Float, Float, float]:
+    """Rays through s × s samples of each pixel in `rows` rows from `row`, tile after tile, pixel after pixel.
 
     Returns:
-        order (n,), each ray's place in (rows·s, width·s) raster order; origin (3, 1); unit directions (3, n);
-        how wide a pixel is at distance 1 (1, ).
+        order (n/s²,), each pixel's place in raster order; origin (3, 1); unit directions (3, n);
+        how wide a pixel is at distance 1.
     """
     width = int(view.widths[0])
     R, K = view.viewmats[0, :3, :3], view.Ks[0]
-    place = np.arange(rows * s * width * s).reshape(rows * s, width * s)
-    step = _TILE * s
-    order = np.concatenate([place[:, c : c + step].ravel() for c in range(0, width * s, step)])
-    y, x = np.divmod(order, width * s)
-    across = ((x + 0.5) / s - K[0, 2]) / K[0, 0]
-    down = (row + (y + 0.5) / s - K[1, 2]) / K[1, 1]
-    d = R.T @ np.stack([across, down, np.ones_like(across)])
-    length = np.linalg.norm(d, axis=0)
-    return order, view.positions.T, d / length, length / length / K[0, 0]
+    place = np.arange(rows * width).reshape(rows, width)
+    order = np.concatenate([place[:, c : c + _TILE].ravel() for c in range(0, width, _TILE)])
+    y, x = np.divmod(order, width)
+    part = (np.arange(s) + 0.5) / s
+    x = (x[:, None] + np.tile(part, s)).ravel()
+    y = (row + y[:, None] + np.repeat(part, s)).ravel()
+    camera = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones(len(x))])
+    d = R.T @ camera
+    return order, view.positions.T, d / np.linalg.norm(d, axis=0), 1.0 / float(K[0, 0])

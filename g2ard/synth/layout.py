@@ -1,4 +1,4 @@
-"""Where everything stands: blocks on a street grid, filled with houses, perimeter buildings, towers and parks."""
+"""Where everything stands: blocks on a street grid, with houses, perimeter buildings, towers and parks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CURB = 0.15
 MARGIN = 45.0
 """How far the ground reaches beyond the outermost street."""
 
-Colour = Sequence[float]
+Colour = Sequence[float] | Float
 
 _WALLS = (
     (0.78, 0.70, 0.56),
@@ -117,7 +117,7 @@ class Layout:
 
     def streets(self, axis: int) -> Float:
         """Coordinates, along `axis`, of the centre lines of the streets that cross it."""
-        return (np.arange(self.blocks + 1) - self.blocks / 2) * PITCH[axis]
+        return (np.arange(self.blocks + 1, dtype=np.float64) - self.blocks / 2) * PITCH[axis]
 
     @property
     def reach(self) -> Float:
@@ -128,7 +128,7 @@ class Layout:
 def _pick(rng: Generator, items: Sequence[Colour], jitter: float = 0.05) -> Float:
     base = np.asarray(items[int(rng.random() * len(items))])
     shift = jitter * (2 * rng.random() - 1) + 0.4 * jitter * (2 * rng.random(3) - 1)
-    return np.clip(base + shift, 0.02, 0.95)
+    return np.clip(base + shift, 0.02, 0.95).astype(np.float64)
 
 
 def _tree(b: _Builder, rng: Generator, x: float, y: float, foot: float) -> None:
@@ -241,7 +241,9 @@ def _tower(b: _Builder, rng: Generator, lo: Float, hi: Float) -> None:
         Kind.BOX, (*corner, roof - 0.1), (*opposite, top), _pick(rng, _WALLS[2:6]), Material.FACADE, windows
     )
     b.around(Kind.BOX, (*middle, top), (3.0, 2.4, 2.6), (0.6, 0.6, 0.6))
-    b.around(Kind.CYLINDER, (*(middle + [1.5, 0.5]), top + 2.6), (0.08, 0.08, 5.0), (0.75, 0.2, 0.15))
+    b.around(
+        Kind.CYLINDER, (middle[0] + 1.5, middle[1] + 0.5, top + 2.6), (0.08, 0.08, 5.0), (0.75, 0.2, 0.15)
+    )
     for x in np.arange(lo[0] + 2.5, hi[0] - 2, 6.0):
         for y in (lo[1] + 2.2, hi[1] - 2.2):
             _tree(b, rng, x, y, CURB)
@@ -266,9 +268,11 @@ def _furnish(b: _Builder, rng: Generator, lo: Float, hi: Float) -> None:
     for axis in (0, 1):
         for edge, inwards in ((lo[1 - axis], 1.0), (hi[1 - axis], -1.0)):
 
-            def place(s: float, inset: float, edge: float = edge, inwards: float = inwards) -> Float:
+            def place(
+                s: float, inset: float, axis: int = axis, edge: float = edge, inwards: float = inwards
+            ) -> tuple[float, float]:
                 across = edge + inwards * inset
-                return np.array([s, across] if axis == 0 else [across, s])
+                return (s, across) if axis == 0 else (across, s)
 
             towards = np.array([0.0, -inwards] if axis == 0 else [-inwards, 0.0])
             for k, s in enumerate(np.arange(lo[axis] + 4.0, hi[axis] - 3.5, 8.0)):
@@ -285,10 +289,10 @@ def _outskirts(b: _Builder, rng: Generator, reach: Float) -> None:
     """A belt of trees and a few houses beyond the outermost streets."""
     total = reach + MARGIN
     for _ in range(int(0.006 * 4 * (total.prod() - reach.prod()))):
-        at = (rng.random(2) * 2 - 1) * (total - 4)
+        at = (2 * rng.random(2) - 1) * (total - 4)
         outside = (np.abs(at) - reach).max()
         if outside > 11:
-            _tree(b, rng, *at, 0.0)
+            _tree(b, rng, at[0], at[1], 0.0)
         elif outside > 9.5 and (np.abs(at) - reach).min() < -8:
             half = np.array([4.5, 4.0]) + rng.random(2)
             away = np.where(np.abs(at) - reach > 0, np.sign(at) * half, 0.0)

@@ -49,7 +49,8 @@ class Returns:
 
 def _stations(layout: Layout) -> tuple[Float, Float]:
     """(n, 3) scanner positions on the streets, and (m, 3) on flight lines."""
-    street, flight = [], []
+    street: list[Float] = []
+    flight: list[Float] = []
     for axis in (0, 1):
         end = layout.reach[1 - axis] + 10.0
         along = np.linspace(-end, end, max(2, int(2 * end / _SPACING) + 1))
@@ -90,9 +91,7 @@ def _fire(layout: Layout, rng: Generator, stations: Float, rays: int, aerial: bo
         far = np.inf if aerial else _STREET_RANGE
         t, hit = cast(layout.shapes, origin, d, far=far, packet=max(64, min(8192, each // _SECTORS)))
         found = np.flatnonzero(hit >= 0)
-        parts.append(
-            Returns(np.broadcast_to(origin, (3, len(found))), d[:, found], t[found], hit[found])
-        )
+        parts.append(Returns(np.broadcast_to(origin, (3, len(found))), d[:, found], t[found], hit[found]))
     return Returns(
         np.concatenate([p.origins for p in parts], 1),
         np.concatenate([p.directions for p in parts], 1),

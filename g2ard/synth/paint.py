@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.synth.layout import CURB, PITCH, ROAD, Layout, Material
+from g2ard.synth.layout import PITCH, ROAD, Layout, Material
 from g2ard.synth.noise import Array, Noise, band, hash01, ramp
 from g2ard.synth.shapes import Float, cast
 
@@ -43,6 +43,18 @@ def _mix(base: Array, over: Array | tuple[float, ...], share: Array) -> Array:
     if isinstance(over, tuple):
         over = np.asarray(over, np.float32)[:, None]
     return base + (over - base) * share
+
+
+def _tones(s: _Spots, u: Array, v: Array, cell: tuple[float, float], amplitude: float) -> Array:
+    """(n,) a tone for each cell of a primitive's grid, mean 0, fading where a pixel spans many cells."""
+    tone = hash01(np.floor(u / cell[0]), np.floor(v / cell[1]), s.primitive) - np.float32(0.5)
+    return tone * np.float32(amplitude) / (1 + (np.maximum(s.wu, s.wv) / min(cell)) ** 4)
+
+
+def _to_edge(s: _Spots) -> Array:
+    """(n,) metres, seen from above, from the nearest side of the primitive's bounding box."""
+    inset = np.minimum(s.p - s.lo, s.hi - s.p)
+    return np.minimum(inset[0], inset[1])
 
 
 class _Shadows:
@@ -170,10 +182,10 @@ class Painter:
         )
 
     def _grain(self, s: _Spots, *octaves: tuple[float, float]) -> Array:
-        """1 ± noise: (wavelength, amplitude) each; a primitive's own corner of the table, so that none repeat."""
+        """1 ± noise: (wavelength, amplitude) each; each primitive has its own corner of the table."""
         shift = hash01(s.primitive) * np.float32(199.0)
         wide = np.maximum(s.wu, s.wv)
-        out = np.float32(1.0)
+        out: Array = np.ones_like(wide)
         for wavelength, amplitude in octaves:
             out = out + np.float32(amplitude) * self._noise(s.u + shift, s.v - shift, wavelength, wide)
         return out
@@ -226,15 +238,10 @@ class Painter:
     def _block(self, s: _Spots) -> Array:
         """Paving slabs round the lot, a curb, and grass or a yard within."""
         wide = np.maximum(s.wu, s.wv)
-        joint = 1 - 0.28 * np.maximum(
-            band(s.u, 0.0, 0.025, s.wu, 0.6), band(s.v, 0.0, 0.025, s.wv, 0.6)
-        )
-        slab = hash01(np.floor(s.u / 0.6), np.floor(s.v / 0.6)) - np.float32(0.5)
-        slab = slab * np.float32(0.14) / (1 + (wide / np.float32(0.5)) ** 4)
+        joint = 1 - 0.28 * np.maximum(band(s.u, 0.0, 0.025, s.wu, 0.6), band(s.v, 0.0, 0.025, s.wv, 0.6))
+        slab = _tones(s, s.u, s.v, (0.6, 0.6), 0.14)
         paving = s.colour * (self._grain(s, (0.05, 0.08), (1.2, 0.07), (9.0, 0.05)) + slab) * joint
-        edge = np.minimum(
-            np.minimum(s.p[0] - s.lo[0], s.hi[0] - s.p[0]), np.minimum(s.p[1] - s.lo[1], s.hi[1] - s.p[1])
-        )
+        edge = _to_edge(s)
         paving = _mix(paving, (0.72, 0.71, 0.69), 1 - ramp(edge, 0.3, wide))
         within = ramp(edge, 2.9, wide) * s.parameters[0]
         middle = (s.lo + s.hi) / 2
@@ -251,17 +258,14 @@ class Painter:
             band(s.v, 0.0, 0.014, s.wv, 0.085),
             band(s.u + 0.125 * (np.floor(s.v / np.float32(0.085)) % 2), 0.0, 0.014, s.wu, 0.25),
         )
-        tone = hash01(np.floor(s.u / 0.25), np.floor(s.v / 0.085)) - np.float32(0.5)
-        tone = tone * np.float32(0.35) / (1 + (np.maximum(s.wu, s.wv) / np.float32(0.12)) ** 4)
+        tone = _tones(s, s.u, s.v, (0.25, 0.085), 0.35)
         wall = wall * (1 + tone * s.parameters[4])
         wall = _mix(wall, (0.70, 0.67, 0.62), brick * s.parameters[4] * 0.7)
         return np.where(s.top, self._flat_roof(s), self._windows(s, wall))
 
     def _flat_roof(self, s: _Spots) -> Array:
-        edge = np.minimum(
-            np.minimum(s.p[0] - s.lo[0], s.hi[0] - s.p[0]), np.minimum(s.p[1] - s.lo[1], s.hi[1] - s.p[1])
-        )
-        gravel = np.float32(0.46) * self._grain(s, (0.15, 0.2), (1.0, 0.12), (6.0, 0.12)) * np.ones_like(s.colour)
+        edge = _to_edge(s)
+        gravel = np.tile(np.float32(0.46) * self._grain(s, (0.15, 0.2), (1.0, 0.12), (6.0, 0.12)), (3, 1))
         return _mix(gravel, s.colour * np.float32(0.9), 1 - ramp(edge, 0.4, s.wu))
 
     def _windows(self, s: _Spots, wall: Array) -> Array:
@@ -288,7 +292,7 @@ class Painter:
         glass = np.stack([0.10 + 0.16 * tone, 0.14 + 0.17 * tone, 0.20 + 0.17 * tone])
         blind = (hash01(column, floor, s.primitive, 3) < 0.25) * ramp(v - floor, lo_v + 0.3 * share_v, wv)
         glass = _mix(glass, (0.72, 0.68, 0.58), blind * 0.8)
-        trim = _mix(wall, (0.90, 0.88, 0.84), np.float32(0.75))
+        trim = 0.25 * wall + np.array([0.68, 0.66, 0.63], np.float32)[:, None]
         out = _mix(wall, trim, frame)
         out = _mix(out, glass, pane)
         out = _mix(out, trim, cross * np.float32(0.9))
@@ -300,15 +304,15 @@ class Painter:
     def _tiles(self, s: _Spots) -> Array:
         row = band(s.v, 0.0, 0.05, s.wv, 0.24)
         column = band(s.u + 0.15 * (np.floor(s.v / np.float32(0.24)) % 2), 0.0, 0.03, s.wu, 0.3)
-        tone = hash01(np.floor(s.u / 0.3), np.floor(s.v / 0.24), s.primitive) - np.float32(0.5)
-        tone = tone * np.float32(0.3) / (1 + (np.maximum(s.wu, s.wv) / np.float32(0.2)) ** 4)
-        return s.colour * (self._grain(s, (0.8, 0.08), (4.0, 0.1)) + tone) * (1 - 0.4 * np.maximum(row, column))
+        tone = _tones(s, s.u, s.v, (0.3, 0.24), 0.3)
+        return (
+            s.colour * (self._grain(s, (0.8, 0.08), (4.0, 0.1)) + tone) * (1 - 0.4 * np.maximum(row, column))
+        )
 
     def _leaves(self, s: _Spots) -> Array:
         wide = np.maximum(s.wu, s.wv)
         leaf_u, leaf_v = s.u + np.float32(0.5) * s.v, s.v - np.float32(0.5) * s.u
-        leaf = hash01(np.floor(leaf_u / 0.09), np.floor(leaf_v / 0.09), s.primitive) - np.float32(0.5)
-        leaf = leaf * np.float32(0.5) / (1 + (wide / np.float32(0.08)) ** 4)
+        leaf = _tones(s, leaf_u, leaf_v, (0.09, 0.09), 0.5)
         yellow = np.array([0.12, 0.06, 0.0], np.float32)[:, None]
         tint = s.colour + yellow * self._noise(s.u, s.v, 0.7, wide)
         return tint * (self._grain(s, (0.17, 0.35), (0.45, 0.40), (1.1, 0.18)) + leaf)

@@ -1,7 +1,7 @@
 """Convex primitives and their first hits.
 
-Every shape is a canonical convex body stretched to an axis-aligned box, so that a ray's entry and exit are found
-in the body's own coordinates q = (p − centre)/half, where the ray parameter t is unchanged.
+Every shape is a canonical convex body stretched to an axis-aligned box: a ray's entry and exit are found in
+the body's own coordinates q = (p − centre)/half, where the ray parameter t is unchanged.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["Float", "Kind", "Shapes", "Spans", "cast"]
 Float = NDArray[np.float64]
 
 PACKET = 8192
-"""Rays tested together: enough to hide numpy's cost per call, few enough to stay in cache and share a cone."""
+"""Rays tested together: enough to hide numpy's cost per call, few enough to share a narrow cone."""
 
 _TINY = 1e-12
 
@@ -123,7 +123,7 @@ def _cylinder(o: Float, d: Float) -> Spans:
 
 
 def _cone(o: Float, d: Float) -> Spans:
-    """x² + y² ≤ w², w = (1 − z)/2: a ray steeper than the mantle is inside before or after both of its roots."""
+    """x² + y² ≤ w², w = (1 − z)/2: a ray steeper than the mantle is inside before or after both roots."""
     w, dw = (1.0 - o[2]) / 2, -d[2] / 2
     a = (d[:2] ** 2).sum(0) - dw * dw
     a = np.where(np.abs(a) < _TINY, _TINY, a)

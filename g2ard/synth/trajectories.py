@@ -65,10 +65,23 @@ def _along(path: list[tuple[Float, Float]], count: int) -> tuple[Float, NDArray[
     return starts[k] + share[:, None] * (stops - starts)[k], heading
 
 
+def _inwards(layout: Layout, at: Float, heading: float, yaw: float) -> float:
+    """The direction to face, with `yaw` mirrored where it would look away from the city at its edge."""
+    facing = np.deg2rad(heading + yaw)
+    outwards = np.where(np.abs(at) > layout.reach - 6.0, np.sign(at), 0.0)
+    leaving = outwards @ [np.cos(facing), np.sin(facing)] > 0.3
+    return heading - yaw if leaving else heading + yaw
+
+
 def _street(layout: Layout, count: int, parity: int, lane: float, height: float, pitch: float) -> list[Float]:
     at, heading = _along(_drives(layout, parity, lane), count)
     return [
-        _pose(np.array([*at[i], height]), heading[i] + _YAWS[i % len(_YAWS)], pitch) for i in range(count)
+        _pose(
+            np.array([*at[i], height]),
+            _inwards(layout, at[i], heading[i], _YAWS[i % len(_YAWS)]),
+            pitch,
+        )
+        for i in range(count)
     ]
 
 
@@ -94,7 +107,11 @@ def _drone(layout: Layout, count: int) -> list[Float]:
     path = [(b, a) for parity in (1, 0) for a, b in _drives(layout, parity, -0.4)]
     at, heading = _along(path, count)
     return [
-        _pose(np.array([*at[i], 9.0 + 4.0 * (i % 3)]), heading[i] + (40.0, -65.0, 150.0)[i % 3], -18.0)
+        _pose(
+            np.array([*at[i], 9.0 + 4.0 * (i % 3)]),
+            _inwards(layout, at[i], heading[i], (40.0, -65.0, 150.0)[i % 3]),
+            -18.0,
+        )
         for i in range(count)
     ]
 

@@ -3,5 +3,6 @@
 from g2ard.cli.commands import recover  # isort: skip
 from g2ard.cli.commands import render  # isort: skip
 from g2ard.cli.commands import evaluate  # isort: skip
+from g2ard.cli.commands import synth  # isort: skip
 
-__all__ = ["evaluate", "recover", "render"]
+__all__ = ["evaluate", "recover", "render", "synth"]
