@@ -1,6 +1,73 @@
 """The compiled kernels. Private: the public functions of `g2ard` check and document what goes in here."""
 
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.splats import Splats
+
 __version__: str
 
 def set_num_threads(threads: int) -> None: ...
 def num_threads() -> int: ...
+def lift_points(
+    points: NDArray[np.float64],
+    *,
+    neighbors: int,
+    normal_ratio: float,
+    max_anisotropy: float,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
+def simplify_flags(
+    scene: Splats,
+    cells: int,
+    threshold: float,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> NDArray[np.bool_]: ...
+def simplify_paper(
+    scene: Splats,
+    schedule: list[int],
+    flag_cells: int,
+    *,
+    protected: NDArray[np.bool_] | None,
+    min_opacity: float,
+    color_bin: float,
+    max_energy: float,
+    min_coverage: float,
+    flag_threshold: float,
+    protection: float,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]: ...
+
+_F32 = NDArray[np.float32]
+_Arrays = tuple[_F32, ...]
+_View = tuple[list[list[float]], list[float], tuple[int, int], float]
+_Choices = tuple[str, bool, float]
+
+def instruction_sets() -> list[str]: ...
+
+class Rasterizer:
+    def __init__(self, isa: str | None = None) -> None: ...
+    def forward(
+        self,
+        arrays: _Arrays,
+        view: _View,
+        choices: _Choices,
+        background: list[float],
+        depth: bool = True,
+        median: bool = False,
+    ) -> tuple[_F32, _F32, _F32 | None, _F32 | None]: ...
+    def backward(
+        self, arrays: _Arrays, image: _F32, alpha: _F32 | None = None, depth: _F32 | None = None
+    ) -> list[_F32]: ...
+    def counts(self) -> dict[str, int]: ...
+
+def accumulate(
+    arrays: _Arrays,
+    views: list[_View],
+    choices: _Choices,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]: ...

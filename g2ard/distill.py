@@ -76,7 +76,7 @@ def distill(
     shot.
 
     Args:
-        prior: a trained model, or a lift; in the coordinates of the targets' cameras.
+        prior: a trained model, or a lift; its offset counts, cameras are in world coordinates.
         budget: N_S, at most the prior's count.
         targets: photos, or the prior's own renders.
         config: see `DistillConfig`.
@@ -102,7 +102,7 @@ def distill(
 
 
 class _Rounds:
-    """The scene as it shrinks, its protection flags, and the log; saved after every stage if `work` is given."""
+    """The scene as it shrinks, its protection flags, and the log; each stage is saved if `work` is given."""
 
     def __init__(
         self,

@@ -84,7 +84,7 @@ def evaluate(
     zero-padded.
 
     Args:
-        splats: the scene, in the cameras' coordinates.
+        splats: the scene; its offset counts, cameras are in world coordinates.
         targets: photos or teacher renders; photo-relative and teacher-relative figures never mix.
         background: RGB behind the scene.
         progress: told after each view.

@@ -24,27 +24,20 @@ def load_scene(run: Run, path: Path) -> Splats:
     return scene.splats
 
 
-def load_views(run: Run, path: Path, split: str, size: int | None, offset: object = None) -> Cameras:
-    """Read views, pick a split, shrink them, and bring them into the scene's coordinates.
+def load_views(run: Run, path: Path, split: str, size: int | None) -> Cameras:
+    """Read views, pick a split, shrink them.
 
     Raises:
         InputError: the file has no views, or the split is empty.
     """
-    import numpy as np
-
-    from g2ard.errors import InputError
     from g2ard.io import read_view_set
-    from g2ard.splits import split_names
+    from g2ard.splits import split_mask
 
     found = read_view_set(path)
     for note in found.notes:
         run.say(f"{path}: {note}")
-    chosen = set(split_names(path, found.cameras.names, split))
-    cameras = found.cameras.take(np.array([name in chosen for name in found.cameras.names]))
-    if not len(cameras):
-        raise InputError(f"{path}: no views in split {split!r}")
-    cameras = cameras.resized(size)
-    return cameras if offset is None else cameras.recentred(np.asarray(offset))
+    mask = split_mask(path, found.cameras.names, split, stated=found.splits)
+    return found.cameras.take(mask).resized(size)
 
 
 def make_targets(

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +41,7 @@ def load(path: Path, key: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]
         with np.load(path) as data:
             arrays = dict(data)
         meta: dict[str, Any] = json.loads(str(arrays.pop("meta")))
-    except (OSError, ValueError, KeyError, EOFError) as e:
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as e:
         raise InputError(f"{path}: not a checkpoint of g2ard: {e}") from None
     if meta.pop("key") != key:
         raise InputError(

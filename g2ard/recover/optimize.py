@@ -100,7 +100,7 @@ def recover(
     or removed.
 
     Args:
-        student: the scene to recover, in the coordinates of the targets' cameras.
+        student: the scene to recover; its offset counts, cameras are in world coordinates.
         targets: photos or teacher renders with their cameras.
         config: see `RecoverConfig`.
         anchors: frozen geometry; None freezes the student as given.
@@ -158,7 +158,7 @@ class _Loop:
         self.multiplier = multiplier
         self.engine: Engine = TorchEngine(
             student,
-            targets.cameras,
+            targets.cameras.recentred(student.offset),
             anchors=anchors,
             regularizers=config.regularizers,
             means_in_scales=config.schedule.means_in_scales,

@@ -1,8 +1,8 @@
-"""One module per command, in the order `g2ard --help` lists them."""
+"""One module per command; importing this package registers them, in the order `g2ard --help` lists them."""
 
-from g2ard.cli.commands import recover  # isort: skip
-from g2ard.cli.commands import render  # isort: skip
-from g2ard.cli.commands import evaluate  # isort: skip
-from g2ard.cli.commands import synth  # isort: skip
+from importlib import import_module
 
-__all__ = ["evaluate", "recover", "render", "synth"]
+COMMANDS = ("distill", "lift", "simplify", "recover", "render", "evaluate", "synth", "info")
+
+for _name in COMMANDS:
+    import_module(f"{__name__}.{_name}")

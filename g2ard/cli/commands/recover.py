@@ -49,9 +49,7 @@ def recover(
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(run, student)
     dense = load_scene(run, teacher) if teacher else None
-    if dense is not None and (dense.offset != splats.offset).any():
-        dense = dense.recentred(splats.offset)
-    cameras = load_views(run, views, split, size, splats.offset)
+    cameras = load_views(run, views, split, size)
     regularizers, why = preset_for(preset, splats)
     run.say(f"regularisers: {why}")
     config = RecoverConfig(

@@ -1,1 +1,226 @@
 //! Coloured points → surface-aligned discs (supplement, "Dense Prior Construction").
+
+use rayon::prelude::*;
+
+use crate::linalg::{Sym3, outer, quat_from_rotation, sub, symmetric_eigen};
+use crate::spatial::{Neighbor, Tree};
+use crate::{Control, Error, Result};
+
+/// Defaults are the paper's.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LiftConfig {
+    /// Nearest others that PCA looks at.
+    pub neighbors: usize,
+    /// Normal scale over the geometric mean of the tangential ones.
+    pub normal_ratio: f64,
+    /// Largest ratio of the two tangential scales.
+    pub max_anisotropy: f64,
+    /// Tangential scale over the neighbourhood's standard deviation along that axis.
+    pub spread: f64,
+}
+
+impl Default for LiftConfig {
+    fn default() -> Self {
+        Self {
+            neighbors: 10,
+            normal_ratio: 0.1,
+            max_anisotropy: 4.0,
+            spread: 0.75,
+        }
+    }
+}
+
+impl LiftConfig {
+    fn validate(&self) -> Result<()> {
+        if self.neighbors < 3 {
+            return Err(Error::invalid("neighbors", "at least 3", self.neighbors));
+        }
+        for (name, value, least) in [
+            ("normal_ratio", self.normal_ratio, 0.0),
+            ("max_anisotropy", self.max_anisotropy, 1.0),
+            ("spread", self.spread, 0.0),
+        ] {
+            if !(value.is_finite() && value >= least && value > 0.0) {
+                return Err(Error::invalid(
+                    name,
+                    format!("a number above {least}"),
+                    value,
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The frame and size of each point's disc: axes 1 and 2 span the tangent plane, axis 3 is the normal.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Discs {
+    /// wxyz, unit.
+    pub quats: Vec<[f32; 4]>,
+    /// Descending standard deviations.
+    pub scales: Vec<[f32; 3]>,
+}
+
+/// Tangential standard deviations (descending) and orientation of one neighbourhood.
+#[derive(Clone, Copy)]
+struct Patch {
+    tangential: [f64; 2],
+    quat: [f64; 4],
+}
+
+/// Rows between two looks at the control.
+const CHUNK: usize = 4096;
+
+/// `points`: centred near the origin, finite.
+pub fn lift(points: &[[f64; 3]], config: &LiftConfig, control: &Control) -> Result<Discs> {
+    config.validate()?;
+    let tree = Tree::build(points);
+    control.begin(points.len() as u64);
+    let chunks: Vec<Vec<Patch>> = (0..points.len().div_ceil(CHUNK))
+        .into_par_iter()
+        .map(|chunk| {
+            control.check()?;
+            let here = chunk * CHUNK..((chunk + 1) * CHUNK).min(points.len());
+            let mut near = Vec::new();
+            let patches = here.clone().map(|at| {
+                tree.nearest(at, config.neighbors, &mut near);
+                patch(points, tree.rows()[at], &near, config)
+            });
+            let patches = patches.collect();
+            control.advance(here.len() as u64);
+            Ok(patches)
+        })
+        .collect::<Result<_>>()?;
+    Ok(discs(&tree, &chunks.concat(), config))
+}
+
+/// PCA of the point and its neighbours about their mean.
+fn patch(points: &[[f64; 3]], row: u32, near: &[Neighbor], config: &LiftConfig) -> Patch {
+    let here = points[row as usize];
+    let share = 1.0 / (near.len() + 1) as f64;
+    let offsets = || near.iter().map(|n| sub(points[n.1 as usize], here));
+    let mut mean = [0.0; 3];
+    for d in offsets() {
+        (0..3).for_each(|k| mean[k] += d[k] * share);
+    }
+    let mut cov: Sym3 = [0.0; 6];
+    for d in offsets().chain([[0.0; 3]]) {
+        let o = outer(sub(d, mean));
+        (0..6).for_each(|k| cov[k] += o[k] * share);
+    }
+    let e = symmetric_eigen(&cov);
+    let [t1, t2, n] = e.vectors;
+    let wide = config.spread * e.values[0].max(0.0).sqrt();
+    let narrow = config.spread * e.values[1].max(0.0).sqrt();
+    Patch {
+        tangential: [wide, narrow.max(wide / config.max_anisotropy)],
+        quat: quat_from_rotation(&[0, 1, 2].map(|r| [t1[r], t2[r], n[r]])),
+    }
+}
+
+/// Sizes in the order of the points. A patch without extent (its neighbours all at one place) takes the
+/// median extent of the nearest patches that have one; where none has, 1: nothing tells its size.
+fn discs(tree: &Tree, patches: &[Patch], config: &LiftConfig) -> Discs {
+    let sized: Vec<usize> = (0..patches.len())
+        .filter(|&at| patches[at].tangential[0] > 0.0)
+        .collect();
+    let mut out = Discs {
+        quats: vec![[0.0; 4]; patches.len()],
+        scales: vec![[0.0; 3]; patches.len()],
+    };
+    for (at, &row) in tree.rows().iter().enumerate() {
+        let Patch { tangential, quat } = patches[at];
+        let [a, b] = if tangential[0] > 0.0 {
+            tangential
+        } else {
+            [local_median(patches, &sized, at, config.neighbors); 2]
+        };
+        out.quats[row as usize] = quat.map(|v| v as f32);
+        out.scales[row as usize] = [a, b, config.normal_ratio * (a * b).sqrt()].map(|v| v as f32);
+    }
+    out
+}
+
+/// Of the `count` patches around `at` in Morton order, among those that have an extent.
+fn local_median(patches: &[Patch], sized: &[usize], at: usize, count: usize) -> f64 {
+    let middle = sized.partition_point(|&s| s < at);
+    let window =
+        &sized[middle.saturating_sub(count / 2)..(middle + count.div_ceil(2)).min(sized.len())];
+    let mut extents: Vec<f64> = window.iter().map(|&s| patches[s].tangential[0]).collect();
+    extents.sort_by(f64::total_cmp);
+    extents.get(extents.len() / 2).copied().unwrap_or(1.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::linalg::rotation_from_quat;
+
+    fn lifted(points: &[[f64; 3]]) -> Discs {
+        let discs = lift(points, &LiftConfig::default(), &Control::default()).unwrap();
+        for s in &discs.scales {
+            assert!(s.iter().all(|v| v.is_finite() && *v > 0.0), "{s:?}");
+        }
+        discs
+    }
+
+    fn plane(n: i32) -> Vec<[f64; 3]> {
+        (0..n * n)
+            .map(|i| [f64::from(i % n), f64::from(i / n), 0.0])
+            .collect()
+    }
+
+    #[test]
+    fn a_plane_becomes_flat_discs_facing_its_normal() {
+        let discs = lifted(&plane(12));
+        for (q, s) in discs.quats.iter().zip(&discs.scales) {
+            let normal = rotation_from_quat(q.map(f64::from)).map(|row| row[2]);
+            assert!(normal[2].abs() > 1.0 - 1e-6);
+            assert!((s[2] - 0.1 * (s[0] * s[1]).sqrt()).abs() < 1e-6 * s[2]);
+            assert!(s[0] / s[1] <= 4.0 * (1.0 + 1e-6));
+        }
+    }
+
+    #[test]
+    fn a_pole_keeps_its_direction_and_its_anisotropy_bound() {
+        let pole: Vec<_> = (0..50).map(|i| [1.0, 2.0, f64::from(i)]).collect();
+        let discs = lifted(&pole);
+        for (q, s) in discs.quats.iter().zip(&discs.scales) {
+            let along = rotation_from_quat(q.map(f64::from)).map(|row| row[0]);
+            assert!(along[2].abs() > 1.0 - 1e-6);
+            assert!((s[0] / s[1] - 4.0).abs() < 1e-5);
+        }
+    }
+
+    #[test]
+    fn duplicates_take_the_size_of_their_surroundings() {
+        let mut points = plane(10);
+        let one = lifted(&points).scales[44][0];
+        points.extend(vec![[4.0, 4.0, 0.0]; 30]);
+        let s = lifted(&points).scales[120];
+        assert!(s[0] > 0.3 * one && s[0] < 3.0 * one, "{s:?} {one}");
+        assert_eq!(lifted(&vec![[7.0; 3]; 1000]).scales[0][0], 1.0);
+    }
+
+    #[test]
+    fn hardly_any_points() {
+        assert!(lifted(&[]).quats.is_empty());
+        assert_eq!(lifted(&[[5.0; 3]]).scales[0][0], 1.0);
+        assert_eq!(lifted(&[[0.0; 3], [2.0, 0.0, 0.0]]).scales[0][0], 0.75);
+    }
+
+    #[test]
+    fn moves_and_scales_with_dyadic_points() {
+        let points = plane(9);
+        let moved: Vec<_> = points.iter().map(|p| p.map(|v| v * 8.0 + 1024.0)).collect();
+        let (a, b) = (lifted(&points), lifted(&moved));
+        assert_eq!(a.quats, b.quats);
+        assert_eq!(
+            a.scales
+                .iter()
+                .map(|s| s.map(|v| v * 8.0))
+                .collect::<Vec<_>>(),
+            b.scales
+        );
+    }
+}

@@ -2,12 +2,19 @@
 
 use pyo3::prelude::*;
 
+mod arrays;
 mod error;
+mod lift;
+mod raster;
+mod simplify;
 mod work;
 
 #[pymodule]
 fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("__version__", env!("CARGO_PKG_VERSION"))?;
     work::register(m)?;
+    lift::register(m)?;
+    simplify::register(m)?;
+    raster::register(m)?;
     Ok(())
 }

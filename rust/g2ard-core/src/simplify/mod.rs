@@ -1,1 +1,35 @@
-//! Simplification: shared parts (moments, residual flags, guards, trim) and the policies over them.
+//! Simplification: shared parts (scene order, moments, residual flags, guards, trim) and the policies over them.
+//!
+//! A scene is first put in an order of its own ([`Ordered`]); every policy works on that order, so the
+//! result depends neither on the order of the input's rows nor on the number of threads.
+
+mod guards;
+mod moments;
+mod ordered;
+mod outcome;
+mod paper;
+mod residual;
+mod trim;
+
+pub use guards::coverage;
+pub use moments::{Gaussian, MAX_OPACITY, optical_mass, pool};
+pub use ordered::{Means, Ordered, SceneRef};
+pub use outcome::Outcome;
+pub use paper::{Paper, PaperRound};
+pub use residual::flags;
+
+use crate::Splats;
+
+/// A row that went nowhere: dropped or trimmed.
+pub const GONE: u32 = u32::MAX;
+
+/// Rows of one round's output and where each row of its input went.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Step {
+    pub splats: Splats,
+    /// Output row of each input row, or [`GONE`].
+    pub parents: Vec<u32>,
+    pub flags: Vec<bool>,
+    /// The input row that an output row is a copy of, or [`GONE`] where it was made by merging.
+    pub copied: Vec<u32>,
+}

@@ -1,1 +1,11 @@
-//! Spatial structures: Morton order, adaptive voxel cells, nearest neighbours.
+//! Spatial structures: robust frame, Morton order, adaptive voxel cells, nearest neighbours.
+
+mod frame;
+mod knn;
+mod morton;
+mod voxels;
+
+pub use frame::Frame;
+pub use knn::{Neighbor, Tree};
+pub use morton::{codes, order};
+pub use voxels::Cells;

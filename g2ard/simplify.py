@@ -1,0 +1,263 @@
+"""Fewer Gaussians at an exact budget: rounds of drop, merge and trim (section 3.2 of the paper)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.errors import InputError
+from g2ard.progress import Progress, counter, silent
+from g2ard.splats import Splats
+
+__all__ = ["Simplified", "SimplifyConfig", "flag", "schedule", "simplify"]
+
+METHODS = ("paper",)
+
+_FOLD = 0.05
+"""A last cut smaller than this is folded into the round before."""
+
+
+@dataclass(frozen=True)
+class SimplifyConfig:
+    """The constants of simplification; defaults are the paper's (`tab:s_config`).
+
+    Args:
+        retention: share of the Gaussians that a round keeps.
+        min_opacity: below this α a Gaussian is dropped.
+        color_bin: edge of the colour bins within a cell, in colour units (0–1).
+        max_energy: largest affine energy of a merged group, colour units squared.
+        min_coverage: least share of the members' footprint that the merged footprint covers.
+        flag_threshold: ε_h, the affine residual of a cell above which its Gaussians are protected.
+        protection: λ_h, what a protected Gaussian's priority π is raised by.
+    """
+
+    retention: float = 0.75
+    min_opacity: float = 0.01
+    color_bin: float = 0.25
+    max_energy: float = 0.01
+    min_coverage: float = 0.6
+    flag_threshold: float = 0.01
+    protection: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.retention < 1:
+            raise InputError(f"retention: expected a number between 0 and 1, got {self.retention}")
+        if not (math.isfinite(self.color_bin) and self.color_bin > 0):
+            raise InputError(f"color_bin: expected a positive number, got {self.color_bin}")
+        for name in ("min_opacity", "max_energy", "min_coverage", "flag_threshold", "protection"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"{name}: expected a number ≥ 0, got {getattr(self, name)}")
+
+
+_DEFAULTS = SimplifyConfig()
+
+
+@dataclass(frozen=True, eq=False)
+class Simplified:
+    """What simplification made.
+
+    Args:
+        splats: exactly the budget of Gaussians, in an order that only the scene's content decides. Their
+            geometry is what recovery takes as anchors.
+        parents: (N,) int64, the output row each input row went to; −1 if it was dropped or trimmed.
+        protected: (M,) bool, flags inherited by OR from everything merged into the row.
+        report: `input_count`, `output_count`, `rounds` (one dict each), `protected`, `nonfinite_rows`,
+            `clamped_logits`.
+    """
+
+    splats: Splats
+    parents: NDArray[np.int64]
+    protected: NDArray[np.bool_]
+    report: dict[str, Any] = field(default_factory=dict)
+
+
+def schedule(count: int, budget: int, retention: float = 0.75) -> list[int]:
+    """Counts after each round: N_r = max(N_S, ⌈retention·N_{r−1}⌉), a last cut under 5 % folded in.
+
+    >>> schedule(500_000, 50_000)
+    [375000, 281250, 210938, 158204, 118653, 88990, 66743, 50000]
+    >>> schedule(10, 10)
+    []
+    """
+    rounds: list[int] = []
+    while count > budget:
+        count = max(budget, min(count - 1, math.ceil(retention * count)))
+        if budget > (1 - _FOLD) * count:
+            count = budget
+        rounds.append(count)
+    return rounds
+
+
+def flag(
+    splats: Splats, budget: int, *, config: SimplifyConfig = _DEFAULTS, progress: Progress = silent
+) -> NDArray[np.bool_]:
+    """Protection flags of a raw prior: p_i = 1[E_c(i) > ε_h] (eq. `frequency`).
+
+    E_j is the mean squared leave-one-out residual of an affine colour predictor within cell j, over about
+    `budget` cells; a cell of under 8 members borrows those of its face neighbours.
+
+    Args:
+        splats: the raw prior, never a recovered scene: fitting hides the residual.
+        budget: the final count N_S, which sets the cell size.
+        config: `flag_threshold` is read.
+        progress: told when done.
+
+    Returns:
+        (N,) bool; False for rows that are not finite.
+
+    Raises:
+        InputError: no finite row, or a budget below 1.
+
+    >>> plane = np.stack(np.meshgrid(range(20), range(20), [0]), -1).reshape(-1, 3)
+    >>> noise = np.random.default_rng(0).normal(size=(400, 1, 3)) * (plane[:, :1, None] > 9)
+    >>> scene = Splats.create(plane, scales=np.ones((400, 3)), sh0=noise)
+    >>> flags = flag(scene, 40)
+    >>> float(flags[plane[:, 0] < 8].mean()), float(flags[plane[:, 0] > 12].mean())
+    (0.0, 1.0)
+    """
+    _check_budget(budget, None)
+    scene, finite = _clean(splats)
+    found = _core.simplify_flags(scene, budget, config.flag_threshold, progress=counter(progress, "flag"))
+    flags = np.zeros(len(splats), bool)
+    flags[finite] = found
+    return flags
+
+
+def simplify(
+    splats: Splats,
+    budget: int,
+    *,
+    method: str = "paper",
+    protected: NDArray[np.bool_] | None = None,
+    flag_budget: int | None = None,
+    config: SimplifyConfig = _DEFAULTS,
+    progress: Progress = silent,
+) -> Simplified:
+    """Reduce a scene to exactly `budget` Gaussians.
+
+    `paper`: rounds of `config.retention`; each drops α < 0.01, merges cell × colour-bin groups by moment
+    matching where the affine-energy and surface-coverage guards pass, and trims by
+    π = −log(1 − α)·A·(1 + λ_h·p) (eq. `importance`).
+
+    The result does not depend on the order of the rows, the unit, or the number of threads.
+
+    Args:
+        splats: the scene. Infinite logits mean α = 0 or 1; rows with other non-finite values are dropped
+            and counted.
+        budget: Gaussians to keep, at most as many as there are.
+        method: the policy.
+        protected: (N,) bool flags to inherit; None computes them (see `flag`).
+        flag_budget: the count that sets the flags' cell size, where this call is one round on the way to a
+            smaller one; None means `budget`.
+        config: the constants.
+        progress: told of Gaussians shed, round by round.
+
+    Returns:
+        The scene, where each row went, the inherited flags and a report.
+
+    Raises:
+        InputError: a budget below 1 or above the count of finite rows, flags of another length, or an
+            unknown method.
+
+    >>> rng = np.random.default_rng(0)
+    >>> scene = Splats.create(rng.normal(size=(1000, 3)), scales=np.full((1000, 3), 0.1))
+    >>> small = simplify(scene, 100)
+    >>> len(small.splats), small.parents.shape, int(small.parents.max())
+    (100, (1000,), 99)
+    """
+    if method not in METHODS:
+        raise InputError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+    return _paper(splats, budget, protected, flag_budget or budget, config, progress)
+
+
+def _paper(
+    splats: Splats,
+    budget: int,
+    protected: NDArray[np.bool_] | None,
+    flag_budget: int,
+    config: SimplifyConfig,
+    progress: Progress,
+) -> Simplified:
+    scene, finite = _clean(splats)
+    _check_budget(budget, len(scene))
+    flags = _check_flags(protected, len(splats))
+    out = _core.simplify_paper(
+        scene,
+        schedule(len(scene), budget, config.retention),
+        flag_budget,
+        protected=None if flags is None else np.ascontiguousarray(flags[finite]),
+        min_opacity=config.min_opacity,
+        color_bin=config.color_bin,
+        max_energy=config.max_energy,
+        min_coverage=config.min_coverage,
+        flag_threshold=config.flag_threshold,
+        protection=config.protection,
+        progress=counter(progress, "simplify"),
+    )
+    return _simplified(splats, finite, out)
+
+
+def _check_budget(budget: int, count: int | None) -> None:
+    if budget < 1:
+        raise InputError(f"budget: expected at least 1, got {budget}")
+    if count is not None and budget > count:
+        raise InputError(f"budget: expected at most the {count} Gaussians there are, got {budget}")
+
+
+def _check_flags(protected: NDArray[np.bool_] | None, count: int) -> NDArray[np.bool_] | None:
+    if protected is None:
+        return None
+    flags = np.asarray(protected)
+    if flags.dtype != np.bool_ or flags.shape != (count,):
+        raise InputError(f"protected: expected bool of shape ({count},), got {flags.dtype} {flags.shape}")
+    return flags
+
+
+def _clean(splats: Splats) -> tuple[Splats, NDArray[np.bool_] | slice]:
+    """The finite rows, C-contiguous, and which they are."""
+    finite = splats.finite_rows()
+    if not finite.any():
+        raise InputError(f"splats: none of {len(splats)} rows is finite")
+    everything = bool(finite.all())
+    scene = splats if everything else splats.take(finite)
+    kind = np.float64 if scene.means.dtype == np.float64 else np.float32
+    scene = replace(
+        scene,
+        means=np.ascontiguousarray(scene.means, kind),
+        quats=np.ascontiguousarray(scene.quats, np.float32),
+        scales=np.ascontiguousarray(scene.scales, np.float32),
+        logit_opacities=np.ascontiguousarray(scene.logit_opacities, np.float32),
+        sh0=np.ascontiguousarray(scene.sh0, np.float32),
+        shN=np.ascontiguousarray(scene.shN, np.float32),
+    )
+    return scene, slice(None) if everything else finite
+
+
+def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str, Any]) -> Simplified:
+    parents = np.full(len(splats), -1, np.int64)
+    parents[finite] = out["parents"]
+    sh: NDArray[np.float32] = out["sh"]
+    small = Splats(
+        means=out["means"].astype(splats.means.dtype, copy=False),
+        quats=out["quats"],
+        scales=out["scales"],
+        logit_opacities=out["logit_opacities"],
+        sh0=np.ascontiguousarray(sh[:, :1]),
+        shN=np.ascontiguousarray(sh[:, 1:]),
+        offset=splats.offset,
+    )
+    protected: NDArray[np.bool_] = out["protected"]
+    report = {
+        "input_count": len(splats),
+        "output_count": len(small),
+        "rounds": out["rounds"],
+        "protected": int(np.count_nonzero(protected)),
+        "nonfinite_rows": 0 if isinstance(finite, slice) else len(splats) - int(np.count_nonzero(finite)),
+        "clamped_logits": out["clamped_logits"],
+    }
+    return Simplified(small, parents, protected, report)

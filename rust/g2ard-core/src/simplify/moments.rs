@@ -1,0 +1,229 @@
+//! Moment matching: what a group of Gaussians weighs, where it lies and how far it spreads.
+
+use crate::Splats;
+use crate::linalg::{
+    Mat3, Sym3, covariance, outer, quat_from_rotation, rotation_from_quat, sub, symmetric_eigen,
+};
+
+/// Renderers clip α here, so no Gaussian weighs more, and none is merged into more.
+pub const MAX_OPACITY: f64 = 0.99;
+
+/// Variances below this share of the largest are raised to it: a rank-1 or rank-2 group stays finite.
+const VARIANCE_FLOOR: f64 = 1e-14;
+
+/// −log(1 − σ(x)) without cancellation: 1 − σ(x) loses every digit from x = 17 on.
+pub fn softplus(x: f64) -> f64 {
+    x.max(0.0) + (-x.abs()).exp().ln_1p()
+}
+
+pub fn sigmoid(x: f64) -> f64 {
+    1.0 / (1.0 + (-x).exp())
+}
+
+/// Product of the two largest scales.
+pub fn footprint(scales: [f64; 3]) -> f64 {
+    let [a, b, c] = scales;
+    (a * b).max(b * c).max(a * c)
+}
+
+/// −log(1 − α)·A, α clipped at [`MAX_OPACITY`].
+pub fn optical_mass(logit: f64, scales: [f64; 3]) -> f64 {
+    let cap = (MAX_OPACITY / (1.0 - MAX_OPACITY)).ln();
+    softplus(logit.min(cap)) * footprint(scales)
+}
+
+/// One Gaussian's geometry in f64.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Gaussian {
+    pub mean: [f64; 3],
+    pub rotation: Mat3,
+    pub scales: [f64; 3],
+}
+
+impl Gaussian {
+    pub fn of(splats: &Splats, i: usize) -> Self {
+        Self {
+            mean: splats.means[i],
+            rotation: rotation_from_quat(splats.quats[i].map(f64::from)),
+            scales: splats.scales[i].map(f64::from),
+        }
+    }
+
+    pub fn covariance(&self) -> Sym3 {
+        covariance(&self.rotation, self.scales)
+    }
+
+    /// Scales descend; axis 3 is the normal.
+    pub fn from_moments(mean: [f64; 3], cov: &Sym3) -> Self {
+        let e = symmetric_eigen(cov);
+        let floor = (VARIANCE_FLOOR * e.values[0]).max(f64::from(f32::MIN_POSITIVE).powi(2));
+        let [a, b, c] = e.vectors;
+        Self {
+            mean,
+            rotation: [0, 1, 2].map(|r| [a[r], b[r], c[r]]),
+            scales: e.values.map(|v| v.max(floor).sqrt()),
+        }
+    }
+
+    pub fn quat(&self) -> [f32; 4] {
+        quat_from_rotation(&self.rotation).map(|v| v as f32)
+    }
+
+    /// Axes in order of descending scale.
+    pub fn axes_by_scale(&self) -> [usize; 3] {
+        let mut order = [0, 1, 2];
+        order.sort_by(|&i, &j| self.scales[j].total_cmp(&self.scales[i]));
+        order
+    }
+
+    pub fn axis(&self, k: usize) -> [f64; 3] {
+        self.rotation.map(|row| row[k])
+    }
+}
+
+/// Mean and covariance of a mixture: parallel-axis terms about the group's own mean, itself taken about
+/// the first member, so that neither a far origin nor a narrow group costs digits.
+///
+/// Members are (weight, mean, covariance); the weights sum to something positive.
+pub fn pool(members: &[(f64, [f64; 3], Sym3)]) -> ([f64; 3], Sym3) {
+    let total: f64 = members.iter().map(|m| m.0).sum();
+    let base = members[0].1;
+    let mut mean = [0.0; 3];
+    for (w, x, _) in members {
+        let d = sub(*x, base);
+        (0..3).for_each(|k| mean[k] += w * d[k]);
+    }
+    let mean = [0, 1, 2].map(|k| base[k] + mean[k] / total);
+    let mut cov = [0.0; 6];
+    for (w, x, c) in members {
+        let o = outer(sub(*x, mean));
+        (0..6).for_each(|k| cov[k] += w * (c[k] + o[k]));
+    }
+    (mean, cov.map(|v| v / total))
+}
+
+/// A group merged into one Gaussian.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Merged {
+    pub gaussian: Gaussian,
+    pub logit: f64,
+    pub sh: Vec<[f32; 3]>,
+    /// Σ m.
+    pub mass: f64,
+    /// Whether α reached [`MAX_OPACITY`], so that the group's mass could not all be kept.
+    pub clamped: bool,
+}
+
+/// Mean, covariance and SH averaged by optical mass; α = 1 − exp(−Σm / A), A the merged footprint.
+/// A group without any mass is averaged evenly.
+pub fn merge(splats: &Splats, rows: &[u32]) -> Merged {
+    let each = rows.iter().map(|&i| Gaussian::of(splats, i as usize));
+    let mut members: Vec<_> = each
+        .zip(rows)
+        .map(|(g, &i)| {
+            let logit = f64::from(splats.logit_opacities[i as usize]);
+            (optical_mass(logit, g.scales), g.mean, g.covariance())
+        })
+        .collect();
+    let mass: f64 = members.iter().map(|m| m.0).sum();
+    if mass <= 0.0 {
+        members.iter_mut().for_each(|m| m.0 = 1.0);
+    }
+    let (mean, cov) = pool(&members);
+    let gaussian = Gaussian::from_moments(mean, &cov);
+    let depth = mass / footprint(gaussian.scales);
+    let limit = softplus((MAX_OPACITY / (1.0 - MAX_OPACITY)).ln());
+    let logit = if depth > 0.0 {
+        depth.min(limit).exp_m1().ln()
+    } else {
+        f64::from(splats.logit_opacities[rows[0] as usize])
+    };
+    Merged {
+        gaussian,
+        logit,
+        sh: average_sh(splats, rows, &members),
+        mass,
+        clamped: depth > limit,
+    }
+}
+
+fn average_sh(splats: &Splats, rows: &[u32], members: &[(f64, [f64; 3], Sym3)]) -> Vec<[f32; 3]> {
+    let total: f64 = members.iter().map(|m| m.0).sum();
+    let mut sums = vec![[0.0; 3]; splats.sh_coeffs];
+    for (&i, m) in rows.iter().zip(members) {
+        for (sum, sh) in sums.iter_mut().zip(splats.sh_of(i as usize)) {
+            (0..3).for_each(|k| sum[k] += m.0 * f64::from(sh[k]));
+        }
+    }
+    sums.into_iter()
+        .map(|s| s.map(|v| (v / total) as f32))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn softplus_is_minus_log_of_transmittance() {
+        for x in [-1e4f64, -40.0, -1.0, 0.0, 3.0, 15.0, 17.0, 40.0, 1e4] {
+            let want = if x > 30.0 { x } else { x.exp().ln_1p() };
+            assert!((softplus(x) - want).abs() <= 1e-6 * want.max(1e-300), "{x}");
+        }
+        assert!(optical_mass(1e4, [1.0; 3]) < 5.0);
+    }
+
+    #[test]
+    fn pooling_conserves_moments_far_from_the_origin() {
+        let at = |x: f64| [5.4e6 + x, -3e5, 12.0];
+        let unit = [1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4];
+        let (mean, cov) = pool(&[(1.0, at(0.0), unit), (3.0, at(0.125), unit)]);
+        assert_eq!(mean, at(0.09375));
+        assert!((cov[0] - (1e-4 + 0.1875 * 0.015625)).abs() < 1e-16);
+        assert!((cov[3] - 1e-4).abs() < 1e-18);
+    }
+
+    #[test]
+    fn pooling_in_any_grouping_is_the_same() {
+        let member = |i: usize| {
+            let x = i as f64;
+            let g = Gaussian {
+                mean: [x.sin(), (2.0 * x).cos(), 0.1 * x],
+                rotation: rotation_from_quat([1.0, x, -0.5, 0.3 * x]),
+                scales: [1.0, 0.2, 0.05 + 0.01 * x],
+            };
+            (0.3 + (x * 7.0).sin().abs(), g.mean, g.covariance())
+        };
+        let all: Vec<_> = (0..9).map(member).collect();
+        let once = pool(&all);
+        let weight = |s: &[(f64, [f64; 3], Sym3)]| s.iter().map(|m| m.0).sum();
+        let parts: Vec<_> = [&all[..4], &all[4..5], &all[5..]]
+            .map(|s| {
+                let (mean, cov) = pool(s);
+                (weight(s), mean, cov)
+            })
+            .to_vec();
+        let twice = pool(&parts);
+        (0..3).for_each(|k| assert!((once.0[k] - twice.0[k]).abs() < 1e-14));
+        (0..6).for_each(|k| assert!((once.1[k] - twice.1[k]).abs() < 1e-13));
+    }
+
+    #[test]
+    fn merging_identical_gaussians_keeps_their_shape_and_saturates() {
+        let splats = Splats {
+            means: vec![[1.0, 2.0, 3.0]; 1000],
+            quats: vec![[0.2, 0.4, -0.1, 0.9]; 1000],
+            scales: vec![[0.3, 0.2, 0.01]; 1000],
+            logit_opacities: vec![0.0; 1000],
+            sh: vec![[0.7, -0.1, 0.2]; 1000],
+            sh_coeffs: 1,
+        };
+        let rows: Vec<u32> = (0..1000).collect();
+        let m = merge(&splats, &rows);
+        assert!(m.clamped && (sigmoid(m.logit) - MAX_OPACITY).abs() < 1e-12);
+        for (got, want) in m.gaussian.scales.iter().zip([0.3, 0.2, 0.01]) {
+            assert!((got - want).abs() < 1e-7);
+        }
+        assert_eq!(m.gaussian.mean, [1.0, 2.0, 3.0]);
+    }
+}

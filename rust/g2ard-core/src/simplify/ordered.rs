@@ -1,0 +1,241 @@
+//! The scene as simplification sees it: centred, finite, in an order that only its content decides.
+
+use std::cmp::Ordering;
+
+use rayon::prelude::*;
+
+use crate::spatial::{Frame, codes, order};
+use crate::{Error, Result, Splats};
+
+/// Means as the caller holds them.
+#[derive(Debug, Clone, Copy)]
+pub enum Means<'a> {
+    F32(&'a [[f32; 3]]),
+    F64(&'a [[f64; 3]]),
+}
+
+impl Means<'_> {
+    pub fn len(&self) -> usize {
+        match self {
+            Self::F32(m) => m.len(),
+            Self::F64(m) => m.len(),
+        }
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    pub fn get(&self, i: usize) -> [f64; 3] {
+        match self {
+            Self::F32(m) => m[i].map(f64::from),
+            Self::F64(m) => m[i],
+        }
+    }
+}
+
+/// N Gaussians, borrowed. Logits may be infinite (α = 0 or 1); everything else is finite.
+#[derive(Debug, Clone, Copy)]
+pub struct SceneRef<'a> {
+    pub means: Means<'a>,
+    pub quats: &'a [[f32; 4]],
+    pub scales: &'a [[f32; 3]],
+    pub logit_opacities: &'a [f32],
+    pub sh0: &'a [[f32; 3]],
+    /// N × `rest` triples.
+    pub sh_rest: &'a [[f32; 3]],
+    pub rest: usize,
+}
+
+impl SceneRef<'_> {
+    pub fn len(&self) -> usize {
+        self.means.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    fn validate(&self) -> Result<()> {
+        let n = self.len();
+        if n >= u32::MAX as usize {
+            return Err(Error::invalid("means", "fewer than 2³² − 1 rows", n));
+        }
+        for (name, rows) in [
+            ("quats", self.quats.len()),
+            ("scales", self.scales.len()),
+            ("logit_opacities", self.logit_opacities.len()),
+            ("sh0", self.sh0.len()),
+        ] {
+            if rows != n {
+                return Err(Error::invalid(name, format!("{n} rows"), rows));
+            }
+        }
+        if self.sh_rest.len() != n * self.rest {
+            return Err(Error::invalid(
+                "shN",
+                format!("{} triples", n * self.rest),
+                self.sh_rest.len(),
+            ));
+        }
+        Ok(())
+    }
+
+    /// All attributes of two rows, bit by bit: equal only where the rows are interchangeable.
+    fn compare(&self, a: usize, b: usize) -> Ordering {
+        let bits = |v: f32| v.to_bits();
+        let triple = |v: &[f32; 3]| v.map(bits);
+        let rest = |i: usize| {
+            self.sh_rest[i * self.rest..(i + 1) * self.rest]
+                .iter()
+                .map(triple)
+        };
+        self.means
+            .get(a)
+            .map(f64::to_bits)
+            .cmp(&self.means.get(b).map(f64::to_bits))
+            .then_with(|| self.scales[a].map(bits).cmp(&self.scales[b].map(bits)))
+            .then_with(|| self.quats[a].map(bits).cmp(&self.quats[b].map(bits)))
+            .then_with(|| bits(self.logit_opacities[a]).cmp(&bits(self.logit_opacities[b])))
+            .then_with(|| triple(&self.sh0[a]).cmp(&triple(&self.sh0[b])))
+            .then_with(|| rest(a).cmp(rest(b)))
+    }
+}
+
+/// Logit of α = 0 and α = 1 stated exactly: 1e-7 away, as for files.
+const LOGIT_OF_ONE: f32 = 16.0;
+
+/// Merged means lie on a grid of this share of the scene's radius (rounded down to a power of two), so
+/// that adding back a dyadic origin rounds nothing.
+const MEAN_GRID: f64 = 1.0 / (1u64 << 36) as f64;
+
+/// A scene in Morton order, ties by all attribute bits, by row only between identical rows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Ordered {
+    /// Means relative to `origin`.
+    pub splats: Splats,
+    /// The input row of each ordered row.
+    pub rows: Vec<u32>,
+    pub origin: [f64; 3],
+    /// Spacing of merged means, a power of two.
+    pub grid: f64,
+    /// Logits that were infinite and were clamped.
+    pub clamped_logits: usize,
+}
+
+impl Ordered {
+    pub fn new(scene: &SceneRef) -> Result<Self> {
+        scene.validate()?;
+        let world: Vec<[f64; 3]> = (0..scene.len()).map(|i| scene.means.get(i)).collect();
+        let frame = Frame::of(&world);
+        let keys = codes(&world, &frame);
+        let mut rows = order(&keys);
+        let ties = rows.chunk_by_mut(|&a, &b| keys[a as usize] == keys[b as usize]);
+        for run in ties.filter(|run| run.len() > 1) {
+            run.sort_by(|&a, &b| scene.compare(a as usize, b as usize).then(a.cmp(&b)));
+        }
+        let coeffs = scene.rest + 1;
+        let mut sh = vec![[0.0; 3]; rows.len() * coeffs];
+        sh.par_chunks_mut(coeffs)
+            .zip(&rows)
+            .for_each(|(out, &row)| {
+                let i = row as usize;
+                out[0] = scene.sh0[i];
+                out[1..].copy_from_slice(&scene.sh_rest[i * scene.rest..(i + 1) * scene.rest]);
+            });
+        let logits: Vec<f32> = rows
+            .iter()
+            .map(|&i| scene.logit_opacities[i as usize])
+            .collect();
+        Ok(Self {
+            clamped_logits: logits.iter().filter(|v| v.is_infinite()).count(),
+            splats: Splats {
+                means: rows
+                    .iter()
+                    .map(|&i| crate::linalg::sub(world[i as usize], frame.origin))
+                    .collect(),
+                quats: rows.iter().map(|&i| scene.quats[i as usize]).collect(),
+                scales: rows.iter().map(|&i| scene.scales[i as usize]).collect(),
+                logit_opacities: logits.into_iter().map(clamp_logit).collect(),
+                sh,
+                sh_coeffs: coeffs,
+            },
+            rows,
+            origin: frame.origin,
+            grid: power_of_two_below(frame.radius) * MEAN_GRID,
+        })
+    }
+}
+
+fn clamp_logit(v: f32) -> f32 {
+    if v.is_infinite() {
+        LOGIT_OF_ONE.copysign(v)
+    } else {
+        v
+    }
+}
+
+fn power_of_two_below(x: f64) -> f64 {
+    f64::from_bits(x.to_bits() & (0x7ff << 52))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn order_depends_on_content_only() {
+        let means = [
+            [0.5f32, 0.0, 0.0],
+            [0.0; 3],
+            [0.0; 3],
+            [0.0; 3],
+            [-0.5, 0.1, 0.0],
+        ];
+        let logits = [1.0f32, 3.0, f32::INFINITY, 2.0, 0.0];
+        let sorted = |permutation: [usize; 5]| {
+            let scene = SceneRef {
+                means: Means::F32(&permutation.map(|i| means[i])),
+                quats: &[[1.0, 0.0, 0.0, 0.0]; 5],
+                scales: &[[0.1; 3]; 5],
+                logit_opacities: &permutation.map(|i| logits[i]),
+                sh0: &[[0.0; 3]; 5],
+                sh_rest: &[],
+                rest: 0,
+            };
+            Ordered::new(&scene).unwrap()
+        };
+        let (a, b) = (sorted([0, 1, 2, 3, 4]), sorted([3, 4, 2, 0, 1]));
+        assert_eq!(a.splats, b.splats);
+        assert_eq!(a.clamped_logits, 1);
+        let back: Vec<usize> = b
+            .rows
+            .iter()
+            .map(|&r| [3, 4, 2, 0, 1][r as usize])
+            .collect();
+        assert_eq!(back, a.rows.iter().map(|&r| r as usize).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn grid_is_a_power_of_two() {
+        assert_eq!(power_of_two_below(5.3), 4.0);
+        assert_eq!(power_of_two_below(0.3), 0.25);
+    }
+
+    #[test]
+    fn names_the_short_array() {
+        let scene = SceneRef {
+            means: Means::F64(&[[0.0; 3]; 2]),
+            quats: &[[1.0, 0.0, 0.0, 0.0]],
+            scales: &[[0.1; 3]; 2],
+            logit_opacities: &[0.0; 2],
+            sh0: &[[0.0; 3]; 2],
+            sh_rest: &[],
+            rest: 0,
+        };
+        assert_eq!(
+            Ordered::new(&scene).unwrap_err(),
+            Error::invalid("quats", "2 rows", 1)
+        );
+    }
+}

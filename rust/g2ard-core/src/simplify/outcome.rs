@@ -1,0 +1,80 @@
+//! From the rounds of a policy back to the rows and the coordinates of the caller.
+
+use super::{GONE, Ordered, SceneRef, Step};
+use crate::Splats;
+
+/// The simplified scene in the caller's coordinates, and what became of each of its rows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Outcome<R> {
+    pub splats: Splats,
+    /// Output row of each input row; −1 where it was dropped or trimmed.
+    pub parents: Vec<i64>,
+    pub flags: Vec<bool>,
+    pub rounds: Vec<R>,
+    /// Infinite logits, clamped.
+    pub clamped_logits: usize,
+}
+
+/// Follows parents and copies through successive steps.
+pub struct Trail {
+    pub step: Step,
+}
+
+impl Trail {
+    /// Before the first round: every row is a copy of itself.
+    pub fn start(splats: Splats, flags: Vec<bool>) -> Self {
+        let rows: Vec<u32> = (0..splats.len() as u32).collect();
+        Self {
+            step: Step {
+                splats,
+                parents: rows.clone(),
+                flags,
+                copied: rows,
+            },
+        }
+    }
+
+    pub fn then(&mut self, next: Step) {
+        let through = |rows: &[u32], map: &[u32]| -> Vec<u32> {
+            let follow = |&p: &u32| if p == GONE { GONE } else { map[p as usize] };
+            rows.iter().map(follow).collect()
+        };
+        self.step = Step {
+            parents: through(&self.step.parents, &next.parents),
+            copied: through(&next.copied, &self.step.copied),
+            ..next
+        };
+    }
+
+    /// Adds the origin back; the mean of a copied row is the caller's own, bit for bit.
+    pub fn finish<R>(self, scene: &SceneRef, ordered: &Ordered, rounds: Vec<R>) -> Outcome<R> {
+        let Step {
+            mut splats,
+            parents,
+            flags,
+            copied,
+        } = self.step;
+        for (mean, &source) in splats.means.iter_mut().zip(&copied) {
+            *mean = if source == GONE {
+                [0, 1, 2].map(|k| mean[k] + ordered.origin[k])
+            } else {
+                scene.means.get(ordered.rows[source as usize] as usize)
+            };
+        }
+        let mut by_row = vec![-1i64; parents.len()];
+        for (&row, &parent) in ordered.rows.iter().zip(&parents) {
+            by_row[row as usize] = if parent == GONE {
+                -1
+            } else {
+                i64::from(parent)
+            };
+        }
+        Outcome {
+            splats,
+            parents: by_row,
+            flags,
+            rounds,
+            clamped_logits: ordered.clamped_logits,
+        }
+    }
+}

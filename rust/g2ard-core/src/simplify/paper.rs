@@ -1,0 +1,382 @@
+//! The paper's policy: drop, merge cell × colour bin under guards, trim to the budget.
+
+use rayon::prelude::*;
+
+use super::moments::{Gaussian, Merged, merge, optical_mass, sigmoid};
+use super::outcome::Trail;
+use super::residual::{self, color};
+use super::trim::best;
+use super::{GONE, Ordered, Outcome, SceneRef, Step, coverage};
+use crate::linalg::affine_energy;
+use crate::spatial::{Cells, Frame};
+use crate::{Control, Error, Result, Splats};
+
+/// Defaults are the paper's (`tab:s_config`).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Paper {
+    /// Below this α a Gaussian is dropped.
+    pub min_opacity: f64,
+    /// Edge of the colour bins, in colour units.
+    pub color_bin: f64,
+    /// Largest affine energy of a merged group.
+    pub max_energy: f64,
+    /// Least share of the members' footprint that the merged one covers.
+    pub min_coverage: f64,
+    /// ε_h: a cell of higher affine residual is protected.
+    pub flag_threshold: f64,
+    /// λ_h of π.
+    pub protection: f64,
+}
+
+impl Default for Paper {
+    fn default() -> Self {
+        Self {
+            min_opacity: 0.01,
+            color_bin: 0.25,
+            max_energy: 0.01,
+            min_coverage: 0.6,
+            flag_threshold: 0.01,
+            protection: 10.0,
+        }
+    }
+}
+
+/// What one round did, in rows unless said otherwise.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct PaperRound {
+    pub before: usize,
+    pub dropped: usize,
+    pub cells: usize,
+    /// Rows alone in their cell and colour bin: no group to examine.
+    pub alone: usize,
+    pub merged_groups: usize,
+    pub merged_members: usize,
+    /// Groups refused by each guard; energy is asked first.
+    pub refused_energy: usize,
+    pub refused_coverage: usize,
+    /// Merges taken back because they would have undershot the budget.
+    pub undone_groups: usize,
+    /// Merged groups whose α was clipped.
+    pub clamped_opacities: usize,
+    pub trimmed: usize,
+    pub after: usize,
+}
+
+enum Verdict {
+    Merge(Box<Candidate>),
+    Energy,
+    Coverage,
+}
+
+struct Candidate {
+    merged: Merged,
+    cost: f64,
+}
+
+const CHUNK: usize = 256;
+
+impl Paper {
+    /// Rounds down to each count of `schedule`. Without `flags` they are computed first, on the raw
+    /// scene over about `flag_cells` cells.
+    pub fn run(
+        &self,
+        scene: &SceneRef,
+        flags: Option<&[bool]>,
+        flag_cells: usize,
+        schedule: &[usize],
+        control: &Control,
+    ) -> Result<Outcome<PaperRound>> {
+        let mut ordered = Ordered::new(scene)?;
+        let splats = std::mem::take(&mut ordered.splats);
+        let flags = match flags {
+            Some(flags) if flags.len() == splats.len() => ordered
+                .rows
+                .iter()
+                .map(|&row| flags[row as usize])
+                .collect(),
+            Some(flags) => {
+                return Err(Error::invalid(
+                    "protected",
+                    format!("{} rows", splats.len()),
+                    flags.len(),
+                ));
+            }
+            None => residual::flags(&splats, flag_cells, self.flag_threshold, control)?,
+        };
+        let mut trail = Trail::start(splats, flags);
+        let mut rounds = Vec::new();
+        let shed = |budget: usize| ordered.rows.len().saturating_sub(budget) as u64;
+        control.begin(shed(schedule.last().copied().unwrap_or(usize::MAX)));
+        for &budget in schedule {
+            let Step { splats, flags, .. } = &trail.step;
+            let (step, report) = self.round(splats, flags, budget, ordered.grid, control)?;
+            control.advance((report.before - report.after) as u64);
+            trail.then(step);
+            rounds.push(report);
+        }
+        Ok(trail.finish(scene, &ordered, rounds))
+    }
+
+    /// One round, to exactly `budget` rows (all of them when there are no more than that).
+    fn round(
+        &self,
+        splats: &Splats,
+        flags: &[bool],
+        budget: usize,
+        grid: f64,
+        control: &Control,
+    ) -> Result<(Step, PaperRound)> {
+        if flags.len() != splats.len() {
+            return Err(Error::invalid(
+                "protected",
+                format!("{} rows", splats.len()),
+                flags.len(),
+            ));
+        }
+        let mut report = PaperRound {
+            before: splats.len(),
+            after: splats.len().min(budget),
+            ..PaperRound::default()
+        };
+        let kept = self.drop_transparent(splats, flags, budget);
+        report.dropped = splats.len() - kept.len();
+        let groups = if kept.len() > budget {
+            self.groups(splats, &kept, budget, &mut report)
+        } else {
+            kept.iter().map(|&i| vec![i]).collect()
+        };
+        let mut merges = self.judge(splats, &groups, &mut report, control)?;
+        undo_costliest(&groups, &mut merges, budget, &mut report);
+        let built = build(splats, flags, &groups, merges, grid, &mut report);
+        Ok((self.trim(built, budget, &mut report), report))
+    }
+
+    fn priority(&self, splats: &Splats, flags: &[bool]) -> Vec<f64> {
+        let score = |i: usize| {
+            let logit = f64::from(splats.logit_opacities[i]);
+            let mass = optical_mass(logit, splats.scales[i].map(f64::from));
+            mass * (1.0 + self.protection * f64::from(u8::from(flags[i])))
+        };
+        (0..splats.len()).into_par_iter().map(score).collect()
+    }
+
+    /// Rows with α ≥ α_min; if they are fewer than the budget, the best of the others too.
+    fn drop_transparent(&self, splats: &Splats, flags: &[bool], budget: usize) -> Vec<u32> {
+        let visible =
+            |i: u32| sigmoid(f64::from(splats.logit_opacities[i as usize])) >= self.min_opacity;
+        let kept: Vec<u32> = (0..splats.len() as u32).filter(|&i| visible(i)).collect();
+        if kept.len() >= budget.min(splats.len()) {
+            return kept;
+        }
+        let mut scores = self.priority(splats, flags);
+        kept.iter()
+            .for_each(|&i| scores[i as usize] = f64::INFINITY);
+        best(&scores, budget)
+    }
+
+    /// Rows that share a cell and a colour bin; groups in order of their first row.
+    fn groups(
+        &self,
+        splats: &Splats,
+        kept: &[u32],
+        budget: usize,
+        report: &mut PaperRound,
+    ) -> Vec<Vec<u32>> {
+        let points: Vec<_> = kept.iter().map(|&i| splats.means[i as usize]).collect();
+        let cells = Cells::adaptive(&points, &Frame::of(&points), budget);
+        report.cells = cells.len();
+        let ids: Vec<usize> = (0..cells.len()).collect();
+        let mut groups: Vec<Vec<u32>> = ids
+            .par_iter()
+            .flat_map_iter(|&c| {
+                let mut keyed: Vec<([i32; 3], u32)> = cells
+                    .members_of(c)
+                    .iter()
+                    .map(|&at| {
+                        (
+                            self.bin(color(splats, kept[at as usize] as usize)),
+                            kept[at as usize],
+                        )
+                    })
+                    .collect();
+                keyed.sort_unstable();
+                let runs = keyed.chunk_by(|a, b| a.0 == b.0);
+                runs.map(|run| run.iter().map(|m| m.1).collect())
+                    .collect::<Vec<Vec<u32>>>()
+            })
+            .collect();
+        groups.par_sort_unstable_by_key(|g| g[0]);
+        report.alone = groups.iter().filter(|g| g.len() == 1).count();
+        groups
+    }
+
+    fn bin(&self, color: [f64; 3]) -> [i32; 3] {
+        color.map(|c| (c / self.color_bin).floor() as i32)
+    }
+
+    /// Each group's merged Gaussian where both guards pass.
+    fn judge(
+        &self,
+        splats: &Splats,
+        groups: &[Vec<u32>],
+        report: &mut PaperRound,
+        control: &Control,
+    ) -> Result<Vec<Option<Box<Candidate>>>> {
+        let verdicts: Vec<Vec<Option<Verdict>>> = groups
+            .par_chunks(CHUNK)
+            .map(|chunk| {
+                control.check()?;
+                Ok(chunk
+                    .iter()
+                    .map(|g| (g.len() > 1).then(|| self.verdict(splats, g)))
+                    .collect())
+            })
+            .collect::<Result<_>>()?;
+        let accepted = verdicts.into_iter().flatten().map(|v| match v? {
+            Verdict::Merge(candidate) => Some(candidate),
+            Verdict::Energy => {
+                report.refused_energy += 1;
+                None
+            }
+            Verdict::Coverage => {
+                report.refused_coverage += 1;
+                None
+            }
+        });
+        Ok(accepted.collect())
+    }
+
+    fn verdict(&self, splats: &Splats, rows: &[u32]) -> Verdict {
+        let points: Vec<_> = rows.iter().map(|&i| splats.means[i as usize]).collect();
+        let colors: Vec<_> = rows.iter().map(|&i| color(splats, i as usize)).collect();
+        let energy = affine_energy(&points, &colors, rows.len());
+        if energy > self.max_energy {
+            return Verdict::Energy;
+        }
+        let merged = merge(splats, rows);
+        let members: Vec<_> = rows
+            .iter()
+            .map(|&i| Gaussian::of(splats, i as usize))
+            .collect();
+        let covered = coverage(&members, &merged.gaussian);
+        if covered < self.min_coverage {
+            return Verdict::Coverage;
+        }
+        let cost = merged.mass * (energy + 1.0 - covered);
+        Verdict::Merge(Box::new(Candidate { merged, cost }))
+    }
+
+    fn trim(&self, built: Step, budget: usize, report: &mut PaperRound) -> Step {
+        let n = built.splats.len();
+        if n <= budget {
+            return built;
+        }
+        report.trimmed = n - budget;
+        let stay = best(&self.priority(&built.splats, &built.flags), budget);
+        let mut to = vec![GONE; n];
+        stay.iter()
+            .enumerate()
+            .for_each(|(out, &row)| to[row as usize] = out as u32);
+        let follow = |p: u32| if p == GONE { GONE } else { to[p as usize] };
+        Step {
+            splats: take(&built.splats, &stay),
+            parents: built.parents.into_iter().map(follow).collect(),
+            flags: stay.iter().map(|&i| built.flags[i as usize]).collect(),
+            copied: stay.iter().map(|&i| built.copied[i as usize]).collect(),
+        }
+    }
+}
+
+/// Takes merges back, the costliest first (the later between equals), until `budget` is reached again.
+fn undo_costliest(
+    groups: &[Vec<u32>],
+    merges: &mut [Option<Box<Candidate>>],
+    budget: usize,
+    report: &mut PaperRound,
+) {
+    let size = |g: usize, merges: &[Option<Box<Candidate>>]| {
+        if merges[g].is_some() {
+            1
+        } else {
+            groups[g].len()
+        }
+    };
+    let mut count: usize = (0..groups.len()).map(|g| size(g, merges)).sum();
+    if count >= budget {
+        return;
+    }
+    let mut order: Vec<(f64, usize)> = (0..groups.len())
+        .filter_map(|g| merges[g].as_ref().map(|m| (m.cost, g)))
+        .collect();
+    order.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    while count < budget
+        && let Some((_, g)) = order.pop()
+    {
+        merges[g] = None;
+        count += groups[g].len() - 1;
+        report.undone_groups += 1;
+    }
+}
+
+/// The groups' rows in order: one for a merged group, else its members.
+fn build(
+    splats: &Splats,
+    flags: &[bool],
+    groups: &[Vec<u32>],
+    merges: Vec<Option<Box<Candidate>>>,
+    grid: f64,
+    report: &mut PaperRound,
+) -> Step {
+    let mut out = Step {
+        parents: vec![GONE; splats.len()],
+        ..Step::default()
+    };
+    out.splats.sh_coeffs = splats.sh_coeffs;
+    for (rows, candidate) in groups.iter().zip(merges) {
+        if let Some(candidate) = candidate {
+            report.merged_groups += 1;
+            report.merged_members += rows.len();
+            report.clamped_opacities += usize::from(candidate.merged.clamped);
+            let to = out.splats.len() as u32;
+            rows.iter().for_each(|&i| out.parents[i as usize] = to);
+            push_merged(&mut out.splats, candidate.merged, grid);
+            out.flags.push(rows.iter().any(|&i| flags[i as usize]));
+            out.copied.push(GONE);
+            continue;
+        }
+        for &i in rows {
+            out.parents[i as usize] = out.splats.len() as u32;
+            push_copy(&mut out.splats, splats, i as usize);
+            out.flags.push(flags[i as usize]);
+            out.copied.push(i);
+        }
+    }
+    out
+}
+
+fn push_merged(out: &mut Splats, merged: Merged, grid: f64) {
+    out.means
+        .push(merged.gaussian.mean.map(|v| (v / grid).round() * grid));
+    out.quats.push(merged.gaussian.quat());
+    out.scales.push(merged.gaussian.scales.map(|v| v as f32));
+    out.logit_opacities.push(merged.logit as f32);
+    out.sh.extend(merged.sh);
+}
+
+fn push_copy(out: &mut Splats, splats: &Splats, i: usize) {
+    out.means.push(splats.means[i]);
+    out.quats.push(splats.quats[i]);
+    out.scales.push(splats.scales[i]);
+    out.logit_opacities.push(splats.logit_opacities[i]);
+    out.sh.extend_from_slice(splats.sh_of(i));
+}
+
+fn take(splats: &Splats, rows: &[u32]) -> Splats {
+    let mut out = Splats {
+        sh_coeffs: splats.sh_coeffs,
+        ..Splats::default()
+    };
+    rows.iter()
+        .for_each(|&i| push_copy(&mut out, splats, i as usize));
+    out
+}

@@ -1,0 +1,45 @@
+//! numpy ↔ slices of fixed-size rows, without copying.
+
+use g2ard_core::Error;
+use numpy::ndarray::Dimension;
+use numpy::{Element, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray, PyUntypedArrayMethods};
+use pyo3::prelude::*;
+
+use crate::error::to_py;
+
+/// A C-contiguous array whose last axes hold `C` values, as rows of `C`.
+pub fn rows<'a, T: Element, const C: usize>(
+    name: &'static str,
+    array: &'a PyReadonlyArray<'_, T, impl Dimension>,
+) -> PyResult<&'a [[T; C]]> {
+    let flat = flat(name, array)?;
+    let (rows, left) = flat.as_chunks::<C>();
+    if left.is_empty() {
+        Ok(rows)
+    } else {
+        Err(to_py(Error::invalid(
+            name,
+            format!("rows of {C}"),
+            format!("{:?}", array.shape()),
+        )))
+    }
+}
+
+/// A C-contiguous array as one slice.
+pub fn flat<'a, T: Element>(
+    name: &'static str,
+    array: &'a PyReadonlyArray<'_, T, impl Dimension>,
+) -> PyResult<&'a [T]> {
+    array
+        .as_slice()
+        .map_err(|_| to_py(Error::invalid(name, "a C-contiguous array", "strides")))
+}
+
+/// Rows as an (N, C) array; the memory moves, nothing is copied.
+pub fn matrix<'py, T: Element, const C: usize>(
+    py: Python<'py>,
+    rows: Vec<[T; C]>,
+) -> PyResult<Bound<'py, PyArray2<T>>> {
+    let n = rows.len();
+    PyArray1::from_vec(py, rows.into_flattened()).reshape([n, C])
+}

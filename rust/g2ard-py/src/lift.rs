@@ -1,0 +1,39 @@
+//! `g2ard.lift`.
+
+use g2ard_core::lift::{LiftConfig, lift};
+use numpy::{PyArray2, PyReadonlyArray2};
+use pyo3::prelude::*;
+
+use crate::arrays;
+use crate::work::long;
+
+type Discs<'py> = (Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<f32>>);
+
+/// (quats, scales) of the discs of centred (N, 3) points.
+#[pyfunction]
+#[pyo3(signature = (points, *, neighbors, normal_ratio, max_anisotropy, progress=None))]
+fn lift_points<'py>(
+    py: Python<'py>,
+    points: PyReadonlyArray2<'py, f64>,
+    neighbors: usize,
+    normal_ratio: f64,
+    max_anisotropy: f64,
+    progress: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Discs<'py>> {
+    let points = arrays::rows::<f64, 3>("points", &points)?;
+    let config = LiftConfig {
+        neighbors,
+        normal_ratio,
+        max_anisotropy,
+        ..LiftConfig::default()
+    };
+    let discs = long(py, progress, |control| lift(points, &config, control))?;
+    Ok((
+        arrays::matrix(py, discs.quats)?,
+        arrays::matrix(py, discs.scales)?,
+    ))
+}
+
+pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_function(wrap_pyfunction!(lift_points, m)?)
+}

@@ -1,0 +1,164 @@
+//! `g2ard.simplify`.
+
+use g2ard_core::simplify::{Means, Ordered, Outcome, Paper, PaperRound, SceneRef, flags};
+use numpy::{
+    PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
+    PyUntypedArrayMethods,
+};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::arrays;
+use crate::work::long;
+
+/// Means in whichever float the caller holds them.
+#[derive(FromPyObject)]
+enum PyMeans<'py> {
+    F32(PyReadonlyArray2<'py, f32>),
+    F64(PyReadonlyArray2<'py, f64>),
+}
+
+/// The six arrays of a `g2ard.Splats`.
+#[derive(FromPyObject)]
+struct PyScene<'py> {
+    means: PyMeans<'py>,
+    quats: PyReadonlyArray2<'py, f32>,
+    scales: PyReadonlyArray2<'py, f32>,
+    logit_opacities: PyReadonlyArray1<'py, f32>,
+    sh0: PyReadonlyArray3<'py, f32>,
+    #[pyo3(attribute("shN"))]
+    sh_rest: PyReadonlyArray3<'py, f32>,
+}
+
+impl PyScene<'_> {
+    fn borrow(&self) -> PyResult<SceneRef<'_>> {
+        Ok(SceneRef {
+            means: match &self.means {
+                PyMeans::F32(m) => Means::F32(arrays::rows("means", m)?),
+                PyMeans::F64(m) => Means::F64(arrays::rows("means", m)?),
+            },
+            quats: arrays::rows("quats", &self.quats)?,
+            scales: arrays::rows("scales", &self.scales)?,
+            logit_opacities: arrays::flat("logit_opacities", &self.logit_opacities)?,
+            sh0: arrays::rows("sh0", &self.sh0)?,
+            sh_rest: arrays::rows("shN", &self.sh_rest)?,
+            rest: self.sh_rest.shape()[1],
+        })
+    }
+}
+
+/// `protected` (N,) bool of the raw prior over about `cells` cells.
+#[pyfunction]
+#[pyo3(signature = (scene, cells, threshold, *, progress=None))]
+fn simplify_flags<'py>(
+    py: Python<'py>,
+    scene: PyScene<'py>,
+    cells: usize,
+    threshold: f64,
+    progress: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Bound<'py, PyArray1<bool>>> {
+    let scene = scene.borrow()?;
+    let found = long(py, progress, |control| {
+        let ordered = Ordered::new(&scene)?;
+        let found = flags(&ordered.splats, cells, threshold, control)?;
+        let mut by_row = vec![false; found.len()];
+        for (&row, &flag) in ordered.rows.iter().zip(&found) {
+            by_row[row as usize] = flag;
+        }
+        Ok(by_row)
+    })?;
+    Ok(PyArray1::from_vec(py, found))
+}
+
+/// The paper's rounds, down to each count of `schedule`.
+#[pyfunction]
+#[pyo3(signature = (
+    scene, schedule, flag_cells, *, protected, min_opacity, color_bin, max_energy, min_coverage,
+    flag_threshold, protection, progress=None
+))]
+fn simplify_paper<'py>(
+    py: Python<'py>,
+    scene: PyScene<'py>,
+    schedule: Vec<usize>,
+    flag_cells: usize,
+    protected: Option<PyReadonlyArray1<'py, bool>>,
+    min_opacity: f64,
+    color_bin: f64,
+    max_energy: f64,
+    min_coverage: f64,
+    flag_threshold: f64,
+    protection: f64,
+    progress: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let scene = scene.borrow()?;
+    let protected = protected
+        .as_ref()
+        .map(|p| arrays::flat("protected", p))
+        .transpose()?;
+    let policy = Paper {
+        min_opacity,
+        color_bin,
+        max_energy,
+        min_coverage,
+        flag_threshold,
+        protection,
+    };
+    let outcome = long(py, progress, |control| {
+        { policy.run(&scene, protected, flag_cells, &schedule, control) }
+    })?;
+    let rounds = outcome
+        .rounds
+        .iter()
+        .map(|r| round_dict(py, r))
+        .collect::<PyResult<Vec<_>>>()?;
+    outcome_dict(py, outcome, rounds)
+}
+
+fn round_dict<'py>(py: Python<'py>, r: &PaperRound) -> PyResult<Bound<'py, PyDict>> {
+    let refused = PyDict::new(py);
+    refused.set_item("energy", r.refused_energy)?;
+    refused.set_item("coverage", r.refused_coverage)?;
+    let round = PyDict::new(py);
+    round.set_item("refused", refused)?;
+    for (key, value) in [
+        ("before", r.before),
+        ("dropped", r.dropped),
+        ("cells", r.cells),
+        ("skipped_alone", r.alone),
+        ("merged_groups", r.merged_groups),
+        ("merged_members", r.merged_members),
+        ("undone_groups", r.undone_groups),
+        ("clamped_opacities", r.clamped_opacities),
+        ("trimmed", r.trimmed),
+        ("after", r.after),
+    ] {
+        round.set_item(key, value)?;
+    }
+    Ok(round)
+}
+
+fn outcome_dict<'py, R>(
+    py: Python<'py>,
+    outcome: Outcome<R>,
+    rounds: Vec<Bound<'py, PyDict>>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let s = outcome.splats;
+    let (n, coeffs) = (s.means.len(), s.sh_coeffs);
+    let out = PyDict::new(py);
+    out.set_item("means", arrays::matrix(py, s.means)?)?;
+    out.set_item("quats", arrays::matrix(py, s.quats)?)?;
+    out.set_item("scales", arrays::matrix(py, s.scales)?)?;
+    out.set_item("logit_opacities", PyArray1::from_vec(py, s.logit_opacities))?;
+    let sh = PyArray1::from_vec(py, s.sh.into_flattened()).reshape([n, coeffs, 3])?;
+    out.set_item("sh", sh)?;
+    out.set_item("parents", PyArray1::from_vec(py, outcome.parents))?;
+    out.set_item("protected", PyArray1::from_vec(py, outcome.flags))?;
+    out.set_item("clamped_logits", outcome.clamped_logits)?;
+    out.set_item("rounds", rounds)?;
+    Ok(out)
+}
+
+pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_function(wrap_pyfunction!(simplify_flags, m)?)?;
+    m.add_function(wrap_pyfunction!(simplify_paper, m)?)
+}

@@ -1,0 +1,69 @@
+"""Simplification, naively: float64, one group at a time, sets and loops."""
+
+from __future__ import annotations
+
+import numpy as np
+
+C0 = 0.28209479177387814
+
+
+def rotation(q):
+    w, x, y, z = np.asarray(q, np.float64) / np.linalg.norm(np.asarray(q, np.float64))
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def covariance(splats, i):
+    R, s = rotation(splats.quats[i]), splats.scales[i].astype(np.float64)
+    return R @ np.diag(s * s) @ R.T
+
+
+def footprint(scales):
+    return np.prod(np.sort(np.asarray(scales, np.float64))[1:])
+
+
+def optical_mass(splats, i):
+    """−log(1 − α)·A with α at most 0.99."""
+    alpha = min(0.99, 1 / (1 + np.exp(-float(splats.logit_opacities[i]))))
+    return -np.log1p(-alpha) * footprint(splats.scales[i])
+
+
+def merge(splats, rows):
+    """(mean, covariance, α, sh (K, 3), mass) of one group."""
+    m = np.array([optical_mass(splats, i) for i in rows])
+    w = m / m.sum()
+    x = splats.means[rows].astype(np.float64)
+    mean = w @ x
+    cov = sum(w[k] * (covariance(splats, i) + np.outer(x[k] - mean, x[k] - mean)) for k, i in enumerate(rows))
+    values = np.linalg.eigvalsh(cov)
+    area = np.sqrt(max(values[2], 0) * max(values[1], 0))
+    alpha = min(0.99, 1 - np.exp(-m.sum() / area))
+    sh = np.concatenate([splats.sh0[rows], splats.shN[rows]], 1).astype(np.float64)
+    return mean, cov, alpha, np.einsum("i,ikc->kc", w, sh), m.sum()
+
+
+def affine_energy(points, colors, own):
+    """Leave-one-out by refitting: rank at most (n − 1) // 2, so two points for each coefficient."""
+    if len(points) < 2:
+        return 0.0
+    total = 0.0
+    for i in range(own):
+        rest = np.arange(len(points)) != i
+        x, c = points[rest], colors[rest]
+        center, mean = x.mean(0), c.mean(0)
+        rank = min(3, (len(points) - 1) // 2)
+        _, _, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
+        axes = axes[:rank]
+        slope, *_ = np.linalg.lstsq((x - center) @ axes.T, c - mean, rcond=1e-9)
+        total += ((colors[i] - mean - (points[i] - center) @ axes.T @ slope) ** 2).sum()
+    return total / own
+
+
+def priority(splats, protected, weight=10.0):
+    mass = np.array([optical_mass(splats, i) for i in range(len(splats))])
+    return mass * (1 + weight * protected)

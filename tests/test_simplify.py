@@ -1,0 +1,309 @@
+"""Simplification: its parts against their float64 twins, and what must hold whatever the policy."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard import _core
+from g2ard.errors import InputError
+from g2ard.simplify import METHODS, SimplifyConfig, flag, schedule, simplify
+from g2ard.splats import Splats
+
+sys.path.insert(0, str(Path(__file__).parent))
+from reference import simplify as naive
+
+
+def scene(n=2000, rest=3, seed=0, dtype=np.float32):
+    """Discs on a wavy surface, smooth in colour on one half, noisy on the other, on a dyadic lattice."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-4, 4, (2, n))
+    means = np.stack([x, y, 0.3 * np.sin(x)], 1)
+    color = np.stack([0.1 * x, 0.1 * y, 0 * x], 1) + (x > 0)[:, None] * rng.normal(size=(n, 3))
+    return Splats.create(
+        (np.round(means * 2**12) / 2**12).astype(dtype),
+        quats=rng.normal(size=(n, 4)),
+        scales=np.exp(rng.normal(-2.5, 0.3, (n, 3))) * [1, 1, 0.2],
+        logit_opacities=rng.normal(0, 2, n),
+        sh0=color[:, None],
+        shN=rng.normal(0, 0.1, (n, rest, 3)),
+    )
+
+
+def one_round(prior, budget, flags, **options):
+    config = SimplifyConfig(retention=1e-9, **options)
+    return simplify(prior, budget, method="paper", protected=flags, config=config)
+
+
+ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+
+
+def assert_same(a, b):
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+def assert_sound(result, count, budget):
+    """What every result must be, on any input."""
+    out = result.splats
+    assert len(out) == budget
+    assert np.isfinite(out.logit_opacities).all()
+    assert out.finite_rows().all()
+    assert (out.scales > 0).all()
+    assert result.parents.shape == (count,)
+    assert result.parents.dtype == np.int64
+    used = np.unique(result.parents[result.parents >= 0])
+    np.testing.assert_array_equal(used, np.arange(budget))
+    assert result.protected.shape == (budget,)
+    assert result.report["output_count"] == budget
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("budget", [1, 2, 77, 500, 1234, 1999, 2000])
+def test_exact_count(method, budget):
+    assert_sound(simplify(scene(), budget, method=method), 2000, budget)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("rest", [0, 3, 8, 15])
+def test_any_sh_degree(method, rest):
+    assert simplify(scene(300, rest), 40, method=method).splats.shN.shape == (40, rest, 3)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_threads_do_not_matter(method):
+    prior = scene(20_000)
+    results = []
+    for threads in (1, 2, 8):
+        _core.set_num_threads(threads)
+        results.append(simplify(prior, 3000, method=method))
+    _core.set_num_threads(0)
+    for other in results[1:]:
+        assert_same(results[0].splats, other.splats)
+        np.testing.assert_array_equal(results[0].parents, other.parents)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_row_order_does_not_matter(method):
+    prior = scene()
+    rows = np.random.default_rng(1).permutation(len(prior))
+    here, there = simplify(prior, 300, method=method), simplify(prior.take(rows), 300, method=method)
+    assert_same(here.splats, there.splats)
+    np.testing.assert_array_equal(here.parents[rows], there.parents)
+    np.testing.assert_array_equal(here.protected, there.protected)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("factor", "shift"), [(1.0, 2.0**20), (2.0**-7, 0.0), (2.0**9, -(2.0**15))])
+def test_moving_and_scaling_by_powers_of_two_is_exact(method, factor, shift):
+    prior = scene(dtype=np.float64)
+    moved = replace(prior, means=prior.means * factor + shift, scales=prior.scales * np.float32(factor))
+    here, there = (simplify(s, 300, method=method) for s in (prior, moved))
+    np.testing.assert_array_equal(there.splats.means, here.splats.means * factor + shift)
+    np.testing.assert_array_equal(there.splats.scales, here.splats.scales * np.float32(factor))
+    for name in ("quats", "logit_opacities", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(there.splats, name), getattr(here.splats, name), err_msg=name)
+    np.testing.assert_array_equal(there.parents, here.parents)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_flags_are_inherited_by_or(method):
+    prior = scene()
+    flags = np.random.default_rng(2).random(len(prior)) < 0.2
+    out = simplify(prior, 400, method=method, protected=flags)
+    want = np.zeros(400, bool)
+    alive = out.parents >= 0
+    np.logical_or.at(want, out.parents[alive], flags[alive])
+    np.testing.assert_array_equal(out.protected, want)
+
+
+def odd_scenes():
+    rng = np.random.default_rng(3)
+    base = scene(500)
+    one = np.zeros(1000, int)
+    flat = replace(base, means=base.means * np.float32([1, 1, 0]))
+    line = replace(base, means=base.means * np.float32([1, 0, 0]))
+    far = base.means.copy()
+    far[[3, 77, 400]] = 8 * 20_000 * np.float32([[1, 0, 0], [0, -1, 1], [1, 1, 1]])
+    scales = base.scales.copy()
+    scales[::7] = 3e-10
+    huge = base.scales.astype(np.float64)
+    huge[5] = np.exp(43)  # files' clamp of e^100
+    logits = np.where(rng.random(500) < 0.5, 1e4, -1e4)
+    endless = np.where(np.arange(500) % 3 == 0, np.inf, np.where(np.arange(500) % 3 == 1, -np.inf, 0.3))
+    return {
+        "identical": base.take(one),
+        "one": base.take([0]),
+        "two": base.take([0, 1]),
+        "coplanar": flat,
+        "collinear": line,
+        "floaters": replace(base, means=far),
+        "tiny": replace(base, scales=scales),
+        "huge": replace(base, scales=huge.astype(np.float32)),
+        "logits": replace(base, logit_opacities=logits.astype(np.float32)),
+        "infinite": replace(base, logit_opacities=endless.astype(np.float32)),
+        "transparent": replace(base, logit_opacities=np.full(500, -np.inf, np.float32)),
+    }
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", odd_scenes())
+def test_odd_scenes(method, name):
+    prior = odd_scenes()[name]
+    for budget in {1, max(1, len(prior) // 10), len(prior)}:
+        out = simplify(prior, budget, method=method)
+        assert_sound(out, len(prior), budget)
+        infinite = int(np.isinf(prior.logit_opacities).sum())
+        assert out.report["clamped_logits"] == infinite
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_identical_gaussians_keep_their_shape(method):
+    prior = scene(500).take(np.zeros(1000, int))
+    out = simplify(prior, 1, method=method).splats
+    np.testing.assert_array_equal(out.means, prior.means[:1])
+    np.testing.assert_allclose(np.sort(out.scales[0]), np.sort(prior.scales[0]), rtol=1e-5)
+    np.testing.assert_allclose(out.sh0, prior.sh0[:1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_non_finite_rows_are_dropped_and_counted(method):
+    prior = scene(400)
+    prior.means[5, 0], prior.scales[9, 1], prior.shN[30, 1, 2] = np.nan, np.inf, np.nan
+    out = simplify(prior, 100, method=method)
+    assert_sound(out, 400, 100)
+    assert out.report["nonfinite_rows"] == 3
+    assert (out.parents[[5, 9, 30]] == -1).all()
+
+
+def test_bad_input_is_named():
+    prior = scene(50)
+    for budget, message in ((0, "at least 1, got 0"), (51, "at most the 50 Gaussians there are, got 51")):
+        with pytest.raises(InputError, match=message):
+            simplify(prior, budget)
+    with pytest.raises(InputError, match="method: expected one of"):
+        simplify(prior, 5, method="best")
+    with pytest.raises(InputError, match=r"protected: expected bool of shape \(50,\)"):
+        simplify(prior, 5, protected=np.zeros(49, bool))
+    with pytest.raises(InputError, match="none of 50 rows is finite"):
+        simplify(replace(prior, means=prior.means * np.nan), 5)
+    with pytest.raises(InputError, match="retention: expected"):
+        SimplifyConfig(retention=1.0)
+
+
+def test_schedule():
+    rounds = schedule(500_000, 50_000)
+    assert len(rounds) == 8
+    assert rounds[-1] == 50_000
+    for before, after in zip([500_000, *rounds], rounds, strict=False):
+        assert after < before
+    assert schedule(100, 1, 0.999)[-1] == 1
+
+
+def test_paper_rounds_report_adds_up():
+    prior = scene(5000)
+    out = simplify(prior, 600, method="paper")
+    rounds = out.report["rounds"]
+    assert [r["after"] for r in rounds] == schedule(5000, 600)
+    for r in rounds:
+        merged = r["merged_members"] - r["merged_groups"]
+        assert r["after"] == r["before"] - r["dropped"] - merged - r["trimmed"]
+
+
+def test_paper_merges_as_the_naive_twin_and_conserves_moments():
+    prior = scene(3000, dtype=np.float64)
+    flags = flag(prior, 1000)
+    out = one_round(prior, 1000, flags, max_energy=10, min_coverage=0)
+    small = out.splats
+    groups = {p: np.flatnonzero(out.parents == p) for p in np.unique(out.parents) if p >= 0}
+    assert sum(len(rows) > 1 for rows in groups.values()) > 100
+    for p, rows in groups.items():
+        if len(rows) == 1:
+            for name in ARRAYS:
+                np.testing.assert_array_equal(getattr(small, name)[p], getattr(prior, name)[rows[0]])
+            continue
+        mean, cov, alpha, sh, _ = naive.merge(prior, rows)
+        np.testing.assert_allclose(small.means[p], mean, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(naive.covariance(small, p), cov, rtol=0, atol=1e-6 * np.trace(cov))
+        np.testing.assert_allclose(small.opacities[p], alpha, rtol=1e-5)
+        np.testing.assert_allclose(np.r_[small.sh0[p], small.shN[p]], sh, rtol=0, atol=1e-5)
+
+
+def test_paper_trims_by_priority():
+    prior = scene(1000)
+    flags = np.random.default_rng(4).random(1000) < 0.3
+    # Nothing may merge: all is trimming.
+    out = one_round(prior, 200, flags, max_energy=0, min_coverage=2, min_opacity=0)
+    score = naive.priority(prior, flags)
+    want = np.zeros(1000, bool)
+    want[np.argsort(-score)[:200]] = True
+    np.testing.assert_array_equal(out.parents >= 0, want)
+
+
+def test_paper_drops_the_transparent_but_never_below_the_budget():
+    prior = scene(1000)
+    prior.logit_opacities[::5] = -6
+    visible = int((prior.opacities >= 0.01).sum())
+    out = one_round(prior, visible - 50, np.zeros(1000, bool))
+    assert out.report["rounds"][0]["dropped"] == 1000 - visible
+    assert_sound(one_round(prior, visible + 10, np.zeros(1000, bool)), 1000, visible + 10)
+
+
+def test_flags_find_texture_and_borrow_in_sparse_cells():
+    prior = scene(4000)
+    flags = flag(prior, 400)
+    noisy = prior.means[:, 0] > 0
+    assert flags[noisy].mean() > 0.95
+    assert flags[prior.means[:, 0] < -0.5].mean() < 0.05
+    few = flag(prior, 1500)  # two or three members a cell: all borrow
+    assert few[noisy].mean() > 0.9
+
+
+def test_flag_residual_equals_the_naive_twin():
+    rng = np.random.default_rng(5)
+    for n in (2, 5, 8, 9, 30):
+        points, colors = rng.normal(size=(n, 3)), rng.normal(size=(n, 3)) * 0.05
+        prior = Splats.create(points, scales=np.ones((n, 3)), sh0=colors[:, None] / naive.C0)
+        colors = 0.5 + naive.C0 * prior.sh0[:, 0].astype(np.float64)
+        energy = naive.affine_energy(prior.means.astype(np.float64), colors, n)
+        for factor, want in ((0.98, True), (1.02, False)):
+            config = SimplifyConfig(flag_threshold=factor * energy)
+            assert flag(prior, 1, config=config).all() == want, n
+
+
+def test_command_line(tmp_path, command_line):
+    from g2ard.io import read_splats, write_splats
+
+    write_splats(tmp_path / "prior.ply", scene(1000))
+
+    def run(*arguments):
+        return command_line("simplify", "prior.ply", *arguments, cwd=tmp_path)
+
+    status, out, err = run("-r", "10", "-o", "small.ply", "--json", "-")
+    assert status == 0, err
+    report = json.loads(out)
+    assert (report["input_count"], report["output_count"]) == (1000, 100)
+    assert set(report["seconds"]) == {"read", "simplify", "write", "total"}
+    assert report["peak_rss_bytes"] > 1e6
+    small, want = (
+        read_splats(tmp_path / "small.ply"),
+        simplify(read_splats(tmp_path / "prior.ply"), 100).splats,
+    )
+    for name in ARRAYS:  # files hold logarithms of the scales
+        np.testing.assert_allclose(getattr(small, name), getattr(want, name), rtol=1e-5, err_msg=name)
+    for arguments, want, part in (
+        (("-r", "10", "-o", "small.ply"), 1, "small.ply"),  # exists
+        (("-n", "1001", "-o", "b.ply"), 1, "at most the 1000"),
+        (("-n", "0", "-o", "b.ply"), 2, "positive count"),
+        (("-o", "b.ply"), 2, "either -n COUNT or -r RATIO"),
+        (("-n", "5", "-o", "b.ply", "--method", "best"), 1, "method"),
+    ):
+        status, _, err = run(*arguments)
+        assert (status, part in err) == (want, True), (arguments, err)
+        assert len(err.splitlines()) == 1
+        assert not (tmp_path / "b.ply").exists()
