@@ -30,6 +30,7 @@ def simplify_flags(
 def simplify_paper(
     scene: Splats,
     schedule: list[int],
+    flag_cells: int,
     *,
     protected: NDArray[np.bool_] | None,
     min_opacity: float,
@@ -40,3 +41,37 @@ def simplify_paper(
     protection: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]: ...
+
+_F32 = NDArray[np.float32]
+_Arrays = tuple[_F32, ...]
+_View = tuple[list[list[float]], list[float], tuple[int, int], float]
+_Choices = tuple[str, bool, float]
+
+def instruction_sets() -> list[str]: ...
+
+class Rasterizer:
+    def __init__(self, isa: str | None = None) -> None: ...
+    def forward(
+        self,
+        arrays: _Arrays,
+        view: _View,
+        choices: _Choices,
+        background: list[float],
+        depth: bool = True,
+        median: bool = False,
+    ) -> tuple[_F32, _F32, _F32 | None, _F32 | None]: ...
+    def backward(
+        self, arrays: _Arrays, image: _F32, alpha: _F32 | None = None, depth: _F32 | None = None
+    ) -> list[_F32]: ...
+    def counts(self) -> dict[str, int]: ...
+    def passes(self) -> dict[str, float]: ...
+
+def accumulate(
+    arrays: _Arrays,
+    views: list[_View],
+    choices: _Choices,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]: ...
+def l1_ssim(image: _F32, target: _F32, ssim_weight: float) -> tuple[float, _F32]: ...
+def ssim(image: _F32, target: _F32) -> float: ...
+def psnr(image: _F32, target: _F32) -> float: ...

@@ -28,8 +28,8 @@ def preview(
         scenes: (label, scene), left to right after the target.
         background: RGB behind the scenes.
     """
-    from g2ard.evaluate import psnr
     from g2ard.images import contact_sheet, write_png
+    from g2ard.metrics import psnr
     from g2ard.render import render
 
     count = len(targets.cameras)

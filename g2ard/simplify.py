@@ -14,7 +14,7 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
 from g2ard.splats import Splats
 
-__all__ = ["Simplified", "SimplifyConfig", "flag", "schedule", "simplify", "simplify_round"]
+__all__ = ["Simplified", "SimplifyConfig", "flag", "schedule", "simplify"]
 
 METHODS = ("paper",)
 
@@ -105,7 +105,7 @@ def flag(
         splats: the raw prior, never a recovered scene: fitting hides the residual.
         budget: the final count N_S, which sets the cell size.
         config: `flag_threshold` is read.
-        progress: told of cells done.
+        progress: told when done.
 
     Returns:
         (N,) bool; False for rows that are not finite.
@@ -134,6 +134,7 @@ def simplify(
     *,
     method: str = "paper",
     protected: NDArray[np.bool_] | None = None,
+    flag_budget: int | None = None,
     config: SimplifyConfig = _DEFAULTS,
     progress: Progress = silent,
 ) -> Simplified:
@@ -151,8 +152,10 @@ def simplify(
         budget: Gaussians to keep, at most as many as there are.
         method: the policy.
         protected: (N,) bool flags to inherit; None computes them (see `flag`).
+        flag_budget: the count that sets the flags' cell size, where this call is one round on the way to a
+            smaller one; None means `budget`.
         config: the constants.
-        progress: told of groups done in each round.
+        progress: told of Gaussians shed, round by round.
 
     Returns:
         The scene, where each row went, the inherited flags and a report.
@@ -169,40 +172,14 @@ def simplify(
     """
     if method not in METHODS:
         raise InputError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
-    return _paper(splats, budget, None, protected, config, progress)
-
-
-def simplify_round(
-    splats: Splats,
-    budget: int,
-    protected: NDArray[np.bool_],
-    *,
-    config: SimplifyConfig = _DEFAULTS,
-    progress: Progress = silent,
-) -> Simplified:
-    """One round of the paper's policy, straight to `budget`: what distillation runs between recoveries.
-
-    Args:
-        splats: the current scene.
-        budget: this round's count N_r.
-        protected: (N,) bool flags, from `flag` on the raw prior and then from the round before.
-        config: the constants.
-        progress: told of groups done.
-
-    Returns:
-        As `simplify`.
-
-    Raises:
-        InputError: as `simplify`.
-    """
-    return _paper(splats, budget, [budget], protected, config, progress)
+    return _paper(splats, budget, protected, flag_budget or budget, config, progress)
 
 
 def _paper(
     splats: Splats,
     budget: int,
-    rounds: list[int] | None,
     protected: NDArray[np.bool_] | None,
+    flag_budget: int,
     config: SimplifyConfig,
     progress: Progress,
 ) -> Simplified:
@@ -211,7 +188,8 @@ def _paper(
     flags = _check_flags(protected, len(splats))
     out = _core.simplify_paper(
         scene,
-        schedule(len(scene), budget, config.retention) if rounds is None else rounds,
+        schedule(len(scene), budget, config.retention),
+        flag_budget,
         protected=None if flags is None else np.ascontiguousarray(flags[finite]),
         min_opacity=config.min_opacity,
         color_bin=config.color_bin,

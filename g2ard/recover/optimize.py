@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.evaluate import psnr
+from g2ard.metrics import psnr
 from g2ard.progress import Progress, silent
 from g2ard.recover import checkpoint as checkpoints
 from g2ard.recover.anchors import PRESETS, Anchors, Regularizers, drift95, needle

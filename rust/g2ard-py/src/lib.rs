@@ -5,7 +5,9 @@ use pyo3::prelude::*;
 mod arrays;
 mod error;
 mod lift;
+mod raster;
 mod simplify;
+mod ssim;
 mod work;
 
 #[pymodule]
@@ -14,5 +16,7 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     work::register(m)?;
     lift::register(m)?;
     simplify::register(m)?;
+    raster::register(m)?;
+    ssim::register(m)?;
     Ok(())
 }

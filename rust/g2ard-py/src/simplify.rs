@@ -73,13 +73,14 @@ fn simplify_flags<'py>(
 /// The paper's rounds, down to each count of `schedule`.
 #[pyfunction]
 #[pyo3(signature = (
-    scene, schedule, *, protected, min_opacity, color_bin, max_energy, min_coverage,
+    scene, schedule, flag_cells, *, protected, min_opacity, color_bin, max_energy, min_coverage,
     flag_threshold, protection, progress=None
 ))]
 fn simplify_paper<'py>(
     py: Python<'py>,
     scene: PyScene<'py>,
     schedule: Vec<usize>,
+    flag_cells: usize,
     protected: Option<PyReadonlyArray1<'py, bool>>,
     min_opacity: f64,
     color_bin: f64,
@@ -103,7 +104,7 @@ fn simplify_paper<'py>(
         protection,
     };
     let outcome = long(py, progress, |control| {
-        policy.run(&scene, protected, &schedule, control)
+        { policy.run(&scene, protected, flag_cells, &schedule, control) }
     })?;
     let rounds = outcome
         .rounds

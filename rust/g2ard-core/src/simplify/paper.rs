@@ -77,11 +77,12 @@ const CHUNK: usize = 256;
 
 impl Paper {
     /// Rounds down to each count of `schedule`. Without `flags` they are computed first, on the raw
-    /// scene over as many cells as the last count.
+    /// scene over about `flag_cells` cells.
     pub fn run(
         &self,
         scene: &SceneRef,
         flags: Option<&[bool]>,
+        flag_cells: usize,
         schedule: &[usize],
         control: &Control,
     ) -> Result<Outcome<PaperRound>> {
@@ -100,16 +101,16 @@ impl Paper {
                     flags.len(),
                 ));
             }
-            None => {
-                let cells = schedule.last().copied().unwrap_or(splats.len());
-                residual::flags(&splats, cells, self.flag_threshold, control)?
-            }
+            None => residual::flags(&splats, flag_cells, self.flag_threshold, control)?,
         };
         let mut trail = Trail::start(splats, flags);
         let mut rounds = Vec::new();
+        let shed = |budget: usize| ordered.rows.len().saturating_sub(budget) as u64;
+        control.begin(shed(schedule.last().copied().unwrap_or(usize::MAX)));
         for &budget in schedule {
             let Step { splats, flags, .. } = &trail.step;
             let (step, report) = self.round(splats, flags, budget, ordered.grid, control)?;
+            control.advance((report.before - report.after) as u64);
             trail.then(step);
             rounds.push(report);
         }
@@ -221,12 +222,10 @@ impl Paper {
         report: &mut PaperRound,
         control: &Control,
     ) -> Result<Vec<Option<Box<Candidate>>>> {
-        control.begin(groups.len() as u64);
         let verdicts: Vec<Vec<Option<Verdict>>> = groups
             .par_chunks(CHUNK)
             .map(|chunk| {
                 control.check()?;
-                control.advance(chunk.len() as u64);
                 Ok(chunk
                     .iter()
                     .map(|g| (g.len() > 1).then(|| self.verdict(splats, g)))

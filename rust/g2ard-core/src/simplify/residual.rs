@@ -28,12 +28,10 @@ pub fn flags(
 ) -> Result<Vec<bool>> {
     let grid = Cells::adaptive(&splats.means, &Frame::of(&splats.means), cells);
     let ids: Vec<usize> = (0..grid.len()).collect();
-    control.begin(grid.len() as u64);
     let textured: Vec<Vec<bool>> = ids
         .par_chunks(CHUNK)
         .map(|chunk| {
             control.check()?;
-            control.advance(chunk.len() as u64);
             Ok(chunk
                 .iter()
                 .map(|&c| energy(splats, &grid, c) > threshold)

@@ -1,0 +1,125 @@
+"""Which cells of a box are opaque, how far the nearest opaque one is, and what a ray meets first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Grid"]
+
+Floats = NDArray[np.float64]
+
+_CELLS = 2_000_000
+"""Cells in all: matter thinner than a 128th of a cubic scene does not matter to where cameras may stand."""
+
+_OPAQUE = 0.3
+"""Opacity × area, summed, per face of a cell: above it light hardly passes."""
+
+_REACH = 12
+"""Distances are known up to this many cells, enough for rays to stride through free space."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Axis-aligned cells from `low`, each of side `cell`.
+
+    Args:
+        low: (3,) corner.
+        cell: side.
+        opaque: (X, Y, Z) whether light is stopped.
+        steps: (X, Y, Z) int8 distance to the nearest opaque cell in king's moves, at most `_REACH`.
+    """
+
+    low: Floats
+    cell: float
+    opaque: NDArray[np.bool_]
+    steps: NDArray[np.int8]
+
+    @classmethod
+    def of(cls, low: Floats, high: Floats, points: Floats, spans: Floats, opacities: Floats) -> Grid:
+        """Fill the box from `low` to `high` with Gaussians: means, (M, 2, 3) main axes, opacities."""
+        sides = np.maximum(high - low, np.max(high - low) / 256)
+        cell = float(np.cbrt(np.prod(sides) / _CELLS))
+        shape = np.maximum(1, np.ceil(sides / cell)).astype(int)
+        lengths = np.linalg.norm(spans, axis=2)
+        optical = opacities * 2 * np.pi * lengths[:, 0] * lengths[:, 1] / cell**2
+        filled = np.zeros(int(np.prod(shape)))
+        parts = np.clip(np.ceil(2.5 * lengths.max(axis=1) / cell), 1, 9).astype(int)
+        for count in np.unique(parts):
+            rows = np.flatnonzero(parts == count)
+            for a, b in _lattice(int(count)):
+                at = points[rows] + a * spans[rows, 0] + b * spans[rows, 1]
+                index, inside = _index(at, low, cell, shape)
+                filled += np.bincount(index[inside], (optical[rows] / count**2)[inside], filled.size)
+        opaque = (filled > _OPAQUE).reshape(shape)
+        return cls(low, cell, opaque, _steps(opaque))
+
+    def distance(self, points: Floats) -> Floats:
+        """(M,) from points to the nearest opaque cell, never too long; to the box where that is nearer.
+
+        Beyond `_REACH` cells the answer is `_REACH` cells.
+        """
+        index, inside = _index(points, self.low, self.cell, np.array(self.steps.shape))
+        found = np.maximum(self.steps.ravel()[index].astype(np.float64) - 0.5, 0) * self.cell
+        high = self.low + self.cell * np.array(self.steps.shape)
+        outside = np.linalg.norm(np.maximum(0, np.maximum(self.low - points, points - high)), axis=1)
+        return np.where(inside, found, np.maximum(outside, found))
+
+    def cast(self, eyes: Floats, directions: Floats) -> Floats:
+        """(M,) distances at which rays of unit direction first meet an opaque cell; inf where they do not."""
+        shape = np.array(self.opaque.shape)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = (np.stack([self.low, self.low + self.cell * shape])[:, None] - eyes) / directions
+        near = np.nan_to_num(ends.min(axis=0), nan=-np.inf).max(axis=1)
+        far = np.nan_to_num(ends.max(axis=0), nan=np.inf).min(axis=1)
+        reached, hits = np.maximum(near, 0) + 0.01 * self.cell, np.full(len(eyes), np.inf)
+        steps, rows = self.steps.ravel(), np.flatnonzero(reached < far)
+        while len(rows):
+            index, _ = _index(eyes[rows] + reached[rows, None] * directions[rows], self.low, self.cell, shape)
+            ahead = steps[index]
+            met = ahead == 0
+            hits[rows[met]] = reached[rows[met]]
+            reached[rows] += self.cell * np.maximum(ahead - 1.0, 0.6)
+            rows = rows[~met & (reached[rows] < far[rows])]
+        return hits
+
+
+def _lattice(count: int) -> list[tuple[float, float]]:
+    """Offsets in standard deviations that stand for a Gaussian too wide for one cell."""
+    line = (1.6 * ((np.arange(count) + 0.5) / count * 2 - 1)).tolist()
+    return [(a, b) for a in line for b in line]
+
+
+def _index(points: Floats, low: Floats, cell: float, shape: NDArray[Any]) -> tuple[Any, NDArray[np.bool_]]:
+    """Flat cell indices, clamped into the box, and whether the points were in it."""
+    flat, inside = np.zeros(len(points), np.int64), np.ones(len(points), bool)
+    for axis in range(3):
+        place = np.floor((points[:, axis] - low[axis]) / cell)
+        inside &= (place >= 0) & (place < shape[axis])
+        flat = flat * shape[axis] + np.clip(place, 0, shape[axis] - 1).astype(np.int64)
+    return flat, inside
+
+
+def _steps(opaque: NDArray[np.bool_]) -> NDArray[np.int8]:
+    steps = np.where(opaque, 0, _REACH).astype(np.int8)
+    grown = opaque
+    for reach in range(1, _REACH):
+        wider = _grown(grown)
+        steps[wider & ~grown] = reach
+        grown = wider
+    return steps
+
+
+def _grown(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The cells and their 26 neighbours."""
+    for axis in range(3):
+        wider = cells.copy()
+        ahead, behind = [slice(None)] * 3, [slice(None)] * 3
+        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
+        wider[tuple(ahead)] |= cells[tuple(behind)]
+        wider[tuple(behind)] |= cells[tuple(ahead)]
+        cells = wider
+    return cells
