@@ -5,6 +5,7 @@ use pyo3::prelude::*;
 mod error;
 mod raster;
 mod ssim;
+mod train;
 mod work;
 
 #[pymodule]
@@ -13,5 +14,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     work::register(m)?;
     raster::register(m)?;
     ssim::register(m)?;
+    train::register(m)?;
     Ok(())
 }
