@@ -8,6 +8,7 @@ mod lift;
 mod raster;
 mod simplify;
 mod ssim;
+mod train;
 mod work;
 
 #[pymodule]
@@ -18,5 +19,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     simplify::register(m)?;
     raster::register(m)?;
     ssim::register(m)?;
+    train::register(m)?;
     Ok(())
 }
