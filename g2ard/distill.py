@@ -31,6 +31,7 @@ class DistillConfig:
         schedule: recovery's; one with `round_steps` recovers after every round of 75 % (the paper), without
             them the reduction is one shot and all recovery happens at the target count.
         steps: overrides the schedule's final horizon.
+        time_limit: seconds for the final recovery; its horizon becomes what fits into them.
         regularizers: weights of L_anchor and L_shape.
         sh_degree: of the result; None keeps the prior's.
         background: RGB behind the scene.
@@ -40,6 +41,7 @@ class DistillConfig:
     method: str = "default"
     schedule: Schedule = TUNED
     steps: int | None = None
+    time_limit: float | None = None
     regularizers: Regularizers = PRESETS["trained"]
     sh_degree: int | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -160,6 +162,7 @@ class _Rounds:
             config = RecoverConfig(
                 schedule=self.config.schedule,
                 steps=self.config.steps if final else None,
+                time_limit=self.config.time_limit if final else None,
                 regularizers=self.config.regularizers,
                 background=self.config.background,
                 final=final,

@@ -166,3 +166,25 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert len(lines) == 1, error
     assert words in lines[0]
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_every_stage_writes_the_same_bytes_for_any_threads(command_line: CommandLine, tmp_path: Path) -> None:
+    cloud_with_photos(tmp_path)
+    write_splats(tmp_path / "ball.ply", PRIOR)
+    commands = [
+        ("lift", "cloud.ply", "-o", "lift.ply"),
+        ("simplify", "ball.ply", "-r", 8, "-o", "small.ply", "--method", "paper"),
+        ("recover", "small.ply", "--views", "views.json", "--steps", 30, "-o", "better.ply"),
+        ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 30, "--size", 80, "--method", "paper"),
+        ("render", "better.ply", "--views", "views.json", "-o", "renders"),
+    ]
+    written = []
+    for threads in (1, 2):
+        for command in commands:
+            status, _, error = command_line(*command, "-w", "--threads", threads, cwd=tmp_path)
+            assert status == 0, error
+        files = [tmp_path / name for name in ("lift.ply", "small.ply", "better.ply", "run/scene.ply")]
+        files += sorted((tmp_path / "renders").iterdir())
+        written.append([file.read_bytes() for file in files])
+    assert len(written[0]) == 4 + 12
+    assert written[0] == written[1]
