@@ -6,7 +6,7 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -137,4 +137,11 @@ BackgroundOption = Annotated[
 TeacherOption = Annotated[
     Path | None,
     typer.Option("--teacher", metavar="SCENE", help="Its renders are the targets; without it, the photos."),
+]
+
+Method = Literal["default", "fast", "paper"]
+ScheduleName = Literal["fast", "default", "best", "paper"]
+PresetOption = Annotated[
+    Literal["auto", "trained", "lift", "noisy"],
+    typer.Option(help="Which regularisers hold the geometry; auto measures the scene."),
 ]

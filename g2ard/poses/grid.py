@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.poses.matter import Matter
+from g2ard.poses.numbers import norms, turned
+
 __all__ = ["Grid"]
 
 Floats = NDArray[np.float64]
@@ -39,21 +42,22 @@ class Grid:
     steps: NDArray[np.int8]
 
     @classmethod
-    def of(cls, low: Floats, high: Floats, points: Floats, spans: Floats, opacities: Floats) -> Grid:
-        """Fill the box from `low` to `high` with Gaussians: means, (M, 2, 3) main axes, opacities."""
+    def of(cls, low: Floats, high: Floats, matter: Matter, axes: Floats) -> Grid:
+        """Fill the box from `low` to `high`, in coordinates along the rows of `axes`."""
         sides = np.maximum(high - low, np.max(high - low) / 256)
         cell = float(np.cbrt(np.prod(sides) / _CELLS))
         shape = np.maximum(1, np.ceil(sides / cell)).astype(int)
-        lengths = np.linalg.norm(spans, axis=2)
-        optical = opacities * 2 * np.pi * lengths[:, 0] * lengths[:, 1] / cell**2
-        filled = np.zeros(int(np.prod(shape)))
-        parts = np.clip(np.ceil(2.5 * lengths.max(axis=1) / cell), 1, 9).astype(int)
+        points, filled = turned(matter.points, axes), np.zeros(int(np.prod(shape)))
+        optical = matter.opacities * 2 * np.pi * matter.scales[:, 1] * matter.scales[:, 2] / cell**2
+        parts = np.clip(np.ceil(1.6 * matter.scales[:, 2] / cell), 1, 9).astype(np.int8)
         for count in np.unique(parts):
             rows = np.flatnonzero(parts == count)
+            share = optical[rows] / count**2
+            spans = turned(matter.spans(rows).reshape(-1, 3), axes).reshape(-1, 2, 3) if count > 1 else None
             for a, b in _lattice(int(count)):
-                at = points[rows] + a * spans[rows, 0] + b * spans[rows, 1]
+                at = points[rows] if spans is None else points[rows] + a * spans[:, 0] + b * spans[:, 1]
                 index, inside = _index(at, low, cell, shape)
-                filled += np.bincount(index[inside], (optical[rows] / count**2)[inside], filled.size)
+                filled += np.bincount(index[inside], share[inside], filled.size)
         opaque = (filled > _OPAQUE).reshape(shape)
         return cls(low, cell, opaque, _steps(opaque))
 
@@ -65,7 +69,7 @@ class Grid:
         index, inside = _index(points, self.low, self.cell, np.array(self.steps.shape))
         found = np.maximum(self.steps.ravel()[index].astype(np.float64) - 0.5, 0) * self.cell
         high = self.low + self.cell * np.array(self.steps.shape)
-        outside = np.linalg.norm(np.maximum(0, np.maximum(self.low - points, points - high)), axis=1)
+        outside = norms(np.maximum(0, np.maximum(self.low - points, points - high)))
         return np.where(inside, found, np.maximum(outside, found))
 
     def cast(self, eyes: Floats, directions: Floats) -> Floats:

@@ -28,22 +28,23 @@ def fibonacci(count: int, turn: float = 0.0, low: float = -1.0, high: float = 1.
     return np.stack([across * np.cos(around), across * np.sin(around), z], axis=1)
 
 
-def halton(count: int, dimensions: int, seed: int) -> Floats:
-    """(count, dimensions ≤ 6) points of the unit cube: Halton's sequence, moved on the torus by `seed`.
+def halton(start: int, stop: int, dimensions: int, seed: int) -> Floats:
+    """(stop − start, dimensions ≤ 6) points of the unit cube from Halton's endless sequence, moved on the
+    torus by `seed`.
 
-    >>> halton(3, 2, 0).shape
-    (3, 2)
+    >>> bool(np.abs(halton(0, 1000, 3, seed=0).mean(axis=0) - 0.5).max() < 0.01)
+    True
     """
     shift = np.random.default_rng(seed).random(dimensions)
-    columns = []
-    for base in (2, 3, 5, 7, 11, 13)[:dimensions]:
-        index, value, share = np.arange(1, count + 1), np.zeros(count), 1.0
+    columns = np.empty((stop - start, dimensions))
+    for column, base in zip(columns.T, (2, 3, 5, 7, 11, 13), strict=False):
+        index, share = np.arange(start + 1, stop + 1), 1.0
+        column[:] = 0
         while index.any():
             share /= base
-            value += share * (index % base)
+            column += share * (index % base)
             index = index // base
-        columns.append(value)
-    return (np.stack(columns, axis=1) + shift) % 1
+    return (columns + shift) % 1
 
 
 def strata(features: Floats, size: int, seed: int) -> NDArray[Any]:

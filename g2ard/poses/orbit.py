@@ -2,73 +2,62 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.poses.lattice import fibonacci, halton
-from g2ard.poses.matter import quantile
+from g2ard.poses.gather import gather
+from g2ard.poses.lattice import halton
+from g2ard.poses.numbers import quantile, turned
 from g2ard.poses.sight import Lens, Poses, look
 from g2ard.poses.site import Site
 
-__all__ = ["ELEVATIONS", "plan_orbit"]
+__all__ = ["plan_orbit"]
 
 Floats = NDArray[np.float64]
 
-ELEVATIONS = (-5.0, 50.0)
+_ELEVATIONS = (-5.0, 50.0)
 """Degrees above the horizon of the thing's middle."""
 
 _DISTANCES = (0.9, 1.25)
 """Each pose's own share of the distance at which the thing just fits."""
 
+_OUTLINE = 8_000
+"""Points that stand for the thing's outline."""
 
-def plan_orbit(site: Site, count: int, lens: Lens, seed: int) -> Poses:
-    """Up to `count` poses around the middle of the matter, evenly over the dome.
 
-    Poses below the ground, in or close to matter, or that see much less than the others do are left out;
-    the dome is asked for more until enough are left.
+def plan_orbit(site: Site, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]) -> Poses:
+    """At most `count` poses around the middle of the matter, evenly over the dome.
+
+    Poses below the ground, in or close to matter, or that see nothing are left out.
     """
-    low, high = np.sin(np.radians(ELEVATIONS))
-    target = _target(site)
-    asked = count
-    for _ in range(6):
-        turn, *_ = np.random.default_rng(seed).random(1)
-        outward = fibonacci(asked, turn, low, high)
-        poses = _fitting(site, target, outward, halton(asked, 1, seed)[:, 0], lens)
-        good = np.flatnonzero(_allowed(site, poses, lens))
-        if len(good) >= count:
-            break
-        asked = int(np.ceil(1.1 * asked * min(4.0, count / max(len(good), 1)))) + 1
-    spread = np.floor((np.arange(min(count, len(good))) + 0.5) * len(good) / min(count, max(len(good), 1)))
-    return poses.take(good[spread.astype(int)])
+    target = site.box.mean(axis=0)
+    low, high = np.sin(np.radians(_ELEVATIONS))
+
+    def propose(start: int, stop: int) -> Poses:
+        across, rise, chance = halton(start, stop, 3, seed).T
+        z = low + (high - low) * rise
+        flat, turn = np.sqrt(1 - z * z), 2 * np.pi * across
+        outward = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+        distances = _fitting(site, target, outward, lens)
+        distances *= _DISTANCES[0] + (_DISTANCES[1] - _DISTANCES[0]) * chance
+        return Poses(target + distances[:, None] * outward, -outward)
+
+    def judge(poses: Poses) -> Floats:
+        free = (site.grid.distance(poses.eyes) > 2 * site.grid.cell) & (site.above_ground(poses.eyes) > 0.02)
+        seen = look(site, poses, lens, free)
+        return ((seen.covered > 0.01) & (seen.close > 4 * site.grid.cell)).astype(float)
+
+    return gather(count, propose, judge, tell)
 
 
-def _target(site: Site) -> Floats:
-    """The middle of the extents; over a ground, of what lies around the middle of the mass."""
-    return site.box.mean(axis=0)
-
-
-def _fitting(site: Site, target: Floats, outward: Floats, chance: Floats, lens: Lens) -> Poses:
-    """Eyes so far out that 97 % of the matter is in frame, times a share between `_DISTANCES`."""
-    points, weights = site.points[:20_000] - target, site.weights[:20_000]
-    frames = Poses(outward, -outward).frames()
+def _fitting(site: Site, target: Floats, outward: Floats, lens: Lens) -> Floats:
+    """(P,) distances at which 97 % of the matter is in frame, and all of it ahead."""
+    points, weights = site.points[:_OUTLINE] - target, site.weights[:_OUTLINE]
     wide, tall = lens.tangents
     distances = np.empty(len(outward))
-    for i, (right, down, ahead) in enumerate(frames):
-        x, y, z = (
-            points[:, 0] * a[0] + points[:, 1] * a[1] + points[:, 2] * a[2] for a in (right, down, ahead)
-        )
-        needed = np.maximum(np.abs(x) / wide, np.abs(y) / tall) - z
-        distances[i] = quantile(needed, weights, 0.97)
-    distances *= _DISTANCES[0] + (_DISTANCES[1] - _DISTANCES[0]) * chance
-    return Poses(target + distances[:, None] * outward, -outward)
-
-
-def _allowed(site: Site, poses: Poses, lens: Lens) -> NDArray[np.bool_]:
-    clear = site.grid.distance(poses.eyes) > 2 * site.grid.cell
-    above = site.above_ground(poses.eyes) > 0.02
-    good = clear & above
-    if good.any():
-        rows = np.flatnonzero(good)
-        seen = look(site, poses.take(rows), lens)
-        good[rows] = (seen.covered > 0.4 * np.median(seen.covered)) & (seen.close > 4 * site.grid.cell)
-    return good
+    for i, frame in enumerate(Poses(outward, -outward).frames()):
+        x, y, z = turned(points, frame).T
+        distances[i] = quantile(np.maximum(np.abs(x) / wide, np.abs(y) / tall) - z, weights, 0.97)
+    return np.maximum(distances, 1.2)  # everything lies within about 1 of the middle

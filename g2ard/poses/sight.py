@@ -97,8 +97,8 @@ class Seen:
     median: Floats
 
 
-def look(site: Site, poses: Poses, lens: Lens) -> Seen:
-    """Cast a coarse frame of rays from each pose into the site's opaque cells."""
+def look(site: Site, poses: Poses, lens: Lens, wanted: NDArray[np.bool_] | None = None) -> Seen:
+    """Cast a coarse frame of rays from each pose into the site's opaque cells; nothing where not wanted."""
     columns, rows = _RAYS
     x = lens.tangents[0] * ((np.arange(columns) + 0.5) / columns * 2 - 1)
     y = lens.tangents[1] * ((np.arange(rows) + 0.5) / rows * 2 - 1)
@@ -106,7 +106,7 @@ def look(site: Site, poses: Poses, lens: Lens) -> Seen:
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     covered, close, median = np.zeros(len(poses)), np.zeros(len(poses)), np.zeros(len(poses))
     frames = poses.frames()
-    for i in range(len(poses)):
+    for i in range(len(poses)) if wanted is None else np.flatnonzero(wanted):
         directions = np.einsum("ri,ij->rj", rays, frames[i])
         hits = np.sort(site.grid.cast(np.broadcast_to(poses.eyes[i], directions.shape), directions))
         count = int(np.isfinite(hits).sum())

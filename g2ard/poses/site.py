@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.poses.grid import Grid
-from g2ard.poses.matter import Matter, along, quantile
+from g2ard.poses.matter import Matter, Sample
+from g2ard.poses.numbers import along, moments, quantile, turned
 from g2ard.poses.terrain import Terrain
 from g2ard.poses.up import Up, estimate_up, given_up
 from g2ard.splats import Splats
@@ -51,46 +53,45 @@ class Site:
             InputError: nothing visible, or an `up` that is no direction.
         """
         matter = Matter.of(splats)
-        found = estimate_up(matter) if up is None else given_up(matter, up)
-        axes = _axes(matter, found.axis)
-        points = _turned(matter.points, axes)
         some = matter.sample()
-        k = len(some.points)
-        box = np.array([quantile(points[:k, a], some.weights, [0.01, 0.99]) for a in range(3)]).T
+        found = estimate_up(some) if up is None else given_up(some, up)
+        axes = _axes(some, found.axis)
+        points = turned(some.points, axes)
+        box = np.array([quantile(points[:, a], some.weights, [0.01, 0.99]) for a in range(3)]).T
         room = 0.1 * (box[1] - box[0]) + 0.02
-        spans = _turned(matter.spans.reshape(-1, 3), axes).reshape(-1, 2, 3)
-        grid = Grid.of(box[0] - room, box[1] + room, points, spans, matter.opacities)
+        grid = Grid.of(box[0] - room, box[1] + room, matter, axes)
         facing = np.abs(along(some.normals, found.axis)) > np.cos(np.radians(35))
-        terrain = Terrain.of(points[:k][facing], some.weights[facing], box) if found.grounded else None
+        terrain = Terrain.of(points[facing], some.weights[facing], box) if found.grounded else None
         origin = splats.offset + matter.origin
-        return cls(points[:k], some.weights, box, terrain, grid, axes, origin, matter.size, found)
+        return cls(points, some.weights, box, terrain, grid, axes, origin, matter.size, found)
+
+    def ground(self, points: Floats) -> Floats:
+        """(M,) heights of the ground under points; the matter's lowest where there is no ground."""
+        if self.terrain is None:
+            return np.full(len(points), self.box[0, 2])
+        return self.terrain.height(points)
 
     def above_ground(self, points: Floats) -> Floats:
-        """(M,) heights over the ground; over −∞ where there is none."""
-        if self.terrain is None:
-            return np.full(len(points), np.inf)
-        return points[:, 2] - self.terrain.height(points)
+        """(M,) heights over the ground; infinite where there is none."""
+        return points[:, 2] - self.ground(points) if self.terrain else np.full(len(points), np.inf)
+
+    @cached_property
+    def tallness(self) -> float:
+        """How high things stand over the ground: 98 % of the matter is lower."""
+        return max(float(quantile(self.points[:, 2] - self.ground(self.points), self.weights, 0.98)), 0.0)
 
 
-def _axes(matter: Matter, up: Floats) -> Floats:
-    """Rows: along the scene if it is long, else along the first coordinate axis; to its left; up."""
-    some = matter.sample()
+def _axes(some: Sample, up: Floats) -> Floats:
+    """Rows: along the scene if it is long, else along a coordinate axis; to its left; up."""
     ahead = np.eye(3)[int(np.argmin(np.round(np.abs(up), 3)))]
     ahead = ahead - (ahead @ up) * up
     ahead /= np.linalg.norm(ahead)
     left = np.cross(up, ahead)
-    w = some.weights / some.weights.sum()
-    x, y = along(some.points, ahead), along(some.points, left)
-    x, y = x - (w * x).sum(), y - (w * y).sum()
-    values, vectors = np.linalg.eigh(
-        np.array([[(w * x * x).sum(), (w * x * y).sum()], [(w * x * y).sum(), (w * y * y).sum()]])
-    )
+    weights = some.weights / some.weights.sum()
+    flat = np.stack([along(some.points, ahead), along(some.points, left)], axis=1)
+    flat -= (weights[:, None] * flat).sum(axis=0)
+    values, vectors = np.linalg.eigh(moments(flat, weights))
     if values[1] > 1.5 * values[0]:
-        along_it = vectors[:, 1] * np.copysign(1.0, vectors[int(np.argmax(np.abs(vectors[:, 1]))), 1])
-        ahead = along_it[0] * ahead + along_it[1] * left
-        left = np.cross(up, ahead)
-    return np.stack([ahead, left, up])
-
-
-def _turned(vectors: Floats, axes: Floats) -> Floats:
-    return np.stack([along(vectors, axis) for axis in axes], axis=1)
+        x, y = vectors[:, 1] * np.copysign(1.0, vectors[np.argmax(np.abs(vectors[:, 1])), 1])
+        ahead = x * ahead + y * left
+    return np.stack([ahead, np.cross(up, ahead), up])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 from g2ard.poses.lattice import fibonacci
-from g2ard.poses.matter import Matter, along, moments, quantile
+from g2ard.poses.matter import Sample
+from g2ard.poses.numbers import along, moments, quantile
 
 __all__ = ["Up", "estimate_up", "given_up"]
 
@@ -33,7 +34,7 @@ class Up:
     why: str
 
 
-def given_up(matter: Matter, up: ArrayLike) -> Up:
+def given_up(matter: Sample, up: ArrayLike) -> Up:
     """The user's own answer; only whether there is a ground is looked up.
 
     Raises:
@@ -43,32 +44,30 @@ def given_up(matter: Matter, up: ArrayLike) -> Up:
     if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
         raise InputError(f"up: expected three finite numbers, not all zero, got {up!r}")
     axis = axis / np.linalg.norm(axis)
-    some = matter.sample()
-    layer, _ = _layer(some, axis)
-    return Up(axis, _is_flat(some)[0] or layer > 0.1, "up as given")
+    layer, _ = _layer(matter, axis)
+    return Up(axis, _is_flat(matter)[0] or layer > 0.1, "up as given")
 
 
-def estimate_up(matter: Matter) -> Up:
+def estimate_up(matter: Sample) -> Up:
     """The axis from planes or the scene's shape, its sign from where the matter lies.
 
     In turn: a scene much flatter than wide lies on its ground; else the strongest plane at the edge of the
-    matter is the ground; else (an object cut out of its surroundings) the long axis of something long, or
+    matter is the ground; else (an object cut out of its surroundings) the long axis of matterthing long, or
     the axis that capture software usually calls up.
     """
-    some = matter.sample()
-    flat, thin, long = _is_flat(some)
+    flat, thin, long = _is_flat(matter)
     if flat:
-        axis = _mean_normal(some, thin, np.abs(along(some.normals, thin)) > np.cos(np.radians(35)))
-        return _signed(some, axis, True, "the scene is flat")
-    axis, strength = _best_plane(some)
+        axis = _mean_normal(matter, thin, np.abs(along(matter.normals, thin)) > np.cos(np.radians(35)))
+        return _signed(matter, axis, True, "the scene is flat")
+    axis, strength = _best_plane(matter)
     if strength > 0.12:
-        return _signed(some, axis, True, "a ground plane")
+        return _signed(matter, axis, True, "a ground plane")
     if long is not None:
-        return _signed(some, _snapped(long), False, "no ground; the long axis")
-    return _signed(some, np.array([0.0, -1.0, 0.0]), False, "no ground; a guess")
+        return _signed(matter, _snapped(long), False, "no ground; the long axis")
+    return _signed(matter, np.array([0.0, -1.0, 0.0]), False, "no ground; a guess")
 
 
-def _is_flat(matter: Matter) -> tuple[bool, Floats, Floats | None]:
+def _is_flat(matter: Sample) -> tuple[bool, Floats, Floats | None]:
     """Whether the scene is a sheet; its thinnest axis; its longest if it sticks out."""
     w = matter.weights / matter.weights.sum()
     centred = matter.points - (w[:, None] * matter.points).sum(axis=0)
@@ -77,7 +76,7 @@ def _is_flat(matter: Matter) -> tuple[bool, Floats, Floats | None]:
     return bool(values[0] < 0.08 * values[1]), vectors[:, 0], long
 
 
-def _layer(matter: Matter, axis: Floats) -> tuple[float, float]:
+def _layer(matter: Sample, axis: Floats) -> tuple[float, float]:
     """Share of all matter in the strongest layer that faces `axis`, and the layer's height."""
     facing = np.abs(along(matter.normals, axis)) > _FACING
     if not facing.any():
@@ -91,9 +90,9 @@ def _layer(matter: Matter, axis: Floats) -> tuple[float, float]:
     return float(pairs[best] / matter.weights.sum()), float((low + best + 1) * _SLAB)
 
 
-def _best_plane(matter: Matter) -> tuple[Floats, float]:
+def _best_plane(matter: Sample) -> tuple[Floats, float]:
     """The direction whose strongest layer holds most and has matter on one side only, refined."""
-    few = replace(matter, **{name: getattr(matter, name)[:_SEARCHED] for name in _ROWS})
+    few = matter.take(slice(_SEARCHED))
     directions = np.concatenate([np.eye(3), fibonacci(600)[:300]])
     scores = [_edge(few, axis) * _habit(axis) for axis in directions]
     axis = directions[int(np.argmax(scores))]
@@ -104,10 +103,7 @@ def _best_plane(matter: Matter) -> tuple[Floats, float]:
     return axis, _edge(matter, axis)
 
 
-_ROWS = ("points", "weights", "normals", "flatness", "spans", "opacities")
-
-
-def _edge(matter: Matter, axis: Floats) -> float:
+def _edge(matter: Sample, axis: Floats) -> float:
     """The strongest layer's share, less what lies on both its sides: ground and walls have one side."""
     share, height = _layer(matter, axis)
     beside = along(matter.points, axis) - height
@@ -121,7 +117,7 @@ def _habit(axis: Floats) -> float:
     return 1.2 if np.abs(axis[1:]).max() > np.cos(np.radians(15)) else 1.0
 
 
-def _mean_normal(matter: Matter, axis: Floats, rows: NDArray[np.bool_]) -> Floats:
+def _mean_normal(matter: Sample, axis: Floats, rows: NDArray[np.bool_]) -> Floats:
     weights = (matter.weights * matter.flatness)[rows]
     if not weights.sum() > 0:
         return axis
@@ -135,7 +131,7 @@ def _snapped(axis: Floats) -> Floats:
     return np.eye(3)[best] if abs(axis[best]) > np.cos(np.radians(15)) else axis
 
 
-def _signed(matter: Matter, axis: Floats, grounded: bool, why: str) -> Up:
+def _signed(matter: Sample, axis: Floats, grounded: bool, why: str) -> Up:
     lean = _lean(matter, axis) if grounded else -_balance(matter, axis)
     if abs(lean) > 0.05:
         side = "most matter lies above it" if grounded else "its heavier end is down"
@@ -145,7 +141,7 @@ def _signed(matter: Matter, axis: Floats, grounded: bool, why: str) -> Up:
     return Up(axis * sign, grounded, f"{why}, its sign by custom")
 
 
-def _lean(matter: Matter, axis: Floats) -> float:
+def _lean(matter: Sample, axis: Floats) -> float:
     """−1…1: how far the matter stands on the side of `axis`, seen from what faces it.
 
     Heights are taken from the median of the facing matter in each of 6×6 columns, so that slopes do not
@@ -172,7 +168,7 @@ def _lean(matter: Matter, axis: Floats) -> float:
     return float((matter.weights * above).sum() / max(total, np.finfo(float).tiny))
 
 
-def _columns(matter: Matter, axis: Floats) -> NDArray[Any]:
+def _columns(matter: Sample, axis: Floats) -> NDArray[Any]:
     across = np.eye(3)[int(np.argmin(np.abs(axis)))]
     first = np.cross(axis, across)
     first /= np.linalg.norm(first)
@@ -181,7 +177,7 @@ def _columns(matter: Matter, axis: Floats) -> NDArray[Any]:
     return row * 6 + column
 
 
-def _two_layers(matter: Matter, heights: Floats, facing: NDArray[np.bool_]) -> tuple[float, float] | None:
+def _two_layers(matter: Sample, heights: Floats, facing: NDArray[np.bool_]) -> tuple[float, float] | None:
     """Heights of a floor and a ceiling: both ends of what faces the axis are strong layers."""
     if not facing.any():
         return None
@@ -194,7 +190,7 @@ def _two_layers(matter: Matter, heights: Floats, facing: NDArray[np.bool_]) -> t
     return (float(low), float(high)) if min(shares) > 0.25 else None
 
 
-def _balance(matter: Matter, axis: Floats) -> float:
+def _balance(matter: Sample, axis: Floats) -> float:
     """−1…1: which half of its height a thing's matter leans to."""
     heights = along(matter.points, axis)
     low, high = quantile(heights, matter.weights, [0.01, 0.99])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,7 +14,10 @@ from g2ard.cli.options import (
     BackgroundOption,
     Count,
     CountOption,
+    Method,
+    PresetOption,
     RatioOption,
+    ScheduleName,
     SizeOption,
     ViewsOption,
     budget_of,
@@ -53,12 +58,10 @@ def distill(
         Path | None,
         typer.Option(metavar="VIEWS", help="Score on these; --views is then all for recovery."),
     ] = None,
-    method: Annotated[str, typer.Option(metavar="default|fast|paper", help="How to simplify.")] = "default",
-    preset: Annotated[
-        str, typer.Option(metavar="auto|trained|lift|noisy", help="Which regularisers hold the geometry.")
-    ] = "auto",
+    method: Annotated[Method, typer.Option(help="How to simplify.")] = "default",
+    preset: PresetOption = "auto",
     schedule: Annotated[
-        str, typer.Option(metavar="fast|default|best|paper", help="Recovery; paper also goes round by round.")
+        ScheduleName, typer.Option(help="Recovery; paper also goes round by round.")
     ] = "default",
     steps: Annotated[int | None, typer.Option(min=1, help="Overrides the final horizon.")] = None,
     sh_degree: Annotated[
@@ -76,7 +79,7 @@ def distill(
 
     from g2ard.distill import DistillConfig
     from g2ard.distill import distill as pipeline
-    from g2ard.io import kind
+    from g2ard.io import kind, write_views
     from g2ard.io.atomic import check_output
     from g2ard.recover.presets import preset_for
     from g2ard.recover.schedule import schedule_named
@@ -85,13 +88,12 @@ def distill(
     lifted = kind(scene) != "splats"
     if lifted and views is None:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
-    work = check_output(output, run.overwrite or resume, folder=True) / "work"
+    check_output(output, run.overwrite or resume, folder=True)
     prior = _lift(run, scene) if lifted else load_scene(run, scene)
     budget = _budget(scene, count, ratio, len(prior))
-    if not resume:
-        shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True, exist_ok=True)
-    train, test, use_photos = _views(run, views or _pool(run, prior, output), held_out, size, photos, lifted)
+    train, test, pool = _views(run, prior, views, held_out, size)
+    pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
+    use_photos = lifted or (pictured if photos is None else photos)
     teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
     colour = background or (0.0, 0.0, 0.0)
     regularizers, why = preset_for("lift" if preset == "auto" and lifted else preset, prior)
@@ -106,23 +108,45 @@ def distill(
         background=colour,
         seed=run.seed,
     )
-    try:
-        targets = make_targets(run, train, teacher, colour)
-        result = pipeline(prior, budget, targets, config, work=work, progress=run.progress)
-    except KeyboardInterrupt:
-        run.say(f"stopped; the same command with --resume goes on in {output}")
-        raise
+    targets = make_targets(run, train, teacher, colour)
     unseen = make_targets(run, test, teacher, colour)
+    with _work_folder(output, resume) as work:
+        try:
+            result = pipeline(prior, budget, targets, config, work=work, progress=run.progress)
+        except KeyboardInterrupt:
+            run.say(f"stopped; the same command with --resume goes on in {output}")
+            raise
     report = _score(run, prior, result, unseen, colour)
     report |= {"against": against, "preset": why, "rounds": result.report["rounds"]}
     report["seconds"] = {**result.report["seconds"], "total": time.monotonic() - began}
     _write(run, output, result, unseen, colour, report)
-    shutil.rmtree(work)
+    if pool is not None:
+        write_views(output / "views.json", pool, overwrite=True)
+    shutil.rmtree(output / "work")
     _table(run, report)
     run.say(
         f"scene: {output / 'scene.ply'}\npicture: {output / 'preview.png'}\nreport: {output / 'report.json'}"
     )
     run.result(report)
+
+
+@contextmanager
+def _work_folder(output: Path, resume: bool) -> Iterator[Path]:
+    """Where finished rounds and checkpoints wait for --resume; an error leaves nothing behind."""
+    import shutil
+
+    from g2ard.errors import G2ardError
+
+    work, made = output / "work", not output.exists()
+    if not resume:
+        shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True, exist_ok=True)
+    try:
+        yield work
+    except G2ardError:
+        if not resume:
+            shutil.rmtree(output if made else work, ignore_errors=True)
+        raise
 
 
 def _lift(run: Run, path: Path) -> Splats:
@@ -144,24 +168,21 @@ def _budget(scene: Path, count: Count | None, ratio: float | None, total: int) -
     return budget
 
 
-def _pool(run: Run, prior: Splats, output: Path) -> Path:
-    """Poses for a scene that comes without views, kept in the run's folder."""
-    from g2ard.io import write_views
-    from g2ard.poses import make_pool
-
-    path = output / "views.json"
-    write_views(path, make_pool(prior, _POOL, seed=run.seed, progress=run.progress), overwrite=True)
-    return path
-
-
 def _views(
-    run: Run, path: Path, held_out: Path | None, size: int | None, photos: bool | None, lifted: bool
-) -> tuple[Cameras, Cameras, bool]:
-    """Training views, held-out views, and whether their photos are the targets."""
-    train = load_views(run, path, "all" if held_out else "train", size)
-    test = load_views(run, held_out or path, "all" if held_out else "test", size)
-    pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
-    return train, test, lifted or (pictured if photos is None else photos)
+    run: Run, prior: Splats, views: Path | None, held_out: Path | None, size: int | None
+) -> tuple[Cameras, Cameras, Cameras | None]:
+    """Views for recovery, views for scoring, and the pool both came from where one had to be made."""
+    from g2ard.poses import make_pool
+    from g2ard.splits import split_mask
+
+    if views is not None:
+        train = load_views(run, views, "all" if held_out else "train", size)
+        return train, load_views(run, held_out or views, "all" if held_out else "test", size), None
+    pool = make_pool(prior, _POOL, seed=run.seed, progress=run.progress)
+    if held_out is not None:
+        return pool.resized(size), load_views(run, held_out, "all", size), pool
+    test = split_mask("views.json", pool.names, "test")
+    return pool.take(~test).resized(size), pool.take(test).resized(size), pool
 
 
 def _score(run: Run, prior: Splats, result: Distilled, unseen: Targets, colour: Colour) -> dict[str, Any]:

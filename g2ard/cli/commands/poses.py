@@ -9,7 +9,7 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import OutputOption, SceneArgument
 
-_KINDS = ("auto", "orbit")
+_KINDS = ("auto", "orbit", "walk", "aerial")
 
 
 def _numbers(text: str, separator: str, count: int) -> tuple[float, ...] | None:
@@ -50,7 +50,7 @@ def poses(
         typer.Option(
             parser=_kind,
             metavar="|".join(_KINDS),
-            help="Around an object; auto: by the scene's shape.",
+            help="Around an object, through rooms and streets, from the air; auto: by the scene's shape.",
         ),
     ] = "auto",
     count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many poses.")] = 128,

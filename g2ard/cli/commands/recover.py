@@ -8,7 +8,15 @@ from typing import Annotated
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import BackgroundOption, OutputOption, SizeOption, SplitOption, TeacherOption
+from g2ard.cli.options import (
+    BackgroundOption,
+    OutputOption,
+    PresetOption,
+    ScheduleName,
+    SizeOption,
+    SplitOption,
+    TeacherOption,
+)
 
 
 @command("recover", example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply")
@@ -18,12 +26,8 @@ def recover(
     views: Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")],
     output: OutputOption,
     teacher: TeacherOption = None,
-    preset: Annotated[
-        str, typer.Option(metavar="auto|trained|lift|noisy", help="Which regularisers hold the geometry.")
-    ] = "auto",
-    schedule: Annotated[
-        str, typer.Option(metavar="fast|default|best|paper", help="Rates, decay and horizon.")
-    ] = "default",
+    preset: PresetOption = "auto",
+    schedule: Annotated[ScheduleName, typer.Option(help="Rates, decay and horizon.")] = "default",
     steps: Annotated[int | None, typer.Option(min=1, help="Overrides the schedule's horizon.")] = None,
     sh_degree: Annotated[
         int | None,

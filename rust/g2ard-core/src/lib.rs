@@ -13,6 +13,7 @@ pub mod simplify;
 pub mod spatial;
 pub mod splats;
 pub mod ssim;
+pub mod train;
 
 pub use control::Control;
 pub use error::{Error, Result};

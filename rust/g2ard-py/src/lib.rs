@@ -9,6 +9,7 @@ mod raster;
 mod select;
 mod simplify;
 mod ssim;
+mod train;
 mod work;
 
 #[pymodule]
@@ -20,5 +21,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     raster::register(m)?;
     select::register(m)?;
     ssim::register(m)?;
+    train::register(m)?;
     Ok(())
 }

@@ -2,7 +2,8 @@
 
 use g2ard_core::raster::simd::Isa;
 use g2ard_core::raster::{
-    Accumulated, Camera, Convention, Gradients, Image, ImageGradients, Params, Rasterizer, Settings,
+    Accumulated, Camera, Convention, Gradients, Image, ImageGradients, Params, Passes, Rasterizer,
+    Settings,
 };
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
@@ -11,9 +12,9 @@ use pyo3::types::PyDict;
 use crate::error::to_py;
 use crate::work;
 
-type Floats<'py> = PyReadonlyArrayDyn<'py, f32>;
+pub type Floats<'py> = PyReadonlyArrayDyn<'py, f32>;
 
-fn slice<'a>(name: &'static str, array: &'a Floats<'_>) -> PyResult<&'a [f32]> {
+pub fn slice<'a>(name: &'static str, array: &'a Floats<'_>) -> PyResult<&'a [f32]> {
     array.as_slice().map_err(|_| {
         to_py(g2ard_core::Error::invalid(
             name,
@@ -35,7 +36,7 @@ pub struct Arrays<'py>(
 );
 
 impl Arrays<'_> {
-    fn params(&self) -> PyResult<Params<'_>> {
+    pub fn params(&self) -> PyResult<Params<'_>> {
         let shape = self.5.shape();
         let rest = if shape.len() == 3 { shape[1] } else { 0 };
         let params = Params {
@@ -57,7 +58,7 @@ impl Arrays<'_> {
 pub struct View([[f64; 4]; 4], [f64; 4], (usize, usize), f32);
 
 impl View {
-    fn camera(&self) -> Camera {
+    pub fn camera(&self) -> Camera {
         let (v, k) = (&self.0, &self.1);
         Camera {
             viewmat: [v[0], v[1], v[2]],
@@ -77,7 +78,7 @@ impl View {
 pub struct Choices(String, bool, f32);
 
 impl Choices {
-    fn settings(&self) -> PyResult<Settings> {
+    pub fn settings(&self) -> PyResult<Settings> {
         let convention = match self.0.as_str() {
             "gsplat" => Convention::Gsplat,
             "inria" => Convention::Inria,
@@ -252,19 +253,7 @@ impl PyRasterizer {
 
     /// Seconds the passes of the last calls took.
     fn passes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let passes = self.inner.passes();
-        let dict = PyDict::new(py);
-        for (name, seconds) in [
-            ("project", passes.project),
-            ("sort", passes.sort),
-            ("bin", passes.bin),
-            ("forward", passes.forward),
-            ("backward", passes.backward),
-            ("gather", passes.gather),
-        ] {
-            dict.set_item(name, seconds)?;
-        }
-        Ok(dict)
+        passes(py, &self.inner.passes())
     }
 
     /// Work done by the last forward pass.
@@ -276,6 +265,21 @@ impl PyRasterizer {
         dict.set_item("evaluated", counts.evaluated)?;
         Ok(dict)
     }
+}
+
+pub fn passes<'py>(py: Python<'py>, passes: &Passes) -> PyResult<Bound<'py, PyDict>> {
+    let dict = PyDict::new(py);
+    for (name, seconds) in [
+        ("project", passes.project),
+        ("sort", passes.sort),
+        ("bin", passes.bin),
+        ("forward", passes.forward),
+        ("backward", passes.backward),
+        ("gather", passes.gather),
+    ] {
+        dict.set_item(name, seconds)?;
+    }
+    Ok(dict)
 }
 
 /// Per-Gaussian sums over all `views`: a dict of (N,) arrays.

@@ -69,6 +69,16 @@ fn lap(from: &mut Instant) -> f64 {
     seconds
 }
 
+/// One chunk of rows after the backward pass: its visible splats and where their sums lie.
+pub(crate) struct ChunkSums<'a> {
+    pub view: &'a View,
+    pub first_group: usize,
+    pub last_group: usize,
+    pub splats: &'a [Splat],
+    pub slots: &'a [[f32; SUMS]],
+    pub written: &'a [u8],
+}
+
 struct Frame {
     camera: Camera,
     settings: Settings,
@@ -165,7 +175,7 @@ impl Rasterizer {
                 return Err(Error::invalid(name, format!("{expected} values"), got));
             }
         }
-        self.prepare(*params, camera, settings, background)?;
+        self.prepare(*params, camera, settings, background);
         let mut clock = Instant::now();
         if image.depth.is_some() || image.median.is_some() {
             self.blend::<true>(image);
@@ -246,6 +256,50 @@ impl Rasterizer {
         Ok(())
     }
 
+    /// Renders any source, image only.
+    pub(crate) fn forward_from<S: Source>(
+        &mut self,
+        source: S,
+        camera: &Camera,
+        settings: &Settings,
+        background: [f32; 3],
+        image: &mut Image,
+    ) {
+        self.prepare(source, camera, settings, background);
+        let mut clock = Instant::now();
+        self.blend::<false>(image);
+        self.passes.forward = lap(&mut clock);
+    }
+
+    /// Fills the slots, then calls `finish(chunk, slots of the chunk's splats)` for every chunk of rows, in parallel,
+    /// and returns what the calls do, in order.
+    pub(crate) fn backward_by_chunk<T: Send>(
+        &mut self,
+        image: &ImageGradients,
+        finish: impl Fn(&ChunkSums) -> T + Sync,
+    ) -> Vec<T> {
+        let mut clock = Instant::now();
+        self.unblend::<false>(image);
+        self.passes.backward = lap(&mut clock);
+        let Some(frame) = &self.frame else {
+            return Vec::new();
+        };
+        let groups = frame.rows.div_ceil(LANES);
+        let finish = |(chunk, &(first, count)): (usize, &(usize, usize))| {
+            finish(&ChunkSums {
+                view: &frame.view,
+                first_group: chunk * CHUNK,
+                last_group: groups.min((chunk + 1) * CHUNK),
+                splats: &self.splats[first..first + count],
+                slots: &self.slots,
+                written: &self.written,
+            })
+        };
+        let results = self.chunks.par_iter().enumerate().map(finish).collect();
+        self.passes.gather = lap(&mut clock);
+        results
+    }
+
     /// Renders a view without an image and adds what every Gaussian contributes to it.
     pub fn accumulate(
         &mut self,
@@ -264,7 +318,7 @@ impl Rasterizer {
                 sums.weight.len(),
             ));
         }
-        self.prepare(*params, camera, settings, [0.0; 3])?;
+        self.prepare(*params, camera, settings, [0.0; 3]);
         let pixels = camera.width * camera.height;
         let (mut rgb, mut alpha) = (vec![0.0; 3 * pixels], vec![0.0; pixels]);
         let mut image = Image {
@@ -316,7 +370,7 @@ impl Rasterizer {
         camera: &Camera,
         settings: &Settings,
         background: [f32; 3],
-    ) -> Result<()> {
+    ) {
         let view = View::new(camera, settings);
         self.frame = Some(Frame {
             camera: *camera,
@@ -341,7 +395,6 @@ impl Rasterizer {
             first += ((tile[1] - tile[0]) as usize).div_ceil(BATCH);
         }
         self.words.resize(first, [0; BLOCKS]);
-        Ok(())
     }
 
     fn project<S: Source>(&mut self, view: &View, source: S) {

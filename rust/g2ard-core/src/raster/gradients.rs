@@ -141,42 +141,59 @@ impl<S: Source, K: Sink> Kernel for Gather<'_, S, K> {
         let mut next = 0;
         while next < self.splats.len() {
             let group = self.splats[next].row as usize / LANES;
-            let mut rows = [Row::default(); SUMS];
-            let mut touched = 0u16;
-            while next < self.splats.len() && self.splats[next].row as usize / LANES == group {
-                let splat = &self.splats[next];
-                next += 1;
-                let (from, to) = (splat.slot as usize, (splat.slot + splat.tiles) as usize);
-                let mut sum = [0f32; SUMS];
-                let mut any = 0;
-                for slot in from..to {
-                    if self.written[slot] != 0 {
-                        any = 1;
-                        for k in 0..SUMS {
-                            sum[k] += self.slots[slot][k];
-                        }
-                    }
-                }
-                let lane = splat.row as usize % LANES;
-                touched |= any << lane;
-                for k in 0..SUMS {
-                    rows[k].0[lane] = sum[k];
-                }
-            }
+            let (touched, screen) =
+                collect::<F>(self.splats, &mut next, group, self.slots, self.written);
             if touched == 0 {
                 continue;
             }
-            let mut moments = [F::zero(); 6];
-            for k in 0..6 {
-                moments[k] = F::load(&rows[k]);
-            }
-            let screen = ScreenGradients {
-                moments,
-                rgb: [F::load(&rows[6]), F::load(&rows[7]), F::load(&rows[8])],
-                depth: F::load(&rows[9]),
-            };
             let gradients = unproject::<F, S>(self.view, &self.source, group, &screen);
             self.sink.take(group, touched, &gradients);
         }
     }
+}
+
+/// Adds up the slots of the splats of one group, from `splats[*next]` on. Returns the lanes that any pixel touched.
+#[inline(always)]
+pub(crate) fn collect<F: Lanes>(
+    splats: &[Splat],
+    next: &mut usize,
+    group: usize,
+    slots: &[[f32; SUMS]],
+    written: &[u8],
+) -> (u16, ScreenGradients<F>) {
+    let mut rows = [Row::default(); SUMS];
+    let mut touched = 0u16;
+    while *next < splats.len() && splats[*next].row as usize / LANES == group {
+        let splat = &splats[*next];
+        *next += 1;
+        let (from, to) = (splat.slot as usize, (splat.slot + splat.tiles) as usize);
+        let mut sum = [0f32; SUMS];
+        let mut any = 0;
+        for slot in from..to {
+            if written[slot] != 0 {
+                any = 1;
+                for k in 0..SUMS {
+                    sum[k] += slots[slot][k];
+                }
+            }
+        }
+        let lane = splat.row as usize % LANES;
+        touched |= any << lane;
+        for k in 0..SUMS {
+            rows[k].0[lane] = sum[k];
+        }
+    }
+    let mut moments = [F::zero(); 6];
+    for k in 0..6 {
+        moments[k] = F::load(&rows[k]);
+    }
+    let rgb = [F::load(&rows[6]), F::load(&rows[7]), F::load(&rows[8])];
+    (
+        touched,
+        ScreenGradients {
+            moments,
+            rgb,
+            depth: F::load(&rows[9]),
+        },
+    )
 }

@@ -9,13 +9,13 @@
 //! is skipped; a pixel stops before its transmittance would fall to 1e-4; colour = max(0, 0.5 + SH).
 
 mod accumulate;
-mod backward;
+pub(crate) mod backward;
 mod forward;
-mod frame;
-mod gradients;
-mod order;
-mod params;
-mod project;
+pub(crate) mod frame;
+pub(crate) mod gradients;
+pub(crate) mod order;
+pub(crate) mod params;
+pub(crate) mod project;
 mod sh;
 pub mod simd;
 mod tiles;

@@ -35,6 +35,13 @@ impl<T> Shared<T> {
         unsafe { self.0.add(i).write(value) }
     }
     /// # Safety
+    /// As for [`Self::write`].
+    #[inline(always)]
+    pub unsafe fn at(self, i: usize) -> *mut T {
+        // SAFETY: the caller's promise.
+        unsafe { self.0.add(i) }
+    }
+    /// # Safety
     /// As for [`Self::write`], for the `len` elements from `i`.
     #[inline(always)]
     #[allow(clippy::mut_from_ref)]

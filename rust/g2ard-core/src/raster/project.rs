@@ -288,7 +288,7 @@ fn half_log2<F: Lanes>(x: F) -> F {
 }
 
 #[inline(always)]
-fn unit_quaternion<F: Lanes, S: Source>(source: &S, group: usize) -> ([F; 4], F) {
+pub fn unit_quaternion<F: Lanes, S: Source>(source: &S, group: usize) -> ([F; 4], F) {
     let mut q = [F::zero(); 4];
     for k in 0..4 {
         q[k] = source.quat::<F>(group, k);
@@ -310,7 +310,7 @@ fn unit_quaternion<F: Lanes, S: Source>(source: &S, group: usize) -> ([F; 4], F)
 }
 
 #[inline(always)]
-fn rotation<F: Lanes>(q: &[F; 4]) -> [[F; 3]; 3] {
+pub fn rotation<F: Lanes>(q: &[F; 4]) -> [[F; 3]; 3] {
     let [w, x, y, z] = *q;
     let (one, two) = (F::splat(1.0), F::splat(2.0));
     let (xx, yy, zz) = (x * x, y * y, z * z);
@@ -499,7 +499,7 @@ pub fn unproject<F: Lanes, S: Source>(
             }
         }
     }
-    let quat = quaternion_gradient(&p, &dr);
+    let quat = quaternion_gradient(&p.q, p.rq, &dr);
 
     // J·W = (f/z)·(Wᵢ − t·W₂): the 1/z in front, then t where it was not clamped.
     let focal = [F::splat(view.fx as f32), F::splat(view.fy as f32)];
@@ -555,10 +555,10 @@ pub fn unproject<F: Lanes, S: Source>(
     }
 }
 
-/// dL/dR → dL/dq for R(q/|q|).
+/// dL/dR → dL/dq for R(q/|q|), from the unit quaternion and 1/|q|.
 #[inline(always)]
-fn quaternion_gradient<F: Lanes>(p: &Projected<F>, g: &[[F; 3]; 3]) -> [F; 4] {
-    let [w, x, y, z] = p.q;
+pub fn quaternion_gradient<F: Lanes>(q: &[F; 4], rq: F, g: &[[F; 3]; 3]) -> [F; 4] {
+    let [w, x, y, z] = *q;
     let two = F::splat(2.0);
     let (sxy, sxz, syz) = (g[0][1] + g[1][0], g[0][2] + g[2][0], g[1][2] + g[2][1]);
     let (ax, ay, az) = (g[2][1] - g[1][2], g[0][2] - g[2][0], g[1][0] - g[0][1]);
@@ -571,7 +571,7 @@ fn quaternion_gradient<F: Lanes>(p: &Projected<F>, g: &[[F; 3]; 3]) -> [F; 4] {
     let radial = w * d[0] + x * d[1] + y * d[2] + z * d[3];
     let mut out = [F::zero(); 4];
     for k in 0..4 {
-        out[k] = (d[k] - p.q[k] * radial) * p.rq;
+        out[k] = (d[k] - q[k] * radial) * rq;
     }
     out
 }
