@@ -97,3 +97,31 @@ def accumulate(
 def l1_ssim(image: _F32, target: _F32, ssim_weight: float) -> tuple[float, _F32]: ...
 def ssim(image: _F32, target: _F32) -> float: ...
 def psnr(image: _F32, target: _F32) -> float: ...
+
+_F64 = NDArray[np.float64]
+_Surface = tuple[_F64, _F64, _F64, _F64, float]
+_Scene = tuple[NDArray[Any], ...]
+
+def select_surface(scene: _Scene, cells: int) -> dict[str, Any]: ...
+def select_depth(scene: _Scene, view: _View | tuple[Any, ...], stride: int) -> _F32: ...
+def select_visible(
+    scene: _Scene,
+    surface: _Surface,
+    views: list[tuple[Any, ...]],
+    stride: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[NDArray[np.uint64], NDArray[np.uint32]]: ...
+def select_greedy(
+    surface: _Surface,
+    starts: NDArray[np.uint64],
+    cells: NDArray[np.uint32],
+    positions: _F64,
+    k: int,
+    *,
+    directional: bool,
+    kappa: float,
+    alpha: float,
+    lambda_: float,
+    lazy: bool,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[NDArray[np.uint32], _F64, int]: ...

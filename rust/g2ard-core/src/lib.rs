@@ -8,6 +8,7 @@ pub mod error;
 pub mod lift;
 pub mod linalg;
 pub mod raster;
+pub mod select;
 pub mod simplify;
 pub mod spatial;
 pub mod splats;

@@ -6,6 +6,7 @@ mod arrays;
 mod error;
 mod lift;
 mod raster;
+mod select;
 mod simplify;
 mod ssim;
 mod train;
@@ -18,6 +19,7 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     lift::register(m)?;
     simplify::register(m)?;
     raster::register(m)?;
+    select::register(m)?;
     ssim::register(m)?;
     train::register(m)?;
     Ok(())

@@ -1,0 +1,377 @@
+//! What each view sees: the scene's median depth on every `stride`-th pixel, and the cells that lie at it.
+//!
+//! Pixels that are left out cost nothing, and those that are kept show what the full image would, bit for bit:
+//! thinning the lattice, unlike shrinking the image, changes no footprint.
+
+use rayon::prelude::*;
+
+use super::{Gaussians, Surface};
+use crate::raster::Camera;
+use crate::{Control, Result};
+
+/// As gsplat: splats are widened by 0.3 px², opacity ends at 0.99, less than 1/255 is nothing.
+const DILATION: f32 = 0.3;
+const ALPHA_MAX: f32 = 0.99;
+const ALPHA_MIN: f32 = 1.0 / 255.0;
+
+/// The Gaussians of a scene that can hide anything, ready to be projected.
+#[derive(Debug)]
+pub struct Opaque {
+    rows: Vec<Row>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Row {
+    mean: [f32; 3],
+    opacity: f32,
+    covariance: [f32; 6],
+}
+
+impl Opaque {
+    pub fn of(scene: &Gaussians<'_>) -> Self {
+        let rows = (0..scene.means.len())
+            .into_par_iter()
+            .filter(|&i| scene.opacities[i] >= ALPHA_MIN)
+            .map(|i| Row {
+                mean: scene.means[i].map(|v| v as f32),
+                opacity: scene.opacities[i],
+                covariance: scene.covariance(i).map(|v| v as f32),
+            })
+            .collect();
+        Self { rows }
+    }
+}
+
+/// A splat on the thinned lattice.
+struct Splat {
+    x: f32,
+    y: f32,
+    conic: [f32; 3],
+    opacity: f32,
+    columns: [u32; 2],
+    rows: [u32; 2],
+}
+
+/// The thinned lattice of one camera: sample (i, j) is the centre of pixel stride·(i, j) + stride/2.
+struct Lattice {
+    rotation: [[f32; 3]; 3],
+    translation: [f32; 3],
+    focal: [f32; 2],
+    center: [f32; 2],
+    limits: [[f32; 2]; 2],
+    near: f32,
+    stride: f32,
+    first: f32,
+    width: usize,
+    height: usize,
+}
+
+impl Lattice {
+    fn of(camera: &Camera, stride: usize) -> Self {
+        let (w, h) = (camera.width as f64, camera.height as f64);
+        let limit = |c: f64, f: f64, size: f64| {
+            [
+                (-c / f - 0.15 * size / f) as f32,
+                ((size - c) / f + 0.15 * size / f) as f32,
+            ]
+        };
+        let count = |size: usize| (size.saturating_sub(stride / 2)).div_ceil(stride);
+        Self {
+            rotation: [0, 1, 2].map(|r| [0, 1, 2].map(|c| camera.viewmat[r][c] as f32)),
+            translation: [0, 1, 2].map(|r| camera.viewmat[r][3] as f32),
+            focal: [camera.fx as f32, camera.fy as f32],
+            center: [camera.cx as f32, camera.cy as f32],
+            limits: [
+                limit(camera.cx, camera.fx, w),
+                limit(camera.cy, camera.fy, h),
+            ],
+            near: camera.near,
+            stride: stride as f32,
+            first: (stride / 2) as f32 + 0.5,
+            width: count(camera.width),
+            height: count(camera.height),
+        }
+    }
+
+    fn to_camera(&self, p: [f32; 3]) -> [f32; 3] {
+        [0, 1, 2].map(|r| {
+            let a = &self.rotation[r];
+            a[0] * p[0] + a[1] * p[1] + a[2] * p[2] + self.translation[r]
+        })
+    }
+
+    /// Samples within `reach` of `at` along an axis of `count`: [from, to).
+    fn span(&self, at: f32, reach: f32, count: usize) -> [u32; 2] {
+        let index = |v: f32| ((v - self.first) / self.stride).clamp(-1.0, count as f32);
+        let (from, to) = (
+            index(at - reach).ceil().max(0.0),
+            index(at + reach).floor() + 1.0,
+        );
+        [from as u32, (to.max(0.0) as u32).min(count as u32)]
+    }
+
+    /// The splat and its depth; None where no sample can show it.
+    fn project(&self, row: &Row) -> Option<(f32, Splat)> {
+        let [tx, ty, z] = self.to_camera(row.mean);
+        if z <= self.near {
+            return None;
+        }
+        let (x, y) = (
+            self.focal[0] * tx / z + self.center[0],
+            self.focal[1] * ty / z + self.center[1],
+        );
+        let (u, v) = (
+            (tx / z).clamp(self.limits[0][0], self.limits[0][1]),
+            (ty / z).clamp(self.limits[1][0], self.limits[1][1]),
+        );
+        // Rows of J·W: gradients of the pixel with respect to the world.
+        let w = &self.rotation;
+        let (a, b) = (self.focal[0] / z, self.focal[1] / z);
+        let jx = [0, 1, 2].map(|k| a * (w[0][k] - u * w[2][k]));
+        let jy = [0, 1, 2].map(|k| b * (w[1][k] - v * w[2][k]));
+        let s = &row.covariance;
+        let apply = |j: &[f32; 3]| {
+            [
+                s[0] * j[0] + s[1] * j[1] + s[2] * j[2],
+                s[1] * j[0] + s[3] * j[1] + s[4] * j[2],
+                s[2] * j[0] + s[4] * j[1] + s[5] * j[2],
+            ]
+        };
+        let dot = |p: &[f32; 3], q: &[f32; 3]| p[0] * q[0] + p[1] * q[1] + p[2] * q[2];
+        let (sx, sy) = (apply(&jx), apply(&jy));
+        let (xx, xy, yy) = (
+            dot(&sx, &jx) + DILATION,
+            dot(&sx, &jy),
+            dot(&sy, &jy) + DILATION,
+        );
+        let det = xx * yy - xy * xy;
+        if !(det > 0.0 && det.is_finite()) {
+            return None;
+        }
+        let reach = 2.0 * (row.opacity / ALPHA_MIN).ln();
+        let columns = self.span(x, (reach * xx).sqrt(), self.width);
+        let rows = self.span(y, (reach * yy).sqrt(), self.height);
+        if columns[0] >= columns[1] || rows[0] >= rows[1] {
+            return None;
+        }
+        let conic = [yy / det, -xy / det, xx / det];
+        Some((
+            z,
+            Splat {
+                x,
+                y,
+                conic,
+                opacity: row.opacity,
+                columns,
+                rows,
+            },
+        ))
+    }
+}
+
+/// What one thread needs for a view; kept from view to view.
+#[derive(Default)]
+struct Scratch {
+    splats: Vec<Splat>,
+    keys: Vec<u64>,
+    spare: Vec<u64>,
+    light: Vec<f32>,
+}
+
+impl Scratch {
+    /// Depth of the splat behind which less than half the light is left, 0 where there is none.
+    fn depth(&mut self, scene: &Opaque, lattice: &Lattice) -> Vec<f32> {
+        self.splats.clear();
+        self.keys.clear();
+        for row in &scene.rows {
+            if let Some((z, splat)) = lattice.project(row) {
+                self.keys
+                    .push(u64::from(z.to_bits()) << 32 | self.splats.len() as u64);
+                self.splats.push(splat);
+            }
+        }
+        sort_by_high_half(&mut self.keys, &mut self.spare);
+        let size = lattice.width * lattice.height;
+        let mut depth = vec![0.0; size];
+        self.light.clear();
+        self.light.resize(size, 1.0);
+        for &key in &self.keys {
+            let z = f32::from_bits((key >> 32) as u32);
+            let splat = &self.splats[(key & 0xffff_ffff) as usize];
+            draw(splat, z, lattice, &mut self.light, &mut depth);
+        }
+        depth
+    }
+}
+
+fn draw(s: &Splat, z: f32, lattice: &Lattice, light: &mut [f32], depth: &mut [f32]) {
+    for j in s.rows[0]..s.rows[1] {
+        let dy = lattice.first + lattice.stride * j as f32 - s.y;
+        for i in s.columns[0]..s.columns[1] {
+            let at = j as usize * lattice.width + i as usize;
+            if light[at] < 0.5 {
+                continue;
+            }
+            let dx = lattice.first + lattice.stride * i as f32 - s.x;
+            let power = 0.5 * (s.conic[0] * dx * dx + s.conic[2] * dy * dy) + s.conic[1] * dx * dy;
+            let alpha = (s.opacity * (-power).exp()).min(ALPHA_MAX);
+            if alpha < ALPHA_MIN || power < 0.0 {
+                continue;
+            }
+            light[at] *= 1.0 - alpha;
+            if light[at] < 0.5 {
+                depth[at] = z;
+            }
+        }
+    }
+}
+
+/// Radix sort by the upper 32 bits, stable: equal depths keep the order of the rows.
+fn sort_by_high_half(keys: &mut Vec<u64>, spare: &mut Vec<u64>) {
+    const BITS: u32 = 11;
+    spare.resize(keys.len(), 0);
+    for pass in 0..3 {
+        let digit = |k: u64| (k >> (32 + pass * BITS)) as usize & ((1 << BITS) - 1);
+        let mut starts = [0usize; 1 << BITS];
+        for &k in keys.iter() {
+            starts[digit(k)] += 1;
+        }
+        let mut total = 0;
+        for s in &mut starts {
+            total += std::mem::replace(s, total);
+        }
+        for &k in keys.iter() {
+            let slot = &mut starts[digit(k)];
+            spare[*slot] = k;
+            *slot += 1;
+        }
+        std::mem::swap(keys, spare);
+    }
+}
+
+/// Median depths of one camera, row by row of its thinned lattice, and the lattice's width.
+pub fn median_depths(scene: &Opaque, camera: &Camera, stride: usize) -> (Vec<f32>, usize) {
+    let lattice = Lattice::of(camera, stride);
+    (Scratch::default().depth(scene, &lattice), lattice.width)
+}
+
+/// For each camera the cells it sees, ascending: the cell's centre falls on the image and lies within
+/// max(cell size, 1 % of its depth) of the median depth at the nearest sample.
+pub fn visible(
+    scene: &Opaque,
+    surface: &Surface,
+    cameras: &[Camera],
+    stride: usize,
+    control: &Control,
+) -> Result<Vec<Vec<u32>>> {
+    control.begin(cameras.len() as u64);
+    let centers: Vec<[f32; 3]> = surface
+        .centers
+        .iter()
+        .map(|c| c.map(|v| v as f32))
+        .collect();
+    cameras
+        .par_iter()
+        .map_init(Scratch::default, |scratch, camera| {
+            control.check()?;
+            let lattice = Lattice::of(camera, stride);
+            let depth = scratch.depth(scene, &lattice);
+            let seen = (0..centers.len() as u32)
+                .filter(|&c| shows(&lattice, &depth, centers[c as usize], surface.size as f32))
+                .collect();
+            control.advance(1);
+            Ok(seen)
+        })
+        .collect()
+}
+
+fn shows(lattice: &Lattice, depth: &[f32], center: [f32; 3], size: f32) -> bool {
+    let [tx, ty, z] = lattice.to_camera(center);
+    if z <= lattice.near {
+        return false;
+    }
+    let nearest = |t: f32, axis: usize, count: usize| {
+        let pixel = lattice.focal[axis] * t / z + lattice.center[axis];
+        let index = (pixel - lattice.first + 0.5 * lattice.stride) / lattice.stride;
+        (index >= 0.0 && index < count as f32).then_some(index as usize)
+    };
+    let (Some(i), Some(j)) = (
+        nearest(tx, 0, lattice.width),
+        nearest(ty, 1, lattice.height),
+    ) else {
+        return false;
+    };
+    let median = depth[j * lattice.width + i];
+    median > 0.0 && (z - median).abs() <= size.max(0.01 * z)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sorts_stably_by_the_high_half() {
+        let mut state = 9u64;
+        let mut keys: Vec<u64> = (0..5000u64)
+            .map(|i| {
+                state = state
+                    .wrapping_mul(6364136223846793005)
+                    .wrapping_add(1442695040888963407);
+                ((state >> 40) % 97 * 40_000_000) << 32 | i
+            })
+            .collect();
+        let mut want = keys.clone();
+        want.sort_unstable();
+        sort_by_high_half(&mut keys, &mut Vec::new());
+        assert_eq!(keys, want);
+    }
+
+    #[test]
+    fn every_stride_shows_samples_of_the_whole_image() {
+        let mut means = Vec::new();
+        for i in 0..40 {
+            for j in 0..40 {
+                means.push([
+                    f64::from(i) * 0.1 - 2.0,
+                    f64::from(j) * 0.1 - 2.0,
+                    f64::from(i * j % 7) * 0.2,
+                ]);
+            }
+        }
+        let n = means.len();
+        let scene = Gaussians {
+            means: &means,
+            quats: &vec![[0.9, 0.1, 0.3, 0.0]; n],
+            scales: &vec![[0.08, 0.05, 0.01]; n],
+            opacities: &vec![0.7; n],
+        };
+        let camera = Camera {
+            viewmat: [
+                [1.0, 0.0, 0.0, 0.0],
+                [0.0, 1.0, 0.0, 0.0],
+                [0.0, 0.0, 1.0, 4.0],
+            ],
+            fx: 60.0,
+            fy: 60.0,
+            cx: 31.0,
+            cy: 24.0,
+            width: 63,
+            height: 47,
+            near: 0.01,
+        };
+        let opaque = Opaque::of(&scene);
+        let (whole, width) = median_depths(&opaque, &camera, 1);
+        assert_eq!((width, whole.len()), (63, 63 * 47));
+        assert!(whole.iter().filter(|&&d| d > 0.0).count() > 1000);
+        for stride in [2, 3, 5] {
+            let (thin, columns) = median_depths(&opaque, &camera, stride);
+            for (k, &d) in thin.iter().enumerate() {
+                let (i, j) = (
+                    k % columns * stride + stride / 2,
+                    k / columns * stride + stride / 2,
+                );
+                assert_eq!(d, whole[j * 63 + i]);
+            }
+        }
+    }
+}
