@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 _PITCHES = (-25.0, 10.0)
 """Degrees above the horizon that eyes gaze at."""
 
-_HEIGHTS = {True: (0.35, 0.75), False: (0.12, 0.5)}
+_HEIGHTS = {True: (0.35, 0.75), False: (0.2, 0.6)}
 """Of eyes over the ground, in heights of the room indoors, of what stands around outdoors."""
 
 _SKY = 0.25
