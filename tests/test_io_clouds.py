@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import sys
 from pathlib import Path
 
@@ -150,7 +151,19 @@ def test_las_without_color(tmp_path: Path) -> None:
 def test_broken_las(tmp_path: Path, suffix: str, keep: int) -> None:
     path = las(tmp_path / f"a{suffix}", FAR + np.arange(600.0).reshape(200, 3), np.ones((200, 3), int))
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(InputError, match=rf"a\{suffix}: (cannot be read as LAS|truncated)"):
+    with pytest.raises(InputError, match=rf"a\{suffix}: (cannot be read as LAS|truncated|broken)"):
+        read_points(path)
+
+
+def test_absurd_chunk_table(tmp_path: Path) -> None:
+    """Handed to lazrs as it is, this one would abort the process."""
+    path = las(tmp_path / "a.laz", np.arange(30.0).reshape(10, 3), np.ones((10, 3), int))
+    data = bytearray(path.read_bytes())
+    (points_at,) = struct.unpack_from("<I", data, 96)
+    (table,) = struct.unpack_from("<q", data, points_at)
+    struct.pack_into("<I", data, table + 4, 3_000_000_000)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="3,000,000,000 chunks for 10 points"):
         read_points(path)
 
 

@@ -40,7 +40,7 @@ def test_loss_and_gradient_are_the_twin_s(shape: tuple[int, int, int], kind: str
         x64 = torch.from_numpy(a.astype(np.float64)).requires_grad_()
         want = reference.l1_ssim(x64, torch.from_numpy(b.astype(np.float64)), weight)
         (3 * want).backward()
-        assert abs(loss.item() - want.item()) < 5e-6
+        assert abs(loss.item() - want.item()) < 1e-5
         assert x.grad is not None
         assert x64.grad is not None
         error = float((x.grad - x64.grad).norm() / x64.grad.norm().clamp(min=1e-9))

@@ -278,6 +278,28 @@ def test_refuses_bad_rays(town):
         town.cast([0, 0, 1], [[1, 0]])
 
 
+def test_command_line(tmp_path, command_line):
+    options = ["--points", "2k", "--views", "8", "--size", "40x30", "--blocks", "1", "--sky", "0,0,0"]
+    options += ["--offset", "1e6,2e6,100", "--seed", "5"]
+
+    def run(*more):
+        return command_line("synth", "city", "-o", "out", *options, *more, cwd=tmp_path)
+
+    status, out, err = run("-q", "--json", "-")
+    assert (status, err) == (0, "")
+    assert json.loads(out)["options"]["size"] == [40, 30]
+    assert json.loads(out)["options"]["seed"] == 5
+    cloud = read_points(tmp_path / "out" / "cloud.ply")
+    assert len(cloud) == 2000
+    np.testing.assert_allclose(cloud.positions.mean(0), [1e6, 2e6, 105], atol=30)
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+    status, _, err = run()
+    assert status == 1
+    assert "exists" in err
+    for wrong in (["--size", "0x4"], ["--points", "25%"], ["--offset", "1,2"], ["--views", "3"]):
+        assert run("-w", *wrong)[0] == 2
+
+
 def test_is_quick():
     began = time.perf_counter()
     town = city(blocks=3, views=40, size=(400, 300))

@@ -16,6 +16,7 @@ __all__ = [
     "OutputOption",
     "RatioOption",
     "SceneArgument",
+    "Triple",
     "ViewsOption",
     "budget_of",
     "one_budget",
@@ -106,8 +107,12 @@ def budget_of(count: Count | None, ratio: float | None, total: int) -> int:
     return max(1, math.floor(total / ratio + 0.5))
 
 
-def _colour(text: str) -> tuple[float, float, float]:
-    named = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+class Triple(tuple[float, float, float]):
+    """Three numbers in one argument; a class, for typer reads a bare tuple as several."""
+
+
+def _colour(text: str) -> Triple:
+    named = {"black": Triple((0.0, 0.0, 0.0)), "white": Triple((1.0, 1.0, 1.0))}
     if text in named:
         return named[text]
     try:
@@ -116,7 +121,7 @@ def _colour(text: str) -> tuple[float, float, float]:
         values = ()
     if len(values) != 3 or not all(0 <= v <= 1 for v in values):
         raise typer.BadParameter(f"black, white or three numbers in [0, 1] such as 0.2,0.3,0.4, not {text!r}")
-    return (values[0], values[1], values[2])
+    return Triple((values[0], values[1], values[2]))
 
 
 SplitOption = Annotated[
@@ -126,7 +131,7 @@ SizeOption = Annotated[
     int | None, typer.Option(min=16, metavar="PIXELS", help="Shrink views to this longer side.")
 ]
 BackgroundOption = Annotated[
-    tuple[float, float, float] | None,
+    Triple | None,
     typer.Option(parser=_colour, metavar="COLOUR", help="black (the default), white or R,G,B in [0, 1]."),
 ]
 TeacherOption = Annotated[

@@ -100,10 +100,12 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     frames = []
     for image in sorted(found, key=lambda i: i.name):
         if image.camera not in cameras:
-            raise InputError(f"{tables[1]}: {image.name} names camera {image.camera}, which is absent")
+            raise InputError(f"{tables[1]}: {image.name!r} names camera {image.camera}, which is absent")
         camera = cameras[image.camera]
         photo = photos / image.name if photos else None
-        frames.append(Frame(image.name, _viewmat(image), camera.K, camera.size, photo, camera.distortion))
+        frames.append(
+            Frame(image.name, _viewmat(tables[1], image), camera.K, camera.size, photo, camera.distortion)
+        )
     return view_set(folder, frames)
 
 
@@ -112,12 +114,12 @@ def _photo_folder(path: Path, model: Path) -> Path | None:
     return next((root / "images" for root in roots if (root / "images").is_dir()), None)
 
 
-def _viewmat(image: _Image) -> NDArray[np.float64]:
+def _viewmat(path: Path, image: _Image) -> NDArray[np.float64]:
     import numpy as np
 
     q = np.array(image.quat)
     if not np.linalg.norm(q) > 0:
-        raise InputError(f"{image.name}: its quaternion is zero")
+        raise InputError(f"{path}: {image.name!r}: its quaternion is zero")
     w, x, y, z = q / np.linalg.norm(q)
     view = np.eye(4)
     view[:3, :3] = [
@@ -172,7 +174,7 @@ def _images_bin(path: Path) -> list[_Image]:
         images.append(_Image(data[at + 64 : end].decode(), camera, tuple(pose[:4]), tuple(pose[4:])))
         at = end + 9 + 24 * points
         if at > len(data):
-            raise InputError(f"{path}: truncated in the points of {images[-1].name}")
+            raise InputError(f"{path}: truncated in the points of {images[-1].name!r}")
     return images
 
 

@@ -2,7 +2,7 @@
 
 from importlib import import_module
 
-COMMANDS = ("distill", "lift", "simplify", "recover", "render", "evaluate", "synth", "info", "poses")
+COMMANDS = ("distill", "simplify", "recover", "lift", "poses", "render", "evaluate", "info", "synth")
 
 for _name in COMMANDS:
     import_module(f"{__name__}.{_name}")

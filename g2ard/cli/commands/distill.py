@@ -49,6 +49,10 @@ def distill(
             help="Targets: the views' photos, or the scene's renders; photos if there are.",
         ),
     ] = None,
+    held_out: Annotated[
+        Path | None,
+        typer.Option(metavar="VIEWS", help="Score on these; --views is then all for recovery."),
+    ] = None,
     method: Annotated[str, typer.Option(metavar="default|fast|paper", help="How to simplify.")] = "default",
     preset: Annotated[
         str, typer.Option(metavar="auto|trained|lift|noisy", help="Which regularisers hold the geometry.")
@@ -78,7 +82,7 @@ def distill(
     from g2ard.recover.schedule import schedule_named
 
     began = time.monotonic()
-    lifted = kind(scene) == "points"
+    lifted = kind(scene) != "splats"
     if lifted and views is None:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
     work = check_output(output, run.overwrite or resume, folder=True) / "work"
@@ -87,7 +91,7 @@ def distill(
     if not resume:
         shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True, exist_ok=True)
-    train, test, use_photos = _views(run, views or _pool(run, prior, output), size, photos, lifted)
+    train, test, use_photos = _views(run, views or _pool(run, prior, output), held_out, size, photos, lifted)
     teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
     colour = background or (0.0, 0.0, 0.0)
     regularizers, why = preset_for("lift" if preset == "auto" and lifted else preset, prior)
@@ -108,11 +112,11 @@ def distill(
     except KeyboardInterrupt:
         run.say(f"stopped; the same command with --resume goes on in {output}")
         raise
-    held_out = make_targets(run, test, teacher, colour)
-    report = _score(run, prior, result, held_out, colour)
+    unseen = make_targets(run, test, teacher, colour)
+    report = _score(run, prior, result, unseen, colour)
     report |= {"against": against, "preset": why, "rounds": result.report["rounds"]}
     report["seconds"] = {**result.report["seconds"], "total": time.monotonic() - began}
-    _write(run, output, result, held_out, colour, report)
+    _write(run, output, result, unseen, colour, report)
     shutil.rmtree(work)
     _table(run, report)
     run.say(
@@ -151,20 +155,21 @@ def _pool(run: Run, prior: Splats, output: Path) -> Path:
 
 
 def _views(
-    run: Run, path: Path, size: int | None, photos: bool | None, lifted: bool
+    run: Run, path: Path, held_out: Path | None, size: int | None, photos: bool | None, lifted: bool
 ) -> tuple[Cameras, Cameras, bool]:
     """Training views, held-out views, and whether their photos are the targets."""
-    train, test = (load_views(run, path, split, size) for split in ("train", "test"))
+    train = load_views(run, path, "all" if held_out else "train", size)
+    test = load_views(run, held_out or path, "all" if held_out else "test", size)
     pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
     return train, test, lifted or (pictured if photos is None else photos)
 
 
-def _score(run: Run, prior: Splats, result: Distilled, held_out: Targets, colour: Colour) -> dict[str, Any]:
+def _score(run: Run, prior: Splats, result: Distilled, unseen: Targets, colour: Colour) -> dict[str, Any]:
     from g2ard.evaluate import evaluate
 
     scenes = {"simplified": result.simplified, "recovered": result.splats}
     scores = {
-        name: evaluate(splats, held_out, background=colour, progress=run.progress, stage=f"score {name}")
+        name: evaluate(splats, unseen, background=colour, progress=run.progress, stage=f"score {name}")
         for name, splats in scenes.items()
     }
     return {
@@ -176,7 +181,7 @@ def _score(run: Run, prior: Splats, result: Distilled, held_out: Targets, colour
 
 
 def _write(
-    run: Run, output: Path, result: Distilled, held_out: Targets, colour: Colour, report: dict[str, Any]
+    run: Run, output: Path, result: Distilled, unseen: Targets, colour: Colour, report: dict[str, Any]
 ) -> None:
     import json
 
@@ -185,7 +190,7 @@ def _write(
     from g2ard.preview import preview
 
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
-    preview(output / "preview.png", held_out, scenes, colour)
+    preview(output / "preview.png", unseen, scenes, colour)
     with atomic_output(output / "report.json", overwrite=True) as temporary:
         temporary.write_text(json.dumps({**report, "config": run.config}, indent=2, default=str) + "\n")
     write_splats(output / "scene.ply", result.splats, overwrite=True)

@@ -9,24 +9,28 @@ from typing import Annotated
 import typer
 
 from g2ard.cli.frame import Run, command, group
-from g2ard.cli.options import BackgroundOption, Count
+from g2ard.cli.options import BackgroundOption, Count, Triple
 
-synth = group("synth", "Make data where none is at hand.")
+synth = group("synth", "Make data where none is at hand.\n\nExample: g2ard synth city -o city/")
 
 
-def _size(text: str) -> tuple[int, int]:
+class _Size(tuple[int, int]):
+    """Width and height in one argument (see `Triple`)."""
+
+
+def _size(text: str) -> _Size:
     match = re.fullmatch(r"(\d+)[x×](\d+)", text.strip())
     if match is None or not (int(match[1]) and int(match[2])):
         raise typer.BadParameter(f"a size such as 800x600, not {text!r}")
-    return int(match[1]), int(match[2])
+    return _Size((int(match[1]), int(match[2])))
 
 
-def _offset(text: str) -> tuple[float, float, float]:
+def _offset(text: str) -> Triple:
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
         raise typer.BadParameter(f"three numbers such as 443000,4428000,1600, not {text!r}") from None
-    return x, y, z
+    return Triple((x, y, z))
 
 
 @command("city", parent=synth, example="g2ard synth city -o city/ --points 1M --views 120")
@@ -41,7 +45,7 @@ def city(
     ] = None,
     views: Annotated[int, typer.Option(min=8, help="Photos in all four splits together.")] = 120,
     size: Annotated[
-        tuple[int, int] | None,
+        _Size | None,
         typer.Option(parser=_size, metavar="WxH", help="Size of a photo; 800x600 if not given."),
     ] = None,
     blocks: Annotated[int, typer.Option(min=1, max=40, help="City blocks along each side.")] = 3,
@@ -50,7 +54,7 @@ def city(
     supersample: Annotated[int, typer.Option(min=1, max=8, help="Samples a pixel along each axis.")] = 2,
     sky: BackgroundOption = None,
     offset: Annotated[
-        tuple[float, float, float] | None,
+        Triple | None,
         typer.Option(parser=_offset, metavar="X,Y,Z", help="World coordinates of the middle, as maps have."),
     ] = None,
     depth: Annotated[bool, typer.Option("--depth", help="Also write exact depth, metres, as .npy.")] = False,

@@ -250,6 +250,23 @@ impl PyRasterizer {
             .collect()
     }
 
+    /// Seconds the passes of the last calls took.
+    fn passes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let passes = self.inner.passes();
+        let dict = PyDict::new(py);
+        for (name, seconds) in [
+            ("project", passes.project),
+            ("sort", passes.sort),
+            ("bin", passes.bin),
+            ("forward", passes.forward),
+            ("backward", passes.backward),
+            ("gather", passes.gather),
+        ] {
+            dict.set_item(name, seconds)?;
+        }
+        Ok(dict)
+    }
+
     /// Work done by the last forward pass.
     fn counts<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let counts = self.inner.counts();

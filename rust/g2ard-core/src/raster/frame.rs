@@ -1,5 +1,7 @@
 //! The passes in order, and the buffers they share: one view's worth, reused from call to call.
 
+use std::time::Instant;
+
 use rayon::prelude::*;
 
 use super::accumulate::{Accumulate, Accumulated, total};
@@ -46,6 +48,27 @@ pub struct Counts {
     pub evaluated: u64,
 }
 
+/// Seconds the passes of the last calls took.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Passes {
+    pub project: f64,
+    pub sort: f64,
+    pub bin: f64,
+    pub forward: f64,
+    /// Tiles, from the image's gradient to the slots.
+    pub backward: f64,
+    /// From the slots to the parameters, and whatever the caller does with their gradient there.
+    pub gather: f64,
+}
+
+/// Seconds since `from`, which becomes now.
+fn lap(from: &mut Instant) -> f64 {
+    let now = Instant::now();
+    let seconds = now.duration_since(*from).as_secs_f64();
+    *from = now;
+    seconds
+}
+
 struct Frame {
     camera: Camera,
     settings: Settings,
@@ -71,6 +94,7 @@ pub struct Rasterizer {
     last: Vec<[Row; BLOCKS]>,
     slots: Vec<[f32; SUMS]>,
     written: Vec<u8>,
+    passes: Passes,
 }
 
 #[derive(Default)]
@@ -102,6 +126,7 @@ impl Rasterizer {
             last: Vec::new(),
             slots: Vec::new(),
             written: Vec::new(),
+            passes: Passes::default(),
         }
     }
 
@@ -141,11 +166,13 @@ impl Rasterizer {
             }
         }
         self.prepare(*params, camera, settings, background)?;
+        let mut clock = Instant::now();
         if image.depth.is_some() || image.median.is_some() {
             self.blend::<true>(image);
         } else {
             self.blend::<false>(image);
         }
+        self.passes.forward = lap(&mut clock);
         Ok(())
     }
 
@@ -194,11 +221,13 @@ impl Rasterizer {
                 return Err(Error::invalid(name, expected.to_string(), got));
             }
         }
+        let mut clock = Instant::now();
         if image.depth.is_some() {
             self.unblend::<true>(image);
         } else {
             self.unblend::<false>(image);
         }
+        self.passes.backward = lap(&mut clock);
         let Some(frame) = &self.frame else {
             return Ok(());
         };
@@ -213,6 +242,7 @@ impl Rasterizer {
             };
             dispatch(self.isa, gather);
         });
+        self.passes.gather = lap(&mut clock);
         Ok(())
     }
 
@@ -261,6 +291,11 @@ impl Rasterizer {
         Ok(())
     }
 
+    /// How long the last calls' passes took.
+    pub fn passes(&self) -> Passes {
+        self.passes
+    }
+
     pub fn counts(&self) -> Counts {
         let words = self
             .batches
@@ -290,11 +325,15 @@ impl Rasterizer {
             background,
             rows: source.len(),
         });
+        let mut clock = Instant::now();
         self.project(&view, source);
+        self.passes.project = lap(&mut clock);
         self.collect_keys();
         order::sort(&mut self.order, &mut self.spare);
+        self.passes.sort = lap(&mut clock);
         self.bins
             .fill(&self.order, &mut self.splats, &self.chunks, camera.tiles());
+        self.passes.bin = lap(&mut clock);
         self.batches.clear();
         let mut first = 0;
         for tile in self.bins.starts.windows(2) {

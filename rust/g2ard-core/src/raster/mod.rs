@@ -21,7 +21,7 @@ pub mod simd;
 mod tiles;
 
 pub use accumulate::Accumulated;
-pub use frame::{Counts, Image, ImageGradients, Rasterizer};
+pub use frame::{Counts, Image, ImageGradients, Passes, Rasterizer};
 pub use gradients::Gradients;
 pub use params::Params;
 pub use simd::Isa;
