@@ -51,7 +51,8 @@ def plan_walk(
     def judge(poses: Poses) -> Floats:
         seen = look(site, poses, lens)
         covered = seen.covered / (0.8 if indoors else 0.5)
-        return np.minimum(covered, np.minimum(seen.close / (2 * room), seen.median / (5 * room)))
+        near, far = (2, 5) if indoors else (4, 8)
+        return np.minimum(covered, np.minimum(seen.close / (near * room), seen.median / (far * room)))
 
     return gather(count, propose, judge, tell)
 
