@@ -197,8 +197,8 @@ def simplify(
 
     `default` aims at the error in the image. In rounds that lock what they merge, the cheapest pairs of
     neighbours become one: mean, covariance and SH averaged by mass, mass m = α·A *as rendered* conserved,
-    with A = √tr adj(Σ + e²I) and e the blur of a renderer. A pair costs the squared error of its projections times
-    how much of it the views see. Without `visibility` it needs no cameras at all.
+    with A = √tr adj(Σ + e²I) and e the blur of a renderer. A pair costs the squared error of its projections
+    times how much of it the views see. Without `visibility` it needs no cameras at all.
 
     `paper`: rounds of 75 %; each drops α < 0.01, merges cell × colour-bin groups by moment matching where the
     affine-energy and surface-coverage guards pass, and trims by π = −log(1 − α)·A·(1 + λ_h·p)
