@@ -15,8 +15,8 @@ __all__ = ["Grid"]
 
 Floats = NDArray[np.float64]
 
-_CELLS = 2_000_000
-"""Cells in all: matter thinner than a 128th of a cubic scene does not matter to where cameras may stand."""
+_CELLS = (2_000_000, 6_000_000)
+"""Cells in all, one for each Gaussian between these: a large scene is looked at more finely."""
 
 _OPAQUE = 0.3
 """Opacity × area, summed, per face of a cell: above it light hardly passes."""
@@ -45,8 +45,9 @@ class Grid:
     murky: NDArray[np.int8]
 
     @classmethod
-    def of(cls, low: Floats, high: Floats, matter: Matter, axes: Floats, *, cells: int = _CELLS) -> Grid:
-        """Fill the box from `low` to `high`, in coordinates along the rows of `axes`."""
+    def of(cls, low: Floats, high: Floats, matter: Matter, axes: Floats, *, cells: int = 0) -> Grid:
+        """Fill the box from `low` to `high`, along the rows of `axes`; 0 cells means by the matter's rows."""
+        cells = cells or int(np.clip(len(matter.points), *_CELLS))
         sides = np.maximum(high - low, np.max(high - low) / 256)
         cell = float(np.cbrt(np.prod(sides) / cells))
         shape = np.maximum(1, np.ceil(sides / cell)).astype(int)

@@ -82,13 +82,14 @@ class Matter:
         Raises:
             InputError: nothing is visible.
         """
-        rows = np.flatnonzero(splats.finite_rows() & (splats.opacities > 1 / 255))
+        opacities = splats.opacities.astype(np.float64)
+        rows = np.flatnonzero(splats.finite_rows() & (opacities > 1 / 255))
         rows = rows[canonical_order(splats, rows)]
+        opacities = opacities[rows]
         means = splats.means[rows].astype(np.float64)
         scales = np.abs(splats.scales[rows])
         order = np.argsort(scales, axis=1, kind="stable")
         scales = np.take_along_axis(scales, order, axis=1).astype(np.float64)
-        opacities = splats.opacities[rows].astype(np.float64)
         areas = scales[:, 1] * scales[:, 2]
         if not (areas > 0).any():
             raise InputError("the scene has nothing to look at: no visible Gaussian with a surface")

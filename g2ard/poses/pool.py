@@ -58,7 +58,11 @@ def plan_pool(
     seed: int = 0,
     progress: Progress = silent,
 ) -> Pool:
-    """As `make_pool`, with what was found out about the scene."""
+    """As `make_pool` (see there for all but the result), and what was found out about the scene.
+
+    Raises:
+        InputError: as `make_pool`.
+    """
     lens = _lens(size, fov)
     if count < 1:
         raise InputError(f"count: expected at least 1 pose, got {count}")
@@ -97,6 +101,8 @@ def _planned(
     used: list[str] = []
     for kind, share in kinds.items():
         wanted = round(share * (count - sum(len(part) for part in parts)))
+        if not wanted:
+            continue
         if kind == "walk":
             part = plan_walk(site, wanted, lens, seed, tell, indoors=shape_of(site)[0] == "room")
         else:

@@ -24,7 +24,7 @@ def shape_of(site: Site) -> tuple[str, str]:
     """
     inside = _surrounded(site)
     if inside > (0.5 if site.terrain is not None else 0.75):
-        return "room", f"matter surrounds {inside:.0%} of its box"
+        return "room", f"{inside:.0%} of its box is free and enclosed"
     sides = site.box[1] - site.box[0]
     flat = float(sides[2] / max(np.sqrt(sides[0] * sides[1]), np.finfo(float).tiny))
     if site.terrain is not None and flat < _FLAT:

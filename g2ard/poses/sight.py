@@ -84,12 +84,12 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Per pose (P,): the share of the frame that meets matter, and at which distances.
+    """Per pose (P,): the share of the frame that meets matter, and how far the view is open.
 
     Args:
-        covered: share of the rays that hit.
+        covered: share of the rays that opaque matter stops.
         close: the distance at which a tenth of the rays have met something, if only leaves or haze.
-        median: of the hits' distances; inf where nothing is hit.
+        median: the distance at which half of those that meet anything have; inf where none does.
     """
 
     covered: Floats
@@ -109,10 +109,8 @@ def look(site: Site, poses: Poses, lens: Lens, wanted: NDArray[np.bool_] | None 
     for i in range(len(poses)) if wanted is None else np.flatnonzero(wanted):
         directions = np.einsum("ri,ij->rj", rays, frames[i])
         eyes = np.broadcast_to(poses.eyes[i], directions.shape)
-        hits = np.sort(site.grid.cast(eyes, directions))
-        tenth = len(rays) // 10
-        close[i] = np.partition(site.grid.cast(eyes, directions, murky=True), tenth)[tenth]
-        count = int(np.isfinite(hits).sum())
-        covered[i] = count / len(hits)
-        median[i] = hits[count // 2] if count else np.inf
+        covered[i] = np.isfinite(site.grid.cast(eyes, directions)).mean()
+        met = np.sort(site.grid.cast(eyes, directions, murky=True))
+        count = int(np.isfinite(met).sum())
+        close[i], median[i] = met[len(met) // 10], met[count // 2] if count else np.inf
     return Seen(covered, close, median)

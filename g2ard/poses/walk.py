@@ -25,6 +25,9 @@ _HEIGHTS = {True: (0.35, 0.75), False: (0.2, 0.6)}
 _SKY = 0.25
 """Outdoors at least this share of the sky is open: else the place is inside a hollow building."""
 
+_TRIES = (512, 2048)
+"""Places tried; more poses than are free share places and look elsewhere."""
+
 _HALLS = 0.15
 """Places that at least this share of all can be walked to from are kept; fewer are hollows."""
 
@@ -34,10 +37,11 @@ def plan_walk(
 ) -> Poses:
     """At most `count` poses at eye height in free space that hangs together, gazing all around.
 
-    Gazes into a near wall, or out of the scene, are left out.
+    Gazes into a near wall or leaves, or out of the scene, are left out.
     """
     room = _clearance(site, indoors)
-    places = _places(site, max(512, 4 * count), seed, room, indoors)
+    far = 0.4 * min(site.box[1, :2] - site.box[0, :2]) if indoors else site.tallness
+    places = _places(site, int(np.clip(4 * count, *_TRIES)), seed, room, indoors)
     if not len(places):
         return Poses(np.zeros((0, 3)), np.zeros((0, 3)))
 
@@ -51,8 +55,7 @@ def plan_walk(
     def judge(poses: Poses) -> Floats:
         seen = look(site, poses, lens)
         covered = seen.covered / (0.8 if indoors else 0.5)
-        near, far = (2, 5) if indoors else (4, 8)
-        return np.minimum(covered, np.minimum(seen.close / (near * room), seen.median / (far * room)))
+        return np.minimum(covered, np.minimum(seen.close / (2 * room), seen.median / far))
 
     return gather(count, propose, judge, tell)
 
@@ -88,13 +91,15 @@ def _places(site: Site, tries: int, seed: int, room: float, indoors: bool) -> Fl
         points = points[enclosed(site, points) > 0.7]
     else:
         points = points[_met(site, points, fibonacci(32, low=0.5, high=1.0)) < 1 - _SKY]
+        points = points[_met(site, points, fibonacci(16, low=-1.0, high=-0.8)) > 0.8]
     return points[_together(site, points)] if len(points) else points
 
 
 def _together(site: Site, points: Floats) -> NDArray[np.bool_]:
     """Which points belong to a large part of the graph of points in sight of their neighbours."""
     count = len(points)
-    near = np.argsort(((points[:, None] - points) ** 2).sum(axis=2), axis=1, kind="stable")[:, 1:13]
+    apart = sum((column[:, None] - column) ** 2 for column in points.T)
+    near = np.argsort(apart, axis=1, kind="stable")[:, 1:13]
     start, stop = np.repeat(np.arange(count), near.shape[1]), near.ravel()
     ways = points[stop] - points[start]
     lengths = np.linalg.norm(ways, axis=1)
