@@ -23,6 +23,10 @@ struct Row {
     mean: [f32; 3],
     opacity: f32,
     covariance: [f32; 6],
+    /// No direction has more variance.
+    trace: f32,
+    /// (distance/σ)² at which α falls to 1/255.
+    reach: f32,
 }
 
 impl Opaque {
@@ -30,10 +34,15 @@ impl Opaque {
         let rows = (0..scene.means.len())
             .into_par_iter()
             .filter(|&i| scene.opacities[i] >= ALPHA_MIN)
-            .map(|i| Row {
-                mean: scene.means[i].map(|v| v as f32),
-                opacity: scene.opacities[i],
-                covariance: scene.covariance(i).map(|v| v as f32),
+            .map(|i| {
+                let covariance = scene.covariance(i).map(|v| v as f32);
+                Row {
+                    mean: scene.means[i].map(|v| v as f32),
+                    opacity: scene.opacities[i],
+                    covariance,
+                    trace: covariance[0] + covariance[3] + covariance[5],
+                    reach: 2.0 * (scene.opacities[i] / ALPHA_MIN).ln(),
+                }
             })
             .collect();
         Self { rows }
@@ -127,9 +136,17 @@ impl Pinhole {
             (tx / z).clamp(self.limits[0][0], self.limits[0][1]),
             (ty / z).clamp(self.limits[1][0], self.limits[1][1]),
         );
+        let (a, b) = (self.focal[0] / z, self.focal[1] / z);
+        // Most Gaussians are out of sight: a bound on their extent is enough to tell.
+        let out = |at: f32, size: usize| at - at.clamp(0.0, size as f32);
+        let far = |d: f32, scale: f32, t: f32| {
+            d * d > row.reach * (row.trace * scale * scale * (1.0 + t * t) + DILATION)
+        };
+        if far(out(x, self.width), a, u) || far(out(y, self.height), b, v) {
+            return None;
+        }
         // Rows of J·W: gradients of the pixel with respect to the world.
         let w = &self.rotation;
-        let (a, b) = (self.focal[0] / z, self.focal[1] / z);
         let jx = [0, 1, 2].map(|k| a * (w[0][k] - u * w[2][k]));
         let jy = [0, 1, 2].map(|k| b * (w[1][k] - v * w[2][k]));
         let s = &row.covariance;
@@ -151,9 +168,8 @@ impl Pinhole {
         if !(det > 0.0 && det.is_finite()) {
             return None;
         }
-        let reach = 2.0 * (row.opacity / ALPHA_MIN).ln();
-        let columns = Self::span(x, (reach * xx).sqrt(), self.width);
-        let rows = Self::span(y, (reach * yy).sqrt(), self.height);
+        let columns = Self::span(x, (row.reach * xx).sqrt(), self.width);
+        let rows = Self::span(y, (row.reach * yy).sqrt(), self.height);
         if columns[0] >= columns[1] || rows[0] >= rows[1] {
             return None;
         }
