@@ -41,6 +41,20 @@ def simplify_paper(
     protection: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]: ...
+def simplify_pairwise(
+    scene: Splats,
+    schedule: list[int],
+    *,
+    protected: NDArray[np.bool_] | None,
+    weight: NDArray[np.float32] | None,
+    pixel_size: NDArray[np.float32] | None,
+    min_opacity: float,
+    neighbors: int,
+    geometric: float,
+    dilation: float,
+    pixel_scale: float,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]: ...
 
 _F32 = NDArray[np.float32]
 _Arrays = tuple[_F32, ...]

@@ -132,6 +132,13 @@ def test_paper_schedule_runs_with_its_own_rates(student: Splats, targets: Teache
     assert result.report["psnr"]["after"] > result.report["psnr"]["before"]
 
 
+def test_a_time_limit_sets_the_horizon(student: Splats, targets: TeacherRenders) -> None:
+    report = recover(student, targets, RecoverConfig(time_limit=1.0)).report
+    assert report["steps"] > 5
+    assert 1.0 <= report["seconds"] < 2.5
+    assert report["psnr"]["after"] > report["psnr"]["before"] + 1
+
+
 def test_a_far_offset_changes_nothing_but_the_offset(student: Splats, targets: TeacherRenders) -> None:
     far = np.array([447_000.0, 5_411_000.0, 130.0])
     moved = replace(student, offset=student.offset + far)

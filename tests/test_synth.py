@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -298,11 +297,3 @@ def test_command_line(tmp_path, command_line):
     assert "exists" in err
     for wrong in (["--size", "0x4"], ["--points", "25%"], ["--offset", "1,2"], ["--views", "3"]):
         assert run("-w", *wrong)[0] == 2
-
-
-def test_is_quick():
-    began = time.perf_counter()
-    town = city(blocks=3, views=40, size=(400, 300))
-    town.points(50_000)
-    town.photo(town.views["train"], 0)
-    assert time.perf_counter() - began < 40  # some 6 s on two idle cores

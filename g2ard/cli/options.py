@@ -139,9 +139,22 @@ TeacherOption = Annotated[
     typer.Option("--teacher", metavar="SCENE", help="Its renders are the targets; without it, the photos."),
 ]
 
-Method = Literal["default", "fast", "paper"]
+Method = Literal["default", "paper"]
 ScheduleName = Literal["fast", "default", "best", "paper"]
 PresetOption = Annotated[
     Literal["auto", "trained", "lift", "noisy"],
     typer.Option(help="Which regularisers hold the geometry; auto measures the scene."),
+]
+
+
+def _duration(text: str) -> float:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|min|h)?", text.strip())
+    if match is None or not float(match[1]) > 0:
+        raise typer.BadParameter(f"a time such as 90s, 2m or 1h, not {text!r}")
+    return float(match[1]) * {"s": 1, "m": 60, "min": 60, "h": 3600}[match[2] or "s"]
+
+
+TimeLimitOption = Annotated[
+    float | None,
+    typer.Option("--time-limit", parser=_duration, metavar="TIME", help="Fit recovery into 90s, 2m or 1h."),
 ]

@@ -30,7 +30,7 @@ def plan_aerial(site: Site, count: int, lens: Lens, seed: int, tell: Callable[[i
     """At most `count` poses above everything, their footprints spread evenly over the scene.
 
     The height follows from the count: few poses see much each, many see detail. Poses in or close to
-    matter, or with half their frame empty, are left out.
+    matter, or with a quarter of their frame empty, are left out.
     """
     height = _height(site, count, lens)
 
@@ -50,7 +50,7 @@ def plan_aerial(site: Site, count: int, lens: Lens, seed: int, tell: Callable[[i
     def judge(poses: Poses) -> Floats:
         free = (site.grid.distance(poses.eyes) > 3 * site.grid.cell) & (site.above_ground(poses.eyes) > 0)
         seen = look(site, poses, lens, free)
-        return np.where(seen.close > 0.3 * height, seen.covered / 0.6, 0.0)
+        return np.where(seen.close > 0.3 * height, seen.covered / 0.75, 0.0)
 
     return gather(count, propose, judge, tell)
 

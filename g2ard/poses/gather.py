@@ -42,7 +42,8 @@ def gather(
         parts.append(propose(asked, asked + more))
         scores.append(judge(parts[-1]))
         asked += more
-        tell(min(good, count), count)
+        tell(min(good, count - 1), count)
+    tell(count, count)
     score = np.minimum(np.concatenate(scores), 1.0)
     best = np.argsort(-score, kind="stable")[:count]
     return Poses.joined(parts).take(np.sort(best[score[best] >= _TOLERABLE]))

@@ -21,6 +21,9 @@ _CELLS = 2_000_000
 _OPAQUE = 0.3
 """Opacity × area, summed, per face of a cell: above it light hardly passes."""
 
+_MURKY = 0.04
+"""Above it a cell has something in it: leaves, glass, haze. No place for a camera."""
+
 _REACH = 12
 """Distances are known up to this many cells, enough for rays to stride through free space."""
 
@@ -32,20 +35,20 @@ class Grid:
     Args:
         low: (3,) corner.
         cell: side.
-        opaque: (X, Y, Z) whether light is stopped.
-        steps: (X, Y, Z) int8 distance to the nearest opaque cell in king's moves, at most `_REACH`.
+        opaque: (X, Y, Z) int8 king's moves to the nearest cell that stops light, at most `_REACH`.
+        murky: likewise to the nearest cell that is not quite empty.
     """
 
     low: Floats
     cell: float
-    opaque: NDArray[np.bool_]
-    steps: NDArray[np.int8]
+    opaque: NDArray[np.int8]
+    murky: NDArray[np.int8]
 
     @classmethod
-    def of(cls, low: Floats, high: Floats, matter: Matter, axes: Floats) -> Grid:
+    def of(cls, low: Floats, high: Floats, matter: Matter, axes: Floats, *, cells: int = _CELLS) -> Grid:
         """Fill the box from `low` to `high`, in coordinates along the rows of `axes`."""
         sides = np.maximum(high - low, np.max(high - low) / 256)
-        cell = float(np.cbrt(np.prod(sides) / _CELLS))
+        cell = float(np.cbrt(np.prod(sides) / cells))
         shape = np.maximum(1, np.ceil(sides / cell)).astype(int)
         points, filled = turned(matter.points, axes), np.zeros(int(np.prod(shape)))
         optical = matter.opacities * 2 * np.pi * matter.scales[:, 1] * matter.scales[:, 2] / cell**2
@@ -58,29 +61,29 @@ class Grid:
                 at = points[rows] if spans is None else points[rows] + a * spans[:, 0] + b * spans[:, 1]
                 index, inside = _index(at, low, cell, shape)
                 filled += np.bincount(index[inside], share[inside], filled.size)
-        opaque = (filled > _OPAQUE).reshape(shape)
-        return cls(low, cell, opaque, _steps(opaque))
+        opaque, murky = (_steps((filled > limit).reshape(shape)) for limit in (_OPAQUE, _MURKY))
+        return cls(low, cell, opaque, murky)
 
     def distance(self, points: Floats) -> Floats:
-        """(M,) from points to the nearest opaque cell, never too long; to the box where that is nearer.
+        """(M,) from points to the nearest cell with something in it, or from outside to the box if farther.
 
-        Beyond `_REACH` cells the answer is `_REACH` cells.
+        Within the box what lies farther than `_REACH` cells is not looked for.
         """
-        index, inside = _index(points, self.low, self.cell, np.array(self.steps.shape))
-        found = np.maximum(self.steps.ravel()[index].astype(np.float64) - 0.5, 0) * self.cell
-        high = self.low + self.cell * np.array(self.steps.shape)
+        index, inside = _index(points, self.low, self.cell, np.array(self.murky.shape))
+        found = np.maximum(self.murky.ravel()[index].astype(np.float64) - 1, 0) * self.cell
+        high = self.low + self.cell * np.array(self.murky.shape)
         outside = norms(np.maximum(0, np.maximum(self.low - points, points - high)))
         return np.where(inside, found, np.maximum(outside, found))
 
-    def cast(self, eyes: Floats, directions: Floats) -> Floats:
-        """(M,) distances at which rays of unit direction first meet an opaque cell; inf where they do not."""
+    def cast(self, eyes: Floats, directions: Floats, *, murky: bool = False) -> Floats:
+        """(M,) distances at which unit rays first meet an opaque cell, or a murky one; inf if they do not."""
         shape = np.array(self.opaque.shape)
         with np.errstate(divide="ignore", invalid="ignore"):
             ends = (np.stack([self.low, self.low + self.cell * shape])[:, None] - eyes) / directions
         near = np.nan_to_num(ends.min(axis=0), nan=-np.inf).max(axis=1)
         far = np.nan_to_num(ends.max(axis=0), nan=np.inf).min(axis=1)
         reached, hits = np.maximum(near, 0) + 0.01 * self.cell, np.full(len(eyes), np.inf)
-        steps, rows = self.steps.ravel(), np.flatnonzero(reached < far)
+        steps, rows = (self.murky if murky else self.opaque).ravel(), np.flatnonzero(reached < far)
         while len(rows):
             index, _ = _index(eyes[rows] + reached[rows, None] * directions[rows], self.low, self.cell, shape)
             ahead = steps[index]

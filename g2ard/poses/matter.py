@@ -16,8 +16,8 @@ __all__ = ["Matter", "Sample"]
 
 Floats = NDArray[np.float64]
 
-_FAR = 8.0
-"""Floaters and sky: farther from the middle than this many median distances."""
+_FAR = 7.0
+"""Floaters and sky: farther from the middle than this many times the radius of two thirds of the rows."""
 
 _WIDEST = 16.0
 """No Gaussian weighs more than this many median ones, or a sky of a few hundred would outweigh the rest."""
@@ -93,7 +93,7 @@ class Matter:
         if not (areas > 0).any():
             raise InputError("the scene has nothing to look at: no visible Gaussian with a surface")
         weights = opacities * np.minimum(areas / middle(areas[areas > 0]), _WIDEST)
-        near = _near(means, weights)
+        near = _near(means, opacities)
         origin, size = _frame(means[near][:_SAMPLE], weights[near][:_SAMPLE], scales[near][:_SAMPLE])
         return cls(
             points=(means[near] - origin) / size,
@@ -137,13 +137,16 @@ class Matter:
 
 
 def _near(means: Floats, weights: Floats) -> NDArray[np.bool_]:
-    """Rows within `_FAR` median distances of the middle, found again once the farthest are out."""
+    """Rows within `_FAR` usual distances of the middle, found again once the farthest are out.
+
+    Weighed by opacity alone: a sky is few rows and much area.
+    """
     near = np.ones(len(means), bool)
     for _ in range(4):
         some = np.flatnonzero(near)[:_SAMPLE]
         centre = np.array([quantile(means[some, a], weights[some], 0.5) for a in range(3)])
         distances = norms(means - centre)
-        within = distances <= _FAR * float(quantile(distances[some], weights[some], 0.5))
+        within = distances <= _FAR * float(quantile(distances[some], weights[some], 2 / 3))
         if (within == near).all():
             break
         near = within

@@ -30,7 +30,7 @@ _OUTLINE = 8_000
 def plan_orbit(site: Site, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]) -> Poses:
     """At most `count` poses around the middle of the matter, evenly over the dome.
 
-    Poses below the ground, in or close to matter, or that see nothing are left out.
+    Poses below the ground, in or close to matter are left out; the rest see it, for it fills their frame.
     """
     target = site.box.mean(axis=0)
     low, high = np.sin(np.radians(_ELEVATIONS))
@@ -46,8 +46,7 @@ def plan_orbit(site: Site, count: int, lens: Lens, seed: int, tell: Callable[[in
 
     def judge(poses: Poses) -> Floats:
         free = (site.grid.distance(poses.eyes) > 2 * site.grid.cell) & (site.above_ground(poses.eyes) > 0.02)
-        seen = look(site, poses, lens, free)
-        return ((seen.covered > 0.01) & (seen.close > 4 * site.grid.cell)).astype(float)
+        return (look(site, poses, lens, free).close > 4 * site.grid.cell).astype(float)
 
     return gather(count, propose, judge, tell)
 

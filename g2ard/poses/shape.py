@@ -28,8 +28,8 @@ def shape_of(site: Site) -> tuple[str, str]:
     sides = site.box[1] - site.box[0]
     flat = float(sides[2] / max(np.sqrt(sides[0] * sides[1]), np.finfo(float).tiny))
     if site.terrain is not None and flat < _FLAT:
-        return "landscape", f"its height is {flat:.0%} of its width"
-    return "object", f"its height is {flat:.0%} of its width, matter surrounds {inside:.0%} of its box"
+        return "landscape", f"{flat:.2g} times as high as wide"
+    return "object", f"{flat:.2g} times as high as wide, open around"
 
 
 def _surrounded(site: Site) -> float:

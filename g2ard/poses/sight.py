@@ -88,7 +88,7 @@ class Seen:
 
     Args:
         covered: share of the rays that hit.
-        close: the distance that a tenth of the hits stay below; inf where nothing is hit.
+        close: the distance at which a tenth of the rays have met something, if only leaves or haze.
         median: of the hits' distances; inf where nothing is hit.
     """
 
@@ -104,12 +104,15 @@ def look(site: Site, poses: Poses, lens: Lens, wanted: NDArray[np.bool_] | None 
     y = lens.tangents[1] * ((np.arange(rows) + 0.5) / rows * 2 - 1)
     rays = np.stack([np.tile(x, rows), np.repeat(y, columns), np.ones(columns * rows)], axis=1)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    covered, close, median = np.zeros(len(poses)), np.zeros(len(poses)), np.zeros(len(poses))
+    covered, close, median = (np.zeros(len(poses)) for _ in range(3))
     frames = poses.frames()
     for i in range(len(poses)) if wanted is None else np.flatnonzero(wanted):
         directions = np.einsum("ri,ij->rj", rays, frames[i])
-        hits = np.sort(site.grid.cast(np.broadcast_to(poses.eyes[i], directions.shape), directions))
+        eyes = np.broadcast_to(poses.eyes[i], directions.shape)
+        hits = np.sort(site.grid.cast(eyes, directions))
+        tenth = len(rays) // 10
+        close[i] = np.partition(site.grid.cast(eyes, directions, murky=True), tenth)[tenth]
         count = int(np.isfinite(hits).sum())
         covered[i] = count / len(hits)
-        close[i], median[i] = (hits[count // 10], hits[count // 2]) if count else (np.inf, np.inf)
+        median[i] = hits[count // 2] if count else np.inf
     return Seen(covered, close, median)

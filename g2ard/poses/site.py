@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.poses.grid import Grid
 from g2ard.poses.matter import Matter, Sample
-from g2ard.poses.numbers import along, moments, quantile, turned
+from g2ard.poses.numbers import along, middle, moments, quantile, turned
 from g2ard.poses.terrain import Terrain
 from g2ard.poses.up import Up, estimate_up, given_up
 from g2ard.splats import Splats
@@ -58,6 +58,8 @@ class Site:
         axes = _axes(some, found.axis)
         points = turned(some.points, axes)
         box = np.array([quantile(points[:, a], some.weights, [0.01, 0.99]) for a in range(3)]).T
+        body = 1.5 * middle(matter.scales[:, 2])  # of a scene no larger than its Gaussians
+        box += np.maximum(0, body - (box[1] - box[0]) / 2) * np.array([[-1.0], [1.0]])
         room = 0.1 * (box[1] - box[0]) + 0.02
         grid = Grid.of(box[0] - room, box[1] + room, matter, axes)
         facing = np.abs(along(some.normals, found.axis)) > np.cos(np.radians(35))

@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 _PITCHES = (-25.0, 10.0)
 """Degrees above the horizon that eyes gaze at."""
 
-_HEIGHTS = {True: (0.35, 0.75), False: (0.12, 0.5)}
+_HEIGHTS = {True: (0.35, 0.75), False: (0.2, 0.6)}
 """Of eyes over the ground, in heights of the room indoors, of what stands around outdoors."""
 
 _SKY = 0.25
@@ -51,7 +51,8 @@ def plan_walk(
     def judge(poses: Poses) -> Floats:
         seen = look(site, poses, lens)
         covered = seen.covered / (0.8 if indoors else 0.5)
-        return np.minimum(covered, np.minimum(seen.close / (2 * room), seen.median / (5 * room)))
+        near, far = (2, 5) if indoors else (4, 8)
+        return np.minimum(covered, np.minimum(seen.close / (near * room), seen.median / (far * room)))
 
     return gather(count, propose, judge, tell)
 

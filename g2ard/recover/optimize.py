@@ -33,6 +33,8 @@ class RecoverConfig:
     Args:
         schedule: rates, horizon and decay.
         steps: overrides the schedule's horizon.
+        time_limit: seconds; the horizon becomes what fits into them, so that the result depends on the
+            machine's speed.
         regularizers: weights of L_anchor and L_shape (`tab:s_recovery`).
         sh_degree: of the result; None keeps the student's.
         ssim_weight: λ in (1−λ)·L1 + λ·(1−SSIM); 0.2 as 3DGS has it.
@@ -45,6 +47,7 @@ class RecoverConfig:
 
     schedule: Schedule = TUNED
     steps: int | None = None
+    time_limit: float | None = None
     regularizers: Regularizers = PRESETS["trained"]
     sh_degree: int | None = None
     ssim_weight: float = 0.2
@@ -139,7 +142,7 @@ def recover(
     return Recovered(
         result,
         {
-            "steps": config.horizon,
+            "steps": loop.done,
             "seconds": loop.seconds,
             "loss": loop.curve(),
             "psnr": {"before": before, "after": after},
@@ -171,36 +174,50 @@ class _Loop:
         )
         self.done = 0
         self.seconds = 0.0
-        self.losses = np.zeros(config.horizon)
+        self.losses: list[float] = []
         self.key = _fingerprint(student, targets, config)
 
     def run(self, checkpoint: Path | None, progress: Progress, stage: str) -> None:
         if checkpoint is not None and checkpoint.exists():
             self._resume(checkpoint)
-        horizon, config = self.config.horizon, self.config
-        began, saved, earlier, first = time.monotonic(), time.monotonic(), self.seconds, self.done
+        earlier, began, saved = self.seconds, time.monotonic(), time.monotonic()
         with checkpoints.deferred_interrupt() as interrupted:
-            while self.done < horizon:
-                step = self.done
-                rates = config.schedule.at(step, horizon, final=config.final, multiplier=self.multiplier)
-                view = self._view(step)
-                regularize = config.regularizers.active and (step + 1) % config.regularizers.period == 0
-                self.losses[step] = self.engine.step(view, self.targets[view], rates, regularize=regularize)
-                self.done += 1
+            while self._share() < 1:
+                self._step()
                 now = time.monotonic()
                 self.seconds = earlier + now - began
-                speed = (self.done - first) / max(now - began, 1e-9)
-                recent = self.losses[max(0, self.done - 20) : self.done].mean()
-                progress(stage, self.done, horizon, {"loss": f"{recent:.4f}", "steps/s": f"{speed:.1f}"})
+                self._tell(progress, stage)
                 if checkpoint is not None and (interrupted.is_set() or now - saved > checkpoints.PERIOD):
                     self._save(checkpoint)
                     saved = now
                 if interrupted.is_set():
                     raise KeyboardInterrupt
 
+    def _share(self) -> float:
+        """How much of the horizon, of steps or of seconds, has been used."""
+        if self.config.time_limit is not None:
+            return self.seconds / self.config.time_limit
+        return self.done / self.config.horizon
+
+    def _step(self) -> None:
+        config, step = self.config, self.done
+        rates = config.schedule.at(self._share(), final=config.final, multiplier=self.multiplier)
+        view = self._view(step)
+        regularize = config.regularizers.active and (step + 1) % config.regularizers.period == 0
+        self.losses.append(self.engine.step(view, self.targets[view], rates, regularize=regularize))
+        self.done += 1
+
+    def _tell(self, progress: Progress, stage: str) -> None:
+        speed = self.done / max(self.seconds, 1e-9)
+        recent = np.mean(self.losses[-20:])
+        total = self.config.horizon
+        if self.config.time_limit is not None:
+            total = max(self.done, round(self.done / max(self._share(), 1e-9)))
+        progress(stage, self.done, total, {"loss": f"{recent:.4f}", "steps/s": f"{speed:.1f}"})
+
     def curve(self) -> list[float]:
         """Up to 100 means of the loss over equal stretches of the horizon."""
-        return [float(part.mean()) for part in np.array_split(self.losses, 100) if len(part)]
+        return [float(part.mean()) for part in np.array_split(np.array(self.losses), 100) if len(part)]
 
     def _view(self, step: int) -> int:
         """Views in a fresh random order each time all have been seen; depends on seed and step alone."""
@@ -210,11 +227,11 @@ class _Loop:
 
     def _save(self, path: Path) -> None:
         meta = {"done": self.done, "seconds": self.seconds, "multiplier": self.multiplier}
-        checkpoints.save(path, self.key, meta, {**self.engine.state(), "losses": self.losses})
+        checkpoints.save(path, self.key, meta, {**self.engine.state(), "losses": np.array(self.losses)})
 
     def _resume(self, path: Path) -> None:
         meta, arrays = checkpoints.load(path, self.key)
-        self.losses = arrays.pop("losses")
+        self.losses = arrays.pop("losses").tolist()
         self.engine.load(arrays)
         self.done, self.seconds = int(meta["done"]), float(meta["seconds"])
         self.multiplier = float(meta["multiplier"])

@@ -19,6 +19,7 @@ from g2ard.cli.options import (
     RatioOption,
     ScheduleName,
     SizeOption,
+    TimeLimitOption,
     ViewsOption,
     budget_of,
     one_budget,
@@ -64,6 +65,7 @@ def distill(
         ScheduleName, typer.Option(help="Recovery; paper also goes round by round.")
     ] = "default",
     steps: Annotated[int | None, typer.Option(min=1, help="Overrides the final horizon.")] = None,
+    time_limit: TimeLimitOption = None,
     sh_degree: Annotated[
         int | None,
         typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own, 3 from a cloud."),
@@ -103,6 +105,7 @@ def distill(
         method=method,
         schedule=schedule_named(schedule),
         steps=steps,
+        time_limit=time_limit,
         regularizers=regularizers,
         sh_degree=sh_degree if sh_degree is not None else (3 if lifted or schedule == "paper" else None),
         background=colour,

@@ -2,36 +2,37 @@
 
 from __future__ import annotations
 
+import math
+import re
 from typing import Annotated
 
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import OutputOption, SceneArgument
+from g2ard.cli.options import OutputOption, SceneArgument, Triple
 
 _KINDS = ("auto", "orbit", "walk", "aerial")
 
 
-def _numbers(text: str, separator: str, count: int) -> tuple[float, ...] | None:
-    try:
-        values = tuple(float(part) for part in text.lower().split(separator))
-    except ValueError:
-        return None
-    return values if len(values) == count else None
+class _Size(tuple[int, int]):
+    """Width and height in one argument (see `Triple`)."""
 
 
-def _size(text: str) -> tuple[int, int]:
-    values = _numbers(text.replace("×", "x"), "x", 2)
-    if values is None or any(v != round(v) or not 16 <= v <= 16384 for v in values):
+def _size(text: str) -> _Size:
+    match = re.fullmatch(r"(\d+)[x×](\d+)", text.strip())
+    if match is None or not all(16 <= int(side) <= 16384 for side in match.groups()):
         raise typer.BadParameter(f"width x height in pixels from 16 to 16384, such as 800x600, not {text!r}")
-    return int(values[0]), int(values[1])
+    return _Size((int(match[1]), int(match[2])))
 
 
-def _direction(text: str) -> tuple[float, float, float]:
-    values = _numbers(text, ",", 3)
-    if values is None or not all(abs(v) < 1e30 for v in values) or not any(values):
+def _direction(text: str) -> Triple:
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not (all(abs(v) < 1e30 for v in (x, y, z)) and any((x, y, z))):
         raise typer.BadParameter(f"a direction such as 0,0,1 or 0,-1,0, not {text!r}")
-    return values[0], values[1], values[2]
+    return Triple((x, y, z))
 
 
 def _kind(text: str) -> str:
@@ -55,12 +56,12 @@ def poses(
     ] = "auto",
     count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many poses.")] = 128,
     size: Annotated[
-        tuple[int, int] | None,
+        _Size | None,
         typer.Option(parser=_size, metavar="WxH", help="Pixels; 800x600 unless given."),
     ] = None,
     fov: Annotated[float, typer.Option(min=1, max=170, help="Horizontal field of view, degrees.")] = 50.0,
     up: Annotated[
-        tuple[float, float, float] | None,
+        Triple | None,
         typer.Option(
             parser=_direction, metavar="X,Y,Z", help="Away from the ground; estimated unless given."
         ),

@@ -16,6 +16,7 @@ from g2ard.cli.options import (
     SizeOption,
     SplitOption,
     TeacherOption,
+    TimeLimitOption,
 )
 
 
@@ -29,6 +30,7 @@ def recover(
     preset: PresetOption = "auto",
     schedule: Annotated[ScheduleName, typer.Option(help="Rates, decay and horizon.")] = "default",
     steps: Annotated[int | None, typer.Option(min=1, help="Overrides the schedule's horizon.")] = None,
+    time_limit: TimeLimitOption = None,
     sh_degree: Annotated[
         int | None,
         typer.Option("--sh-degree", min=0, max=3, help="Of the result; the student's if not given."),
@@ -59,6 +61,7 @@ def recover(
     config = RecoverConfig(
         schedule=schedule_named(schedule),
         steps=steps,
+        time_limit=time_limit,
         regularizers=regularizers,
         sh_degree=sh_degree,
         background=colour,

@@ -20,8 +20,11 @@ def simplify(
     output: OutputOption,
     count: CountOption = None,
     ratio: RatioOption = None,
-    method: Annotated[str, typer.Option(metavar="paper", help="The policy.")] = "paper",
-    retention: Annotated[float, typer.Option(help="Share of the Gaussians that a round keeps.")] = 0.75,
+    method: Annotated[str, typer.Option(metavar="default|paper", help="The policy.")] = "default",
+    retention: Annotated[
+        float | None,
+        typer.Option(help="Share of the Gaussians that a round keeps; the method's own if absent."),
+    ] = None,
 ) -> None:
     """Reduce a scene to an exact number of Gaussians; no images needed."""
     import time
@@ -77,7 +80,7 @@ def _tell(run: Run, small: Simplified) -> None:
                 r["before"],
                 r["dropped"],
                 r["merged_members"] - r["merged_groups"],
-                sum(r["refused"].values()),
+                sum(r.get("refused", {}).values()),
                 r["trimmed"],
                 r["after"],
             )

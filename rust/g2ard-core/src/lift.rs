@@ -95,7 +95,7 @@ pub fn lift(points: &[[f64; 3]], config: &LiftConfig, control: &Control) -> Resu
 }
 
 /// PCA of the point and its neighbours about their mean.
-fn patch(points: &[[f64; 3]], row: u32, near: &[Neighbor], config: &LiftConfig) -> Patch {
+fn patch(points: &[[f64; 3]], row: u32, near: &[Neighbor<f64>], config: &LiftConfig) -> Patch {
     let here = points[row as usize];
     let share = 1.0 / (near.len() + 1) as f64;
     let offsets = || near.iter().map(|n| sub(points[n.1 as usize], here));

@@ -1,6 +1,8 @@
 //! `g2ard.simplify`.
 
-use g2ard_core::simplify::{Means, Ordered, Outcome, Paper, PaperRound, SceneRef, flags};
+use g2ard_core::simplify::{
+    Means, Ordered, Outcome, Pairwise, PairwiseRound, Paper, PaperRound, SceneRef, Seen, flags,
+};
 use numpy::{
     PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
     PyUntypedArrayMethods,
@@ -60,7 +62,7 @@ fn simplify_flags<'py>(
     let scene = scene.borrow()?;
     let found = long(py, progress, |control| {
         let ordered = Ordered::new(&scene)?;
-        let found = flags(&ordered.splats, cells, threshold, control)?;
+        let found = flags(&ordered.splats(&scene), cells, threshold, control)?;
         let mut by_row = vec![false; found.len()];
         for (&row, &flag) in ordered.rows.iter().zip(&found) {
             by_row[row as usize] = flag;
@@ -104,7 +106,7 @@ fn simplify_paper<'py>(
         protection,
     };
     let outcome = long(py, progress, |control| {
-        { policy.run(&scene, protected, flag_cells, &schedule, control) }
+        policy.run(&scene, protected, flag_cells, &schedule, control)
     })?;
     let rounds = outcome
         .rounds
@@ -112,6 +114,75 @@ fn simplify_paper<'py>(
         .map(|r| round_dict(py, r))
         .collect::<PyResult<Vec<_>>>()?;
     outcome_dict(py, outcome, rounds)
+}
+
+/// The default: pairs of neighbours, cheapest first.
+#[pyfunction]
+#[pyo3(signature = (
+    scene, schedule, *, protected, weight, pixel_size, min_opacity, neighbors, geometric, dilation,
+    pixel_scale, progress=None
+))]
+fn simplify_pairwise<'py>(
+    py: Python<'py>,
+    scene: PyScene<'py>,
+    schedule: Vec<usize>,
+    protected: Option<PyReadonlyArray1<'py, bool>>,
+    weight: Option<PyReadonlyArray1<'py, f32>>,
+    pixel_size: Option<PyReadonlyArray1<'py, f32>>,
+    min_opacity: f64,
+    neighbors: usize,
+    geometric: f64,
+    dilation: f64,
+    pixel_scale: f64,
+    progress: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let scene = scene.borrow()?;
+    let protected = protected
+        .as_ref()
+        .map(|p| arrays::flat("protected", p))
+        .transpose()?;
+    let weight = weight
+        .as_ref()
+        .map(|a| arrays::flat("weight", a))
+        .transpose()?;
+    let pixel = pixel_size
+        .as_ref()
+        .map(|a| arrays::flat("pixel_size", a))
+        .transpose()?;
+    let seen = weight
+        .zip(pixel)
+        .map(|(weight, pixel)| Seen { weight, pixel });
+    let policy = Pairwise {
+        min_opacity,
+        neighbors,
+        geometric,
+        dilation,
+        pixel_scale,
+    };
+    let outcome = long(py, progress, |control| {
+        policy.run(&scene, seen, protected, &schedule, control)
+    })?;
+    let rounds = outcome
+        .rounds
+        .iter()
+        .map(|r| pairwise_dict(py, r))
+        .collect::<PyResult<Vec<_>>>()?;
+    outcome_dict(py, outcome, rounds)
+}
+
+fn pairwise_dict<'py>(py: Python<'py>, r: &PairwiseRound) -> PyResult<Bound<'py, PyDict>> {
+    let round = PyDict::new(py);
+    for (key, value) in [
+        ("before", r.before),
+        ("dropped", r.dropped),
+        ("merged_groups", r.merged),
+        ("merged_members", 2 * r.merged),
+        ("trimmed", 0),
+        ("after", r.after),
+    ] {
+        round.set_item(key, value)?;
+    }
+    Ok(round)
 }
 
 fn round_dict<'py>(py: Python<'py>, r: &PaperRound) -> PyResult<Bound<'py, PyDict>> {
@@ -153,6 +224,7 @@ fn outcome_dict<'py, R>(
     out.set_item("sh", sh)?;
     out.set_item("parents", PyArray1::from_vec(py, outcome.parents))?;
     out.set_item("protected", PyArray1::from_vec(py, outcome.flags))?;
+    out.set_item("clamped_opacities", outcome.clamped_opacities)?;
     out.set_item("clamped_logits", outcome.clamped_logits)?;
     out.set_item("rounds", rounds)?;
     Ok(out)
@@ -160,5 +232,6 @@ fn outcome_dict<'py, R>(
 
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(simplify_flags, m)?)?;
-    m.add_function(wrap_pyfunction!(simplify_paper, m)?)
+    m.add_function(wrap_pyfunction!(simplify_paper, m)?)?;
+    m.add_function(wrap_pyfunction!(simplify_pairwise, m)?)
 }

@@ -3,10 +3,14 @@
 //! A scene is first put in an order of its own ([`Ordered`]); every policy works on that order, so the
 //! result depends neither on the order of the input's rows nor on the number of threads.
 
+mod clusters;
+mod cost;
 mod guards;
+mod matching;
 mod moments;
 mod ordered;
 mod outcome;
+mod pairwise;
 mod paper;
 mod residual;
 mod trim;
@@ -15,6 +19,7 @@ pub use guards::coverage;
 pub use moments::{Gaussian, MAX_OPACITY, optical_mass, pool};
 pub use ordered::{Means, Ordered, SceneRef};
 pub use outcome::Outcome;
+pub use pairwise::{Pairwise, PairwiseRound, Seen};
 pub use paper::{Paper, PaperRound};
 pub use residual::flags;
 

@@ -32,6 +32,21 @@ pub fn optical_mass(logit: f64, scales: [f64; 3]) -> f64 {
     softplus(logit.min(cap)) * footprint(scales)
 }
 
+/// √tr adj(Σ + e²I): √3 times the root mean square, over all directions, of the area a Gaussian covers in
+/// an image, with the variance e² that a renderer adds. No eigenvalues needed.
+pub fn rendered_area(cov: &Sym3, blur: f64) -> f64 {
+    let [xx, xy, xz, yy, yz, zz] = [
+        cov[0] + blur,
+        cov[1],
+        cov[2],
+        cov[3] + blur,
+        cov[4],
+        cov[5] + blur,
+    ];
+    let trace = yy * zz - yz * yz + xx * zz - xz * xz + xx * yy - xy * xy;
+    trace.max(f64::MIN_POSITIVE).sqrt()
+}
+
 /// One Gaussian's geometry in f64.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Gaussian {

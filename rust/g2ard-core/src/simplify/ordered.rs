@@ -4,6 +4,8 @@ use std::cmp::Ordering;
 
 use rayon::prelude::*;
 
+use super::moments::Gaussian;
+use crate::linalg::{rotation_from_quat, sub};
 use crate::spatial::{Frame, codes, order};
 use crate::{Error, Result, Splats};
 
@@ -54,6 +56,19 @@ impl SceneRef<'_> {
 
     pub fn is_empty(&self) -> bool {
         self.len() == 0
+    }
+
+    /// The logit of a row, finite.
+    pub fn logit(&self, row: usize) -> f32 {
+        clamp_logit(self.logit_opacities[row])
+    }
+
+    /// Band 0 and the higher bands of a row.
+    pub fn sh_of(&self, row: usize) -> ([f32; 3], &[[f32; 3]]) {
+        (
+            self.sh0[row],
+            &self.sh_rest[row * self.rest..(row + 1) * self.rest],
+        )
     }
 
     fn validate(&self) -> Result<()> {
@@ -109,17 +124,16 @@ const LOGIT_OF_ONE: f32 = 16.0;
 /// that adding back a dyadic origin rounds nothing.
 const MEAN_GRID: f64 = 1.0 / (1u64 << 36) as f64;
 
-/// A scene in Morton order, ties by all attribute bits, by row only between identical rows.
+/// The order of a scene: Morton, ties by all attribute bits, by row only between identical rows.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ordered {
-    /// Means relative to `origin`.
-    pub splats: Splats,
     /// The input row of each ordered row.
     pub rows: Vec<u32>,
+    /// The median point; everything is computed relative to it.
     pub origin: [f64; 3],
     /// Spacing of merged means, a power of two.
     pub grid: f64,
-    /// Logits that were infinite and were clamped.
+    /// Logits that are infinite, and clamped wherever they are used.
     pub clamped_logits: usize,
 }
 
@@ -134,36 +148,62 @@ impl Ordered {
         for run in ties.filter(|run| run.len() > 1) {
             run.sort_by(|&a, &b| scene.compare(a as usize, b as usize).then(a.cmp(&b)));
         }
-        let coeffs = scene.rest + 1;
-        let mut sh = vec![[0.0; 3]; rows.len() * coeffs];
-        sh.par_chunks_mut(coeffs)
-            .zip(&rows)
-            .for_each(|(out, &row)| {
-                let i = row as usize;
-                out[0] = scene.sh0[i];
-                out[1..].copy_from_slice(&scene.sh_rest[i * scene.rest..(i + 1) * scene.rest]);
-            });
-        let logits: Vec<f32> = rows
-            .iter()
-            .map(|&i| scene.logit_opacities[i as usize])
-            .collect();
         Ok(Self {
-            clamped_logits: logits.iter().filter(|v| v.is_infinite()).count(),
-            splats: Splats {
-                means: rows
-                    .iter()
-                    .map(|&i| crate::linalg::sub(world[i as usize], frame.origin))
-                    .collect(),
-                quats: rows.iter().map(|&i| scene.quats[i as usize]).collect(),
-                scales: rows.iter().map(|&i| scene.scales[i as usize]).collect(),
-                logit_opacities: logits.into_iter().map(clamp_logit).collect(),
-                sh,
-                sh_coeffs: coeffs,
-            },
             rows,
             origin: frame.origin,
             grid: power_of_two_below(frame.radius) * MEAN_GRID,
+            clamped_logits: scene
+                .logit_opacities
+                .iter()
+                .filter(|v| v.is_infinite())
+                .count(),
         })
+    }
+
+    /// Values by input row, in the scene's order.
+    pub fn sorted<T: Copy + Send + Sync>(&self, by_row: &[T]) -> Vec<T> {
+        self.rows
+            .par_iter()
+            .map(|&row| by_row[row as usize])
+            .collect()
+    }
+
+    /// One row's geometry about the origin.
+    pub fn gaussian(&self, scene: &SceneRef, row: usize) -> Gaussian {
+        Gaussian {
+            mean: sub(scene.means.get(row), self.origin),
+            rotation: rotation_from_quat(scene.quats[row].map(f64::from)),
+            scales: scene.scales[row].map(f64::from),
+        }
+    }
+
+    /// The whole scene in its order, about the origin.
+    pub fn splats(&self, scene: &SceneRef) -> Splats {
+        let coeffs = scene.rest + 1;
+        let mut sh = vec![[0.0; 3]; self.rows.len() * coeffs];
+        sh.par_chunks_mut(coeffs)
+            .zip(&self.rows)
+            .for_each(|(out, &row)| {
+                let (dc, rest) = scene.sh_of(row as usize);
+                out[0] = dc;
+                out[1..].copy_from_slice(rest);
+            });
+        let rows = || self.rows.iter().map(|&row| row as usize);
+        Splats {
+            means: rows()
+                .map(|i| sub(scene.means.get(i), self.origin))
+                .collect(),
+            quats: rows().map(|i| scene.quats[i]).collect(),
+            scales: rows().map(|i| scene.scales[i]).collect(),
+            logit_opacities: rows().map(|i| scene.logit(i)).collect(),
+            sh,
+            sh_coeffs: coeffs,
+        }
+    }
+
+    /// A merged mean, rounded to the grid.
+    pub fn on_grid(&self, mean: [f64; 3]) -> [f64; 3] {
+        mean.map(|v| (v / self.grid).round() * self.grid)
     }
 }
 
@@ -203,10 +243,12 @@ mod tests {
                 sh_rest: &[],
                 rest: 0,
             };
-            Ordered::new(&scene).unwrap()
+            let ordered = Ordered::new(&scene).unwrap();
+            (ordered.splats(&scene), ordered)
         };
         let (a, b) = (sorted([0, 1, 2, 3, 4]), sorted([3, 4, 2, 0, 1]));
-        assert_eq!(a.splats, b.splats);
+        assert_eq!(a.0, b.0);
+        let (a, b) = (a.1, b.1);
         assert_eq!(a.clamped_logits, 1);
         let back: Vec<usize> = b
             .rows

@@ -11,6 +11,8 @@ pub struct Outcome<R> {
     pub parents: Vec<i64>,
     pub flags: Vec<bool>,
     pub rounds: Vec<R>,
+    /// Merged rows whose α was clipped, so that some of their mass is lost.
+    pub clamped_opacities: usize,
     /// Infinite logits, clamped.
     pub clamped_logits: usize,
 }
@@ -46,14 +48,22 @@ impl Trail {
         };
     }
 
-    /// Adds the origin back; the mean of a copied row is the caller's own, bit for bit.
+    /// Back to the caller's rows and coordinates.
     pub fn finish<R>(self, scene: &SceneRef, ordered: &Ordered, rounds: Vec<R>) -> Outcome<R> {
-        let Step {
+        self.step.finish(scene, ordered, rounds)
+    }
+}
+
+impl Step {
+    /// Back to the caller's rows and coordinates: adds the origin, except to copied rows, whose mean is the
+    /// caller's own, bit for bit.
+    pub fn finish<R>(self, scene: &SceneRef, ordered: &Ordered, rounds: Vec<R>) -> Outcome<R> {
+        let Self {
             mut splats,
             parents,
             flags,
             copied,
-        } = self.step;
+        } = self;
         for (mean, &source) in splats.means.iter_mut().zip(&copied) {
             *mean = if source == GONE {
                 [0, 1, 2].map(|k| mean[k] + ordered.origin[k])
@@ -74,6 +84,7 @@ impl Trail {
             parents: by_row,
             flags,
             rounds,
+            clamped_opacities: 0,
             clamped_logits: ordered.clamped_logits,
         }
     }

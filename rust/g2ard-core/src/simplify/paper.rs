@@ -86,14 +86,10 @@ impl Paper {
         schedule: &[usize],
         control: &Control,
     ) -> Result<Outcome<PaperRound>> {
-        let mut ordered = Ordered::new(scene)?;
-        let splats = std::mem::take(&mut ordered.splats);
+        let ordered = Ordered::new(scene)?;
+        let splats = ordered.splats(scene);
         let flags = match flags {
-            Some(flags) if flags.len() == splats.len() => ordered
-                .rows
-                .iter()
-                .map(|&row| flags[row as usize])
-                .collect(),
+            Some(flags) if flags.len() == splats.len() => ordered.sorted(flags),
             Some(flags) => {
                 return Err(Error::invalid(
                     "protected",
@@ -114,7 +110,13 @@ impl Paper {
             trail.then(step);
             rounds.push(report);
         }
-        Ok(trail.finish(scene, &ordered, rounds))
+        let clamped = rounds
+            .iter()
+            .map(|r: &PaperRound| r.clamped_opacities)
+            .sum();
+        let mut outcome = trail.finish(scene, &ordered, rounds);
+        outcome.clamped_opacities = clamped;
+        Ok(outcome)
     }
 
     /// One round, to exactly `budget` rows (all of them when there are no more than that).

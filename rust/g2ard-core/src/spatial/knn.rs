@@ -1,86 +1,128 @@
 //! Exact nearest neighbours: an eight-way box tree over blocks of eight points in Morton order.
+//!
+//! Exact in the arithmetic of the coordinates: f64 where cancellation matters, f32 where speed does.
+
+use std::ops::{AddAssign, Mul, Sub};
 
 use rayon::prelude::*;
 
 use super::{Frame, codes, order};
 
 const WIDTH: usize = 8;
-type Lanes = [f64; WIDTH];
+type Lanes<T> = [T; WIDTH];
+
+/// f32 or f64.
+pub trait Real:
+    Copy + PartialOrd + Send + Sync + Default + Sub<Output = Self> + Mul<Output = Self> + AddAssign
+{
+    const INFINITY: Self;
+    const NEG_INFINITY: Self;
+    fn least(self, other: Self) -> Self;
+    fn most(self, other: Self) -> Self;
+}
+
+macro_rules! real {
+    ($t:ident) => {
+        impl Real for $t {
+            const INFINITY: Self = $t::INFINITY;
+            const NEG_INFINITY: Self = $t::NEG_INFINITY;
+
+            #[inline(always)]
+            fn least(self, other: Self) -> Self {
+                if self < other { self } else { other }
+            }
+
+            #[inline(always)]
+            fn most(self, other: Self) -> Self {
+                if self > other { self } else { other }
+            }
+        }
+    };
+}
+
+real!(f32);
+real!(f64);
 
 /// Squared distance and row.
-pub type Neighbor = (f64, u32);
+pub type Neighbor<T> = (T, u32);
 
 /// Eight boxes, side by side.
 #[derive(Clone, Copy)]
-struct Boxes {
-    low: [Lanes; 3],
-    high: [Lanes; 3],
+struct Boxes<T> {
+    low: [Lanes<T>; 3],
+    high: [Lanes<T>; 3],
 }
 
-const NOWHERE: Boxes = Boxes {
-    low: [[f64::INFINITY; WIDTH]; 3],
-    high: [[f64::NEG_INFINITY; WIDTH]; 3],
-};
+impl<T: Real> Boxes<T> {
+    const NOWHERE: Self = Self {
+        low: [[T::INFINITY; WIDTH]; 3],
+        high: [[T::NEG_INFINITY; WIDTH]; 3],
+    };
 
-impl Boxes {
     /// Squared distances from `q`; infinite for an empty box.
-    fn distances(&self, q: [f64; 3]) -> Lanes {
-        let mut sum = [0.0; WIDTH];
+    #[inline(always)]
+    fn distances(&self, q: [T; 3]) -> Lanes<T> {
+        let mut sum = [T::default(); WIDTH];
         for k in 0..3 {
             for i in 0..WIDTH {
-                let d = (self.low[k][i] - q[k]).max(q[k] - self.high[k][i]).max(0.0);
+                let d = (self.low[k][i] - q[k])
+                    .most(q[k] - self.high[k][i])
+                    .most(T::default());
                 sum[i] += d * d;
             }
         }
         sum
     }
 
-    fn union(&self) -> ([f64; 3], [f64; 3]) {
-        let fold = |v: &Lanes, start, f: fn(f64, f64) -> f64| v.iter().copied().fold(start, f);
+    fn union(&self) -> ([T; 3], [T; 3]) {
+        let fold = |v: &Lanes<T>, start, f: fn(T, T) -> T| v.iter().copied().fold(start, f);
         (
-            [0, 1, 2].map(|k| fold(&self.low[k], f64::INFINITY, f64::min)),
-            [0, 1, 2].map(|k| fold(&self.high[k], f64::NEG_INFINITY, f64::max)),
+            [0, 1, 2].map(|k| fold(&self.low[k], T::INFINITY, T::least)),
+            [0, 1, 2].map(|k| fold(&self.high[k], T::NEG_INFINITY, T::most)),
         )
     }
 }
 
 /// Finds neighbours of the points it was built from.
-pub struct Tree {
+pub struct Tree<T = f64> {
     rows: Vec<u32>,
     /// Points in Morton order, eight to a block; lanes beyond the end are at infinity.
-    blocks: Vec<[Lanes; 3]>,
+    blocks: Vec<[Lanes<T>; 3]>,
     /// `levels[0]` bounds blocks, each next level bounds the one below; the last is one node.
-    levels: Vec<Vec<Boxes>>,
+    levels: Vec<Vec<Boxes<T>>>,
 }
 
-impl Tree {
+impl Tree<f64> {
     pub fn build(points: &[[f64; 3]]) -> Self {
         let rows = order(&codes(points, &Frame::of(points)));
-        Self::over(points, rows)
+        Self::over(rows, |row| points[row])
     }
+}
 
-    /// `rows`: the rows of `points` in an order that keeps near points together.
-    pub fn over(points: &[[f64; 3]], rows: Vec<u32>) -> Self {
-        let blocks: Vec<[Lanes; 3]> = rows
+impl<T: Real> Tree<T> {
+    /// `rows` in an order that keeps near points together, and where each row lies.
+    pub fn over(rows: Vec<u32>, point: impl Fn(usize) -> [T; 3] + Sync) -> Self {
+        let blocks: Vec<[Lanes<T>; 3]> = rows
             .par_chunks(WIDTH)
             .map(|chunk| {
-                let mut block = [[f64::INFINITY; WIDTH]; 3];
+                let mut block = [[T::INFINITY; WIDTH]; 3];
                 for (i, &row) in chunk.iter().enumerate() {
-                    (0..3).for_each(|k| block[k][i] = points[row as usize][k]);
+                    let p = point(row as usize);
+                    (0..3).for_each(|k| block[k][i] = p[k]);
                 }
                 block
             })
             .collect();
-        let bounds = blocks
+        let bounds: Vec<_> = blocks
             .par_iter()
             .map(|b| {
-                let finite = |k: usize| b[k].iter().copied().filter(|v| v.is_finite());
+                let finite = |k: usize| b[k].iter().copied().filter(|v| *v < T::INFINITY);
                 (
-                    [0, 1, 2].map(|k| finite(k).fold(f64::INFINITY, f64::min)),
-                    [0, 1, 2].map(|k| finite(k).fold(f64::NEG_INFINITY, f64::max)),
+                    [0, 1, 2].map(|k| finite(k).fold(T::INFINITY, T::least)),
+                    [0, 1, 2].map(|k| finite(k).fold(T::NEG_INFINITY, T::most)),
                 )
             })
-            .collect::<Vec<_>>();
+            .collect();
         let mut levels = vec![pack(&bounds)];
         while levels[levels.len() - 1].len() > 1 {
             let bounds: Vec<_> = levels[levels.len() - 1].iter().map(Boxes::union).collect();
@@ -99,53 +141,79 @@ impl Tree {
     }
 
     /// The `k` points nearest to the `at`-th of [`Tree::rows`], itself excepted, by (distance, row), into `found`.
-    pub fn nearest(&self, at: usize, k: usize, found: &mut Vec<Neighbor>) {
+    #[inline]
+    pub fn nearest(&self, at: usize, k: usize, found: &mut Vec<Neighbor<T>>) {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe { self.nearest_avx2(at, k, found) };
+        }
+        self.search(at, k, found);
+    }
+
+    /// The same code with wider registers; no fused operations, so the same bits.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn nearest_avx2(&self, at: usize, k: usize, found: &mut Vec<Neighbor<T>>) {
+        self.search(at, k, found);
+    }
+
+    #[inline(always)]
+    fn search(&self, at: usize, k: usize, found: &mut Vec<Neighbor<T>>) {
         found.clear();
         if k == 0 {
             return;
         }
-        let block = &self.blocks[at / WIDTH];
-        let q = [0, 1, 2].map(|axis| block[axis][at % WIDTH]);
+        let own = at / WIDTH;
+        let block = &self.blocks[own];
         let mut search = Search {
-            q,
+            q: [0, 1, 2].map(|axis| block[axis][at % WIDTH]),
             itself: self.rows[at],
             k,
             found,
         };
-        self.visit(self.levels.len() - 1, 0, &mut search);
-    }
-
-    fn visit(&self, level: usize, node: usize, search: &mut Search) {
-        let distances = self.levels[level][node].distances(search.q);
-        let limit = search.limit();
-        let (mut near, mut count) = ([(0.0, 0usize); WIDTH], 0);
-        for (i, &d) in distances.iter().enumerate() {
-            if d <= limit && d < f64::INFINITY {
-                let mut at = count;
-                while at > 0 && near[at - 1].0 > d {
-                    near[at] = near[at - 1];
-                    at -= 1;
-                }
-                near[at] = (d, i);
-                count += 1;
+        // Its own block first: near enough to rule most others out.
+        self.scan(own, &mut search);
+        let mut stack = [(T::default(), 0u32, 0u32); STACK];
+        stack[0] = (T::default(), self.levels.len() as u32 - 1, 0);
+        let mut depth = 1;
+        while depth > 0 {
+            depth -= 1;
+            let (distance, level, node) = stack[depth];
+            if distance > search.limit() {
+                continue;
             }
-        }
-        for &(d, i) in &near[..count] {
-            if d > search.limit() {
-                break;
-            }
-            let child = node * WIDTH + i;
+            let distances = self.levels[level as usize][node as usize].distances(search.q);
+            let limit = search.limit();
             if level == 0 {
-                self.scan(child, search);
-            } else {
-                self.visit(level - 1, child, search);
+                for (i, &d) in distances.iter().enumerate() {
+                    let block = node as usize * WIDTH + i;
+                    if d <= limit && d < T::INFINITY && block != own && d <= search.limit() {
+                        self.scan(block, &mut search);
+                    }
+                }
+                continue;
+            }
+            // Nearest on top: insertion from the bottom of this node's share of the stack.
+            let base = depth;
+            for (i, &d) in distances.iter().enumerate() {
+                if d <= limit && d < T::INFINITY {
+                    let mut at = depth;
+                    while at > base && stack[at - 1].0 < d {
+                        stack[at] = stack[at - 1];
+                        at -= 1;
+                    }
+                    stack[at] = (d, level - 1, node * WIDTH as u32 + i as u32);
+                    depth += 1;
+                }
             }
         }
     }
 
-    fn scan(&self, block: usize, search: &mut Search) {
+    #[inline(always)]
+    fn scan(&self, block: usize, search: &mut Search<T>) {
         let points = &self.blocks[block];
-        let mut sum = [0.0; WIDTH];
+        let mut sum = [T::default(); WIDTH];
         for k in 0..3 {
             for i in 0..WIDTH {
                 let d = points[k][i] - search.q[k];
@@ -154,16 +222,19 @@ impl Tree {
         }
         let limit = search.limit();
         for (i, &d) in sum.iter().enumerate() {
-            if d <= limit && d < f64::INFINITY {
+            if d <= limit && d < T::INFINITY {
                 search.offer((d, self.rows[block * WIDTH + i]));
             }
         }
     }
 }
 
-fn pack(bounds: &[([f64; 3], [f64; 3])]) -> Vec<Boxes> {
+/// Eleven levels hold 2³² points; each leaves at most eight nodes on the stack.
+const STACK: usize = 11 * WIDTH;
+
+fn pack<T: Real>(bounds: &[([T; 3], [T; 3])]) -> Vec<Boxes<T>> {
     let packed = bounds.chunks(WIDTH).map(|chunk| {
-        let mut boxes = NOWHERE;
+        let mut boxes = Boxes::NOWHERE;
         for (i, (low, high)) in chunk.iter().enumerate() {
             for k in 0..3 {
                 (boxes.low[k][i], boxes.high[k][i]) = (low[k], high[k]);
@@ -173,45 +244,48 @@ fn pack(bounds: &[([f64; 3], [f64; 3])]) -> Vec<Boxes> {
     });
     let packed: Vec<_> = packed.collect();
     if packed.is_empty() {
-        vec![NOWHERE]
+        vec![Boxes::NOWHERE]
     } else {
         packed
     }
 }
 
-struct Search<'a> {
-    q: [f64; 3],
+struct Search<'a, T> {
+    q: [T; 3],
     itself: u32,
     k: usize,
-    found: &'a mut Vec<Neighbor>,
+    found: &'a mut Vec<Neighbor<T>>,
 }
 
-impl Search<'_> {
+impl<T: Real> Search<'_, T> {
     /// Nothing farther than this can still get in.
-    fn limit(&self) -> f64 {
+    #[inline(always)]
+    fn limit(&self) -> T {
         if self.found.len() < self.k {
-            f64::INFINITY
+            T::INFINITY
         } else {
             self.found[self.k - 1].0
         }
     }
 
-    fn offer(&mut self, new: Neighbor) {
+    #[inline(always)]
+    fn offer(&mut self, new: Neighbor<T>) {
         if new.1 == self.itself {
             return;
         }
-        if self.found.len() == self.k {
-            if new >= self.found[self.k - 1] {
-                return;
-            }
-            self.found.pop();
+        if self.found.len() < self.k {
+            self.found.push(new);
+        } else if new < self.found[self.k - 1] {
+            self.found[self.k - 1] = new;
+        } else {
+            return;
         }
-        let at = self
-            .found
-            .iter()
-            .rposition(|&old| old < new)
-            .map_or(0, |i| i + 1);
-        self.found.insert(at, new);
+        let mut at = self.found.len() - 1;
+        while at > 0 && new < self.found[at - 1] {
+            self.found[at] = self.found[at - 1];
+            at -= 1;
+        }
+        self.found[at] = new;
     }
 }
 
@@ -219,8 +293,8 @@ impl Search<'_> {
 mod tests {
     use super::*;
 
-    fn brute(points: &[[f64; 3]], i: usize, k: usize) -> Vec<Neighbor> {
-        let mut all: Vec<Neighbor> = (0..points.len())
+    fn brute(points: &[[f64; 3]], i: usize, k: usize) -> Vec<Neighbor<f64>> {
+        let mut all: Vec<Neighbor<f64>> = (0..points.len())
             .filter(|&j| j != i)
             .map(|j| {
                 let d = crate::linalg::sub(points[j], points[i]);

@@ -1,0 +1,166 @@
+//! From a partition of the rows to Gaussians: each cluster's moments in f64, from its raw members.
+
+use rayon::prelude::*;
+
+use super::moments::{Gaussian, MAX_OPACITY, pool, rendered_area, sigmoid};
+use super::{GONE, Ordered, SceneRef, Step};
+use crate::{Control, Result, Splats};
+
+/// Which cluster each ordered row belongs to ([`GONE`] for none).
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Partition {
+    pub of: Vec<u32>,
+    pub count: usize,
+}
+
+impl Partition {
+    /// Members of cluster `c`, ascending: `rows[starts[c]..starts[c + 1]]`.
+    fn members(&self) -> (Vec<u32>, Vec<u32>) {
+        let mut starts = vec![0u32; self.count + 2];
+        for &c in self.of.iter().filter(|&&c| c != GONE) {
+            starts[c as usize + 2] += 1;
+        }
+        for c in 2..starts.len() {
+            starts[c] += starts[c - 1];
+        }
+        let mut rows = vec![0; starts[self.count + 1] as usize];
+        for (i, &c) in self.of.iter().enumerate().filter(|(_, c)| **c != GONE) {
+            rows[starts[c as usize + 1] as usize] = i as u32;
+            starts[c as usize + 1] += 1;
+        }
+        starts.pop();
+        (starts, rows)
+    }
+
+    /// One Gaussian per cluster, in the order of the clusters; a cluster of one is a copy of its member.
+    ///
+    /// Mass is α·A as rendered, A with the row's dilation `blur` (a variance), and is conserved: α of a
+    /// cluster is Σm / A. Returns also how many clusters reached α = 0.99 and lost mass.
+    pub fn assemble(
+        &self,
+        scene: &SceneRef,
+        ordered: &Ordered,
+        flags: &[bool],
+        blur: impl Fn(usize) -> f64 + Sync,
+        control: &Control,
+    ) -> Result<(Step, usize)> {
+        let (starts, rows) = self.members();
+        let chunks: Vec<Vec<Made>> = (0..self.count.div_ceil(CHUNK))
+            .into_par_iter()
+            .map(|chunk| {
+                control.check()?;
+                let here = chunk * CHUNK..((chunk + 1) * CHUNK).min(self.count);
+                let members = |c: usize| &rows[starts[c] as usize..starts[c + 1] as usize];
+                Ok(here
+                    .map(|c| make(scene, ordered, members(c), &blur))
+                    .collect())
+            })
+            .collect::<Result<_>>()?;
+        let mut step = Step {
+            splats: Splats {
+                sh_coeffs: scene.rest + 1,
+                ..Splats::default()
+            },
+            parents: self.of.clone(),
+            ..Step::default()
+        };
+        step.splats.sh.reserve(self.count * (scene.rest + 1));
+        let mut clamped = 0;
+        for (c, made) in chunks.into_iter().flatten().enumerate() {
+            let members = &rows[starts[c] as usize..starts[c + 1] as usize];
+            step.flags.push(members.iter().any(|&i| flags[i as usize]));
+            step.copied
+                .push(if members.len() == 1 { members[0] } else { GONE });
+            clamped += usize::from(made.clamped);
+            step.splats.means.push(made.mean);
+            step.splats.quats.push(made.quat);
+            step.splats.scales.push(made.scales);
+            step.splats.logit_opacities.push(made.logit);
+            average_sh(scene, ordered, members, &made.weights, &mut step.splats.sh);
+        }
+        Ok((step, clamped))
+    }
+}
+
+const CHUNK: usize = 1024;
+
+/// A cluster's Gaussian; its SH wait for the one array they all go to.
+struct Made {
+    mean: [f64; 3],
+    quat: [f32; 4],
+    scales: [f32; 3],
+    logit: f32,
+    /// Share of each member in the mass; empty for a copy.
+    weights: Vec<f64>,
+    clamped: bool,
+}
+
+fn make(scene: &SceneRef, ordered: &Ordered, members: &[u32], blur: impl Fn(usize) -> f64) -> Made {
+    if let [only] = members {
+        let row = ordered.rows[*only as usize] as usize;
+        return Made {
+            mean: ordered.gaussian(scene, row).mean,
+            quat: scene.quats[row],
+            scales: scene.scales[row],
+            logit: scene.logit(row),
+            weights: Vec::new(),
+            clamped: false,
+        };
+    }
+    let mut least = f64::INFINITY;
+    let mut parts: Vec<_> = members
+        .iter()
+        .map(|&i| {
+            let row = ordered.rows[i as usize] as usize;
+            let g = ordered.gaussian(scene, row);
+            let (cov, blur) = (g.covariance(), blur(i as usize));
+            least = least.min(blur);
+            let alpha = sigmoid(f64::from(scene.logit(row))).min(MAX_OPACITY);
+            (alpha * rendered_area(&cov, blur), g.mean, cov)
+        })
+        .collect();
+    let mass: f64 = parts.iter().map(|p| p.0).sum();
+    if mass <= 0.0 {
+        parts.iter_mut().for_each(|p| p.0 = 1.0);
+    }
+    let (mean, cov) = pool(&parts);
+    let alpha = mass / rendered_area(&cov, least);
+    let total: f64 = parts.iter().map(|p| p.0).sum();
+    let gaussian = Gaussian::from_moments(mean, &cov);
+    Made {
+        mean: ordered.on_grid(mean),
+        quat: gaussian.quat(),
+        scales: gaussian.scales.map(|v| v as f32),
+        logit: logit_of(alpha.min(MAX_OPACITY)),
+        weights: parts.iter().map(|p| p.0 / total).collect(),
+        clamped: alpha > MAX_OPACITY,
+    }
+}
+
+fn logit_of(alpha: f64) -> f32 {
+    (alpha / (1.0 - alpha)).max(f64::MIN_POSITIVE).ln() as f32
+}
+
+fn average_sh(
+    scene: &SceneRef,
+    ordered: &Ordered,
+    members: &[u32],
+    weights: &[f64],
+    out: &mut Vec<[f32; 3]>,
+) {
+    let of = |i: u32| scene.sh_of(ordered.rows[i as usize] as usize);
+    if weights.is_empty() {
+        let (dc, rest) = of(members[0]);
+        out.push(dc);
+        out.extend_from_slice(rest);
+        return;
+    }
+    let mut sums = [[0.0f64; 3]; 16];
+    for (&i, w) in members.iter().zip(weights) {
+        let (dc, rest) = of(i);
+        for (sum, sh) in sums.iter_mut().zip(std::iter::once(&dc).chain(rest)) {
+            (0..3).for_each(|k| sum[k] += w * f64::from(sh[k]));
+        }
+    }
+    out.extend(sums[..=scene.rest].iter().map(|s| s.map(|v| v as f32)));
+}
