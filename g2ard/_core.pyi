@@ -117,12 +117,11 @@ _Surface = tuple[_F64, _F64, _F64, _F64, float]
 _Scene = tuple[NDArray[Any], ...]
 
 def select_surface(scene: _Scene, cells: int) -> dict[str, Any]: ...
-def select_depth(scene: _Scene, view: _View | tuple[Any, ...], stride: int) -> _F32: ...
+def select_depth(scene: _Scene, view: tuple[Any, ...]) -> _F32: ...
 def select_visible(
     scene: _Scene,
     surface: _Surface,
     views: list[tuple[Any, ...]],
-    stride: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[NDArray[np.uint64], NDArray[np.uint32]]: ...
 def select_greedy(

@@ -46,8 +46,6 @@ class CoverageOptions:
         kappa: sharpness of the observation kernel and of the targets.
         alpha: exponent of the fair utility u(x) = x^(1−α)/(1−α).
         offset: g(x) = u(offset + x); the paper's λ.
-        stride: every stride-th pixel tells what a view sees; 0 takes the largest at which the median cell in
-            view is still two samples wide, at most 8.
         lazy: look again only at the view that leads (CELF): the same views, fewer evaluations.
     """
 
@@ -55,7 +53,6 @@ class CoverageOptions:
     kappa: float = 20.0
     alpha: float = 2.0
     offset: float = 1.0
-    stride: int = 0
     lazy: bool = True
 
 
@@ -219,18 +216,17 @@ def surface(splats: Splats, cells: int = 300_000) -> Surface:
 
 
 def visible_cells(
-    splats: Splats, cells: Surface, cameras: Cameras, *, stride: int = 2, progress: Progress = silent
+    splats: Splats, cells: Surface, cameras: Cameras, *, progress: Progress = silent
 ) -> Visible:
     """Rasterise the prior's median depth into every view and compare: ν_jv.
 
     A cell is visible where its centre falls on the image within max(cell size, 1 % of depth) of the median
-    depth (by gsplat's conventions) at the nearest of every `stride`-th pixel.
+    depth (by gsplat's conventions) in that pixel. Pixels without a cell are not worked out.
 
     Args:
         splats: the prior that `cells` came from.
         cells: see `surface`.
         cameras: C views in world coordinates.
-        stride: pixels from one sample to the next.
         progress: told of the views done.
 
     Returns:
@@ -238,7 +234,7 @@ def visible_cells(
     """
     scene, origin = _scene(splats)
     starts, seen = _core.select_visible(
-        scene, cells.parts, _views(cameras, origin), stride, progress=counter(progress, "visibility")
+        scene, cells.parts, _views(cameras, origin), progress=counter(progress, "visibility")
     )
     return Visible(starts, seen)
 
@@ -279,9 +275,8 @@ def _by_surface(
     began = time.perf_counter()
     cells = surface(splats, options.cells)
     seconds["surface"] = time.perf_counter() - began
-    stride = options.stride or _stride(cells, cameras)
     began = time.perf_counter()
-    seen = visible_cells(splats, cells, cameras, stride=stride, progress=progress)
+    seen = visible_cells(splats, cells, cameras, progress=progress)
     seconds["visibility"] = time.perf_counter() - began
     usable = np.diff(seen.starts.astype(np.int64)) > 0
     began = time.perf_counter()
@@ -301,16 +296,6 @@ def _by_surface(
     seconds["greedy"] = time.perf_counter() - began
     keep = usable[order]
     return order.astype(np.int64)[keep], gains[keep], evaluations, usable
-
-
-def _stride(cells: Surface, cameras: Cameras) -> int:
-    """The largest stride at which the median cell in view is two samples wide."""
-    depths = _viewing_distances(cells, cameras)
-    seen = depths > 0
-    if not seen.any():
-        return 8
-    wide = np.median(cameras.Ks[seen, 0, 0] * cells.size / depths[seen])
-    return int(np.clip(wide // 2, 1, 8))
 
 
 def _viewing_distances(cells: Surface, cameras: Cameras) -> Float:

@@ -53,18 +53,6 @@ impl Scene<'_> {
     }
 }
 
-fn stride_of(stride: usize) -> PyResult<usize> {
-    if stride > 0 {
-        Ok(stride)
-    } else {
-        Err(to_py(g2ard_core::Error::invalid(
-            "stride",
-            "at least 1",
-            stride,
-        )))
-    }
-}
-
 /// Surface cells: centers, normals, confidence, weights, size.
 #[pyfunction]
 fn select_surface<'py>(
@@ -83,20 +71,16 @@ fn select_surface<'py>(
     Ok(out)
 }
 
-/// The median depth of every `stride`-th pixel of a view.
+/// The median depth of every pixel of a view.
 #[pyfunction]
 fn select_depth<'py>(
     py: Python<'py>,
     scene: Scene<'py>,
     view: View,
-    stride: usize,
 ) -> PyResult<Bound<'py, PyArray2<f32>>> {
-    let (scene, camera, stride) = (scene.borrow()?, view.camera(), stride_of(stride)?);
-    let (depth, width) = quick(py, || {
-        Ok(median_depths(&Opaque::of(&scene), &camera, stride))
-    })?;
-    let height = depth.len() / width.max(1);
-    PyArray1::from_vec(py, depth).reshape([height, width])
+    let (scene, camera) = (scene.borrow()?, view.camera());
+    let depth = quick(py, || Ok(median_depths(&Opaque::of(&scene), &camera)))?;
+    PyArray1::from_vec(py, depth).reshape([camera.height, camera.width])
 }
 
 type Surfaces<'py> = (
@@ -136,19 +120,18 @@ type Lists<'py> = (Bound<'py, PyArray1<u64>>, Bound<'py, PyArray1<u32>>);
 
 /// (starts (C + 1,), cells): view v sees cells[starts[v]..starts[v + 1]].
 #[pyfunction]
-#[pyo3(signature = (scene, surface, views, stride, progress=None))]
+#[pyo3(signature = (scene, surface, views, progress=None))]
 fn select_visible<'py>(
     py: Python<'py>,
     scene: Scene<'py>,
     surface: Surfaces<'py>,
     views: Vec<View>,
-    stride: usize,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Lists<'py>> {
-    let (scene, surface, stride) = (scene.borrow()?, surface_of(&surface)?, stride_of(stride)?);
+    let (scene, surface) = (scene.borrow()?, surface_of(&surface)?);
     let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
     let seen = long(py, progress, |control| {
-        visible(&Opaque::of(&scene), &surface, &cameras, stride, control)
+        visible(&Opaque::of(&scene), &surface, &cameras, control)
     })?;
     let mut starts = vec![0u64];
     for cells in &seen {

@@ -1,7 +1,5 @@
-//! What each view sees: the scene's median depth on every `stride`-th pixel, and the cells that lie at it.
-//!
-//! Pixels that are left out cost nothing, and those that are kept show what the full image would, bit for bit:
-//! thinning the lattice, unlike shrinking the image, changes no footprint.
+//! What each view sees: the scene's median depth at the pixels where surface cells fall, and which of them lie
+//! at it. No other pixel is worked out, so that this is far cheaper than an image and yet exactly what it would show.
 
 use rayon::prelude::*;
 
@@ -25,6 +23,10 @@ struct Row {
     mean: [f32; 3],
     opacity: f32,
     covariance: [f32; 6],
+    /// No direction has more variance.
+    trace: f32,
+    /// (distance/σ)² at which α falls to 1/255.
+    reach: f32,
 }
 
 impl Opaque {
@@ -32,17 +34,22 @@ impl Opaque {
         let rows = (0..scene.means.len())
             .into_par_iter()
             .filter(|&i| scene.opacities[i] >= ALPHA_MIN)
-            .map(|i| Row {
-                mean: scene.means[i].map(|v| v as f32),
-                opacity: scene.opacities[i],
-                covariance: scene.covariance(i).map(|v| v as f32),
+            .map(|i| {
+                let covariance = scene.covariance(i).map(|v| v as f32);
+                Row {
+                    mean: scene.means[i].map(|v| v as f32),
+                    opacity: scene.opacities[i],
+                    covariance,
+                    trace: covariance[0] + covariance[3] + covariance[5],
+                    reach: 2.0 * (scene.opacities[i] / ALPHA_MIN).ln(),
+                }
             })
             .collect();
         Self { rows }
     }
 }
 
-/// A splat on the thinned lattice.
+/// A splat on the image.
 struct Splat {
     x: f32,
     y: f32,
@@ -52,22 +59,20 @@ struct Splat {
     rows: [u32; 2],
 }
 
-/// The thinned lattice of one camera: sample (i, j) is the centre of pixel stride·(i, j) + stride/2.
-struct Lattice {
+/// One camera's numbers.
+struct Pinhole {
     rotation: [[f32; 3]; 3],
     translation: [f32; 3],
     focal: [f32; 2],
     center: [f32; 2],
     limits: [[f32; 2]; 2],
     near: f32,
-    stride: f32,
-    first: f32,
     width: usize,
     height: usize,
 }
 
-impl Lattice {
-    fn of(camera: &Camera, stride: usize) -> Self {
+impl Pinhole {
+    fn of(camera: &Camera) -> Self {
         let (w, h) = (camera.width as f64, camera.height as f64);
         let limit = |c: f64, f: f64, size: f64| {
             [
@@ -75,7 +80,6 @@ impl Lattice {
                 ((size - c) / f + 0.15 * size / f) as f32,
             ]
         };
-        let count = |size: usize| (size.saturating_sub(stride / 2)).div_ceil(stride);
         Self {
             rotation: [0, 1, 2].map(|r| [0, 1, 2].map(|c| camera.viewmat[r][c] as f32)),
             translation: [0, 1, 2].map(|r| camera.viewmat[r][3] as f32),
@@ -86,10 +90,8 @@ impl Lattice {
                 limit(camera.cy, camera.fy, h),
             ],
             near: camera.near,
-            stride: stride as f32,
-            first: (stride / 2) as f32 + 0.5,
-            width: count(camera.width),
-            height: count(camera.height),
+            width: camera.width,
+            height: camera.height,
         }
     }
 
@@ -100,17 +102,27 @@ impl Lattice {
         })
     }
 
-    /// Samples within `reach` of `at` along an axis of `count`: [from, to).
-    fn span(&self, at: f32, reach: f32, count: usize) -> [u32; 2] {
-        let index = |v: f32| ((v - self.first) / self.stride).clamp(-1.0, count as f32);
-        let (from, to) = (
-            index(at - reach).ceil().max(0.0),
-            index(at + reach).floor() + 1.0,
-        );
-        [from as u32, (to.max(0.0) as u32).min(count as u32)]
+    /// Pixels whose centres lie within `reach` of `at` along an axis of `count`: [from, to).
+    fn span(at: f32, reach: f32, count: usize) -> [u32; 2] {
+        let index = |v: f32| (v - 0.5).clamp(-1.0, count as f32);
+        let from = index(at - reach).ceil().max(0.0);
+        let to = (index(at + reach).floor() + 1.0).max(0.0);
+        [from as u32, (to as u32).min(count as u32)]
     }
 
-    /// The splat and its depth; None where no sample can show it.
+    /// The pixel a point falls into, and its depth.
+    fn pixel(&self, p: [f32; 3]) -> Option<(u32, f32)> {
+        let [tx, ty, z] = self.to_camera(p);
+        if z <= self.near {
+            return None;
+        }
+        let x = self.focal[0] * tx / z + self.center[0];
+        let y = self.focal[1] * ty / z + self.center[1];
+        let inside = x >= 0.0 && y >= 0.0 && x < self.width as f32 && y < self.height as f32;
+        inside.then(|| ((y as usize * self.width + x as usize) as u32, z))
+    }
+
+    /// The splat and its depth; None where no pixel can show it.
     fn project(&self, row: &Row) -> Option<(f32, Splat)> {
         let [tx, ty, z] = self.to_camera(row.mean);
         if z <= self.near {
@@ -124,9 +136,17 @@ impl Lattice {
             (tx / z).clamp(self.limits[0][0], self.limits[0][1]),
             (ty / z).clamp(self.limits[1][0], self.limits[1][1]),
         );
+        let (a, b) = (self.focal[0] / z, self.focal[1] / z);
+        // Most Gaussians are out of sight: a bound on their extent is enough to tell.
+        let out = |at: f32, size: usize| at - at.clamp(0.0, size as f32);
+        let far = |d: f32, scale: f32, t: f32| {
+            d * d > row.reach * (row.trace * scale * scale * (1.0 + t * t) + DILATION)
+        };
+        if far(out(x, self.width), a, u) || far(out(y, self.height), b, v) {
+            return None;
+        }
         // Rows of J·W: gradients of the pixel with respect to the world.
         let w = &self.rotation;
-        let (a, b) = (self.focal[0] / z, self.focal[1] / z);
         let jx = [0, 1, 2].map(|k| a * (w[0][k] - u * w[2][k]));
         let jy = [0, 1, 2].map(|k| b * (w[1][k] - v * w[2][k]));
         let s = &row.covariance;
@@ -148,9 +168,8 @@ impl Lattice {
         if !(det > 0.0 && det.is_finite()) {
             return None;
         }
-        let reach = 2.0 * (row.opacity / ALPHA_MIN).ln();
-        let columns = self.span(x, (reach * xx).sqrt(), self.width);
-        let rows = self.span(y, (reach * yy).sqrt(), self.height);
+        let columns = Self::span(x, (row.reach * xx).sqrt(), self.width);
+        let rows = Self::span(y, (row.reach * yy).sqrt(), self.height);
         if columns[0] >= columns[1] || rows[0] >= rows[1] {
             return None;
         }
@@ -175,44 +194,62 @@ struct Scratch {
     splats: Vec<Splat>,
     keys: Vec<u64>,
     spare: Vec<u64>,
+    /// What is left at each pixel: 1 at first where the depth is wanted, 0 elsewhere.
     light: Vec<f32>,
+    depth: Vec<f32>,
 }
 
 impl Scratch {
-    /// Depth of the splat behind which less than half the light is left, 0 where there is none.
-    fn depth(&mut self, scene: &Opaque, lattice: &Lattice) -> Vec<f32> {
+    /// Wants every pixel, or none yet.
+    fn clear(&mut self, view: &Pinhole, light: f32) {
+        let size = view.width * view.height;
+        self.light.clear();
+        self.light.resize(size, light);
+        self.depth.clear();
+        self.depth.resize(size, 0.0);
         self.splats.clear();
         self.keys.clear();
+    }
+
+    /// Depth of the splat behind which less than half the light is left, 0 where there is none.
+    fn trace(&mut self, scene: &Opaque, view: &Pinhole) {
         for row in &scene.rows {
-            if let Some((z, splat)) = lattice.project(row) {
+            if let Some((z, splat)) = view.project(row)
+                && self.touches(view, &splat)
+            {
                 self.keys
                     .push(u64::from(z.to_bits()) << 32 | self.splats.len() as u64);
                 self.splats.push(splat);
             }
         }
         sort_by_high_half(&mut self.keys, &mut self.spare);
-        let size = lattice.width * lattice.height;
-        let mut depth = vec![0.0; size];
-        self.light.clear();
-        self.light.resize(size, 1.0);
         for &key in &self.keys {
             let z = f32::from_bits((key >> 32) as u32);
             let splat = &self.splats[(key & 0xffff_ffff) as usize];
-            draw(splat, z, lattice, &mut self.light, &mut depth);
+            draw(splat, z, view, &mut self.light, &mut self.depth);
         }
-        depth
+    }
+
+    /// Whether a splat may reach a wanted pixel; wide ones are not looked through.
+    fn touches(&self, view: &Pinhole, s: &Splat) -> bool {
+        let row = |j: u32| j as usize * view.width;
+        (s.columns[1] - s.columns[0]) * (s.rows[1] - s.rows[0]) > 64
+            || (s.rows[0]..s.rows[1]).any(|j| {
+                let span = row(j) + s.columns[0] as usize..row(j) + s.columns[1] as usize;
+                self.light[span].iter().any(|&l| l > 0.0)
+            })
     }
 }
 
-fn draw(s: &Splat, z: f32, lattice: &Lattice, light: &mut [f32], depth: &mut [f32]) {
+fn draw(s: &Splat, z: f32, view: &Pinhole, light: &mut [f32], depth: &mut [f32]) {
     for j in s.rows[0]..s.rows[1] {
-        let dy = lattice.first + lattice.stride * j as f32 - s.y;
+        let dy = j as f32 + 0.5 - s.y;
         for i in s.columns[0]..s.columns[1] {
-            let at = j as usize * lattice.width + i as usize;
+            let at = j as usize * view.width + i as usize;
             if light[at] < 0.5 {
                 continue;
             }
-            let dx = lattice.first + lattice.stride * i as f32 - s.x;
+            let dx = i as f32 + 0.5 - s.x;
             let power = 0.5 * (s.conic[0] * dx * dx + s.conic[2] * dy * dy) + s.conic[1] * dx * dy;
             let alpha = (s.opacity * (-power).exp()).min(ALPHA_MAX);
             if alpha < ALPHA_MIN || power < 0.0 {
@@ -249,19 +286,20 @@ fn sort_by_high_half(keys: &mut Vec<u64>, spare: &mut Vec<u64>) {
     }
 }
 
-/// Median depths of one camera, row by row of its thinned lattice, and the lattice's width.
-pub fn median_depths(scene: &Opaque, camera: &Camera, stride: usize) -> (Vec<f32>, usize) {
-    let lattice = Lattice::of(camera, stride);
-    (Scratch::default().depth(scene, &lattice), lattice.width)
+/// Median depths of one camera, row by row.
+pub fn median_depths(scene: &Opaque, camera: &Camera) -> Vec<f32> {
+    let (view, mut scratch) = (Pinhole::of(camera), Scratch::default());
+    scratch.clear(&view, 1.0);
+    scratch.trace(scene, &view);
+    scratch.depth
 }
 
 /// For each camera the cells it sees, ascending: the cell's centre falls on the image and lies within
-/// max(cell size, 1 % of its depth) of the median depth at the nearest sample.
+/// max(cell size, 1 % of its depth) of the median depth in that pixel.
 pub fn visible(
     scene: &Opaque,
     surface: &Surface,
     cameras: &[Camera],
-    stride: usize,
     control: &Control,
 ) -> Result<Vec<Vec<u32>>> {
     control.begin(cameras.len() as u64);
@@ -274,35 +312,24 @@ pub fn visible(
         .par_iter()
         .map_init(Scratch::default, |scratch, camera| {
             control.check()?;
-            let lattice = Lattice::of(camera, stride);
-            let depth = scratch.depth(scene, &lattice);
-            let seen = (0..centers.len() as u32)
-                .filter(|&c| shows(&lattice, &depth, centers[c as usize], surface.size as f32))
-                .collect();
+            let view = Pinhole::of(camera);
+            scratch.clear(&view, 0.0);
+            let mut cells: Vec<(u32, u32, f32)> = Vec::new();
+            for (cell, &center) in centers.iter().enumerate() {
+                if let Some((pixel, z)) = view.pixel(center) {
+                    scratch.light[pixel as usize] = 1.0;
+                    cells.push((cell as u32, pixel, z));
+                }
+            }
+            scratch.trace(scene, &view);
             control.advance(1);
-            Ok(seen)
+            let near = |&(_, pixel, z): &(u32, u32, f32)| {
+                let median = scratch.depth[pixel as usize];
+                median > 0.0 && (z - median).abs() <= (surface.size as f32).max(0.01 * z)
+            };
+            Ok(cells.iter().filter(|c| near(c)).map(|c| c.0).collect())
         })
         .collect()
-}
-
-fn shows(lattice: &Lattice, depth: &[f32], center: [f32; 3], size: f32) -> bool {
-    let [tx, ty, z] = lattice.to_camera(center);
-    if z <= lattice.near {
-        return false;
-    }
-    let nearest = |t: f32, axis: usize, count: usize| {
-        let pixel = lattice.focal[axis] * t / z + lattice.center[axis];
-        let index = (pixel - lattice.first + 0.5 * lattice.stride) / lattice.stride;
-        (index >= 0.0 && index < count as f32).then_some(index as usize)
-    };
-    let (Some(i), Some(j)) = (
-        nearest(tx, 0, lattice.width),
-        nearest(ty, 1, lattice.height),
-    ) else {
-        return false;
-    };
-    let median = depth[j * lattice.width + i];
-    median > 0.0 && (z - median).abs() <= size.max(0.01 * z)
 }
 
 #[cfg(test)]
@@ -327,15 +354,12 @@ mod tests {
     }
 
     #[test]
-    fn every_stride_shows_samples_of_the_whole_image() {
+    fn wanted_pixels_show_what_the_whole_image_does() {
         let mut means = Vec::new();
         for i in 0..40 {
             for j in 0..40 {
-                means.push([
-                    f64::from(i) * 0.1 - 2.0,
-                    f64::from(j) * 0.1 - 2.0,
-                    f64::from(i * j % 7) * 0.2,
-                ]);
+                let z = f64::from(i * j % 7) * 0.2;
+                means.push([f64::from(i) * 0.1 - 2.0, f64::from(j) * 0.1 - 2.0, z]);
             }
         }
         let n = means.len();
@@ -360,17 +384,17 @@ mod tests {
             near: 0.01,
         };
         let opaque = Opaque::of(&scene);
-        let (whole, width) = median_depths(&opaque, &camera, 1);
-        assert_eq!((width, whole.len()), (63, 63 * 47));
+        let whole = median_depths(&opaque, &camera);
         assert!(whole.iter().filter(|&&d| d > 0.0).count() > 1000);
-        for stride in [2, 3, 5] {
-            let (thin, columns) = median_depths(&opaque, &camera, stride);
-            for (k, &d) in thin.iter().enumerate() {
-                let (i, j) = (
-                    k % columns * stride + stride / 2,
-                    k / columns * stride + stride / 2,
-                );
-                assert_eq!(d, whole[j * 63 + i]);
+        let (view, mut scratch) = (Pinhole::of(&camera), Scratch::default());
+        for step in [1, 7, 100] {
+            scratch.clear(&view, 0.0);
+            for at in (0..whole.len()).step_by(step) {
+                scratch.light[at] = 1.0;
+            }
+            scratch.trace(&opaque, &view);
+            for (at, &depth) in whole.iter().enumerate() {
+                assert_eq!(scratch.depth[at], if at % step == 0 { depth } else { 0.0 });
             }
         }
     }
