@@ -2,7 +2,18 @@
 
 from importlib import import_module
 
-COMMANDS = ("distill", "simplify", "recover", "lift", "poses", "select", "render", "evaluate", "info", "synth")
+COMMANDS = (
+    "distill",
+    "simplify",
+    "recover",
+    "lift",
+    "poses",
+    "select",
+    "render",
+    "evaluate",
+    "info",
+    "synth",
+)
 
 for _name in COMMANDS:
     import_module(f"{__name__}.{_name}")
