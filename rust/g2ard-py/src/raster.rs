@@ -1,5 +1,6 @@
 //! `_core.Rasterizer`: one view's buffers, forward, backward and the sums visibility is made of.
 
+use g2ard_core::raster::limits::measure;
 use g2ard_core::raster::simd::Isa;
 use g2ard_core::raster::{
     Accumulated, Camera, Convention, Gradients, Image, ImageGradients, Params, Passes, Rasterizer,
@@ -120,6 +121,15 @@ pub fn isa_named(name: Option<&str>) -> PyResult<Isa> {
 #[pyfunction]
 fn instruction_sets() -> Vec<&'static str> {
     Isa::available().into_iter().map(Isa::name).collect()
+}
+
+/// (FMA 10⁹ flops/s, read 10⁹ bytes/s) of all threads, measured now.
+#[pyfunction]
+#[pyo3(signature = (isa = None))]
+fn machine_limits(py: Python<'_>, isa: Option<&str>) -> PyResult<(f64, f64)> {
+    let isa = isa_named(isa)?;
+    let limits = work::quick(py, || Ok(measure(isa)))?;
+    Ok((limits.fma_gflops, limits.read_gb_s))
 }
 
 #[pyclass(name = "Rasterizer", module = "g2ard._core")]
@@ -318,5 +328,6 @@ fn accumulate<'py>(
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<PyRasterizer>()?;
     m.add_function(wrap_pyfunction!(instruction_sets, m)?)?;
+    m.add_function(wrap_pyfunction!(machine_limits, m)?)?;
     m.add_function(wrap_pyfunction!(accumulate, m)?)
 }

@@ -67,18 +67,12 @@ impl PyTrainer {
         rates: [f32; 6],
         regularizers: Option<(f32, f32, bool)>,
     ) -> PyResult<(f64, usize)> {
-        let (camera, settings) = (view.camera(), choices.settings()?);
-        let layout =
-            |_| g2ard_core::Error::invalid("target", "a C-contiguous array", "another layout");
         let [means, quats, log_scales, logit_opacities, sh0, sh_n] = rates;
         let lesson = Lesson {
-            camera: &camera,
-            settings: &settings,
+            camera: &view.camera(),
+            settings: &choices.settings()?,
             background,
-            target: target
-                .as_slice()
-                .map_err(layout)
-                .map_err(crate::error::to_py)?,
+            target: values(&target)?,
             ssim_weight,
             rates: Rates {
                 means,
@@ -99,6 +93,31 @@ impl PyTrainer {
         self.seconds_loss = report.seconds_loss;
         self.skipped += report.skipped;
         Ok((report.loss, report.updated))
+    }
+
+    /// A step up to the gradients, which are thrown away: for timing. Returns the photometric loss.
+    fn rehearse(
+        &mut self,
+        py: Python<'_>,
+        view: View,
+        choices: Choices,
+        background: [f32; 3],
+        target: PyReadonlyArray3<'_, f32>,
+        ssim_weight: f32,
+    ) -> PyResult<f64> {
+        let lesson = Lesson {
+            camera: &view.camera(),
+            settings: &choices.settings()?,
+            background,
+            target: values(&target)?,
+            ssim_weight,
+            rates: Rates::default(),
+            regularizers: None,
+        };
+        let inner = &mut self.inner;
+        let report = work::quick(py, || inner.rehearse(&lesson))?;
+        self.seconds_loss = report.seconds_loss;
+        Ok(report.loss)
     }
 
     /// The six parameter arrays as they stand, rows in the caller's order.
@@ -168,6 +187,14 @@ impl PyTrainer {
         dict.set_item("loss", self.seconds_loss)?;
         Ok(dict)
     }
+}
+
+fn values<'a>(target: &'a PyReadonlyArray3<'_, f32>) -> PyResult<&'a [f32]> {
+    let layout = |_| g2ard_core::Error::invalid("target", "a C-contiguous array", "another layout");
+    target
+        .as_slice()
+        .map_err(layout)
+        .map_err(crate::error::to_py)
 }
 
 fn vector<T: numpy::Element + Clone>(

@@ -88,13 +88,18 @@ impl<const DEPTH: bool> Kernel for Backward<'_, DEPTH> {
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
             self.staged.load(pairs, self.splats, &self.place);
             let s = &*self.staged;
+            let mut masks = [0u16; BATCH];
+            for block in 0..BLOCKS {
+                let mut word = words[block];
+                while word != 0 {
+                    masks[word.trailing_zeros() as usize] |= 1 << block;
+                    word &= word - 1;
+                }
+            }
             while union != 0 {
                 let p = 63 - union.leading_zeros() as usize;
                 union ^= 1 << p;
-                let mut blocks = 0u32;
-                for block in 0..BLOCKS {
-                    blocks |= ((words[block] >> p & 1) as u32) << block;
-                }
+                let mut blocks = u32::from(masks[p]);
                 let number = F::splat((first + p) as f32);
                 let mut sums = [F::zero(); SUMS];
                 while blocks != 0 {

@@ -8,6 +8,21 @@ use super::{ALPHA_MIN, BLOCKS, Settings, TILE};
 /// Pairs looked at together: a bit each in a block's word.
 pub const BATCH: usize = 64;
 
+/// A tile's splats lie scattered in memory: each is asked for this many pairs before it is needed.
+const AHEAD: usize = 12;
+
+#[inline(always)]
+fn prefetch<T>(value: &T) {
+    #[cfg(target_arch = "x86_64")]
+    // SAFETY: a prefetch of a valid address has no effect but on the cache.
+    unsafe {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast());
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = value;
+}
+
 /// A batch's splats relative to the tile's first pixel centre, one field after another.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
@@ -83,18 +98,27 @@ pub fn block_pixel(block: usize, lane: usize) -> (usize, usize) {
     (block % 4 * 4 + lane % 4, block / 4 * 4 + lane / 4)
 }
 
+/// The pixels' coordinates within the tile, block by block.
+static COORDINATES: [[Row; 2]; BLOCKS] = {
+    let mut rows = [[Row([0.0; LANES]); 2]; BLOCKS];
+    let mut block = 0;
+    while block < BLOCKS {
+        let mut l = 0;
+        while l < LANES {
+            rows[block][0].0[l] = (block % 4 * 4 + l % 4) as f32;
+            rows[block][1].0[l] = (block / 4 * 4 + l / 4) as f32;
+            l += 1;
+        }
+        block += 1;
+    }
+    rows
+};
+
 /// The lanes' pixel coordinates within the tile.
 #[inline(always)]
 pub fn block_coordinates<F: Lanes>(block: usize) -> (F, F) {
-    const COLUMN: Row = Row([
-        0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3.,
-    ]);
-    const ROW: Row = Row([
-        0., 0., 0., 0., 1., 1., 1., 1., 2., 2., 2., 2., 3., 3., 3., 3.,
-    ]);
-    let x = F::load(&COLUMN) + F::splat((block % 4 * 4) as f32);
-    let y = F::load(&ROW) + F::splat((block / 4 * 4) as f32);
-    (x, y)
+    let [x, y] = &COORDINATES[block];
+    (F::load(x), F::load(y))
 }
 
 impl Staged {
@@ -102,6 +126,9 @@ impl Staged {
     pub fn load(&mut self, pairs: &[Pair], splats: &[Splat], place: &Place) {
         let (x0, y0) = (place.x as f64 + 0.5, place.y as f64 + 0.5);
         for (i, pair) in pairs.iter().enumerate() {
+            if let Some(ahead) = pairs.get(i + AHEAD) {
+                prefetch(&splats[ahead.splat as usize]);
+            }
             let s = &splats[pair.splat as usize];
             let (dx, dy) = (x0 - s.x, y0 - s.y);
             // In f64: far from the centre of a needle u is a small difference of large numbers.
@@ -176,10 +203,10 @@ pub fn log2_alpha<F: Lanes>(s: &Staged, p: usize, x: F, y: F) -> (F, F, F) {
     (u, v, u.fnma(u, v.fnma(v, F::splat(s.log2_opacity[p]))))
 }
 
-/// α of lanes whose log2 is known to matter; the rest get something small and finite.
+/// α before clipping, where its log2 is above the minimum; elsewhere anything, even NaN: to be masked.
 #[inline(always)]
 pub fn alpha<F: Lanes>(log2: F) -> F {
-    log2.max(F::splat(-32.0)).exp2()
+    log2.exp2()
 }
 
 /// One tile's pixels, a row of 16 lanes per block.
@@ -215,9 +242,14 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
         *self.pixels = Pixels::default();
         *self.transmittance = [Row([1.0; LANES]); BLOCKS];
         *self.last = [Row([-1.0; LANES]); BLOCKS];
-        let mut alive = [0u16; BLOCKS];
+        // The light that would be left if nothing ever stopped. A stopped pixel's only falls further below the
+        // minimum, so "would it stop here" needs no memory, and the loop below waits for nothing but one product.
+        // Pixels off the image start without light.
+        let mut unstopped = [Row::default(); BLOCKS];
         for b in 0..BLOCKS {
-            alive[b] = self.place.lanes(b);
+            F::splat(1.0)
+                .only(F::Mask::from_bits(self.place.lanes(b)))
+                .store(&mut unstopped[b]);
         }
         let minimum = F::splat(ALPHA_MIN.log2());
         let clip = F::splat(self.settings.alpha_max);
@@ -229,18 +261,18 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
             self.staged.load(pairs, self.splats, &self.place);
             let s = &*self.staged;
             s.reachable::<F>(pairs.len(), words);
-            let mut any = 0;
+            let mut any = false;
             for block in 0..BLOCKS {
-                let mut live = F::Mask::from_bits(alive[block]);
-                let mut todo = if alive[block] == 0 { 0 } else { words[block] };
-                let mut kept = 0u64;
-                if todo == 0 {
+                let mut todo = words[block];
+                let mut t = F::load(&unstopped[block]);
+                if todo == 0 || !t.gt(stop).any() {
+                    any |= t.gt(stop).any();
                     words[block] = 0;
-                    any |= alive[block];
                     continue;
                 }
+                let mut kept = 0u64;
                 let (x, y) = block_coordinates::<F>(block);
-                let mut t = F::load(&self.transmittance[block]);
+                let mut left = F::load(&self.transmittance[block]);
                 let mut last = F::load(&self.last[block]);
                 let px = &mut *self.pixels;
                 let mut rgb = [
@@ -250,35 +282,35 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
                 ];
                 let mut depth = F::load(&px.depth[block]);
                 let mut median = F::load(&px.median[block]);
-                while todo != 0 {
+                let mut light = true;
+                while todo != 0 && light {
                     let p = todo.trailing_zeros() as usize;
                     todo &= todo - 1;
                     let (_, _, log2) = log2_alpha(s, p, x, y);
-                    let hit = live.and(log2.ge(minimum));
-                    let a = alpha(log2).min(clip);
-                    let left = a.fnma(t, t);
-                    let go = hit.and(left.gt(stop));
-                    live = live.and_not(hit.and_not(go));
-                    let w = (a * t).only(go);
+                    let hit = log2.ge(minimum);
+                    let a = alpha(log2).min(clip).only(hit);
+                    let next = a.fnma(t, t);
+                    let going = next.gt(stop);
+                    let w = (a * t).only(going);
                     for c in 0..3 {
                         rgb[c] = F::splat(s.rgb[c][p]).fma(w, rgb[c]);
                     }
+                    let go = hit.and(going);
                     if DEPTH {
                         let z = F::splat(s.depth[p]);
                         depth = z.fma(w, depth);
-                        median = F::select(go.and(t.ge(half)).and(half.gt(left)), z, median);
+                        median = F::select(go.and(t.ge(half)).and(half.gt(next)), z, median);
                     }
-                    t = F::select(go, left, t);
+                    t = next;
+                    left = F::select(going, next, left);
                     last = F::select(go, F::splat((first + p) as f32), last);
                     kept |= u64::from(go.any()) << p;
-                    if !live.any() {
-                        break;
-                    }
+                    light = going.any();
                 }
                 words[block] = kept;
-                alive[block] = live.bits();
-                any |= alive[block];
-                t.store(&mut self.transmittance[block]);
+                any |= light;
+                t.store(&mut unstopped[block]);
+                left.store(&mut self.transmittance[block]);
                 last.store(&mut self.last[block]);
                 for c in 0..3 {
                     rgb[c].store(&mut px.rgb[c][block]);
@@ -288,7 +320,7 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
                     median.store(&mut px.median[block]);
                 }
             }
-            if any == 0 {
+            if !any {
                 return batch + 1;
             }
         }

@@ -92,6 +92,7 @@ pub struct Rasterizer {
     isa: Isa,
     frame: Option<Frame>,
     splats: Vec<Splat>,
+    halves: Vec<[f32; 2]>,
     /// (first splat, number visible) of each chunk of rows.
     chunks: Vec<(usize, usize)>,
     order: Vec<Key>,
@@ -126,6 +127,7 @@ impl Rasterizer {
             isa,
             frame: None,
             splats: Vec::new(),
+            halves: Vec::new(),
             chunks: Vec::new(),
             order: Vec::new(),
             spare: Vec::new(),
@@ -385,8 +387,14 @@ impl Rasterizer {
         self.collect_keys();
         order::sort(&mut self.order, &mut self.spare);
         self.passes.sort = lap(&mut clock);
-        self.bins
-            .fill(&self.order, &mut self.splats, &self.chunks, camera.tiles());
+        self.bins.fill(
+            self.isa,
+            &self.order,
+            &mut self.splats,
+            &self.halves,
+            &self.chunks,
+            camera.tiles(),
+        );
         self.passes.bin = lap(&mut clock);
         self.batches.clear();
         let mut first = 0;
@@ -401,10 +409,13 @@ impl Rasterizer {
         let groups = source.len().div_ceil(LANES);
         let isa = self.isa;
         self.splats.resize(groups * LANES, Splat::default());
+        self.halves.resize(groups * LANES, [0.0; 2]);
+        let halves = self.halves.par_chunks_mut(CHUNK * LANES);
         self.splats
             .par_chunks_mut(CHUNK * LANES)
+            .zip(halves)
             .enumerate()
-            .map(|(chunk, out)| {
+            .map(|(chunk, (out, halves))| {
                 let first = chunk * CHUNK;
                 let last = groups.min(first + CHUNK);
                 (
@@ -417,6 +428,7 @@ impl Rasterizer {
                             first,
                             last,
                             out,
+                            halves,
                         },
                     ),
                 )

@@ -122,6 +122,29 @@ impl Sink for RowMajor {
     }
 }
 
+/// Throws the gradients away: for timing what leads up to them.
+#[derive(Clone, Copy)]
+pub(crate) struct Discard;
+
+impl Sink for Discard {
+    #[inline(always)]
+    fn take<F: Lanes>(&self, _group: usize, _touched: u16, g: &RowGradients<F>) {
+        let mut sum = g.logit_opacity;
+        for k in 0..3 {
+            sum = sum + g.mean[k] + g.log_scale[k] + g.rgb[k];
+        }
+        for k in 0..4 {
+            sum = sum + g.quat[k];
+        }
+        for k in 0..16 {
+            sum = sum + g.basis[k];
+        }
+        let mut row = Row::default();
+        sum.store(&mut row);
+        std::hint::black_box(&row);
+    }
+}
+
 /// Adds up the slots of one chunk's splats and hands every group that was touched to the sink.
 pub(crate) struct Gather<'a, S: Source, K: Sink> {
     pub view: &'a View,

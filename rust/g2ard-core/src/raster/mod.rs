@@ -13,6 +13,7 @@ pub(crate) mod backward;
 mod forward;
 pub(crate) mod frame;
 pub(crate) mod gradients;
+pub mod limits;
 pub(crate) mod order;
 pub(crate) mod params;
 pub(crate) mod project;

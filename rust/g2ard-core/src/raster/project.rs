@@ -118,6 +118,8 @@ pub struct Projected<F: Lanes> {
     /// 1 − opacity.
     pub rest_opacity: F,
     pub radius: F,
+    /// Half the width and height of the ellipse at α = 1/255, pixels.
+    pub half: [F; 2],
 }
 
 /// exp(−|x|)-based logistic: (log2 σ(x), 1 − σ(x)).
@@ -260,6 +262,7 @@ pub fn project<F: Lanes, S: Source>(view: &View, source: &S, group: usize) -> Pr
         log2_opacity,
         rest_opacity,
         radius,
+        half: [out_x, out_y],
     }
 }
 
@@ -355,6 +358,8 @@ pub struct Project<'a, S: Source> {
     pub first: usize,
     pub last: usize,
     pub out: &'a mut [Splat],
+    /// Their half extents.
+    pub halves: &'a mut [[f32; 2]],
 }
 
 impl<S: Source> Kernel for Project<'_, S> {
@@ -377,7 +382,7 @@ impl<S: Source> Kernel for Project<'_, S> {
             let (mut x, mut y) = ([0.0; LANES], [0.0; LANES]);
             p.x.store(&mut x);
             p.y.store(&mut y);
-            let mut rows = [Row::default(); 9];
+            let mut rows = [Row::default(); 11];
             let values = [
                 p.a,
                 p.b,
@@ -388,8 +393,10 @@ impl<S: Source> Kernel for Project<'_, S> {
                 rgb[2].max(F::zero()),
                 p.depth,
                 p.radius,
+                p.half[0],
+                p.half[1],
             ];
-            for k in 0..9 {
+            for k in 0..11 {
                 values[k].store(&mut rows[k]);
             }
             while bits != 0 {
@@ -409,6 +416,7 @@ impl<S: Source> Kernel for Project<'_, S> {
                     slot: 0,
                     radius: rows[8].0[l],
                 };
+                self.halves[count] = [rows[9].0[l], rows[10].0[l]];
                 count += 1;
             }
         }
@@ -576,31 +584,19 @@ pub fn quaternion_gradient<F: Lanes>(q: &[F; 4], rq: F, g: &[[F; 3]; 3]) -> [F; 
     out
 }
 
-/// Splat-to-tile geometry: the half-extents in pixels of the ellipse at α = 1/255, and its tangent slopes.
-#[derive(Debug, Clone, Copy)]
-pub struct Reach {
-    /// u² + v² at α = 1/255, a little over.
-    pub level: f32,
-    pub half_x: f32,
-    pub half_y: f32,
-    /// dy at the rightmost point.
-    pub dy_right: f32,
-}
-
 impl Splat {
-    /// Slack beyond rounding: kernels test every pixel, so a little too much costs time and never correctness.
-    pub fn reach(&self) -> Reach {
-        let level = (self.log2_opacity - ALPHA_MIN.log2()).max(0.0) * 1.000_1 + 1e-4;
-        let half_y = level.sqrt() / self.c;
-        // Σ_xx ∝ (b² + c²)/(a c)², Σ_xy ∝ −b/(a c²).
+    /// u² + v² at α = 1/255, and a little more: kernels test every pixel, so too much costs time, never correctness.
+    #[inline(always)]
+    pub fn level(&self) -> f32 {
+        (self.log2_opacity - ALPHA_MIN.log2()).max(0.0) * 1.000_1 + 1e-4
+    }
+
+    /// Half the width and height of that ellipse: Σ_xx ∝ (b² + c²)/(a·c)², Σ_yy ∝ 1/c².
+    #[cfg(test)]
+    pub fn half_extents(&self) -> [f32; 2] {
         let root = (self.b * self.b + self.c * self.c).sqrt();
-        let half_x = level.sqrt() * root / (self.a * self.c);
-        Reach {
-            level,
-            half_x,
-            half_y,
-            dy_right: -level.sqrt() * self.b / (self.c * root),
-        }
+        let level = self.level().sqrt();
+        [level * root / (self.a * self.c), level / self.c]
     }
 }
 

@@ -12,7 +12,10 @@ mod store;
 pub use anchors::{Anchors, Regularizers};
 pub use store::{Exported, Store};
 
+use std::time::Instant;
+
 use crate::raster::frame::ChunkSums;
+use crate::raster::gradients::Discard;
 use crate::raster::simd::dispatch;
 use crate::raster::{Camera, Image, ImageGradients, Isa, Params, Passes, Rasterizer, Settings};
 use crate::ssim::{Loss, Shape};
@@ -121,6 +124,35 @@ impl Trainer {
 
     /// Renders the view, compares, goes back and takes one Adam step.
     pub fn step(&mut self, lesson: &Lesson) -> Result<Report> {
+        let (loss, seconds_loss) = self.compare(lesson)?;
+        let (updated, skipped) = self.descend(lesson);
+        Ok(Report {
+            loss,
+            updated,
+            skipped,
+            seconds_loss,
+        })
+    }
+
+    /// A step up to the gradients, which are thrown away: for timing.
+    pub fn rehearse(&mut self, lesson: &Lesson) -> Result<Report> {
+        let (loss, seconds_loss) = self.compare(lesson)?;
+        let gradients = ImageGradients {
+            rgb: &self.gradient,
+            alpha: None,
+            depth: None,
+        };
+        let packed = self.store.packed();
+        self.rasterizer.backward_into(packed, &gradients, Discard)?;
+        Ok(Report {
+            loss,
+            seconds_loss,
+            ..Report::default()
+        })
+    }
+
+    /// Renders the view and compares it with the target; returns the loss and the seconds it took.
+    fn compare(&mut self, lesson: &Lesson) -> Result<(f64, f64)> {
         let camera = lesson.camera;
         camera.validate()?;
         lesson.settings.validate()?;
@@ -156,19 +188,12 @@ impl Trainer {
             lesson.background,
             &mut image,
         );
-        let clock = std::time::Instant::now();
+        let clock = Instant::now();
         let (image, gradient) = (&self.image, &mut self.gradient);
         let loss = self
             .loss
             .l1_ssim(image, lesson.target, shape, lesson.ssim_weight, gradient)?;
-        let seconds_loss = clock.elapsed().as_secs_f64();
-        let (updated, skipped) = self.descend(lesson);
-        Ok(Report {
-            loss,
-            updated,
-            skipped,
-            seconds_loss,
-        })
+        Ok((loss, clock.elapsed().as_secs_f64()))
     }
 
     /// The backward pass and Adam; returns how many Gaussians moved and how many were skipped.
