@@ -12,6 +12,7 @@ COMMANDS = (
     "render",
     "evaluate",
     "info",
+    "bench",
     "synth",
 )
 
