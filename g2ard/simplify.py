@@ -67,6 +67,7 @@ class SimplifyConfig:
 
     retention: float | None = None
     min_opacity: float | None = None
+    ladder: float = math.inf
     neighbors: int = 6
     geometric_weight: float = 0.03
     dilation: float = 0.4
@@ -309,6 +310,7 @@ def _pairwise(
             weight=None if seen is None else seen.weight,
             pixel_size=None if seen is None else seen.pixel_size,
             min_opacity=config.min_opacity_of("default"),
+            ladder=config.ladder,
             neighbors=config.neighbors,
             geometric=config.geometric_weight,
             dilation=config.dilation,

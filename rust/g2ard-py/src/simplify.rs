@@ -119,7 +119,7 @@ fn simplify_paper<'py>(
 /// The default: pairs of neighbours, cheapest first.
 #[pyfunction]
 #[pyo3(signature = (
-    scene, schedule, *, protected, weight, pixel_size, min_opacity, neighbors, geometric, dilation,
+    scene, schedule, *, protected, weight, pixel_size, min_opacity, ladder, neighbors, geometric, dilation,
     pixel_scale, progress=None
 ))]
 fn simplify_pairwise<'py>(
@@ -130,6 +130,7 @@ fn simplify_pairwise<'py>(
     weight: Option<PyReadonlyArray1<'py, f32>>,
     pixel_size: Option<PyReadonlyArray1<'py, f32>>,
     min_opacity: f64,
+    ladder: f64,
     neighbors: usize,
     geometric: f64,
     dilation: f64,
@@ -154,6 +155,7 @@ fn simplify_pairwise<'py>(
         .map(|(weight, pixel)| Seen { weight, pixel });
     let policy = Pairwise {
         min_opacity,
+        ladder,
         neighbors,
         geometric,
         dilation,

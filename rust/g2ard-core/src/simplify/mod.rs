@@ -6,6 +6,7 @@
 mod clusters;
 mod cost;
 mod guards;
+mod ladder;
 mod matching;
 mod moments;
 mod ordered;

@@ -129,6 +129,8 @@ const MEAN_GRID: f64 = 1.0 / (1u64 << 36) as f64;
 pub struct Ordered {
     /// The input row of each ordered row.
     pub rows: Vec<u32>,
+    /// Morton codes in that order, ascending.
+    pub codes: Vec<u64>,
     /// The median point; everything is computed relative to it.
     pub origin: [f64; 3],
     /// Spacing of merged means, a power of two.
@@ -149,6 +151,7 @@ impl Ordered {
             run.sort_by(|&a, &b| scene.compare(a as usize, b as usize).then(a.cmp(&b)));
         }
         Ok(Self {
+            codes: rows.par_iter().map(|&row| keys[row as usize]).collect(),
             rows,
             origin: frame.origin,
             grid: power_of_two_below(frame.radius) * MEAN_GRID,

@@ -7,6 +7,7 @@ use rayon::prelude::*;
 
 use super::clusters::Partition;
 use super::cost::{MAX_ALPHA, Node};
+use super::ladder::{climb, cut};
 use super::matching::{Nodes, candidates, matched};
 use super::moments::sigmoid;
 use super::trim::best;
@@ -19,6 +20,8 @@ use crate::{Control, Error, Result};
 pub struct Pairwise {
     /// Below this α a Gaussian is dropped: no renderer draws it.
     pub min_opacity: f64,
+    /// Down to this many times the budget, rows merge along Morton order alone; infinite for never.
+    pub ladder: f64,
     /// Nearest clusters that one may merge with.
     pub neighbors: usize,
     /// Weight of the geometric error beside that of colour.
@@ -33,6 +36,7 @@ impl Default for Pairwise {
     fn default() -> Self {
         Self {
             min_opacity: 0.004,
+            ladder: f64::INFINITY,
             neighbors: 6,
             geometric: 0.03,
             dilation: 0.4,
@@ -84,6 +88,7 @@ impl Pairwise {
         let (mut partition, dropped) = self.visible(scene, &ordered, budget);
         let mut nodes = self.nodes(scene, &ordered, &partition, &blur, seen);
         let mut rounds = Vec::new();
+        self.climb(&ordered, &mut partition, &mut nodes, budget, &mut rounds);
         for &target in schedule {
             while nodes.len() > target {
                 let before = nodes.len();
@@ -113,6 +118,44 @@ impl Pairwise {
         let mut outcome = step.finish(scene, &ordered, rounds);
         outcome.clamped_opacities = clamped;
         Ok(outcome)
+    }
+
+    /// Merges runs of Morton order into `ladder` times the budget.
+    fn climb(
+        &self,
+        ordered: &Ordered,
+        partition: &mut Partition,
+        nodes: &mut Nodes,
+        budget: usize,
+        rounds: &mut Vec<PairwiseRound>,
+    ) {
+        let target = (self.ladder * budget as f64).min(nodes.len() as f64) as usize;
+        if target == nodes.len() {
+            return;
+        }
+        let kept = ordered
+            .codes
+            .iter()
+            .zip(&partition.of)
+            .filter(|(_, c)| **c != GONE);
+        let codes: Vec<u64> = kept.map(|(&code, _)| code).collect();
+        let spent = climb(
+            &codes,
+            &nodes.geometry,
+            &nodes.sh,
+            nodes.width,
+            self.geometric as f32,
+        );
+        let runs = cut(&spent, target);
+        rounds.push(PairwiseRound {
+            before: nodes.len(),
+            merged: nodes.len() - runs.count,
+            after: runs.count,
+            ..PairwiseRound::default()
+        });
+        nodes.merge_runs(&runs);
+        let of = partition.of.par_iter_mut().filter(|c| **c != GONE);
+        of.for_each(|c| *c = runs.of[*c as usize]);
     }
 
     fn check(&self, scene: &SceneRef, seen: Option<Seen>, flags: Option<&[bool]>) -> Result<()> {
