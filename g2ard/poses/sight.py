@@ -17,6 +17,12 @@ Floats = NDArray[np.float64]
 _RAYS = (24, 18)
 """Columns and rows of rays that stand for a frame."""
 
+_RAISED = 0.1
+"""Of the scene's height: what is higher over the ground stands on it."""
+
+_BATCH = 16
+"""Poses whose rays are cast together."""
+
 
 @dataclass(frozen=True)
 class Lens:
@@ -88,11 +94,13 @@ class Seen:
 
     Args:
         covered: share of the rays that opaque matter stops.
+        standing: share of the rays that meet things which stand on the ground, if there is one.
         close: the distance at which a tenth of the rays have met something, if only leaves or haze.
         median: the distance at which half of those that meet anything have; inf where none does.
     """
 
     covered: Floats
+    standing: Floats
     close: Floats
     median: Floats
 
@@ -104,13 +112,19 @@ def look(site: Site, poses: Poses, lens: Lens, wanted: NDArray[np.bool_] | None 
     y = lens.tangents[1] * ((np.arange(rows) + 0.5) / rows * 2 - 1)
     rays = np.stack([np.tile(x, rows), np.repeat(y, columns), np.ones(columns * rows)], axis=1)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    covered, close, median = (np.zeros(len(poses)) for _ in range(3))
-    frames = poses.frames()
-    for i in range(len(poses)) if wanted is None else np.flatnonzero(wanted):
-        directions = np.einsum("ri,ij->rj", rays, frames[i])
-        eyes = np.broadcast_to(poses.eyes[i], directions.shape)
-        covered[i] = np.isfinite(site.grid.cast(eyes, directions)).mean()
-        met = np.sort(site.grid.cast(eyes, directions, murky=True))
-        count = int(np.isfinite(met).sum())
-        close[i], median[i] = met[len(met) // 10], met[count // 2] if count else np.inf
-    return Seen(covered, close, median)
+    covered, standing, close, median = (np.zeros(len(poses)) for _ in range(4))
+    frames, asked = poses.frames(), np.arange(len(poses)) if wanted is None else np.flatnonzero(wanted)
+    for some in np.array_split(asked, -(-len(asked) // _BATCH)) if len(asked) else ():
+        directions = np.einsum("ri,pij->prj", rays, frames[some]).reshape(-1, 3)
+        eyes = np.repeat(poses.eyes[some], len(rays), axis=0)
+        stopped = site.grid.cast(eyes, directions)
+        hit = np.isfinite(stopped)
+        covered[some] = hit.reshape(len(some), -1).mean(axis=1)
+        hit[hit] = (
+            site.above_ground(eyes[hit] + stopped[hit, None] * directions[hit]) > _RAISED * site.tallness
+        )
+        standing[some] = hit.reshape(len(some), -1).mean(axis=1)
+        met = np.sort(site.grid.cast(eyes, directions, murky=True).reshape(len(some), -1), axis=1)
+        halfway = np.isfinite(met).sum(axis=1) // 2
+        close[some], median[some] = met[:, len(rays) // 10], met[np.arange(len(some)), halfway]
+    return Seen(covered, standing, close, median)

@@ -28,6 +28,9 @@ _SKY = 0.25
 _TRIES = (512, 2048)
 """Places tried; more poses than are free share places and look elsewhere."""
 
+_THINGS = 0.12
+"""Outdoors at least this share of the frame shows what stands on the ground, not bare ground alone."""
+
 _HALLS = 0.15
 """Places that at least this share of all can be walked to from are kept; fewer are hollows."""
 
@@ -40,7 +43,7 @@ def plan_walk(
     Gazes into a near wall or leaves, or out of the scene, are left out.
     """
     room = _clearance(site, indoors)
-    far = 0.4 * min(site.box[1, :2] - site.box[0, :2]) if indoors else site.tallness
+    far = 0.4 * min(site.box[1, :2] - site.box[0, :2]) if indoors else 0.6 * site.tallness
     places = _places(site, int(np.clip(4 * count, *_TRIES)), seed, room, indoors)
     if not len(places):
         return Poses(np.zeros((0, 3)), np.zeros((0, 3)))
@@ -55,7 +58,8 @@ def plan_walk(
     def judge(poses: Poses) -> Floats:
         seen = look(site, poses, lens)
         covered = seen.covered / (0.8 if indoors else 0.5)
-        return np.minimum(covered, np.minimum(seen.close / (2 * room), seen.median / far))
+        limits = [covered, seen.close / (2 * room), seen.median / far]
+        return np.min(limits if indoors else [*limits, seen.standing / _THINGS], axis=0)
 
     return gather(count, propose, judge, tell)
 
