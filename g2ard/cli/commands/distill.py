@@ -175,13 +175,15 @@ def _views(
     run: Run, prior: Splats, views: Path | None, held_out: Path | None, size: int | None
 ) -> tuple[Cameras, Cameras, Cameras | None]:
     """Views for recovery, views for scoring, and the pool both came from where one had to be made."""
-    from g2ard.poses import make_pool
+    from g2ard.poses import plan_pool
     from g2ard.splits import split_mask
 
     if views is not None:
         train = load_views(run, views, "all" if held_out else "train", size)
         return train, load_views(run, held_out or views, "all" if held_out else "test", size), None
-    pool = make_pool(prior, _POOL, seed=run.seed, progress=run.progress)
+    planned = plan_pool(prior, _POOL, seed=run.seed, progress=run.progress)
+    pool = planned.cameras
+    run.say(f"poses: {planned.kind} ({planned.why})")
     if held_out is not None:
         return pool.resized(size), load_views(run, held_out, "all", size), pool
     test = split_mask("views.json", pool.names, "test")
