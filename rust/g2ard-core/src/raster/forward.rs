@@ -9,7 +9,7 @@ use super::{ALPHA_MIN, BLOCKS, Settings, TILE};
 pub const BATCH: usize = 64;
 
 /// A tile's splats lie scattered in memory: each is asked for this many pairs before it is needed.
-const AHEAD: usize = 12;
+const AHEAD: usize = 24;
 
 #[inline(always)]
 fn prefetch<T>(value: &T) {
@@ -122,10 +122,10 @@ pub fn block_coordinates<F: Lanes>(block: usize) -> (F, F) {
 }
 
 impl Staged {
-    /// Loads up to 64 pairs; the rest of the batch is made unreachable.
+    /// Loads the first 64 pairs; if there are fewer, the rest of the batch is made unreachable.
     pub fn load(&mut self, pairs: &[Pair], splats: &[Splat], place: &Place) {
         let (x0, y0) = (place.x as f64 + 0.5, place.y as f64 + 0.5);
-        for (i, pair) in pairs.iter().enumerate() {
+        for (i, pair) in pairs.iter().take(BATCH).enumerate() {
             if let Some(ahead) = pairs.get(i + AHEAD) {
                 prefetch(&splats[ahead.splat as usize]);
             }
@@ -149,7 +149,7 @@ impl Staged {
             let size = s.a * cx.abs() + (s.b.abs() + s.c) * cy.abs();
             self.level[i] = s.log2_opacity - ALPHA_MIN.log2() + 0.01 + 2e-6 * size;
         }
-        for i in pairs.len()..BATCH {
+        for i in pairs.len().min(BATCH)..BATCH {
             self.level[i] = -1.0;
         }
     }
@@ -258,7 +258,8 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
         for (batch, words) in self.words.iter_mut().enumerate() {
             let first = batch * BATCH;
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
-            self.staged.load(pairs, self.splats, &self.place);
+            self.staged
+                .load(&self.pairs[first..], self.splats, &self.place);
             let s = &*self.staged;
             s.reachable::<F>(pairs.len(), words);
             let mut any = false;

@@ -5,8 +5,8 @@ use std::time::Instant;
 use rayon::prelude::*;
 
 use super::accumulate::{Accumulate, Accumulated, total};
-use super::backward::{Backward, Incoming, SUMS};
-use super::forward::{BATCH, Forward, Pixels, Place, Staged, block_pixel};
+use super::backward::{self, Backward, Incoming, SUMS};
+use super::forward::{BATCH, Forward, Pixels, Place, Staged};
 use super::gradients::{Gather, Gradients, Sink};
 use super::order::{self, Key, Shared};
 use super::params::{Params, Source};
@@ -486,29 +486,29 @@ impl Rasterizer {
                 };
                 batch.1 = dispatch(isa, forward);
                 let pixels = &scratch.pixels;
-                for block in 0..BLOCKS {
-                    for l in 0..LANES {
-                        let (x, y) = block_pixel(block, l);
-                        if x >= place.columns || y >= place.rows {
-                            continue;
-                        }
-                        let at = (place.y + y) * camera.width + place.x + x;
+                for y in 0..place.rows {
+                    let first = (place.y + y) * camera.width + place.x;
+                    // SAFETY: as above.
+                    let (rgb, alpha) = unsafe {
+                        (
+                            rgb.slice(3 * first, 3 * place.columns),
+                            alpha.slice(first, place.columns),
+                        )
+                    };
+                    for (x, (rgb, alpha)) in rgb.chunks_exact_mut(3).zip(alpha).enumerate() {
+                        let (block, l) = (y / 4 * 4 + x / 4, y % 4 * 4 + x % 4);
                         let t = transmittance[block].0[l];
+                        *alpha = 1.0 - t;
+                        for c in 0..3 {
+                            rgb[c] = pixels.rgb[c][block].0[l] + t * background[c];
+                        }
+                    }
+                    for (plane, rows) in [(depth, &pixels.depth), (median, &pixels.median)] {
+                        let Some(plane) = plane else { continue };
                         // SAFETY: as above.
-                        unsafe {
-                            for c in 0..3 {
-                                rgb.write(
-                                    3 * at + c,
-                                    pixels.rgb[c][block].0[l] + t * background[c],
-                                );
-                            }
-                            alpha.write(at, 1.0 - t);
-                            if let Some(depth) = depth {
-                                depth.write(at, pixels.depth[block].0[l]);
-                            }
-                            if let Some(median) = median {
-                                median.write(at, pixels.median[block].0[l]);
-                            }
+                        let row = unsafe { plane.slice(first, place.columns) };
+                        for (x, value) in row.iter_mut().enumerate() {
+                            *value = rows[y / 4 * 4 + x / 4].0[y % 4 * 4 + x % 4];
                         }
                     }
                 }
@@ -539,14 +539,12 @@ impl Rasterizer {
                 }
                 let place = Place::of(tile, tiles_x, camera.width, camera.height);
                 let incoming = &mut scratch.incoming;
-                for c in 0..3 {
-                    Incoming::load(&mut incoming.rgb[c], image.rgb, c, 3, camera.width, &place);
-                }
+                incoming.load(backward::RGB, image.rgb, 3, camera.width, &place);
                 if let Some(alpha) = image.alpha {
-                    Incoming::load(&mut incoming.alpha, alpha, 0, 1, camera.width, &place);
+                    incoming.load(backward::ALPHA, alpha, 1, camera.width, &place);
                 }
                 if let Some(depth) = image.depth {
-                    Incoming::load(&mut incoming.depth, depth, 0, 1, camera.width, &place);
+                    incoming.load(backward::DEPTH, depth, 1, camera.width, &place);
                 }
                 let backward = Backward::<DEPTH> {
                     pairs,
