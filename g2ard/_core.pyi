@@ -57,3 +57,90 @@ def simplify_pairwise(
     pixel_scale: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]: ...
+
+_F32 = NDArray[np.float32]
+_Arrays = tuple[_F32, ...]
+_View = tuple[list[list[float]], list[float], tuple[int, int], float]
+_Choices = tuple[str, bool, float]
+
+def instruction_sets() -> list[str]: ...
+def machine_limits(isa: str | None = None) -> tuple[float, float]: ...
+
+class Rasterizer:
+    def __init__(self, isa: str | None = None) -> None: ...
+    def forward(
+        self,
+        arrays: _Arrays,
+        view: _View,
+        choices: _Choices,
+        background: list[float],
+        depth: bool = True,
+        median: bool = False,
+    ) -> tuple[_F32, _F32, _F32 | None, _F32 | None]: ...
+    def backward(
+        self, arrays: _Arrays, image: _F32, alpha: _F32 | None = None, depth: _F32 | None = None
+    ) -> list[_F32]: ...
+    def counts(self) -> dict[str, int]: ...
+    def passes(self) -> dict[str, float]: ...
+
+class Trainer:
+    def __init__(self, arrays: _Arrays, units: _F32 | None = None, isa: str | None = None) -> None: ...
+    def anchor(self, means: _F32, frames: _F32, r_parallel: _F32, r_perp: _F32) -> None: ...
+    def step(
+        self,
+        view: _View,
+        choices: _Choices,
+        background: list[float],
+        target: _F32,
+        ssim_weight: float,
+        rates: list[float],
+        regularizers: tuple[float, float, bool] | None = None,
+    ) -> tuple[float, int]: ...
+    def rehearse(
+        self, view: _View, choices: _Choices, background: list[float], target: _F32, ssim_weight: float
+    ) -> float: ...
+    def arrays(self) -> list[_F32]: ...
+    def state(self) -> dict[str, NDArray[Any]]: ...
+    def load(self, state: dict[str, NDArray[Any]]) -> None: ...
+    @property
+    def skipped(self) -> int: ...
+    @property
+    def isa(self) -> str: ...
+    def passes(self) -> dict[str, float]: ...
+
+def accumulate(
+    arrays: _Arrays,
+    views: list[_View],
+    choices: _Choices,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]: ...
+def l1_ssim(image: _F32, target: _F32, ssim_weight: float) -> tuple[float, _F32]: ...
+def ssim(image: _F32, target: _F32) -> float: ...
+def psnr(image: _F32, target: _F32) -> float: ...
+
+_F64 = NDArray[np.float64]
+_Surface = tuple[_F64, _F64, _F64, _F64, float]
+_Scene = tuple[NDArray[Any], ...]
+
+def select_surface(scene: _Scene, cells: int) -> dict[str, Any]: ...
+def select_depth(scene: _Scene, view: tuple[Any, ...]) -> _F32: ...
+def select_visible(
+    scene: _Scene,
+    surface: _Surface,
+    views: list[tuple[Any, ...]],
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[NDArray[np.uint64], NDArray[np.uint32]]: ...
+def select_greedy(
+    surface: _Surface,
+    starts: NDArray[np.uint64],
+    cells: NDArray[np.uint32],
+    positions: _F64,
+    k: int,
+    *,
+    directional: bool,
+    kappa: float,
+    alpha: float,
+    lambda_: float,
+    lazy: bool,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[NDArray[np.uint32], _F64, int]: ...

@@ -7,7 +7,7 @@ import json
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from g2ard.recover.schedule import TUNED, Schedule
 from g2ard.splats import Splats
 from g2ard.targets import Targets
 
+if TYPE_CHECKING:
+    from g2ard.render import Visibility
+
 __all__ = ["DistillConfig", "Distilled", "distill"]
 
 
@@ -27,10 +30,12 @@ class DistillConfig:
     """How a scene is distilled.
 
     Args:
-        method: simplification's: default, fast or paper.
+        method: simplification's: default or paper.
+        visibility_views: training views, evenly spaced, that tell the default method what is seen.
         schedule: recovery's; one with `round_steps` recovers after every round of 75 % (the paper), without
             them the reduction is one shot and all recovery happens at the target count.
         steps: overrides the schedule's final horizon.
+        time_limit: seconds for the final recovery; its horizon becomes what fits into them.
         regularizers: weights of L_anchor and L_shape.
         sh_degree: of the result; None keeps the prior's.
         background: RGB behind the scene.
@@ -38,8 +43,10 @@ class DistillConfig:
     """
 
     method: str = "default"
+    visibility_views: int = 48
     schedule: Schedule = TUNED
     steps: int | None = None
+    time_limit: float | None = None
     regularizers: Regularizers = PRESETS["trained"]
     sh_degree: int | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -76,7 +83,7 @@ def distill(
     shot.
 
     Args:
-        prior: a trained model, or a lift; in the coordinates of the targets' cameras.
+        prior: a trained model, or a lift; its offset counts, cameras are in world coordinates.
         budget: N_S, at most the prior's count.
         targets: photos, or the prior's own renders.
         config: see `DistillConfig`.
@@ -141,6 +148,7 @@ class _Rounds:
                 self.state,
                 count,
                 method=self.config.method,
+                visibility=self._visibility if self.config.method == "default" else None,
                 protected=self.protected,
                 flag_budget=self.budget,
                 progress=self.progress,
@@ -153,6 +161,15 @@ class _Rounds:
             self.state = self.state.with_sh_degree(self.config.sh_degree)
         self.simplified = self.state
 
+    def _visibility(self, scene: Splats) -> Visibility:
+        """What a sample of the training views sees of each Gaussian."""
+        from g2ard.render import visibility
+
+        cameras = self.targets.cameras
+        count = min(len(cameras), self.config.visibility_views)
+        sample = np.unique(np.linspace(0, len(cameras) - 1, count).round().astype(int))
+        return visibility(scene, cameras.take(sample), progress=self.progress)
+
     def _recover(self, name: str, entry: dict[str, Any], *, final: bool) -> None:
         from g2ard.recover import RecoverConfig, recover
 
@@ -160,6 +177,7 @@ class _Rounds:
             config = RecoverConfig(
                 schedule=self.config.schedule,
                 steps=self.config.steps if final else None,
+                time_limit=self.config.time_limit if final else None,
                 regularizers=self.config.regularizers,
                 background=self.config.background,
                 final=final,

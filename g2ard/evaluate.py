@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.metrics import psnr, ssim
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
 from g2ard.targets import Targets
 
-__all__ = ["Evaluation", "ViewScore", "evaluate", "psnr"]
+__all__ = ["Evaluation", "ViewScore", "evaluate"]
 
 
 @dataclass(frozen=True)
@@ -60,16 +60,6 @@ class Evaluation:
         }
 
 
-def psnr(image: NDArray[np.floating[Any]], target: NDArray[np.floating[Any]]) -> float:
-    """−10·log10 of the mean squared difference, peak 1; at most 100 dB, which identical images reach.
-
-    >>> round(psnr(np.full((2, 2, 3), 0.5), np.full((2, 2, 3), 0.6)), 6)
-    20.0
-    """
-    error = float(np.mean((image.astype(np.float64) - target.astype(np.float64)) ** 2))
-    return 100.0 if error <= 1e-10 else -10 * float(np.log10(error))
-
-
 def evaluate(
     splats: Splats,
     targets: Targets,
@@ -84,7 +74,7 @@ def evaluate(
     zero-padded.
 
     Args:
-        splats: the scene, in the cameras' coordinates.
+        splats: the scene; its offset counts, cameras are in world coordinates.
         targets: photos or teacher renders; photo-relative and teacher-relative figures never mix.
         background: RGB behind the scene.
         progress: told after each view.
@@ -96,7 +86,6 @@ def evaluate(
     Raises:
         InputError: a photo cannot be read.
     """
-    from g2ard.metrics import ssim
     from g2ard.render import render
 
     cameras = targets.cameras

@@ -25,23 +25,24 @@ def preview(
     Args:
         path: where the PNG goes.
         targets: photos or teacher renders with their cameras.
-        scenes: (label, scene), left to right.
+        scenes: (label, scene), left to right after the target.
         background: RGB behind the scenes.
     """
-    from g2ard.evaluate import psnr
-    from g2ard.images import contact_sheet
+    from g2ard.images import contact_sheet, write_png
+    from g2ard.metrics import psnr
     from g2ard.render import render
 
     count = len(targets.cameras)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _ROWS)).round().astype(int))
-    rows, labels = [], []
+    rows, captions = [], []
     for view in map(int, chosen):
         target = targets[view]
-        row, captions = [target], [f"target ({targets.cameras.names[view]})"]
-        for name, splats in scenes:
-            image = np.clip(render(splats, targets.cameras, view, background=background).image, 0, 1)
-            row.append(image)
-            captions.append(f"{name} ({len(splats):,}): {psnr(image, target):.2f} dB")
-        rows.append(row)
-        labels.append(captions)
-    contact_sheet(path, rows, labels)
+        images = [render(splats, targets.cameras, view, background=background).image for _, splats in scenes]
+        rows.append([target, *(np.clip(image, 0, 1) for image in images)])
+        scores = [
+            f"{name} {psnr(image, target):.2f} dB"
+            for (name, _), image in zip(scenes, rows[-1][1:], strict=True)
+        ]
+        captions.append(", ".join([targets.cameras.names[view], *scores]))
+    labels = ["target", *(f"{name}: {len(splats):,} Gaussians" for name, splats in scenes)]
+    write_png(path, contact_sheet(rows, labels, row_labels=captions), overwrite=True)

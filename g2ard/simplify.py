@@ -217,8 +217,8 @@ def simplify(
             and counted.
         budget: Gaussians to keep, at most as many as there are.
         method: the policy.
-        visibility: for `default` and `fast`: what views see of each Gaussian (`g2ard.render.visibility`), or a
-            function that finds it for a scene, asked again as the scene shrinks (+0.4 dB on small objects).
+        visibility: for `default` and `fast`: what views see of each Gaussian (`g2ard.render.visibility`), or
+            a function that finds it for a scene, asked again as the scene shrinks (+0.4 dB on small objects).
         protected: (N,) bool flags to inherit. With None, `paper` computes them (see `flag`), the others,
             which have no use for them, go without.
         flag_budget: the count that sets the flags' cell size, where this call is one round on the way to a

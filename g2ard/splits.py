@@ -85,8 +85,10 @@ def _split_file(views: Path) -> dict[str, list[str]] | None:
 
 
 def _listed(names: Sequence[str], wanted: Sequence[str]) -> NDArray[np.bool_]:
-    exact = set(wanted)
-    if not exact & set(names):  # another spelling of the same photos
-        exact = {PurePosixPath(name).stem for name in wanted}
-        return np.array([PurePosixPath(name).stem in exact for name in names], bool)
-    return np.array([name in exact for name in names], bool)
+    """By stem, so that suffix and folder may differ, unless stems do not tell the views apart."""
+    stems = [PurePosixPath(name).stem for name in names]
+    if len(set(stems)) < len(stems):
+        exact = set(wanted)
+        return np.array([name in exact for name in names], bool)
+    chosen = {PurePosixPath(name).stem for name in wanted}
+    return np.array([stem in chosen for stem in stems], bool)

@@ -1,16 +1,17 @@
-"""Where real data is, and what tests share."""
+"""What tests of several stages share: where real data is, and the program as a user types it."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-_ROOT = Path(__file__).resolve().parents[1]
-_DATA = Path(os.environ.get("G2ARD_DATA", Path(__file__).parents[2] / "shared" / "data"))
+ROOT = Path(__file__).resolve().parents[1]
+_DATA = Path(os.environ.get("G2ARD_DATA", ROOT.parent / "shared" / "data"))
 
 
 @pytest.fixture(scope="session")
@@ -21,12 +22,12 @@ def data() -> Path:
     return _DATA
 
 
-@pytest.fixture
-def command_line():
-    """Runs `g2ard …` as a program: (exit status, stdout, stderr)."""
+@pytest.fixture(scope="session")
+def command_line() -> Callable[..., tuple[int, str, str]]:
+    """Runs `g2ard …` as a program in a folder: (exit status, stdout, stderr)."""
 
-    def run(*arguments, cwd):
-        path = os.pathsep.join(filter(None, [str(_ROOT), os.environ.get("PYTHONPATH")]))
+    def run(*arguments: object, cwd: Path) -> tuple[int, str, str]:
+        path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
         done = subprocess.run(
             [sys.executable, "-m", "g2ard", *map(str, arguments)],
             cwd=cwd,

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-COMMANDS = ["evaluate", "recover", "render"]
+from g2ard.cli.commands import COMMANDS
+from g2ard.cli.console import Console
 
-
-def g2ard(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "g2ard", *arguments], capture_output=True, text=True, cwd=cwd, timeout=300
-    )
+CommandLine = Callable[..., tuple[int, str, str]]
 
 
 def imported_by(statement: str, *heavy: str) -> list[str]:
@@ -33,10 +31,10 @@ def test_import_and_help_load_nothing_heavy() -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_an_example(command: str) -> None:
-    shown = g2ard(command, "--help")
-    assert shown.returncode == 0
-    assert "Example: g2ard " + command in shown.stdout.replace("\n", " ")
+def test_every_command_has_an_example(command: str, command_line: CommandLine, tmp_path: Path) -> None:
+    status, shown, _ = command_line(command, "--help", cwd=tmp_path)
+    assert status == 0
+    assert "Example: g2ard " + command in shown
 
 
 @pytest.mark.parametrize(
@@ -48,23 +46,50 @@ def test_every_command_has_an_example(command: str) -> None:
         (["render", "x.ply", "--views", "v.json", "-o", "out", "--device", "abacus"], "abacus"),
     ],
 )
-def test_usage_errors_are_one_line_and_status_2(arguments: list[str], words: str, tmp_path: Path) -> None:
-    done = g2ard(*arguments, cwd=tmp_path)
-    assert done.returncode == 2
-    assert len(done.stderr.strip().splitlines()) == 1
-    assert words in done.stderr
+def test_usage_errors_are_one_line_and_status_2(
+    arguments: list[str], words: str, command_line: CommandLine, tmp_path: Path
+) -> None:
+    status, _, error = command_line(*arguments, cwd=tmp_path)
+    assert status == 2
+    assert len(error.strip().splitlines()) == 1
+    assert words in error
     assert list(tmp_path.iterdir()) == []
 
 
-def test_config_file_gives_defaults_and_refuses_unknown_names(tmp_path: Path) -> None:
+def test_config_file_gives_defaults_and_refuses_unknown_names(
+    command_line: CommandLine, tmp_path: Path
+) -> None:
     (tmp_path / "bad.toml").write_text('[render]\nbackgruond = "white"\n')
-    done = g2ard("render", "x.ply", "--views", "v", "-o", "o", "--config", "bad.toml", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "backgruond" in done.stderr
     (tmp_path / "good.toml").write_text('[render]\ndevice = "abacus"\n')
-    done = g2ard("render", "x.ply", "--views", "v", "-o", "o", "--config", "good.toml", cwd=tmp_path)
-    assert "abacus" in done.stderr  # the file's value is used …
-    done = g2ard(
-        "render", "x", "--views", "v", "-o", "o", "--config", "good.toml", "--device", "cpu", cwd=tmp_path
-    )
-    assert "abacus" not in done.stderr  # … and a flag wins
+    render = ("render", "x.ply", "--views", "v", "-o", "o", "--config")
+    status, _, error = command_line(*render, "bad.toml", cwd=tmp_path)
+    assert status == 2
+    assert "backgruond" in error
+    assert "abacus" in command_line(*render, "good.toml", cwd=tmp_path)[2]  # the file's value is used …
+    flagged = command_line(*render, "good.toml", "--device", "cpu", cwd=tmp_path)[2]
+    assert "abacus" not in flagged  # … a flag wins
+
+
+def test_progress_lines_are_rare_and_tell_eta(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter(range(100))
+    monkeypatch.setattr("g2ard.cli.console.time.monotonic", lambda: next(clock))
+    console = Console()
+    for done in range(1, 41):
+        console("recover", done, 40, {"loss": 0.5})
+    console("short", 1, 1)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 4  # every 10 s, and the end
+    assert "ETA" in lines[0]
+    assert "loss 0.5" in lines[0]
+    assert lines[-1].startswith("recover: 40/40")
+
+
+def test_quiet_says_errors_only(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console(quiet=True)
+    console.say("hello")
+    console("stage", 1, 1)
+    console.table("t", ["a"], [["1"]])
+    console.error("bad")
+    assert capsys.readouterr().err == "g2ard: bad\n"

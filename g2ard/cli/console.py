@@ -33,9 +33,8 @@ def duration(seconds: float) -> str:
 class Console:
     """A progress callback (see `g2ard.progress`) that draws; used as a context so that bars end cleanly."""
 
-    def __init__(self, *, quiet: bool = False, verbose: bool = False) -> None:
+    def __init__(self, *, quiet: bool = False) -> None:
         self.quiet = quiet
-        self.verbose = verbose
         self._bars: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
         self._plain: dict[str, tuple[float, float]] = {}  # stage → (began, last line)
@@ -110,7 +109,7 @@ class Console:
         finished = bool(total) and done >= total
         if now - last < _PLAIN_PERIOD and not finished:
             return
-        if finished and now - began < 1.0 and not self.verbose:
+        if finished and now - began < 1.0:
             del self._plain[stage]  # too short to be worth a line
             return
         elapsed = now - began

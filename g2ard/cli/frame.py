@@ -101,7 +101,7 @@ class Run:
         self.device: str = common["device"]
         self.verbose: bool = common["verbose"]
         self.json: str | None = common["json"]
-        self.console = Console(quiet=common["quiet"], verbose=self.verbose)
+        self.console = Console(quiet=common["quiet"])
         self.config = {**options, "seed": self.seed, "threads": self.threads, "device": self.device}
 
     @property

@@ -6,7 +6,7 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -16,6 +16,7 @@ __all__ = [
     "OutputOption",
     "RatioOption",
     "SceneArgument",
+    "Triple",
     "ViewsOption",
     "budget_of",
     "one_budget",
@@ -106,8 +107,12 @@ def budget_of(count: Count | None, ratio: float | None, total: int) -> int:
     return max(1, math.floor(total / ratio + 0.5))
 
 
-def _colour(text: str) -> tuple[float, float, float]:
-    named = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+class Triple(tuple[float, float, float]):
+    """Three numbers in one argument; a class, for typer reads a bare tuple as several."""
+
+
+def _colour(text: str) -> Triple:
+    named = {"black": Triple((0.0, 0.0, 0.0)), "white": Triple((1.0, 1.0, 1.0))}
     if text in named:
         return named[text]
     try:
@@ -116,7 +121,7 @@ def _colour(text: str) -> tuple[float, float, float]:
         values = ()
     if len(values) != 3 or not all(0 <= v <= 1 for v in values):
         raise typer.BadParameter(f"black, white or three numbers in [0, 1] such as 0.2,0.3,0.4, not {text!r}")
-    return (values[0], values[1], values[2])
+    return Triple((values[0], values[1], values[2]))
 
 
 SplitOption = Annotated[
@@ -126,10 +131,30 @@ SizeOption = Annotated[
     int | None, typer.Option(min=16, metavar="PIXELS", help="Shrink views to this longer side.")
 ]
 BackgroundOption = Annotated[
-    tuple[float, float, float] | None,
+    Triple | None,
     typer.Option(parser=_colour, metavar="COLOUR", help="black (the default), white or R,G,B in [0, 1]."),
 ]
 TeacherOption = Annotated[
     Path | None,
     typer.Option("--teacher", metavar="SCENE", help="Its renders are the targets; without it, the photos."),
+]
+
+Method = Literal["default", "paper"]
+ScheduleName = Literal["fast", "default", "best", "paper"]
+PresetOption = Annotated[
+    Literal["auto", "trained", "lift", "noisy"],
+    typer.Option(help="Which regularisers hold the geometry; auto measures the scene."),
+]
+
+
+def _duration(text: str) -> float:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|min|h)?", text.strip())
+    if match is None or not float(match[1]) > 0:
+        raise typer.BadParameter(f"a time such as 90s, 2m or 1h, not {text!r}")
+    return float(match[1]) * {"s": 1, "m": 60, "min": 60, "h": 3600}[match[2] or "s"]
+
+
+TimeLimitOption = Annotated[
+    float | None,
+    typer.Option("--time-limit", parser=_duration, metavar="TIME", help="Fit recovery into 90s, 2m or 1h."),
 ]

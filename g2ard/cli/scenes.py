@@ -24,14 +24,12 @@ def load_scene(run: Run, path: Path) -> Splats:
     return scene.splats
 
 
-def load_views(run: Run, path: Path, split: str, size: int | None, offset: object = None) -> Cameras:
-    """Read views, pick a split, shrink them, and bring them into the scene's coordinates.
+def load_views(run: Run, path: Path, split: str, size: int | None) -> Cameras:
+    """Read views, pick a split, shrink them.
 
     Raises:
         InputError: the file has no views, or the split is empty.
     """
-    import numpy as np
-
     from g2ard.io import read_view_set
     from g2ard.splits import split_mask
 
@@ -39,9 +37,7 @@ def load_views(run: Run, path: Path, split: str, size: int | None, offset: objec
     for note in found.notes:
         run.say(f"{path}: {note}")
     mask = split_mask(path, found.cameras.names, split, stated=found.splits)
-    cameras = found.cameras.take(mask)
-    cameras = cameras.resized(size)
-    return cameras if offset is None else cameras.recentred(np.asarray(offset))
+    return found.cameras.take(mask).resized(size)
 
 
 def make_targets(

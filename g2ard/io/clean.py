@@ -78,13 +78,13 @@ def cleaned(path: Path, raw: Raw, notes: list[Note] | None = None) -> Scene:
         first = int(np.argmin(keep))
         text = f"{plural(dropped, 'non-finite Gaussian')} dropped (the first is row {first})"
         notes.append(Note("dropped_rows", dropped, text))
-    for key, code, text in (
-        ("logits", "clamped_logits", f"opacity logits beyond ±{LOGIT_LIMIT:g} clamped"),
-        ("scales", "clamped_scales", f"log-scales beyond ±{LOG_SCALE_LIMIT:g} clamped"),
-        ("quats", "zero_quats", "quaternions of length zero replaced by the identity"),
+    for key, code, what, then in (
+        ("logits", "clamped_logits", "opacity logit", f"beyond ±{LOGIT_LIMIT:g} clamped"),
+        ("scales", "clamped_scales", "log-scale", f"beyond ±{LOG_SCALE_LIMIT:g} clamped"),
+        ("quats", "zero_quats", "quaternion", "of length zero made the identity"),
     ):
         if tally[key]:
-            notes.append(Note(code, tally[key], f"{tally[key]:,} {text}"))
+            notes.append(Note(code, tally[key], f"{plural(tally[key], what)} {then}"))
     splats = Splats(
         raw.means, raw.quats, raw.log_scales, raw.logit_opacities, raw.sh0, raw.shN, raw.offset
     )  # `log_scales` were exponentiated in place

@@ -46,15 +46,17 @@ def model_folder(path: Path) -> Path | None:
     Looks at `path` itself, then sparse/0, sparse, colmap/sparse/0 in it.
     """
     path = path.parent if path.is_file() else path
-    for folder in (path, path / "sparse" / "0", path / "sparse", path / "colmap" / "sparse" / "0"):
-        if _table(folder, "cameras") and _table(folder, "images"):
-            return folder
+    places = (path, path / "sparse" / "0", path / "sparse", path / "colmap" / "sparse" / "0")
+    return next((folder for folder in places if _tables(folder)), None)
+
+
+def _tables(folder: Path) -> tuple[Path, Path] | None:
+    """The tables of cameras and images, binary before text; None if either is absent."""
+    for suffix in (".bin", ".txt"):
+        cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
+        if cameras.is_file() and images.is_file():
+            return cameras, images
     return None
-
-
-def _table(folder: Path, name: str) -> Path | None:
-    """`name`.bin, else `name`.txt, else None."""
-    return next((p for s in (".bin", ".txt") if (p := folder / f"{name}{s}").is_file()), None)
 
 
 @contextmanager
@@ -86,24 +88,24 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     from g2ard.io.photos import Frame, view_set
 
     folder = model_folder(path)
-    if folder is None:
+    tables = _tables(folder) if folder else None
+    if folder is None or tables is None:
         raise InputError(f"{path}: no COLMAP model there (cameras and images, .bin or .txt)")
-    cameras_path, images_path = _table(folder, "cameras"), _table(folder, "images")
-    assert cameras_path is not None
-    assert images_path is not None
-    with parsing(cameras_path):
-        binary = cameras_path.suffix == ".bin"
-        cameras = (_cameras_bin if binary else _cameras_txt)(cameras_path)
-    with parsing(images_path):
-        found = (_images_bin if images_path.suffix == ".bin" else _images_txt)(images_path)
+    binary = tables[0].suffix == ".bin"
+    with parsing(tables[0]):
+        cameras = (_cameras_bin if binary else _cameras_txt)(tables[0])
+    with parsing(tables[1]):
+        found = (_images_bin if binary else _images_txt)(tables[1])
     photos = images or _photo_folder(path, folder)
     frames = []
     for image in sorted(found, key=lambda i: i.name):
         if image.camera not in cameras:
-            raise InputError(f"{images_path}: {image.name} names camera {image.camera}, which is absent")
+            raise InputError(f"{tables[1]}: {image.name!r} names camera {image.camera}, which is absent")
         camera = cameras[image.camera]
         photo = photos / image.name if photos else None
-        frames.append(Frame(image.name, _viewmat(image), camera.K, camera.size, photo, camera.distortion))
+        frames.append(
+            Frame(image.name, _viewmat(tables[1], image), camera.K, camera.size, photo, camera.distortion)
+        )
     return view_set(folder, frames)
 
 
@@ -112,12 +114,12 @@ def _photo_folder(path: Path, model: Path) -> Path | None:
     return next((root / "images" for root in roots if (root / "images").is_dir()), None)
 
 
-def _viewmat(image: _Image) -> NDArray[np.float64]:
+def _viewmat(path: Path, image: _Image) -> NDArray[np.float64]:
     import numpy as np
 
     q = np.array(image.quat)
     if not np.linalg.norm(q) > 0:
-        raise InputError(f"{image.name}: its quaternion is zero")
+        raise InputError(f"{path}: {image.name!r}: its quaternion is zero")
     w, x, y, z = q / np.linalg.norm(q)
     view = np.eye(4)
     view[:3, :3] = [
@@ -172,7 +174,7 @@ def _images_bin(path: Path) -> list[_Image]:
         images.append(_Image(data[at + 64 : end].decode(), camera, tuple(pose[:4]), tuple(pose[4:])))
         at = end + 9 + 24 * points
         if at > len(data):
-            raise InputError(f"{path}: truncated in the points of {images[-1].name}")
+            raise InputError(f"{path}: truncated in the points of {images[-1].name!r}")
     return images
 
 

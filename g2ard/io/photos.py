@@ -58,6 +58,20 @@ def rigid(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
+def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
+    try:
+        return Cameras.from_lists(
+            [f.viewmat for f in frames],
+            [f.K for f in frames],
+            [f.size for f in frames],
+            [f.name for f in frames],
+            [f.photo for f in frames],
+            [f.distortion for f in frames],
+        )
+    except (InputError, OverflowError) as error:
+        raise InputError(f"{path}: {error}") from error
+
+
 def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
     """Stack frames; those whose photo is missing are skipped and counted.
 
@@ -78,7 +92,7 @@ def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
         missing = len(frames) - len(present)
         there = {frame.name for frame in present}
         first = next(frame.name for frame in frames if frame.name not in there)
-        text = f"{plural(missing, 'view')} of {len(frames)} skipped: no photo (the first is {first})"
+        text = f"{plural(missing, 'view')} of {len(frames)} skipped: no photo (the first is {first!r})"
         notes.append(Note("missing_photos", missing, text))
         frames = present
     elif not present and listed:
@@ -86,14 +100,7 @@ def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
             Note("no_photos", len(listed), f"none of {plural(len(listed), 'photo')} found: poses only")
         )
         frames = [frame._replace(photo=None) for frame in frames]
-    cameras = Cameras.from_lists(
-        [f.viewmat for f in frames],
-        [f.K for f in frames],
-        [f.size for f in frames],
-        [f.name for f in frames],
-        [f.photo for f in frames],
-        [f.distortion for f in frames],
-    )
+    cameras = _cameras(path, frames)
     splits = tuple(f.split for f in frames)
     weights = [f.weight for f in frames]
     return ViewSet(

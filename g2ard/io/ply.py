@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
@@ -105,19 +106,15 @@ def _recentre(rows: NDArray[Any]) -> NDArray[np.float64]:
 def _read_block(
     block: NDArray[Any], raw: Raw, at: slice, rest: list[str], stored: int, shift: NDArray[np.float64]
 ) -> None:
-    for axis, name in enumerate(_MEANS):
-        raw.means[at, axis] = block[name] - shift[axis] if shift.any() else block[name]
-    for axis, name in enumerate(_DC):
-        raw.sh0[at, 0, axis] = block[name]
-    for axis, name in enumerate(_SCALES):
-        raw.log_scales[at, axis] = block[name]
-    for axis, name in enumerate(_QUATS):
-        raw.quats[at, axis] = block[name]
+    means = structured_to_unstructured(block[_MEANS])
+    raw.means[at] = means - shift if shift.any() else means
+    raw.sh0[at, 0] = structured_to_unstructured(block[_DC])
+    raw.log_scales[at] = structured_to_unstructured(block[_SCALES])
+    raw.quats[at] = structured_to_unstructured(block[_QUATS])
     raw.logit_opacities[at] = block["opacity"]
-    kept = raw.shN.shape[1]
-    for channel in range(3):  # channel-major: all of red's coefficients, then green's, then blue's
-        for k in range(kept):
-            raw.shN[at, k, channel] = block[rest[channel * stored + k]]
+    if rest:  # channel-major: all of red's coefficients, then green's, then blue's
+        bands = structured_to_unstructured(block[rest]).reshape(-1, 3, stored)
+        raw.shN[at] = bands[:, :, : raw.shN.shape[1]].transpose(0, 2, 1)
 
 
 def write(path: Path, splats: Splats, *, overwrite: bool = False, normals: bool = False) -> None:

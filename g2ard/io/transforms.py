@@ -71,12 +71,9 @@ def _camera_from_world(world_from_camera: NDArray[np.float64]) -> NDArray[np.flo
 
 def _intrinsics(where: str, values: dict[str, Any], photo: Path) -> dict[str, Any]:
     model = str(values.get("camera_model", "OPENCV"))
-    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") or values.get(
-        "is_fisheye"
-    ):
-        raise InputError(
-            f"{where}: camera model {model} is not supported (a pinhole with OPENCV distortion is)"
-        )
+    if model not in _MODELS or values.get("is_fisheye"):
+        known = ", ".join(_MODELS)
+        raise InputError(f"{where}: a {model} lens, or a fisheye, is not supported ({known} are)")
     width, height = _size(where, values, photo)
     fx = _focal(values, "x", width)
     fy = _focal(values, "y", height) or fx

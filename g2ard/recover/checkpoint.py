@@ -26,9 +26,9 @@ PERIOD = 60.0
 
 def save(path: Path, key: str, meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
     """Write a checkpoint; `key` says what work it belongs to."""
-    text = json.dumps({"key": key, **meta})
+    everything: dict[str, Any] = {"meta": np.array(json.dumps({"key": key, **meta})), **arrays}
     with atomic_output(path, overwrite=True) as temporary:
-        np.savez(temporary, meta=np.array(text), **arrays)
+        np.savez(temporary, **everything)
 
 
 def load(path: Path, key: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:

@@ -6,13 +6,13 @@ import hashlib
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.evaluate import psnr
+from g2ard.metrics import psnr
 from g2ard.progress import Progress, silent
 from g2ard.recover import checkpoint as checkpoints
 from g2ard.recover.anchors import PRESETS, Anchors, Regularizers, drift95, needle
@@ -33,22 +33,28 @@ class RecoverConfig:
     Args:
         schedule: rates, horizon and decay.
         steps: overrides the schedule's horizon.
+        time_limit: seconds; the horizon becomes what fits into them, so that the result depends on the
+            machine's speed.
         regularizers: weights of L_anchor and L_shape (`tab:s_recovery`).
         sh_degree: of the result; None keeps the student's.
         ssim_weight: λ in (1−λ)·L1 + λ·(1−SSIM); 0.2 as 3DGS has it.
         background: RGB behind the scene.
         final: whether this is the recovery at the target count; the paper decays rounds differently.
         seed: of the order of views.
+        engine: "fused" takes whole steps in Rust; "torch" goes through autograd and torch's Adam, with the
+            same result to rounding but for Gaussians that a view does not touch.
     """
 
     schedule: Schedule = TUNED
     steps: int | None = None
+    time_limit: float | None = None
     regularizers: Regularizers = PRESETS["trained"]
     sh_degree: int | None = None
     ssim_weight: float = 0.2
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     final: bool = True
     seed: int = 0
+    engine: Literal["fused", "torch"] = "fused"
 
     @property
     def horizon(self) -> int:
@@ -83,6 +89,9 @@ class Engine(Protocol):
 
     def load(self, state: dict[str, NDArray[Any]]) -> None: ...
 
+    @property
+    def skipped(self) -> int: ...
+
 
 def recover(
     student: Splats,
@@ -100,7 +109,7 @@ def recover(
     or removed.
 
     Args:
-        student: the scene to recover, in the coordinates of the targets' cameras.
+        student: the scene to recover; its offset counts, cameras are in world coordinates.
         targets: photos or teacher renders with their cameras.
         config: see `RecoverConfig`.
         anchors: frozen geometry; None freezes the student as given.
@@ -133,14 +142,14 @@ def recover(
     return Recovered(
         result,
         {
-            "steps": config.horizon,
+            "steps": loop.done,
             "seconds": loop.seconds,
             "loss": loop.curve(),
             "psnr": {"before": before, "after": after},
             "multiplier": multiplier,
             "drift95": drift95(anchors, result.means),
             "needle": needle(result.scales),
-            "skipped": {"regularizers": "off" if not config.regularizers.active else None},
+            "skipped": {"non_finite": loop.engine.skipped},
         },
     )
 
@@ -151,14 +160,12 @@ class _Loop:
     def __init__(
         self, student: Splats, targets: Targets, config: RecoverConfig, anchors: Anchors, multiplier: float
     ) -> None:
-        from g2ard.recover.torch_engine import TorchEngine
-
         self.targets = targets
         self.config = config
         self.multiplier = multiplier
-        self.engine: Engine = TorchEngine(
+        self.engine: Engine = _engine_class(config.engine)(
             student,
-            targets.cameras,
+            targets.cameras.recentred(student.offset),
             anchors=anchors,
             regularizers=config.regularizers,
             means_in_scales=config.schedule.means_in_scales,
@@ -167,36 +174,50 @@ class _Loop:
         )
         self.done = 0
         self.seconds = 0.0
-        self.losses = np.zeros(config.horizon)
+        self.losses: list[float] = []
         self.key = _fingerprint(student, targets, config)
 
     def run(self, checkpoint: Path | None, progress: Progress, stage: str) -> None:
         if checkpoint is not None and checkpoint.exists():
             self._resume(checkpoint)
-        horizon, config = self.config.horizon, self.config
-        began, saved, earlier, first = time.monotonic(), time.monotonic(), self.seconds, self.done
+        earlier, began, saved = self.seconds, time.monotonic(), time.monotonic()
         with checkpoints.deferred_interrupt() as interrupted:
-            while self.done < horizon:
-                step = self.done
-                rates = config.schedule.at(step, horizon, final=config.final, multiplier=self.multiplier)
-                view = self._view(step)
-                regularize = config.regularizers.active and (step + 1) % config.regularizers.period == 0
-                self.losses[step] = self.engine.step(view, self.targets[view], rates, regularize=regularize)
-                self.done += 1
+            while self._share() < 1:
+                self._step()
                 now = time.monotonic()
                 self.seconds = earlier + now - began
-                speed = (self.done - first) / max(now - began, 1e-9)
-                recent = self.losses[max(0, self.done - 20) : self.done].mean()
-                progress(stage, self.done, horizon, {"loss": f"{recent:.4f}", "steps/s": f"{speed:.1f}"})
+                self._tell(progress, stage)
                 if checkpoint is not None and (interrupted.is_set() or now - saved > checkpoints.PERIOD):
                     self._save(checkpoint)
                     saved = now
                 if interrupted.is_set():
                     raise KeyboardInterrupt
 
+    def _share(self) -> float:
+        """How much of the horizon, of steps or of seconds, has been used."""
+        if self.config.time_limit is not None:
+            return self.seconds / self.config.time_limit
+        return self.done / self.config.horizon
+
+    def _step(self) -> None:
+        config, step = self.config, self.done
+        rates = config.schedule.at(self._share(), final=config.final, multiplier=self.multiplier)
+        view = self._view(step)
+        regularize = config.regularizers.active and (step + 1) % config.regularizers.period == 0
+        self.losses.append(self.engine.step(view, self.targets[view], rates, regularize=regularize))
+        self.done += 1
+
+    def _tell(self, progress: Progress, stage: str) -> None:
+        speed = self.done / max(self.seconds, 1e-9)
+        recent = np.mean(self.losses[-20:])
+        total = self.config.horizon
+        if self.config.time_limit is not None:
+            total = max(self.done, round(self.done / max(self._share(), 1e-9)))
+        progress(stage, self.done, total, {"loss": f"{recent:.4f}", "steps/s": f"{speed:.1f}"})
+
     def curve(self) -> list[float]:
         """Up to 100 means of the loss over equal stretches of the horizon."""
-        return [float(part.mean()) for part in np.array_split(self.losses, 100) if len(part)]
+        return [float(part.mean()) for part in np.array_split(np.array(self.losses), 100) if len(part)]
 
     def _view(self, step: int) -> int:
         """Views in a fresh random order each time all have been seen; depends on seed and step alone."""
@@ -206,14 +227,26 @@ class _Loop:
 
     def _save(self, path: Path) -> None:
         meta = {"done": self.done, "seconds": self.seconds, "multiplier": self.multiplier}
-        checkpoints.save(path, self.key, meta, {**self.engine.state(), "losses": self.losses})
+        checkpoints.save(path, self.key, meta, {**self.engine.state(), "losses": np.array(self.losses)})
 
     def _resume(self, path: Path) -> None:
         meta, arrays = checkpoints.load(path, self.key)
-        self.losses = arrays.pop("losses")
+        self.losses = arrays.pop("losses").tolist()
         self.engine.load(arrays)
         self.done, self.seconds = int(meta["done"]), float(meta["seconds"])
         self.multiplier = float(meta["multiplier"])
+
+
+def _engine_class(name: str) -> Any:
+    if name == "fused":
+        from g2ard.recover.fused_engine import FusedEngine
+
+        return FusedEngine
+    if name == "torch":
+        from g2ard.recover.torch_engine import TorchEngine
+
+        return TorchEngine
+    raise InputError(f"engine: expected fused or torch, got {name!r}")
 
 
 def _sample_error(splats: Splats, targets: Targets, config: RecoverConfig) -> float:

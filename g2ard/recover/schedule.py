@@ -65,9 +65,8 @@ class Schedule:
     appearance_decay: tuple[float, float] = (1.0, 1.0)
     multiplier: float | None = None
 
-    def at(self, step: int, steps: int, *, final: bool, multiplier: float = 1.0) -> Rates:
-        """The rates of step `step` (from 0) out of `steps`."""
-        t = step / max(1, steps)
+    def at(self, t: float, *, final: bool, multiplier: float = 1.0) -> Rates:
+        """The rates at the share `t` of the horizon, from 0 at the first step to 1 after the last."""
         cosine = 1.0
         if self.cosine_floor is not None:
             cosine = self.cosine_floor + (1 - self.cosine_floor) * 0.5 * (1 + math.cos(math.pi * t))

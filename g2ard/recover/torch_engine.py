@@ -84,7 +84,7 @@ class TorchEngine:
                 means, p["quats"], p["log_scales"], self._anchors, self._regularizers
             )
         self._adam.zero_grad(set_to_none=True)
-        total.backward()  # type: ignore[no-untyped-call]
+        torch.autograd.backward(total)
         lively = [name for name in _NAMES if p[name].numel()]
         for group, name in zip(self._adam.param_groups, lively, strict=True):
             group["lr"] = getattr(rates, name)
@@ -115,8 +115,8 @@ class TorchEngine:
     def load(self, state: dict[str, NDArray[Any]]) -> None:
         """Take up a `state` again."""
         with torch.no_grad():
-            for name, value in self._parameters.items():
-                value.copy_(torch.from_numpy(state[f"p.{name}"]))
+            for name, parameter in self._parameters.items():
+                parameter.copy_(torch.from_numpy(state[f"p.{name}"]))
         self._base, self._unit = torch.from_numpy(state["base"]), torch.from_numpy(state["unit"])
         adam = self._adam.state_dict()
         for key, value in state.items():
@@ -124,3 +124,8 @@ class TorchEngine:
                 _, i, name = key.split(".")
                 adam["state"].setdefault(int(i), {})[name] = torch.from_numpy(np.asarray(value).copy())
         self._adam.load_state_dict(adam)
+
+    @property
+    def skipped(self) -> int:
+        """Torch's Adam leaves nothing out."""
+        return 0

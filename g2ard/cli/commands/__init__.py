@@ -1,9 +1,20 @@
-"""One module per command, in the order `g2ard --help` lists them."""
+"""One module per command; importing this package registers them, in the order `g2ard --help` lists them."""
 
-from g2ard.cli.commands import lift  # isort: skip
-from g2ard.cli.commands import simplify  # isort: skip
-from g2ard.cli.commands import recover  # isort: skip
-from g2ard.cli.commands import render  # isort: skip
-from g2ard.cli.commands import evaluate  # isort: skip
+from importlib import import_module
 
-__all__ = ["evaluate", "lift", "recover", "render", "simplify"]
+COMMANDS = (
+    "distill",
+    "simplify",
+    "recover",
+    "lift",
+    "poses",
+    "select",
+    "render",
+    "evaluate",
+    "info",
+    "bench",
+    "synth",
+)
+
+for _name in COMMANDS:
+    import_module(f"{__name__}.{_name}")

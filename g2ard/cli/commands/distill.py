@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,17 +12,27 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
+    Count,
     CountOption,
+    Method,
+    PresetOption,
     RatioOption,
+    ScheduleName,
     SizeOption,
+    TimeLimitOption,
     ViewsOption,
     budget_of,
     one_budget,
 )
+from g2ard.cli.scenes import load_scene, load_views, make_targets
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
+    from g2ard.distill import Distilled
     from g2ard.splats import Splats
+    from g2ard.targets import Targets
+
+    Colour = tuple[float, float, float]
 
 _POOL = 128
 """Poses of a pool made for a scene without views; every 8th is held out for scoring."""
@@ -43,14 +55,17 @@ def distill(
             help="Targets: the views' photos, or the scene's renders; photos if there are.",
         ),
     ] = None,
-    method: Annotated[str, typer.Option(metavar="default|fast|paper", help="How to simplify.")] = "default",
-    preset: Annotated[
-        str, typer.Option(metavar="auto|trained|lift|noisy", help="Which regularisers hold the geometry.")
-    ] = "auto",
+    held_out: Annotated[
+        Path | None,
+        typer.Option(metavar="VIEWS", help="Score on these; --views is then all for recovery."),
+    ] = None,
+    method: Annotated[Method, typer.Option(help="How to simplify.")] = "default",
+    preset: PresetOption = "auto",
     schedule: Annotated[
-        str, typer.Option(metavar="fast|default|best|paper", help="Recovery; paper also goes round by round.")
+        ScheduleName, typer.Option(help="Recovery; paper also goes round by round.")
     ] = "default",
     steps: Annotated[int | None, typer.Option(min=1, help="Overrides the final horizon.")] = None,
+    time_limit: TimeLimitOption = None,
     sh_degree: Annotated[
         int | None,
         typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own, 3 from a cloud."),
@@ -61,176 +76,165 @@ def distill(
 ) -> None:
     """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget."""
     one_budget(count, ratio)
-    from g2ard.io import kind
+    import shutil
+    import time
 
-    if kind(scene) == "points" and views is None:
+    from g2ard.distill import DistillConfig
+    from g2ard.distill import distill as pipeline
+    from g2ard.io import kind, write_views
+    from g2ard.io.atomic import check_output
+    from g2ard.recover.presets import preset_for
+    from g2ard.recover.schedule import schedule_named
+
+    began = time.monotonic()
+    lifted = kind(scene) != "splats"
+    if lifted and views is None:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
-    _Distillation(run, output, resume).go(
-        scene, count, ratio, views, photos, method, preset, schedule, steps, sh_degree, size, background
+    check_output(output, run.overwrite or resume, folder=True)
+    prior = _lift(run, scene) if lifted else load_scene(run, scene)
+    budget = _budget(scene, count, ratio, len(prior))
+    train, test, pool = _views(run, prior, views, held_out, size)
+    pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
+    use_photos = lifted or (pictured if photos is None else photos)
+    teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
+    colour = background or (0.0, 0.0, 0.0)
+    regularizers, why = preset_for("lift" if preset == "auto" and lifted else preset, prior)
+    run.say(f"{len(prior):,} → {budget:,} Gaussians; {len(train)} views against {against}")
+    run.say(f"regularisers: {why}")
+    config = DistillConfig(
+        method=method,
+        schedule=schedule_named(schedule),
+        steps=steps,
+        time_limit=time_limit,
+        regularizers=regularizers,
+        sh_degree=sh_degree if sh_degree is not None else (3 if lifted or schedule == "paper" else None),
+        background=colour,
+        seed=run.seed,
     )
-
-
-class _Distillation:
-    """One run of the command and its folder."""
-
-    def __init__(self, run: Run, output: Path, resume: bool) -> None:
-        import shutil
-        import time
-
-        from g2ard.io.atomic import check_output
-
-        self.run, self.output = run, output
-        self.work = output / "work"
-        self.began = time.monotonic()
-        check_output(output, run.overwrite or resume, folder=True)
-        if not resume:
-            shutil.rmtree(self.work, ignore_errors=True)
-
-    def go(
-        self,
-        scene: Path,
-        count: Any,
-        ratio: float | None,
-        views: Path | None,
-        photos: bool | None,
-        method: str,
-        preset: str,
-        schedule: str,
-        steps: int | None,
-        sh_degree: int | None,
-        size: int | None,
-        background: tuple[float, float, float] | None,
-    ) -> None:
-        import torch
-
-        from g2ard.distill import DistillConfig
-        from g2ard.distill import distill as pipeline
-        from g2ard.errors import InputError
-        from g2ard.evaluate import evaluate
-        from g2ard.recover.presets import preset_for
-        from g2ard.recover.schedule import schedule_named
-
-        run = self.run
-        if run.threads:
-            torch.set_num_threads(run.threads)
-        colour = background or (0.0, 0.0, 0.0)
-        prior, lifted = self._prior(scene)
-        budget = budget_of(count, ratio, len(prior))
-        if budget > len(prior):
-            raise InputError(f"{scene}: the budget {budget} is above its {len(prior)} Gaussians")
-        train, test, use_photos = self._views(prior, views, photos, lifted, size)
-        self.work.mkdir(parents=True, exist_ok=True)
-        teacher = None if use_photos else prior
-        against = "photos" if use_photos else "teacher renders"
-        targets, held_out = self._targets(train, teacher, colour), self._targets(test, teacher, colour)
-        regularizers, why = preset_for("lift" if preset == "auto" and lifted else preset, prior)
-        run.say(f"{len(prior):,} → {budget:,} Gaussians; {len(train)} views against {against}")
-        run.say(f"regularisers: {why}")
-        config = DistillConfig(
-            method=method,
-            schedule=schedule_named(schedule),
-            steps=steps,
-            regularizers=regularizers,
-            sh_degree=sh_degree if sh_degree is not None else (3 if lifted or schedule == "paper" else None),
-            background=colour,
-            seed=run.seed,
-        )
+    targets = make_targets(run, train, teacher, colour)
+    unseen = make_targets(run, test, teacher, colour)
+    with _work_folder(output, resume) as work:
         try:
-            result = pipeline(prior, budget, targets, config, work=self.work, progress=run.progress)
+            result = pipeline(prior, budget, targets, config, work=work, progress=run.progress)
         except KeyboardInterrupt:
-            run.say(f"stopped; the same command with --resume goes on in {self.output}")
+            run.say(f"stopped; the same command with --resume goes on in {output}")
             raise
-        scores = {
-            name: evaluate(s, held_out, background=colour, progress=run.progress, stage=f"score {name}")
-            for name, s in (("simplified", result.simplified), ("recovered", result.splats))
-        }
-        self._write(prior, result, held_out, scores, against, why, colour)
+    report = _score(run, prior, result, unseen, colour)
+    report |= {"against": against, "preset": why, "rounds": result.report["rounds"]}
+    report["seconds"] = {**result.report["seconds"], "total": time.monotonic() - began}
+    _write(run, output, result, unseen, colour, report)
+    if pool is not None:
+        write_views(output / "views.json", pool, overwrite=True)
+    shutil.rmtree(output / "work")
+    _table(run, report)
+    run.say(
+        f"scene: {output / 'scene.ply'}\npicture: {output / 'preview.png'}\nreport: {output / 'report.json'}"
+    )
+    run.result(report)
 
-    def _prior(self, scene: Path) -> tuple[Splats, bool]:
-        from g2ard.cli.scenes import load_scene
-        from g2ard.io import kind, read_cloud
-        from g2ard.lift import lift
 
-        if kind(scene) != "points":
-            return load_scene(self.run, scene), False
-        cloud = read_cloud(scene)
-        for note in cloud.notes:
-            self.run.say(f"{scene}: {note}")
-        return lift(cloud.points.positions, cloud.points.colors, progress=self.run.progress), True
+@contextmanager
+def _work_folder(output: Path, resume: bool) -> Iterator[Path]:
+    """Where finished rounds and checkpoints wait for --resume; an error leaves nothing behind."""
+    import shutil
 
-    def _views(
-        self, prior: Splats, views: Path | None, photos: bool | None, lifted: bool, size: int | None
-    ) -> tuple[Cameras, Cameras, bool]:
-        """Training views, held-out views, and whether photos are the targets."""
-        from g2ard.cli.scenes import load_views
-        from g2ard.io import write_views
-        from g2ard.poses import make_pool
+    from g2ard.errors import G2ardError
 
-        if views is None:
-            pool = make_pool(prior, _POOL, seed=self.run.seed, progress=self.run.progress)
-            self.output.mkdir(exist_ok=True)
-            write_views(self.output / "views.json", pool, overwrite=True)
-            views = self.output / "views.json"
-        train = load_views(self.run, views, "train", size, prior.offset)
-        test = load_views(self.run, views, "test", size, prior.offset)
-        has_photos = all(p is not None for p in (*train.image_paths, *test.image_paths))
-        return train, test, (has_photos if photos is None else photos) or lifted
+    work, made = output / "work", not output.exists()
+    if not resume:
+        shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True, exist_ok=True)
+    try:
+        yield work
+    except G2ardError:
+        if not resume:
+            shutil.rmtree(output if made else work, ignore_errors=True)
+        raise
 
-    def _targets(self, cameras: Cameras, teacher: Splats | None, colour: tuple[float, float, float]) -> Any:
-        from g2ard.cli.scenes import make_targets
 
-        return make_targets(self.run, cameras, teacher, colour)
+def _lift(run: Run, path: Path) -> Splats:
+    from g2ard.io import read_cloud
+    from g2ard.lift import lift
 
-    def _write(
-        self, prior: Splats, result: Any, held_out: Any, scores: Any, against: str, why: str, colour: Any
-    ) -> None:
-        import json
-        import shutil
-        import time
+    cloud = read_cloud(path)
+    for note in cloud.notes:
+        run.say(f"{path}: {note}")
+    return lift(cloud.points.positions, cloud.points.colors, progress=run.progress)
 
-        from g2ard.io import write_splats
-        from g2ard.io.atomic import atomic_output
-        from g2ard.preview import preview
 
-        run, out = self.run, self.output
-        write_splats(out / "scene.ply", result.splats, overwrite=True)
-        with atomic_output(out / "preview.png", overwrite=True) as temporary:
-            preview(
-                temporary, held_out, [("simplified", result.simplified), ("recovered", result.splats)], colour
-            )
-        seconds = {**result.report["seconds"], "total": time.monotonic() - self.began}
-        report = {
-            "input_count": len(prior),
-            "output_count": len(result.splats),
-            "bytes": {"input": prior.nbytes, "output": (out / "scene.ply").stat().st_size},
-            "against": against,
-            "preset": why,
-            "seconds": seconds,
-            "scores": {name: s.as_dict() for name, s in scores.items()},
-            "rounds": result.report["rounds"],
-        }
-        with atomic_output(out / "report.json", overwrite=True) as temporary:
-            temporary.write_text(json.dumps({**report, "config": run.config}, indent=2, default=str) + "\n")
-        shutil.rmtree(self.work, ignore_errors=True)
-        self._table(prior, result, scores, seconds)
-        run.say(f"scene: {out / 'scene.ply'}\npicture: {out / 'preview.png'}\nreport: {out / 'report.json'}")
-        run.result(report)
+def _budget(scene: Path, count: Count | None, ratio: float | None, total: int) -> int:
+    from g2ard.errors import InputError
 
-    def _table(self, prior: Splats, result: Any, scores: Any, seconds: dict[str, float]) -> None:
-        compact = result.splats
+    budget = budget_of(count, ratio, total)
+    if budget > total:
+        raise InputError(f"{scene}: the budget of {budget} is above its {total} Gaussians")
+    return budget
 
-        def row(name: str, splats: Splats, score: Any) -> list[str]:
-            figures = [f"{score.psnr:.2f}", f"{score.ssim:.4f}"] if score else ["–", "–"]
-            each = splats.nbytes / len(splats)
-            return [name, f"{len(splats):,}", f"{splats.nbytes / 1e6:.2f}", f"{each:.0f}", *figures]
 
-        self.run.console.table(
-            f"unseen views: {len(scores['recovered'].views)}; "
-            + ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items()),
-            ["scene", "Gaussians", "MB", "bytes each", "PSNR", "SSIM"],
-            [
-                row("dense", prior, None),
-                row("simplified", result.simplified, scores["simplified"]),
-                row("recovered", compact, scores["recovered"]),
-            ],
-        )
+def _views(
+    run: Run, prior: Splats, views: Path | None, held_out: Path | None, size: int | None
+) -> tuple[Cameras, Cameras, Cameras | None]:
+    """Views for recovery, views for scoring, and the pool both came from where one had to be made."""
+    from g2ard.poses import plan_pool
+    from g2ard.splits import split_mask
+
+    if views is not None:
+        train = load_views(run, views, "all" if held_out else "train", size)
+        return train, load_views(run, held_out or views, "all" if held_out else "test", size), None
+    planned = plan_pool(prior, _POOL, seed=run.seed, progress=run.progress)
+    pool = planned.cameras
+    run.say(f"poses: {planned.kind} ({planned.why})")
+    if held_out is not None:
+        return pool.resized(size), load_views(run, held_out, "all", size), pool
+    test = split_mask("views.json", pool.names, "test")
+    return pool.take(~test).resized(size), pool.take(test).resized(size), pool
+
+
+def _score(run: Run, prior: Splats, result: Distilled, unseen: Targets, colour: Colour) -> dict[str, Any]:
+    from g2ard.evaluate import evaluate
+
+    scenes = {"simplified": result.simplified, "recovered": result.splats}
+    scores = {
+        name: evaluate(splats, unseen, background=colour, progress=run.progress, stage=f"score {name}")
+        for name, splats in scenes.items()
+    }
+    return {
+        "input_count": len(prior),
+        "output_count": len(result.splats),
+        "bytes": {"input": prior.nbytes, "output": result.splats.nbytes},
+        "scores": {name: score.as_dict() for name, score in scores.items()},
+    }
+
+
+def _write(
+    run: Run, output: Path, result: Distilled, unseen: Targets, colour: Colour, report: dict[str, Any]
+) -> None:
+    import json
+
+    from g2ard.io import write_splats
+    from g2ard.io.atomic import atomic_output
+    from g2ard.preview import preview
+
+    scenes = [("simplified", result.simplified), ("recovered", result.splats)]
+    preview(output / "preview.png", unseen, scenes, colour)
+    with atomic_output(output / "report.json", overwrite=True) as temporary:
+        temporary.write_text(json.dumps({**report, "config": run.config}, indent=2, default=str) + "\n")
+    write_splats(output / "scene.ply", result.splats, overwrite=True)
+
+
+def _table(run: Run, report: dict[str, Any]) -> None:
+    def row(name: str, count: int, size: int, score: dict[str, Any] | None) -> list[str]:
+        figures = [f"{score['psnr']:.2f}", f"{score['ssim']:.4f}"] if score else ["–", "–"]
+        return [name, f"{count:,}", f"{size / 1e6:.2f}", f"{size / count:.0f}", *figures]
+
+    scores, size = report["scores"], report["bytes"]
+    times = ", ".join(f"{name} {value:.1f} s" for name, value in report["seconds"].items())
+    run.console.table(
+        f"{len(scores['recovered']['views'])} unseen views against {report['against']}; {times}",
+        ["scene", "Gaussians", "MB", "bytes each", "PSNR", "SSIM"],
+        [
+            row("dense", report["input_count"], size["input"], None),
+            row("simplified", report["output_count"], size["output"], scores["simplified"]),
+            row("recovered", report["output_count"], size["output"], scores["recovered"]),
+        ],
+    )

@@ -34,15 +34,10 @@ def evaluate(
     colour = background or (0.0, 0.0, 0.0)
     dense = load_scene(run, teacher) if teacher else None
     frozen = load_scene(run, anchors) if anchors else None
+    targets = make_targets(run, load_views(run, views, split, size), dense, colour)
     rows: list[dict[str, Any]] = []
-    targets = None
     for path in scenes:
         splats = load_scene(run, path)
-        origin = dense.offset if dense is not None else splats.offset
-        if targets is None:
-            cameras = load_views(run, views, split, size, origin)
-            targets = make_targets(run, cameras, dense, colour)
-        splats = splats.recentred(origin) if (splats.offset != origin).any() else splats
         scored = score(splats, targets, background=colour, progress=run.progress, stage=path.name)
         row = {"scene": str(path), **scored.as_dict(), "drift95": None, "needle": needle(splats.scales)}
         row["file_bytes"] = path.stat().st_size if path.is_file() else None
@@ -52,7 +47,7 @@ def evaluate(
             row["drift95"] = drift95(Anchors.of(frozen), splats.means)
         rows.append(row)
     run.console.table(
-        f"{len(targets.cameras) if targets else 0} views, against {'the teacher' if dense else 'photos'}",
+        f"{len(targets.cameras)} views, against {'the teacher' if dense else 'photos'}",
         ["scene", "Gaussians", "MB", "PSNR", "SSIM", "needle"],
         [
             [

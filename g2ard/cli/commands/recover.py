@@ -8,7 +8,16 @@ from typing import Annotated
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import BackgroundOption, OutputOption, SizeOption, SplitOption, TeacherOption
+from g2ard.cli.options import (
+    BackgroundOption,
+    OutputOption,
+    PresetOption,
+    ScheduleName,
+    SizeOption,
+    SplitOption,
+    TeacherOption,
+    TimeLimitOption,
+)
 
 
 @command("recover", example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply")
@@ -18,13 +27,10 @@ def recover(
     views: Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")],
     output: OutputOption,
     teacher: TeacherOption = None,
-    preset: Annotated[
-        str, typer.Option(metavar="auto|trained|lift|noisy", help="Which regularisers hold the geometry.")
-    ] = "auto",
-    schedule: Annotated[
-        str, typer.Option(metavar="fast|default|best|paper", help="Rates, decay and horizon.")
-    ] = "default",
+    preset: PresetOption = "auto",
+    schedule: Annotated[ScheduleName, typer.Option(help="Rates, decay and horizon.")] = "default",
     steps: Annotated[int | None, typer.Option(min=1, help="Overrides the schedule's horizon.")] = None,
+    time_limit: TimeLimitOption = None,
     sh_degree: Annotated[
         int | None,
         typer.Option("--sh-degree", min=0, max=3, help="Of the result; the student's if not given."),
@@ -49,14 +55,13 @@ def recover(
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(run, student)
     dense = load_scene(run, teacher) if teacher else None
-    if dense is not None and (dense.offset != splats.offset).any():
-        dense = dense.recentred(splats.offset)
-    cameras = load_views(run, views, split, size, splats.offset)
+    cameras = load_views(run, views, split, size)
     regularizers, why = preset_for(preset, splats)
     run.say(f"regularisers: {why}")
     config = RecoverConfig(
         schedule=schedule_named(schedule),
         steps=steps,
+        time_limit=time_limit,
         regularizers=regularizers,
         sh_degree=sh_degree,
         background=colour,

@@ -32,7 +32,7 @@ def render(
 
     check_output(output, run.overwrite, folder=True)
     splats = load_scene(run, scene)
-    cameras = load_views(run, views, split, size, splats.offset)
+    cameras = load_views(run, views, split, size)
     with atomic_folder(output, overwrite=run.overwrite) as folder:
         for view, name in enumerate(cameras.names):
             rendered = rasterize(splats, cameras, view, background=background or (0.0, 0.0, 0.0))

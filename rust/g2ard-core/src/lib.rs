@@ -8,10 +8,12 @@ pub mod error;
 pub mod lift;
 pub mod linalg;
 pub mod raster;
+pub mod select;
 pub mod simplify;
 pub mod spatial;
 pub mod splats;
 pub mod ssim;
+pub mod train;
 
 pub use control::Control;
 pub use error::{Error, Result};

@@ -5,7 +5,11 @@ use pyo3::prelude::*;
 mod arrays;
 mod error;
 mod lift;
+mod raster;
+mod select;
 mod simplify;
+mod ssim;
+mod train;
 mod work;
 
 #[pymodule]
@@ -14,5 +18,9 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     work::register(m)?;
     lift::register(m)?;
     simplify::register(m)?;
+    raster::register(m)?;
+    select::register(m)?;
+    ssim::register(m)?;
+    train::register(m)?;
     Ok(())
 }

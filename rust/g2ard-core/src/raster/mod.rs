@@ -1,1 +1,149 @@
 //! The tiled differentiable rasteriser: one room per pass.
+//!
+//! [`project`] turns 16 Gaussians at a time into screen splats; [`order`] sorts them by depth once; [`tiles`] scatters
+//! them stably into the 16×16 tiles their ellipse at α = 1/255 really meets; [`forward`] blends each tile, 4×4 pixels to a
+//! register; [`backward`] walks the same pairs from back to front, each pair summing into its own slot; [`gradients`]
+//! adds a Gaussian's slots in order and goes back through the projection. No atomics: the bits do not depend on threads.
+//!
+//! Conventions (gsplat's by default): pixel centres at +0.5; 0.3 px² dilation; α = min(0.99, opacity·exp(−q)); α < 1/255
+//! is skipped; a pixel stops before its transmittance would fall to 1e-4; colour = max(0, 0.5 + SH).
+
+mod accumulate;
+pub(crate) mod backward;
+mod forward;
+pub(crate) mod frame;
+pub(crate) mod gradients;
+pub mod limits;
+pub(crate) mod order;
+pub(crate) mod params;
+pub(crate) mod project;
+mod sh;
+pub mod simd;
+mod tiles;
+
+pub use accumulate::Accumulated;
+pub use frame::{Counts, Image, ImageGradients, Passes, Rasterizer};
+pub use gradients::Gradients;
+pub use params::Params;
+pub use simd::Isa;
+
+use crate::{Error, Result};
+
+/// Pixels on a tile's side.
+pub const TILE: usize = 16;
+/// 4×4-pixel blocks in a tile, and pixels in a block.
+pub(crate) const BLOCKS: usize = 16;
+/// Below this a Gaussian does not touch a pixel.
+pub const ALPHA_MIN: f32 = 1.0 / 255.0;
+/// Added to both variances of the projected covariance, px².
+pub const DILATION: f32 = 0.3;
+
+/// One pinhole view, OpenCV axes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Camera {
+    /// camera_from_world, the upper three rows; rigid.
+    pub viewmat: [[f64; 4]; 3],
+    pub fx: f64,
+    pub fy: f64,
+    pub cx: f64,
+    pub cy: f64,
+    pub width: usize,
+    pub height: usize,
+    /// Gaussians nearer than this are culled. gsplat: 0.01; INRIA: 0.2.
+    pub near: f32,
+}
+
+impl Camera {
+    pub fn validate(&self) -> Result<()> {
+        let pose = self.viewmat.iter().flatten();
+        let all = pose.chain([&self.fx, &self.fy, &self.cx, &self.cy]);
+        if !all.into_iter().all(|v| v.is_finite()) {
+            return Err(Error::invalid(
+                "camera",
+                "finite pose and intrinsics",
+                "NaN or infinity",
+            ));
+        }
+        if self.fx <= 0.0 || self.fy <= 0.0 {
+            return Err(Error::invalid(
+                "camera",
+                "positive focal lengths",
+                format!("{} {}", self.fx, self.fy),
+            ));
+        }
+        let most = 1 << 15;
+        if self.width == 0 || self.height == 0 || self.width > most || self.height > most {
+            let got = format!("{}×{}", self.width, self.height);
+            return Err(Error::invalid(
+                "camera",
+                format!("an image of 1 to {most} pixels a side"),
+                got,
+            ));
+        }
+        if self.near.is_nan() || self.near <= 0.0 {
+            return Err(Error::invalid("near", "a positive distance", self.near));
+        }
+        Ok(())
+    }
+
+    /// The camera's centre in the world.
+    pub fn position(&self) -> [f64; 3] {
+        let v = &self.viewmat;
+        [0, 1, 2].map(|j| -(v[0][j] * v[0][3] + v[1][j] * v[1][3] + v[2][j] * v[2][3]))
+    }
+
+    pub(crate) fn tiles(&self) -> (usize, usize) {
+        (self.width.div_ceil(TILE), self.height.div_ceil(TILE))
+    }
+}
+
+/// Whose rasteriser to agree with where they differ.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Convention {
+    #[default]
+    Gsplat,
+    /// Also cuts each splat to the tiles its 3σ square meets, and floors the antialiasing factor at √2.5e-5.
+    Inria,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Settings {
+    pub convention: Convention,
+    /// Opacity × √(det Σ₂ / det(Σ₂ + 0.3 I)): splats under a pixel fade instead of growing.
+    pub antialiased: bool,
+    /// α is clipped here; 0.99 (3DGS, gsplat) or 0.999 (gsplat ≥ 1.5 with `packed` kernels).
+    pub alpha_max: f32,
+    /// A pixel stops before its transmittance would fall to this.
+    pub transmittance_min: f32,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            convention: Convention::Gsplat,
+            antialiased: false,
+            alpha_max: 0.99,
+            transmittance_min: 1e-4,
+        }
+    }
+}
+
+impl Settings {
+    pub fn validate(&self) -> Result<()> {
+        if !(ALPHA_MIN..1.0).contains(&self.alpha_max) {
+            return Err(Error::invalid(
+                "alpha_max",
+                "a value in [1/255, 1)",
+                self.alpha_max,
+            ));
+        }
+        if !(1e-12..1.0).contains(&self.transmittance_min) {
+            return Err(Error::invalid(
+                "transmittance_min",
+                "a value in [1e-12, 1)",
+                self.transmittance_min,
+            ));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,1 @@
+"""Measuring: speed against the machine's limit, quality against the baselines."""

@@ -1,0 +1,90 @@
+"""`g2ard poses`: scene → cameras to look at it from."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Annotated
+
+import typer
+
+from g2ard.cli.frame import Run, command
+from g2ard.cli.options import OutputOption, SceneArgument, Triple
+
+_KINDS = ("auto", "orbit", "walk", "aerial")
+
+
+class _Size(tuple[int, int]):
+    """Width and height in one argument (see `Triple`)."""
+
+
+def _size(text: str) -> _Size:
+    match = re.fullmatch(r"(\d+)[x×](\d+)", text.strip())
+    if match is None or not all(16 <= int(side) <= 16384 for side in match.groups()):
+        raise typer.BadParameter(f"width x height in pixels from 16 to 16384, such as 800x600, not {text!r}")
+    return _Size((int(match[1]), int(match[2])))
+
+
+def _direction(text: str) -> Triple:
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not (all(abs(v) < 1e30 for v in (x, y, z)) and any((x, y, z))):
+        raise typer.BadParameter(f"a direction such as 0,0,1 or 0,-1,0, not {text!r}")
+    return Triple((x, y, z))
+
+
+def _kind(text: str) -> str:
+    if text not in _KINDS:
+        raise typer.BadParameter(f"one of {', '.join(_KINDS)}, not {text!r}")
+    return text
+
+
+@command("poses", example="g2ard poses scene.ply --count 128 -o poses.json")
+def poses(
+    run: Run,
+    scene: SceneArgument,
+    output: OutputOption,
+    kind: Annotated[
+        str,
+        typer.Option(
+            parser=_kind,
+            metavar="|".join(_KINDS),
+            help="Around an object, through rooms and streets, from the air; auto: by the scene's shape.",
+        ),
+    ] = "auto",
+    count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many poses.")] = 128,
+    size: Annotated[
+        _Size | None,
+        typer.Option(parser=_size, metavar="WxH", help="Pixels; 800x600 unless given."),
+    ] = None,
+    fov: Annotated[float, typer.Option(min=1, max=170, help="Horizontal field of view, degrees.")] = 50.0,
+    up: Annotated[
+        Triple | None,
+        typer.Option(
+            parser=_direction, metavar="X,Y,Z", help="Away from the ground; estimated unless given."
+        ),
+    ] = None,
+) -> None:
+    """Make a pool of candidate views for a scene without photos: poses in free space that see it well."""
+    from g2ard.cli.scenes import load_scene
+    from g2ard.io import check_output, write_views
+    from g2ard.poses import plan_pool
+
+    check_output(output, overwrite=run.overwrite)
+    splats = load_scene(run, scene)
+    pool = plan_pool(
+        splats,
+        count,
+        kind=kind,
+        size=size or (800, 600),
+        fov=fov,
+        up=up,
+        seed=run.seed,
+        progress=run.progress,
+    )
+    write_views(output, pool.cameras, overwrite=run.overwrite)
+    direction = ", ".join(f"{v:.2f}" for v in pool.up)
+    run.say(f"{output}: {count} poses, {pool.kind} ({pool.why}; up is {direction})")
+    run.result({"count": count, "kind": pool.kind, "why": pool.why, "up": pool.up.tolist()})

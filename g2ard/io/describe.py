@@ -1,0 +1,132 @@
+"""What is in a file, as plain figures: `g2ard info` shows them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.cameras import Cameras
+from g2ard.io import kind, read_cloud, read_scene, read_view_set
+from g2ard.io.detect import file_format
+from g2ard.io.sog import chunks_of
+from g2ard.io.types import Points, ViewSet
+from g2ard.splats import Splats
+
+__all__ = ["describe"]
+
+_QUANTILES = (0, 1, 25, 50, 75, 99, 100)
+
+
+def describe(path: str | Path) -> dict[str, Any]:
+    """Read a scene, cloud or views and sum it up.
+
+    Args:
+        path: whatever `g2ard.io.kind` knows.
+
+    Returns:
+        `path`, `kind`, `format`, `bytes`, `count`, `notes` [{code, count, text}], and per kind: `sh_degree`,
+        `extent` {min, max, robust_min, robust_max: the 1st and 99th percentiles}, `opacity`,
+        `largest_scale`, `smallest_scale`, `elongation` (quantiles by percentage), `odd`; `color`;
+        `photos`, `sizes`, `fov_degrees`, `splits`.
+
+    Raises:
+        InputError: as the readers do.
+    """
+    path, what = Path(path), kind(path)
+    if what == "splats":
+        scene = read_scene(path)
+        notes, figures = scene.notes, _splats(scene.splats)
+    elif what == "points":
+        cloud = read_cloud(path)
+        notes, figures = cloud.notes, _points(cloud.points)
+    else:
+        views = read_view_set(path)
+        notes, figures = views.notes, _views(views)
+    return {
+        "path": str(path),
+        "kind": what,
+        "format": file_format(path),
+        "bytes": _bytes(path),
+        **figures,
+        "notes": [{"code": n.code, "count": n.count, "text": n.text} for n in notes],
+    }
+
+
+def _bytes(path: Path) -> int:
+    """Size on disk; of a SOG folder only the chunks that are read."""
+    folders = chunks_of(path) or [path]
+    files = [file for folder in folders for file in (folder.rglob("*") if folder.is_dir() else [folder])]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+def _quantiles(values: NDArray[Any]) -> dict[str, float]:
+    found = np.percentile(values.astype(np.float64), _QUANTILES)
+    return {str(q): float(v) for q, v in zip(_QUANTILES, found, strict=True)}
+
+
+def _extent(positions: NDArray[Any]) -> dict[str, list[float]]:
+    low, high = np.percentile(positions, (1, 99), axis=0)
+    return {
+        "min": positions.min(0).tolist(),
+        "max": positions.max(0).tolist(),
+        "robust_min": low.tolist(),
+        "robust_max": high.tolist(),
+    }
+
+
+def _splats(splats: Splats) -> dict[str, Any]:
+    scales = np.sort(splats.scales, axis=1)
+    opacities = splats.opacities
+    unique = len(np.unique(np.ascontiguousarray(splats.means).view(f"V{3 * splats.means.itemsize}")))
+    return {
+        "count": len(splats),
+        "sh_degree": splats.sh_degree,
+        "bytes_as_ply": splats.nbytes,
+        "offset": splats.offset.tolist(),
+        "extent": _extent(splats.means.astype(np.float64) + splats.offset),
+        "opacity": _quantiles(opacities),
+        "largest_scale": _quantiles(scales[:, 2]),
+        "smallest_scale": _quantiles(scales[:, 0]),
+        "elongation": _quantiles(scales[:, 2] / scales[:, 1]),
+        "odd": {
+            "opacity_below_0.005": int(np.count_nonzero(opacities < 0.005)),
+            "opacity_above_0.99": int(np.count_nonzero(opacities > 0.99)),
+            "elongation_above_100": int(np.count_nonzero(scales[:, 2] > 100 * scales[:, 1])),
+            "same_position_as_another": len(splats) - unique,
+        },
+    }
+
+
+def _points(points: Points) -> dict[str, Any]:
+    return {
+        "count": len(points),
+        "extent": _extent(points.positions),
+        "color": {
+            "mean": points.colors.mean(0, dtype=np.float64).tolist(),
+            "min": points.colors.min(0).tolist(),
+            "max": points.colors.max(0).tolist(),
+        },
+    }
+
+
+def _views(views: ViewSet) -> dict[str, Any]:
+    cameras = views.cameras
+    sizes = Counter(f"{w}×{h}" for w, h in zip(cameras.widths, cameras.heights, strict=True))
+    return {
+        "count": len(cameras),
+        "photos": sum(path is not None for path in cameras.image_paths),
+        "sizes": dict(sizes.most_common()),
+        "fov_degrees": _quantiles(_fov(cameras)),
+        "distorted": int(cameras.distortions.any(1).sum()),
+        "splits": dict(Counter(s for s in views.splits if s)),
+        "extent": _extent(cameras.positions),
+    }
+
+
+def _fov(cameras: Cameras) -> NDArray[np.float64]:
+    """(C,) horizontal field of view in degrees."""
+    return np.degrees(2 * np.arctan(cameras.widths / (2 * cameras.Ks[:, 0, 0])))

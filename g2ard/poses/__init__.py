@@ -1,0 +1,60 @@
+"""Cameras for a scene that comes without any: around objects, through rooms and streets, from the air.
+
+The scene is stood upright (`up`), weighed without its floaters and sky (`matter`), its free space mapped
+(`grid`, `site`), its shape named (`shape`); then planners (`orbit`, `walk`, `aerial`) propose poses from
+endless even sequences and keep those that stand free and see enough (`sight`, `gather`).
+"""
+
+from __future__ import annotations
+
+from numpy.typing import ArrayLike
+
+from g2ard.cameras import Cameras
+from g2ard.poses.pool import KINDS, Pool, plan_pool
+from g2ard.progress import Progress, silent
+from g2ard.splats import Splats
+
+__all__ = ["KINDS", "Pool", "make_pool", "plan_pool"]
+
+
+def make_pool(
+    splats: Splats,
+    count: int = 128,
+    *,
+    kind: str = "auto",
+    size: tuple[int, int] = (800, 600),
+    fov: float = 50.0,
+    up: ArrayLike | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Cameras:
+    """Poses that see the scene well from free space, evenly spread.
+
+    Args:
+        splats: the scene, any unit, origin and orientation.
+        count: how many.
+        kind: "orbit" (around an object, elevations −5° to 50°), "walk" (in free space at eye height, through
+            rooms and streets), "aerial" (straight down and oblique), or "auto": orbit for an object, walk
+            inside a room, three quarters aerial and a quarter walk for a landscape or a city.
+        size: width and height in pixels.
+        fov: horizontal field of view, degrees.
+        up: (3,) direction away from the ground; None to estimate it.
+        seed: of the placement; the same seed gives the same poses.
+        progress: told of each step.
+
+    Returns:
+        `count` cameras in world coordinates; by name, every 8th is a fair sample of all.
+
+    Raises:
+        InputError: nothing visible in the scene, no free place with a view, or an argument out of range.
+
+    >>> import numpy as np
+    >>> ball = np.random.default_rng(0).normal(size=(500, 3))
+    >>> ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    >>> cameras = make_pool(Splats.create(ball, scales=np.full((500, 3), 0.05)), 16)
+    >>> len(cameras), cameras.names[0], bool((np.linalg.norm(cameras.positions, axis=1) > 2).all())
+    (16, 'pose_0000', True)
+    """
+    return plan_pool(
+        splats, count, kind=kind, size=size, fov=fov, up=up, seed=seed, progress=progress
+    ).cameras

@@ -1,0 +1,133 @@
+"""Which cells of a box are opaque, how far the nearest opaque one is, and what a ray meets first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.poses.matter import Matter
+from g2ard.poses.numbers import norms, turned
+
+__all__ = ["Grid"]
+
+Floats = NDArray[np.float64]
+
+_CELLS = (2_000_000, 6_000_000)
+"""Cells in all, one for each Gaussian between these: a large scene is looked at more finely."""
+
+_OPAQUE = 0.3
+"""Opacity × area, summed, per face of a cell: above it light hardly passes."""
+
+_MURKY = 0.04
+"""Above it a cell has something in it: leaves, glass, haze. No place for a camera."""
+
+_REACH = 12
+"""Distances are known up to this many cells, enough for rays to stride through free space."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Axis-aligned cells from `low`, each of side `cell`.
+
+    Args:
+        low: (3,) corner.
+        cell: side.
+        opaque: (X, Y, Z) int8 king's moves to the nearest cell that stops light, at most `_REACH`.
+        murky: likewise to the nearest cell that is not quite empty.
+    """
+
+    low: Floats
+    cell: float
+    opaque: NDArray[np.int8]
+    murky: NDArray[np.int8]
+
+    @classmethod
+    def of(cls, low: Floats, high: Floats, matter: Matter, axes: Floats, *, cells: int = 0) -> Grid:
+        """Fill the box from `low` to `high`, along the rows of `axes`; 0 cells means by the matter's rows."""
+        cells = cells or int(np.clip(len(matter.points), *_CELLS))
+        sides = np.maximum(high - low, np.max(high - low) / 256)
+        cell = float(np.cbrt(np.prod(sides) / cells))
+        shape = np.maximum(1, np.ceil(sides / cell)).astype(int)
+        points, filled = turned(matter.points, axes), np.zeros(int(np.prod(shape)))
+        optical = matter.opacities * 2 * np.pi * matter.scales[:, 1] * matter.scales[:, 2] / cell**2
+        parts = np.clip(np.ceil(1.6 * matter.scales[:, 2] / cell), 1, 9).astype(np.int8)
+        for count in np.unique(parts):
+            rows = np.flatnonzero(parts == count)
+            share = optical[rows] / count**2
+            spans = turned(matter.spans(rows).reshape(-1, 3), axes).reshape(-1, 2, 3) if count > 1 else None
+            for a, b in _lattice(int(count)):
+                at = points[rows] if spans is None else points[rows] + a * spans[:, 0] + b * spans[:, 1]
+                index, inside = _index(at, low, cell, shape)
+                filled += np.bincount(index[inside], share[inside], filled.size)
+        opaque, murky = (_steps((filled > limit).reshape(shape)) for limit in (_OPAQUE, _MURKY))
+        return cls(low, cell, opaque, murky)
+
+    def distance(self, points: Floats) -> Floats:
+        """(M,) from points to the nearest cell with something in it, or from outside to the box if farther.
+
+        Within the box what lies farther than `_REACH` cells is not looked for.
+        """
+        index, inside = _index(points, self.low, self.cell, np.array(self.murky.shape))
+        found = np.maximum(self.murky.ravel()[index].astype(np.float64) - 1, 0) * self.cell
+        high = self.low + self.cell * np.array(self.murky.shape)
+        outside = norms(np.maximum(0, np.maximum(self.low - points, points - high)))
+        return np.where(inside, found, np.maximum(outside, found))
+
+    def cast(self, eyes: Floats, directions: Floats, *, murky: bool = False) -> Floats:
+        """(M,) distances at which unit rays first meet an opaque cell, or a murky one; inf if they do not."""
+        shape = np.array(self.opaque.shape)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = (np.stack([self.low, self.low + self.cell * shape])[:, None] - eyes) / directions
+        near = np.nan_to_num(ends.min(axis=0), nan=-np.inf).max(axis=1)
+        far = np.nan_to_num(ends.max(axis=0), nan=np.inf).min(axis=1)
+        reached, hits = np.maximum(near, 0) + 0.01 * self.cell, np.full(len(eyes), np.inf)
+        steps, rows = (self.murky if murky else self.opaque).ravel(), np.flatnonzero(reached < far)
+        while len(rows):
+            index, _ = _index(eyes[rows] + reached[rows, None] * directions[rows], self.low, self.cell, shape)
+            ahead = steps[index]
+            met = ahead == 0
+            hits[rows[met]] = reached[rows[met]]
+            reached[rows] += self.cell * np.maximum(ahead - 1.0, 0.6)
+            rows = rows[~met & (reached[rows] < far[rows])]
+        return hits
+
+
+def _lattice(count: int) -> list[tuple[float, float]]:
+    """Offsets in standard deviations that stand for a Gaussian too wide for one cell."""
+    line = (1.6 * ((np.arange(count) + 0.5) / count * 2 - 1)).tolist()
+    return [(a, b) for a in line for b in line]
+
+
+def _index(points: Floats, low: Floats, cell: float, shape: NDArray[Any]) -> tuple[Any, NDArray[np.bool_]]:
+    """Flat cell indices, clamped into the box, and whether the points were in it."""
+    flat, inside = np.zeros(len(points), np.int64), np.ones(len(points), bool)
+    for axis in range(3):
+        place = np.floor((points[:, axis] - low[axis]) / cell)
+        inside &= (place >= 0) & (place < shape[axis])
+        flat = flat * shape[axis] + np.clip(place, 0, shape[axis] - 1).astype(np.int64)
+    return flat, inside
+
+
+def _steps(opaque: NDArray[np.bool_]) -> NDArray[np.int8]:
+    steps = np.where(opaque, 0, _REACH).astype(np.int8)
+    grown = opaque
+    for reach in range(1, _REACH):
+        wider = _grown(grown)
+        steps[wider & ~grown] = reach
+        grown = wider
+    return steps
+
+
+def _grown(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The cells and their 26 neighbours."""
+    for axis in range(3):
+        wider = cells.copy()
+        ahead, behind = [slice(None)] * 3, [slice(None)] * 3
+        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
+        wider[tuple(ahead)] |= cells[tuple(behind)]
+        wider[tuple(behind)] |= cells[tuple(ahead)]
+        cells = wider
+    return cells

@@ -1,0 +1,62 @@
+"""Poses on a dome around a thing, each as near as the thing fits the frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.poses.gather import gather
+from g2ard.poses.lattice import halton
+from g2ard.poses.numbers import quantile, turned
+from g2ard.poses.sight import Lens, Poses, look
+from g2ard.poses.site import Site
+
+__all__ = ["plan_orbit"]
+
+Floats = NDArray[np.float64]
+
+_ELEVATIONS = (-5.0, 50.0)
+"""Degrees above the horizon of the thing's middle."""
+
+_DISTANCES = (0.9, 1.25)
+"""Each pose's own share of the distance at which the thing just fits."""
+
+_OUTLINE = 8_000
+"""Points that stand for the thing's outline."""
+
+
+def plan_orbit(site: Site, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]) -> Poses:
+    """At most `count` poses around the middle of the matter, evenly over the dome.
+
+    Poses below the ground, in or close to matter are left out; the rest see it, for it fills their frame.
+    """
+    target = site.box.mean(axis=0)
+    low, high = np.sin(np.radians(_ELEVATIONS))
+
+    def propose(start: int, stop: int) -> Poses:
+        across, rise, chance = halton(start, stop, 3, seed).T
+        z = low + (high - low) * rise
+        flat, turn = np.sqrt(1 - z * z), 2 * np.pi * across
+        outward = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+        distances = _fitting(site, target, outward, lens)
+        distances *= _DISTANCES[0] + (_DISTANCES[1] - _DISTANCES[0]) * chance
+        return Poses(target + distances[:, None] * outward, -outward)
+
+    def judge(poses: Poses) -> Floats:
+        free = (site.grid.distance(poses.eyes) > 2 * site.grid.cell) & (site.above_ground(poses.eyes) > 0.02)
+        return (look(site, poses, lens, free).close > 4 * site.grid.cell).astype(float)
+
+    return gather(count, propose, judge, tell)
+
+
+def _fitting(site: Site, target: Floats, outward: Floats, lens: Lens) -> Floats:
+    """(P,) distances at which 97 % of the matter is in frame, and all of it ahead."""
+    points, weights = site.points[:_OUTLINE] - target, site.weights[:_OUTLINE]
+    wide, tall = lens.tangents
+    distances = np.empty(len(outward))
+    for i, frame in enumerate(Poses(outward, -outward).frames()):
+        x, y, z = turned(points, frame).T
+        distances[i] = quantile(np.maximum(np.abs(x) / wide, np.abs(y) / tall) - z, weights, 0.97)
+    return np.maximum(distances, 1.2)  # everything lies within about 1 of the middle

@@ -1,0 +1,41 @@
+"""What kind of scene it is, for planners to choose by."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from g2ard.poses.lattice import halton
+from g2ard.poses.site import Site
+from g2ard.poses.walk import enclosed
+
+__all__ = ["shape_of"]
+
+_TRIES = 400
+
+_FLAT = 0.25
+"""Height over width below which a scene with a ground is a landscape."""
+
+
+def shape_of(site: Site) -> tuple[str, str]:
+    """One of "object", "room", "landscape", and why.
+
+    A room holds free space that matter surrounds; a landscape is much wider than high; all else is an object,
+    on its own or on a piece of ground.
+    """
+    inside = _surrounded(site)
+    if inside > (0.5 if site.terrain is not None else 0.75):
+        return "room", f"{inside:.0%} of its box is free and enclosed"
+    sides = site.box[1] - site.box[0]
+    flat = float(sides[2] / max(np.sqrt(sides[0] * sides[1]), np.finfo(float).tiny))
+    if site.terrain is not None and flat < _FLAT:
+        return "landscape", f"{flat:.2g} times as high as wide"
+    return "object", f"{flat:.2g} times as high as wide, open around"
+
+
+def _surrounded(site: Site) -> float:
+    """Share of the scene's box that is free and enclosed from below and around."""
+    points = site.box[0] + (site.box[1] - site.box[0]) * halton(0, _TRIES, 3, seed=0)
+    free = site.grid.distance(points) > site.grid.cell
+    if not free.any():
+        return 0.0
+    return float((enclosed(site, points[free]) > 0.8).sum() / _TRIES)

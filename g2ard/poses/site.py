@@ -1,0 +1,99 @@
+"""A scene stood upright, with what planners ask of it: extents, ground, free space, sight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard.poses.grid import Grid
+from g2ard.poses.matter import Matter, Sample
+from g2ard.poses.numbers import along, middle, moments, quantile, turned
+from g2ard.poses.terrain import Terrain
+from g2ard.poses.up import Up, estimate_up, given_up
+from g2ard.splats import Splats
+
+__all__ = ["Site"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """Coordinates here are upright (z up) and of unit size: world = origin + size · axesᵀ · here.
+
+    Args:
+        points: (K, 3) a sample of the matter, and `weights` (K,).
+        box: (2, 3) low and high corner of the robust extents.
+        terrain: height of the ground; None where there is none.
+        grid: opaque cells of the box and some room around it.
+        axes: (3, 3) rows are this frame's axes in the world.
+        origin: (3,) world.
+        size: scene units per unit here.
+        up: what was found, and why.
+    """
+
+    points: Floats
+    weights: Floats
+    box: Floats
+    terrain: Terrain | None
+    grid: Grid
+    axes: Floats
+    origin: Floats
+    size: float
+    up: Up
+
+    @classmethod
+    def of(cls, splats: Splats, up: ArrayLike | None = None) -> Site:
+        """Stand a scene upright.
+
+        Raises:
+            InputError: nothing visible, or an `up` that is no direction.
+        """
+        matter = Matter.of(splats)
+        some = matter.sample()
+        found = estimate_up(some) if up is None else given_up(some, up)
+        axes = _axes(some, found.axis)
+        points = turned(some.points, axes)
+        box = np.array([quantile(points[:, a], some.weights, [0.01, 0.99]) for a in range(3)]).T
+        body = 1.5 * middle(matter.scales[:, 2])  # of a scene no larger than its Gaussians
+        box += np.maximum(0, body - (box[1] - box[0]) / 2) * np.array([[-1.0], [1.0]])
+        room = 0.1 * (box[1] - box[0]) + 0.02
+        grid = Grid.of(box[0] - room, box[1] + room, matter, axes)
+        facing = np.abs(along(some.normals, found.axis)) > np.cos(np.radians(35))
+        terrain = Terrain.of(points[facing], some.weights[facing], box) if found.grounded else None
+        origin = splats.offset + matter.origin
+        return cls(points, some.weights, box, terrain, grid, axes, origin, matter.size, found)
+
+    def ground(self, points: Floats) -> Floats:
+        """(M,) heights of the ground under points; the matter's lowest where there is no ground."""
+        if self.terrain is None:
+            return np.full(len(points), self.box[0, 2])
+        return self.terrain.height(points)
+
+    def above_ground(self, points: Floats) -> Floats:
+        """(M,) heights over the ground; infinite where there is none."""
+        return points[:, 2] - self.ground(points) if self.terrain else np.full(len(points), np.inf)
+
+    @cached_property
+    def tallness(self) -> float:
+        """How high things stand over the ground: 98 % of the matter is lower."""
+        return max(float(quantile(self.points[:, 2] - self.ground(self.points), self.weights, 0.98)), 0.0)
+
+
+def _axes(some: Sample, up: Floats) -> Floats:
+    """Rows: along the scene if it is long, else along a coordinate axis; to its left; up."""
+    ahead = np.eye(3)[int(np.argmin(np.round(np.abs(up), 3)))]
+    ahead = ahead - (ahead @ up) * up
+    ahead /= np.linalg.norm(ahead)
+    left = np.cross(up, ahead)
+    weights = some.weights / some.weights.sum()
+    flat = np.stack([along(some.points, ahead), along(some.points, left)], axis=1)
+    flat -= (weights[:, None] * flat).sum(axis=0)
+    values, vectors = np.linalg.eigh(moments(flat, weights))
+    if values[1] > 1.5 * values[0]:
+        x, y = vectors[:, 1] * np.copysign(1.0, vectors[np.argmax(np.abs(vectors[:, 1])), 1])
+        ahead = x * ahead + y * left
+    return np.stack([ahead, np.cross(up, ahead), up])

@@ -1,0 +1,198 @@
+"""Which way is up: the normal of the ground where there is one, else a guess that says so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard.errors import InputError
+from g2ard.poses.lattice import fibonacci
+from g2ard.poses.matter import Sample
+from g2ard.poses.numbers import along, moments, quantile
+
+__all__ = ["Up", "estimate_up", "given_up"]
+
+Floats = NDArray[np.float64]
+
+_FACING = np.cos(np.radians(20))
+_SLAB = 0.04
+"""Half the thickness of a layer that counts as a plane, in sizes of the scene."""
+
+_SEARCHED = 20_000
+"""Rows that the search over directions looks at; the winner is refined on all."""
+
+
+@dataclass(frozen=True, eq=False)
+class Up:
+    """The unit vector away from the ground, whether there is a ground, and why we think so."""
+
+    axis: Floats
+    grounded: bool
+    why: str
+
+
+def given_up(matter: Sample, up: ArrayLike) -> Up:
+    """The user's own answer; only whether there is a ground is looked up.
+
+    Raises:
+        InputError: not three finite numbers, or all zero.
+    """
+    axis = np.asarray(up, np.float64)
+    if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
+        raise InputError(f"up: expected three finite numbers, not all zero, got {up!r}")
+    axis = axis / np.linalg.norm(axis)
+    layer, _ = _layer(matter, axis)
+    return Up(axis, _is_flat(matter)[0] or layer > 0.1, "up as given")
+
+
+def estimate_up(matter: Sample) -> Up:
+    """The axis from planes or the scene's shape, its sign from where the matter lies.
+
+    In turn: a scene much flatter than wide lies on its ground; else the strongest plane at the edge of the
+    matter is the ground; else (an object cut out of its surroundings) the long axis of matterthing long, or
+    the axis that capture software usually calls up.
+    """
+    flat, thin, long = _is_flat(matter)
+    if flat:
+        axis = _mean_normal(matter, thin, np.abs(along(matter.normals, thin)) > np.cos(np.radians(35)))
+        return _signed(matter, axis, True, "the scene is flat")
+    axis, strength = _best_plane(matter)
+    if strength > 0.12:
+        return _signed(matter, axis, True, "a ground plane")
+    if long is not None:
+        return _signed(matter, _snapped(long), False, "no ground; the long axis")
+    return _signed(matter, np.array([0.0, -1.0, 0.0]), False, "no ground; a guess")
+
+
+def _is_flat(matter: Sample) -> tuple[bool, Floats, Floats | None]:
+    """Whether the scene is a sheet; its thinnest axis; its longest if it sticks out."""
+    w = matter.weights / matter.weights.sum()
+    centred = matter.points - (w[:, None] * matter.points).sum(axis=0)
+    values, vectors = np.linalg.eigh(moments(centred, w))
+    long = vectors[:, 2] if values[2] > 3 * values[1] else None
+    return bool(values[0] < 0.08 * values[1]), vectors[:, 0], long
+
+
+def _layer(matter: Sample, axis: Floats) -> tuple[float, float]:
+    """Share of all matter in the strongest layer that faces `axis`, and the layer's height."""
+    facing = np.abs(along(matter.normals, axis)) > _FACING
+    if not facing.any():
+        return 0.0, 0.0
+    heights = along(matter.points[facing], axis)
+    bins = np.floor(heights / _SLAB).astype(int)
+    low = bins.min()
+    mass = np.bincount(bins - low, (matter.weights * matter.flatness)[facing])
+    pairs = mass + np.append(mass[1:], 0.0)
+    best = int(np.argmax(pairs))
+    return float(pairs[best] / matter.weights.sum()), float((low + best + 1) * _SLAB)
+
+
+def _best_plane(matter: Sample) -> tuple[Floats, float]:
+    """The direction whose strongest layer holds most and has matter on one side only, refined."""
+    few = matter.take(slice(_SEARCHED))
+    directions = np.concatenate([np.eye(3), fibonacci(600)[:300]])
+    scores = [_edge(few, axis) * _habit(axis) for axis in directions]
+    axis = directions[int(np.argmax(scores))]
+    for _ in range(3):
+        _, height = _layer(matter, axis)
+        inside = np.abs(along(matter.points, axis) - height) < 2 * _SLAB
+        axis = _mean_normal(matter, axis, inside & (np.abs(along(matter.normals, axis)) > _FACING))
+    return axis, _edge(matter, axis)
+
+
+def _edge(matter: Sample, axis: Floats) -> float:
+    """The strongest layer's share, less what lies on both its sides: ground and walls have one side."""
+    share, height = _layer(matter, axis)
+    beside = along(matter.points, axis) - height
+    above = matter.weights[beside > 2 * _SLAB].sum()
+    below = matter.weights[beside < -2 * _SLAB].sum()
+    return share * (1 - 2 * min(above, below) / max(above + below, 0.05 * matter.weights.sum()))
+
+
+def _habit(axis: Floats) -> float:
+    """Between a floor and a wall alike: y or z is up in nearly every file."""
+    return 1.2 if np.abs(axis[1:]).max() > np.cos(np.radians(15)) else 1.0
+
+
+def _mean_normal(matter: Sample, axis: Floats, rows: NDArray[np.bool_]) -> Floats:
+    weights = (matter.weights * matter.flatness)[rows]
+    if not weights.sum() > 0:
+        return axis
+    mean = np.linalg.eigh(moments(matter.normals[rows], weights))[1][:, 2]
+    return mean * np.copysign(1.0, mean @ axis)
+
+
+def _snapped(axis: Floats) -> Floats:
+    """The coordinate axis if it is within 15°: a long thing leans, files are upright."""
+    best = int(np.argmax(np.abs(axis)))
+    return np.eye(3)[best] if abs(axis[best]) > np.cos(np.radians(15)) else axis
+
+
+def _signed(matter: Sample, axis: Floats, grounded: bool, why: str) -> Up:
+    lean = _lean(matter, axis) if grounded else -_balance(matter, axis)
+    if abs(lean) > 0.05:
+        side = "most matter lies above it" if grounded else "its heavier end is down"
+        return Up(axis * np.copysign(1.0, lean), grounded, f"{why}, {side}")
+    usual = (1.0, -1.0, 1.0)[int(np.argmax(np.abs(axis)))]
+    sign = np.copysign(1.0, usual * axis[int(np.argmax(np.abs(axis)))])
+    return Up(axis * sign, grounded, f"{why}, its sign by custom")
+
+
+def _lean(matter: Sample, axis: Floats) -> float:
+    """−1…1: how far the matter stands on the side of `axis`, seen from what faces it.
+
+    Heights are taken from the median of the facing matter in each of 6×6 columns, so that slopes do not
+    count. Between a floor and a ceiling, what is neither decides: furniture stands on floors.
+    """
+    heights = along(matter.points, axis)
+    facing = np.abs(along(matter.normals, axis)) > _FACING
+    ends = _two_layers(matter, heights, facing)
+    if ends is not None:
+        low, high = ends
+        between = (heights > low + 2 * _SLAB) & (heights < high - 2 * _SLAB)
+        weights = matter.weights[between]
+        if not weights.sum() > 0:
+            return 0.0
+        mean = (weights * heights[between]).sum() / weights.sum()
+        return float(1 - 2 * (mean - low) / (high - low))
+    column = _columns(matter, axis)
+    above = np.zeros(len(heights))
+    for cell in np.unique(column):
+        rows = column == cell
+        ground = rows & facing if (rows & facing).any() else rows
+        above[rows] = heights[rows] - quantile(heights[ground], matter.weights[ground], 0.5)
+    total = (matter.weights * np.abs(above)).sum()
+    return float((matter.weights * above).sum() / max(total, np.finfo(float).tiny))
+
+
+def _columns(matter: Sample, axis: Floats) -> NDArray[Any]:
+    across = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    first = np.cross(axis, across)
+    first /= np.linalg.norm(first)
+    sides = [np.floor(3 + 3 * along(matter.points, a)) for a in (first, np.cross(axis, first))]
+    row, column = (np.clip(side, 0, 5).astype(int) for side in sides)
+    return row * 6 + column
+
+
+def _two_layers(matter: Sample, heights: Floats, facing: NDArray[np.bool_]) -> tuple[float, float] | None:
+    """Heights of a floor and a ceiling: both ends of what faces the axis are strong layers."""
+    if not facing.any():
+        return None
+    weights = (matter.weights * matter.flatness)[facing]
+    low, high = quantile(heights[facing], weights, [0.05, 0.95])
+    if high - low < 6 * _SLAB:
+        return None
+    total = weights.sum()
+    shares = [weights[np.abs(heights[facing] - end) < 2 * _SLAB].sum() / total for end in (low, high)]
+    return (float(low), float(high)) if min(shares) > 0.25 else None
+
+
+def _balance(matter: Sample, axis: Floats) -> float:
+    """−1…1: which half of its height a thing's matter leans to."""
+    heights = along(matter.points, axis)
+    low, high = quantile(heights, matter.weights, [0.01, 0.99])
+    mean = (matter.weights * heights).sum() / matter.weights.sum()
+    return float(2 * (mean - low) / max(high - low, np.finfo(float).tiny) - 1)

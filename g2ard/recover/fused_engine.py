@@ -1,0 +1,97 @@
+"""Recovery steps whole in Rust: forward, loss, backward, regularisers and a sparse Adam in one call."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.cameras import Cameras
+from g2ard.recover.anchors import Anchors, Regularizers
+from g2ard.recover.schedule import Rates
+from g2ard.render import RasterSettings, arrays_of, view_of
+from g2ard.splats import Splats
+
+__all__ = ["FusedEngine"]
+
+
+class FusedEngine:
+    """Does what `TorchEngine` does, to rounding, but leaves Gaussians alone that the view did not touch."""
+
+    def __init__(
+        self,
+        splats: Splats,
+        cameras: Cameras,
+        *,
+        anchors: Anchors,
+        regularizers: Regularizers,
+        means_in_scales: bool,
+        ssim_weight: float,
+        background: tuple[float, float, float],
+    ) -> None:
+        self._template = splats
+        self._cameras = cameras
+        self._settings = RasterSettings()
+        self._weights = (regularizers.anchor, regularizers.shape, regularizers.effective_rank)
+        self._ssim_weight = ssim_weight
+        self._background = list(background)
+        units = np.ascontiguousarray(splats.scales.max(1)) if means_in_scales else None
+        self._trainer = _core.Trainer(arrays_of(splats), units)
+        self._anchors = (
+            anchors.means,
+            np.ascontiguousarray(anchors.frames),
+            anchors.r_parallel,
+            anchors.r_perp,
+        )
+        self._trainer.anchor(*self._anchors)
+
+    def step(self, view: int, target: NDArray[np.float32], rates: Rates, *, regularize: bool) -> float:
+        """One optimiser step on one view; returns its photometric loss."""
+        loss, _ = self._trainer.step(
+            view_of(self._cameras, view, self._settings),
+            self._settings.choices,
+            self._background,
+            target,
+            self._ssim_weight,
+            [
+                rates.means,
+                rates.quats,
+                rates.log_scales,
+                rates.logit_opacities,
+                rates.sh0,
+                rates.shN,
+            ],
+            self._weights if regularize else None,
+        )
+        return loss
+
+    def splats(self) -> Splats:
+        """The scene as it stands, quaternions normalised."""
+        means, quats, log_scales, logit_opacities, sh0, shN = self._trainer.arrays()
+        length = np.linalg.norm(quats, axis=1, keepdims=True)
+        quats = np.where(length > 0, quats / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
+        return Splats(
+            means=means,
+            quats=quats.astype(np.float32),
+            scales=np.exp(log_scales.astype(np.float64)).astype(np.float32),
+            logit_opacities=logit_opacities,
+            sh0=sh0,
+            shN=shN,
+            offset=self._template.offset,
+        )
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Everything a bitwise resume needs."""
+        return self._trainer.state()
+
+    def load(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take up a `state` again."""
+        self._trainer.load(state)
+        self._trainer.anchor(*self._anchors)
+
+    @property
+    def skipped(self) -> int:
+        """Steps of single Gaussians left out because a gradient was not finite."""
+        return self._trainer.skipped

@@ -1,0 +1,130 @@
+//! Where the Gaussians' stored values come from, sixteen rows at a time.
+
+use super::simd::{LANES, Lanes, Row};
+use crate::{Error, Result};
+
+/// N Gaussians in the torch layout: row-major borrowed slices, each in its stored (not activated) space.
+#[derive(Debug, Clone, Copy)]
+pub struct Params<'a> {
+    /// N × 3.
+    pub means: &'a [f32],
+    /// N × 4, wxyz, any length; zero means no rotation.
+    pub quats: &'a [f32],
+    /// N × 3.
+    pub log_scales: &'a [f32],
+    /// N.
+    pub logit_opacities: &'a [f32],
+    /// N × 3.
+    pub sh0: &'a [f32],
+    /// N × (K−1) × 3.
+    pub sh_n: &'a [f32],
+    /// K: 1, 4, 9 or 16.
+    pub sh_coeffs: usize,
+}
+
+impl Params<'_> {
+    pub fn len(&self) -> usize {
+        self.logit_opacities.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Every slice has N rows and K is that of a degree from 0 to 3.
+    pub fn validate(&self) -> Result<()> {
+        if ![1, 4, 9, 16].contains(&self.sh_coeffs) {
+            return Err(Error::invalid(
+                "sh",
+                "1, 4, 9 or 16 coefficients",
+                self.sh_coeffs,
+            ));
+        }
+        let n = self.len();
+        if n > u32::MAX as usize / 64 {
+            return Err(Error::invalid("means", "at most 67 million rows", n));
+        }
+        for (name, slice, width) in [
+            ("means", self.means, 3),
+            ("quats", self.quats, 4),
+            ("log_scales", self.log_scales, 3),
+            ("sh0", self.sh0, 3),
+            ("shN", self.sh_n, 3 * (self.sh_coeffs - 1)),
+        ] {
+            if slice.len() != n * width {
+                return Err(Error::invalid(
+                    name,
+                    format!("{n} rows of {width}"),
+                    format!("{} values", slice.len()),
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Sixteen Gaussians' values by attribute. Lanes past the end repeat the last row.
+pub(crate) trait Source: Copy + Sync {
+    fn len(&self) -> usize;
+    fn sh_coeffs(&self) -> usize;
+    fn mean<F: Lanes>(&self, group: usize, axis: usize) -> F;
+    fn quat<F: Lanes>(&self, group: usize, part: usize) -> F;
+    fn log_scale<F: Lanes>(&self, group: usize, axis: usize) -> F;
+    fn logit_opacity<F: Lanes>(&self, group: usize) -> F;
+    /// Coefficient `k` (0 is the base colour) of channel `c`.
+    fn sh<F: Lanes>(&self, group: usize, k: usize, c: usize) -> F;
+}
+
+/// Every `stride`-th value from a row-major array, `offset` into the row.
+#[inline(always)]
+fn strided<F: Lanes>(values: &[f32], group: usize, stride: usize, offset: usize) -> F {
+    let mut row = Row::default();
+    let first = group * LANES;
+    let start = first * stride + offset;
+    if values.len() >= (first + LANES) * stride {
+        for l in 0..LANES {
+            row.0[l] = values[start + l * stride];
+        }
+    } else {
+        let last = values.len() / stride - 1 - first;
+        for l in 0..LANES {
+            row.0[l] = values[start + l.min(last) * stride];
+        }
+    }
+    F::load(&row)
+}
+
+impl Source for Params<'_> {
+    #[inline(always)]
+    fn len(&self) -> usize {
+        self.logit_opacities.len()
+    }
+    #[inline(always)]
+    fn sh_coeffs(&self) -> usize {
+        self.sh_coeffs
+    }
+    #[inline(always)]
+    fn mean<F: Lanes>(&self, group: usize, axis: usize) -> F {
+        strided(self.means, group, 3, axis)
+    }
+    #[inline(always)]
+    fn quat<F: Lanes>(&self, group: usize, part: usize) -> F {
+        strided(self.quats, group, 4, part)
+    }
+    #[inline(always)]
+    fn log_scale<F: Lanes>(&self, group: usize, axis: usize) -> F {
+        strided(self.log_scales, group, 3, axis)
+    }
+    #[inline(always)]
+    fn logit_opacity<F: Lanes>(&self, group: usize) -> F {
+        strided(self.logit_opacities, group, 1, 0)
+    }
+    #[inline(always)]
+    fn sh<F: Lanes>(&self, group: usize, k: usize, c: usize) -> F {
+        if k == 0 {
+            strided(self.sh0, group, 3, c)
+        } else {
+            strided(self.sh_n, group, 3 * (self.sh_coeffs - 1), 3 * (k - 1) + c)
+        }
+    }
+}

@@ -1,0 +1,603 @@
+//! Gaussians → screen splats, sixteen at a time (EWA: Σ₂ = J W R S Sᵀ Rᵀ Wᵀ Jᵀ + 0.3 I).
+
+use super::params::Source;
+use super::sh;
+use super::simd::{Kernel, LANES, LOG2_E, Lanes, Mask, Row, Wide};
+use super::{ALPHA_MIN, Camera, Convention, DILATION, Settings};
+
+/// ½·log2(e): exponents are kept in powers of two, so exp(−½ dᵀΣ₂⁻¹d) = 2^−(u² + v²).
+pub const HALF_LOG2_E: f32 = 0.5 * LOG2_E;
+/// Beyond this determinant (px⁴) f32 runs out; such a splat is wider than 10⁸ images and is culled.
+const DET_MAX: f32 = 1e33;
+/// INRIA's floor under det Σ₂ / det(Σ₂ + 0.3 I).
+const INRIA_FLOOR: f32 = 2.5e-5;
+
+/// A camera's numbers in the form the kernels want.
+#[derive(Debug, Clone, Copy)]
+pub struct View {
+    rotation: [[f64; 3]; 3],
+    translation: [f64; 3],
+    position: [f64; 3],
+    fx: f64,
+    fy: f64,
+    cx: f64,
+    cy: f64,
+    width: f32,
+    height: f32,
+    near: f32,
+    /// x/z and y/z are clamped to these in the Jacobian: 1.3 half-fields of view about the principal point's image.
+    lim_x: [f32; 2],
+    lim_y: [f32; 2],
+    convention: Convention,
+    antialiased: bool,
+}
+
+impl View {
+    pub fn new(camera: &Camera, settings: &Settings) -> Self {
+        let v = &camera.viewmat;
+        let (w, h) = (camera.width as f64, camera.height as f64);
+        let (mx, my) = (0.15 * w / camera.fx, 0.15 * h / camera.fy);
+        Self {
+            rotation: v.map(|r| [r[0], r[1], r[2]]),
+            translation: v.map(|r| r[3]),
+            position: camera.position(),
+            fx: camera.fx,
+            fy: camera.fy,
+            cx: camera.cx,
+            cy: camera.cy,
+            width: camera.width as f32,
+            height: camera.height as f32,
+            near: camera.near,
+            lim_x: [
+                (-camera.cx / camera.fx - mx) as f32,
+                ((w - camera.cx) / camera.fx + mx) as f32,
+            ],
+            lim_y: [
+                (-camera.cy / camera.fy - my) as f32,
+                ((h - camera.cy) / camera.fy + my) as f32,
+            ],
+            convention: settings.convention,
+            antialiased: settings.antialiased,
+        }
+    }
+}
+
+/// What blending needs of one Gaussian: a cache line.
+#[derive(Debug, Clone, Copy, Default)]
+#[repr(C, align(64))]
+pub struct Splat {
+    /// Centre in pixels; f64, for an f32 pixel coordinate is only good to 3e-5.
+    pub x: f64,
+    pub y: f64,
+    /// u = a·dx + b·dy, v = c·dy, and u² + v² is the exponent in powers of two.
+    pub a: f32,
+    pub b: f32,
+    pub c: f32,
+    /// log2 of the opacity (times the antialiasing factor).
+    pub log2_opacity: f32,
+    pub rgb: [f32; 3],
+    pub depth: f32,
+    /// The Gaussian's row.
+    pub row: u32,
+    /// Tiles it meets, and the number of its first slot: set by `tiles`.
+    pub tiles: u32,
+    pub slot: u32,
+    /// INRIA: the 3σ radius in pixels; otherwise infinite.
+    pub radius: f32,
+}
+
+/// Everything the forward and the backward projection share.
+pub struct Projected<F: Lanes> {
+    /// Lanes that can touch the image.
+    pub visible: F::Mask,
+    pub x: F::Wide,
+    pub y: F::Wide,
+    pub depth: F,
+    pub rz: F,
+    /// x/z and y/z; `t` is clamped, `inside` says where it was not.
+    pub ray: [F; 2],
+    pub t: [F; 2],
+    pub inside: [F::Mask; 2],
+    /// The camera's rotation and J·W.
+    pub w: [[F; 3]; 3],
+    pub jw: [[F; 3]; 2],
+    /// Unit quaternion and 1/|q|, 0 for a zero quaternion.
+    pub q: [F; 4],
+    pub rq: F,
+    pub r: [[F; 3]; 3],
+    pub s: [F; 3],
+    /// J·W·R and J·W·R·S.
+    pub m: [[F; 3]; 2],
+    pub minors: [F; 3],
+    pub det0: F,
+    pub det: F,
+    pub a: F,
+    pub b: F,
+    pub c: F,
+    pub log2_opacity: F,
+    /// 1 − opacity.
+    pub rest_opacity: F,
+    pub radius: F,
+    /// Half the width and height of the ellipse at α = 1/255, pixels.
+    pub half: [F; 2],
+}
+
+/// exp(−|x|)-based logistic: (log2 σ(x), 1 − σ(x)).
+#[inline(always)]
+fn logistic<F: Lanes>(x: F) -> (F, F) {
+    let e = (-x.abs()).exp();
+    let one = F::splat(1.0);
+    let r = one / (one + e);
+    let rest = F::select(x.gt(F::zero()), e * r, r);
+    let log2 = -(e.log2_1p()) + x.min(F::zero()) * F::splat(LOG2_E);
+    (log2, rest)
+}
+
+#[inline(always)]
+pub fn project<F: Lanes, S: Source>(view: &View, source: &S, group: usize) -> Projected<F> {
+    let one = F::splat(1.0);
+    let mut p = [F::Wide::splat(0.0); 3];
+    for i in 0..3 {
+        p[i] = F::Wide::splat(view.translation[i]);
+        for k in 0..3 {
+            let mean = source.mean::<F>(group, k).widen();
+            p[i] = mean.fma(F::Wide::splat(view.rotation[i][k]), p[i]);
+        }
+    }
+    let depth = F::narrow(p[2]);
+    let near = F::splat(view.near);
+    let mut visible = match view.convention {
+        Convention::Gsplat => depth.ge(near),
+        Convention::Inria => depth.gt(near),
+    };
+    // Lanes behind the camera go on with z = 1, so that nothing below is infinite.
+    let behind = F::select(visible, F::zero(), one).widen();
+    let in_front = F::select(visible, one, F::zero()).widen();
+    let z = p[2].fma(in_front, behind);
+    let rz_wide = F::Wide::splat(1.0) / z;
+    let (ray_x, ray_y) = (p[0] * rz_wide, p[1] * rz_wide);
+    let x = ray_x.fma(F::Wide::splat(view.fx), F::Wide::splat(view.cx));
+    let y = ray_y.fma(F::Wide::splat(view.fy), F::Wide::splat(view.cy));
+    let ray = [F::narrow(ray_x), F::narrow(ray_y)];
+    let rz = F::narrow(rz_wide);
+
+    let mut t = ray;
+    let mut inside = [visible; 2];
+    for (i, lim) in [view.lim_x, view.lim_y].iter().enumerate() {
+        let (low, high) = (F::splat(lim[0]), F::splat(lim[1]));
+        t[i] = ray[i].max(low).min(high);
+        inside[i] = ray[i].ge(low).and(high.ge(ray[i]));
+    }
+    let mut w = [[F::zero(); 3]; 3];
+    for i in 0..3 {
+        for k in 0..3 {
+            w[i][k] = F::splat(view.rotation[i][k] as f32);
+        }
+    }
+    let (jx, jy) = (rz * F::splat(view.fx as f32), rz * F::splat(view.fy as f32));
+    let mut jw = [[F::zero(); 3]; 2];
+    for k in 0..3 {
+        jw[0][k] = jx * t[0].fnma(w[2][k], w[0][k]);
+        jw[1][k] = jy * t[1].fnma(w[2][k], w[1][k]);
+    }
+
+    let (q, rq) = unit_quaternion::<F, S>(source, group);
+    let r = rotation(&q);
+    let mut s = [F::zero(); 3];
+    for k in 0..3 {
+        s[k] = source.log_scale::<F>(group, k).exp();
+    }
+    let mut m = [[F::zero(); 3]; 2];
+    for i in 0..2 {
+        for k in 0..3 {
+            let mut sum = jw[i][0] * r[0][k];
+            sum = jw[i][1].fma(r[1][k], sum);
+            sum = jw[i][2].fma(r[2][k], sum);
+            m[i][k] = sum * s[k];
+        }
+    }
+    let mut minors = [F::zero(); 3];
+    for k in 0..3 {
+        let (i, j) = ((k + 1) % 3, (k + 2) % 3);
+        minors[k] = m[0][i] * m[1][j] - m[0][j] * m[1][i];
+    }
+    let blur = F::splat(DILATION);
+    let (xx, xy, yy) = (dot(&m[0], &m[0]), dot(&m[0], &m[1]), dot(&m[1], &m[1]));
+    // Cauchy–Binet: det(MMᵀ) is the sum of squared minors. xx·yy − xy² would lose every digit on a needle.
+    let det0 = dot(&minors, &minors);
+    let det = det0 + blur.fma(xx + yy, blur * blur);
+    let (xx, yy) = (xx + blur, yy + blur);
+    visible = visible.and(F::splat(DET_MAX).ge(det));
+
+    let (log2_sigma, rest_opacity) = logistic(source.logit_opacity::<F>(group));
+    let mut log2_opacity = log2_sigma;
+    if view.antialiased {
+        let mut ratio = det0 / det;
+        if view.convention == Convention::Inria {
+            ratio = ratio.max(F::splat(INRIA_FLOOR));
+        }
+        log2_opacity = log2_opacity + half_log2(ratio);
+    }
+    let reach = log2_opacity - F::splat(ALPHA_MIN.log2());
+    visible = visible.and(reach.ge(F::zero()));
+
+    let k2 = F::splat(HALF_LOG2_E);
+    let c = (k2 / yy).sqrt();
+    let a = (k2 * yy / det).sqrt();
+    let b = -(xy / yy * a);
+    let mut radius = F::splat(f32::INFINITY);
+    if view.convention == Convention::Inria {
+        let mid = F::splat(0.5) * (xx + yy);
+        let lambda = mid + (mid.fma(mid, -det)).max(F::splat(0.1)).sqrt();
+        let r3 = F::splat(3.0) * lambda.sqrt();
+        radius = -((-r3).floor());
+    }
+    let out_x = (xx * reach.max(F::zero()) / k2).sqrt();
+    let out_y = (yy * reach.max(F::zero()) / k2).sqrt();
+    visible = visible
+        .and(on_image(F::narrow(x), out_x, view.width))
+        .and(on_image(F::narrow(y), out_y, view.height));
+    Projected {
+        visible,
+        x,
+        y,
+        depth,
+        rz,
+        ray,
+        t,
+        inside,
+        w,
+        jw,
+        q,
+        rq,
+        r,
+        s,
+        m,
+        minors,
+        det0,
+        det,
+        a,
+        b,
+        c,
+        log2_opacity,
+        rest_opacity,
+        radius,
+        half: [out_x, out_y],
+    }
+}
+
+#[inline(always)]
+fn dot<F: Lanes>(a: &[F; 3], b: &[F; 3]) -> F {
+    a[2].fma(b[2], a[1].fma(b[1], a[0] * b[0]))
+}
+
+/// Whether [centre − extent, centre + extent] meets the pixel centres 0.5 … size − 0.5, with room for rounding.
+#[inline(always)]
+fn on_image<F: Lanes>(centre: F, extent: F, size: f32) -> F::Mask {
+    let extent = extent.fma(F::splat(1.0001), F::splat(0.01));
+    let after = (centre + extent).ge(F::splat(0.5));
+    after.and(F::splat(size - 0.5).ge(centre - extent))
+}
+
+/// ½·log2(x), lane by lane: only antialiasing needs it.
+#[inline(always)]
+fn half_log2<F: Lanes>(x: F) -> F {
+    let mut row = Row::default();
+    x.store(&mut row);
+    for l in 0..LANES {
+        row.0[l] = 0.5 * row.0[l].log2();
+    }
+    F::load(&row)
+}
+
+#[inline(always)]
+pub fn unit_quaternion<F: Lanes, S: Source>(source: &S, group: usize) -> ([F; 4], F) {
+    let mut q = [F::zero(); 4];
+    for k in 0..4 {
+        q[k] = source.quat::<F>(group, k);
+    }
+    // Divided by the largest part first: squares of 1e±30 leave f32.
+    let largest = q[0].abs().max(q[1].abs()).max(q[2].abs().max(q[3].abs()));
+    let some = largest.gt(F::zero());
+    let shrink = (F::splat(1.0) / F::select(some, largest, F::splat(1.0))).only(some);
+    for k in 0..4 {
+        q[k] = q[k] * shrink;
+    }
+    q[0] = F::select(some, q[0], F::splat(1.0));
+    let norm2 = q[3].fma(q[3], q[2].fma(q[2], q[1].fma(q[1], q[0] * q[0])));
+    let rn = F::splat(1.0) / norm2.sqrt();
+    for k in 0..4 {
+        q[k] = q[k] * rn;
+    }
+    (q, rn * shrink)
+}
+
+#[inline(always)]
+pub fn rotation<F: Lanes>(q: &[F; 4]) -> [[F; 3]; 3] {
+    let [w, x, y, z] = *q;
+    let (one, two) = (F::splat(1.0), F::splat(2.0));
+    let (xx, yy, zz) = (x * x, y * y, z * z);
+    let (xy, xz, yz) = (x * y, x * z, y * z);
+    let (wx, wy, wz) = (w * x, w * y, w * z);
+    [
+        [one - two * (yy + zz), two * (xy - wz), two * (xz + wy)],
+        [two * (xy + wz), one - two * (xx + zz), two * (yz - wx)],
+        [two * (xz - wy), two * (yz + wx), one - two * (xx + yy)],
+    ]
+}
+
+/// The unit direction from the camera, and 1/distance.
+#[inline(always)]
+pub fn direction<F: Lanes, S: Source>(view: &View, source: &S, group: usize) -> ([F; 3], F) {
+    let mut d = [F::zero(); 3];
+    for k in 0..3 {
+        let from = F::Wide::splat(-view.position[k]);
+        d[k] = F::narrow(source.mean::<F>(group, k).widen() + from);
+    }
+    let length2 = d[2].fma(d[2], d[1].fma(d[1], d[0] * d[0]));
+    let r = F::splat(1.0) / length2.max(F::splat(1e-30)).sqrt();
+    ([d[0] * r, d[1] * r, d[2] * r], r)
+}
+
+/// 0.5 + Σₖ basisₖ·shₖ, not clamped.
+#[inline(always)]
+pub fn colour<F: Lanes, S: Source>(source: &S, group: usize, basis: &[F; 16]) -> [F; 3] {
+    let mut rgb = [F::splat(0.5); 3];
+    for k in 0..source.sh_coeffs() {
+        for c in 0..3 {
+            rgb[c] = basis[k].fma(source.sh::<F>(group, k, c), rgb[c]);
+        }
+    }
+    rgb
+}
+
+/// Projects the groups `first..last`; visible splats go to the front of `out` in row order. Returns how many.
+pub struct Project<'a, S: Source> {
+    pub view: &'a View,
+    pub source: S,
+    pub first: usize,
+    pub last: usize,
+    pub out: &'a mut [Splat],
+    /// Their half extents.
+    pub halves: &'a mut [[f32; 2]],
+}
+
+impl<S: Source> Kernel for Project<'_, S> {
+    type Output = usize;
+
+    #[inline(always)]
+    fn run<F: Lanes>(self) -> usize {
+        let mut count = 0;
+        for group in self.first..self.last {
+            let p = project::<F, S>(self.view, &self.source, group);
+            let rows = (self.source.len() - group * LANES).min(LANES);
+            let mut bits = u32::from(p.visible.bits()) & ((1u32 << rows) - 1);
+            if bits == 0 {
+                continue;
+            }
+            let (dir, _) = direction::<F, S>(self.view, &self.source, group);
+            let mut basis = [F::zero(); 16];
+            sh::basis(self.source.sh_coeffs(), dir[0], dir[1], dir[2], &mut basis);
+            let rgb = colour::<F, S>(&self.source, group, &basis);
+            let (mut x, mut y) = ([0.0; LANES], [0.0; LANES]);
+            p.x.store(&mut x);
+            p.y.store(&mut y);
+            let mut rows = [Row::default(); 11];
+            let values = [
+                p.a,
+                p.b,
+                p.c,
+                p.log2_opacity,
+                rgb[0].max(F::zero()),
+                rgb[1].max(F::zero()),
+                rgb[2].max(F::zero()),
+                p.depth,
+                p.radius,
+                p.half[0],
+                p.half[1],
+            ];
+            for k in 0..11 {
+                values[k].store(&mut rows[k]);
+            }
+            while bits != 0 {
+                let l = bits.trailing_zeros() as usize;
+                bits &= bits - 1;
+                self.out[count] = Splat {
+                    x: x[l],
+                    y: y[l],
+                    a: rows[0].0[l],
+                    b: rows[1].0[l],
+                    c: rows[2].0[l],
+                    log2_opacity: rows[3].0[l],
+                    rgb: [rows[4].0[l], rows[5].0[l], rows[6].0[l]],
+                    depth: rows[7].0[l],
+                    row: (group * LANES + l) as u32,
+                    tiles: 0,
+                    slot: 0,
+                    radius: rows[8].0[l],
+                };
+                self.halves[count] = [rows[9].0[l], rows[10].0[l]];
+                count += 1;
+            }
+        }
+        count
+    }
+}
+
+/// The gradient with respect to what [`project`] computed for sixteen Gaussians, as [`super::gradients`] gathers it.
+pub struct ScreenGradients<F: Lanes> {
+    /// Σ h·(1, u, v, u², uv, v²) over pixels, h = dL/d(ln α).
+    pub moments: [F; 6],
+    pub rgb: [F; 3],
+    pub depth: F,
+}
+
+/// The gradient with respect to the stored parameters; SH is `basis[k] · rgb[c]`, left unmultiplied.
+pub struct RowGradients<F: Lanes> {
+    pub mean: [F; 3],
+    pub quat: [F; 4],
+    pub log_scale: [F; 3],
+    pub logit_opacity: F,
+    pub basis: [F; 16],
+    pub rgb: [F; 3],
+}
+
+/// Back through the projection of one group. Lanes with zero `moments`, `rgb` and `depth` get zeros.
+#[inline(always)]
+pub fn unproject<F: Lanes, S: Source>(
+    view: &View,
+    source: &S,
+    group: usize,
+    g: &ScreenGradients<F>,
+) -> RowGradients<F> {
+    let p = project::<F, S>(view, source, group);
+    let zero = F::zero();
+    let two = F::splat(2.0);
+    let [h, hu, hv, huu, huv, hvv] = g.moments;
+
+    // In whitened coordinates y = U·d nothing cancels: dL/dmean = Uᵀ Σhy, dL/dΣ₂ = ½ Uᵀ (Σ h y yᵀ) U.
+    let rk = F::splat(1.0 / HALF_LOG2_E);
+    let grad_x = p.a * hu * rk;
+    let grad_y = (p.b * hu + p.c * hv) * rk;
+    let half_rk2 = F::splat(0.5 / (HALF_LOG2_E * HALF_LOG2_E));
+    let (uu, uv, vv) = (huu * half_rk2, huv * half_rk2, hvv * half_rk2);
+    let left = p.b * uu + p.c * uv;
+    let right = p.b * uv + p.c * vv;
+    let gxx = p.a * p.a * uu;
+    let gxy = p.a * left;
+    let gyy = p.b * left + p.c * right;
+
+    let mut dm = [[zero; 3]; 2];
+    for k in 0..3 {
+        dm[0][k] = two * (gxx * p.m[0][k] + gxy * p.m[1][k]);
+        dm[1][k] = two * (gxy * p.m[0][k] + gyy * p.m[1][k]);
+    }
+    if view.antialiased {
+        // ln √(det0 / det), det = det0 + 0.3·tr + 0.09; det0 = |minors|², minors = M₀ × M₁.
+        let mut weight = h;
+        if view.convention == Convention::Inria {
+            weight = h.only((p.det0 / p.det).gt(F::splat(INRIA_FLOOR)));
+        }
+        let r_det = F::splat(1.0) / p.det;
+        let r_det0 = F::splat(1.0) / p.det0.max(F::splat(f32::MIN_POSITIVE));
+        let on_minors = weight * (r_det0 - r_det);
+        let on_trace = weight * F::splat(DILATION) * r_det;
+        for k in 0..3 {
+            let (i, j) = ((k + 1) % 3, (k + 2) % 3);
+            let (ni, nj) = (p.minors[i] * on_minors, p.minors[j] * on_minors);
+            dm[0][k] = dm[0][k] + (p.m[1][i] * nj - p.m[1][j] * ni) - on_trace * p.m[0][k];
+            dm[1][k] = dm[1][k] + (ni * p.m[0][j] - nj * p.m[0][i]) - on_trace * p.m[1][k];
+        }
+    }
+
+    let mut log_scale = [zero; 3];
+    let mut dt = [[zero; 3]; 2];
+    for k in 0..3 {
+        log_scale[k] = dm[0][k].fma(p.m[0][k], dm[1][k] * p.m[1][k]);
+        dt[0][k] = dm[0][k] * p.s[k];
+        dt[1][k] = dm[1][k] * p.s[k];
+    }
+    let mut dr = [[zero; 3]; 3];
+    let mut djw = [[zero; 3]; 2];
+    for a in 0..3 {
+        for k in 0..3 {
+            dr[a][k] = p.jw[0][a] * dt[0][k] + p.jw[1][a] * dt[1][k];
+            for i in 0..2 {
+                djw[i][a] = dt[i][k].fma(p.r[a][k], djw[i][a]);
+            }
+        }
+    }
+    let quat = quaternion_gradient(&p.q, p.rq, &dr);
+
+    // J·W = (f/z)·(Wᵢ − t·W₂): the 1/z in front, then t where it was not clamped.
+    let focal = [F::splat(view.fx as f32), F::splat(view.fy as f32)];
+    let on_screen = [grad_x, grad_y];
+    let mut camera = [zero, zero, g.depth];
+    for i in 0..2 {
+        let mut along = zero;
+        let mut on_t = zero;
+        for k in 0..3 {
+            along = djw[i][k].fma(p.jw[i][k], along);
+            on_t = djw[i][k].fma(p.w[2][k], on_t);
+        }
+        let j = focal[i] * p.rz;
+        let through_t = (-(on_t * j * p.rz)).only(p.inside[i]);
+        let through_ray = on_screen[i] * j;
+        camera[i] = through_t + through_ray;
+        camera[2] = camera[2] - through_t * p.t[i] - through_ray * p.ray[i] - along * p.rz;
+    }
+    let mut mean = [zero; 3];
+    for k in 0..3 {
+        mean[k] = camera[0] * p.w[0][k] + camera[1] * p.w[1][k] + camera[2] * p.w[2][k];
+    }
+
+    let (dir, r_distance) = direction::<F, S>(view, source, group);
+    let coeffs = source.sh_coeffs();
+    let mut basis = [zero; 16];
+    sh::basis(coeffs, dir[0], dir[1], dir[2], &mut basis);
+    let value = colour::<F, S>(source, group, &basis);
+    let mut rgb = g.rgb;
+    for c in 0..3 {
+        rgb[c] = rgb[c].only(value[c].gt(zero));
+    }
+    if coeffs > 1 {
+        let mut weights = [zero; 16];
+        for k in 1..coeffs {
+            for c in 0..3 {
+                weights[k] = source.sh::<F>(group, k, c).fma(rgb[c], weights[k]);
+            }
+        }
+        let d = sh::gradient(coeffs, dir[0], dir[1], dir[2], &weights);
+        let radial = d[0] * dir[0] + d[1] * dir[1] + d[2] * dir[2];
+        for k in 0..3 {
+            mean[k] = mean[k] + (d[k] - dir[k] * radial) * r_distance;
+        }
+    }
+    RowGradients {
+        mean,
+        quat,
+        log_scale,
+        logit_opacity: h * p.rest_opacity,
+        basis,
+        rgb,
+    }
+}
+
+/// dL/dR → dL/dq for R(q/|q|), from the unit quaternion and 1/|q|.
+#[inline(always)]
+pub fn quaternion_gradient<F: Lanes>(q: &[F; 4], rq: F, g: &[[F; 3]; 3]) -> [F; 4] {
+    let [w, x, y, z] = *q;
+    let two = F::splat(2.0);
+    let (sxy, sxz, syz) = (g[0][1] + g[1][0], g[0][2] + g[2][0], g[1][2] + g[2][1]);
+    let (ax, ay, az) = (g[2][1] - g[1][2], g[0][2] - g[2][0], g[1][0] - g[0][1]);
+    let d = [
+        two * (x * ax + y * ay + z * az),
+        two * (w * ax + y * sxy + z * sxz - two * x * (g[1][1] + g[2][2])),
+        two * (w * ay + x * sxy + z * syz - two * y * (g[0][0] + g[2][2])),
+        two * (w * az + x * sxz + y * syz - two * z * (g[0][0] + g[1][1])),
+    ];
+    let radial = w * d[0] + x * d[1] + y * d[2] + z * d[3];
+    let mut out = [F::zero(); 4];
+    for k in 0..4 {
+        out[k] = (d[k] - q[k] * radial) * rq;
+    }
+    out
+}
+
+impl Splat {
+    /// u² + v² at α = 1/255, and a little more: kernels test every pixel, so too much costs time, never correctness.
+    #[inline(always)]
+    pub fn level(&self) -> f32 {
+        (self.log2_opacity - ALPHA_MIN.log2()).max(0.0) * 1.000_1 + 1e-4
+    }
+
+    /// Half the width and height of that ellipse: Σ_xx ∝ (b² + c²)/(a·c)², Σ_yy ∝ 1/c².
+    #[cfg(test)]
+    pub fn half_extents(&self) -> [f32; 2] {
+        let root = (self.b * self.b + self.c * self.c).sqrt();
+        let level = self.level().sqrt();
+        [level * root / (self.a * self.c), level / self.c]
+    }
+}
+
+const _: () = assert!(size_of::<Splat>() == 64);

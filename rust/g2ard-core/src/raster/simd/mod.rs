@@ -1,0 +1,377 @@
+//! Sixteen f32 lanes, written once and compiled for each instruction set.
+//!
+//! A kernel is a struct of its arguments with a generic `run`; [`dispatch`] compiles `run` inside a function that
+//! has the instruction set's features enabled. Everything on the way must be `#[inline(always)]` (and free of
+//! closures), or the intrinsics stay calls.
+
+use std::ops::{Add, Div, Mul, Neg, Sub};
+
+#[cfg(target_arch = "x86_64")]
+mod avx2;
+#[cfg(target_arch = "x86_64")]
+mod avx512;
+mod portable;
+
+pub use portable::Portable;
+
+pub const LANES: usize = 16;
+
+/// One value per lane in memory, aligned for the widest registers.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[repr(C, align(64))]
+pub struct Row(pub [f32; LANES]);
+
+/// log2(e) and ln(2).
+pub const LOG2_E: f32 = std::f32::consts::LOG2_E;
+pub const LN_2: f32 = std::f32::consts::LN_2;
+
+/// One truth value per lane.
+pub trait Mask: Copy {
+    fn and(self, other: Self) -> Self;
+    fn or(self, other: Self) -> Self;
+    /// `self & !other`.
+    fn and_not(self, other: Self) -> Self;
+    /// Bit `l` is lane `l`.
+    fn bits(self) -> u16;
+    fn from_bits(bits: u16) -> Self;
+
+    #[inline(always)]
+    fn any(self) -> bool {
+        self.bits() != 0
+    }
+}
+
+/// Sixteen f64 lanes: just enough for a rigid transform and a division.
+pub trait Wide: Copy + Add<Output = Self> + Mul<Output = Self> + Div<Output = Self> {
+    fn splat(value: f64) -> Self;
+    fn fma(self, factor: Self, addend: Self) -> Self;
+    fn store(self, out: &mut [f64; LANES]);
+}
+
+/// Sixteen f32 lanes.
+pub trait Lanes:
+    Copy
+    + Add<Output = Self>
+    + Sub<Output = Self>
+    + Mul<Output = Self>
+    + Div<Output = Self>
+    + Neg<Output = Self>
+{
+    type Mask: Mask;
+    type Wide: Wide;
+
+    fn splat(value: f32) -> Self;
+    fn load(row: &Row) -> Self;
+    /// Sixteen values from `at`, which may be unaligned.
+    ///
+    /// # Safety
+    /// `at` must be readable for 16 values.
+    unsafe fn load_at(at: *const f32) -> Self;
+    fn store(self, row: &mut Row);
+    /// # Safety
+    /// `at` must be writable for 16 values.
+    unsafe fn store_at(self, at: *mut f32);
+    /// `self · factor + addend`.
+    fn fma(self, factor: Self, addend: Self) -> Self;
+    /// `addend − self · factor`.
+    fn fnma(self, factor: Self, addend: Self) -> Self;
+    /// NaN in `self` gives `other`.
+    fn min(self, other: Self) -> Self;
+    /// NaN in `self` gives `other`.
+    fn max(self, other: Self) -> Self;
+    fn sqrt(self) -> Self;
+    fn floor(self) -> Self;
+    /// `self · 2^n` for integral n in −126…127.
+    fn ldexp(self, n: Self) -> Self;
+    fn ge(self, other: Self) -> Self::Mask;
+    fn gt(self, other: Self) -> Self::Mask;
+    /// `yes` where the mask holds, else `no`.
+    fn select(mask: Self::Mask, yes: Self, no: Self) -> Self;
+    fn widen(self) -> Self::Wide;
+    fn narrow(wide: Self::Wide) -> Self;
+    /// Lane `k` of the result is the sum of `rows[k]`, in one fixed order; lanes past 10 are unspecified.
+    fn sums(rows: &[Self; 10]) -> Row;
+
+    #[inline(always)]
+    fn zero() -> Self {
+        Self::splat(0.0)
+    }
+
+    /// `self` where the mask holds, else 0.
+    #[inline(always)]
+    fn only(self, mask: Self::Mask) -> Self {
+        Self::select(mask, self, Self::zero())
+    }
+
+    #[inline(always)]
+    fn abs(self) -> Self {
+        self.max(-self)
+    }
+
+    /// 1 / self to about one ulp, for values far from 0 and ∞.
+    #[inline(always)]
+    fn recip(self) -> Self {
+        Self::splat(1.0) / self
+    }
+
+    /// 2^self for −126 ≤ self ≤ 127: relative error ≤ 2.3e-7.
+    #[inline(always)]
+    fn exp2(self) -> Self {
+        let n = self.floor();
+        exp2_fraction(self - n).ldexp(n)
+    }
+
+    /// e^self, clamped to the normal range; relative error ≤ 2e-7.
+    #[inline(always)]
+    fn exp(self) -> Self {
+        let x = self.max(Self::splat(-87.0)).min(Self::splat(88.0));
+        let n = x.fma(Self::splat(LOG2_E), Self::splat(0.5)).floor();
+        // Cody–Waite: n·ln2 in two parts, so that the fraction keeps all its digits.
+        let r = n.fnma(Self::splat(0.693_359_4), x);
+        let r = n.fnma(Self::splat(-2.121_944_4e-4), r);
+        let mut p = Self::splat(1.0 / 5040.0);
+        for c in [
+            1.0 / 720.0,
+            1.0 / 120.0,
+            1.0 / 24.0,
+            1.0 / 6.0,
+            0.5,
+            1.0,
+            1.0,
+        ] {
+            p = p.fma(r, Self::splat(c));
+        }
+        p.ldexp(n)
+    }
+
+    /// log2(1 + self) for 0 ≤ self ≤ 1: relative error ≤ 3e-7.
+    #[inline(always)]
+    fn log2_1p(self) -> Self {
+        // ln(1 + t) = 2·atanh(s), s = t / (2 + t) ≤ 1/3.
+        let s = self / (self + Self::splat(2.0));
+        let s2 = s * s;
+        let mut p = Self::splat(1.0 / 15.0);
+        for c in [
+            1.0 / 13.0,
+            1.0 / 11.0,
+            1.0 / 9.0,
+            1.0 / 7.0,
+            1.0 / 5.0,
+            1.0 / 3.0,
+            1.0,
+        ] {
+            p = p.fma(s2, Self::splat(c));
+        }
+        p * s * Self::splat(2.0 * LOG2_E)
+    }
+}
+
+/// 2^f on [0, 1): minimax polynomial of degree 5 in the relative error.
+#[inline(always)]
+pub fn exp2_fraction<F: Lanes>(f: F) -> F {
+    let mut p = F::splat(EXP2[5]);
+    for k in (0..5).rev() {
+        p = p.fma(f, F::splat(EXP2[k]));
+    }
+    p
+}
+
+/// Coefficients of 2^f on [0, 1), lowest power first: within 7.5e-08 of it, 1.5e-07 after rounding to f32.
+const EXP2: [f32; 6] = [
+    0.999_999_94,
+    0.693_153_1,
+    0.240_153_61,
+    0.055_826_318,
+    0.008_989_34,
+    0.001_877_576_8,
+];
+
+/// Which instruction set the kernels run on. On aarch64 the portable lanes compile to NEON.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Isa {
+    Avx512,
+    Avx2,
+    Portable,
+}
+
+impl Isa {
+    /// Those this machine can run, the fastest first.
+    pub fn available() -> Vec<Self> {
+        let all = [Self::Avx512, Self::Avx2, Self::Portable];
+        all.into_iter().filter(|isa| isa.runs_here()).collect()
+    }
+
+    /// The fastest.
+    pub fn detect() -> Self {
+        Self::available()[0]
+    }
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Avx512 => "avx512",
+            Self::Avx2 => "avx2",
+            Self::Portable => "portable",
+        }
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    fn runs_here(self) -> bool {
+        let avx2 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+        match self {
+            Self::Avx512 => {
+                avx2 && is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq")
+            }
+            Self::Avx2 => avx2,
+            Self::Portable => true,
+        }
+    }
+
+    #[cfg(not(target_arch = "x86_64"))]
+    fn runs_here(self) -> bool {
+        self == Self::Portable
+    }
+}
+
+/// A kernel: a struct of arguments that can run on any lanes. `run` must be `#[inline(always)]`.
+pub trait Kernel {
+    type Output;
+    fn run<F: Lanes>(self) -> Self::Output;
+}
+
+/// Runs a kernel on an instruction set, which must be one that [`Isa::available`] names.
+#[inline]
+pub fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
+    match isa {
+        #[cfg(target_arch = "x86_64")]
+        Isa::Avx512 => {
+            debug_assert!(isa.runs_here());
+            // SAFETY: the features were detected when the set was chosen.
+            unsafe { on_avx512(kernel) }
+        }
+        #[cfg(target_arch = "x86_64")]
+        Isa::Avx2 => {
+            debug_assert!(isa.runs_here());
+            // SAFETY: as above.
+            unsafe { on_avx2(kernel) }
+        }
+        _ => kernel.run::<Portable>(),
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
+fn on_avx512<K: Kernel>(kernel: K) -> K::Output {
+    kernel.run::<avx512::Avx512>()
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn on_avx2<K: Kernel>(kernel: K) -> K::Output {
+    kernel.run::<avx2::Avx2>()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Runs one lane function over many rows of inputs.
+    struct Over<'a>(&'a [f32], &'static str);
+
+    impl Kernel for Over<'_> {
+        type Output = Vec<f32>;
+        #[inline(always)]
+        fn run<F: Lanes>(self) -> Vec<f32> {
+            let mut out = Vec::new();
+            for chunk in self.0.chunks_exact(LANES) {
+                let mut row = Row::default();
+                row.0.copy_from_slice(chunk);
+                let x = F::load(&row);
+                let y = match self.1 {
+                    "exp2" => x.exp2(),
+                    "exp" => x.exp(),
+                    "log2_1p" => x.log2_1p(),
+                    "recip" => x.recip(),
+                    "floor" => x.floor(),
+                    _ => F::narrow(x.widen() * F::Wide::splat(2.0)),
+                };
+                y.store(&mut row);
+                out.extend(row.0);
+            }
+            out
+        }
+    }
+
+    fn worst(isa: Isa, name: &'static str, from: f64, to: f64, exact: impl Fn(f64) -> f64) -> f64 {
+        let x: Vec<f32> = (0..160_000)
+            .map(|i| (from + (to - from) * f64::from(i) / 160_000.0) as f32)
+            .collect();
+        let y = dispatch(isa, Over(&x, name));
+        let error = |(x, y): (&f32, &f32)| {
+            let e = exact(f64::from(*x));
+            (f64::from(*y) - e).abs() / e.abs().max(1e-30)
+        };
+        x.iter().zip(&y).map(error).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn functions_are_accurate() {
+        for isa in Isa::available() {
+            assert!(worst(isa, "exp2", -40.0, 20.0, f64::exp2) < 2.3e-7);
+            assert!(worst(isa, "exp", -80.0, 80.0, f64::exp) < 3e-7);
+            assert!(
+                worst(isa, "log2_1p", 1e-6, 1.0, |x| x.ln_1p()
+                    / std::f64::consts::LN_2)
+                    < 3e-7
+            );
+            assert!(worst(isa, "recip", 0.001, 2.0, |x| 1.0 / x) < 1.5e-7);
+            assert!(worst(isa, "floor", -30.0, 30.0, f64::floor) == 0.0);
+            assert!(worst(isa, "double", -30.0, 30.0, |x| 2.0 * x) == 0.0);
+        }
+    }
+
+    struct Sums<'a>(&'a [Row; 10]);
+
+    impl Kernel for Sums<'_> {
+        type Output = (Row, u16, u16);
+        #[inline(always)]
+        fn run<F: Lanes>(self) -> (Row, u16, u16) {
+            let mut rows = [F::zero(); 10];
+            for k in 0..10 {
+                rows[k] = F::load(&self.0[k]);
+            }
+            let above = rows[1].gt(rows[0]);
+            let odd = F::Mask::from_bits(0b1010_1010_1010_1010);
+            (
+                F::sums(&rows),
+                above.and(odd).bits(),
+                above.and_not(odd).bits(),
+            )
+        }
+    }
+
+    #[test]
+    fn sums_and_masks_keep_their_places() {
+        let mut rows = [Row::default(); 10];
+        for (k, row) in rows.iter_mut().enumerate() {
+            for l in 0..LANES {
+                row.0[l] = ((k * 37 + l * 11) % 23) as f32 - 7.0;
+            }
+        }
+        for isa in Isa::available() {
+            let (sums, odd, even) = dispatch(isa, Sums(&rows));
+            for k in 0..10 {
+                assert_eq!(
+                    sums.0[k],
+                    rows[k].0.iter().sum::<f32>(),
+                    "{} row {k}",
+                    isa.name()
+                );
+            }
+            for l in 0..LANES {
+                let above = rows[1].0[l] > rows[0].0[l];
+                assert_eq!(odd >> l & 1 == 1, above && l % 2 == 1);
+                assert_eq!(even >> l & 1 == 1, above && l % 2 == 0);
+            }
+        }
+    }
+}

@@ -1,0 +1,335 @@
+//! Greedy choice of views by how they cover the surface (main text, eq. 2; supplement, algorithm S1).
+
+use std::cmp::{Ordering, Reverse};
+use std::collections::BinaryHeap;
+
+use rayon::prelude::*;
+
+use super::Surface;
+use crate::linalg::{dot, sub};
+use crate::{Control, Error, Result};
+
+const ANCHORS: usize = 32;
+/// Keeps the coverage ratio finite where a target is next to nothing.
+const EPSILON: f64 = 1e-9;
+/// Cells summed together: the order of the sum does not depend on the number of threads.
+const CHUNK: usize = 4096;
+
+/// What the objective rewards.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Coverage {
+    /// Cells seen from the directions their normals ask for; else seen at all, from anywhere.
+    pub directional: bool,
+    /// Sharpness of the observation kernel and of the targets.
+    pub kappa: f64,
+    /// Exponent of the fair utility u(x) = x^(1−α)/(1−α); 1 is the logarithm.
+    pub alpha: f64,
+    /// g(x) = u(λ + x).
+    pub lambda: f64,
+}
+
+impl Coverage {
+    pub fn validate(&self) -> Result<()> {
+        for (name, value, ok) in [
+            ("kappa", self.kappa, self.kappa > 0.0),
+            ("alpha", self.alpha, self.alpha >= 0.0),
+            ("lambda", self.lambda, self.lambda > 0.0),
+        ] {
+            if !(ok && value.is_finite()) {
+                return Err(Error::invalid(name, "a positive number", value));
+            }
+        }
+        Ok(())
+    }
+
+    fn g(&self, x: f64) -> f64 {
+        let x = self.lambda + x;
+        if self.alpha == 2.0 {
+            -1.0 / x
+        } else if self.alpha == 1.0 {
+            x.ln()
+        } else {
+            x.powf(1.0 - self.alpha) / (1.0 - self.alpha)
+        }
+    }
+}
+
+/// Cells, who sees them, and from where.
+#[derive(Debug, Clone, Copy)]
+pub struct Problem<'a> {
+    pub surface: &'a Surface,
+    /// Each view's cells.
+    pub visible: &'a [Vec<u32>],
+    /// Each view's camera centre.
+    pub positions: &'a [[f64; 3]],
+}
+
+/// Views in the order they were chosen.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Chosen {
+    pub views: Vec<u32>,
+    /// F(S ∪ v) − F(S) of each.
+    pub gains: Vec<f64>,
+    /// How often a view's gain was computed.
+    pub evaluations: u64,
+}
+
+impl Problem<'_> {
+    /// The `k` views that greedy maximisation of F picks.
+    ///
+    /// F is monotone and submodular, so a gain once computed bounds all later ones: lazily, only the view
+    /// that leads by its bound is looked at again (CELF). `lazy: false` looks at all of them, each time.
+    pub fn greedy(
+        &self,
+        k: usize,
+        coverage: &Coverage,
+        lazy: bool,
+        control: &Control,
+    ) -> Result<Chosen> {
+        coverage.validate()?;
+        let n = self.visible.len();
+        if self.positions.len() != n {
+            return Err(Error::invalid(
+                "positions",
+                format!("{n} rows"),
+                self.positions.len(),
+            ));
+        }
+        let cells = self.surface.len() as u32;
+        if self.visible.iter().flatten().any(|&c| c >= cells) {
+            return Err(Error::invalid(
+                "visible",
+                format!("cells below {cells}"),
+                "one beyond",
+            ));
+        }
+        let state = State::new(*self, *coverage);
+        let k = k.min(n);
+        control.begin(k as u64);
+        if lazy {
+            state.lazy(k, control)
+        } else {
+            state.plain(k, control)
+        }
+    }
+}
+
+struct State<'a> {
+    problem: Problem<'a>,
+    coverage: Coverage,
+    anchors: Vec<[f64; 3]>,
+    /// P_jk and C_jk, anchor by anchor within a cell.
+    targets: Vec<f64>,
+    evidence: Vec<f64>,
+    evaluations: u64,
+}
+
+/// A view and the most it can add; the heap's top has the largest gain and, of equals, the lowest number.
+#[derive(PartialEq)]
+struct Bound {
+    gain: f64,
+    view: Reverse<u32>,
+    round: usize,
+}
+
+impl Eq for Bound {}
+
+impl Ord for Bound {
+    fn cmp(&self, other: &Self) -> Ordering {
+        self.gain
+            .total_cmp(&other.gain)
+            .then(self.view.cmp(&other.view))
+    }
+}
+
+impl PartialOrd for Bound {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl<'a> State<'a> {
+    fn new(problem: Problem<'a>, coverage: Coverage) -> Self {
+        let anchors = if coverage.directional {
+            sphere(ANCHORS)
+        } else {
+            vec![[0.0, 0.0, 1.0]]
+        };
+        let targets: Vec<f64> = problem
+            .surface
+            .normals
+            .par_iter()
+            .flat_map_iter(|&n| target(&anchors, n, coverage.kappa))
+            .collect();
+        let evidence = vec![0.0; targets.len()];
+        Self {
+            problem,
+            coverage,
+            anchors,
+            targets,
+            evidence,
+            evaluations: 0,
+        }
+    }
+
+    /// Calls `f(index of (cell, anchor), ν·η·φ)` for all that `view` adds to a cell.
+    fn observe(&self, view: usize, cell: u32, mut f: impl FnMut(usize, f64)) {
+        let (j, count) = (cell as usize, self.anchors.len());
+        if !self.coverage.directional {
+            return f(j, 1.0);
+        }
+        let surface = self.problem.surface;
+        let to = sub(self.problem.positions[view], surface.centers[j]);
+        let length = dot(to, to).sqrt();
+        if length == 0.0 {
+            return;
+        }
+        let d = to.map(|v| v / length);
+        let confidence = surface.confidence[j];
+        let incidence = (1.0 - confidence) + confidence * dot(d, surface.normals[j]).abs();
+        let kappa = self.coverage.kappa;
+        let mut near = [(0usize, 0.0f64); ANCHORS];
+        let (mut found, mut total, mut best) = (0, 0.0, (0, f64::NEG_INFINITY));
+        for (k, &a) in self.anchors.iter().enumerate() {
+            let away = dot(a, d) - 1.0;
+            if away > best.1 {
+                best = (k, away);
+            }
+            if away > -3.0 / kappa {
+                let value = (kappa * away).exp();
+                near[found] = (k, value);
+                found += 1;
+                total += value;
+            }
+        }
+        if found == 0 {
+            return f(j * count + best.0, incidence); // a kernel narrower than the anchors' spacing
+        }
+        for &(k, value) in &near[..found] {
+            f(j * count + k, incidence * value / total);
+        }
+    }
+
+    fn gain(&self, view: usize) -> f64 {
+        let parts: Vec<f64> = self.problem.visible[view]
+            .par_chunks(CHUNK)
+            .map(|cells| {
+                let mut sum = 0.0;
+                for &cell in cells {
+                    let mut own = 0.0;
+                    self.observe(view, cell, |at, value| {
+                        let p = self.targets[at];
+                        let (before, scale) = (self.evidence[at], p + EPSILON);
+                        let g = |c: f64| self.coverage.g(c / scale);
+                        own += p * (g(before + value) - g(before));
+                    });
+                    sum += self.problem.surface.weights[cell as usize] * own;
+                }
+                sum
+            })
+            .collect();
+        parts.iter().sum()
+    }
+
+    fn add(&mut self, view: usize) {
+        let mut changes = Vec::new();
+        for &cell in &self.problem.visible[view] {
+            self.observe(view, cell, |at, value| changes.push((at, value)));
+        }
+        for (at, value) in changes {
+            self.evidence[at] += value;
+        }
+    }
+
+    fn gains(&mut self, views: &[u32]) -> Vec<f64> {
+        self.evaluations += views.len() as u64;
+        views.par_iter().map(|&v| self.gain(v as usize)).collect()
+    }
+
+    fn lazy(mut self, k: usize, control: &Control) -> Result<Chosen> {
+        let all: Vec<u32> = (0..self.problem.visible.len() as u32).collect();
+        let gains = self.gains(&all);
+        let mut heap: BinaryHeap<Bound> = all
+            .iter()
+            .zip(gains)
+            .map(|(&v, gain)| Bound {
+                gain,
+                view: Reverse(v),
+                round: 0,
+            })
+            .collect();
+        let mut chosen = Chosen {
+            views: Vec::new(),
+            gains: Vec::new(),
+            evaluations: 0,
+        };
+        while chosen.views.len() < k {
+            control.check()?;
+            let Some(top) = heap.pop() else { break };
+            let view = top.view.0;
+            let round = chosen.views.len();
+            if top.round < round {
+                let gain = self.gains(&[view])[0];
+                heap.push(Bound { gain, round, ..top });
+                continue;
+            }
+            self.add(view as usize);
+            chosen.views.push(view);
+            chosen.gains.push(top.gain);
+            control.advance(1);
+        }
+        chosen.evaluations = self.evaluations;
+        Ok(chosen)
+    }
+
+    fn plain(mut self, k: usize, control: &Control) -> Result<Chosen> {
+        let mut left: Vec<u32> = (0..self.problem.visible.len() as u32).collect();
+        let mut chosen = Chosen {
+            views: Vec::new(),
+            gains: Vec::new(),
+            evaluations: 0,
+        };
+        while chosen.views.len() < k {
+            control.check()?;
+            let gains = self.gains(&left);
+            let mut best = 0;
+            for i in 1..left.len() {
+                if gains[i].total_cmp(&gains[best]) == Ordering::Greater {
+                    best = i;
+                }
+            }
+            let view = left.remove(best);
+            self.add(view as usize);
+            chosen.views.push(view);
+            chosen.gains.push(gains[best]);
+            control.advance(1);
+        }
+        chosen.evaluations = self.evaluations;
+        Ok(chosen)
+    }
+}
+
+/// P_k ∝ exp(κ |a_k·n|), summing to 1.
+fn target(anchors: &[[f64; 3]], n: [f64; 3], kappa: f64) -> Vec<f64> {
+    let raw: Vec<f64> = anchors
+        .iter()
+        .map(|&a| (kappa * (dot(a, n).abs() - 1.0)).exp())
+        .collect();
+    let total: f64 = raw.iter().sum();
+    raw.into_iter().map(|v| v / total).collect()
+}
+
+/// `count` directions on the Fibonacci sphere.
+fn sphere(count: usize) -> Vec<[f64; 3]> {
+    let golden = (5.0f64.sqrt() - 1.0) / 2.0;
+    (0..count)
+        .map(|k| {
+            let z = 1.0 - (2.0 * k as f64 + 1.0) / count as f64;
+            let (turn, across) = (
+                std::f64::consts::TAU * (k as f64 * golden).fract(),
+                (1.0 - z * z).sqrt(),
+            );
+            [across * turn.cos(), across * turn.sin(), z]
+        })
+        .collect()
+}

@@ -1,1 +1,0 @@
-//! Fused L1 + SSIM, forward and backward.

@@ -1,0 +1,186 @@
+//! One Adam step of every Gaussian a view touched, sixteen at a time.
+
+use super::Rates;
+use super::anchors::{Anchors, Regularizers};
+use super::store::{SH, Writer};
+use crate::raster::frame::ChunkSums;
+use crate::raster::gradients::collect;
+use crate::raster::params::Source;
+use crate::raster::project::{RowGradients, unproject};
+use crate::raster::simd::{Kernel, LANES, Lanes, Mask, Row};
+
+const BETA1: f64 = 0.9;
+const BETA2: f64 = 0.999;
+const EPSILON: f32 = 1e-15;
+/// Beyond this the square of a gradient leaves f32: such a row is skipped as not finite.
+const GRADIENT_MAX: f32 = 1e18;
+
+/// 1/(1 − β₁ᵗ) and 1/√(1 − β₂ᵗ) for each count of steps t, worked out in f64.
+#[derive(Debug, Default)]
+pub struct Biases(Vec<[f32; 2]>);
+
+impl Biases {
+    pub fn extend_to(&mut self, steps: usize) {
+        while self.0.len() <= steps {
+            let t = self.0.len().max(1) as f64;
+            let bias = |beta: f64| -(t * beta.ln()).exp_m1();
+            self.0.push([
+                (1.0 / bias(BETA1)) as f32,
+                (1.0 / bias(BETA2).sqrt()) as f32,
+            ]);
+        }
+    }
+}
+
+/// Adds up a chunk's slots, goes back to the parameters, and steps.
+pub struct Update<'a> {
+    pub sums: &'a ChunkSums<'a>,
+    pub store: Writer,
+    pub biases: &'a Biases,
+    pub rates: &'a Rates,
+    pub regularize: Option<(&'a Regularizers, &'a Anchors)>,
+}
+
+impl Kernel for Update<'_> {
+    /// (Gaussians stepped, Gaussians skipped).
+    type Output = (usize, usize);
+
+    #[inline(always)]
+    fn run<F: Lanes>(self) -> (usize, usize) {
+        let sums = self.sums;
+        let packed = self.store.packed;
+        let (mut next, mut updated, mut skipped) = (0, 0, 0);
+        for group in sums.first_group..sums.last_group {
+            let (mut active, screen) =
+                collect::<F>(sums.splats, &mut next, group, sums.slots, sums.written);
+            if active == 0 && self.regularize.is_none() {
+                continue;
+            }
+            let mut g = unproject(sums.view, &packed, group, &screen);
+            if let Some((weights, anchors)) = self.regularize {
+                let seen = F::Mask::from_bits(active);
+                zero_unseen(&mut g, seen);
+                let rows = (packed.len() - group * LANES).min(LANES);
+                let real = ((1u32 << rows) - 1) as u16;
+                active |= anchors.add_gradients(weights, &packed, group, &mut g) & real;
+                if active == 0 {
+                    continue;
+                }
+            }
+            let good = finite(&g).bits() & active;
+            skipped += (active & !good).count_ones() as usize;
+            updated += good.count_ones() as usize;
+            if good != 0 {
+                self.step_group(group, good, &g);
+            }
+        }
+        (updated, skipped)
+    }
+}
+
+/// Lanes no pixel touched hold meaningless values: they become 0.
+#[inline(always)]
+fn zero_unseen<F: Lanes>(g: &mut RowGradients<F>, seen: F::Mask) {
+    for k in 0..3 {
+        g.mean[k] = g.mean[k].only(seen);
+        g.log_scale[k] = g.log_scale[k].only(seen);
+        g.rgb[k] = g.rgb[k].only(seen);
+    }
+    for k in 0..4 {
+        g.quat[k] = g.quat[k].only(seen);
+    }
+    g.logit_opacity = g.logit_opacity.only(seen);
+}
+
+/// Lanes whose every gradient can be squared.
+#[inline(always)]
+fn finite<F: Lanes>(g: &RowGradients<F>) -> F::Mask {
+    let most = F::splat(GRADIENT_MAX);
+    let mut ok = most.ge(g.logit_opacity.abs());
+    for k in 0..3 {
+        // Not the larger of them: max(NaN, x) is x.
+        ok = ok
+            .and(most.ge(g.mean[k].abs()))
+            .and(most.ge(g.log_scale[k].abs()))
+            .and(most.ge(g.rgb[k].abs()));
+    }
+    for k in 0..4 {
+        ok = ok.and(most.ge(g.quat[k].abs()));
+    }
+    ok
+}
+
+/// What the attributes of one block share.
+struct Step<F: Lanes> {
+    group: usize,
+    good: F::Mask,
+    bias1: F,
+    bias2: F,
+}
+
+impl Update<'_> {
+    #[inline(always)]
+    fn step_group<F: Lanes>(&self, group: usize, good: u16, g: &RowGradients<F>) {
+        let mut bias = [Row([1.0; LANES]); 2];
+        for l in 0..LANES {
+            if good >> l & 1 == 1 {
+                // SAFETY: the group is this thread's.
+                let steps = unsafe { &mut *self.store.steps.at(group * LANES + l) };
+                *steps += 1;
+                let pair = self.biases.0[*steps as usize];
+                bias[0].0[l] = pair[0];
+                bias[1].0[l] = pair[1];
+            }
+        }
+        let step = Step {
+            group,
+            good: F::Mask::from_bits(good),
+            bias1: F::load(&bias[0]),
+            bias2: F::load(&bias[1]),
+        };
+        // SAFETY: as above.
+        let unit = unsafe { F::load(&*self.store.units.at(group)) };
+        let rates = self.rates;
+        for k in 0..3 {
+            self.attribute(&step, k, g.mean[k], unit * F::splat(rates.means));
+            self.attribute(&step, 7 + k, g.log_scale[k], F::splat(rates.log_scales));
+            self.attribute(&step, SH + k, g.basis[0] * g.rgb[k], F::splat(rates.sh0));
+        }
+        for k in 0..4 {
+            self.attribute(&step, 3 + k, g.quat[k], F::splat(rates.quats));
+        }
+        self.attribute(&step, 10, g.logit_opacity, F::splat(rates.logit_opacities));
+        let rate = F::splat(rates.sh_n);
+        for k in 1..self.store.packed.sh_coeffs() {
+            for c in 0..3 {
+                // The SH gradient has rank one: it is never written out.
+                self.attribute(&step, SH + 3 * k + c, g.basis[k] * g.rgb[c], rate);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn attribute<F: Lanes>(&self, step: &Step<F>, attribute: usize, g: F, rate: F) {
+        let packed = &self.store.packed;
+        let at = packed.index(step.group, attribute);
+        // SAFETY: the group is this thread's, and all three arrays have its rows.
+        let (first, second) = unsafe {
+            (
+                &mut *self.store.first.at(at),
+                &mut *self.store.second.at(at),
+            )
+        };
+        let (m, v) = (F::load(first), F::load(second));
+        let m_new = (g - m).fma(F::splat((1.0 - BETA1) as f32), m);
+        let v_new = v.fma(
+            F::splat(BETA2 as f32),
+            g * g * F::splat((1.0 - BETA2) as f32),
+        );
+        let denominator = v_new.sqrt().fma(step.bias2, F::splat(EPSILON));
+        let value = packed.get::<F>(step.group, attribute);
+        let moved = (rate * step.bias1 * m_new).fnma(denominator.recip(), value);
+        packed.set(step.group, attribute, F::select(step.good, moved, value));
+        F::select(step.good, m_new, m).store(first);
+        F::select(step.good, v_new, v).store(second);
+    }
+}

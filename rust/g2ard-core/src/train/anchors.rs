@@ -1,0 +1,232 @@
+//! L_anchor and L_shape (`eq:anchor`, `eq:shape`) and their gradients, sixteen Gaussians at a time.
+
+use super::store::Packed;
+use crate::raster::params::Source;
+use crate::raster::project::{RowGradients, quaternion_gradient, rotation, unit_quaternion};
+use crate::raster::simd::{LANES, LN_2, Lanes, Mask, Row};
+use crate::{Error, Result};
+
+/// Weights of the two terms.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Regularizers {
+    /// λ_a of (1/N) Σ log(1 + [D² − 1]₊).
+    pub anchor: f32,
+    /// λ_s of (1/N) Σ max(0, −log(r_eff − 1 + ε)) + [log s⊥ − log s̄⊥]₊.
+    pub shape: f32,
+    /// Whether L_shape has its first term.
+    pub effective_rank: bool,
+}
+
+const EPSILON: f32 = 1e-6;
+/// Rows of a block: 3 of the mean, 9 of the frame, 1/r∥², 1/r⊥².
+const ROWS: usize = 14;
+
+/// Frozen geometry of N Gaussians in the trainer's order.
+#[derive(Debug, Clone)]
+pub struct Anchors {
+    blocks: Vec<Row>,
+    count: f32,
+}
+
+impl Anchors {
+    /// `frames`: N × 3 × 3 row-major, columns t₁, t₂, n. `order[i]` is the caller's row of row i.
+    pub(crate) fn new(
+        order: &[u32],
+        means: &[f32],
+        frames: &[f32],
+        r_parallel: &[f32],
+        r_perp: &[f32],
+    ) -> Result<Self> {
+        let n = order.len();
+        for (name, got, expected) in [
+            ("anchor means", means.len(), 3 * n),
+            ("anchor frames", frames.len(), 9 * n),
+            ("r_parallel", r_parallel.len(), n),
+            ("r_perp", r_perp.len(), n),
+        ] {
+            if got != expected {
+                return Err(Error::invalid(name, format!("{expected} values"), got));
+            }
+        }
+        let mut blocks = vec![Row::default(); n.div_ceil(LANES) * ROWS];
+        for (row, from) in order.iter().enumerate() {
+            let from = *from as usize;
+            let block = &mut blocks[row / LANES * ROWS..][..ROWS];
+            for k in 0..3 {
+                block[k].0[row % LANES] = means[3 * from + k];
+            }
+            for k in 0..9 {
+                block[3 + k].0[row % LANES] = frames[9 * from + k];
+            }
+            // The reciprocal, not its square: 1/r² of a 1e-20 thin disc leaves f32.
+            block[12].0[row % LANES] = 1.0 / r_parallel[from];
+            block[13].0[row % LANES] = 1.0 / r_perp[from];
+        }
+        Ok(Self {
+            blocks,
+            count: n as f32,
+        })
+    }
+
+    /// Adds the terms' gradients to a block's; returns the lanes where either term is not flat.
+    #[inline(always)]
+    pub(crate) fn add_gradients<F: Lanes>(
+        &self,
+        weights: &Regularizers,
+        packed: &Packed,
+        group: usize,
+        g: &mut RowGradients<F>,
+    ) -> u16 {
+        let block = &self.blocks[group * ROWS..][..ROWS];
+        let mut active = 0;
+        if weights.anchor > 0.0 {
+            active |= anchor(
+                block,
+                F::splat(weights.anchor / self.count),
+                packed,
+                group,
+                g,
+            );
+        }
+        if weights.shape > 0.0 {
+            let weight = F::splat(weights.shape / self.count);
+            active |= thickness(block, weight, packed, group, g);
+            if weights.effective_rank {
+                active |= effective_rank(weight, packed, group, g);
+            }
+        }
+        active
+    }
+}
+
+/// log(1 + [D² − 1]₊) is 2·log D outside the trust region: its slope in D² is 1/D².
+#[inline(always)]
+fn anchor<F: Lanes>(
+    block: &[Row],
+    weight: F,
+    packed: &Packed,
+    group: usize,
+    g: &mut RowGradients<F>,
+) -> u16 {
+    let mut offset = [F::zero(); 3];
+    for k in 0..3 {
+        offset[k] = packed.mean::<F>(group, k) - F::load(&block[k]);
+    }
+    let radius = [
+        F::load(&block[12]),
+        F::load(&block[12]),
+        F::load(&block[13]),
+    ];
+    let mut local = [F::zero(); 3];
+    let mut d2 = F::zero();
+    for i in 0..3 {
+        for j in 0..3 {
+            local[i] = F::load(&block[3 + 3 * j + i]).fma(offset[j], local[i]);
+        }
+        local[i] = local[i] * radius[i];
+        d2 = local[i].fma(local[i], d2);
+    }
+    let outside = d2.gt(F::splat(1.0));
+    let slope = (weight * F::splat(2.0) / d2).only(outside);
+    for j in 0..3 {
+        for i in 0..3 {
+            let pull = slope * local[i] * radius[i];
+            g.mean[j] = pull.fma(F::load(&block[3 + 3 * j + i]), g.mean[j]);
+        }
+    }
+    outside.bits()
+}
+
+/// [log s⊥ − log s̄⊥]₊, s⊥ = |S Rᵀ n̄|.
+#[inline(always)]
+fn thickness<F: Lanes>(
+    block: &[Row],
+    weight: F,
+    packed: &Packed,
+    group: usize,
+    g: &mut RowGradients<F>,
+) -> u16 {
+    let (q, rq) = unit_quaternion::<F, Packed>(packed, group);
+    let r = rotation(&q);
+    let normal = [F::load(&block[5]), F::load(&block[8]), F::load(&block[11])];
+    let mut scale = [F::zero(); 3];
+    let mut extent = [F::zero(); 3];
+    let mut square = F::zero();
+    for k in 0..3 {
+        // In units of s̄⊥, whose square may not fit f32.
+        scale[k] = packed.log_scale::<F>(group, k).exp() * F::load(&block[13]);
+        extent[k] = (r[0][k] * normal[0] + r[1][k] * normal[1] + r[2][k] * normal[2]) * scale[k];
+        square = extent[k].fma(extent[k], square);
+    }
+    let over = square.gt(F::splat(1.0));
+    let slope = (weight / square).only(over);
+    let mut dr = [[F::zero(); 3]; 3];
+    for k in 0..3 {
+        let pull = slope * extent[k];
+        g.log_scale[k] = pull.fma(extent[k], g.log_scale[k]);
+        for a in 0..3 {
+            dr[a][k] = normal[a] * pull * scale[k];
+        }
+    }
+    let dq = quaternion_gradient(&q, rq, &dr);
+    for k in 0..4 {
+        g.quat[k] = g.quat[k] + dq[k];
+    }
+    over.bits()
+}
+
+/// max(0, −log(r_eff − 1 + ε)), r_eff = exp(H), H = −Σ q log q, q = s/Σs: acts below r_eff = 2.
+#[inline(always)]
+fn effective_rank<F: Lanes>(
+    weight: F,
+    packed: &Packed,
+    group: usize,
+    g: &mut RowGradients<F>,
+) -> u16 {
+    let (zero, one) = (F::zero(), F::splat(1.0));
+    let mut below = [zero; 3];
+    for k in 0..3 {
+        below[k] = packed.log_scale::<F>(group, k);
+    }
+    let largest = below[0].max(below[1]).max(below[2]);
+    let mut share = [zero; 3];
+    let mut taken = F::Mask::from_bits(0);
+    // Σs over the largest is 1 + rest; the 1 is left out, for on a needle it would swallow the rest.
+    let mut rest = zero;
+    for k in 0..3 {
+        let first = below[k].ge(largest).and_not(taken);
+        taken = taken.or(first);
+        below[k] = below[k] - largest;
+        share[k] = below[k].exp();
+        rest = rest + F::select(first, zero, share[k]);
+    }
+    let r_sum = one / (one + rest);
+    // Past rest = 1 the rank is above 2 and the term is 0: log2_1p need not hold there.
+    let log_sum = rest.min(one).log2_1p() * F::splat(LN_2);
+    let mut entropy = log_sum;
+    for k in 0..3 {
+        share[k] = share[k] * r_sum;
+        entropy = share[k].fnma(below[k], entropy);
+    }
+    // exp(H) − 1 by its series: exact where H is small, good enough up to log 2.
+    let mut series = F::splat(1.0 / 40_320.0);
+    for c in [
+        1.0 / 5040.0,
+        1.0 / 720.0,
+        1.0 / 120.0,
+        1.0 / 24.0,
+        1.0 / 6.0,
+        0.5,
+        1.0,
+    ] {
+        series = series.fma(entropy, F::splat(c));
+    }
+    let rank_less_1 = series * entropy;
+    let low = F::splat(1.0 - EPSILON).gt(rank_less_1).and(one.ge(rest));
+    let slope = (weight * (rank_less_1 + one) / (rank_less_1 + F::splat(EPSILON))).only(low);
+    for k in 0..3 {
+        let log_share = below[k] - log_sum;
+        g.log_scale[k] = (slope * share[k]).fma(log_share + entropy, g.log_scale[k]);
+    }
+    low.bits()
+}

@@ -1,0 +1,227 @@
+//! The fused trainer: forward, loss, backward and Adam of one view without leaving Rust.
+//!
+//! It is an optimisation of rasterize + l1_ssim + torch's Adam with the same result to rounding, but that Gaussians no
+//! pixel of the view touched are left alone (sparse Adam): each has its own count of steps for the bias terms.
+//! Parameters and moments lie in blocks of sixteen Gaussians, attribute by attribute, in Morton order of the means, so
+//! every pass reads whole registers and neighbours in space are neighbours in memory.
+
+mod adam;
+mod anchors;
+mod store;
+
+pub use anchors::{Anchors, Regularizers};
+pub use store::{Exported, Store};
+
+use std::time::Instant;
+
+use crate::raster::frame::ChunkSums;
+use crate::raster::gradients::Discard;
+use crate::raster::simd::dispatch;
+use crate::raster::{Camera, Image, ImageGradients, Isa, Params, Passes, Rasterizer, Settings};
+use crate::ssim::{Loss, Shape};
+use crate::{Error, Result};
+use adam::{Biases, Update};
+
+/// Adam's learning rate of each attribute.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Rates {
+    /// Times each Gaussian's own unit, if the trainer was given units.
+    pub means: f32,
+    pub quats: f32,
+    pub log_scales: f32,
+    pub logit_opacities: f32,
+    pub sh0: f32,
+    pub sh_n: f32,
+}
+
+/// One view to learn from.
+#[derive(Debug, Clone, Copy)]
+pub struct Lesson<'a> {
+    pub camera: &'a Camera,
+    pub settings: &'a Settings,
+    pub background: [f32; 3],
+    /// height × width × 3.
+    pub target: &'a [f32],
+    /// λ of (1 − λ)·L1 + λ·(1 − SSIM).
+    pub ssim_weight: f32,
+    pub rates: Rates,
+    /// Added to the loss of this step; needs anchors.
+    pub regularizers: Option<Regularizers>,
+}
+
+/// What became of a step.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Report {
+    /// The photometric loss before the step.
+    pub loss: f64,
+    /// Gaussians that moved.
+    pub updated: usize,
+    /// Gaussians left alone because a gradient was not finite.
+    pub skipped: usize,
+    pub seconds_loss: f64,
+}
+
+/// Parameters, Adam's moments, and everything a step needs.
+pub struct Trainer {
+    store: Store,
+    anchors: Option<Anchors>,
+    rasterizer: Rasterizer,
+    isa: Isa,
+    loss: Loss,
+    biases: Biases,
+    image: Vec<f32>,
+    alpha: Vec<f32>,
+    gradient: Vec<f32>,
+}
+
+impl Trainer {
+    /// `units`: what each Gaussian's means rate is multiplied by; `None` means 1.
+    pub fn new(params: &Params, units: Option<&[f32]>, isa: Isa) -> Result<Self> {
+        Ok(Self {
+            store: Store::new(params, units)?,
+            anchors: None,
+            rasterizer: Rasterizer::new(isa),
+            isa,
+            loss: Loss::new(isa),
+            biases: Biases::default(),
+            image: Vec::new(),
+            alpha: Vec::new(),
+            gradient: Vec::new(),
+        })
+    }
+
+    pub fn store(&self) -> &Store {
+        &self.store
+    }
+
+    /// Takes up an earlier [`Store::export`]; with it training goes on bit for bit.
+    pub fn import(&mut self, state: &Exported) -> Result<()> {
+        self.store.import(state)
+    }
+
+    /// Freezes the surface that [`Lesson::regularizers`] hold the Gaussians to; rows as the caller numbers them.
+    pub fn anchor(
+        &mut self,
+        means: &[f32],
+        frames: &[f32],
+        r_parallel: &[f32],
+        r_perp: &[f32],
+    ) -> Result<()> {
+        self.anchors = Some(Anchors::new(
+            self.store.order(),
+            means,
+            frames,
+            r_parallel,
+            r_perp,
+        )?);
+        Ok(())
+    }
+
+    /// How long the rasteriser's passes of the last step took; Adam is in `gather`.
+    pub fn passes(&self) -> Passes {
+        self.rasterizer.passes()
+    }
+
+    /// Renders the view, compares, goes back and takes one Adam step.
+    pub fn step(&mut self, lesson: &Lesson) -> Result<Report> {
+        let (loss, seconds_loss) = self.compare(lesson)?;
+        let (updated, skipped) = self.descend(lesson);
+        Ok(Report {
+            loss,
+            updated,
+            skipped,
+            seconds_loss,
+        })
+    }
+
+    /// A step up to the gradients, which are thrown away: for timing.
+    pub fn rehearse(&mut self, lesson: &Lesson) -> Result<Report> {
+        let (loss, seconds_loss) = self.compare(lesson)?;
+        let gradients = ImageGradients {
+            rgb: &self.gradient,
+            alpha: None,
+            depth: None,
+        };
+        let packed = self.store.packed();
+        self.rasterizer.backward_into(packed, &gradients, Discard)?;
+        Ok(Report {
+            loss,
+            seconds_loss,
+            ..Report::default()
+        })
+    }
+
+    /// Renders the view and compares it with the target; returns the loss and the seconds it took.
+    fn compare(&mut self, lesson: &Lesson) -> Result<(f64, f64)> {
+        let camera = lesson.camera;
+        camera.validate()?;
+        lesson.settings.validate()?;
+        let shape = Shape {
+            height: camera.height,
+            width: camera.width,
+            channels: 3,
+        };
+        if lesson.target.len() != shape.values() {
+            return Err(Error::invalid(
+                "target",
+                format!("{} values", shape.values()),
+                lesson.target.len(),
+            ));
+        }
+        if lesson.regularizers.is_some() && self.anchors.is_none() {
+            return Err(Error::invalid("regularizers", "anchors set before", "none"));
+        }
+        self.image.resize(shape.values(), 0.0);
+        self.gradient.resize(shape.values(), 0.0);
+        self.alpha.resize(camera.width * camera.height, 0.0);
+        let packed = self.store.packed();
+        let mut image = Image {
+            rgb: &mut self.image,
+            alpha: &mut self.alpha,
+            depth: None,
+            median: None,
+        };
+        self.rasterizer.forward_from(
+            packed,
+            camera,
+            lesson.settings,
+            lesson.background,
+            &mut image,
+        );
+        let clock = Instant::now();
+        let (image, gradient) = (&self.image, &mut self.gradient);
+        let loss = self
+            .loss
+            .l1_ssim(image, lesson.target, shape, lesson.ssim_weight, gradient)?;
+        Ok((loss, clock.elapsed().as_secs_f64()))
+    }
+
+    /// The backward pass and Adam; returns how many Gaussians moved and how many were skipped.
+    fn descend(&mut self, lesson: &Lesson) -> (usize, usize) {
+        self.biases.extend_to(self.store.most_steps() as usize + 1);
+        let (biases, anchors, isa) = (&self.biases, self.anchors.as_ref(), self.isa);
+        let writer = self.store.writer();
+        let finish = |sums: &ChunkSums| {
+            let regularize = lesson.regularizers.as_ref().zip(anchors);
+            dispatch(
+                isa,
+                Update {
+                    sums,
+                    store: writer,
+                    biases,
+                    rates: &lesson.rates,
+                    regularize,
+                },
+            )
+        };
+        let gradients = ImageGradients {
+            rgb: &self.gradient,
+            alpha: None,
+            depth: None,
+        };
+        let chunks = self.rasterizer.backward_by_chunk(&gradients, finish);
+        let (updated, skipped) = chunks.iter().fold((0, 0), |t, c| (t.0 + c.0, t.1 + c.1));
+        self.store.count_step();
+        (updated, skipped)
+    }
+}

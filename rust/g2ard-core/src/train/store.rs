@@ -1,0 +1,330 @@
+//! Parameters and moments in blocks of sixteen, attribute after attribute.
+
+use crate::raster::Params;
+use crate::raster::order::Shared;
+use crate::raster::params::Source;
+use crate::raster::simd::{LANES, Lanes, Row};
+use crate::{Error, Result};
+
+/// Attributes before the SH: 3 means, 4 quats, 3 log-scales, 1 logit.
+const QUAT: usize = 3;
+const LOG_SCALE: usize = 7;
+const LOGIT: usize = 10;
+pub const SH: usize = 11;
+
+/// N Gaussians' parameters, Adam's two moments of each, and how many steps each has taken.
+#[derive(Debug, Clone)]
+pub struct Store {
+    rows: usize,
+    sh_coeffs: usize,
+    /// Block g's attribute a is row `g · attributes + a`.
+    values: Vec<Row>,
+    first: Vec<Row>,
+    second: Vec<Row>,
+    /// What the means' rate is multiplied by.
+    units: Vec<Row>,
+    steps: Vec<u32>,
+    /// An upper bound of `steps`.
+    most_steps: u32,
+    /// The caller's row of each row here.
+    order: Vec<u32>,
+}
+
+/// All of a [`Store`], rows as the caller numbers them, attributes side by side: what a checkpoint holds.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Exported {
+    /// N × (11 + 3K): means, quats, log-scales, logit, SH.
+    pub values: Vec<f32>,
+    pub first: Vec<f32>,
+    pub second: Vec<f32>,
+    pub units: Vec<f32>,
+    pub steps: Vec<u32>,
+    pub order: Vec<u32>,
+}
+
+impl Store {
+    pub fn new(params: &Params, units: Option<&[f32]>) -> Result<Self> {
+        params.validate()?;
+        let rows = params.len();
+        if let Some(units) = units
+            && units.len() != rows
+        {
+            return Err(Error::invalid(
+                "units",
+                format!("{rows} values"),
+                units.len(),
+            ));
+        }
+        let attributes = SH + 3 * params.sh_coeffs;
+        let blocks = rows.div_ceil(LANES);
+        let zeros = vec![Row::default(); blocks * attributes];
+        let mut store = Self {
+            rows,
+            sh_coeffs: params.sh_coeffs,
+            values: zeros.clone(),
+            first: zeros.clone(),
+            second: zeros,
+            units: vec![Row([1.0; LANES]); blocks],
+            steps: vec![0; blocks * LANES],
+            most_steps: 0,
+            order: morton_order(params.means),
+        };
+        for row in 0..rows {
+            let from = store.order[row] as usize;
+            let rest = 3 * (params.sh_coeffs - 1);
+            let parts = [
+                &params.means[3 * from..][..3],
+                &params.quats[4 * from..][..4],
+                &params.log_scales[3 * from..][..3],
+                &params.logit_opacities[from..][..1],
+                &params.sh0[3 * from..][..3],
+                &params.sh_n[rest * from..][..rest],
+            ];
+            for (attribute, value) in parts.into_iter().flatten().enumerate() {
+                store.values[row / LANES * attributes + attribute].0[row % LANES] = *value;
+            }
+            if let Some(units) = units {
+                store.units[row / LANES].0[row % LANES] = units[from];
+            }
+        }
+        Ok(store)
+    }
+
+    pub fn len(&self) -> usize {
+        self.rows
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.rows == 0
+    }
+
+    pub fn sh_coeffs(&self) -> usize {
+        self.sh_coeffs
+    }
+
+    pub(crate) fn attributes(&self) -> usize {
+        SH + 3 * self.sh_coeffs
+    }
+
+    pub(crate) fn order(&self) -> &[u32] {
+        &self.order
+    }
+
+    pub(crate) fn most_steps(&self) -> u32 {
+        self.most_steps
+    }
+
+    pub(crate) fn count_step(&mut self) {
+        self.most_steps += 1;
+    }
+
+    /// Attributes `from..to` of every Gaussian, row-major, in the caller's order.
+    pub fn columns(&self, from: usize, to: usize) -> Vec<f32> {
+        self.unblock(&self.values, from, to)
+    }
+
+    fn unblock(&self, blocks: &[Row], from: usize, to: usize) -> Vec<f32> {
+        let mut out = vec![0.0; self.rows * (to - from)];
+        for row in 0..self.rows {
+            let at = self.order[row] as usize * (to - from);
+            for k in from..to {
+                out[at + k - from] = blocks[row / LANES * self.attributes() + k].0[row % LANES];
+            }
+        }
+        out
+    }
+
+    fn block(&self, rows: &[f32], into: &mut [Row]) {
+        let attributes = self.attributes();
+        for row in 0..self.rows {
+            let from = self.order[row] as usize * attributes;
+            for k in 0..attributes {
+                into[row / LANES * attributes + k].0[row % LANES] = rows[from + k];
+            }
+        }
+    }
+
+    pub fn export(&self) -> Exported {
+        let all = self.attributes();
+        let mut units = vec![0.0; self.rows];
+        let mut steps = vec![0; self.rows];
+        for row in 0..self.rows {
+            units[self.order[row] as usize] = self.units[row / LANES].0[row % LANES];
+            steps[self.order[row] as usize] = self.steps[row];
+        }
+        Exported {
+            values: self.unblock(&self.values, 0, all),
+            first: self.unblock(&self.first, 0, all),
+            second: self.unblock(&self.second, 0, all),
+            units,
+            steps,
+            order: self.order.clone(),
+        }
+    }
+
+    pub fn import(&mut self, state: &Exported) -> Result<()> {
+        let (n, all) = (self.rows, self.rows * self.attributes());
+        for (name, got, expected) in [
+            ("values", state.values.len(), all),
+            ("first moments", state.first.len(), all),
+            ("second moments", state.second.len(), all),
+            ("units", state.units.len(), n),
+            ("steps", state.steps.len(), n),
+            ("order", state.order.len(), n),
+        ] {
+            if got != expected {
+                return Err(Error::invalid(name, format!("{expected} values"), got));
+            }
+        }
+        let mut seen = vec![false; n];
+        for row in &state.order {
+            match seen.get_mut(*row as usize) {
+                Some(s) if !*s => *s = true,
+                _ => {
+                    return Err(Error::invalid(
+                        "order",
+                        "a permutation",
+                        format!("{row} twice or too large"),
+                    ));
+                }
+            }
+        }
+        self.order.clone_from(&state.order);
+        let [mut values, mut first, mut second] =
+            [&self.values, &self.first, &self.second].map(|v| vec![Row::default(); v.len()]);
+        self.block(&state.values, &mut values);
+        self.block(&state.first, &mut first);
+        self.block(&state.second, &mut second);
+        (self.values, self.first, self.second) = (values, first, second);
+        for row in 0..n {
+            self.units[row / LANES].0[row % LANES] = state.units[self.order[row] as usize];
+            self.steps[row] = state.steps[self.order[row] as usize];
+        }
+        self.most_steps = self.steps.iter().copied().max().unwrap_or(0);
+        Ok(())
+    }
+
+    pub(crate) fn packed(&mut self) -> Packed {
+        Packed {
+            values: Shared::new(&mut self.values),
+            rows: self.rows,
+            sh_coeffs: self.sh_coeffs,
+            attributes: SH + 3 * self.sh_coeffs,
+        }
+    }
+
+    pub(crate) fn writer(&mut self) -> Writer {
+        Writer {
+            packed: self.packed(),
+            first: Shared::new(&mut self.first),
+            second: Shared::new(&mut self.second),
+            units: Shared::new(&mut self.units),
+            steps: Shared::new(&mut self.steps),
+        }
+    }
+}
+
+/// A store's parameters as the rasteriser reads them. Must not outlive the store, nor be read while a block is written.
+#[derive(Clone, Copy)]
+pub(crate) struct Packed {
+    values: Shared<Row>,
+    rows: usize,
+    sh_coeffs: usize,
+    attributes: usize,
+}
+
+/// The same, and all that a step changes. Each block must be one thread's.
+#[derive(Clone, Copy)]
+pub(crate) struct Writer {
+    pub packed: Packed,
+    pub first: Shared<Row>,
+    pub second: Shared<Row>,
+    pub units: Shared<Row>,
+    pub steps: Shared<u32>,
+}
+
+impl Packed {
+    #[inline(always)]
+    pub fn index(&self, group: usize, attribute: usize) -> usize {
+        group * self.attributes + attribute
+    }
+
+    #[inline(always)]
+    pub fn get<F: Lanes>(&self, group: usize, attribute: usize) -> F {
+        // SAFETY: the store is borrowed by whoever made this, and its blocks cover all groups.
+        unsafe { F::load(&*self.values.at(self.index(group, attribute))) }
+    }
+
+    #[inline(always)]
+    pub fn set<F: Lanes>(&self, group: usize, attribute: usize, value: F) {
+        // SAFETY: as above, and the group is this thread's.
+        unsafe { value.store(&mut *self.values.at(self.index(group, attribute))) }
+    }
+}
+
+impl Source for Packed {
+    #[inline(always)]
+    fn len(&self) -> usize {
+        self.rows
+    }
+    #[inline(always)]
+    fn sh_coeffs(&self) -> usize {
+        self.sh_coeffs
+    }
+    #[inline(always)]
+    fn mean<F: Lanes>(&self, group: usize, axis: usize) -> F {
+        self.get(group, axis)
+    }
+    #[inline(always)]
+    fn quat<F: Lanes>(&self, group: usize, part: usize) -> F {
+        self.get(group, QUAT + part)
+    }
+    #[inline(always)]
+    fn log_scale<F: Lanes>(&self, group: usize, axis: usize) -> F {
+        self.get(group, LOG_SCALE + axis)
+    }
+    #[inline(always)]
+    fn logit_opacity<F: Lanes>(&self, group: usize) -> F {
+        self.get(group, LOGIT)
+    }
+    #[inline(always)]
+    fn sh<F: Lanes>(&self, group: usize, k: usize, c: usize) -> F {
+        self.get(group, SH + 3 * k + c)
+    }
+}
+
+/// Rows by the interleaved bits of their means, 16 a side, over the 1st to 99th percentile of each axis (one stray
+/// floater must not put all the rest into one cell); ties by row.
+fn morton_order(means: &[f32]) -> Vec<u32> {
+    let rows = means.len() / 3;
+    let ranges = [0, 1, 2].map(|axis| {
+        let mut values: Vec<f32> = means
+            .iter()
+            .skip(axis)
+            .step_by(3)
+            .copied()
+            .filter(|v| v.is_finite())
+            .collect();
+        if values.is_empty() {
+            return (0.0, 1.0);
+        }
+        values.sort_unstable_by(f32::total_cmp);
+        let low = values[values.len() / 100];
+        let high = values[values.len() - 1 - values.len() / 100];
+        (low, 65_535.0 / (high - low).max(f32::MIN_POSITIVE))
+    });
+    let code = |row: u32| {
+        let mut code = 0u64;
+        for axis in 0..3 {
+            let (low, scale) = ranges[axis];
+            let cell = ((means[3 * row as usize + axis] - low) * scale).clamp(0.0, 65_535.0) as u64;
+            for bit in 0..16 {
+                code |= (cell >> bit & 1) << (3 * bit + axis);
+            }
+        }
+        code
+    };
+    let mut order: Vec<u32> = (0..rows as u32).collect();
+    order.sort_by_cached_key(|row| (code(*row), *row));
+    order
+}

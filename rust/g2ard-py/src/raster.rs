@@ -1,0 +1,333 @@
+//! `_core.Rasterizer`: one view's buffers, forward, backward and the sums visibility is made of.
+
+use g2ard_core::raster::limits::measure;
+use g2ard_core::raster::simd::Isa;
+use g2ard_core::raster::{
+    Accumulated, Camera, Convention, Gradients, Image, ImageGradients, Params, Passes, Rasterizer,
+    Settings,
+};
+use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::error::to_py;
+use crate::work;
+
+pub type Floats<'py> = PyReadonlyArrayDyn<'py, f32>;
+
+pub fn slice<'a>(name: &'static str, array: &'a Floats<'_>) -> PyResult<&'a [f32]> {
+    array.as_slice().map_err(|_| {
+        to_py(g2ard_core::Error::invalid(
+            name,
+            "a C-contiguous array",
+            "another layout",
+        ))
+    })
+}
+
+/// The six parameter arrays, in the order every method takes them.
+#[derive(FromPyObject)]
+pub struct Arrays<'py>(
+    Floats<'py>,
+    Floats<'py>,
+    Floats<'py>,
+    Floats<'py>,
+    Floats<'py>,
+    Floats<'py>,
+);
+
+impl Arrays<'_> {
+    pub fn params(&self) -> PyResult<Params<'_>> {
+        let shape = self.5.shape();
+        let rest = if shape.len() == 3 { shape[1] } else { 0 };
+        let params = Params {
+            means: slice("means", &self.0)?,
+            quats: slice("quats", &self.1)?,
+            log_scales: slice("log_scales", &self.2)?,
+            logit_opacities: slice("logit_opacities", &self.3)?,
+            sh0: slice("sh0", &self.4)?,
+            sh_n: slice("shN", &self.5)?,
+            sh_coeffs: rest + 1,
+        };
+        params.validate().map_err(to_py)?;
+        Ok(params)
+    }
+}
+
+/// `(viewmat 4×4, (fx, fy, cx, cy), (width, height), near)`.
+#[derive(FromPyObject)]
+pub struct View([[f64; 4]; 4], [f64; 4], (usize, usize), f32);
+
+impl View {
+    pub fn camera(&self) -> Camera {
+        let (v, k) = (&self.0, &self.1);
+        Camera {
+            viewmat: [v[0], v[1], v[2]],
+            fx: k[0],
+            fy: k[1],
+            cx: k[2],
+            cy: k[3],
+            width: self.2.0,
+            height: self.2.1,
+            near: self.3,
+        }
+    }
+}
+
+/// `(convention, antialiased, alpha_max)`.
+#[derive(FromPyObject)]
+pub struct Choices(String, bool, f32);
+
+impl Choices {
+    pub fn settings(&self) -> PyResult<Settings> {
+        let convention = match self.0.as_str() {
+            "gsplat" => Convention::Gsplat,
+            "inria" => Convention::Inria,
+            other => {
+                return Err(to_py(g2ard_core::Error::invalid(
+                    "convention",
+                    "gsplat or inria",
+                    other,
+                )));
+            }
+        };
+        Ok(Settings {
+            convention,
+            antialiased: self.1,
+            alpha_max: self.2,
+            ..Settings::default()
+        })
+    }
+}
+
+pub fn isa_named(name: Option<&str>) -> PyResult<Isa> {
+    let best = Isa::detect();
+    match name {
+        None => Ok(best),
+        Some(name) => Isa::available()
+            .into_iter()
+            .find(|isa| isa.name() == name)
+            .ok_or_else(|| {
+                to_py(g2ard_core::Error::invalid(
+                    "isa",
+                    "one this machine has",
+                    name,
+                ))
+            }),
+    }
+}
+
+/// The names of the instruction sets this machine can run, the fastest first.
+#[pyfunction]
+fn instruction_sets() -> Vec<&'static str> {
+    Isa::available().into_iter().map(Isa::name).collect()
+}
+
+/// (FMA 10⁹ flops/s, read 10⁹ bytes/s) of all threads, measured now.
+#[pyfunction]
+#[pyo3(signature = (isa = None))]
+fn machine_limits(py: Python<'_>, isa: Option<&str>) -> PyResult<(f64, f64)> {
+    let isa = isa_named(isa)?;
+    let limits = work::quick(py, || Ok(measure(isa)))?;
+    Ok((limits.fma_gflops, limits.read_gb_s))
+}
+
+#[pyclass(name = "Rasterizer", module = "g2ard._core")]
+struct PyRasterizer {
+    inner: Rasterizer,
+    /// Height and width of the last forward pass.
+    shape: [usize; 2],
+}
+
+type Array<'py, D> = Bound<'py, numpy::PyArray<f32, D>>;
+
+fn plane<'py>(
+    py: Python<'py>,
+    values: Option<Vec<f32>>,
+    shape: [usize; 2],
+) -> PyResult<Option<Array<'py, numpy::Ix2>>> {
+    values
+        .map(|v| PyArray1::from_vec(py, v).reshape(shape))
+        .transpose()
+}
+
+#[pymethods]
+impl PyRasterizer {
+    #[new]
+    #[pyo3(signature = (isa = None))]
+    fn new(isa: Option<&str>) -> PyResult<Self> {
+        Ok(Self {
+            inner: Rasterizer::new(isa_named(isa)?),
+            shape: [0, 0],
+        })
+    }
+
+    /// (image (H, W, 3), alpha (H, W), depth (H, W) or None, median depth (H, W) or None).
+    #[pyo3(signature = (arrays, view, choices, background, depth = true, median = false))]
+    #[allow(clippy::type_complexity)]
+    fn forward<'py>(
+        &mut self,
+        py: Python<'py>,
+        arrays: Arrays<'py>,
+        view: View,
+        choices: Choices,
+        background: [f32; 3],
+        depth: bool,
+        median: bool,
+    ) -> PyResult<(
+        Array<'py, numpy::Ix3>,
+        Array<'py, numpy::Ix2>,
+        Option<Array<'py, numpy::Ix2>>,
+        Option<Array<'py, numpy::Ix2>>,
+    )> {
+        let params = arrays.params()?;
+        let (camera, settings) = (view.camera(), choices.settings()?);
+        camera.validate().map_err(to_py)?;
+        let (height, width) = (camera.height, camera.width);
+        let inner = &mut self.inner;
+        let (rgb, alpha, depths, medians) = work::quick(py, || {
+            let zeros = || vec![0f32; height * width];
+            let (mut rgb, mut alpha) = (vec![0f32; 3 * height * width], zeros());
+            let (mut depths, mut medians) = (depth.then(zeros), median.then(zeros));
+            let mut image = Image {
+                rgb: &mut rgb,
+                alpha: &mut alpha,
+                depth: depths.as_deref_mut(),
+                median: medians.as_deref_mut(),
+            };
+            inner.forward(&params, &camera, &settings, background, &mut image)?;
+            Ok((rgb, alpha, depths, medians))
+        })?;
+        self.shape = [height, width];
+        Ok((
+            PyArray1::from_vec(py, rgb).reshape([height, width, 3])?,
+            PyArray1::from_vec(py, alpha).reshape([height, width])?,
+            plane(py, depths, self.shape)?,
+            plane(py, medians, self.shape)?,
+        ))
+    }
+
+    /// Gradients of the six arrays, each in its array's shape.
+    #[pyo3(signature = (arrays, image, alpha = None, depth = None))]
+    fn backward<'py>(
+        &mut self,
+        py: Python<'py>,
+        arrays: Arrays<'py>,
+        image: Floats<'py>,
+        alpha: Option<Floats<'py>>,
+        depth: Option<Floats<'py>>,
+    ) -> PyResult<Vec<Bound<'py, numpy::PyArrayDyn<f32>>>> {
+        let params = arrays.params()?;
+        let gradients = ImageGradients {
+            rgb: slice("image gradient", &image)?,
+            alpha: alpha
+                .as_ref()
+                .map(|a| slice("alpha gradient", a))
+                .transpose()?,
+            depth: depth
+                .as_ref()
+                .map(|a| slice("depth gradient", a))
+                .transpose()?,
+        };
+        let inner = &mut self.inner;
+        let out = work::quick(py, || {
+            let mut out = [
+                params.means,
+                params.quats,
+                params.log_scales,
+                params.logit_opacities,
+                params.sh0,
+                params.sh_n,
+            ]
+            .map(|values| vec![0f32; values.len()]);
+            let [means, quats, log_scales, logit_opacities, sh0, sh_n] = &mut out;
+            let mut rows = Gradients {
+                means,
+                quats,
+                log_scales,
+                logit_opacities,
+                sh0,
+                sh_n,
+            };
+            inner.backward(&params, &gradients, &mut rows)?;
+            Ok(out)
+        })?;
+        let shapes = [
+            &arrays.0, &arrays.1, &arrays.2, &arrays.3, &arrays.4, &arrays.5,
+        ];
+        out.into_iter()
+            .zip(shapes)
+            .map(|(values, like)| PyArray1::from_vec(py, values).reshape(like.shape().to_vec()))
+            .collect()
+    }
+
+    /// Seconds the passes of the last calls took.
+    fn passes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        passes(py, &self.inner.passes())
+    }
+
+    /// Work done by the last forward pass.
+    fn counts<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let counts = self.inner.counts();
+        let dict = PyDict::new(py);
+        dict.set_item("visible", counts.visible)?;
+        dict.set_item("pairs", counts.pairs)?;
+        dict.set_item("evaluated", counts.evaluated)?;
+        Ok(dict)
+    }
+}
+
+pub fn passes<'py>(py: Python<'py>, passes: &Passes) -> PyResult<Bound<'py, PyDict>> {
+    let dict = PyDict::new(py);
+    for (name, seconds) in [
+        ("project", passes.project),
+        ("sort", passes.sort),
+        ("bin", passes.bin),
+        ("forward", passes.forward),
+        ("backward", passes.backward),
+        ("gather", passes.gather),
+    ] {
+        dict.set_item(name, seconds)?;
+    }
+    Ok(dict)
+}
+
+/// Per-Gaussian sums over all `views`: a dict of (N,) arrays.
+#[pyfunction]
+#[pyo3(signature = (arrays, views, choices, progress = None))]
+fn accumulate<'py>(
+    py: Python<'py>,
+    arrays: Arrays<'py>,
+    views: Vec<View>,
+    choices: Choices,
+    progress: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let params = arrays.params()?;
+    let settings = choices.settings()?;
+    let sums = work::long(py, progress, |control| {
+        let mut rasterizer = Rasterizer::default();
+        let mut sums = Accumulated::new(params.len());
+        control.begin(views.len() as u64);
+        for view in &views {
+            control.check()?;
+            rasterizer.accumulate(&params, &view.camera(), &settings, &mut sums)?;
+            control.advance(1);
+        }
+        Ok(sums)
+    })?;
+    let dict = PyDict::new(py);
+    dict.set_item("weight", sums.weight.into_pyarray(py))?;
+    dict.set_item("transmittance", sums.transmittance.into_pyarray(py))?;
+    dict.set_item("hits", sums.hits.into_pyarray(py))?;
+    dict.set_item("dominant", sums.dominant.into_pyarray(py))?;
+    dict.set_item("peak", sums.peak.into_pyarray(py))?;
+    dict.set_item("pixel_size", sums.pixel_size.into_pyarray(py))?;
+    Ok(dict)
+}
+
+pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_class::<PyRasterizer>()?;
+    m.add_function(wrap_pyfunction!(instruction_sets, m)?)?;
+    m.add_function(wrap_pyfunction!(machine_limits, m)?)?;
+    m.add_function(wrap_pyfunction!(accumulate, m)?)
+}

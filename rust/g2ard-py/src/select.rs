@@ -1,0 +1,208 @@
+//! `g2ard.select`.
+
+use g2ard_core::raster::Camera;
+use g2ard_core::select::{Coverage, Gaussians, Opaque, Problem, Surface, median_depths, visible};
+use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::arrays;
+use crate::error::to_py;
+use crate::work::{long, quick};
+
+/// `(viewmat 4×4, (fx, fy, cx, cy), (width, height), near)`.
+#[derive(FromPyObject)]
+struct View([[f64; 4]; 4], [f64; 4], (usize, usize), f32);
+
+impl View {
+    fn camera(&self) -> Camera {
+        let [fx, fy, cx, cy] = self.1;
+        let (width, height) = self.2;
+        Camera {
+            viewmat: [self.0[0], self.0[1], self.0[2]],
+            fx,
+            fy,
+            cx,
+            cy,
+            width,
+            height,
+            near: self.3,
+        }
+    }
+}
+
+/// Centred means, quats, linear scales, opacities.
+#[derive(FromPyObject)]
+struct Scene<'py>(
+    PyReadonlyArray2<'py, f64>,
+    PyReadonlyArray2<'py, f32>,
+    PyReadonlyArray2<'py, f32>,
+    PyReadonlyArray1<'py, f32>,
+);
+
+impl Scene<'_> {
+    fn borrow(&self) -> PyResult<Gaussians<'_>> {
+        let scene = Gaussians {
+            means: arrays::rows("means", &self.0)?,
+            quats: arrays::rows("quats", &self.1)?,
+            scales: arrays::rows("scales", &self.2)?,
+            opacities: arrays::flat("opacities", &self.3)?,
+        };
+        scene.validate().map_err(to_py)?;
+        Ok(scene)
+    }
+}
+
+/// Surface cells: centers, normals, confidence, weights, size.
+#[pyfunction]
+fn select_surface<'py>(
+    py: Python<'py>,
+    scene: Scene<'py>,
+    cells: usize,
+) -> PyResult<Bound<'py, PyDict>> {
+    let scene = scene.borrow()?;
+    let surface = long(py, None, |_| Surface::of(&scene, cells))?;
+    let out = PyDict::new(py);
+    out.set_item("size", surface.size)?;
+    out.set_item("centers", arrays::matrix(py, surface.centers)?)?;
+    out.set_item("normals", arrays::matrix(py, surface.normals)?)?;
+    out.set_item("confidence", PyArray1::from_vec(py, surface.confidence))?;
+    out.set_item("weights", PyArray1::from_vec(py, surface.weights))?;
+    Ok(out)
+}
+
+/// The median depth of every pixel of a view.
+#[pyfunction]
+fn select_depth<'py>(
+    py: Python<'py>,
+    scene: Scene<'py>,
+    view: View,
+) -> PyResult<Bound<'py, PyArray2<f32>>> {
+    let (scene, camera) = (scene.borrow()?, view.camera());
+    let depth = quick(py, || Ok(median_depths(&Opaque::of(&scene), &camera)))?;
+    PyArray1::from_vec(py, depth).reshape([camera.height, camera.width])
+}
+
+type Surfaces<'py> = (
+    PyReadonlyArray2<'py, f64>,
+    PyReadonlyArray2<'py, f64>,
+    PyReadonlyArray1<'py, f64>,
+    PyReadonlyArray1<'py, f64>,
+    f64,
+);
+
+fn surface_of(parts: &Surfaces<'_>) -> PyResult<Surface> {
+    let surface = Surface {
+        centers: arrays::rows("centers", &parts.0)?.to_vec(),
+        normals: arrays::rows("normals", &parts.1)?.to_vec(),
+        confidence: arrays::flat("confidence", &parts.2)?.to_vec(),
+        weights: arrays::flat("weights", &parts.3)?.to_vec(),
+        size: parts.4,
+    };
+    let m = surface.len();
+    for (name, rows) in [
+        ("normals", surface.normals.len()),
+        ("confidence", surface.confidence.len()),
+        ("weights", surface.weights.len()),
+    ] {
+        if rows != m {
+            return Err(to_py(g2ard_core::Error::invalid(
+                name,
+                format!("{m} rows"),
+                rows,
+            )));
+        }
+    }
+    Ok(surface)
+}
+
+type Lists<'py> = (Bound<'py, PyArray1<u64>>, Bound<'py, PyArray1<u32>>);
+
+/// (starts (C + 1,), cells): view v sees cells[starts[v]..starts[v + 1]].
+#[pyfunction]
+#[pyo3(signature = (scene, surface, views, progress=None))]
+fn select_visible<'py>(
+    py: Python<'py>,
+    scene: Scene<'py>,
+    surface: Surfaces<'py>,
+    views: Vec<View>,
+    progress: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Lists<'py>> {
+    let (scene, surface) = (scene.borrow()?, surface_of(&surface)?);
+    let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
+    let seen = long(py, progress, |control| {
+        visible(&Opaque::of(&scene), &surface, &cameras, control)
+    })?;
+    let mut starts = vec![0u64];
+    for cells in &seen {
+        starts.push(starts[starts.len() - 1] + cells.len() as u64);
+    }
+    Ok((
+        PyArray1::from_vec(py, starts),
+        PyArray1::from_vec(py, seen.concat()),
+    ))
+}
+
+type Choice<'py> = (Bound<'py, PyArray1<u32>>, Bound<'py, PyArray1<f64>>, u64);
+
+/// (views, gains, evaluations) of greedy maximisation.
+#[pyfunction]
+#[pyo3(signature = (surface, starts, cells, positions, k, *, directional, kappa, alpha, lambda_, lazy, progress=None))]
+fn select_greedy<'py>(
+    py: Python<'py>,
+    surface: Surfaces<'py>,
+    starts: PyReadonlyArray1<'py, u64>,
+    cells: PyReadonlyArray1<'py, u32>,
+    positions: PyReadonlyArray2<'py, f64>,
+    k: usize,
+    directional: bool,
+    kappa: f64,
+    alpha: f64,
+    lambda_: f64,
+    lazy: bool,
+    progress: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Choice<'py>> {
+    let surface = surface_of(&surface)?;
+    let (starts, cells) = (
+        arrays::flat("starts", &starts)?,
+        arrays::flat("cells", &cells)?,
+    );
+    let positions = arrays::rows("positions", &positions)?;
+    let visible = starts
+        .windows(2)
+        .map(|w| cells.get(w[0] as usize..w[1] as usize).map(<[u32]>::to_vec))
+        .collect::<Option<Vec<_>>>()
+        .ok_or_else(|| {
+            to_py(g2ard_core::Error::invalid(
+                "starts",
+                "ascending offsets into cells",
+                "others",
+            ))
+        })?;
+    let coverage = Coverage {
+        directional,
+        kappa,
+        alpha,
+        lambda: lambda_,
+    };
+    let problem = Problem {
+        surface: &surface,
+        visible: &visible,
+        positions,
+    };
+    let chosen = long(py, progress, |control| {
+        problem.greedy(k, &coverage, lazy, control)
+    })?;
+    Ok((
+        PyArray1::from_vec(py, chosen.views),
+        PyArray1::from_vec(py, chosen.gains),
+        chosen.evaluations,
+    ))
+}
+
+pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_function(wrap_pyfunction!(select_surface, m)?)?;
+    m.add_function(wrap_pyfunction!(select_depth, m)?)?;
+    m.add_function(wrap_pyfunction!(select_visible, m)?)?;
+    m.add_function(wrap_pyfunction!(select_greedy, m)?)
+}

@@ -1,0 +1,218 @@
+//! `_core.Trainer`: whole recovery steps in Rust.
+
+use g2ard_core::raster::Isa;
+use g2ard_core::train::{Exported, Lesson, Rates, Regularizers, Trainer};
+use numpy::{
+    IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray3,
+};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::raster::{Arrays, Choices, Floats, View, isa_named, slice};
+use crate::work;
+
+#[pyclass(name = "Trainer", module = "g2ard._core")]
+struct PyTrainer {
+    inner: Trainer,
+    isa: Isa,
+    seconds_loss: f64,
+    skipped: usize,
+}
+
+#[pymethods]
+impl PyTrainer {
+    #[new]
+    #[pyo3(signature = (arrays, units = None, isa = None))]
+    fn new(arrays: Arrays<'_>, units: Option<Floats<'_>>, isa: Option<&str>) -> PyResult<Self> {
+        let isa = isa_named(isa)?;
+        let units = units.as_ref().map(|u| slice("units", u)).transpose()?;
+        let inner = Trainer::new(&arrays.params()?, units, isa).map_err(crate::error::to_py)?;
+        Ok(Self {
+            inner,
+            isa,
+            seconds_loss: 0.0,
+            skipped: 0,
+        })
+    }
+
+    /// Freezes the anchors: means (N, 3), frames (N, 3, 3) with columns t1, t2, n, and the two radii (N,).
+    fn anchor(
+        &mut self,
+        means: Floats<'_>,
+        frames: Floats<'_>,
+        r_parallel: Floats<'_>,
+        r_perp: Floats<'_>,
+    ) -> PyResult<()> {
+        let (means, frames) = (
+            slice("anchor means", &means)?,
+            slice("anchor frames", &frames)?,
+        );
+        let (r_parallel, r_perp) = (slice("r_parallel", &r_parallel)?, slice("r_perp", &r_perp)?);
+        self.inner
+            .anchor(means, frames, r_parallel, r_perp)
+            .map_err(crate::error::to_py)
+    }
+
+    /// One step: (photometric loss before it, Gaussians moved). `rates`: means, quats, log_scales, logit_opacities,
+    /// sh0, shN. `regularizers`: (λ_anchor, λ_shape, effective rank too) or None.
+    #[pyo3(signature = (view, choices, background, target, ssim_weight, rates, regularizers = None))]
+    fn step(
+        &mut self,
+        py: Python<'_>,
+        view: View,
+        choices: Choices,
+        background: [f32; 3],
+        target: PyReadonlyArray3<'_, f32>,
+        ssim_weight: f32,
+        rates: [f32; 6],
+        regularizers: Option<(f32, f32, bool)>,
+    ) -> PyResult<(f64, usize)> {
+        let [means, quats, log_scales, logit_opacities, sh0, sh_n] = rates;
+        let lesson = Lesson {
+            camera: &view.camera(),
+            settings: &choices.settings()?,
+            background,
+            target: values(&target)?,
+            ssim_weight,
+            rates: Rates {
+                means,
+                quats,
+                log_scales,
+                logit_opacities,
+                sh0,
+                sh_n,
+            },
+            regularizers: regularizers.map(|(anchor, shape, effective_rank)| Regularizers {
+                anchor,
+                shape,
+                effective_rank,
+            }),
+        };
+        let inner = &mut self.inner;
+        let report = work::quick(py, || inner.step(&lesson))?;
+        self.seconds_loss = report.seconds_loss;
+        self.skipped += report.skipped;
+        Ok((report.loss, report.updated))
+    }
+
+    /// A step up to the gradients, which are thrown away: for timing. Returns the photometric loss.
+    fn rehearse(
+        &mut self,
+        py: Python<'_>,
+        view: View,
+        choices: Choices,
+        background: [f32; 3],
+        target: PyReadonlyArray3<'_, f32>,
+        ssim_weight: f32,
+    ) -> PyResult<f64> {
+        let lesson = Lesson {
+            camera: &view.camera(),
+            settings: &choices.settings()?,
+            background,
+            target: values(&target)?,
+            ssim_weight,
+            rates: Rates::default(),
+            regularizers: None,
+        };
+        let inner = &mut self.inner;
+        let report = work::quick(py, || inner.rehearse(&lesson))?;
+        self.seconds_loss = report.seconds_loss;
+        Ok(report.loss)
+    }
+
+    /// The six parameter arrays as they stand, rows in the caller's order.
+    fn arrays<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyArrayDyn<f32>>>> {
+        let store = self.inner.store();
+        let (n, rest) = (store.len(), store.sh_coeffs() - 1);
+        let shapes = [
+            vec![n, 3],
+            vec![n, 4],
+            vec![n, 3],
+            vec![n],
+            vec![n, 1, 3],
+            vec![n, rest, 3],
+        ];
+        let starts = [0, 3, 7, 10, 11, 14, 14 + 3 * rest];
+        shapes
+            .into_iter()
+            .zip(starts.windows(2))
+            .map(|(shape, at)| PyArray1::from_vec(py, store.columns(at[0], at[1])).reshape(shape))
+            .collect()
+    }
+
+    /// Everything a bitwise resume needs: a dict of arrays.
+    fn state<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let state = self.inner.store().export();
+        let dict = PyDict::new(py);
+        for (name, values) in [
+            ("values", state.values),
+            ("first", state.first),
+            ("second", state.second),
+            ("units", state.units),
+        ] {
+            dict.set_item(name, values.into_pyarray(py))?;
+        }
+        dict.set_item("steps", state.steps.into_pyarray(py))?;
+        dict.set_item("order", state.order.into_pyarray(py))?;
+        Ok(dict)
+    }
+
+    /// Takes up a `state` again; anchors must be set afresh.
+    fn load(&mut self, state: &Bound<'_, PyDict>) -> PyResult<()> {
+        let state = Exported {
+            values: vector(state, "values")?,
+            first: vector(state, "first")?,
+            second: vector(state, "second")?,
+            units: vector(state, "units")?,
+            steps: vector(state, "steps")?,
+            order: vector(state, "order")?,
+        };
+        self.inner.import(&state).map_err(crate::error::to_py)
+    }
+
+    /// Gaussian steps left out since the start because a gradient was not finite.
+    #[getter]
+    fn skipped(&self) -> usize {
+        self.skipped
+    }
+
+    #[getter]
+    fn isa(&self) -> &'static str {
+        self.isa.name()
+    }
+
+    /// Seconds of the last step by pass; "gather" holds Adam.
+    fn passes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let dict = crate::raster::passes(py, &self.inner.passes())?;
+        dict.set_item("loss", self.seconds_loss)?;
+        Ok(dict)
+    }
+}
+
+fn values<'a>(target: &'a PyReadonlyArray3<'_, f32>) -> PyResult<&'a [f32]> {
+    let layout = |_| g2ard_core::Error::invalid("target", "a C-contiguous array", "another layout");
+    target
+        .as_slice()
+        .map_err(layout)
+        .map_err(crate::error::to_py)
+}
+
+fn vector<T: numpy::Element + Clone>(
+    state: &Bound<'_, PyDict>,
+    name: &'static str,
+) -> PyResult<Vec<T>> {
+    let missing = || {
+        crate::error::to_py(g2ard_core::Error::invalid(
+            name,
+            "an array in the state",
+            "none",
+        ))
+    };
+    let value = state.get_item(name)?.ok_or_else(missing)?;
+    let array: PyReadonlyArray1<'_, T> = value.extract()?;
+    Ok(array.as_array().to_vec())
+}
+
+pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_class::<PyTrainer>()
+}

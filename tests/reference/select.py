@@ -1,0 +1,104 @@
+"""View selection without shortcuts: dense float64 depths, the objective as written, greedy by trying all."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def median_depth(splats, viewmat, K, pixels):
+    """(n,) depth at which less than half the light is left along each pixel (n, 2), 0 where there is none.
+
+    Every Gaussian is evaluated at every pixel.
+    """
+    means = splats.means.astype(np.float64) + splats.offset
+    camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    order = np.argsort(camera[:, 2], kind="stable")
+    order = order[camera[order, 2] > 0.01]
+    light, depth = np.ones(len(pixels)), np.zeros(len(pixels))
+    width, height = 2 * K[0, 2], 2 * K[1, 2]  # the tests' principal points are centred
+    for i in order:
+        x, y, z = camera[i]
+        u = np.clip(x / z, -0.65 * width / K[0, 0], 0.65 * width / K[0, 0])
+        v = np.clip(y / z, -0.65 * height / K[1, 1], 0.65 * height / K[1, 1])
+        J = (
+            np.array([[K[0, 0] / z, 0, -K[0, 0] * u / z], [0, K[1, 1] / z, -K[1, 1] * v / z]])
+            @ viewmat[:3, :3]
+        )
+        R = rotation(splats.quats[i].astype(np.float64))
+        cov = J @ R @ np.diag(splats.scales[i].astype(np.float64) ** 2) @ R.T @ J.T + 0.3 * np.eye(2)
+        d = pixels - [K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]]
+        power = 0.5 * np.einsum("ni,ij,nj->n", d, np.linalg.inv(cov), d)
+        alpha = np.minimum(float(splats.opacities[i]) * np.exp(-power), 0.99)
+        alpha[alpha < 1 / 255] = 0
+        before = light.copy()
+        light *= 1 - alpha
+        depth[(before >= 0.5) & (light < 0.5)] = z
+    return depth
+
+
+def rotation(q):
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def anchors(count=32):
+    k = np.arange(count)
+    z = 1 - (2 * k + 1) / count
+    turn = 2 * np.pi * ((k * (np.sqrt(5) - 1) / 2) % 1)
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), z], 1)
+
+
+def objective(chosen, surface, seen, positions, *, directional, kappa=20.0, alpha=2.0, offset=1.0):
+    """F(S) as equation 2 has it; `seen[v]` lists cells, `positions` are in the surface's coordinates."""
+    m = len(surface.centers)
+    if directional:
+        a = anchors()
+        raw = np.exp(kappa * np.abs(surface.normals @ a.T))
+        target = raw / raw.sum(1, keepdims=True)
+    else:
+        target = np.ones((m, 1))
+    evidence = np.zeros_like(target)
+    for v in chosen:
+        for j in seen[v]:
+            if not directional:
+                evidence[j, 0] += 1
+                continue
+            d = positions[v] - surface.centers[j]
+            d = d / np.linalg.norm(d)
+            confidence = surface.confidence[j]
+            incidence = (1 - confidence) + confidence * abs(d @ surface.normals[j])
+            phi = np.where(a @ d - 1 > -3 / kappa, np.exp(kappa * (a @ d)), 0)
+            evidence[j] += incidence * phi / phi.sum()
+    x = offset + evidence / (target + 1e-9)
+    u = np.log(x) if alpha == 1 else x ** (1 - alpha) / (1 - alpha)
+    return float((surface.weights[:, None] * target * u).sum())
+
+
+def greedy(k, surface, seen, positions, **options):
+    """Views and gains, the best of all tried at every step; of equals the first."""
+    chosen, gains = [], []
+    value = objective([], surface, seen, positions, **options)
+    for _ in range(k):
+        rest = [v for v in range(len(seen)) if v not in chosen]
+        tried = [objective([*chosen, v], surface, seen, positions, **options) - value for v in rest]
+        best = int(np.argmax(np.round(tried, 14)))
+        chosen.append(rest[best])
+        gains.append(tried[best])
+        value += tried[best]
+    return chosen, gains
+
+
+def facility(k, alike, wanted):
+    """Greedy facility location, by computing the objective from scratch."""
+    chosen = []
+    for _ in range(k):
+        tried = [-1 if v in chosen else wanted @ alike[:, [*chosen, v]].max(1) for v in range(len(alike))]
+        chosen.append(int(np.argmax(np.round(tried, 14))))
+    return chosen

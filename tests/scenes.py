@@ -1,0 +1,44 @@
+"""A small scene and views of it, for tests of whole stages."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from g2ard.cameras import Cameras, look_at
+from g2ard.splats import Splats
+
+
+def checkered_ball(n: int = 3000, seed: int = 0) -> Splats:
+    """Discs on a unit sphere, coloured in squares, nearly opaque; view-dependent a little."""
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(n, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    squares = (np.floor(3 * normals[:, 0]) + np.floor(3 * normals[:, 1])) % 2
+    color = np.where(squares[:, None] > 0, [0.9, 0.5, 0.1], [0.1, 0.3, 0.7])
+    half = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(n)], 1)  # z axis → normal
+    size = 1.6 * np.sqrt(4 * np.pi / n) / 2
+    return Splats.create(
+        normals.astype(np.float32),
+        quats=half,
+        scales=np.tile([size, size, size / 10], (n, 1)),
+        logit_opacities=rng.normal(2.5, 0.5, n),
+        sh0=((color - 0.5) / 0.28209479)[:, None],
+        shN=rng.normal(0, 0.03, (n, 3, 3)),
+    )
+
+
+def around(count: int = 16, size: tuple[int, int] = (64, 48), distance: float = 3.0) -> Cameras:
+    """Views on a Fibonacci sphere, facing the middle."""
+    i = np.arange(count) + 0.5
+    z = 1 - 2 * i / count
+    azimuth = np.pi * (1 + 5**0.5) * i
+    flat = np.sqrt(1 - z * z)
+    eyes = distance * np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z], 1)
+    width, height = size
+    K = [[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]
+    return Cameras.from_lists(
+        [look_at(eye, [0, 0, 0]) for eye in eyes],
+        [K] * count,
+        [size] * count,
+        [f"view_{k:03d}" for k in range(count)],
+    )

@@ -1,0 +1,190 @@
+"""The pipeline: exact budgets, one shot and rounds, resumable; and its command as a user types it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import around, checkered_ball
+
+from g2ard.distill import DistillConfig, distill
+from g2ard.errors import InputError
+from g2ard.evaluate import evaluate
+from g2ard.images import write_png
+from g2ard.io import Points, read_splats, write_points, write_splats, write_views
+from g2ard.recover.schedule import TUNED
+from g2ard.render import render
+from g2ard.splats import SH_C0, Splats
+from g2ard.targets import TeacherRenders
+
+CommandLine = Callable[..., tuple[int, str, str]]
+PRIOR = checkered_ball()
+ROUNDS = replace(TUNED, steps=20, round_steps=10)
+ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+
+
+@pytest.fixture(scope="module")
+def targets() -> TeacherRenders:
+    return TeacherRenders(PRIOR, around())
+
+
+def test_one_shot_reaches_the_budget_and_recovers(targets: TeacherRenders) -> None:
+    result = distill(PRIOR, 300, targets, DistillConfig(steps=120))
+    assert len(result.splats) == len(result.simplified) == 300
+    assert [entry["count"] for entry in result.report["rounds"]] == [300]
+    assert evaluate(result.splats, targets).psnr > evaluate(result.simplified, targets).psnr + 3
+
+
+def test_rounds_follow_the_paper_s_counts(targets: TeacherRenders) -> None:
+    result = distill(PRIOR, 1000, targets, DistillConfig(method="paper", schedule=ROUNDS))
+    assert [entry["count"] for entry in result.report["rounds"]] == [2250, 1688, 1266, 1000]
+    assert [len(entry["recover"]) for entry in result.report["rounds"]] == [1, 1, 1, 2]
+
+
+def test_an_interrupted_run_goes_on_to_the_same_bits(targets: TeacherRenders, tmp_path: Path) -> None:
+    config = DistillConfig(method="paper", schedule=ROUNDS)
+    whole = distill(PRIOR, 1000, targets, config)
+    calls = 0
+
+    def stop(stage: str, done: int, total: int, info: Any = None) -> None:
+        nonlocal calls
+        calls += stage == "recover round-3"
+        if calls == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        distill(PRIOR, 1000, targets, config, work=tmp_path, progress=stop)
+    resumed = distill(PRIOR, 1000, targets, config, work=tmp_path)
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(whole.splats, name), getattr(resumed.splats, name))
+    with pytest.raises(InputError, match="another run"):
+        distill(PRIOR, 1000, targets, replace(config, seed=1), work=tmp_path)
+
+
+def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -> None:
+    write_splats(tmp_path / "ball.ply", PRIOR)
+    ask = (
+        "distill",
+        "ball.ply",
+        "-r",
+        10,
+        "-o",
+        "run",
+        "--steps",
+        60,
+        "--method",
+        "paper",
+        "--size",
+        100,
+        "--json",
+        "-",
+    )
+    status, out, error = command_line(*ask, cwd=tmp_path)
+    assert status == 0, error
+    report = json.loads(out)
+    assert report["output_count"] == len(read_splats(tmp_path / "run" / "scene.ply")) == 300
+    assert report["scores"]["recovered"]["psnr"] > report["scores"]["simplified"]["psnr"]
+    assert report["against"] == "teacher renders"
+    left = sorted(p.name for p in (tmp_path / "run").iterdir())
+    assert left == ["preview.png", "report.json", "scene.ply", "views.json"]
+    status, _, error = command_line(*ask, cwd=tmp_path)
+    assert status == 1
+    assert "run" in error
+    assert "-w" in error
+
+
+def cloud_with_photos(folder: Path) -> None:
+    """A coloured cloud of the ball, and photos of it."""
+    colors = np.clip(0.5 + SH_C0 * PRIOR.sh0[:, 0], 0, 1).astype(np.float32)
+    write_points(folder / "cloud.ply", Points(PRIOR.means.astype(np.float64), colors))
+    views = around(12)
+    paths = []
+    for i, name in enumerate(views.names):
+        paths.append(folder / f"{name}.png")
+        write_png(paths[-1], render(PRIOR, views, i).image)
+    write_views(folder / "views.json", replace(views, image_paths=tuple(paths)))
+
+
+def test_command_on_a_cloud_with_photos(command_line: CommandLine, tmp_path: Path) -> None:
+    cloud_with_photos(tmp_path)
+    ask = ("distill", "cloud.ply", "-n", 400, "-o", "run", "--steps", 80, "--json", "-")
+    status, out, error = command_line(*ask, "--views", "views.json", cwd=tmp_path)
+    assert status == 0, error
+    report = json.loads(out)
+    assert report["against"] == "photos"
+    assert report["scores"]["recovered"]["psnr"] > report["scores"]["simplified"]["psnr"] + 2
+    result = read_splats(tmp_path / "run" / "scene.ply")
+    assert (len(result), result.sh_degree) == (400, 3)
+    status, _, error = command_line(*ask, "-w", cwd=tmp_path)
+    assert status == 2
+    assert "--views" in error
+
+
+def small(folder: Path) -> Splats:
+    scene = checkered_ball(50)
+    write_splats(folder / "s.ply", scene)
+    return scene
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (["distill", "absent.ply", "-r", "10", "-o", "run"], 1, "absent.ply"),
+        (["distill", "s.ply", "-n", "51", "-o", "run"], 1, "51"),
+        (["distill", "s.ply", "-n", "0", "-o", "run"], 2, "'0'"),
+        (["distill", "s.ply", "-n", "many", "-o", "run"], 2, "many"),
+        (["distill", "s.ply", "-r", "0.5", "-o", "run"], 2, "0.5"),
+        (["distill", "s.ply", "-o", "run"], 2, "-n COUNT or -r RATIO"),
+        (["distill", "s.ply", "-r", "2", "-o", "run", "--views", "none.json"], 1, "none.json"),
+        (["distill", "s.ply", "-r", "2", "-o", "nowhere/run"], 1, "nowhere"),
+        (["distill", "s.ply", "-r", "2", "-o", "run", "--schedule", "hasty"], 2, "hasty"),
+        (["distill", "s.ply", "-r", "2", "-o", "run", "--preset", "gentle"], 2, "gentle"),
+        (["distill", "s.ply", "-r", "2", "-o", "run", "--method", "magic"], 2, "magic"),
+        (["recover", "s.ply", "--views", "none.json", "-o", "out.ply"], 1, "none.json"),
+        (["recover", "s.ply", "--views", "v.json", "-o", "out.ply"], 1, "photo"),
+        (["recover", "s.ply", "--views", "v.json", "-o", "no/out.ply"], 1, "no"),
+        (["render", "s.ply", "--views", "none.json", "-o", "out"], 1, "none.json"),
+        (["render", "v.json", "--views", "v.json", "-o", "out"], 1, "v.json"),
+        (["evaluate", "s.ply", "--views", "v.json", "--teacher", "absent.ply"], 1, "absent.ply"),
+        (["evaluate", "s.ply", "--views", "v.json", "--split", "dev"], 1, "dev"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    arguments: list[str], status: int, words: str, command_line: CommandLine, tmp_path: Path
+) -> None:
+    small(tmp_path)
+    write_views(tmp_path / "v.json", around(8))
+    before = sorted(tmp_path.iterdir())
+    code, _, error = command_line(*arguments, cwd=tmp_path)
+    lines = [line for line in error.splitlines() if line.startswith("g2ard")]  # others tell of progress
+    assert code == status, error
+    assert len(lines) == 1, error
+    assert words in lines[0]
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_every_stage_writes_the_same_bytes_for_any_threads(command_line: CommandLine, tmp_path: Path) -> None:
+    cloud_with_photos(tmp_path)
+    write_splats(tmp_path / "ball.ply", PRIOR)
+    commands = [
+        ("lift", "cloud.ply", "-o", "lift.ply"),
+        ("simplify", "ball.ply", "-r", 8, "-o", "small.ply"),
+        ("recover", "small.ply", "--views", "views.json", "--steps", 30, "-o", "better.ply"),
+        ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 30, "--size", 80),
+        ("render", "better.ply", "--views", "views.json", "-o", "renders"),
+    ]
+    written = []
+    for threads in (1, 2):
+        for command in commands:
+            status, _, error = command_line(*command, "-w", "--threads", threads, cwd=tmp_path)
+            assert status == 0, error
+        files = [tmp_path / name for name in ("lift.ply", "small.ply", "better.ply", "run/scene.ply")]
+        files += sorted((tmp_path / "renders").iterdir())
+        written.append([file.read_bytes() for file in files])
+    assert len(written[0]) == 4 + 12
+    assert written[0] == written[1]

@@ -1,0 +1,103 @@
+"""No damaged file ends in a traceback: every reader answers with its data or with one line of InputError."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_io_clouds import columns, las, ply
+from test_io_packed import compressed, save_spz, truth
+from test_io_sog import parts
+from test_views import colmap, orbit, transforms, views
+
+from g2ard.errors import InputError
+from g2ard.io import kind, read_cloud, read_scene, read_view_set, write_splats, write_views
+
+
+def ascii_cloud(path: Path) -> Path:
+    lines = ["ply", "format ascii 1.0", "element vertex 3"]
+    lines += [f"property float {a}" for a in "xyz"]
+    lines += [f"property uchar {c}" for c in ("red", "green", "blue")]
+    lines += ["end_header", "0 0 1 1 2 3", "1 0 0 4 5 6", "0 1 0 7 8 9"]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def bundle(path: Path) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in parts().items():
+            archive.writestr(name, content)
+    return path
+
+
+def saved(path: Path, write: Callable[..., None], what: object) -> Path:
+    write(path, what)
+    return path
+
+
+def table(folder: Path, name: str, text: bool = False) -> Path:
+    return colmap(folder / "project", orbit(3), text) / "sparse" / "0" / name
+
+
+MAKERS: dict[str, Callable[[Path], Path]] = {
+    "scene": lambda f: saved(f / "a.ply", write_splats, truth(9, 1)),
+    "compressed": lambda f: compressed(f / "a.ply", truth(9, 1)),
+    "spz 3": lambda f: save_spz(f / "a.spz", truth(9, 1), 3),
+    "spz 4": lambda f: save_spz(f / "a.spz", truth(9, 1), 4),
+    "splat": lambda f: saved(f / "a.splat", write_splats, truth(9, 0)),
+    "sog": lambda f: bundle(f / "a.sog"),
+    "cloud": lambda f: ply(f / "a.ply", columns("f4", "u1"), np.arange(36.0).reshape(6, 6), faces=3),
+    "ascii cloud": lambda f: ascii_cloud(f / "a.ply"),
+    "las": lambda f: las(f / "a.las", np.arange(30.0).reshape(10, 3), np.ones((10, 3), int)),
+    "cameras.bin": lambda f: table(f, "cameras.bin"),
+    "images.bin": lambda f: table(f, "images.bin"),
+    "points3D.bin": lambda f: table(f, "points3D.bin"),
+    "images.txt": lambda f: table(f, "images.txt", text=True),
+    "transforms": lambda f: transforms(f / "a.json", orbit(2)),
+    "views": lambda f: saved(f / "a.json", write_views, views(2)),
+}
+
+
+def damaged(content: bytes, rng: np.random.Generator) -> bytes:
+    """Some bytes changed, a piece cut out or doubled, or the end cut off; the front half more often."""
+    data = bytearray(content)
+    at = int(len(data) * rng.random() ** 2)
+    match rng.integers(4):
+        case 0:
+            for _ in range(rng.integers(1, 5)):
+                data[int(len(data) * rng.random() ** 2)] = rng.integers(256)
+        case 1:
+            del data[at : at + rng.integers(1, 40)]
+        case 2:
+            data[at:at] = data[at : at + rng.integers(1, 40)]
+        case _:
+            del data[at:]
+    return bytes(data)
+
+
+def attempt(path: Path) -> str | None:
+    """Read a file; the error line, if there is one."""
+    try:
+        {"splats": read_scene, "points": read_cloud, "views": read_view_set}[kind(path)](path)
+    except InputError as error:
+        return str(error)
+    return None
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("what", MAKERS)
+def test_damage_is_an_input_error_at_worst(tmp_path: Path, what: str) -> None:
+    path = MAKERS[what](tmp_path)
+    content = path.read_bytes()
+    assert attempt(path) is None
+    rng = np.random.default_rng(sum(map(ord, what)))
+    refused = 0
+    for _ in range(150):
+        path.write_bytes(damaged(content, rng))
+        line = attempt(path)
+        refused += line is not None
+        assert line is None or ("\n" not in line and str(tmp_path) in line)
+    assert refused > 20

@@ -1,0 +1,297 @@
+""".compressed.ply, .spz and .splat: packed here by plain loops, and real files held against each other."""
+
+from __future__ import annotations
+
+import gzip
+import importlib
+import math
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData, PlyElement
+from realdata import real
+
+from g2ard.errors import InputError, MissingDependencyError
+from g2ard.io import kind, read_scene, read_splats, write_splats
+from g2ard.io.clean import LOGIT_LIMIT
+from g2ard.splats import Splats
+
+
+def rotations(count: int, seed: int) -> np.ndarray:
+    """(N, 4) unit wxyz, each component largest in turn and positive there."""
+    q = np.random.default_rng(seed).uniform(-1, 1, (count, 4))
+    q[np.arange(count), np.arange(count) % 4] = 1.5
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+
+# ── .compressed.ply ──────────────────────────────────────────────────────────────────────────────────
+
+
+def pack(values: list[float], bits: list[int]) -> int:
+    word = 0
+    for value, width in zip(values, bits, strict=True):
+        word = (word << width) | round(value * ((1 << width) - 1))
+    return word
+
+
+def compressed(path: Path, truth: Splats, *, chunk_colors: bool = True, chunk_size: int = 256) -> Path:
+    """Pack a scene as SuperSplat does."""
+    count, logs, colors = len(truth), np.log(truth.scales.astype(float)), truth.colors.astype(float)
+    axes = {"": truth.means.astype(float), "_scale": logs, "_color": colors}
+    chunks, words = [], []
+    for start in range(0, count, chunk_size):
+        rows = range(start, min(start + chunk_size, count))
+        bounds = {key: (v[rows].min(0), v[rows].max(0)) for key, v in axes.items()}
+        if not chunk_colors:
+            bounds["_color"] = (np.zeros(3), np.ones(3))
+        chunks.append(tuple(np.concatenate([np.concatenate(b) for b in bounds.values()])))
+        for i in rows:
+            t = {k: (axes[k][i] - lo) / np.maximum(hi - lo, 1e-12) for k, (lo, hi) in bounds.items()}
+            q = truth.quats[i].astype(float)
+            largest = int(np.argmax(np.abs(q)))
+            small = [q[k] / math.sqrt(2) + 0.5 for k in range(4) if k != largest]
+            words.append(
+                (
+                    pack(list(t[""]), [11, 10, 11]),
+                    (largest << 30) | pack(small, [10, 10, 10]),
+                    pack(list(t["_scale"]), [11, 10, 11]),
+                    pack([*t["_color"], float(truth.opacities[i])], [8, 8, 8, 8]),
+                )
+            )
+    names = [f"{end}{what}_{a}" for what in ("", "_scale") for end in ("min", "max") for a in "xyz"]
+    names += [f"{end}_{a}" for end in ("min", "max") for a in "rgb"]
+    chunk = np.array(chunks, [(n, "f4") for n in names])
+    if not chunk_colors:
+        chunk = chunk[names[:12]].astype([(n, "f4") for n in names[:12]])
+    packed = [f"packed_{n}" for n in ("position", "rotation", "scale", "color")]
+    vertex = np.array(words, [(n, "u4") for n in packed])
+    elements = [PlyElement.describe(chunk, "chunk"), PlyElement.describe(vertex, "vertex")]
+    rest = truth.shN.shape[1]
+    if rest:
+        sh = np.zeros(count, [(f"f_rest_{k}", "u1") for k in range(3 * rest)])
+        for k in range(3 * rest):
+            value = truth.shN[:, k % rest, k // rest].astype(float)
+            sh[f"f_rest_{k}"] = np.clip(np.floor((value / 8 + 0.5) * 256), 0, 255)
+        elements.append(PlyElement.describe(sh, "sh"))
+    PlyData(elements, byte_order="<").write(str(path))
+    return path
+
+
+def truth(count: int, degree: int, seed: int = 0) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats.create(
+        rng.uniform(-2, 2, (count, 3)).astype(np.float32),
+        quats=rotations(count, seed),
+        scales=np.exp(rng.uniform(-8, -2, (count, 3))),
+        logit_opacities=rng.uniform(-4, 4, count),
+        sh0=rng.uniform(-1.2, 1.2, (count, 1, 3)),
+        shN=rng.uniform(-0.9, 0.9, (count, (degree + 1) ** 2 - 1, 3)),
+    )
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_compressed_ply(tmp_path: Path, degree: int) -> None:
+    scene = truth(300, degree)
+    path = compressed(tmp_path / "a.compressed.ply", scene)
+    assert kind(path) == "splats"
+    found = read_splats(path)
+    np.testing.assert_allclose(found.means, scene.means, atol=4 / 1023 / 2 + 1e-6)
+    np.testing.assert_allclose(found.log_scales, scene.log_scales, atol=6 / 1023 / 2 + 1e-5)
+    np.testing.assert_allclose(found.quats, scene.quats, atol=2e-3)
+    np.testing.assert_allclose(found.opacities, scene.opacities, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(found.colors, scene.colors, atol=0.7 / 255 / 2 + 1e-3)
+    np.testing.assert_allclose(found.shN, scene.shN, atol=8 / 256 / 2 + 1e-6)
+
+
+def test_compressed_ply_without_chunk_colors(tmp_path: Path) -> None:
+    found = read_splats(compressed(tmp_path / "a.ply", truth(20, 0), chunk_colors=False))
+    np.testing.assert_allclose(found.colors, truth(20, 0).colors, atol=0.5 / 255 + 1e-6)
+
+
+def test_compressed_ply_with_too_few_chunks(tmp_path: Path) -> None:
+    path = compressed(tmp_path / "a.ply", truth(300, 0))
+    ply = PlyData.read(path, mmap=False)
+    ply.elements = [PlyElement.describe(ply["chunk"].data[:1].copy(), "chunk"), ply["vertex"]]
+    ply.write(str(path))
+    with pytest.raises(InputError, match="1 chunks and 300 Gaussians do not fit"):
+        read_splats(path)
+
+
+def test_truncated_compressed_ply(tmp_path: Path) -> None:
+    path = compressed(tmp_path / "a.ply", truth(300, 0))
+    path.write_bytes(path.read_bytes()[:-10])
+    with pytest.raises(InputError, match=r"truncated: .* 300 rows"):
+        read_splats(path)
+
+
+# ── .spz ─────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def spz_streams(scene: Splats, version: int, fraction_bits: int = 12) -> list[bytes]:
+    """The attributes as SPZ stores them: right-up-back, so y and z and what is odd in them change sign."""
+    byte = lambda v: np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes()  # noqa: E731
+    positions, quats = b"", b""
+    for mean in scene.means.astype(float) * (1, -1, -1):
+        for value in mean:
+            positions += struct.pack("<i", round(value * (1 << fraction_bits)))[:3]
+    for w, x, y, z in scene.quats.astype(float) * (1, 1, -1, -1):
+        if version == 2:
+            sign = -1 if w < 0 else 1
+            quats += byte(np.array([x, y, z]) * sign * 127.5 + 127.5)
+            continue
+        xyzw = np.array([x, y, z, w])
+        largest = int(np.argmax(np.abs(xyzw)))
+        word = largest
+        for i in range(4):
+            if i != largest:
+                value = xyzw[i] * np.sign(xyzw[largest])
+                word = word << 10 | (value < 0) << 9 | round(abs(value) * math.sqrt(2) * 511)
+        quats += struct.pack("<I", int(word))
+    odd = np.array([parity(band, m) for band in (1, 2, 3) for m in range(-band, band + 1)])
+    rest = scene.shN.astype(float) * odd[: scene.shN.shape[1], None]
+    return [
+        positions,
+        byte(scene.opacities * 255),
+        byte((scene.sh0[:, 0] * 0.15 + 0.5) * 255),
+        byte((np.log(scene.scales) + 10) * 16),
+        quats,
+        byte(rest * 128 + 128),
+    ]
+
+
+def parity(degree: int, order: int) -> int:
+    """Sign that a real harmonic takes when y and z change sign, a half turn about x.
+
+    y → −y alone turns sin(mφ) into its negative; z → −z alone multiplies by (−1)^(l+|m|).
+    """
+    return (-1 if order < 0 else 1) * (-1) ** (degree + abs(order))
+
+
+def save_spz(path: Path, scene: Splats, version: int, magic: bytes = b"NGSP") -> Path:
+    streams = spz_streams(scene, version)
+    streams = streams if scene.sh_degree else streams[:5]
+    head = magic + struct.pack("<IIBBB", version, len(scene), scene.sh_degree, 12, 0)
+    if version < 4:
+        path.write_bytes(gzip.compress(head + b"\0" + b"".join(streams)))
+        return path
+    zstd = importlib.import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
+    packed = [zstd.compress(s) for s in streams]
+    table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
+    gap = b"extension"  # the header says where the table begins
+    head += bytes([len(streams)]) + struct.pack("<I12x", 32 + len(gap))
+    path.write_bytes(head + gap + table + b"".join(packed))
+    return path
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_spz(tmp_path: Path, version: int, degree: int) -> None:
+    scene = truth(50, degree, seed=version)
+    found = read_splats(save_spz(tmp_path / "a.spz", scene, version))
+    np.testing.assert_allclose(found.means, scene.means, atol=0.5 / 4096 + 1e-7)
+    np.testing.assert_allclose(found.log_scales, scene.log_scales, atol=0.5 / 16 + 1e-5)
+    np.testing.assert_allclose(found.opacities, scene.opacities, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(found.sh0, scene.sh0, atol=0.5 / 255 / 0.15 + 1e-6)
+    np.testing.assert_allclose(found.shN, scene.shN, atol=0.5 / 128 + 1e-6)
+    same = np.abs((found.quats * scene.quats).sum(1))
+    assert same.min() > (0.99 if version == 2 else 0.99999)  # w is derived in version 2, coarse near 0
+
+
+def test_spz_flips_are_a_half_turn_about_x() -> None:
+    """Colour seen along d in our axes equals colour seen along (x, −y, −z) in SPZ's."""
+    from g2ard.io.spz import _FLIPS
+
+    assert [parity(band, m) for band in (1, 2, 3) for m in range(-band, band + 1)] == _FLIPS.tolist()
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_truncated_spz(tmp_path: Path, version: int) -> None:
+    path = save_spz(tmp_path / "a.spz", truth(50, 1), version)
+    for keep in (0.5, 0.95):
+        path.write_bytes(save_spz(tmp_path / "b.spz", truth(50, 1), version).read_bytes())
+        path.write_bytes(path.read_bytes()[: int(path.stat().st_size * keep)])
+        with pytest.raises(InputError, match=r"a\.spz: (truncated|broken|stream)"):
+            read_splats(path)
+
+
+def test_not_an_spz(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="not an SPZ"):
+        read_splats(save_spz(tmp_path / "a.spz", truth(3, 0), 3, magic=b"NOPE"))
+    (tmp_path / "b.spz").write_bytes(b"")
+    with pytest.raises(InputError, match="not an SPZ"):
+        read_splats(tmp_path / "b.spz")
+    nine = tmp_path / "nine.spz"
+    nine.write_bytes(gzip.compress(b"NGSP" + struct.pack("<IIBBBB", 9, 1, 0, 12, 0, 0)))
+    with pytest.raises(InputError, match="version 9"):
+        read_splats(nine)
+
+
+def test_spz_without_zstandard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = save_spz(tmp_path / "a.spz", truth(3, 0), 4)
+    for name in ("backports", "backports.zstd", "compression.zstd"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(MissingDependencyError, match=r"pip install g2ard\[spz\]"):
+        read_splats(path)
+
+
+def test_spz_equals_compressed_ply_of_the_same_scene() -> None:
+    a = read_scene(real("format_samples", "biker.spz"))
+    b = read_scene(real("format_samples", "biker.compressed.ply"))
+    assert len(a.splats) == len(b.splats) == 152_746
+    for scene in (a, b):
+        assert {n.code: n.count for n in scene.notes} == {"clamped_logits": 198}
+    np.testing.assert_allclose(a.splats.means, b.splats.means, atol=0.5 / 4096 + 1e-6)
+    coarse = np.maximum(b.splats.log_scales, -10)  # SPZ's floor
+    np.testing.assert_allclose(a.splats.log_scales, coarse, atol=0.5 / 16 + 1e-5)
+    np.testing.assert_allclose(a.splats.opacities, b.splats.opacities, atol=1e-6)
+    np.testing.assert_allclose(a.splats.sh0, b.splats.sh0, atol=0.5 / 255 / 0.15 + 1e-6)
+    assert np.abs((a.splats.quats * b.splats.quats).sum(1)).min() > 0.9999
+
+
+def test_guitar_counts() -> None:
+    found = read_scene(real("format_samples", "guitar.compressed.ply"))
+    assert len(found.splats) == 90_854
+    assert {n.code: n.count for n in found.notes} == {"clamped_logits": 667}
+
+
+# ── .splat ───────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_splat_by_hand(tmp_path: Path) -> None:
+    row = struct.pack("<6f8B", 1, 2, 3, 0.1, 0.2, 0.3, 255, 0, 128, 64, 255, 128, 0, 128)
+    (tmp_path / "a.splat").write_bytes(row)
+    splats = read_splats(tmp_path / "a.splat")
+    np.testing.assert_allclose(splats.means, [[1, 2, 3]])
+    np.testing.assert_allclose(splats.scales, [[0.1, 0.2, 0.3]], rtol=1e-6)
+    np.testing.assert_allclose(splats.colors, [[1, 0, 128 / 255]], atol=1e-6)
+    np.testing.assert_allclose(splats.opacities, [64 / 255], atol=1e-6)
+    np.testing.assert_allclose(splats.quats, [[127 / 128, 0, -1, 0]])
+
+
+def test_splat_round_trip(tmp_path: Path) -> None:
+    scene = truth(40, 2)
+    write_splats(tmp_path / "a.splat", scene)
+    found = read_splats(tmp_path / "a.splat")
+    order = np.argsort(-(scene.scales.astype(float).prod(1) * scene.opacities), kind="stable")
+    expected = scene.take(order)
+    np.testing.assert_array_equal(found.means, expected.means)
+    np.testing.assert_allclose(found.scales, expected.scales, rtol=1e-6)
+    np.testing.assert_allclose(found.opacities, expected.opacities, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(found.colors, np.clip(expected.colors, 0, 1), atol=0.5 / 255 + 1e-6)
+    assert np.abs((found.quats * expected.quats).sum(1)).min() > 0.97
+
+
+@pytest.mark.parametrize("size", [0, 33])
+def test_odd_size_is_no_splat(tmp_path: Path, size: int) -> None:
+    (tmp_path / "a.splat").write_bytes(b"\0" * size)
+    with pytest.raises(InputError, match="multiple of 32"):
+        read_splats(tmp_path / "a.splat")
+
+
+def test_full_opacity_in_splat_is_clamped(tmp_path: Path) -> None:
+    row = struct.pack("<6f8B", 0, 0, 0, 1, 1, 1, 9, 9, 9, 255, 255, 128, 128, 128)
+    (tmp_path / "a.splat").write_bytes(row)
+    assert read_splats(tmp_path / "a.splat").logit_opacities[0] == LOGIT_LIMIT

@@ -1,0 +1,74 @@
+"""What pools of poses are planned with: even sequences, fair orders, the occupancy grid, the ground."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from g2ard.poses.grid import Grid
+from g2ard.poses.lattice import halton, strata
+from g2ard.poses.matter import Matter
+from g2ard.poses.site import Site
+from g2ard.poses.terrain import Terrain
+
+sys.path.insert(0, str(Path(__file__).parent))
+from reference import poses as naive
+
+
+def test_strata_take_one_of_each_neighbourhood() -> None:
+    x = np.random.default_rng(0).permutation(60)
+    order = strata(x[:, None].astype(float), 8, seed=1)
+    assert sorted(order) == list(range(60))
+    for start in range(0, 56, 8):
+        assert np.ptp(x[order[start : start + 8]]) == 7
+
+
+def test_halton_goes_on_where_it_stopped() -> None:
+    np.testing.assert_array_equal(halton(0, 30, 6, 3)[10:], halton(10, 30, 6, 3))
+
+
+def test_grid_equals_its_naive_twin() -> None:
+    matter = Matter.of(naive.statue())
+    grid = Grid.of(np.full(3, -0.5), np.full(3, 0.5), matter, np.eye(3), cells=2000)
+    opaque = grid.opaque == 0
+    assert 0.02 < opaque.mean() < 0.9
+    np.testing.assert_array_equal(grid.opaque, naive.king_steps(opaque, 12))
+    np.testing.assert_array_equal(grid.murky, naive.king_steps(grid.murky == 0, 12))
+    rng = np.random.default_rng(0)
+    eyes = rng.uniform(-1, 1, (60, 3))
+    ways = rng.uniform(-0.5, 0.5, (60, 3)) - eyes  # most of them through the box
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    got = grid.cast(eyes, ways)
+    want = np.array(
+        [naive.first_hit(opaque, grid.low, grid.cell, e, w) for e, w in zip(eyes, ways, strict=True)]
+    )
+    assert 10 < np.isfinite(want).sum() < 60
+    hit = np.isfinite(want) & np.isfinite(got)
+    assert (np.isfinite(want) != np.isfinite(got)).sum() <= 2  # corners cut between two steps
+    assert (np.abs(got[hit] - want[hit]) < 0.7 * grid.cell).mean() > 0.9
+    assert (got[hit] > want[hit] - 0.02 * grid.cell).all()
+
+
+def test_distance_is_never_too_long() -> None:
+    site = Site.of(naive.statue())
+    cells = np.argwhere(site.grid.murky == 0)
+    points = np.random.default_rng(0).uniform(site.grid.low - 0.3, -site.grid.low + 0.3, (40, 3))
+    low = site.grid.low + cells * site.grid.cell
+    for point, found in zip(points, site.grid.distance(points), strict=True):
+        gap = np.maximum(0, np.maximum(low - point, point - low - site.grid.cell))
+        assert found <= np.linalg.norm(gap, axis=1).min() + 1e-9
+
+
+def test_terrain_follows_slopes_and_goes_under_roofs() -> None:
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(0, 24, (60_000, 2))
+    z = 0.2 * xy[:, 0]
+    roof = (np.abs(xy - 12.5) < 1).all(axis=1)
+    z[roof] += 5
+    points = np.concatenate([xy, z[:, None]], axis=1)
+    terrain = Terrain.of(points, np.ones(len(points)), np.array([[0, 0, 0], [24, 24, 10.0]]))
+    at = rng.uniform(3, 21, (200, 3))
+    np.testing.assert_allclose(terrain.height(at), 0.2 * at[:, 0], atol=0.3)
+    np.testing.assert_allclose(terrain.height(np.array([[12.5, 12.5, 0]])), 2.5, atol=0.4)

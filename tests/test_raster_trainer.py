@@ -1,0 +1,253 @@
+"""The fused trainer does what rasterize + l1_ssim + torch's Adam do, to rounding; sparse and resumable."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from test_raster import NAMES, Params, camera, scene, tensors_of
+
+from g2ard import _core
+from g2ard.cameras import Cameras
+from g2ard.errors import InputError
+from g2ard.recover.anchors import Anchors, Regularizers
+from g2ard.recover.losses import l1_ssim
+from g2ard.recover.rasterize import rasterize
+from g2ard.recover.regularize import TorchAnchors, regularization
+from g2ard.render import RasterSettings, view_of
+from g2ard.splats import Splats
+
+RATES = {"means": 2e-3, "quats": 1e-2, "log_scales": 2e-2, "logit_opacities": 5e-2, "sh0": 2e-2, "shN": 2e-3}
+BACKGROUND = [0.1, 0.2, 0.3]
+SETTINGS = RasterSettings()
+
+
+def arrays(p: Params) -> tuple[NDArray[np.float32], ...]:
+    return tuple(p[k] for k in NAMES)
+
+
+def trainer_of(p: Params, units: NDArray[np.float32] | None = None, isa: str | None = None) -> _core.Trainer:
+    return _core.Trainer(arrays(p), units, isa)
+
+
+def step(trainer: _core.Trainer, v: Cameras, target: Any, regularizers: Any = None) -> tuple[float, int]:
+    view = view_of(v, 0, SETTINGS)
+    rates = list(RATES.values())
+    return trainer.step(view, SETTINGS.choices, BACKGROUND, target, 0.2, rates, regularizers)
+
+
+def problem(n: int = 200, degree: int = 3, views: int = 3) -> tuple[Params, list[Cameras], list[Any]]:
+    rng = np.random.default_rng(1)
+    p = scene(7, n, degree, size=0.15, spread=0.5)
+    cameras = [camera(56, 40, seed=s) for s in range(views)]
+    targets = [rng.random((40, 56, 3)).astype(np.float32) for _ in cameras]
+    return p, cameras, targets
+
+
+class Twin:
+    """Torch's step, but only for rows with a gradient, each with its own count: Adam in float64."""
+
+    def __init__(self, p: Params, units: NDArray[np.float32] | None = None) -> None:
+        self.p = {k: v.astype(np.float64) for k, v in p.items()}
+        self.m = {k: np.zeros_like(v) for k, v in self.p.items()}
+        self.v = {k: np.zeros_like(v) for k, v in self.p.items()}
+        self.t = np.zeros(len(p["means"]))
+        self.units = np.ones(len(self.t)) if units is None else units.astype(np.float64)
+
+    def step(self, cameras: Cameras, target: Any, extra: Any = None) -> float:
+        mine = tensors_of({k: v.astype(np.float32) for k, v in self.p.items()})
+        image, _, _ = rasterize(*mine, cameras, 0, background=BACKGROUND, settings=SETTINGS)
+        loss = l1_ssim(image, torch.from_numpy(target), 0.2)
+        total = loss if extra is None else loss + extra(dict(zip(NAMES, mine, strict=True)))
+        total.backward()
+        grads = {k: m.grad.double().numpy() for k, m in zip(NAMES, mine, strict=True) if m.grad is not None}
+        rows = np.zeros(len(self.t), bool)
+        for g in grads.values():
+            rows |= (g.reshape(len(g), -1) != 0).any(1) if g.size else False
+        self.t += rows
+        for k, g in grads.items():
+            r = rows.reshape(-1, *[1] * (g.ndim - 1))
+            t = np.maximum(self.t, 1).reshape(r.shape)
+            self.m[k] = np.where(r, 0.9 * self.m[k] + 0.1 * g, self.m[k])
+            self.v[k] = np.where(r, 0.999 * self.v[k] + 0.001 * g * g, self.v[k])
+            m, v = self.m[k] / (1 - 0.9**t), self.v[k] / (1 - 0.999**t)
+            unit = self.units.reshape(r.shape) if k == "means" else 1.0
+            self.p[k] = np.where(r, self.p[k] - RATES[k] * unit * m / (np.sqrt(v) + 1e-15), self.p[k])
+        return loss.item()
+
+
+def assert_close(
+    got: list[NDArray[np.float32]], want: dict[str, NDArray[Any]], start: Params, to: float
+) -> None:
+    for name, a in zip(NAMES, got, strict=True):
+        if not a.size:
+            continue
+        moved = np.linalg.norm(want[name] - start[name])
+        # Adam turns a gradient lost in rounding into a full step: a few rows may differ, most may not.
+        close = np.abs(a - want[name]) <= to * np.maximum(np.abs(want[name] - start[name]), RATES[name])
+        assert close.mean() > 0.99, f"{name}: {1 - close.mean():.4f} of the values differ"
+        assert np.linalg.norm(a - want[name]) < 0.1 * moved, name
+
+
+@pytest.mark.parametrize("isa", _core.instruction_sets())
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_steps_are_torch_s(degree: int, isa: str) -> None:
+    p, cameras, targets = problem(degree=degree)
+    units = np.exp(p["log_scales"]).max(1)
+    trainer, twin = trainer_of(p, units, isa), Twin(p, units)
+    for i in range(6):
+        loss, updated = step(trainer, cameras[i % 3], targets[i % 3])
+        want = twin.step(cameras[i % 3], targets[i % 3])
+        assert abs(loss - want) < 1e-4
+        assert 0 < updated <= len(p["means"])
+    assert_close(trainer.arrays(), twin.p, p, to=2e-2)
+    assert trainer.skipped == 0
+
+
+def test_dense_steps_are_torch_optim_s() -> None:
+    """With every Gaussian in view, sparse Adam is `torch.optim.Adam`."""
+    p, cameras, targets = problem(n=60)
+    p["means"] *= 0.5
+    p["logit_opacities"] = np.abs(p["logit_opacities"])
+    p["sh0"] = np.abs(
+        p["sh0"]
+    )  # a colour clamped at 0 gets no gradient, and dense Adam goes on with its momentum
+    p["shN"] *= 0
+    mine = tensors_of(copy.deepcopy(p))  # the optimiser writes into them
+    groups = [{"params": [m], "lr": RATES[k]} for k, m in zip(NAMES, mine, strict=True)]
+    adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)
+    trainer = trainer_of(p)
+    for _ in range(4):
+        adam.zero_grad()
+        image, _, _ = rasterize(*mine, cameras[0], 0, background=BACKGROUND)
+        l1_ssim(image, torch.from_numpy(targets[0]), 0.2).backward()
+        adam.step()
+        _, updated = step(trainer, cameras[0], targets[0])
+        assert updated == 60
+    want = {k: m.detach().double().numpy() for k, m in zip(NAMES, mine, strict=True)}
+    assert_close(trainer.arrays(), want, p, to=2e-2)
+
+
+def test_untouched_gaussians_do_not_move() -> None:
+    p, cameras, targets = problem()
+    p["means"][:50] += 100
+    trainer = trainer_of(p)
+    for _ in range(3):
+        _, updated = step(trainer, cameras[0], targets[0])
+        assert updated <= 150
+    for name, a in zip(NAMES, trainer.arrays(), strict=True):
+        assert np.array_equal(a[:50], p[name][:50])
+    assert not np.array_equal(trainer.arrays()[0][50:], p["means"][50:])
+
+
+def test_resume_is_bitwise() -> None:
+    p, cameras, targets = problem()
+    straight = trainer_of(p, np.full(200, 0.5, np.float32))
+    for i in range(6):
+        step(straight, cameras[i % 3], targets[i % 3])
+        if i == 2:
+            state = copy.deepcopy(straight.state())
+            middle = dict(zip(NAMES, straight.arrays(), strict=True))
+    resumed = trainer_of(middle)
+    resumed.load(state)
+    for i in range(3, 6):
+        step(resumed, cameras[i % 3], targets[i % 3])
+    for key, value in straight.state().items():
+        assert value.tobytes() == resumed.state()[key].tobytes(), key
+
+
+def test_bits_do_not_depend_on_threads() -> None:
+    p, cameras, targets = problem(n=5000)
+    before = _core.num_threads()
+    try:
+        states = []
+        for threads in (1, 2, 8):
+            _core.set_num_threads(threads)
+            trainer = trainer_of(p)
+            losses = [step(trainer, cameras[i], targets[i])[0] for i in range(3)]
+            states.append((losses, {k: v.tobytes() for k, v in trainer.state().items()}))
+    finally:
+        _core.set_num_threads(before)
+    assert states[0] == states[1] == states[2]
+
+
+@pytest.mark.parametrize(
+    "weights",
+    [
+        Regularizers(5.0, 0.0, False),
+        Regularizers(0.0, 3.0, False),
+        Regularizers(0.0, 3.0, True),
+        Regularizers(5, 3, True),
+    ],
+)
+def test_regularizers_are_torch_s(weights: Regularizers) -> None:
+    """From a scene that has left its anchors, needles among it: the step is that of the summed gradient."""
+    p, cameras, targets = problem(n=100, degree=0)
+    splats = Splats(
+        means=p["means"],
+        quats=p["quats"],
+        scales=np.exp(p["log_scales"]),
+        logit_opacities=p["logit_opacities"],
+        sh0=p["sh0"],
+        shN=p["shN"],
+    )
+    anchors = Anchors.of(splats)
+    rng = np.random.default_rng(3)
+    p["means"] += (0.3 * rng.normal(size=p["means"].shape)).astype(np.float32)
+    p["log_scales"] += rng.normal(size=p["log_scales"].shape).astype(np.float32)
+    p["log_scales"][::5, 1:] -= 6
+    p["quats"] += (0.3 * rng.normal(size=p["quats"].shape)).astype(np.float32)
+    torch_anchors = TorchAnchors(anchors)
+
+    def extra(q: dict[str, torch.Tensor]) -> torch.Tensor:
+        return regularization(q["means"], q["quats"], q["log_scales"], torch_anchors, weights)
+
+    trainer, twin = trainer_of(p), Twin(p)
+    trainer.anchor(anchors.means, np.ascontiguousarray(anchors.frames), anchors.r_parallel, anchors.r_perp)
+    for i in range(3):
+        step(trainer, cameras[i], targets[i], (weights.anchor, weights.shape, weights.effective_rank))
+        twin.step(cameras[i], targets[i], extra)
+    assert_close(trainer.arrays(), twin.p, p, to=3e-2)
+    # The moments hold the gradients themselves: they show the scale that Adam's steps hide.
+    first = trainer.state()["first"].reshape(100, -1)
+    for name, columns in (("means", slice(0, 3)), ("quats", slice(3, 7)), ("log_scales", slice(7, 10))):
+        error = np.linalg.norm(first[:, columns] - twin.m[name]) / np.linalg.norm(twin.m[name])
+        assert error < 2e-3, f"{name}: {error}"
+
+
+def test_gradients_that_are_not_finite_are_skipped_and_counted() -> None:
+    p, cameras, targets = problem(n=50)
+    target = targets[0].copy()
+    target[20, 28] = np.nan
+    trainer = trainer_of(p)
+    _, updated = step(trainer, cameras[0], target)
+    assert trainer.skipped > 0
+    assert updated + trainer.skipped <= 50
+    assert all(np.isfinite(a).all() for a in trainer.arrays())
+
+
+def test_hundreds_of_steps_stay_finite_and_learn() -> None:
+    p, cameras, targets = problem(n=300)
+    flat = [np.full_like(t, 0.4) for t in targets]
+    trainer = trainer_of(p)
+    losses = [step(trainer, cameras[i % 3], flat[i % 3])[0] for i in range(300)]
+    assert losses[-1] < 0.25 * losses[0]
+    assert all(np.isfinite(a).all() for a in trainer.arrays())
+
+
+def test_bad_input_is_named() -> None:
+    p, cameras, targets = problem(n=10)
+    with pytest.raises(InputError, match="target: expected 6720 values"):
+        step(trainer_of(p), cameras[0], targets[0][:5])
+    with pytest.raises(InputError, match="anchors set before"):
+        step(trainer_of(p), cameras[0], targets[0], (1.0, 1.0, True))
+    with pytest.raises(InputError, match="units: expected 10 values"):
+        trainer_of(p, np.ones(9, np.float32))
+    state = trainer_of(p).state()
+    state["order"][:] = 0
+    with pytest.raises(InputError, match="order: expected a permutation"):
+        trainer_of(p).load(state)

@@ -1,0 +1,156 @@
+"""The recovery loop: it recovers, both engines agree, it resumes to the same bits, it holds the anchors."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import around, checkered_ball
+
+from g2ard import _core
+from g2ard.errors import InputError
+from g2ard.evaluate import evaluate
+from g2ard.recover import RecoverConfig, recover
+from g2ard.recover.anchors import PRESETS, Regularizers
+from g2ard.recover.schedule import PAPER
+from g2ard.simplify import simplify
+from g2ard.splats import Splats
+from g2ard.targets import TeacherRenders
+
+ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+VIEWS = around()
+TEACHER = checkered_ball()
+
+
+@pytest.fixture(scope="module")
+def targets() -> TeacherRenders:
+    return TeacherRenders(TEACHER, VIEWS)
+
+
+@pytest.fixture(scope="module")
+def student() -> Splats:
+    return simplify(TEACHER, 500).splats
+
+
+def assert_same_bits(a: Splats, b: Splats) -> None:
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+@pytest.mark.parametrize("engine", ["fused", "torch"])
+def test_recovery_lifts_unseen_views(student: Splats, targets: TeacherRenders, engine: Any) -> None:
+    result = recover(student, targets, RecoverConfig(steps=150, engine=engine))
+    unseen = TeacherRenders(TEACHER, around(7, (80, 60), 2.5))
+    assert len(result.splats) == len(student)
+    assert evaluate(result.splats, unseen).psnr > evaluate(student, unseen).psnr + 3
+    assert result.report["psnr"]["after"] > result.report["psnr"]["before"] + 3
+    assert len(result.report["loss"]) == 100
+
+
+def test_both_engines_take_the_same_way(student: Splats, targets: TeacherRenders) -> None:
+    scores = [
+        recover(student, targets, RecoverConfig(steps=60, engine=engine)).report["psnr"]["after"]
+        for engine in ("fused", "torch")
+    ]
+    assert abs(scores[0] - scores[1]) < 0.3
+
+
+def test_same_bits_from_run_to_run_and_for_any_threads(student: Splats, targets: TeacherRenders) -> None:
+    config = RecoverConfig(steps=25, regularizers=replace(PRESETS["noisy"], period=10))
+    before = _core.num_threads()
+    try:
+        results = []
+        for threads in (1, 2, 8):
+            _core.set_num_threads(threads)
+            results.append(recover(student, targets, config).splats)
+    finally:
+        _core.set_num_threads(before)
+    assert_same_bits(results[0], results[1])
+    assert_same_bits(results[0], results[2])
+
+
+class _StopAt:
+    """A progress callback that presses Ctrl-C at a step."""
+
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+    def __call__(self, stage: str, done: int, total: int, info: Any = None) -> None:
+        if stage == "recover" and done == self.step:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize("engine", ["fused", "torch"])
+def test_ctrl_c_then_resume_is_never_having_stopped(
+    student: Splats, targets: TeacherRenders, engine: Any, tmp_path: Path
+) -> None:
+    config = RecoverConfig(steps=40, engine=engine, regularizers=replace(PRESETS["lift"], period=10))
+    whole = recover(student, targets, config)
+    checkpoint = tmp_path / "c.npz"
+    with pytest.raises(KeyboardInterrupt):
+        recover(student, targets, config, checkpoint=checkpoint, progress=_StopAt(17))
+    assert checkpoint.exists()
+    resumed = recover(student, targets, config, checkpoint=checkpoint)
+    assert_same_bits(whole.splats, resumed.splats)
+    assert whole.report["loss"] == resumed.report["loss"]
+
+
+def test_resume_refuses_other_options(student: Splats, targets: TeacherRenders, tmp_path: Path) -> None:
+    checkpoint = tmp_path / "c.npz"
+    config = RecoverConfig(steps=40)
+    with pytest.raises(KeyboardInterrupt):
+        recover(student, targets, config, checkpoint=checkpoint, progress=_StopAt(5))
+    with pytest.raises(InputError, match="other options"):
+        recover(student, targets, replace(config, seed=1), checkpoint=checkpoint)
+
+
+def test_a_strong_anchor_holds_gaussians_to_their_surface(student: Splats, targets: TeacherRenders) -> None:
+    free = RecoverConfig(steps=120, regularizers=Regularizers(0, 0, effective_rank=False))
+    held = replace(free, regularizers=Regularizers(50.0, 0, effective_rank=False, period=1))
+    drift = [recover(student, targets, config).report["drift95"] for config in (free, held)]
+    assert drift[1] < 0.8 * drift[0]
+
+
+def test_the_effective_rank_barrier_keeps_needles_away(targets: TeacherRenders) -> None:
+    thin = checkered_ball(400)
+    thin = replace(thin, scales=(thin.scales * np.float32([4, 0.01, 0.05])).astype(np.float32))
+    free = RecoverConfig(steps=80, regularizers=Regularizers(0, 0, effective_rank=False))
+    held = replace(free, regularizers=Regularizers(0, 20.0, effective_rank=True, period=1))
+    needles = [recover(thin, targets, config).report["needle"] for config in (free, held)]
+    assert needles[1] < needles[0]
+
+
+def test_paper_schedule_runs_with_its_own_rates(student: Splats, targets: TeacherRenders) -> None:
+    result = recover(student, targets, RecoverConfig(schedule=PAPER, steps=40, sh_degree=3))
+    assert result.splats.sh_degree == 3
+    assert result.report["multiplier"] == 1.0
+    assert result.report["psnr"]["after"] > result.report["psnr"]["before"]
+
+
+def test_a_time_limit_sets_the_horizon(student: Splats, targets: TeacherRenders) -> None:
+    report = recover(student, targets, RecoverConfig(time_limit=1.0)).report
+    assert report["steps"] > 5
+    assert 1.0 <= report["seconds"] < 2.5
+    assert report["psnr"]["after"] > report["psnr"]["before"] + 1
+
+
+def test_a_far_offset_changes_nothing_but_the_offset(student: Splats, targets: TeacherRenders) -> None:
+    far = np.array([447_000.0, 5_411_000.0, 130.0])
+    moved = replace(student, offset=student.offset + far)
+    views = VIEWS.recentred(-far)
+    teacher = replace(TEACHER, offset=TEACHER.offset + far)
+    here = recover(student, targets, RecoverConfig(steps=20)).report["psnr"]["after"]
+    there = recover(moved, TeacherRenders(teacher, views), RecoverConfig(steps=20)).report["psnr"]["after"]
+    assert there == pytest.approx(here, abs=0.05)
+
+
+def test_nothing_to_do_is_said(student: Splats, targets: TeacherRenders) -> None:
+    with pytest.raises(InputError, match="0 Gaussians"):
+        recover(student.take(slice(0, 0)), targets)
+    with pytest.raises(InputError, match="engine"):
+        recover(student, targets, RecoverConfig(engine="steam"))  # type: ignore[arg-type]
