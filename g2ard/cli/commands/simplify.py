@@ -57,12 +57,14 @@ def simplify(
     import time
 
     from g2ard import io
-    from g2ard.simplify import SimplifyConfig
+    from g2ard.simplify import METHODS, SimplifyConfig
     from g2ard.simplify import simplify as reduce
 
     one_budget(count, ratio)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other")
+    if method not in METHODS:
+        raise typer.BadParameter(f"--method: {', '.join(METHODS)}, not {method!r}")
     io.check_output(output, overwrite=run.overwrite)
     began = time.perf_counter()
     found = io.read_scene(scene)
@@ -105,12 +107,17 @@ def _cameras(run: Run, splats: Splats, views: Path | None, method: str) -> Camer
     import numpy as np
 
     from g2ard.cli.scenes import load_views
+    from g2ard.errors import InputError
     from g2ard.poses import make_pool
 
     if method == "paper" or (method == "fast" and views is None):
         return None
     if views is None:
-        return make_pool(splats, _VIEWS, seed=run.seed, progress=run.progress)
+        try:
+            return make_pool(splats, _VIEWS, seed=run.seed, progress=run.progress)
+        except InputError as e:
+            run.say(f"no pool of views ({e}): going without, as with --no-views")
+            return None
     cameras = load_views(run, views, "train", None)
     return cameras.take(np.unique(np.linspace(0, len(cameras) - 1, _VIEWS).round().astype(int)))
 
