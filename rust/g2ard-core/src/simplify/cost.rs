@@ -237,3 +237,155 @@ pub fn color_distance(a: &[f32], b: &[f32]) -> f32 {
         .sum();
     (lanes.iter().sum::<f32>() + rest) / (4.0 * PI)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::linalg::{Sym3, covariance, dot, rotation_from_quat};
+
+    type Flat = ([f64; 2], [f64; 3]);
+
+    /// Mean and 2×2 covariance (xx, xy, yy) in the plane across `d`.
+    fn projected(mean: [f64; 3], s: &Sym3, d: [f64; 3]) -> Flat {
+        let helper = if d[0].abs() < 0.9 {
+            [1.0, 0.0, 0.0]
+        } else {
+            [0.0, 1.0, 0.0]
+        };
+        let cross = |a: [f64; 3], b: [f64; 3]| {
+            [
+                a[1] * b[2] - a[2] * b[1],
+                a[2] * b[0] - a[0] * b[2],
+                a[0] * b[1] - a[1] * b[0],
+            ]
+        };
+        let u = cross(d, helper);
+        let u = u.map(|v| v / dot(u, u).sqrt());
+        let v = cross(d, u);
+        let row = |a: [f64; 3]| {
+            [
+                s[0] * a[0] + s[1] * a[1] + s[2] * a[2],
+                s[1] * a[0] + s[3] * a[1] + s[4] * a[2],
+                s[2] * a[0] + s[4] * a[1] + s[5] * a[2],
+            ]
+        };
+        (
+            [dot(u, mean), dot(v, mean)],
+            [dot(u, row(u)), dot(u, row(v)), dot(v, row(v))],
+        )
+    }
+
+    /// ∫ G_a G_b over the plane.
+    fn product(a: &Flat, b: &Flat) -> f64 {
+        let det = |c: [f64; 3]| c[0] * c[2] - c[1] * c[1];
+        let c = [0, 1, 2].map(|k| a.1[k] + b.1[k]);
+        let (x, y) = (a.0[0] - b.0[0], a.0[1] - b.0[1]);
+        let q = (c[2] * x * x - 2.0 * c[1] * x * y + c[0] * y * y) / det(c);
+        2.0 * std::f64::consts::PI * (det(a.1) * det(b.1) / det(c)).sqrt() * (-0.5 * q).exp()
+    }
+
+    fn naive(a: &Node, b: &Node, color: f64, geometric: f64) -> f64 {
+        let m = a.merged(b);
+        let mut error = 0.0;
+        for l in 0..6 {
+            let d = [0, 1, 2].map(|k| f64::from(AXES[k][l]));
+            let flat = |n: &Node| {
+                projected(
+                    n.mean.map(f64::from),
+                    &dilated(&n.cov, n.blur).map(f64::from),
+                    d,
+                )
+            };
+            let all = [(a, flat(a)), (b, flat(b)), (&m, flat(&m))];
+            let squared = |w: [f64; 3]| -> f64 {
+                (0..9)
+                    .map(|k| {
+                        let ((p, x), (q, y)) = (&all[k / 3], &all[k % 3]);
+                        w[k / 3]
+                            * w[k % 3]
+                            * f64::from(p.alpha)
+                            * f64::from(q.alpha)
+                            * product(x, y)
+                    })
+                    .sum()
+            };
+            let share = f64::from(b.mass / m.mass);
+            error +=
+                geometric * squared([1.0, 1.0, -1.0]) + color * squared([share, share - 1.0, 0.0]);
+        }
+        error / 6.0 * f64::from(m.seen / m.mass)
+    }
+
+    #[test]
+    fn equals_the_projected_squared_error_in_f64() {
+        let mut state = 11u64;
+        let mut next = || {
+            state = state
+                .wrapping_mul(6364136223846793005)
+                .wrapping_add(1442695040888963407);
+            (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
+        };
+        let mut node = || {
+            let r = rotation_from_quat([next(), next(), next(), next()]);
+            let scales = [0, 1, 2].map(|_| (3.0 * next()).exp());
+            let mut n = Node {
+                mean: [0, 1, 2].map(|_| (2.0 * next()) as f32),
+                cov: covariance(&r, scales).map(|v| v as f32),
+                blur: 0.1,
+                alpha: (next() + 0.5) as f32,
+                ..Node::default()
+            }
+            .weighed();
+            n.seen = 3.0 * n.mass;
+            n
+        };
+        for _ in 0..300 {
+            let (a, b) = (node(), node());
+            for (color, geometric) in [(0.3, 0.0), (0.0, 1.0), (0.2, 0.03)] {
+                let (got, want) = (
+                    a.cost(&b, color, geometric),
+                    naive(&a, &b, color.into(), geometric.into()),
+                );
+                let scale = f64::from(3.0 * (a.mass + b.mass));
+                assert!(
+                    (f64::from(got) - want).abs() <= 1e-4 * want + 1e-5 * scale,
+                    "{got} {want}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn identical_gaussians_cost_nothing_and_extremes_stay_finite() {
+        let plain = Node {
+            cov: [1.0, 0.0, 0.0, 1.0, 0.0, 0.01],
+            blur: 0.1,
+            alpha: 0.3,
+            ..Node::default()
+        };
+        let mut a = plain.weighed();
+        a.seen = a.mass;
+        assert!(a.cost(&a, 0.0, 1.0) < 0.2); // α adds up, shape stays
+        let mut far = Node {
+            mean: [1e15; 3],
+            cov: [1e12, 0.0, 0.0, 1e12, 0.0, 1e12],
+            ..plain
+        }
+        .weighed();
+        far.seen = far.mass;
+        let cost = a.cost(&far, 1.0, 0.03);
+        assert!(cost.is_finite() && cost >= 0.0);
+    }
+
+    #[test]
+    fn color_distance_is_the_mean_over_directions() {
+        let (a, b): (Vec<f32>, Vec<f32>) = (0..27).map(|i| (i as f32, i as f32 * 0.5)).unzip();
+        let want: f32 = a
+            .iter()
+            .zip(&b)
+            .map(|(x, y)| (x - y) * (x - y))
+            .sum::<f32>()
+            / (4.0 * PI);
+        assert!((color_distance(&a, &b) - want).abs() < 1e-4 * want);
+    }
+}
