@@ -49,6 +49,8 @@ def simplify_pairwise(
     weight: NDArray[np.float32] | None,
     pixel_size: NDArray[np.float32] | None,
     min_opacity: float,
+    ladder: float,
+    ladder_steps: int,
     neighbors: int,
     geometric: float,
     dilation: float,

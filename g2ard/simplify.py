@@ -17,10 +17,12 @@ from g2ard.splats import Splats
 
 __all__ = ["Seen", "Simplified", "SimplifyConfig", "flag", "schedule", "simplify"]
 
-METHODS = ("default", "paper")
+METHODS = ("default", "fast", "paper")
 
-_RETENTION = {"default": 0.65, "paper": 0.75}
-_MIN_OPACITY = {"default": 0.004, "paper": 0.01}
+_RETENTION = {"default": 0.65, "fast": 0.65, "paper": 0.75}
+_MIN_OPACITY = {"default": 0.004, "fast": 0.004, "paper": 0.01}
+_LADDER = {"default": (3.0, 1), "fast": (1.0, 3)}
+"""Down to how many times the budget rows merge along Morton order, and in how many steps."""
 
 _REFRESH = 0.3
 """Visibility is looked at again when the count has fallen to this share of what it was."""
@@ -50,14 +52,15 @@ class SimplifyConfig:
 
     Args:
         retention: share of the Gaussians that a round keeps; None means the method's own, 0.75 in the paper,
-            0.65 for `default` (fewer rounds, as good).
+            0.65 for the others (fewer rounds, as good).
         min_opacity: below this α a Gaussian is dropped; None means the method's own, 0.01 in the paper, 0.004
-            (what no renderer draws) for `default`.
+            (what no renderer draws) for the others.
         neighbors: `default`: nearest clusters that one may merge with. More lets far ones in: 16 is worse.
-        geometric_weight: `default`: weight of the error of coverage beside that of colour.
-        dilation: `default`: standard deviation of the blur that renderers add, in pixels (√0.3 would be all
-            of it; 0.4 measured best).
-        pixel_scale: `default` without views: the size of a pixel over the median of the largest scales.
+        geometric_weight: of `default` and `fast`: weight of the error of coverage beside that of colour.
+        dilation: of `default` and `fast`: standard deviation of the blur that renderers add, in pixels
+            (√0.3 would be all of it; 0.4 measured best).
+        pixel_scale: of `default` and `fast` without views: the size of a pixel over the median of the largest
+            scales.
         color_bin: `paper`: edge of the colour bins within a cell, in colour units (0–1).
         max_energy: `paper`: largest affine energy of a merged group, colour units squared.
         min_coverage: `paper`: least share of the members' footprint that the merged footprint covers.
@@ -67,7 +70,6 @@ class SimplifyConfig:
 
     retention: float | None = None
     min_opacity: float | None = None
-    ladder: float = math.inf
     neighbors: int = 6
     geometric_weight: float = 0.03
     dilation: float = 0.4
@@ -196,10 +198,13 @@ def simplify(
 ) -> Simplified:
     """Reduce a scene to exactly `budget` Gaussians.
 
-    `default` aims at the error in the image. In rounds that lock what they merge, the cheapest pairs of
-    neighbours become one: mean, covariance and SH averaged by mass, mass m = α·A *as rendered* conserved,
-    with A = √tr adj(Σ + e²I) and e the blur of a renderer. A pair costs the squared error of its projections
+    `default` aims at the error in the image. Down to three times the budget it merges along Morton order,
+    wherever that costs least; then, in rounds that lock what they merge, the cheapest pairs of neighbours
+    become one. Mean, covariance and SH are averaged by mass, and mass m = α·A *as rendered* is conserved,
+    with A = √tr adj(Σ + e²I) and e the blur of a renderer. A merge costs the squared error of its projections
     times how much of it the views see. Without `visibility` it needs no cameras at all.
+
+    `fast` merges along Morton order all the way, on three lattices in turn: no graph of neighbours.
 
     `paper`: rounds of 75 %; each drops α < 0.01, merges cell × colour-bin groups by moment matching where the
     affine-energy and surface-coverage guards pass, and trims by π = −log(1 − α)·A·(1 + λ_h·p)
@@ -212,10 +217,10 @@ def simplify(
             and counted.
         budget: Gaussians to keep, at most as many as there are.
         method: the policy.
-        visibility: `default`: what views see of each Gaussian (`g2ard.render.visibility`), or a function that
-            finds it for a scene, asked again as the scene shrinks (+0.4 dB on small objects).
-        protected: (N,) bool flags to inherit. With None, `paper` computes them (see `flag`), `default`, which
-            has no use for them, goes without.
+        visibility: for `default` and `fast`: what views see of each Gaussian (`g2ard.render.visibility`), or
+            a function that finds it for a scene, asked again as the scene shrinks (+0.4 dB on small objects).
+        protected: (N,) bool flags to inherit. With None, `paper` computes them (see `flag`), the others,
+            which have no use for them, go without.
         flag_budget: the count that sets the flags' cell size, where this call is one round on the way to a
             smaller one; None means `budget`.
         config: the constants.
@@ -246,7 +251,7 @@ def simplify(
     else:
         if visibility is not None and not callable(visibility):
             visibility = _rows_of(visibility, len(splats), finite)
-        out = _pairwise(scene, budget, visibility, flags, config, progress)
+        out = _pairwise(scene, budget, method, visibility, flags, config, progress)
     return _simplified(splats, finite, out)
 
 
@@ -291,6 +296,7 @@ def _rows_of(seen: Seen, count: int, finite: NDArray[np.bool_] | slice) -> _View
 def _pairwise(
     scene: Splats,
     budget: int,
+    method: str,
     visibility: Visibility | None,
     flags: NDArray[np.bool_] | None,
     config: SimplifyConfig,
@@ -305,12 +311,13 @@ def _pairwise(
         seen = _rows_of(visibility(scene), len(scene), slice(None)) if callable(visibility) else visibility
         out = _core.simplify_pairwise(
             scene,
-            schedule(len(scene), target, config.retention_of("default")),
+            schedule(len(scene), target, config.retention_of(method)),
             protected=flags,
             weight=None if seen is None else seen.weight,
             pixel_size=None if seen is None else seen.pixel_size,
-            min_opacity=config.min_opacity_of("default"),
-            ladder=config.ladder,
+            min_opacity=config.min_opacity_of(method),
+            ladder=_LADDER[method][0],
+            ladder_steps=_LADDER[method][1],
             neighbors=config.neighbors,
             geometric=config.geometric_weight,
             dilation=config.dilation,

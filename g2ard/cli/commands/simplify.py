@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import CountOption, OutputOption, RatioOption, SceneArgument, budget_of, one_budget
+from g2ard.cli.options import (
+    CountOption,
+    OutputOption,
+    RatioOption,
+    SceneArgument,
+    ViewsOption,
+    budget_of,
+    one_budget,
+)
 
 if TYPE_CHECKING:
+    from g2ard.cameras import Cameras
+    from g2ard.render import Visibility
     from g2ard.simplify import Simplified
+    from g2ard.splats import Splats
+
+_VIEWS = 16
+"""Views that tell what is seen: 112 were no better."""
+
+_LONGEST = 400
+"""Their longer side: what is seen of a Gaussian needs no more pixels."""
 
 
 @command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply")
@@ -20,13 +39,21 @@ def simplify(
     output: OutputOption,
     count: CountOption = None,
     ratio: RatioOption = None,
-    method: Annotated[str, typer.Option(metavar="default|paper", help="The policy.")] = "default",
+    views: ViewsOption = None,
+    no_views: Annotated[
+        bool, typer.Option("--no-views", help="Use no cameras at all, not even a pool of its own.")
+    ] = False,
+    method: Annotated[str, typer.Option(metavar="default|fast|paper", help="The policy.")] = "default",
     retention: Annotated[
         float | None,
         typer.Option(help="Share of the Gaussians that a round keeps; the method's own if absent."),
     ] = None,
 ) -> None:
-    """Reduce a scene to an exact number of Gaussians; no images needed."""
+    """Reduce a scene to an exact number of Gaussians; no images needed.
+
+    The default method weighs errors by what is seen: from --views, else from a pool of poses of its own. The
+    fast one looks only at given views, the paper's at none.
+    """
     import time
 
     from g2ard import io
@@ -34,16 +61,21 @@ def simplify(
     from g2ard.simplify import simplify as reduce
 
     one_budget(count, ratio)
+    if views is not None and no_views:
+        raise typer.BadParameter("--views and --no-views exclude each other")
     io.check_output(output, overwrite=run.overwrite)
     began = time.perf_counter()
     found = io.read_scene(scene)
     for note in found.notes:
         run.say(f"{scene}: {note}")
     read = time.perf_counter()
+    budget = budget_of(count, ratio, len(found.splats))
+    cameras = None if no_views or budget >= len(found.splats) else _cameras(run, found.splats, views, method)
     small = reduce(
         found.splats,
-        budget_of(count, ratio, len(found.splats)),
+        budget,
         method=method,
+        visibility=None if cameras is None else _looker(run, cameras),
         config=SimplifyConfig(retention=retention),
         progress=run.progress,
     )
@@ -66,6 +98,37 @@ def simplify(
             "peak_rss_bytes": _peak_rss(),
         }
     )
+
+
+def _cameras(run: Run, splats: Splats, views: Path | None, method: str) -> Cameras | None:
+    """A few views, evenly spaced over what there is."""
+    import numpy as np
+
+    from g2ard.cli.scenes import load_views
+    from g2ard.poses import make_pool
+
+    if method == "paper" or (method == "fast" and views is None):
+        return None
+    if views is None:
+        return make_pool(splats, _VIEWS, seed=run.seed, progress=run.progress)
+    cameras = load_views(run, views, "train", None)
+    return cameras.take(np.unique(np.linspace(0, len(cameras) - 1, _VIEWS).round().astype(int)))
+
+
+def _looker(run: Run, cameras: Cameras) -> Callable[[Splats], Visibility]:
+    """What small renders of the views see; the size of a pixel is that of the full image."""
+    from dataclasses import replace
+
+    from g2ard.render import visibility
+
+    small = cameras.resized(_LONGEST)
+    factor = float((small.widths / cameras.widths).mean())
+
+    def look(scene: Splats) -> Visibility:
+        seen = visibility(scene, small, run.progress)
+        return replace(seen, pixel_size=seen.pixel_size * factor)
+
+    return look
 
 
 def _tell(run: Run, small: Simplified) -> None:

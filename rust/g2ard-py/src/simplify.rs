@@ -119,7 +119,7 @@ fn simplify_paper<'py>(
 /// The default: pairs of neighbours, cheapest first.
 #[pyfunction]
 #[pyo3(signature = (
-    scene, schedule, *, protected, weight, pixel_size, min_opacity, ladder, neighbors, geometric, dilation,
+    scene, schedule, *, protected, weight, pixel_size, min_opacity, ladder, ladder_steps, neighbors, geometric, dilation,
     pixel_scale, progress=None
 ))]
 fn simplify_pairwise<'py>(
@@ -131,6 +131,7 @@ fn simplify_pairwise<'py>(
     pixel_size: Option<PyReadonlyArray1<'py, f32>>,
     min_opacity: f64,
     ladder: f64,
+    ladder_steps: usize,
     neighbors: usize,
     geometric: f64,
     dilation: f64,
@@ -156,6 +157,7 @@ fn simplify_pairwise<'py>(
     let policy = Pairwise {
         min_opacity,
         ladder,
+        ladder_steps,
         neighbors,
         geometric,
         dilation,

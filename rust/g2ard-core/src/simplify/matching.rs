@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::GONE;
 use super::clusters::Partition;
 use super::cost::{Node, color_distance};
-use crate::spatial::Tree;
+use crate::spatial::{Frame, Tree, codes, order};
 use crate::{Control, Result};
 
 /// Clusters in Morton order, with their SH, `width` values each.
@@ -50,6 +50,42 @@ impl Nodes {
             })
             .collect();
         (self.geometry, self.sh) = (geometry, sh);
+    }
+
+    /// Puts the nodes in Morton order on a shifted lattice. Returns where each went, and their codes.
+    pub fn sort(&mut self, shift: [f64; 3]) -> (Vec<u32>, Vec<u64>) {
+        self.pick(&(0..self.len() as u32).collect::<Vec<_>>(), shift)
+    }
+
+    /// Keeps the nodes `left`, in Morton order on a lattice shifted by shares of the frame's radius. Returns
+    /// where each went, and their codes.
+    pub fn pick(&mut self, left: &[u32], shift: [f64; 3]) -> (Vec<u32>, Vec<u64>) {
+        let means: Vec<[f64; 3]> = left
+            .par_iter()
+            .map(|&i| self.geometry[i as usize].mean.map(f64::from))
+            .collect();
+        let mut frame = Frame::of(&means);
+        (0..3).for_each(|k| frame.origin[k] += shift[k] * frame.radius);
+        let keys = codes(&means, &frame);
+        let sorted = order(&keys);
+        let from: Vec<u32> = sorted.par_iter().map(|&at| left[at as usize]).collect();
+        let mut map = vec![GONE; self.len()];
+        from.iter()
+            .enumerate()
+            .for_each(|(to, &i)| map[i as usize] = to as u32);
+        let width = self.width;
+        let mut sh = vec![0.0; from.len() * width];
+        let rows = sh.par_chunks_mut(width).zip(&from);
+        rows.for_each(|(out, &i)| out.copy_from_slice(self.sh_of(i as usize)));
+        self.geometry = from
+            .par_iter()
+            .map(|&i| self.geometry[i as usize])
+            .collect();
+        self.sh = sh;
+        (
+            map,
+            sorted.par_iter().map(|&at| keys[at as usize]).collect(),
+        )
     }
 
     fn sh_of(&self, i: usize) -> &[f32] {

@@ -12,7 +12,6 @@ use super::matching::{Nodes, candidates, matched};
 use super::moments::sigmoid;
 use super::trim::best;
 use super::{GONE, Ordered, Outcome, SceneRef};
-use crate::spatial::{Frame, codes, order};
 use crate::{Control, Error, Result};
 
 /// Defaults are what measured best (docs/decisions.md).
@@ -22,6 +21,8 @@ pub struct Pairwise {
     pub min_opacity: f64,
     /// Down to this many times the budget, rows merge along Morton order alone; infinite for never.
     pub ladder: f64,
+    /// In so many steps, each but the first halving the count on a lattice that lies elsewhere.
+    pub ladder_steps: usize,
     /// Nearest clusters that one may merge with.
     pub neighbors: usize,
     /// Weight of the geometric error beside that of colour.
@@ -36,7 +37,8 @@ impl Default for Pairwise {
     fn default() -> Self {
         Self {
             min_opacity: 0.004,
-            ladder: f64::INFINITY,
+            ladder: 3.0,
+            ladder_steps: 1,
             neighbors: 6,
             geometric: 0.03,
             dilation: 0.4,
@@ -120,7 +122,8 @@ impl Pairwise {
         Ok(outcome)
     }
 
-    /// Merges runs of Morton order into `ladder` times the budget.
+    /// Merges runs of Morton order down to `ladder` times the budget. Each time the lattice lies
+    /// elsewhere, so that what one cut apart the next may join.
     fn climb(
         &self,
         ordered: &Ordered,
@@ -129,33 +132,38 @@ impl Pairwise {
         budget: usize,
         rounds: &mut Vec<PairwiseRound>,
     ) {
-        let target = (self.ladder * budget as f64).min(nodes.len() as f64) as usize;
-        if target == nodes.len() {
-            return;
-        }
+        let last = (self.ladder * budget as f64).min(nodes.len() as f64) as usize;
         let kept = ordered
             .codes
             .iter()
             .zip(&partition.of)
             .filter(|(_, c)| **c != GONE);
-        let codes: Vec<u64> = kept.map(|(&code, _)| code).collect();
-        let spent = climb(
-            &codes,
-            &nodes.geometry,
-            &nodes.sh,
-            nodes.width,
-            self.geometric as f32,
-        );
-        let runs = cut(&spent, target);
-        rounds.push(PairwiseRound {
-            before: nodes.len(),
-            merged: nodes.len() - runs.count,
-            after: runs.count,
-            ..PairwiseRound::default()
-        });
-        nodes.merge_runs(&runs);
-        let of = partition.of.par_iter_mut().filter(|c| **c != GONE);
-        of.for_each(|c| *c = runs.of[*c as usize]);
+        let mut codes: Vec<u64> = kept.map(|(&code, _)| code).collect();
+        for step in (0..self.ladder_steps).rev() {
+            let target = last.saturating_mul(1 << step.min(32));
+            if target >= nodes.len() {
+                continue;
+            }
+            let spent = climb(
+                &codes,
+                &nodes.geometry,
+                &nodes.sh,
+                nodes.width,
+                self.geometric as f32,
+            );
+            let runs = cut(&spent, target);
+            rounds.push(PairwiseRound {
+                before: nodes.len(),
+                merged: nodes.len() - runs.count,
+                after: runs.count,
+                ..PairwiseRound::default()
+            });
+            nodes.merge_runs(&runs);
+            let (map, new) = nodes.sort(LATTICES[step % LATTICES.len()]);
+            codes = new;
+            let of = partition.of.par_iter_mut().filter(|c| **c != GONE);
+            of.for_each(|c| *c = map[runs.of[*c as usize] as usize]);
+        }
     }
 
     fn check(&self, scene: &SceneRef, seen: Option<Seen>, flags: Option<&[bool]>) -> Result<()> {
@@ -171,6 +179,9 @@ impl Pairwise {
         }
         if self.neighbors == 0 {
             return Err(Error::invalid("neighbors", "at least 1", 0));
+        }
+        if self.ladder.is_nan() || self.ladder < 1.0 {
+            return Err(Error::invalid("ladder", "at least 1", self.ladder));
         }
         Ok(())
     }
@@ -326,25 +337,7 @@ fn merge(nodes: &mut Nodes, pairs: &[(u32, u32)]) -> Vec<u32> {
     let left: Vec<u32> = (0..nodes.len() as u32)
         .filter(|&i| into[i as usize] == GONE)
         .collect();
-    let means: Vec<[f64; 3]> = left
-        .par_iter()
-        .map(|&i| nodes.geometry[i as usize].mean.map(f64::from))
-        .collect();
-    let sorted = order(&codes(&means, &Frame::of(&means)));
-    let from: Vec<u32> = sorted.into_iter().map(|at| left[at as usize]).collect();
-    nodes.geometry = from
-        .par_iter()
-        .map(|&i| nodes.geometry[i as usize])
-        .collect();
-    let mut sh = vec![0.0; from.len() * width];
-    sh.par_chunks_mut(width).zip(&from).for_each(|(out, &i)| {
-        out.copy_from_slice(&nodes.sh[i as usize * width..(i as usize + 1) * width])
-    });
-    nodes.sh = sh;
-    let mut map = vec![0; into.len()];
-    from.iter()
-        .enumerate()
-        .for_each(|(to, &i)| map[i as usize] = to as u32);
+    let (mut map, _) = nodes.pick(&left, [0.0; 3]);
     for i in 0..into.len() {
         if into[i] != GONE {
             map[i] = map[into[i] as usize];
@@ -352,3 +345,6 @@ fn merge(nodes: &mut Nodes, pairs: &[(u32, u32)]) -> Vec<u32> {
     }
     map
 }
+
+/// Where the lattice lies, in shares of the frame's radius.
+const LATTICES: [[f64; 3]; 3] = [[0.0; 3], [0.31, 0.17, 0.43], [0.13, 0.41, 0.23]];
