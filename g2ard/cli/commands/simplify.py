@@ -98,15 +98,20 @@ def simplify(
 
 
 def _cameras(run: Run, splats: Splats, views: Path | None, method: str) -> Cameras | None:
-    """The views given, or a few of its own."""
+    """The views given, or a few of its own where the scene leaves room for them."""
     from g2ard.cli.scenes import load_views
+    from g2ard.errors import InputError
     from g2ard.poses import make_pool
 
     if method == "paper" or (method == "fast" and views is None):
         return None
-    if views is None:
+    if views is not None:
+        return load_views(run, views, "train", None)
+    try:
         return make_pool(splats, _VIEWS, seed=run.seed, progress=run.progress)
-    return load_views(run, views, "train", None)
+    except InputError as e:
+        run.say(f"goes on without views: {e}")
+        return None
 
 
 def _tell(run: Run, small: Simplified) -> None:
