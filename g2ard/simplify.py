@@ -15,9 +15,10 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
 from g2ard.splats import Splats
 
-__all__ = ["Seen", "Simplified", "SimplifyConfig", "flag", "schedule", "simplify"]
+__all__ = ["METHODS", "Seen", "Simplified", "SimplifyConfig", "flag", "schedule", "simplify"]
 
 METHODS = ("default", "fast", "paper")
+"""The policies."""
 
 _RETENTION = {"default": 0.65, "fast": 0.65, "paper": 0.75}
 _MIN_OPACITY = {"default": 0.004, "fast": 0.004, "paper": 0.01}
@@ -306,7 +307,7 @@ def _pairwise(
     start, parents, rounds = len(scene), None, []
     clamped = {"clamped_logits": 0, "clamped_opacities": 0}
     while True:
-        staged = callable(visibility) and budget < _REFRESH * len(scene)
+        staged = callable(visibility) and 2 * budget < _REFRESH * len(scene)  # else not worth it
         target = math.ceil(_REFRESH * len(scene)) if staged else budget
         seen = _rows_of(visibility(scene), len(scene), slice(None)) if callable(visibility) else visibility
         out = _core.simplify_pairwise(

@@ -284,7 +284,7 @@ def test_command_line(tmp_path, command_line):
     def run(*arguments):
         return command_line("simplify", "prior.ply", *arguments, cwd=tmp_path)
 
-    status, out, err = run("-r", "10", "-o", "small.ply", "--json", "-")
+    status, out, err = run("-r", "10", "-o", "small.ply", "--no-views", "--json", "-")
     assert status == 0, err
     report = json.loads(out)
     assert (report["input_count"], report["output_count"]) == (1000, 100)
@@ -296,14 +296,69 @@ def test_command_line(tmp_path, command_line):
     )
     for name in ARRAYS:  # files hold logarithms of the scales
         np.testing.assert_allclose(getattr(small, name), getattr(want, name), rtol=1e-5, err_msg=name)
+    status, _, err = run("-r", "10", "-o", "seen.ply", "-q")
+    assert status == 0, err
+    assert len(read_splats(tmp_path / "seen.ply")) == 100
     for arguments, want, part in (
         (("-r", "10", "-o", "small.ply"), 1, "small.ply"),  # exists
+        (("-n", "5", "-o", "b.ply", "--no-views", "--views", "x"), 2, "exclude"),
         (("-n", "1001", "-o", "b.ply"), 1, "at most the 1000"),
         (("-n", "0", "-o", "b.ply"), 2, "positive count"),
         (("-o", "b.ply"), 2, "either -n COUNT or -r RATIO"),
-        (("-n", "5", "-o", "b.ply", "--method", "best"), 1, "method"),
+        (("-n", "5", "-o", "b.ply", "--method", "best"), 2, "method"),
     ):
         status, _, err = run(*arguments)
         assert (status, part in err) == (want, True), (arguments, err)
         assert len(err.splitlines()) == 1
         assert not (tmp_path / "b.ply").exists()
+
+
+class Views:
+    """What a caller's views see, as `g2ard.render.visibility` returns it."""
+
+    def __init__(self, weight, pixel_size):
+        self.weight, self.pixel_size = np.asarray(weight), np.asarray(pixel_size)
+
+
+@pytest.mark.parametrize("method", ["default", "fast"])
+def test_what_is_seen_is_kept_finer(method):
+    prior = scene(4000)
+    left = prior.means[:, 0] < 0
+    seen = Views(np.where(left, 100.0, 0.0), np.where(left, 0.01, np.inf))
+    out = simplify(prior, 400, method=method, visibility=seen)
+    assert_sound(out, 4000, 400)
+    assert (out.splats.means[:, 0] < 0).mean() > 0.75
+    with pytest.raises(InputError, match=r"visibility.weight: expected shape \(4000,\)"):
+        simplify(prior, 400, method=method, visibility=Views(np.ones(3), np.ones(4000)))
+
+
+def test_a_function_of_visibility_is_asked_again_as_the_scene_shrinks():
+    prior, asked = scene(4000), []
+
+    def look(splats):
+        asked.append(len(splats))
+        return Views(np.ones(len(splats)), np.full(len(splats), 0.01))
+
+    out = simplify(prior, 100, visibility=look, protected=np.ones(4000, bool))
+    assert_sound(out, 4000, 100)
+    assert asked == [4000, 1200, 360]
+    assert out.protected.all()
+
+
+@pytest.mark.parametrize("method", ["default", "fast"])
+def test_clusters_conserve_mass_mean_and_covariance(method):
+    prior = scene(3000, dtype=np.float64)
+    e2 = (0.4 * 0.01) ** 2
+    out = simplify(prior, 1500, method=method, visibility=Views(np.ones(3000), np.full(3000, 0.01)))
+    small = out.splats
+    for p in range(0, 1500, 7):
+        rows = np.flatnonzero(out.parents == p)
+        if len(rows) == 1:
+            for name in ARRAYS:
+                np.testing.assert_array_equal(getattr(small, name)[p], getattr(prior, name)[rows[0]])
+            continue
+        mean, cov, alpha, sh = naive.merge_as_rendered(prior, rows, e2)
+        np.testing.assert_allclose(small.means[p], mean, rtol=0, atol=1e-7)  # blur and α are float32
+        np.testing.assert_allclose(naive.covariance(small, p), cov, rtol=0, atol=1e-6 * np.trace(cov))
+        np.testing.assert_allclose(small.opacities[p], alpha, rtol=1e-4)
+        np.testing.assert_allclose(np.r_[small.sh0[p], small.shN[p]], sh, rtol=0, atol=1e-5)

@@ -67,3 +67,22 @@ def affine_energy(points, colors, own):
 def priority(splats, protected, weight=10.0):
     mass = np.array([optical_mass(splats, i) for i in range(len(splats))])
     return mass * (1 + weight * protected)
+
+
+def rendered_area(cov, e2):
+    """√tr adj(Σ + e²I): adj has the products of pairs of eigenvalues."""
+    a, b, c = np.linalg.eigvalsh(cov + e2 * np.eye(3))
+    return np.sqrt(a * b + b * c + a * c)
+
+
+def merge_as_rendered(splats, rows, e2):
+    """(mean, covariance, α, sh (K, 3)) with mass α·A as rendered conserved."""
+    alphas = np.minimum(0.99, 1 / (1 + np.exp(-splats.logit_opacities[rows].astype(np.float64))))
+    covs = [covariance(splats, i) for i in rows]
+    m = alphas * [rendered_area(cov, e2) for cov in covs]
+    w = m / m.sum()
+    x = splats.means[rows].astype(np.float64)
+    mean = w @ x
+    cov = sum(w[k] * (covs[k] + np.outer(x[k] - mean, x[k] - mean)) for k in range(len(rows)))
+    sh = np.concatenate([splats.sh0[rows], splats.shN[rows]], 1).astype(np.float64)
+    return mean, cov, min(0.99, m.sum() / rendered_area(cov, e2)), np.einsum("i,ikc->kc", w, sh)
