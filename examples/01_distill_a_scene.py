@@ -21,6 +21,7 @@ def g2ard(*arguments: str) -> None:
 
 
 def main() -> None:
+    OUT.mkdir(exist_ok=True)
     playbot = Path(os.environ.get("G2ARD_DATA", "")) / "playbot" / "0_0"
     if os.environ.get("G2ARD_DATA") and playbot.is_dir():
         # Trained, without photos: a pool of poses is made, and the scene itself is the teacher.

@@ -7,7 +7,7 @@ import json
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from g2ard.recover.schedule import TUNED, Schedule
 from g2ard.splats import Splats
 from g2ard.targets import Targets
 
-if TYPE_CHECKING:
-    from g2ard.render import Visibility
-
 __all__ = ["DistillConfig", "Distilled", "distill"]
 
 
@@ -30,8 +27,7 @@ class DistillConfig:
     """How a scene is distilled.
 
     Args:
-        method: simplification's: default or paper.
-        visibility_views: training views, evenly spaced, that tell the default method what is seen.
+        method: simplification's: default, fast or paper.
         schedule: recovery's; one with `round_steps` recovers after every round of 75 % (the paper), without
             them the reduction is one shot and all recovery happens at the target count.
         steps: overrides the schedule's final horizon.
@@ -43,7 +39,6 @@ class DistillConfig:
     """
 
     method: str = "default"
-    visibility_views: int = 48
     schedule: Schedule = TUNED
     steps: int | None = None
     time_limit: float | None = None
@@ -139,6 +134,7 @@ class _Rounds:
         self.log.append(entry)
 
     def _simplify(self, number: int, count: int, entry: dict[str, Any]) -> None:
+        from g2ard.render import looker
         from g2ard.simplify import simplify
 
         name = f"simplified-{number}"
@@ -148,7 +144,9 @@ class _Rounds:
                 self.state,
                 count,
                 method=self.config.method,
-                visibility=self._visibility if self.config.method == "default" else None,
+                visibility=None
+                if self.config.method == "paper"
+                else looker(self.targets.cameras, progress=self.progress),
                 protected=self.protected,
                 flag_budget=self.budget,
                 progress=self.progress,
@@ -160,15 +158,6 @@ class _Rounds:
         if self.config.sh_degree is not None:
             self.state = self.state.with_sh_degree(self.config.sh_degree)
         self.simplified = self.state
-
-    def _visibility(self, scene: Splats) -> Visibility:
-        """What a sample of the training views sees of each Gaussian."""
-        from g2ard.render import visibility
-
-        cameras = self.targets.cameras
-        count = min(len(cameras), self.config.visibility_views)
-        sample = np.unique(np.linspace(0, len(cameras) - 1, count).round().astype(int))
-        return visibility(scene, cameras.take(sample), progress=self.progress)
 
     def _recover(self, name: str, entry: dict[str, Any], *, final: bool) -> None:
         from g2ard.recover import RecoverConfig, recover

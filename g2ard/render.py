@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -15,7 +15,7 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
 from g2ard.splats import Splats
 
-__all__ = ["RasterSettings", "Rendered", "Visibility", "render", "visibility"]
+__all__ = ["RasterSettings", "Rendered", "Visibility", "looker", "render", "visibility"]
 
 _Floats = NDArray[np.float32]
 View = tuple[list[list[float]], list[float], tuple[int, int], float]
@@ -214,3 +214,29 @@ def visibility(
         arrays_of(splats), views, settings.choices, counter(progress, "visibility")
     )
     return Visibility(**sums)
+
+
+def looker(
+    cameras: Cameras, *, views: int = 16, longest: int = 400, progress: Progress = silent
+) -> Callable[[Splats], Visibility]:
+    """A function that tells what a few small renders see of a scene, as `g2ard.simplify.simplify` takes it.
+
+    Args:
+        cameras: `views` of them are used, evenly spaced.
+        views: 112 were no better than 16 (`docs/benchmarks.md`).
+        longest: longer side of the renders, pixels; `pixel_size` stays that of the full image.
+        progress: told after each view.
+
+    Returns:
+        scene → `Visibility`.
+    """
+    sample = np.unique(np.linspace(0, len(cameras) - 1, min(views, len(cameras))).round().astype(int))
+    full = cameras.take(sample)
+    small = full.resized(longest)
+    factor = float((small.widths / full.widths).mean())
+
+    def look(scene: Splats) -> Visibility:
+        seen = visibility(scene, small, progress)
+        return replace(seen, pixel_size=seen.pixel_size * factor)
+
+    return look

@@ -139,7 +139,7 @@ TeacherOption = Annotated[
     typer.Option("--teacher", metavar="SCENE", help="Its renders are the targets; without it, the photos."),
 ]
 
-Method = Literal["default", "paper"]
+Method = Literal["default", "fast", "paper"]
 ScheduleName = Literal["fast", "default", "best", "paper"]
 PresetOption = Annotated[
     Literal["auto", "trained", "lift", "noisy"],

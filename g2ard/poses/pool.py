@@ -89,7 +89,11 @@ def _kinds(site: Site, kind: str) -> tuple[dict[str, float], str]:
     if kind != "auto":
         return {kind: 1.0}, "as asked"
     shape, why = shape_of(site)
-    shares = {"object": {"orbit": 1.0}, "room": {"walk": 1.0}, "landscape": {"walk": _STREET, "aerial": 1.0}}
+    shares = {  # an orbit takes what the others could not place
+        "object": {"orbit": 1.0},
+        "room": {"walk": 1.0, "orbit": 1.0},
+        "landscape": {"walk": _STREET, "aerial": 1.0, "orbit": 1.0},
+    }
     return shares[shape], f"{shape}: {why}"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +10,7 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     CountOption,
+    Method,
     OutputOption,
     RatioOption,
     SceneArgument,
@@ -21,15 +21,11 @@ from g2ard.cli.options import (
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
-    from g2ard.render import Visibility
     from g2ard.simplify import Simplified
     from g2ard.splats import Splats
 
 _VIEWS = 16
-"""Views that tell what is seen: 112 were no better."""
-
-_LONGEST = 400
-"""Their longer side: what is seen of a Gaussian needs no more pixels."""
+"""Poses of a pool of its own: 112 were no better."""
 
 
 @command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply")
@@ -43,7 +39,7 @@ def simplify(
     no_views: Annotated[
         bool, typer.Option("--no-views", help="Use no cameras at all, not even a pool of its own.")
     ] = False,
-    method: Annotated[str, typer.Option(metavar="default|fast|paper", help="The policy.")] = "default",
+    method: Annotated[Method, typer.Option(help="The policy.")] = "default",
     retention: Annotated[
         float | None,
         typer.Option(help="Share of the Gaussians that a round keeps; the method's own if absent."),
@@ -57,14 +53,13 @@ def simplify(
     import time
 
     from g2ard import io
-    from g2ard.simplify import METHODS, SimplifyConfig
+    from g2ard.render import looker
+    from g2ard.simplify import SimplifyConfig
     from g2ard.simplify import simplify as reduce
 
     one_budget(count, ratio)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other")
-    if method not in METHODS:
-        raise typer.BadParameter(f"--method: {', '.join(METHODS)}, not {method!r}")
     io.check_output(output, overwrite=run.overwrite)
     began = time.perf_counter()
     found = io.read_scene(scene)
@@ -77,7 +72,7 @@ def simplify(
         found.splats,
         budget,
         method=method,
-        visibility=None if cameras is None else _looker(run, cameras),
+        visibility=None if cameras is None else looker(cameras, progress=run.progress),
         config=SimplifyConfig(retention=retention),
         progress=run.progress,
     )
@@ -103,39 +98,20 @@ def simplify(
 
 
 def _cameras(run: Run, splats: Splats, views: Path | None, method: str) -> Cameras | None:
-    """A few views, evenly spaced over what there is."""
-    import numpy as np
-
+    """The views given, or a few of its own where the scene leaves room for them."""
     from g2ard.cli.scenes import load_views
     from g2ard.errors import InputError
     from g2ard.poses import make_pool
 
     if method == "paper" or (method == "fast" and views is None):
         return None
-    if views is None:
-        try:
-            return make_pool(splats, _VIEWS, seed=run.seed, progress=run.progress)
-        except InputError as e:
-            run.say(f"no pool of views ({e}): going without, as with --no-views")
-            return None
-    cameras = load_views(run, views, "train", None)
-    return cameras.take(np.unique(np.linspace(0, len(cameras) - 1, _VIEWS).round().astype(int)))
-
-
-def _looker(run: Run, cameras: Cameras) -> Callable[[Splats], Visibility]:
-    """What small renders of the views see; the size of a pixel is that of the full image."""
-    from dataclasses import replace
-
-    from g2ard.render import visibility
-
-    small = cameras.resized(_LONGEST)
-    factor = float((small.widths / cameras.widths).mean())
-
-    def look(scene: Splats) -> Visibility:
-        seen = visibility(scene, small, run.progress)
-        return replace(seen, pixel_size=seen.pixel_size * factor)
-
-    return look
+    if views is not None:
+        return load_views(run, views, "train", None)
+    try:
+        return make_pool(splats, _VIEWS, seed=run.seed, progress=run.progress)
+    except InputError as e:
+        run.say(f"goes on without views: {e}")
+        return None
 
 
 def _tell(run: Run, small: Simplified) -> None:
