@@ -28,11 +28,11 @@ def main() -> None:
         g2ard("distill", str(playbot), "--ratio", "10", "--output", str(OUT / "playbot"), "--overwrite")
     else:
         # A LiDAR-like cloud has geometry but no appearance: its photos are the targets.
-        g2ard("synth", "city", "--output", str(OUT / "city"), "--overwrite")
-        g2ard(
-            "distill", str(OUT / "city" / "cloud.ply"), "--views", str(OUT / "city" / "train.json"),
-            "--ratio", "10", "--output", str(OUT / "city-10x"), "--overwrite",
-        )  # fmt: skip
+        city = OUT / "city"
+        g2ard("synth", "city", "--size", "480x360", "--output", str(city), "--overwrite")
+        views = ["--views", str(city / "train.json"), "--held-out", str(city / "val.json")]
+        options = ["--ratio", "10", "--background", "0.6,0.8,1", "--overwrite"]  # the sky's colour
+        g2ard("distill", str(city / "cloud.ply"), *views, *options, "--output", str(OUT / "city-10x"))
 
 
 if __name__ == "__main__":
