@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from g2ard.splats import Splats
     from g2ard.targets import Targets
 
-__all__ = ["load_scene", "load_views", "make_targets"]
+__all__ = ["load_scene", "load_splits", "load_views", "make_targets"]
 
 
 def load_scene(run: Run, path: Path) -> Splats:
@@ -30,14 +30,23 @@ def load_views(run: Run, path: Path, split: str, size: int | None) -> Cameras:
     Raises:
         InputError: the file has no views, or the split is empty.
     """
+    return load_splits(run, path, [split], size)[0]
+
+
+def load_splits(run: Run, path: Path, splits: list[str], size: int | None) -> list[Cameras]:
+    """Read views once and give each of several splits, shrunk.
+
+    Raises:
+        InputError: as `load_views`.
+    """
     from g2ard.io import read_view_set
     from g2ard.splits import split_mask
 
     found = read_view_set(path)
     for note in found.notes:
         run.say(f"{path}: {note}")
-    mask = split_mask(path, found.cameras.names, split, stated=found.splits)
-    return found.cameras.take(mask).resized(size)
+    masks = [split_mask(path, found.cameras.names, split, stated=found.splits) for split in splits]
+    return [found.cameras.take(mask).resized(size) for mask in masks]
 
 
 def make_targets(

@@ -24,7 +24,7 @@ from g2ard.cli.options import (
     budget_of,
     one_budget,
 )
-from g2ard.cli.scenes import load_scene, load_views, make_targets
+from g2ard.cli.scenes import load_scene, load_splits, load_views, make_targets
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
@@ -179,8 +179,10 @@ def _views(
     from g2ard.splits import split_mask
 
     if views is not None:
-        train = load_views(run, views, "all" if held_out else "train", size)
-        return train, load_views(run, held_out or views, "all" if held_out else "test", size), None
+        if held_out is not None:
+            return load_views(run, views, "all", size), load_views(run, held_out, "all", size), None
+        train, test = load_splits(run, views, ["train", "test"], size)
+        return train, test, None
     planned = plan_pool(prior, _POOL, seed=run.seed, progress=run.progress)
     pool = planned.cameras
     run.say(f"poses: {planned.kind} ({planned.why})")
