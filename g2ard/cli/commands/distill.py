@@ -188,8 +188,8 @@ def _views(
     run.say(f"poses: {planned.kind} ({planned.why})")
     if held_out is not None:
         return pool.resized(size), load_views(run, held_out, "all", size), pool
-    test = split_mask("views.json", pool.names, "test")
-    return pool.take(~test).resized(size), pool.take(test).resized(size), pool
+    unseen = split_mask("views.json", pool.names, "test")
+    return pool.take(~unseen).resized(size), pool.take(unseen).resized(size), pool
 
 
 def _score(run: Run, prior: Splats, result: Distilled, unseen: Targets, colour: Colour) -> dict[str, Any]:
