@@ -1,5 +1,49 @@
-"""g2ard: distil a dense 3D Gaussian scene into a compact, standard 3DGS model at an exact budget."""
+"""g2ard: distil a dense 3D Gaussian scene into a compact, standard 3DGS model at an exact budget.
+
+Each stage is a module with a function of its name, or nearly so:
+
+| module | function |
+|---|---|
+| `g2ard.lift` | `lift`: coloured points → surface-aligned discs |
+| `g2ard.simplify` | `simplify`: fewer Gaussians, at an exact count |
+| `g2ard.poses` | `make_pool`: views for a scene that has none |
+| `g2ard.select` | `select`: the views worth having |
+| `g2ard.recover` | `recover`: a fixed set of Gaussians against photos or a teacher's renders |
+| `g2ard.distill` | `distill`: all of it |
+| `g2ard.render`, `g2ard.evaluate` | `render`, `visibility`; `evaluate` |
+| `g2ard.synth` | `city`: a procedural city |
+
+What they pass on, and files, are here: `Splats`, `Cameras`, `read_splats`, `write_splats`, `read_points`, `read_views`,
+`write_views`. Nothing heavy loads before it is used.
+"""
 
 from __future__ import annotations
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from g2ard.cameras import Cameras
+    from g2ard.io import read_points, read_splats, read_views, write_splats, write_views
+    from g2ard.splats import Splats
+
 __version__ = "0.1.0"
+
+__all__ = [
+    "Cameras",
+    "Splats",
+    "__version__",
+    "read_points",
+    "read_splats",
+    "read_views",
+    "write_splats",
+    "write_views",
+]
+
+_HOMES = {"Splats": "g2ard.splats", "Cameras": "g2ard.cameras"}
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        return getattr(import_module(_HOMES.get(name, "g2ard.io")), name)
+    raise AttributeError(f"module 'g2ard' has no attribute {name!r}")

@@ -30,6 +30,15 @@ def test_import_and_help_load_nothing_heavy() -> None:
     assert eval(out.stdout) == []
 
 
+def test_the_package_hands_out_what_its_docstring_names() -> None:
+    import g2ard
+
+    for name in g2ard.__all__:
+        assert getattr(g2ard, name) is not None
+    with pytest.raises(AttributeError, match="nonsense"):
+        _ = g2ard.nonsense
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_an_example(command: str, command_line: CommandLine, tmp_path: Path) -> None:
     status, shown, _ = command_line(command, "--help", cwd=tmp_path)

@@ -172,6 +172,8 @@ def command(name: str, *, example: str, parent: typer.Typer = app) -> Callable[[
 def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None:
     if run.device not in ("auto", "cpu", "gpu", "cuda"):
         raise typer.BadParameter(f"--device: auto, cpu, gpu or cuda, not {run.device!r}")
+    if run.device in ("gpu", "cuda"):
+        run.say(f"--device {run.device}: this build computes on the CPU only, and does")
     try:
         if run.threads:
             from g2ard import _core
