@@ -13,8 +13,8 @@ Each stage is a module with a function of its name, or nearly so:
 | `g2ard.render`, `g2ard.evaluate` | `render`, `visibility`; `evaluate` |
 | `g2ard.synth` | `city`: a procedural city |
 
-What they pass on, and files, are here: `Splats`, `Cameras`, `read_splats`, `write_splats`, `read_points`, `read_views`,
-`write_views`. Nothing heavy loads before it is used.
+What they pass on, and files, are here: `Splats`, `Cameras`, `read_splats`, `write_splats`, `read_points`,
+`read_views`, `write_views`. Nothing heavy loads before it is used.
 """
 
 from __future__ import annotations
