@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 RUST := $(shell find rust -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml) Cargo.toml Cargo.lock
 
-.PHONY: demo test lint wheel setup clean
+.PHONY: demo test lint bench wheel setup clean
 
 setup: $(VENV)/.built
 
@@ -31,6 +31,12 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# Needs a scene: SCENE=path, or real data.
+SCENE ?= $(G2ARD_DATA)/playbot/0_0
+bench: setup
+	$(BIN)/g2ard bench raster $(SCENE)
+	$(BIN)/g2ard bench simplify $(SCENE) --ratios 10,30 --output bench
 
 wheel: setup
 	$(BIN)/maturin build --release --out dist

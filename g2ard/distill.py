@@ -17,7 +17,7 @@ from g2ard.progress import Progress, silent
 from g2ard.recover.anchors import PRESETS, Regularizers
 from g2ard.recover.schedule import TUNED, Schedule
 from g2ard.splats import Splats
-from g2ard.targets import Targets
+from g2ard.targets import Targets, fingerprint_of
 
 __all__ = ["DistillConfig", "Distilled", "distill"]
 
@@ -121,7 +121,7 @@ class _Rounds:
         self.protected: Any = None
         self.log: list[dict[str, Any]] = []
         self.seconds = {"simplify": 0.0, "recover": 0.0}
-        self.key = _fingerprint(prior, budget, config)
+        self.key = _fingerprint(prior, budget, targets, config)
 
     def advance(self, number: int, count: int, *, final: bool) -> None:
         """One round: simplify to `count`, recover; the final one recovers for the final horizon as well."""
@@ -227,8 +227,6 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-def _fingerprint(prior: Splats, budget: int, config: DistillConfig) -> str:
-    digest = hashlib.sha256(repr((budget, config)).encode())
-    for array in (prior.means, prior.scales, prior.sh0, prior.logit_opacities):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+def _fingerprint(prior: Splats, budget: int, targets: Targets, config: DistillConfig) -> str:
+    parts = (repr((budget, config)), prior.fingerprint(), fingerprint_of(targets))
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()

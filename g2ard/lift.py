@@ -44,7 +44,7 @@ def lift(
 
     Returns:
         N discs of SH degree 0 in the order of the points; rows that are not finite are left out. Means are
-        float32 about `offset`, the median point in float64.
+        float32; far coordinates, which float32 cannot hold, are relative to `offset`, the median point.
 
     Raises:
         InputError: shapes that do not fit, no finite point, or a parameter out of its range.
@@ -67,8 +67,8 @@ def lift(
         raise InputError(f"points: none of {len(xyz)} is finite")
     if not finite.all():
         xyz, rgb = xyz[finite], rgb[finite]
-    offset = _middle(xyz)
-    centered = xyz - offset
+    middle = _middle(xyz)
+    centered = xyz - middle
     quats, scales = _core.lift_points(
         centered,
         neighbors=neighbors,
@@ -77,14 +77,21 @@ def lift(
         progress=counter(progress, "lift"),
     )
     n = len(centered)
+    near = _fits_float32(xyz, scales)
     return Splats.create(
-        centered.astype(np.float32),
+        (xyz if near else centered).astype(np.float32),
         quats=quats,
         scales=scales,
         logit_opacities=np.full(n, np.log(opacity / (1 - opacity))),
         sh0=((rgb - 0.5) / SH_C0)[:, None],
-        offset=offset,
+        offset=np.zeros(3) if near else middle,
     )
+
+
+def _fits_float32(points: NDArray[np.float64], scales: NDArray[np.float32]) -> bool:
+    """Whether float32 holds the coordinates as they are, to 1 % of a disc: other programs know no offset."""
+    step = np.spacing(np.float32(np.abs(points).max()))
+    return bool(step <= 0.01 * np.median(scales[:, 0]))
 
 
 def _middle(points: NDArray[np.float64]) -> NDArray[np.float64]:

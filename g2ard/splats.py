@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -128,6 +129,13 @@ class Splats:
     def nbytes(self) -> int:
         """Bytes of all arrays in float32, the form a .ply holds."""
         return 4 * len(self) * (14 + 3 * self.shN.shape[1])
+
+    def fingerprint(self) -> str:
+        """A hash of every array: the same scene, the same text."""
+        digest = hashlib.sha256()
+        for name in ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset"):
+            digest.update(np.ascontiguousarray(getattr(self, name)).tobytes())
+        return digest.hexdigest()
 
     def take(self, index: Any) -> Splats:
         """The rows `index` selects (a mask, a slice or indices), in its order."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,7 +13,7 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
 
-__all__ = ["CACHE_BYTES", "Photos", "Targets", "TeacherRenders"]
+__all__ = ["CACHE_BYTES", "Photos", "Targets", "TeacherRenders", "fingerprint_of"]
 
 CACHE_BYTES = 2_000_000_000
 """Targets are kept in memory up to this many bytes; beyond it they are made again when they are asked for."""
@@ -24,6 +25,15 @@ class Targets(Protocol):
     cameras: Cameras
 
     def __getitem__(self, view: int) -> NDArray[np.float32]: ...
+
+
+def fingerprint_of(targets: Targets) -> str:
+    """What a checkpoint remembers of its targets: the views, and where their images come from."""
+    cameras = targets.cameras
+    digest = hashlib.sha256(str(getattr(targets, "source", type(targets).__name__)).encode())
+    for array in (cameras.viewmats, cameras.Ks, cameras.widths, cameras.heights):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 class _Cached:
@@ -64,8 +74,9 @@ class Photos(_Cached):
             (n for n, p in zip(cameras.names, cameras.image_paths, strict=True) if p is None), None
         )
         if missing is not None:
-            raise InputError(f"view {missing}: has no photo; give --teacher to render targets instead")
+            raise InputError(f"view {missing}: has no photo, and no teacher stands in for it")
         super().__init__(cameras, limit)
+        self.source = "photos " + " ".join(str(path) for path in cameras.image_paths)
 
     def _make(self, view: int) -> NDArray[np.uint8]:
         from g2ard.images import load_image
@@ -91,6 +102,7 @@ class TeacherRenders(_Cached):
         super().__init__(cameras, limit)
         self._teacher = teacher
         self._background = background
+        self.source = f"teacher {teacher.fingerprint()} {background}"
         self.fill(progress, "teacher")
 
     def _make(self, view: int) -> NDArray[np.float32]:

@@ -79,6 +79,18 @@ def test_config_file_gives_defaults_and_refuses_unknown_names(
     assert "abacus" not in flagged  # … a flag wins
 
 
+def test_config_file_takes_plain_toml_values(command_line: CommandLine, tmp_path: Path) -> None:
+    from scenes import checkered_ball
+
+    from g2ard.io import read_splats, write_splats
+
+    write_splats(tmp_path / "s.ply", checkered_ball(50))
+    (tmp_path / "c.toml").write_text("[simplify]\nratio = 10\nno-views = true\n")
+    status, _, error = command_line("simplify", "s.ply", "-o", "o.ply", "--config", "c.toml", cwd=tmp_path)
+    assert status == 0, error
+    assert len(read_splats(tmp_path / "o.ply")) == 5
+
+
 def test_progress_lines_are_rare_and_tell_eta(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -49,11 +49,12 @@ def test_map_coordinates_keep_their_precision():
 def test_translation_and_scale_by_powers_of_two_are_exact():
     points = np.round(surface() * 2**20) / 2**20
     colors = np.full_like(points, 0.5)
-    here, there = lift(points, colors), lift(points * 4 + 1024, colors)
-    np.testing.assert_array_equal(there.means, here.means * 4)
-    np.testing.assert_array_equal(there.offset, here.offset * 4 + 1024)
-    np.testing.assert_array_equal(there.scales, here.scales * 4)
-    np.testing.assert_array_equal(there.quats, here.quats)
+    here, far = lift(points, colors), lift(points * 4 + 2**22, colors)
+    assert far.offset.any()  # float32 cannot hold such coordinates
+    np.testing.assert_allclose(far.means + far.offset, points * 4 + 2**22, rtol=0, atol=1e-5)
+    for there in (far, lift(points * 4 + 1024, colors)):
+        np.testing.assert_array_equal(there.scales, here.scales * 4)
+        np.testing.assert_array_equal(there.quats, here.quats)
 
 
 def test_threads_do_not_matter():
@@ -126,3 +127,13 @@ def test_command_line(tmp_path, command_line):
     status, _, err = command_line("lift", "absent.ply", "-o", "other.ply", cwd=tmp_path)
     assert (status, len(err.splitlines())) == (1, 1)
     assert "absent.ply" in err
+
+
+def test_near_coordinates_stay_the_caller_s_own():
+    rng = np.random.default_rng(3)
+    points, shift = rng.uniform(-150, 150, (500, 3)), np.array([5e5, 4e6, 0])
+    near, far = lift(points, np.full((500, 3), 0.5)), lift(points + shift, np.full((500, 3), 0.5))
+    np.testing.assert_array_equal(near.offset, 0)
+    np.testing.assert_array_equal(near.means, points.astype(np.float32))
+    assert far.offset.any()
+    np.testing.assert_allclose(far.means + far.offset, points + shift, atol=1e-3)

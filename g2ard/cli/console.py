@@ -72,7 +72,7 @@ class Console:
             table.add_column(name, justify="left" if i == 0 else "right")
         for row in rows:
             table.add_row(*row)
-        Rich(stderr=True).print(table)
+        Rich(stderr=True, width=None if sys.stderr.isatty() else 120).print(table)
 
     def __call__(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
         if self.quiet:

@@ -56,12 +56,19 @@ def _load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     except (OSError, tomllib.TOMLDecodeError) as e:
         raise typer.BadParameter(f"{path}: {e}") from None
     table = values.get(str(ctx.info_name), {k: v for k, v in values.items() if not isinstance(v, dict)})
-    table = {key.replace("-", "_"): value for key, value in table.items()}
+    table = {key.replace("-", "_"): _as_typed(value) for key, value in table.items()}
     unknown = sorted(set(table) - {p.name for p in ctx.command.params})
     if unknown:
         raise typer.BadParameter(f"{path}: no option of `{ctx.info_name}` is called {', '.join(unknown)}")
     ctx.default_map = {**(ctx.default_map or {}), **table}
     return path
+
+
+def _as_typed(value: Any) -> Any:
+    """A TOML value as it would be typed: options parse text; [1, 1, 1] is 1,1,1."""
+    if isinstance(value, list):
+        return ",".join(str(item) for item in value)
+    return value if isinstance(value, bool) else str(value)
 
 
 _COMMON: dict[str, tuple[Any, Any]] = {
@@ -75,8 +82,8 @@ _COMMON: dict[str, tuple[Any, Any]] = {
         Annotated[str | None, typer.Option("--json", metavar="FILE|-", help="Write the result as JSON.")],
         None,
     ),
-    "seed": (Annotated[int, typer.Option(help="Seed of everything random.")], 0),
-    "threads": (Annotated[int, typer.Option(min=0, help="Threads to use; 0 means every core.")], 0),
+    "seed": (Annotated[int, typer.Option(min=0, help="Seed of everything random.")], 0),
+    "threads": (Annotated[int, typer.Option(min=0, max=256, help="Threads; 0 means every core.")], 0),
     "device": (Annotated[str, typer.Option(metavar="auto|cpu|gpu|cuda", help="Where to compute.")], "auto"),
     "config": (
         Annotated[
@@ -172,9 +179,15 @@ def command(name: str, *, example: str, parent: typer.Typer = app) -> Callable[[
 def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None:
     if run.device not in ("auto", "cpu", "gpu", "cuda"):
         raise typer.BadParameter(f"--device: auto, cpu, gpu or cuda, not {run.device!r}")
+    if run.json not in (None, "-") and Path(str(run.json)) == options.get("output"):
+        raise typer.BadParameter(f"--json and --output are both {run.json}")
     if run.device in ("gpu", "cuda"):
         run.say(f"--device {run.device}: this build computes on the CPU only, and does")
     try:
+        if run.json not in (None, "-"):
+            from g2ard.io.atomic import check_output
+
+            check_output(str(run.json), run.overwrite)
         if run.threads:
             from g2ard import _core
 

@@ -99,12 +99,22 @@ def one_budget(count: Count | None, ratio: float | None) -> None:
         raise typer.BadParameter("give the budget as either -n COUNT or -r RATIO")
 
 
-def budget_of(count: Count | None, ratio: float | None, total: int) -> int:
-    """The exact budget out of `total` Gaussians; N/RATIO is rounded to the nearest and at least 1."""
+def budget_of(scene: Path, count: Count | None, ratio: float | None, total: int) -> int:
+    """The exact budget out of the scene's `total` Gaussians; N/RATIO is rounded to the nearest, at least 1.
+
+    Raises:
+        InputError: it is above `total`.
+    """
+    from g2ard.errors import InputError
+
     if count is not None:
-        return count.of(total)
-    assert ratio is not None  # one_budget has seen to it
-    return max(1, math.floor(total / ratio + 0.5))
+        budget = count.of(total)
+    else:
+        assert ratio is not None  # one_budget has seen to it
+        budget = max(1, math.floor(total / ratio + 0.5))
+    if budget > total:
+        raise InputError(f"{scene}: the budget of {budget} is above its {total} Gaussians")
+    return budget
 
 
 class Triple(tuple[float, float, float]):
@@ -158,3 +168,9 @@ TimeLimitOption = Annotated[
     float | None,
     typer.Option("--time-limit", parser=_duration, metavar="TIME", help="Fit recovery into 90s, 2m or 1h."),
 ]
+
+
+def one_horizon(steps: int | None, time_limit: float | None) -> None:
+    """Usage check: --steps and --time-limit both set the horizon."""
+    if steps is not None and time_limit is not None:
+        raise typer.BadParameter("--steps and --time-limit exclude each other")

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 __all__ = ["RecoverConfig", "Recovered", "recover"]
 
 
-def __getattr__(name: str) -> Any:  # torch loads when recovery is first asked for, not at import
+def __getattr__(name: str) -> Any:  # numpy loads when recovery is first asked for
     if name in __all__:
         from g2ard.recover import optimize
 

@@ -18,7 +18,7 @@ from g2ard.recover import checkpoint as checkpoints
 from g2ard.recover.anchors import PRESETS, Anchors, Regularizers, drift95, needle
 from g2ard.recover.schedule import TUNED, Rates, Schedule, multiplier_for
 from g2ard.splats import Splats
-from g2ard.targets import Targets
+from g2ard.targets import Targets, fingerprint_of
 
 __all__ = ["RecoverConfig", "Recovered", "recover"]
 
@@ -263,8 +263,5 @@ def _sample_error(splats: Splats, targets: Targets, config: RecoverConfig) -> fl
 
 
 def _fingerprint(student: Splats, targets: Targets, config: RecoverConfig) -> str:
-    digest = hashlib.sha256(repr(config).encode())
-    cameras = targets.cameras
-    for array in (student.means, student.scales, student.sh0, cameras.viewmats, cameras.Ks, cameras.widths):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+    parts = (repr(config), student.fingerprint(), fingerprint_of(targets))
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()

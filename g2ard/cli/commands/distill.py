@@ -12,7 +12,6 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
-    Count,
     CountOption,
     Method,
     PresetOption,
@@ -23,6 +22,7 @@ from g2ard.cli.options import (
     ViewsOption,
     budget_of,
     one_budget,
+    one_horizon,
 )
 from g2ard.cli.scenes import load_scene, load_splits, load_views, make_targets
 
@@ -76,6 +76,7 @@ def distill(
 ) -> None:
     """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget."""
     one_budget(count, ratio)
+    one_horizon(steps, time_limit)
     import shutil
     import time
 
@@ -90,15 +91,16 @@ def distill(
     lifted = kind(scene) != "splats"
     if lifted and views is None:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
-    check_output(output, run.overwrite or resume, folder=True)
+    stopped = resume and (output / "work").is_dir()
+    check_output(output, run.overwrite or stopped, folder=True)
     prior = _lift(run, scene) if lifted else load_scene(run, scene)
-    budget = _budget(scene, count, ratio, len(prior))
+    budget = budget_of(scene, count, ratio, len(prior))
     train, test, pool = _views(run, prior, views, held_out, size)
     pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
     use_photos = lifted or (pictured if photos is None else photos)
     teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
     colour = background or (0.0, 0.0, 0.0)
-    regularizers, why = preset_for("lift" if preset == "auto" and lifted else preset, prior)
+    regularizers, why = preset_for(preset, prior)
     run.say(f"{len(prior):,} → {budget:,} Gaussians; {len(train)} views against {against}")
     run.say(f"regularisers: {why}")
     config = DistillConfig(
@@ -119,10 +121,10 @@ def distill(
         except KeyboardInterrupt:
             run.say(f"stopped; the same command with --resume goes on in {output}")
             raise
-    report = _score(run, prior, result, unseen, colour)
-    report |= {"against": against, "preset": why, "rounds": result.report["rounds"]}
-    report["seconds"] = {**result.report["seconds"], "total": time.monotonic() - began}
-    _write(run, output, result, unseen, colour, report)
+        report = _score(run, prior, result, unseen, colour)
+        report |= {"against": against, "preset": why, "rounds": result.report["rounds"]}
+        report["seconds"] = {**result.report["seconds"], "total": time.monotonic() - began}
+        _write(run, output, result, unseen, colour, report)
     if pool is not None:
         write_views(output / "views.json", pool, overwrite=True)
     shutil.rmtree(output / "work")
@@ -138,15 +140,13 @@ def _work_folder(output: Path, resume: bool) -> Iterator[Path]:
     """Where finished rounds and checkpoints wait for --resume; an error leaves nothing behind."""
     import shutil
 
-    from g2ard.errors import G2ardError
-
     work, made = output / "work", not output.exists()
     if not resume:
         shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True, exist_ok=True)
     try:
         yield work
-    except G2ardError:
+    except Exception:
         if not resume:
             shutil.rmtree(output if made else work, ignore_errors=True)
         raise
@@ -160,15 +160,6 @@ def _lift(run: Run, path: Path) -> Splats:
     for note in cloud.notes:
         run.say(f"{path}: {note}")
     return lift(cloud.points.positions, cloud.points.colors, progress=run.progress)
-
-
-def _budget(scene: Path, count: Count | None, ratio: float | None, total: int) -> int:
-    from g2ard.errors import InputError
-
-    budget = budget_of(count, ratio, total)
-    if budget > total:
-        raise InputError(f"{scene}: the budget of {budget} is above its {total} Gaussians")
-    return budget
 
 
 def _views(

@@ -14,7 +14,9 @@ from g2ard.cli.options import OutputOption
 @command("lift", example="g2ard lift stadium.laz -o prior.ply")
 def lift(
     run: Run,
-    cloud: Annotated[Path, typer.Argument(metavar="CLOUD", help="A coloured .ply, .las or .laz.")],
+    cloud: Annotated[
+        Path, typer.Argument(metavar="CLOUD", help=".ply, .las, .laz or COLMAP points, coloured.")
+    ],
     output: OutputOption,
     neighbors: Annotated[int, typer.Option(help="Nearest points that each disc's plane is fitted to.")] = 10,
     normal_ratio: Annotated[float, typer.Option(help="Thickness of a disc over its width.")] = 0.1,

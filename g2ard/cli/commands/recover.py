@@ -17,6 +17,7 @@ from g2ard.cli.options import (
     SplitOption,
     TeacherOption,
     TimeLimitOption,
+    one_horizon,
 )
 
 
@@ -51,6 +52,7 @@ def recover(
     from g2ard.recover.presets import preset_for
     from g2ard.recover.schedule import schedule_named
 
+    one_horizon(steps, time_limit)
     check_output(output, run.overwrite)
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(run, student)

@@ -66,7 +66,7 @@ def simplify(
     for note in found.notes:
         run.say(f"{scene}: {note}")
     read = time.perf_counter()
-    budget = budget_of(count, ratio, len(found.splats))
+    budget = budget_of(scene, count, ratio, len(found.splats))
     cameras = None if no_views or budget >= len(found.splats) else _cameras(run, found.splats, views, method)
     small = reduce(
         found.splats,
