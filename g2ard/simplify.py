@@ -356,10 +356,11 @@ def _check_flags(protected: NDArray[np.bool_] | None, count: int) -> NDArray[np.
 
 def _clean(splats: Splats) -> tuple[Splats, NDArray[np.bool_] | slice]:
     """The finite rows, C-contiguous, and which they are."""
-    finite = splats.finite_rows()
+    arrays = (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN)
+    everything = all(np.isfinite(a).all() for a in arrays) and not np.isnan(splats.logit_opacities).any()
+    finite = np.ones(len(splats), bool) if everything else splats.finite_rows()
     if not finite.any():
         raise InputError(f"splats: none of {len(splats)} rows is finite")
-    everything = bool(finite.all())
     scene = splats if everything else splats.take(finite)
     kind = np.float64 if scene.means.dtype == np.float64 else np.float32
     scene = replace(

@@ -314,3 +314,15 @@ def test_real_scenes(name, kind, up, data: Path) -> None:
     assert pool.kind == kind
     assert pool.up @ up > np.cos(np.radians(5))
     assert len(pool.cameras) == 128
+
+
+def test_a_pool_planned_on_a_sample_looks_at_the_same_thing(scenes: dict[str, Splats]) -> None:
+    splats = scenes["statue"]
+    whole, part = (plan_pool(splats, 16, rows=rows) for rows in (None, len(splats) // 2))
+    assert part.kind == whole.kind
+    assert part.up @ whole.up > 0.99
+    mixed = splats.take(np.random.default_rng(1).permutation(len(splats)))
+    again = make_pool(mixed, 16, rows=len(splats) // 2)
+    np.testing.assert_array_equal(again.viewmats, part.cameras.viewmats)
+    with pytest.raises(InputError, match="rows: expected at least 1"):
+        make_pool(splats, 4, rows=0)

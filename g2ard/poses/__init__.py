@@ -26,6 +26,7 @@ def make_pool(
     fov: float = 50.0,
     up: ArrayLike | None = None,
     seed: int = 0,
+    rows: int | None = None,
     progress: Progress = silent,
 ) -> Cameras:
     """Poses that see the scene well from free space, evenly spread.
@@ -40,6 +41,8 @@ def make_pool(
         fov: horizontal field of view, degrees.
         up: (3,) direction away from the ground; None to estimate it.
         seed: of the placement; the same seed gives the same poses.
+        rows: of more Gaussians than this only a fair sample is looked at, on a coarser grid: less sure of
+            narrow places, several times as fast. None for all.
         progress: told of each step.
 
     Returns:
@@ -56,5 +59,5 @@ def make_pool(
     (16, 'pose_0000', True)
     """
     return plan_pool(
-        splats, count, kind=kind, size=size, fov=fov, up=up, seed=seed, progress=progress
+        splats, count, kind=kind, size=size, fov=fov, up=up, seed=seed, rows=rows, progress=progress
     ).cameras

@@ -18,6 +18,9 @@ Floats = NDArray[np.float64]
 _CELLS = (2_000_000, 6_000_000)
 """Cells in all, one for each Gaussian between these: a large scene is looked at more finely."""
 
+_CELLS_A_ROW = 5
+"""For each Gaussian of a sample: 100,000 rows fill as fine a grid as plans an overview."""
+
 _OPAQUE = 0.3
 """Opacity × area, summed, per face of a cell: above it light hardly passes."""
 
@@ -47,12 +50,15 @@ class Grid:
     @classmethod
     def of(cls, low: Floats, high: Floats, matter: Matter, axes: Floats, *, cells: int = 0) -> Grid:
         """Fill the box from `low` to `high`, along the rows of `axes`; 0 cells means by the matter's rows."""
+        if matter.stand_for > 1:
+            cells = cells or _CELLS_A_ROW * len(matter.points)
         cells = cells or int(np.clip(len(matter.points), *_CELLS))
         sides = np.maximum(high - low, np.max(high - low) / 256)
         cell = float(np.cbrt(np.prod(sides) / cells))
         shape = np.maximum(1, np.ceil(sides / cell)).astype(int)
         points, filled = turned(matter.points, axes), np.zeros(int(np.prod(shape)))
-        optical = matter.opacities * 2 * np.pi * matter.scales[:, 1] * matter.scales[:, 2] / cell**2
+        faces = 2 * np.pi * matter.scales[:, 1] * matter.scales[:, 2] / cell**2
+        optical = matter.stand_for * matter.opacities * faces
         parts = np.clip(np.ceil(1.6 * matter.scales[:, 2] / cell), 1, 9).astype(np.int8)
         for count in np.unique(parts):
             rows = np.flatnonzero(parts == count)

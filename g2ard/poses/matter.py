@@ -64,6 +64,7 @@ class Matter:
         opacities: (M,) in (0, 1].
         origin: (3,) relative to the scene's offset.
         size: scene units per unit here: half the diagonal of the box that holds 98 % along each axis.
+        stand_for: how many Gaussians each row stands for: more than 1 in a sample.
     """
 
     points: Floats
@@ -74,17 +75,24 @@ class Matter:
     opacities: Floats
     origin: Floats
     size: float
+    stand_for: float = 1.0
 
     @classmethod
-    def of(cls, splats: Splats) -> Matter:
+    def of(cls, splats: Splats, limit: int | None = None) -> Matter:
         """Weigh a scene's rows, leave out what is invisible or far off, and normalise the rest.
+
+        Of more than `limit` rows only a fair sample is looked at.
 
         Raises:
             InputError: nothing is visible.
         """
         opacities = splats.opacities.astype(np.float64)
-        rows = np.flatnonzero(splats.finite_rows() & (opacities > 1 / 255))
-        rows = rows[canonical_order(splats, rows)]
+        rows = np.flatnonzero(opacities > 1 / 255)
+        visible = len(rows)
+        rows = rows[canonical_order(splats, rows)[:limit]]
+        stand_for = visible / max(1, len(rows))
+        if len(rows):
+            rows = rows[splats.take(rows).finite_rows()]
         opacities = opacities[rows]
         means = splats.means[rows].astype(np.float64)
         scales = np.abs(splats.scales[rows])
@@ -105,6 +113,7 @@ class Matter:
             opacities=opacities[near],
             origin=origin,
             size=size,
+            stand_for=stand_for,
         )
 
     def sample(self) -> Sample:

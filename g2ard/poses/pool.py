@@ -56,6 +56,7 @@ def plan_pool(
     fov: float = 50.0,
     up: ArrayLike | None = None,
     seed: int = 0,
+    rows: int | None = None,
     progress: Progress = silent,
 ) -> Pool:
     """As `make_pool` (see there for all but the result), and what was found out about the scene.
@@ -66,10 +67,12 @@ def plan_pool(
     lens = _lens(size, fov)
     if count < 1:
         raise InputError(f"count: expected at least 1 pose, got {count}")
+    if rows is not None and rows < 1:
+        raise InputError(f"rows: expected at least 1, got {rows}")
     if kind not in KINDS:
         raise InputError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
     progress("scene", 0, 1)
-    site = Site.of(splats, up)
+    site = Site.of(splats, up, rows)
     progress("scene", 1, 1)
     kinds, why = _kinds(site, kind)
     tell = counter(progress, "poses")

@@ -46,13 +46,13 @@ class Site:
     up: Up
 
     @classmethod
-    def of(cls, splats: Splats, up: ArrayLike | None = None) -> Site:
-        """Stand a scene upright.
+    def of(cls, splats: Splats, up: ArrayLike | None = None, rows: int | None = None) -> Site:
+        """Stand a scene upright, looking at `rows` of its Gaussians at most.
 
         Raises:
             InputError: nothing visible, or an `up` that is no direction.
         """
-        matter = Matter.of(splats)
+        matter = Matter.of(splats, rows)
         some = matter.sample()
         found = estimate_up(some) if up is None else given_up(some, up)
         axes = _axes(some, found.axis)

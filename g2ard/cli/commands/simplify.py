@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 _VIEWS = 16
 """Poses of a pool of its own: 112 were no better."""
 
+_ROWS = 100_000
+"""Gaussians that those are planned on."""
+
 
 @command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply")
 def simplify(
@@ -108,7 +111,7 @@ def _cameras(run: Run, splats: Splats, views: Path | None, method: str) -> Camer
     if views is not None:
         return load_views(run, views, "train", None)
     try:
-        return make_pool(splats, _VIEWS, seed=run.seed, progress=run.progress)
+        return make_pool(splats, _VIEWS, seed=run.seed, rows=_ROWS, progress=run.progress)
     except InputError as e:
         run.say(f"goes on without views: {e}")
         return None

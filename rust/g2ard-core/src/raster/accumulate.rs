@@ -1,6 +1,5 @@
 //! What each Gaussian contributes to a view: the sums that visibility, pruning and counting are made of.
 
-use super::backward::SUMS;
 use super::forward::{BATCH, Place, Staged, alpha, block_coordinates, log2_alpha};
 use super::order::Shared;
 use super::project::Splat;
@@ -39,17 +38,27 @@ impl Accumulated {
     }
 }
 
-/// One tile's sums, pair by pair, in the slots: weight, transmittance, hits, peak, dominant.
+/// One pair's sums: weight, transmittance, hits, dominant, peak.
+pub type Share = [f32; 5];
+
+/// A block's state from front to back; what a pair touches lies side by side.
+#[derive(Clone, Copy)]
+struct Block {
+    /// The light that would be left if nothing ever stopped: see the forward kernel.
+    unstopped: Row,
+    /// The largest αT so far, and the number of its pair, −1 for none.
+    most: Row,
+    winner: Row,
+}
+
+/// Blends one tile from front to back without an image: only every pair's sums, each in its own slot.
 pub struct Accumulate<'a> {
     pub pairs: &'a [Pair],
     pub splats: &'a [Splat],
     pub place: Place,
     pub settings: &'a Settings,
-    /// What the forward pass left: one entry per batch it looked at.
-    pub words: &'a [[u64; BLOCKS]],
-    pub last: &'a [Row; BLOCKS],
     pub staged: &'a mut Staged,
-    pub slots: Shared<[f32; SUMS]>,
+    pub slots: Shared<Share>,
     pub written: Shared<u8>,
 }
 
@@ -60,70 +69,127 @@ impl Kernel for Accumulate<'_> {
     fn run<F: Lanes>(self) {
         let minimum = F::splat(ALPHA_MIN.log2());
         let clip = F::splat(self.settings.alpha_max);
-        let mut transmittance = [Row([1.0; LANES]); BLOCKS];
-        let mut best = [Row::default(); BLOCKS];
-        let mut winner = [Row([-1.0; LANES]); BLOCKS];
-        for (batch, words) in self.words.iter().enumerate() {
-            let first = batch * BATCH;
+        let stop = F::splat(self.settings.transmittance_min);
+        let mut blocks = [Block {
+            unstopped: Row::default(),
+            most: Row::default(),
+            winner: Row([-1.0; LANES]),
+        }; BLOCKS];
+        for b in 0..BLOCKS {
+            let on_image = F::Mask::from_bits(self.place.lanes(b));
+            F::splat(1.0).only(on_image).store(&mut blocks[b].unstopped);
+        }
+        let mut words = [0; BLOCKS];
+        let mut lit = u16::MAX;
+        for first in (0..self.pairs.len()).step_by(BATCH) {
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
-            self.staged.load(pairs, self.splats, &self.place);
-            let mut sums = [[0f32; SUMS]; BATCH];
-            for block in 0..BLOCKS {
-                let (x, y) = block_coordinates::<F>(block);
-                let last = F::load(&self.last[block]);
-                let mut t = F::load(&transmittance[block]);
-                let mut most = F::load(&best[block]);
-                let mut who = F::load(&winner[block]);
-                let mut todo = words[block];
+            self.staged
+                .load(&self.pairs[first..], self.splats, &self.place);
+            let s = &*self.staged;
+            s.reachable::<F>(pairs.len(), &mut words);
+            let masks = by_pair(&words);
+            for (p, pair) in pairs.iter().enumerate() {
+                let mut todo = masks[p] & lit;
+                let number = F::splat((first + p) as f32);
+                let [mut weight, mut light, mut peak] = [F::zero(); 3];
+                let mut hits = 0;
                 while todo != 0 {
-                    let p = todo.trailing_zeros() as usize;
+                    let b = todo.trailing_zeros() as usize % BLOCKS;
                     todo &= todo - 1;
-                    let number = F::splat((first + p) as f32);
-                    let (_, _, log2) = log2_alpha(self.staged, p, x, y);
-                    let hit = log2.ge(minimum).and(last.ge(number));
+                    let block = &mut blocks[b];
+                    let (x, y) = block_coordinates::<F>(b);
+                    let (_, _, log2) = log2_alpha(s, p, x, y);
+                    let hit = log2.ge(minimum);
                     let a = alpha(log2).min(clip).only(hit);
-                    let w = a * t;
-                    let wins = w.gt(most);
-                    who = F::select(wins, number, who);
-                    most = most.max(w);
-                    let mut row = [Row::default(); 2];
-                    w.store(&mut row[0]);
-                    t.only(hit).store(&mut row[1]);
-                    let sum = &mut sums[p];
-                    for l in 0..LANES {
-                        sum[0] += row[0].0[l];
-                        sum[1] += row[1].0[l];
-                        sum[3] = sum[3].max(row[0].0[l]);
+                    let t = F::load(&block.unstopped);
+                    let next = a.fnma(t, t);
+                    next.store(&mut block.unstopped);
+                    let going = next.gt(stop);
+                    if !going.any() {
+                        lit &= !(1 << b);
+                        continue;
                     }
-                    sum[2] += hit.bits().count_ones() as f32;
-                    t = a.fnma(t, t);
+                    let go = hit.and(going);
+                    let w = (a * t).only(go);
+                    let most = F::load(&block.most);
+                    let winner = F::load(&block.winner);
+                    F::select(w.gt(most), number, winner).store(&mut block.winner);
+                    most.max(w).store(&mut block.most);
+                    weight = weight + w;
+                    light = light + t.only(go);
+                    peak = peak.max(w);
+                    hits += go.bits().count_ones();
                 }
-                t.store(&mut transmittance[block]);
-                most.store(&mut best[block]);
-                who.store(&mut winner[block]);
-            }
-            for (pair, sum) in pairs.iter().zip(&sums) {
-                if sum[2] > 0.0 {
+                if hits > 0 {
+                    let share = [
+                        folded(weight, add),
+                        folded(light, add),
+                        hits as f32,
+                        0.0,
+                        folded(peak, larger),
+                    ];
                     // SAFETY: a slot belongs to one pair, and a pair to one tile.
                     unsafe {
-                        self.slots.write(pair.slot as usize, *sum);
+                        self.slots.write(pair.slot as usize, share);
                         self.written.write(pair.slot as usize, 1);
                     }
                 }
             }
+            if lit == 0 {
+                break;
+            }
         }
-        for number in winner.iter().flat_map(|row| row.0) {
+        for number in blocks.iter().flat_map(|block| block.winner.0) {
             if number >= 0.0 {
                 let slot = self.pairs[number as usize].slot as usize;
                 // SAFETY: as above.
-                unsafe { self.slots.slice(slot, 1)[0][4] += 1.0 };
+                unsafe { self.slots.slice(slot, 1)[0][3] += 1.0 };
             }
         }
     }
 }
 
+/// The blocks that each pair reaches, from the pairs that reach each block.
+#[inline(always)]
+fn by_pair(words: &[u64; BLOCKS]) -> [u16; BATCH] {
+    let mut masks = [0; BATCH];
+    for (block, &word) in words.iter().enumerate() {
+        let mut word = word;
+        while word != 0 {
+            masks[word.trailing_zeros() as usize] |= 1 << block;
+            word &= word - 1;
+        }
+    }
+    masks
+}
+
+#[inline(always)]
+fn add(a: f32, b: f32) -> f32 {
+    a + b
+}
+
+#[inline(always)]
+fn larger(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
+}
+
+/// All lanes as one value, halves first.
+#[inline(always)]
+fn folded<F: Lanes>(lanes: F, with: impl Fn(f32, f32) -> f32) -> f32 {
+    let mut row = Row::default();
+    lanes.store(&mut row);
+    let mut half = LANES / 2;
+    while half > 0 {
+        for l in 0..half {
+            row.0[l] = with(row.0[l], row.0[l + half]);
+        }
+        half /= 2;
+    }
+    row.0[0]
+}
+
 /// Adds one splat's slots to its row, in slot order. Returns (weight, transmittance, hits, dominant, peak).
-pub fn total(splat: &Splat, slots: &[[f32; SUMS]], written: &[u8]) -> (f64, f64, u64, u64, f32) {
+pub fn total(splat: &Splat, slots: &[Share], written: &[u8]) -> (f64, f64, u64, u64, f32) {
     let mut sum = (0.0, 0.0, 0, 0, 0f32);
     for slot in splat.slot as usize..(splat.slot + splat.tiles) as usize {
         if written[slot] != 0 {
@@ -131,8 +197,8 @@ pub fn total(splat: &Splat, slots: &[[f32; SUMS]], written: &[u8]) -> (f64, f64,
             sum.0 += f64::from(s[0]);
             sum.1 += f64::from(s[1]);
             sum.2 += s[2] as u64;
-            sum.3 += s[4] as u64;
-            sum.4 = sum.4.max(s[3]);
+            sum.3 += s[3] as u64;
+            sum.4 = sum.4.max(s[4]);
         }
     }
     sum

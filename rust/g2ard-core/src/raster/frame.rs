@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use rayon::prelude::*;
 
-use super::accumulate::{Accumulate, Accumulated, total};
+use super::accumulate::{Accumulate, Accumulated, Share, total};
 use super::backward::{self, Backward, Incoming, SUMS};
 use super::forward::{BATCH, Forward, Pixels, Place, Staged};
 use super::gradients::{Gather, Gradients, Sink};
@@ -104,6 +104,7 @@ pub struct Rasterizer {
     transmittance: Vec<[Row; BLOCKS]>,
     last: Vec<[Row; BLOCKS]>,
     slots: Vec<[f32; SUMS]>,
+    shares: Vec<Share>,
     written: Vec<u8>,
     passes: Passes,
 }
@@ -137,6 +138,7 @@ impl Rasterizer {
             transmittance: Vec::new(),
             last: Vec::new(),
             slots: Vec::new(),
+            shares: Vec::new(),
             written: Vec::new(),
             passes: Passes::default(),
         }
@@ -320,21 +322,17 @@ impl Rasterizer {
                 sums.weight.len(),
             ));
         }
-        self.prepare(*params, camera, settings, [0.0; 3]);
-        let pixels = camera.width * camera.height;
-        let (mut rgb, mut alpha) = (vec![0.0; 3 * pixels], vec![0.0; pixels]);
-        let mut image = Image {
-            rgb: &mut rgb,
-            alpha: &mut alpha,
-            depth: None,
-            median: None,
+        let colourless = Params {
+            sh_n: &[],
+            sh_coeffs: 1,
+            ..*params
         };
-        self.blend::<false>(&mut image);
+        self.prepare(colourless, camera, settings, [0.0; 3]);
         self.accumulate_tiles();
         for &(first, count) in &self.chunks {
             for splat in &self.splats[first..first + count] {
                 let (weight, transmittance, hits, dominant, peak) =
-                    total(splat, &self.slots, &self.written);
+                    total(splat, &self.shares, &self.written);
                 let row = splat.row as usize;
                 sums.weight[row] += weight;
                 sums.transmittance[row] += transmittance;
@@ -344,6 +342,7 @@ impl Rasterizer {
             }
         }
         smallest_pixels(params, camera, &mut sums.pixel_size);
+        self.frame = None; // nothing was blended that a backward pass could go back from
         Ok(())
     }
 
@@ -566,24 +565,24 @@ impl Rasterizer {
     }
 
     fn accumulate_tiles(&mut self) {
-        self.clear_slots();
+        let pairs = self.bins.pairs.len();
+        self.shares.resize(pairs, Share::default());
+        self.written.clear();
+        self.written.resize(pairs, 0);
         let Some(frame) = &self.frame else { return };
         let camera = &frame.camera;
         let tiles_x = camera.tiles().0;
-        let slots = Shared::new(&mut self.slots);
+        let slots = Shared::new(&mut self.shares);
         let written = Shared::new(&mut self.written);
         let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
-        let states = self.batches.par_iter().zip(&self.last);
-        states
-            .enumerate()
-            .for_each_init(Staged::default, |staged, (tile, (batch, last))| {
+        (0..self.batches.len())
+            .into_par_iter()
+            .for_each_init(Staged::default, |staged, tile| {
                 let accumulate = Accumulate {
                     pairs: &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize],
                     splats,
                     place: Place::of(tile, tiles_x, camera.width, camera.height),
                     settings: &frame.settings,
-                    words: &self.words[batch.0..batch.0 + batch.1],
-                    last,
                     staged,
                     slots,
                     written,
