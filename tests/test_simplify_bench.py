@@ -35,12 +35,13 @@ def test_measures_writes_and_resumes(tmp_path: Path) -> None:
     assert again[4].psnr is None
 
     program = tmp_path / "broken"
-    program.write_text("#!/bin/sh\necho it broke >&2\nexit 7\n")
+    program.write_text("#!/bin/sh\necho it broke 1.2 >&2\nexit 7\n")
     program.chmod(0o755)
     (failed,) = bench_simplify(
         [scene], csv, ratios=[4], methods=["splat-transform"], views=views, splat_transform=program
     )
-    assert failed.error == "exit status 7: it broke"
+    assert failed.error == "exit status 7: it broke 1.2"
+    assert failed.version == "it broke 1.2"
     assert len(read_cells(csv)) == 5  # in the old failure's place
 
 

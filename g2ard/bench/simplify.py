@@ -267,7 +267,7 @@ def _version(method: str, splat_transform: Path | None) -> str:
     if splat_transform is None:
         return ""
     told = subprocess.run([splat_transform, "--version"], capture_output=True, text=True, check=False)
-    lines = told.stdout.splitlines()
+    lines = (told.stdout or told.stderr).splitlines()
     return lines[0].strip() if lines else ""
 
 
