@@ -20,6 +20,7 @@ def lift_points(
     max_anisotropy: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
+def knn(points: NDArray[np.float64], k: int) -> NDArray[np.uint32]: ...
 def simplify_flags(
     scene: Splats,
     cells: int,

@@ -17,7 +17,7 @@ from g2ard.progress import Progress, silent
 from g2ard.render import RasterSettings, arrays_of, view_of
 from g2ard.splats import Splats
 
-__all__ = ["RasterBench", "SceneFigures", "bench_raster", "built_in_view", "drawn"]
+__all__ = ["RasterBench", "SceneFigures", "bench_raster", "built_in_view", "cpu_name", "drawn"]
 
 FLOPS_FORWARD, FLOPS_BACKWARD = 36, 55
 """Per contributing pixel–Gaussian: what the formulae need, counted by hand (an FMA is two)."""
@@ -151,7 +151,7 @@ def bench_raster(
                         progress("bench raster", len(rows), total)
     finally:
         _core.set_num_threads(before)
-    machine = {"cpu": _cpu(), "fma_gflops": best[0], "read_gb_s": best[1]}
+    machine = {"cpu": cpu_name(), "fma_gflops": best[0], "read_gb_s": best[1]}
     return RasterBench(tuple(rows), machine)
 
 
@@ -213,7 +213,8 @@ def _bytes(splats: Splats, counts: dict[str, int], pixels: int) -> int:
     return rows + counts["pairs"] * (2 * 8 + 2 * 64 + 2 * 40) + 2 * 4 * pixels * (3 + 1 + 1)
 
 
-def _cpu() -> str:
+def cpu_name() -> str:
+    """The processor's name, as its maker gives it where the system tells."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:

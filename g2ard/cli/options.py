@@ -20,6 +20,7 @@ __all__ = [
     "ViewsOption",
     "budget_of",
     "one_budget",
+    "parse_ratio",
 ]
 
 _COUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmM%]?)")
@@ -61,7 +62,8 @@ class Count:
         return self.text
 
 
-def _ratio(text: str) -> float:
+def parse_ratio(text: str) -> float:
+    """Read 10 or 10x."""
     try:
         value = float(text.strip().rstrip("xX×"))
     except ValueError:
@@ -80,7 +82,7 @@ CountOption = Annotated[
 RatioOption = Annotated[
     float | None,
     typer.Option(
-        "-r", "--ratio", parser=_ratio, metavar="RATIO", help="Budget as a ratio: 10 keeps a tenth."
+        "-r", "--ratio", parser=parse_ratio, metavar="RATIO", help="Budget as a ratio: 10 keeps a tenth."
     ),
 ]
 SceneArgument = Annotated[

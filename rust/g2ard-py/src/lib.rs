@@ -8,6 +8,7 @@ mod lift;
 mod raster;
 mod select;
 mod simplify;
+mod spatial;
 mod ssim;
 mod train;
 mod work;
@@ -18,6 +19,7 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     work::register(m)?;
     lift::register(m)?;
     simplify::register(m)?;
+    spatial::register(m)?;
     raster::register(m)?;
     select::register(m)?;
     ssim::register(m)?;

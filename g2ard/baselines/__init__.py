@@ -1,0 +1,1 @@
+"""Other people's methods, built from their papers to be measured beside ours."""

@@ -1,0 +1,328 @@
+"""Every simplifier at hand, as its user runs it: file to file, a process each, scored on unseen views."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from g2ard import __version__, io
+from g2ard.bench.raster import cpu_name
+from g2ard.cameras import Cameras
+from g2ard.errors import InputError
+from g2ard.evaluate import evaluate
+from g2ard.poses import make_pool
+from g2ard.progress import Progress, silent
+from g2ard.splats import Splats
+from g2ard.splits import HOLD_OUT, split_mask
+from g2ard.targets import TeacherRenders
+
+__all__ = [
+    "METHODS",
+    "Cell",
+    "bench_simplify",
+    "find_splat_transform",
+    "machine",
+    "read_cells",
+    "scene_label",
+]
+
+METHODS = (
+    "default",
+    "no-views",
+    "fast",
+    "paper",
+    "splat-transform",
+    "splat-transform-adaptive",
+    "nanogs",
+)
+_POOL = 128
+_MAX_LOGIT = 20.0
+"""An opacity of exactly 1 has no finite logit; here it is 1 − 2e-9, which every peer can read."""
+_LAUNCHER = """
+import os, sys, time
+began = time.perf_counter()
+to_log = [(os.POSIX_SPAWN_DUP2, 2, 1)]
+pid = os.posix_spawnp(sys.argv[1], sys.argv[1:], os.environ, file_actions=to_log)
+_, status, usage = os.wait4(pid, 0)
+cpu, wall = usage.ru_utime + usage.ru_stime, time.perf_counter() - began
+print(os.waitstatus_to_exitcode(status), cpu, wall, usage.ru_maxrss)
+"""
+"""Between us and the child: Linux counts the memory of whoever starts a process as the process's own peak."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One method on one scene at one ratio; a row of the CSV.
+
+    Args:
+        scene: its file's or folder's name (`scene_label`).
+        input_count: Gaussians before.
+        budget: Gaussians asked for.
+        count: Gaussians in the method's output.
+        cpu_s: user + system seconds of the whole command, its start and files included.
+        wall_s: the same by the clock.
+        peak_mb: largest resident size, 10⁶ bytes.
+        psnr: mean over the held-out views, dB, against the scene itself.
+        ssim: the same.
+        views: how many were scored.
+        version: of the method's program.
+        machine: processor and cores.
+        error: why there are no figures; "" if there are.
+    """
+
+    scene: str
+    ratio: float
+    method: str
+    input_count: int
+    budget: int
+    count: int | None = None
+    cpu_s: float | None = None
+    wall_s: float | None = None
+    peak_mb: float | None = None
+    psnr: float | None = None
+    ssim: float | None = None
+    views: int | None = None
+    version: str = ""
+    machine: str = ""
+    error: str = ""
+
+    @property
+    def key(self) -> tuple[str, float, str]:
+        """What tells it from other rows."""
+        return self.scene, self.ratio, self.method
+
+
+def scene_label(path: Path) -> str:
+    """A short name that tells scenes apart: a folder's with its parent's, a file's without its extension.
+
+    >>> scene_label(Path("data/guitar.compressed.ply"))
+    'guitar'
+    """
+    return f"{path.absolute().parent.name}/{path.name}" if path.is_dir() else path.name.split(".")[0]
+
+
+def machine() -> str:
+    """Processor and cores, as recorded in every row."""
+    return f"{cpu_name()}, {os.cpu_count()} cores"
+
+
+def bench_simplify(
+    scenes: Sequence[Path],
+    csv_path: Path,
+    *,
+    ratios: Sequence[float] = (5, 10, 20, 30),
+    methods: Sequence[str] = METHODS,
+    views: Path | None = None,
+    splat_transform: Path | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> list[Cell]:
+    """Measure every scene × ratio × method that `csv_path` does not hold yet; append rows as they are done.
+
+    The scene is written as .ply once; each method reads that and writes its own. Scored are every 8th of a
+    pool of 128 poses, or the views' own test split; `default` gets the others, so nothing it used is scored.
+
+    Args:
+        scenes: anything `g2ard.io.read_scene` reads.
+        csv_path: where the rows go. Rows without an error are kept and not measured again; failed ones are.
+        ratios: the budget is round(N / ratio).
+        methods: of `METHODS`; leave out peers that are not installed.
+        views: to train and score on; None makes a pool for each scene.
+        splat_transform: its program; needed for its two methods.
+        seed: of the pool.
+        progress: told after each cell.
+
+    Returns:
+        The rows of these scenes, ratios and methods; a method that fails is a row with its error.
+
+    Raises:
+        InputError: a scene, the views or the CSV cannot be read, or an unknown method.
+    """
+    unknown = [m for m in methods if m not in METHODS]
+    if unknown:
+        raise InputError(f"methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown)}")
+    done = {cell.key: cell for cell in read_cells(csv_path) if not cell.error}
+    _rewrite(csv_path, list(done.values()))
+    wanted = [(p, (scene_label(p), float(r), m)) for p in scenes for r in ratios for m in methods]
+    total, finished = len(wanted), sum(key in done for _, key in wanted)
+    versions = {m: _version(m, splat_transform) for m in methods}
+    for scene in scenes:
+        missing = [key for path, key in wanted if path == scene and key not in done]
+        if not missing:
+            continue
+        with tempfile.TemporaryDirectory(prefix="g2ard-bench-") as folder:
+            stand = _Stand(Path(folder), _readable(scene), views, splat_transform, seed)
+            for key in missing:
+                cell = replace(stand.measure(*key), version=versions[key[2]], machine=machine())
+                _append(csv_path, cell)
+                done[key] = cell
+                finished += 1
+                progress("bench simplify", finished, total, {key[0]: f"{key[1]:g}× {key[2]}"})
+    return [done[key] for _, key in wanted]
+
+
+class _Stand:
+    """One scene, written out, with its views; measures methods on it."""
+
+    def __init__(
+        self, folder: Path, splats: Splats, views: Path | None, splat_transform: Path | None, seed: int
+    ) -> None:
+        self.folder, self.splats, self.splat_transform = folder, splats, splat_transform
+        self.source, self.views = folder / "scene.ply", folder / "views.json"
+        io.write_splats(self.source, splats)
+        cameras, held_out = _split(splats, views, seed)
+        splits = ["test" if test else "train" for test in held_out]
+        io.write_views(self.views, cameras, splits=splits)
+        self.test = cameras.take(held_out)
+
+    @cached_property
+    def targets(self) -> TeacherRenders:
+        return TeacherRenders(self.splats, self.test)
+
+    def measure(self, scene: str, ratio: float, method: str) -> Cell:
+        n = len(self.splats)
+        budget = max(1, int(np.floor(n / ratio + 0.5)))
+        cell = Cell(scene, ratio, method, n, budget)
+        output = self.folder / "out.ply"
+        output.unlink(missing_ok=True)
+        try:
+            usage = _run(self.command(method, budget, output), self.folder / "log")
+            small = io.read_splats(output)
+            score = evaluate(small, self.targets)
+        except (InputError, OSError) as e:
+            return replace(cell, error=" ".join(str(e).split()))
+        return replace(
+            cell, **usage, count=len(small), psnr=score.psnr, ssim=score.ssim, views=len(score.views)
+        )
+
+    def command(self, method: str, budget: int, output: Path) -> list[str]:
+        source, python = str(self.source), [sys.executable, "-m"]
+        if method.startswith("splat-transform"):
+            if self.splat_transform is None:
+                raise InputError("splat-transform: not found")
+            mode = "--decimate-adaptive" if method.endswith("adaptive") else "--decimate"
+            options = [str(self.splat_transform), "-q", "-w", "-g", "cpu"]
+            return [*options, source, mode, str(budget), str(output)]
+        if method == "nanogs":
+            return [*python, "g2ard.baselines.nanogs", source, str(budget), str(output)]
+        flags = {
+            "default": ["--views", str(self.views)],
+            "no-views": ["--no-views"],
+            "fast": ["--method", "fast"],
+            "paper": ["--method", "paper"],
+        }[method]
+        return [*python, "g2ard", "simplify", source, "-n", str(budget), "-o", str(output), "-q", *flags]
+
+
+def _run(command: Sequence[str], log: Path) -> dict[str, Any]:
+    """Seconds and memory of a child process.
+
+    Raises:
+        InputError: it failed; the message is its last line.
+    """
+    with log.open("wb") as out:
+        launched = [sys.executable, "-I", "-S", "-c", _LAUNCHER, *command]
+        told = subprocess.run(
+            launched, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=out, check=False
+        ).stdout.split()
+    said = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    last = said[-1] if said else "it said nothing"
+    if len(told) != 4:
+        raise InputError(f"{command[0]}: did not start: {last}")
+    status, cpu, wall, peak = (float(value) for value in told)
+    if status:
+        raise InputError(f"exit status {status:.0f}: {last}")
+    unit = 1 if sys.platform == "darwin" else 1024
+    return {"cpu_s": cpu, "wall_s": wall, "peak_mb": peak * unit / 1e6}
+
+
+def _readable(scene: Path) -> Splats:
+    splats = io.read_splats(scene)
+    return replace(splats, logit_opacities=np.clip(splats.logit_opacities, -_MAX_LOGIT, _MAX_LOGIT))
+
+
+def _split(splats: Splats, views: Path | None, seed: int) -> tuple[Cameras, np.ndarray]:
+    """Cameras, and which are held out."""
+    if views is None:
+        pool = make_pool(splats, _POOL, seed=seed)
+        return pool, np.arange(len(pool)) % HOLD_OUT == 0
+    found = io.read_view_set(views)
+    return found.cameras, split_mask(views, found.cameras.names, "test", stated=found.splits)
+
+
+def _version(method: str, splat_transform: Path | None) -> str:
+    if not method.startswith("splat-transform"):
+        return f"g2ard {__version__}"
+    if splat_transform is None:
+        return ""
+    told = subprocess.run([splat_transform, "--version"], capture_output=True, text=True, check=False)
+    lines = (told.stdout or told.stderr).splitlines()
+    return lines[0].strip() if lines else ""
+
+
+def find_splat_transform(given: Path | None) -> Path | None:
+    """The program given, else the one on PATH; None without either."""
+    found = shutil.which(given or "splat-transform")
+    if given is not None and found is None:
+        raise InputError(f"{given}: no such program")
+    return Path(found) if found else None
+
+
+def read_cells(path: Path) -> list[Cell]:
+    """The rows of a CSV; none if there is no such file.
+
+    Raises:
+        InputError: it is not one that `bench_simplify` wrote.
+    """
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = csv.DictReader(file)
+        if rows.fieldnames != [f.name for f in fields(Cell)]:
+            raise InputError(f"{path}: not a CSV of `g2ard bench simplify`")
+        return [_cell(path, number, row) for number, row in enumerate(rows, 2)]
+
+
+def _cell(path: Path, line: int, row: dict[str, str]) -> Cell:
+    text = {"scene", "method", "version", "machine", "error"}
+    whole = {"input_count", "budget", "count", "views"}
+    try:
+        return Cell(**{k: v if k in text else _number(v, k in whole) for k, v in row.items()})  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise InputError(f"{path}: line {line}: not a row of `g2ard bench simplify`") from None
+
+
+def _number(value: str, whole: bool) -> float | int | None:
+    if not value:
+        return None
+    return int(value) if whole else float(value)
+
+
+def _lines(cells: Sequence[Cell]) -> Iterator[dict[str, object]]:
+    for cell in cells:
+        yield {k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(cell).items()}
+
+
+def _rewrite(path: Path, cells: Sequence[Cell]) -> None:
+    from g2ard.io.atomic import atomic_output
+
+    with atomic_output(path, overwrite=True) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [f.name for f in fields(Cell)], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(_lines(cells))
+
+
+def _append(path: Path, cell: Cell) -> None:
+    with path.open("a", newline="", encoding="utf-8") as file:
+        csv.DictWriter(file, [f.name for f in fields(Cell)], lineterminator="\n").writerows(_lines([cell]))

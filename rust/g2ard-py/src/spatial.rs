@@ -1,0 +1,55 @@
+//! Exact nearest neighbours.
+
+use g2ard_core::Error;
+use g2ard_core::spatial::Tree;
+use numpy::ndarray::Array2;
+use numpy::{IntoPyArray, PyArray2, PyReadonlyArray2};
+use pyo3::prelude::*;
+use rayon::prelude::*;
+
+use crate::arrays;
+use crate::error::to_py;
+use crate::work::quick;
+
+/// (N, k) rows of the points nearest to each of (N, 3) finite points, itself excepted, by (distance, row).
+#[pyfunction]
+fn knn<'py>(
+    py: Python<'py>,
+    points: PyReadonlyArray2<'py, f64>,
+    k: usize,
+) -> PyResult<Bound<'py, PyArray2<u32>>> {
+    let points = arrays::rows::<f64, 3>("points", &points)?;
+    if k == 0 || k >= points.len() {
+        let wanted = format!("1 to {}", points.len().saturating_sub(1));
+        return Err(to_py(Error::invalid("k", wanted, k)));
+    }
+    if let Some(row) = points.iter().position(|p| p.iter().any(|v| !v.is_finite())) {
+        let got = format!("{:?} in row {row}", points[row]);
+        return Err(to_py(Error::invalid("points", "finite coordinates", got)));
+    }
+    let near = quick(py, || Ok(neighbors(points, k)))?;
+    Ok(near.into_pyarray(py))
+}
+
+fn neighbors(points: &[[f64; 3]], k: usize) -> Array2<u32> {
+    let tree = Tree::build(points);
+    let found: Vec<(u32, Vec<u32>)> = (0..points.len())
+        .into_par_iter()
+        .map_init(Vec::new, |near, at| {
+            tree.nearest(at, k, near);
+            (tree.rows()[at], near.iter().map(|n| n.1).collect())
+        })
+        .collect();
+    let mut rows = Array2::zeros((points.len(), k));
+    for (row, near) in found {
+        rows.row_mut(row as usize)
+            .iter_mut()
+            .zip(near)
+            .for_each(|(to, from)| *to = from);
+    }
+    rows
+}
+
+pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_function(wrap_pyfunction!(knn, m)?)
+}
