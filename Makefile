@@ -36,7 +36,7 @@ lint: setup
 SCENE ?= $(G2ARD_DATA)/playbot/0_0
 bench: setup
 	$(BIN)/g2ard bench raster $(SCENE)
-	$(BIN)/g2ard bench simplify $(SCENE) --ratios 10,30 --output bench
+	$(BIN)/g2ard bench simplify $(SCENE) --ratios 10,30 --csv bench.csv
 
 wheel: setup
 	$(BIN)/maturin build --release --out dist
