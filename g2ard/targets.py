@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from abc import ABC, abstractmethod
 from typing import Any, Protocol
 
 import numpy as np
@@ -36,7 +37,7 @@ def fingerprint_of(targets: Targets) -> str:
     return digest.hexdigest()
 
 
-class _Cached:
+class _Cached(ABC):
     """Keeps what `_make` returns, first come first kept, within `limit` bytes."""
 
     def __init__(self, cameras: Cameras, limit: int) -> None:
@@ -45,8 +46,9 @@ class _Cached:
         self._kept: dict[int, NDArray[Any]] = {}
         self._bytes = 0
 
+    @abstractmethod
     def _make(self, view: int) -> NDArray[Any]:
-        raise NotImplementedError
+        """The image of one view, as it is kept."""
 
     def _stored(self, view: int) -> NDArray[Any]:
         image = self._kept.get(view)

@@ -1,4 +1,4 @@
-"""What tests of several stages share: where real data is, and the program as a user types it."""
+"""What tests of several stages share: the program as a user types it."""
 
 from __future__ import annotations
 
@@ -11,15 +11,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-_DATA = Path(os.environ.get("G2ARD_DATA", ROOT.parent / "shared" / "data"))
-
-
-@pytest.fixture(scope="session")
-def data() -> Path:
-    """The folder of real scenes; a test that needs it is skipped where there is none."""
-    if not _DATA.is_dir():
-        pytest.skip(f"no real data at {_DATA} (set G2ARD_DATA)")
-    return _DATA
 
 
 @pytest.fixture(scope="session")

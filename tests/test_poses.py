@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from realdata import real
 
 from g2ard.errors import InputError
 from g2ard.io import read_splats, read_views, write_splats
@@ -307,10 +308,8 @@ def test_threads_do_not_matter(scenes, tmp_path: Path) -> None:
         ("format_samples/biker.compressed.ply", "orbit", (0, -1, 0)),
     ],
 )
-def test_real_scenes(name, kind, up, data: Path) -> None:
-    if not (data / name).exists():
-        pytest.skip(f"no {name} at {data}")
-    pool = plan_pool(read_splats(data / name), 128)
+def test_real_scenes(name, kind, up) -> None:
+    pool = plan_pool(read_splats(real(name)), 128)
     assert pool.kind == kind
     assert pool.up @ up > np.cos(np.radians(5))
     assert len(pool.cameras) == 128
