@@ -11,6 +11,7 @@ use super::gradients::{Gather, Gradients, Sink};
 use super::order::{self, Key, Shared};
 use super::params::{Params, Source};
 use super::project::{Project, Splat, View};
+use super::sensitivity::{GatherSensitivity, MOMENTS, Sensitivity, TRIANGLE};
 use super::simd::{Isa, LANES, Row, dispatch};
 use super::tiles::Bins;
 use super::{BLOCKS, Camera, Settings};
@@ -346,6 +347,49 @@ impl Rasterizer {
         Ok(())
     }
 
+    /// Renders a view over black and adds to every Gaussian's F, 21 values of the upper triangle a row: see
+    /// [`super::sensitivity`].
+    pub fn sensitivity(
+        &mut self,
+        params: &Params,
+        camera: &Camera,
+        settings: &Settings,
+        sums: &mut [f64],
+    ) -> Result<()> {
+        if settings.antialiased {
+            return Err(Error::invalid("sensitivity", "no antialiasing", "some"));
+        }
+        if sums.len() != TRIANGLE * params.len() {
+            let expected = format!("{TRIANGLE} values for each of {} rows", params.len());
+            return Err(Error::invalid("sensitivity", expected, sums.len()));
+        }
+        let pixels = camera.width * camera.height;
+        let mut image = Image {
+            rgb: &mut vec![0.0; 3 * pixels],
+            alpha: &mut vec![0.0; pixels],
+            depth: None,
+            median: None,
+        };
+        self.forward(params, camera, settings, [0.0; 3], &mut image)?;
+        let slots = self.sensitivity_tiles();
+        let Some(frame) = &self.frame else {
+            return Ok(());
+        };
+        let out = Shared::new(sums);
+        self.chunks.par_iter().for_each(|&(first, count)| {
+            let gather = GatherSensitivity {
+                view: &frame.view,
+                source: *params,
+                splats: &self.splats[first..first + count],
+                slots: &slots,
+                written: &self.written,
+                out,
+            };
+            dispatch(self.isa, gather);
+        });
+        Ok(())
+    }
+
     /// How long the last calls' passes took.
     pub fn passes(&self) -> Passes {
         self.passes
@@ -589,6 +633,43 @@ impl Rasterizer {
                 };
                 dispatch(isa, accumulate);
             });
+    }
+
+    fn sensitivity_tiles(&mut self) -> Vec<[f32; MOMENTS]> {
+        self.clear_slots();
+        let mut sums = vec![[0.0; MOMENTS]; self.bins.pairs.len()];
+        let Some(frame) = &self.frame else {
+            return sums;
+        };
+        let camera = &frame.camera;
+        let tiles_x = camera.tiles().0;
+        let slots = Shared::new(&mut sums);
+        let written = Shared::new(&mut self.written);
+        let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
+        let states = self
+            .batches
+            .par_iter()
+            .zip(&self.transmittance)
+            .zip(&self.last);
+        states.enumerate().for_each_init(
+            Staged::default,
+            |staged, (tile, ((batch, transmittance), last))| {
+                let sensitivity = Sensitivity {
+                    pairs: &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize],
+                    splats,
+                    place: Place::of(tile, tiles_x, camera.width, camera.height),
+                    settings: &frame.settings,
+                    words: &self.words[batch.0..batch.0 + batch.1],
+                    transmittance,
+                    last,
+                    staged,
+                    slots,
+                    written,
+                };
+                dispatch(isa, sensitivity);
+            },
+        );
+        sums
     }
 
     /// Slots keep stale sums: `written` says which of them count.

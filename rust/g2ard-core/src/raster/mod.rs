@@ -17,6 +17,7 @@ pub mod limits;
 pub(crate) mod order;
 pub(crate) mod params;
 pub(crate) mod project;
+mod sensitivity;
 mod sh;
 pub mod simd;
 mod tiles;
@@ -25,6 +26,7 @@ pub use accumulate::Accumulated;
 pub use frame::{Counts, Image, ImageGradients, Passes, Rasterizer};
 pub use gradients::Gradients;
 pub use params::Params;
+pub use sensitivity::TRIANGLE as SENSITIVITY_TRIANGLE;
 pub use simd::Isa;
 
 use crate::{Error, Result};
