@@ -26,7 +26,7 @@ class AdaptConfig:
 
     Args:
         steps: at most; 7,000 as in the paper.
-        tolerance: dB; a stretch of steps that gains less on the training views is the last. 0 takes all steps.
+        tolerance: dB; a stretch of steps that gains less on the training views is the last; 0 takes all.
         schedule: "default" takes stretches of 500, 1,000, 2,000 … steps, each under a cosine; "paper" takes
             all steps at its rates, which decay to a tenth.
         sh_degree: of the result; None keeps the scene's. A scene without higher bands has no place for shine.
