@@ -1,4 +1,4 @@
-"""Cambridge Landmarks: poses of dataset_train.txt and dataset_test.txt, focal lengths of reconstruction.nvm."""
+"""Cambridge Landmarks: poses of dataset_*.txt, focal lengths of reconstruction.nvm."""
 
 from __future__ import annotations
 
@@ -35,8 +35,9 @@ def is_cambridge(folder: Path) -> bool:
 def read(path: Path, images: Path | None = None) -> ViewSet:
     """Read both lists; each view states its split.
 
-    A line is the photo's name, the camera's centre and the quaternion (wxyz) of camera_from_world. VisualSFM's
-    radial parameter r undistorts, m_u = (1 + r·|m|²)·m; OpenCV's k1 distorts, and is −r to first order.
+    A line is the photo's name, the camera's centre and the quaternion (wxyz) of camera_from_world.
+    VisualSFM's radial parameter r undistorts, m_u = (1 + r·|m|²)·m; OpenCV's k1 distorts, and is −r to first
+    order.
 
     Args:
         path: the scene's folder.

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from g2ard.cli.frame import Run, command, group
-from g2ard.cli.options import SceneArgument, SizeOption, ViewsOption
+from g2ard.cli.options import SceneArgument, SizeOption, ViewsOption, parse_ratio
 
 if TYPE_CHECKING:
+    from g2ard.bench.run import Row
     from g2ard.bench.simplify import Cell
 
 bench = group("bench", "Measure on this machine.\n\nExample: g2ard bench raster scene.ply --json -")
@@ -92,7 +94,6 @@ def simplify(
     Scored are every 8th of 128 poses made for the scene, or the test split of --views; nothing a method used.
     """
     from g2ard.bench.simplify import METHODS, bench_simplify, find_splat_transform, machine
-    from g2ard.cli.options import parse_ratio
 
     program = find_splat_transform(splat_transform)
     chosen = [m.strip() for m in methods.split(",")] if methods else list(METHODS)
@@ -115,6 +116,121 @@ def simplify(
         [_row(cell) for cell in cells],
     )
     run.result({"machine": machine(), "rows": [asdict(cell) for cell in cells]})
+
+
+@command("run", parent=bench, example="g2ard bench run benches/definitions/compression.toml -o figures/")
+def run_(
+    run: Run,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the run.")],
+    definitions: Annotated[
+        list[Path] | None, typer.Argument(metavar="[DEFINITION.toml...]", help="Studies.")
+    ] = None,
+    scene: Annotated[
+        list[Path] | None,
+        typer.Option("--scene", metavar="SCENE", help="Instead of a study: scenes to measure on."),
+    ] = None,
+    views: ViewsOption = None,
+    photos: Annotated[bool, typer.Option("--photos", help="With --scene: targets are the photos.")] = False,
+    only: Annotated[
+        str | None, typer.Option(metavar="NAMES", help="Of the studies' scenes, comma-separated.")
+    ] = None,
+    methods: Annotated[str | None, typer.Option(metavar="NAMES", help="Comma-separated.")] = None,
+    ratios: Annotated[str | None, typer.Option(help="Comma-separated.")] = None,
+    steps: Annotated[str | None, typer.Option(help="Step-matched at these, comma-separated.")] = None,
+    seconds: Annotated[
+        str | None, typer.Option("--seconds", "--time", help="Time-matched at these, comma-separated.")
+    ] = None,
+    seeds: Annotated[str | None, typer.Option(help="Comma-separated.")] = None,
+    released: Annotated[
+        bool | None, typer.Option("--released/--matched", help="Also each method's own schedule.")
+    ] = None,
+    lpips: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Weights of LPIPS; without them it is absent.")
+    ] = None,
+    size: SizeOption = None,
+    keep: Annotated[bool, typer.Option("--keep", help="Keep intermediate scenes.")] = False,
+) -> None:
+    """Compare methods under matched compute: CSV, and an HTML report of error against time and count.
+
+    A stopped run goes on where it was; a cell that failed is a row with its error, and is tried again.
+    """
+    from g2ard.bench.definition import METHODS, Definition, SceneSpec, read_definition
+    from g2ard.bench.report import write_report
+    from g2ard.bench.run import bench_run
+    from g2ard.bench.simplify import scene_label
+    from g2ard.errors import InputError
+
+    if bool(definitions) == bool(scene):
+        raise typer.BadParameter("give either DEFINITION.toml files or --scene SCENE")
+    if scene:
+        targets = "photos" if photos else "teacher"
+        train = None if views is None else str(views.absolute())
+        specs = tuple(SceneSpec(scene_label(p), str(p.absolute()), train, targets=targets) for p in scene)
+        studies = [Definition("scenes", "", specs, tuple(METHODS[m] for m in _PRUNERS), steps=(500,))]
+    else:
+        studies = [read_definition(path) for path in definitions or []]
+    numbers: dict[str, Any] = {
+        "ratios": _numbers(ratios, parse_ratio),
+        "steps": _numbers(steps, _whole),
+        "seconds": _numbers(seconds, float),
+        "seeds": _numbers(seeds, int),
+    }
+    if steps is not None or seconds is not None:  # either one alone means only that
+        numbers |= {key: numbers[key] or () for key in ("steps", "seconds")}
+    narrowed = []
+    for study in studies:
+        own = {**METHODS, **{m.name: m for m in study.methods}}
+        names = [name.strip() for name in methods.split(",")] if methods else []
+        unknown = next((name for name in names if name not in own), None)
+        if unknown is not None:
+            raise InputError(f"{study.name}: no method {unknown!r} (there are {', '.join(own)})")
+        chosen = tuple(own[name] for name in names) or None
+        wanted = only.split(",") if only else None
+        scenes = tuple(s for s in study.scenes if wanted is None or s.name in wanted)
+        if not scenes:
+            raise InputError(f"{study.name}: no scene {only!r}")
+        folder = None if lpips is None else str(lpips.absolute())
+        options = {**numbers, "methods": chosen, "scenes": scenes, "released": released, "size": size}
+        narrowed.append(study.narrowed(**options, lpips=folder))
+    rows = bench_run(narrowed, output, keep=keep, progress=run.progress)
+    write_report(output, narrowed, rows)
+    run.console.table(
+        "PSNR and SSIM on unseen views; CPU seconds of reduction and recovery",
+        ["study", "scene", "ratio", "method", "matched", "split", "Gaussians", "PSNR", "SSIM", "CPU s"],
+        [_bench_row(row) for row in rows],
+    )
+    run.say(f"rows: {output / 'rows.csv'}\nreport: {output / 'report.html'}")
+    run.result({"rows": [asdict(row) for row in rows]})
+    failed = sum(bool(row.error) for row in rows)
+    if failed:
+        run.unmet(f"{failed} cells failed; the same command tries them again")
+
+
+_PRUNERS = ("g2ard", "lightgaussian", "pup", "mini-splatting", "nanogs", "opacity-area", "random")
+
+
+def _numbers(text: str | None, parse: Callable[[str], Any]) -> tuple[Any, ...] | None:
+    if text is None:
+        return None
+    try:
+        return tuple(parse(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"numbers separated by commas, not {text!r}") from None
+
+
+def _whole(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise ValueError(text)
+    return value
+
+
+def _bench_row(row: Row) -> list[str]:
+    matched = row.matched if row.matched == "released" else f"{row.amount:g} {row.matched}"
+    head = [row.study, row.scene, f"{row.ratio:g}", row.method, matched, row.split]
+    if row.error:
+        return [*head, row.error, "", "", ""]
+    return [*head, f"{row.count:,}", f"{row.psnr:.2f}", f"{row.ssim:.4f}", f"{row.cpu_s:.1f}"]
 
 
 def _row(cell: Cell) -> list[str]:
