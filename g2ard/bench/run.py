@@ -27,7 +27,7 @@ from g2ard.recover.presets import preset_for
 from g2ard.simplify import METHODS as SIMPLIFIERS
 from g2ard.simplify import schedule as paper_rounds
 
-__all__ = ["Row", "bench_run", "read_rows", "write_csv"]
+__all__ = ["Cell", "Row", "bench_run", "cells_of", "read_rows", "write_csv"]
 
 _SURVEY = {
     "submethod": "Submethod",
@@ -122,7 +122,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class _Cell:
+class Cell:
     """What is to be measured, and where its answer lies."""
 
     definition: Definition
@@ -172,7 +172,7 @@ def bench_run(
         InputError: LPIPS weights that cannot be read. Anything else is an error of its cell.
         KeyboardInterrupt: after Ctrl-C; the next call goes on.
     """
-    cells = [_Cell(d, *what) for d in definitions for what in d.cells()]
+    cells = cells_of(definitions)
     (folder / "cells").mkdir(parents=True, exist_ok=True)
     weights = {d.lpips: load_lpips(d.folder / d.lpips) for d in definitions if d.lpips is not None}
     stand: Stand | None = None
@@ -197,21 +197,26 @@ def bench_run(
     return rows
 
 
-def _done(folder: Path, cell: _Cell) -> bool:
+def cells_of(definitions: Sequence[Definition]) -> list[Cell]:
+    """All cells of some studies, in the order they are measured."""
+    return [Cell(d, *what) for d in definitions for what in d.cells()]
+
+
+def _done(folder: Path, cell: Cell) -> bool:
     rows = _read_cell(folder, cell)
     return bool(rows) and not any(row.error for row in rows)
 
 
-def _read_cell(folder: Path, cell: _Cell) -> list[Row]:
+def _read_cell(folder: Path, cell: Cell) -> list[Row]:
     path = folder / "cells" / f"{cell.key}.json"
     return [Row(**row) for row in json.loads(path.read_text())["rows"]] if path.exists() else []
 
 
-def _rows(folder: Path, cells: Sequence[_Cell]) -> list[Row]:
+def _rows(folder: Path, cells: Sequence[Cell]) -> list[Row]:
     return [row for cell in cells for row in _read_cell(folder, cell)]
 
 
-def _head(cell: _Cell, prior: str, split: str) -> Row:
+def _head(cell: Cell, prior: str, split: str) -> Row:
     return Row(
         study=cell.definition.name,
         scene=cell.scene.name,
@@ -229,7 +234,7 @@ def _head(cell: _Cell, prior: str, split: str) -> Row:
     )
 
 
-def _failed(cell: _Cell, error: BaseException) -> Row:
+def _failed(cell: Cell, error: BaseException) -> Row:
     text = " ".join(str(error).split()) or type(error).__name__
     return replace(_head(cell, cell.method.prior or "", ""), error=text)
 
@@ -248,7 +253,7 @@ class _Spent:
         self.peak = max(self.peak, usage.peak_mb)
 
 
-def _measure(stand: Stand, cell: _Cell, folder: Path, lpips: dict[str, Lpips]) -> dict[str, Any]:
+def _measure(stand: Stand, cell: Cell, folder: Path, lpips: dict[str, Lpips]) -> dict[str, Any]:
     work = _Pipeline(stand, cell)
     result = work.run()
     splats = io.read_splats(result.output)
@@ -300,7 +305,7 @@ def _picture_targets(folder: Path, stand: Stand, split: str) -> None:
 class _Pipeline:
     """One cell's stages, from the prior to the scene that is scored."""
 
-    def __init__(self, stand: Stand, cell: _Cell) -> None:
+    def __init__(self, stand: Stand, cell: Cell) -> None:
         self.stand, self.cell = stand, cell
         self.source = stand.prior(cell.method.prior)
         self.prior = cell.method.prior or stand.kinds[0]
