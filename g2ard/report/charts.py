@@ -205,5 +205,5 @@ def _beside(point: Point, x: float, y: float) -> str:
     right = x < _WIDTH - 120
     anchor, at = ("start", x + 9) if right else ("end", x - 9)
     return (
-        f'<text class="name" x="{at:.1f}" y="{y + 4:.1f}" text-anchor="{anchor}">{escape(point.label)}</text>'
+        f'<text class="name" x="{at:.1f}" y="{y - 6:.1f}" text-anchor="{anchor}">{escape(point.label)}</text>'
     )

@@ -130,7 +130,7 @@ class Page:
             f'<span class="tag left">target</span><span class="tag right"></span>'
             f'<input type="range" min="0" max="100" value="50" aria-label="target or rendering"></div>'
             f'<label class="pick">right: <select>{options}</select></label></div>'
-            f'<div class="crops">{"".join(crops)}</div></section>'
+            f'<div class="crops" style="--shape:{width}/{height}">{"".join(crops)}</div></section>'
         )
 
     def _crop(self, number: int, name: str, caption: str, x: float, y: float) -> str:
@@ -191,7 +191,7 @@ main{max-width:1200px;margin:0 auto;padding:24px 20px 80px}
 h1{font-size:26px;margin:0}h2{margin:48px 0 4px;border-top:1px solid var(--line);padding-top:24px}
 h3{margin:28px 0 4px}h4{margin:0 0 8px;font-weight:600}
 .sub,figcaption,.legend{color:var(--soft);font-size:13px}
-.row{display:flex;flex-wrap:wrap;gap:16px}.row figure{flex:1 1 440px;margin:0;min-width:0}
+.row{display:flex;flex-wrap:wrap;gap:16px}.row figure{flex:1 1 440px;margin:0;min-width:0;max-width:600px}
 .chart{width:100%;height:auto;background:var(--card);border-radius:8px}
 .grid{stroke:var(--line)}.tick,.axis,.name{font-size:11px;fill:var(--soft)}.name{fill:var(--fg)}
 .dot{fill:var(--c);stroke:var(--bg);stroke-width:1.2}.line{fill:none;stroke:var(--c);stroke-width:2}
@@ -214,7 +214,7 @@ box-shadow:0 0 3px #000;pointer-events:none}
 .tag.left{left:8px}.tag.right{right:8px}.pick{display:block;margin:8px 0;font-size:13px}
 select{font:inherit;max-width:100%}
 .crops{display:flex;flex-wrap:wrap;gap:10px}.crop{margin:0;width:132px}
-.crop div{position:relative;overflow:hidden;width:132px;aspect-ratio:4/3;border-radius:4px}
+.crop div{position:relative;overflow:hidden;width:132px;aspect-ratio:var(--shape);border-radius:4px}
 .crop img{position:absolute;max-width:none}
 @media(max-width:600px){.row figure{flex-basis:100%}}
 """

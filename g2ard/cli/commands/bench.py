@@ -141,6 +141,9 @@ def run_(
         str | None, typer.Option("--seconds", "--time", help="Time-matched at these, comma-separated.")
     ] = None,
     seeds: Annotated[str | None, typer.Option(help="Comma-separated.")] = None,
+    adapt_steps: Annotated[
+        int | None, typer.Option(min=1, help="At most, in studies that adapt on frozen geometry.")
+    ] = None,
     released: Annotated[
         bool | None, typer.Option("--released/--matched", help="Also each method's own schedule.")
     ] = None,
@@ -175,7 +178,7 @@ def run_(
         "seconds": _numbers(seconds, float),
         "seeds": _numbers(seeds, int),
     }
-    if steps is not None or seconds is not None:  # either one alone means only that
+    if scene and (steps is not None or seconds is not None):  # either one alone means only that
         numbers |= {key: numbers[key] or () for key in ("steps", "seconds")}
     narrowed = []
     for study in studies:
@@ -191,6 +194,10 @@ def run_(
             raise InputError(f"{study.name}: no scene {only!r}")
         folder = None if lpips is None else str(lpips.absolute())
         options = {**numbers, "methods": chosen, "scenes": scenes, "released": released, "size": size}
+        if definitions:  # a study keeps to the kinds of budget it has
+            options |= {key: None for key in ("steps", "seconds") if not getattr(study, key)}
+        if study.adapt_steps:
+            options["adapt_steps"] = adapt_steps
         narrowed.append(study.narrowed(**options, lpips=folder))
     rows = bench_run(narrowed, output, keep=keep, progress=run.progress)
     write_report(output, narrowed, rows)

@@ -86,6 +86,7 @@ def distill(
     from g2ard.io.atomic import check_output
     from g2ard.recover.presets import preset_for
     from g2ard.recover.schedule import schedule_named
+    from g2ard.report.distilled import distill_report
 
     began = time.monotonic()
     lifted = kind(scene) != "splats"
@@ -124,13 +125,22 @@ def distill(
         report = _score(run, prior, result, unseen, colour)
         report |= {"against": against, "preset": why, "rounds": result.report["rounds"]}
         report["seconds"] = {**result.report["seconds"], "total": time.monotonic() - began}
+        distill_report(
+            output / "report.html",
+            f"{scene.name}: {len(prior):,} → {budget:,}",
+            [("simplified", result.simplified), ("recovered", result.splats)],
+            unseen,
+            report,
+            colour,
+        )
         _write(run, output, result, unseen, colour, report)
     if pool is not None:
         write_views(output / "views.json", pool, overwrite=True)
     shutil.rmtree(output / "work")
     _table(run, report)
     run.say(
-        f"scene: {output / 'scene.ply'}\npicture: {output / 'preview.png'}\nreport: {output / 'report.json'}"
+        f"scene: {output / 'scene.ply'}\npicture: {output / 'preview.png'}\n"
+        f"report: {output / 'report.html'}, {output / 'report.json'}"
     )
     run.result(report)
 
