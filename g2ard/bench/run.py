@@ -70,7 +70,8 @@ class Row:
         views: how many were scored.
         steps: optimiser steps taken.
         reduce_cpu_s: user + system seconds of all reductions, each a whole process.
-        reduce_wall_s: by the clock.
+        reduce_wall_s: by the clock, without a program's start and its files: in one process there is one
+            start however many the rounds. A rival program's whole.
         reduce_peak_mb: of the largest.
         recover_cpu_s: of all recoveries, whole processes.
         recover_wall_s: of their loops alone, which is what a limit in seconds counts.
@@ -360,7 +361,7 @@ class _Pipeline:
         if method.reduce not in baselines.METHODS:
             job |= {"budget": self.budget, "protection": method.protection}
         done = self.stand.reduce(state, views, job, flags)
-        self.reducing.add(done.usage)
+        self.reducing.add(done.usage, done.report.get("seconds"))
         return done
 
     def _recover(self, state: Stage, views: Path, number: int, rounds: int) -> Stage:

@@ -23,7 +23,7 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
 from g2ard.splits import split_mask
-from g2ard.targets import Photos, Targets
+from g2ard.targets import Photos, Targets, TeacherRenders
 
 __all__ = ["Stage", "Stand", "fingerprint"]
 
@@ -188,23 +188,24 @@ class Stand:
         return {name: self._scored(name, cameras) for name, cameras in views.items()}
 
     def _scored(self, name: str, cameras: Cameras) -> Targets:
-        if self.scene.targets == "photos":
-            return Photos(cameras)
-        return StoredTargets(cameras, self._rendered(f"targets-{name}", cameras))
+        return StoredTargets(cameras, self._stored(f"targets-{name}", cameras))
 
     @cached_property
-    def train_targets(self) -> Path | None:
-        """Where the teacher's renders of the training views lie; None where photos are the targets."""
-        if self.scene.targets == "photos":
-            return None
-        return self._rendered("targets-train", io.read_views(self.train))
+    def train_targets(self) -> Path:
+        """Where the targets of the training views lie."""
+        return self._stored("targets-train", io.read_views(self.train))
 
-    def _rendered(self, name: str, cameras: Cameras) -> Path:
+    def _stored(self, name: str, cameras: Cameras) -> Path:
         folder = self.folder / name
         if not (folder / "names.json").exists():  # written last
-            teacher = io.read_splats(self.prior(None).output)
-            store_targets(teacher, cameras, folder, self.scene.background)
+            store_targets(self._made(cameras), folder)
         return folder
+
+    def _made(self, cameras: Cameras) -> Targets:
+        if self.scene.targets == "photos":
+            return Photos(cameras, limit=0)
+        teacher = io.read_splats(self.prior(None).output)
+        return TeacherRenders(teacher, cameras, background=self.scene.background, limit=0)
 
     def reduce(self, source: Stage, views: Path, options: dict[str, Any], flags: Path | None = None) -> Stage:
         """Fewer Gaussians; `options` are those of the worker's job."""
@@ -251,12 +252,10 @@ class Stand:
         return self._run(job, source.key, "out.ply", files)
 
     @cached_property
-    def _adapt_targets(self) -> Path | None:
-        if self.scene.targets == "photos":
-            return None
-        return self._rendered("targets-adapt", self.adaptation("train"))
+    def _adapt_targets(self) -> Path:
+        return self._stored("targets-adapt", self.adaptation("train"))
 
-    def _inputs(self, source: Stage, views: Path) -> dict[str, Path | None]:
+    def _inputs(self, source: Stage, views: Path) -> dict[str, Path]:
         return {"scene": source.output, "views": views, "targets": self.train_targets}
 
     def _run(
@@ -264,18 +263,18 @@ class Stand:
         job: dict[str, Any],
         upstream: str,
         output: str,
-        files: dict[str, Any],
+        files: dict[str, Path],
         command: Callable[[Path], list[str]] | None = None,
     ) -> Stage:
-        views = files.get("views")
-        chosen = _stamp(views) if isinstance(views, Path) and views.parent != self.folder else None
+        views = files.get("views", self.train)
+        chosen = None if views.parent == self.folder else views.read_text(encoding="utf-8")
         key = fingerprint([job, upstream, chosen, __version__])
         place = self.folder / "stages" / key
         made, usage = place / output, place / "usage.json"
         if not usage.exists():  # written last
             shutil.rmtree(place, ignore_errors=True)
             place.mkdir(parents=True)
-            paths = {name: None if path is None else str(path) for name, path in files.items()}
+            paths = {name: str(path) for name, path in files.items()}
             (place / "job.json").write_text(json.dumps({**job, **paths, "output": str(made)}))
             worker = [sys.executable, "-m", "g2ard.bench.worker", str(place / "job.json")]
             took = measured(worker if command is None else command(made), place / "log")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,11 @@ from numpy.typing import NDArray
 from g2ard import io
 from g2ard.cameras import Cameras
 from g2ard.errors import G2ardError
+from g2ard.images import to_bytes
 from g2ard.io.atomic import atomic_output
 from g2ard.recover.anchors import Regularizers
 from g2ard.recover.schedule import Rates, Schedule, schedule_named
-from g2ard.splats import Splats
-from g2ard.targets import Photos, TeacherRenders
+from g2ard.targets import Photos, Targets
 
 __all__ = ["StoredTargets", "store_targets"]
 
@@ -30,29 +31,30 @@ Job = dict[str, Any]
 
 
 class StoredTargets:
-    """Targets rendered once for all cells: one .npy a view, by the view's name."""
+    """Targets made once for all cells: one .npy a view, by the view's name; photos as bytes."""
 
     def __init__(self, cameras: Cameras, folder: Path) -> None:
         self.cameras = cameras
         numbers = json.loads((folder / "names.json").read_text(encoding="utf-8"))
         self._paths = [folder / f"{numbers[name]}.npy" for name in cameras.names]
         self.source = f"stored {folder}"
-        self._kept: dict[int, NDArray[np.float32]] = {}
+        self._kept: dict[int, NDArray[Any]] = {}
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         if view not in self._kept:
             self._kept[view] = np.load(self._paths[view])
-        return self._kept[view]
+        image = self._kept[view]
+        return image.astype(np.float32) / np.float32(255) if image.dtype == np.uint8 else image
 
 
-def store_targets(teacher: Splats, cameras: Cameras, folder: Path, background: tuple[float, ...]) -> None:
-    """Render a teacher's targets to where `StoredTargets` finds them."""
+def store_targets(targets: Targets, folder: Path) -> None:
+    """Put photos (undistorted, at their views' size) or teacher renders where `StoredTargets` finds them."""
     folder.mkdir(parents=True, exist_ok=True)
-    colour = (background[0], background[1], background[2])
-    targets = TeacherRenders(teacher, cameras, background=colour, limit=0)
-    for view in range(len(cameras)):
-        np.save(folder / f"{view}.npy", targets[view])
-    (folder / "names.json").write_text(json.dumps({name: i for i, name in enumerate(cameras.names)}))
+    for view in range(len(targets.cameras)):
+        image = targets[view]
+        np.save(folder / f"{view}.npy", to_bytes(image) if isinstance(targets, Photos) else image)
+    numbers = {name: i for i, name in enumerate(targets.cameras.names)}
+    (folder / "names.json").write_text(json.dumps(numbers))
 
 
 def _reduce(job: Job) -> dict[str, Any]:
@@ -61,13 +63,14 @@ def _reduce(job: Job) -> dict[str, Any]:
     from g2ard.simplify import SimplifyConfig, simplify
 
     splats, cameras = io.read_splats(job["scene"]), io.read_views(job["views"])
-    output = Path(job["output"])
+    output, began = Path(job["output"]), time.monotonic()
     if job["method"] in baselines.METHODS:
         small = baselines.reduce(
             job["method"], splats, job["count"], cameras, seed=job["seed"], indoor=job["indoor"]
         )
+        seconds = time.monotonic() - began
         io.write_splats(output, small, overwrite=True)
-        return {"count": len(small)}
+        return {"count": len(small), "seconds": seconds}
     flags = np.load(job["flags"]) if job.get("flags") else None
     looks = job["method"] in ("default", "fast")
     config = SimplifyConfig()
@@ -82,9 +85,10 @@ def _reduce(job: Job) -> dict[str, Any]:
         flag_budget=job["budget"],
         config=config,
     )
+    seconds = time.monotonic() - began
     io.write_splats(output, done.splats, overwrite=True)
     np.save(output.with_name("flags.npy"), done.protected)
-    return {"count": len(done.splats)}
+    return {"count": len(done.splats), "seconds": seconds}
 
 
 def _select(job: Job) -> dict[str, Any]:
@@ -96,9 +100,8 @@ def _select(job: Job) -> dict[str, Any]:
     return {"views": len(chosen.order)}
 
 
-def _targets(job: Job) -> Any:
-    cameras = io.read_views(job["views"])
-    return StoredTargets(cameras, Path(job["targets"])) if job["targets"] else Photos(cameras)
+def _targets(job: Job) -> StoredTargets:
+    return StoredTargets(io.read_views(job["views"]), Path(job["targets"]))
 
 
 def _recover(job: Job) -> dict[str, Any]:
