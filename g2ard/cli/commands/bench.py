@@ -13,6 +13,7 @@ from g2ard.cli.frame import Run, command, group
 from g2ard.cli.options import SceneArgument, SizeOption, ViewsOption, parse_ratio
 
 if TYPE_CHECKING:
+    from g2ard.bench.definition import Definition, MethodSpec
     from g2ard.bench.run import Row
     from g2ard.bench.simplify import Cell
 
@@ -157,50 +158,28 @@ def run_(
 
     A stopped run goes on where it was; a cell that failed is a row with its error, and is tried again.
     """
-    from g2ard.bench.definition import METHODS, Definition, SceneSpec, read_definition
     from g2ard.bench.report import write_report
     from g2ard.bench.run import bench_run
-    from g2ard.bench.simplify import scene_label
-    from g2ard.errors import InputError
 
     if bool(definitions) == bool(scene):
         raise typer.BadParameter("give either DEFINITION.toml files or --scene SCENE")
-    if scene:
-        targets = "photos" if photos else "teacher"
-        train = None if views is None else str(views.absolute())
-        specs = tuple(SceneSpec(scene_label(p), str(p.absolute()), train, targets=targets) for p in scene)
-        studies = [Definition("scenes", "", specs, tuple(METHODS[m] for m in _PRUNERS), steps=(500,))]
-    else:
-        studies = [read_definition(path) for path in definitions or []]
-    numbers: dict[str, Any] = {
+    options: dict[str, Any] = {
         "ratios": _numbers(ratios, parse_ratio),
         "steps": _numbers(steps, _whole),
         "seconds": _numbers(seconds, float),
         "seeds": _numbers(seeds, int),
+        "released": released,
+        "size": size,
+        "lpips": None if lpips is None else str(lpips.absolute()),
+        "adapt_steps": adapt_steps,
     }
-    if scene and (steps is not None or seconds is not None):  # either one alone means only that
-        numbers |= {key: numbers[key] or () for key in ("steps", "seconds")}
-    narrowed = []
-    for study in studies:
-        own = {**METHODS, **{m.name: m for m in study.methods}}
-        names = [name.strip() for name in methods.split(",")] if methods else []
-        unknown = next((name for name in names if name not in own), None)
-        if unknown is not None:
-            raise InputError(f"{study.name}: no method {unknown!r} (there are {', '.join(own)})")
-        chosen = tuple(own[name] for name in names) or None
-        wanted = only.split(",") if only else None
-        scenes = tuple(s for s in study.scenes if wanted is None or s.name in wanted)
-        if not scenes:
-            raise InputError(f"{study.name}: no scene {only!r}")
-        folder = None if lpips is None else str(lpips.absolute())
-        options = {**numbers, "methods": chosen, "scenes": scenes, "released": released, "size": size}
-        if definitions:  # a study keeps to the kinds of budget it has
-            options |= {key: None for key in ("steps", "seconds") if not getattr(study, key)}
-        if study.adapt_steps:
-            options["adapt_steps"] = adapt_steps
-        narrowed.append(study.narrowed(**options, lpips=folder))
-    rows = bench_run(narrowed, output, keep=keep, progress=run.progress)
-    write_report(output, narrowed, rows)
+    names = [name.strip() for name in methods.split(",")] if methods else []
+    if scene:
+        studies = [_ad_hoc(scene, views, photos, names, options)]
+    else:
+        studies = [_narrowed(path, only, names, options) for path in definitions or []]
+    rows = bench_run(studies, output, keep=keep, progress=run.progress)
+    write_report(output, studies, rows)
     run.console.table(
         "PSNR and SSIM on unseen views; CPU seconds of reduction and recovery",
         ["study", "scene", "ratio", "method", "matched", "split", "Gaussians", "PSNR", "SSIM", "CPU s"],
@@ -211,6 +190,49 @@ def run_(
     failed = sum(bool(row.error) for row in rows)
     if failed:
         run.unmet(f"{failed} cells failed; the same command tries them again")
+
+
+def _ad_hoc(
+    scenes: list[Path], views: Path | None, photos: bool, names: list[str], options: dict[str, Any]
+) -> Definition:
+    """A study of the scenes given; either kind of budget alone means only that."""
+    from g2ard.bench.definition import Definition, SceneSpec
+    from g2ard.bench.simplify import scene_label
+
+    train = None if views is None else str(views.absolute())
+    targets = "photos" if photos else "teacher"
+    specs = tuple(SceneSpec(scene_label(p), str(p.absolute()), train, targets=targets) for p in scenes)
+    if options["steps"] or options["seconds"]:
+        options |= {key: options[key] or () for key in ("steps", "seconds")}
+    made = Definition("scenes", "", specs, (), steps=(500,))
+    return made.narrowed(**{**options, "adapt_steps": None}, methods=_chosen(made, names or list(_PRUNERS)))
+
+
+def _narrowed(path: Path, only: str | None, names: list[str], options: dict[str, Any]) -> Definition:
+    """A definition with the options that apply to it: it keeps to the kinds of budget it has."""
+    from g2ard.bench.definition import read_definition
+    from g2ard.errors import InputError
+
+    study = read_definition(path)
+    wanted = None if only is None else {name.strip() for name in only.split(",")}
+    scenes = tuple(s for s in study.scenes if wanted is None or s.name in wanted)
+    if not scenes:
+        raise InputError(f"{path}: no scene {only!r} (it has {', '.join(s.name for s in study.scenes)})")
+    own = {key: options[key] for key in ("steps", "seconds", "adapt_steps") if getattr(study, key)}
+    shared = {key: options[key] for key in ("ratios", "seeds", "released", "size", "lpips")}
+    methods = _chosen(study, names) if names else None
+    return study.narrowed(**own, **shared, scenes=scenes, methods=methods)
+
+
+def _chosen(study: Definition, names: list[str]) -> tuple[MethodSpec, ...]:
+    from g2ard.bench.definition import METHODS
+    from g2ard.errors import InputError
+
+    known = {**METHODS, **{method.name: method for method in study.methods}}
+    unknown = next((name for name in names if name not in known), None)
+    if unknown is not None:
+        raise InputError(f"{study.name}: no method {unknown!r} (there are {', '.join(known)})")
+    return tuple(known[name] for name in names)
 
 
 _PRUNERS = ("g2ard", "lightgaussian", "pup", "mini-splatting", "nanogs", "opacity-area", "random")
