@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
@@ -19,6 +21,7 @@ from g2ard.bench.run import bench_run, read_rows
 from g2ard.bench.score import Scored, ViewFigures, luma
 from g2ard.errors import InputError
 from g2ard.report.charts import Point, chart, pareto
+from g2ard.report.page import Comparison, Page, Shown
 from g2ard.targets import TeacherRenders
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -107,6 +110,23 @@ def check_page(html: str) -> None:
     parser.feed(html)
     assert parser.open == []
     assert not re.search(r"https?://|@import|url\(", html)
+
+
+def test_the_page_works_in_a_browser(tmp_path: Path) -> None:
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no chromium on PATH")
+    page = Page("A page")
+    target = np.zeros((30, 40, 3), np.uint8)
+    shown = [Shown(name, np.full_like(target, shade), "9 dB") for name, shade in (("one", 90), ("two", 200))]
+    page.comparison(Comparison("a view", target, shown))
+    page.write(tmp_path / "page.html")
+    options = ["--headless=new", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=2000", "--dump-dom"]
+    dom = subprocess.run(
+        [browser, *options, (tmp_path / "page.html").as_uri()], capture_output=True, text=True, timeout=120
+    ).stdout
+    assert '<span class="tag right">one 9 dB</span>' in dom  # the script has run
+    assert dom.count('src="data:image/jpeg;base64,') == 5  # a pair and three crops
 
 
 def test_stages_survive_an_interruption_and_failures_are_rows(tmp_path: Path) -> None:

@@ -18,6 +18,8 @@ from g2ard.targets import Targets
 __all__ = ["distill_report"]
 
 _VIEWS = 6
+_STRETCHES = 25
+"""Of the loss: single views differ more than steps do."""
 
 
 def distill_report(
@@ -99,7 +101,9 @@ def _loss_charts(rounds: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
     runs = [run for entry in rounds for run in entry.get("recover", [])]
     if not runs or not runs[-1]["loss"]:
         return []
-    curve, steps = runs[-1]["loss"], runs[-1]["steps"]
+    steps = runs[-1]["steps"]
+    parts = np.array_split(np.array(runs[-1]["loss"]), _STRETCHES)
+    curve = [float(part.mean()) for part in parts if len(part)]
     points = [
         Point((k + 1) / len(curve) * steps, value, 1, 0, f"{value:.4f}") for k, value in enumerate(curve)
     ]
