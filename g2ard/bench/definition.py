@@ -35,6 +35,7 @@ class MethodSpec:
         preset: of the regularisers.
         anchor: overrides the preset's weight of L_anchor.
         shape: overrides the preset's weight of L_shape; 0 also ends the effective rank's barrier.
+        period: overrides how many steps there are from one addition of the regularisers to the next, 100.
         protection: λ_h of the `paper` policy; 0 takes the flags away.
         released_steps: steps of each recovery in the method's own release; None where there is none.
         released_schedule: their rates.
@@ -50,6 +51,7 @@ class MethodSpec:
     preset: str = "auto"
     anchor: float | None = None
     shape: float | None = None
+    period: int | None = None
     protection: float | None = None
     released_steps: int | None = None
     released_schedule: str = "3dgs"
@@ -68,6 +70,8 @@ class MethodSpec:
                 raise InputError(
                     f"method {self.name}: {key}: expected one of {options}, got {getattr(self, key)!r}"
                 )
+        if self.period is not None and self.period < 1:
+            raise InputError(f"method {self.name}: period: expected at least 1, got {self.period}")
         if not 0 < self.k <= 1 or not 0 <= self.round_share < 1:
             raise InputError(f"method {self.name}: k {self.k} and round_share {self.round_share}: shares")
 

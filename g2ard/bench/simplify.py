@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from g2ard import __version__, io
+from g2ard import __version__, baselines, io
 from g2ard.bench.process import measured
 from g2ard.bench.raster import cpu_name
 from g2ard.cameras import Cameras
@@ -44,7 +44,7 @@ METHODS = (
     "paper",
     "splat-transform",
     "splat-transform-adaptive",
-    "nanogs",
+    *baselines.METHODS,
 )
 _POOL = 128
 _MAX_LOGIT = 20.0
@@ -204,8 +204,9 @@ class _Stand:
             mode = "--decimate-adaptive" if method.endswith("adaptive") else "--decimate"
             options = [str(self.splat_transform), "-q", "-w", "-g", "cpu"]
             return [*options, source, mode, str(budget), str(output)]
-        if method == "nanogs":
-            return [*python, "g2ard.baselines.nanogs", source, str(budget), str(output)]
+        if method in baselines.METHODS:
+            views = ["--views", str(self.views)] if method in baselines.NEED_VIEWS else []
+            return [*python, "g2ard.baselines", method, source, str(budget), str(output), *views]
         flags = {
             "default": ["--views", str(self.views)],
             "no-views": ["--no-views"],

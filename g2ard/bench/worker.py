@@ -23,7 +23,7 @@ from g2ard.images import to_bytes
 from g2ard.io.atomic import atomic_output
 from g2ard.recover.anchors import Regularizers
 from g2ard.recover.schedule import Rates, Schedule, schedule_named
-from g2ard.targets import Photos, Targets
+from g2ard.targets import CACHE_BYTES, Photos, Targets
 
 __all__ = ["StoredTargets", "store_targets"]
 
@@ -39,11 +39,15 @@ class StoredTargets:
         self._paths = [folder / f"{numbers[name]}.npy" for name in cameras.names]
         self.source = f"stored {folder}"
         self._kept: dict[int, NDArray[Any]] = {}
+        self._bytes = 0
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
-        if view not in self._kept:
-            self._kept[view] = np.load(self._paths[view])
-        image = self._kept[view]
+        image = self._kept.get(view)
+        if image is None:
+            image = np.load(self._paths[view])
+            if self._bytes + image.nbytes <= CACHE_BYTES:
+                self._kept[view] = image
+                self._bytes += image.nbytes
         return image.astype(np.float32) / np.float32(255) if image.dtype == np.uint8 else image
 
 

@@ -14,7 +14,7 @@ from g2ard.cli.options import SceneArgument, SizeOption, ViewsOption, parse_rati
 
 if TYPE_CHECKING:
     from g2ard.bench.definition import Definition, MethodSpec
-    from g2ard.bench.run import Row
+    from g2ard.bench.rows import Row
     from g2ard.bench.simplify import Cell
 
 bench = group("bench", "Measure on this machine.\n\nExample: g2ard bench raster scene.ply --json -")
@@ -79,7 +79,8 @@ def simplify(
     methods: Annotated[
         str | None,
         typer.Option(
-            help="Some of default, no-views, fast, paper, splat-transform, splat-transform-adaptive, nanogs."
+            help="Some of default, no-views, fast, paper, splat-transform, splat-transform-adaptive, "
+            "random, opacity-area, lightgaussian, pup, mini-splatting, nanogs."
         ),
     ] = None,
     views: ViewsOption = None,

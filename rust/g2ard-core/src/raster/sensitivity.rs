@@ -164,15 +164,18 @@ impl<S: Source> Kernel for GatherSensitivity<'_, S> {
             .chunk_by(|a, b| a.row as usize / LANES == b.row as usize / LANES)
         {
             let group = splats[0].row as usize / LANES;
-            let columns = columns::<F, S>(self.view, &self.source, group);
+            let mut found = None;
             for splat in splats {
                 let Some(moments) = total(splat, self.slots, self.written) else {
                     continue;
                 };
+                // Most groups of a small image touch no pixel.
+                let columns =
+                    found.get_or_insert_with(|| columns::<F, S>(self.view, &self.source, group));
                 let row = splat.row as usize;
                 // SAFETY: rows belong to one chunk each.
                 let out = unsafe { self.out.slice(row * TRIANGLE, TRIANGLE) };
-                add(&moments, &columns, row % LANES, out);
+                add(&moments, columns, row % LANES, out);
             }
         }
     }
@@ -197,7 +200,9 @@ fn total(splat: &Splat, slots: &[[f32; MOMENTS]], written: &[u8]) -> Option<[f64
 #[inline(always)]
 fn columns<F: Lanes, S: Source>(view: &View, source: &S, group: usize) -> [[Row; 6]; 8] {
     let mut out = [[Row::default(); 6]; 8];
-    for (k, column) in out.iter_mut().enumerate() {
+    // Without higher bands colour does not follow the direction: the last three stay zero.
+    let lively = if source.sh_coeffs() > 1 { 8 } else { 5 };
+    for (k, column) in out.iter_mut().enumerate().take(lively) {
         let mut unit = ScreenGradients {
             moments: [F::zero(); 6],
             rgb: [F::zero(); 3],
