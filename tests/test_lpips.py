@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scenes import around, checkered_ball
 
 from g2ard.errors import InputError
+from g2ard.evaluate import evaluate
 from g2ard.lpips import Lpips, load_lpips
+from g2ard.targets import TeacherRenders
 
 ALEX = ((0, 3, 4, 11, 4, 2), (3, 4, 5, 5, 1, 2), (6, 5, 6, 3, 1, 1), (8, 6, 4, 3, 1, 1), (10, 4, 4, 3, 1, 1))
 """Index, channels in and out, kernel, stride, padding."""
@@ -74,6 +77,16 @@ def test_distance_is_what_a_naive_network_says() -> None:
     model = Lpips("alex", backbone, linear)
     assert model(a, b) == pytest.approx(expected, rel=1e-4)
     assert model(a, a) == 0
+
+
+def test_evaluate_scores_with_it() -> None:
+    ball, views = checkered_ball(200), around(2)
+    found = evaluate(
+        ball.take(slice(100)), TeacherRenders(ball, views), lpips={"alex": Lpips("alex", *weights())}
+    )
+    assert found.lpips["alex"] > 0
+    assert found.as_dict()["lpips"] == found.lpips
+    assert evaluate(ball, TeacherRenders(ball, views)).as_dict()["lpips"] is None
 
 
 def test_weights_come_from_a_folder_and_nowhere_else(tmp_path: Path) -> None:
