@@ -33,7 +33,7 @@ lint: setup
 	$(BIN)/mypy
 
 # Needs a scene: SCENE=path, or real data. Every study runs once, small: one scene, two ratios, few steps.
-QUICK := --only city,guitar --ratios 10,30 --seeds 0 --size 240 --steps 150 --seconds 8 --adapt-steps 500
+QUICK := --only city,guitar --ratios 10,30 --seeds 0 --size 240 --steps 150 --seconds 12 --adapt-steps 500
 SCENE ?= $(G2ARD_DATA)/playbot/0_0
 bench: setup
 	$(BIN)/g2ard bench raster $(SCENE)

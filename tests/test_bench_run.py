@@ -167,10 +167,11 @@ def test_a_missing_scene_is_an_error_of_its_cells(tmp_path: Path) -> None:
     assert all("nowhere.ply" in row.error for row in rows)
 
 
-def test_reduction_that_takes_all_the_time_is_an_error(tmp_path: Path) -> None:
+def test_reduction_that_takes_all_the_time_is_scored_without_recovery(tmp_path: Path) -> None:
     text = STUDY.replace("seconds = [3]", "seconds = [1e-5]").replace("steps = [9]", "")
     rows = bench_run([read_definition(study(tmp_path, text))], tmp_path / "out")
-    assert all("no time left" in row.error for row in rows)
+    assert [(row.error, row.steps, row.count) for row in rows] == [("", 0, 300)] * 4
+    assert all(row.seconds > row.amount and row.recover_cpu_s == 0 for row in rows)
 
 
 def test_a_city_is_made_lifted_trained_and_adapted(tmp_path: Path) -> None:

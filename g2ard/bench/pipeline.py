@@ -13,7 +13,6 @@ from g2ard.baselines.pup import rounds as pup_rounds
 from g2ard.bench.definition import Definition, Matched, MethodSpec, SceneSpec
 from g2ard.bench.process import Usage
 from g2ard.bench.stand import Stage, Stand, fingerprint
-from g2ard.errors import InputError
 from g2ard.recover.presets import preset_for
 from g2ard.simplify import METHODS as SIMPLIFIERS
 from g2ard.simplify import schedule as paper_rounds
@@ -156,10 +155,8 @@ class Pipeline:
             steps = int(matched.amount) - each * (rounds - 1) if final else each
             return {"schedule": schedule, "steps": steps, "seconds": None} if steps else None
         left = matched.amount - self.reducing.wall - self.recovering.wall
-        if left <= 0:
-            raise InputError(
-                f"no time left to recover: reduction took {self.reducing.wall:.1f} of {matched.amount:g} s"
-            )
+        if left <= 0:  # scored as it is: the row's seconds say that they were not enough
+            return None
         remaining = 1 - early * number
         limit = left if final else left * early / remaining
         return {"schedule": schedule, "steps": None, "seconds": round(limit, 3)}
