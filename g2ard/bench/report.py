@@ -51,9 +51,9 @@ def write_report(folder: Path, definitions: Sequence[Definition], rows: Sequence
     page = Page("g2ard bench", f"g2ard {__version__} on {machine()}")
     page.paragraph(
         "PSNR and SSIM on views that no method has used. Step-matched cells took the same number of "
-        "optimiser steps, time-matched ones the same seconds for reduction and recovery together; where reduction "
-        "alone took longer there was no recovery. Figures against photos and against a teacher's renders are "
-        "never in one chart."
+        "optimiser steps, time-matched ones the same seconds for reduction and recovery together; where "
+        "reduction alone took longer there was no recovery. Figures against photos and against a teacher's "
+        "renders are never in one chart."
     )
     for definition in definitions:
         _study(page, folder, definition, [row for row in rows if row.study == definition.name])

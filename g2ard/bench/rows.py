@@ -62,8 +62,8 @@ class Row:
         recover_peak_mb: of the largest.
         adapt_cpu_s: of the adaptation.
         cpu_s: of reductions and recoveries.
-        seconds: reduce_wall_s + recover_wall_s; above `amount` where reduction alone took longer, which then is
-            all there is.
+        seconds: reduce_wall_s + recover_wall_s; above `amount` where reduction alone took longer, and
+            nothing was recovered.
         version: of g2ard.
         machine: processor and cores.
         error: why there are no figures; "" if there are.
