@@ -25,7 +25,7 @@ class Point:
         series: which colour, a number from 0.
         mark: which shape, a number from 0.
         text: what hovering shows.
-        label: written beside it; "" for none.
+        label: written beside it where there is room; "" for none.
     """
 
     x: float
@@ -124,7 +124,7 @@ def chart(
     if joined:
         parts += _lines(points, x, y)
     parts += [_dot(p, x(p.x), y(p.y)) for p in points]
-    parts += [_beside(p, x(p.x), y(p.y)) for p in points if p.label]
+    parts += _names(points, x, y)
     return (
         f'<svg class="chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" '
         f'aria-label="{escape(y_label)} against {escape(x_label)}">{"".join(parts)}</svg>'
@@ -201,9 +201,20 @@ def _dot(point: Point, x: float, y: float) -> str:
     return f'<polygon {css} points="{corners}">{title}</polygon>'
 
 
-def _beside(point: Point, x: float, y: float) -> str:
-    right = x < _WIDTH - 120
-    anchor, at = ("start", x + 9) if right else ("end", x - 9)
-    return (
-        f'<text class="name" x="{at:.1f}" y="{y - 6:.1f}" text-anchor="{anchor}">{escape(point.label)}</text>'
-    )
+def _names(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
+    """Labels beside their dots, best first; one that would cover another is left to hovering."""
+    out: list[str] = []
+    taken: list[tuple[float, float, float]] = []
+    for point in sorted((p for p in points if p.label), key=lambda p: -p.y):
+        width, left = 6.2 * len(point.label), x(point.x) + 9
+        anchor, at = "start", left
+        if left + width > _WIDTH - _RIGHT:
+            anchor, at = "end", x(point.x) - 9
+            left = at - width
+        bottom = y(point.y) - 6
+        if any(left < right and start < left + width and abs(bottom - b) < 12 for start, right, b in taken):
+            continue
+        taken.append((left, left + width, bottom))
+        text = escape(point.label)
+        out.append(f'<text class="name" x="{at:.1f}" y="{bottom:.1f}" text-anchor="{anchor}">{text}</text>')
+    return out
