@@ -254,6 +254,24 @@ def test_luma_drift_is_the_mean_distance_of_lumas() -> None:
     assert luma(np.array([[[1, 0, 0], [0, 1, 0]]], np.float32)) == pytest.approx((0.2126 + 0.7152) / 2)
 
 
+def test_released_schedules_run_beside_the_matched_ones(tmp_path: Path) -> None:
+    text = STUDY.replace('["g2ard", "pup", "rounds", "nanogs"]', '["light", "pair", "nanogs", "random"]')
+    text = text.replace("steps = [9]", "released = true").replace("seconds = [3]", "")
+    text = text.replace(
+        '[method.rounds]\nbase = "g2ard-paper"\nprotection = 0.0',
+        '[method.light]\nbase = "lightgaussian"\nreleased_steps = 7\n'
+        '[method.pair]\nbase = "pup"\nreleased_steps = 3',
+    )
+    rows = bench_run([read_definition(study(tmp_path, text))], tmp_path / "out", keep=True)
+    assert [(r.method, r.matched, r.steps, r.error) for r in rows] == [
+        ("light", "released", 7, ""),
+        ("pair", "released", 6, ""),  # two rounds
+        ("nanogs", "released", 0, ""),
+    ]
+    jobs = [json.loads(p.read_text()) for p in (tmp_path / "out" / "work").glob("*/stages/*/job.json")]
+    assert {job["schedule"] for job in jobs if job["kind"] == "recover"} == {"3dgs"}
+
+
 def test_released_schedules_are_those_of_the_papers() -> None:
     assert METHODS["lightgaussian"].released_steps == 5000
     assert METHODS["pup"].rounds == "pup"
