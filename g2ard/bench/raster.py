@@ -33,8 +33,8 @@ class SceneFigures:
         pairs: (tile, Gaussian) pairs.
         contributing: (pixel, Gaussian) pairs with α ≥ 1/255 in front of a stopped pixel.
         limit_ms: flops over the measured FMA rate; bytes over the measured bandwidth.
-        memory: bytes that a trainer's parameters, moments and buffers hold after a step: "gaussians" in what grows with
-            them (their pairs too), "per_gaussian" that over their count, "images" in what grows with the image.
+        memory: bytes that a trainer's parameters, moments and buffers hold after a step: "gaussians" in what
+            grows with them (their pairs too), "per_gaussian" that over their count, "images" in the rest.
         limit_share: the larger limit over project + sort + bin + forward + backward.
     """
 
