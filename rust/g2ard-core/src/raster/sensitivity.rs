@@ -4,11 +4,11 @@
 //! Of a pixel, g is linear in φ = (u, v, u², uv, v²): g = L·(h φ) + w·d, with h = ∂C/∂(ln α), w = αT, and L (6×5) and d
 //! (by the viewing direction in SH) the same for every pixel of a view. So a pixel adds to moments of u and v only.
 
-use super::forward::{BATCH, Place, Staged, alpha, block_coordinates, log2_alpha};
 use super::order::Shared;
 use super::params::Source;
 use super::project::{ScreenGradients, Splat, View, unproject};
 use super::simd::{Kernel, LANES, Lanes, Mask, Row};
+use super::stage::{BATCH, Batch, Place, alpha, block_coordinates, load_batch, log2_alpha};
 use super::tiles::Pair;
 use super::{ALPHA_MIN, BLOCKS, Settings};
 
@@ -47,7 +47,7 @@ pub struct Sensitivity<'a> {
     pub words: &'a [[u64; BLOCKS]],
     pub transmittance: &'a [Row; BLOCKS],
     pub last: &'a [Row; BLOCKS],
-    pub staged: &'a mut Staged,
+    pub batch: &'a mut Batch,
     pub slots: Shared<[f32; MOMENTS]>,
     pub written: Shared<u8>,
 }
@@ -71,12 +71,12 @@ impl Kernel for Sensitivity<'_> {
             }
             let first = batch * BATCH;
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
-            self.staged.load(pairs, self.splats, &self.place);
-            let s = &*self.staged;
+            load_batch(self.batch, self.pairs, first, self.splats, &self.place);
             while union != 0 {
                 let p = 63 - union.leading_zeros() as usize;
                 union ^= 1 << p;
-                let number = F::splat((first + p) as f32);
+                let near = &self.batch[p];
+                let number = F::splat(near.number);
                 let mut sums = [F::zero(); MOMENTS];
                 for (block, g) in state.iter_mut().enumerate() {
                     if words[block] >> p & 1 == 0 {
@@ -84,7 +84,7 @@ impl Kernel for Sensitivity<'_> {
                     }
                     let on_image = F::Mask::from_bits(self.place.lanes(block));
                     let (x, y) = block_coordinates::<F>(block);
-                    let (u, v, log2) = log2_alpha(s, p, x, y);
+                    let (u, v, log2) = log2_alpha(near, x, y);
                     let hit = log2.ge(minimum).and(F::load(&g.last).ge(number));
                     let raw = alpha(log2);
                     let a = raw.min(clip).only(hit.and(on_image));
@@ -98,7 +98,7 @@ impl Kernel for Sensitivity<'_> {
                     let mut square = F::zero();
                     for c in 0..3 {
                         let behind = F::load(&g.behind[c]);
-                        let gain = F::splat(s.rgb[c][p]) - behind;
+                        let gain = F::splat(near.rgb[c]) - behind;
                         a.fma(gain, behind).store(&mut g.behind[c]);
                         let h = follows * gain;
                         square = h.fma(h, square);
@@ -147,7 +147,7 @@ impl Kernel for Sensitivity<'_> {
 pub struct GatherSensitivity<'a, S: Source> {
     pub view: &'a View,
     pub source: S,
-    /// One chunk's visible splats, in row order.
+    /// One chunk's visible splats, in row order, and their slots.
     pub splats: &'a [Splat],
     pub slots: &'a [[f32; MOMENTS]],
     pub written: &'a [u8],
