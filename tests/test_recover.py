@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from scenes import around, checkered_ball
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.evaluate import evaluate
-from g2ard.recover import RecoverConfig, recover
+from g2ard.recover import RecoverConfig, optimize, recover
 from g2ard.recover.anchors import PRESETS, Regularizers
 from g2ard.recover.schedule import PAPER
 from g2ard.simplify import simplify
@@ -50,6 +51,9 @@ def test_recovery_lifts_unseen_views(student: Splats, targets: TeacherRenders, e
     assert evaluate(result.splats, unseen).psnr > evaluate(student, unseen).psnr + 3
     assert result.report["psnr"]["after"] > result.report["psnr"]["before"] + 3
     assert len(result.report["loss"]) == 100
+    assert [point["step"] for point in result.report["geometry"]] == [15 * k for k in range(1, 11)]
+    assert result.report["geometry"][-1]["drift95"] == result.report["drift95"]
+    assert result.report["regularizers"]["steps"] == 1
 
 
 def test_both_engines_take_the_same_way(student: Splats, targets: TeacherRenders) -> None:
@@ -98,6 +102,7 @@ def test_ctrl_c_then_resume_is_never_having_stopped(
     resumed = recover(student, targets, config, checkpoint=checkpoint)
     assert_same_bits(whole.splats, resumed.splats)
     assert whole.report["loss"] == resumed.report["loss"]
+    assert whole.report["geometry"] == resumed.report["geometry"]
 
 
 def test_resume_refuses_other_options(student: Splats, targets: TeacherRenders, tmp_path: Path) -> None:
@@ -139,6 +144,37 @@ def test_a_time_limit_sets_the_horizon(student: Splats, targets: TeacherRenders)
     assert report["steps"] > 5
     assert report["seconds"] >= 1.0
     assert report["psnr"]["after"] > report["psnr"]["before"] + 1
+
+
+def test_progress_shows_loss_psnr_and_speed(
+    student: Splats, targets: TeacherRenders, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(optimize, "_PROBE_SHARE", 0.5)  # these steps are too short for an honest share
+    seen: list[Any] = []
+    recover(
+        student,
+        targets,
+        RecoverConfig(steps=60),
+        progress=lambda *a: seen.append(a) if a[0] == "recover" else None,
+    )
+    assert [a[1] for a in seen] == list(range(1, 61))
+    assert set(seen[-1][3]) == {"loss", "PSNR", "steps/s"}
+    assert float(seen[-1][3]["PSNR"]) > float(seen[0][3]["PSNR"])
+
+
+def test_watching_costs_no_time_and_changes_no_bit(student: Splats, targets: TeacherRenders) -> None:
+    counts: list[tuple[int, float]] = []
+
+    def watch(step: int, seconds: float, splats: Any) -> None:
+        time.sleep(0.02)
+        if step == 20:
+            counts.append((len(splats()), seconds))
+
+    plain = recover(student, targets, RecoverConfig(steps=20))
+    watched = recover(student, targets, RecoverConfig(steps=20), watch=watch)
+    assert_same_bits(plain.splats, watched.splats)
+    assert counts[0][0] == len(student)
+    assert counts[0][1] == watched.report["seconds"] < plain.report["seconds"] + 0.2
 
 
 def test_a_far_offset_changes_nothing_but_the_offset(student: Splats, targets: TeacherRenders) -> None:

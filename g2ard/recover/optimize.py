@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -20,10 +21,19 @@ from g2ard.recover.schedule import TUNED, Rates, Schedule, multiplier_for
 from g2ard.splats import Splats
 from g2ard.targets import Targets, fingerprint_of
 
-__all__ = ["RecoverConfig", "Recovered", "recover"]
+__all__ = ["RecoverConfig", "Recovered", "Watch", "recover"]
 
 _PROBE_VIEWS = 8
-"""Views whose error tells how good the start is."""
+"""Views whose error tells how good the start is, and how it comes along."""
+
+_PROBE_SHARE = 0.01
+"""Of the time that looking at a probe view may take while somebody watches the progress."""
+
+_LOG_POINTS = 10
+"""How often Drift95 and Needle are logged over a recovery."""
+
+Watch = Callable[[int, float, Callable[[], Splats]], None]
+"""Called after every step with its number, the seconds so far and what gives the scene as it stands."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +81,8 @@ class Recovered:
     Args:
         splats: same count and order as the student.
         report: steps, seconds, loss (one mean per 1 % of the horizon), psnr {before, after} over a sample of
-            the training views, multiplier, drift95, needle, skipped.
+            the training views, multiplier, drift95, needle, geometry (ten of [{step, drift95, needle}] on the
+            way), regularizers {steps, share of the time}, skipped.
     """
 
     splats: Splats
@@ -102,6 +113,7 @@ def recover(
     checkpoint: Path | None = None,
     progress: Progress = silent,
     stage: str = "recover",
+    watch: Watch | None = None,
 ) -> Recovered:
     """Optimise every attribute of a fixed set of Gaussians against targets (`eq:objective`).
 
@@ -115,8 +127,9 @@ def recover(
         anchors: frozen geometry; None freezes the student as given.
         checkpoint: a file written every minute and at Ctrl-C; if it is there, recovery goes on from it, and
             the result is bitwise that of never having stopped.
-        progress: told of every step, with loss, PSNR of the step's view and steps/s.
+        progress: told of every step, with loss, PSNR of a few training views and steps/s.
         stage: the name progress is reported under.
+        watch: called after every step; the time it takes does not count.
 
     Returns:
         A `Recovered` with as many Gaussians as the student, in its order.
@@ -131,14 +144,15 @@ def recover(
     if config.sh_degree is not None:
         student = student.with_sh_degree(config.sh_degree)
     anchors = anchors or Anchors.of(student)
-    before = _sample_error(student, targets, config)
+    probe = _Probe(targets, config)
+    before = probe.all_of(student)
     multiplier = config.schedule.multiplier
     if multiplier is None:
         multiplier = multiplier_for(10 ** (-before / 20))
-    loop = _Loop(student, targets, config, anchors, multiplier)
-    loop.run(checkpoint, progress, stage)
+    loop = _Loop(student, targets, config, anchors, multiplier, probe)
+    loop.run(checkpoint, progress, stage, watch)
     result = loop.engine.splats()
-    after = _sample_error(result, targets, config)
+    after = probe.all_of(result)
     return Recovered(
         result,
         {
@@ -149,6 +163,8 @@ def recover(
             "multiplier": multiplier,
             "drift95": drift95(anchors, result.means),
             "needle": needle(result.scales),
+            "geometry": loop.geometry,
+            "regularizers": loop.regularizers,
             "skipped": {"non_finite": loop.engine.skipped},
         },
     )
@@ -158,11 +174,19 @@ class _Loop:
     """The steps of one recovery; what a resume must bring back lives in `engine`, `done` and `losses`."""
 
     def __init__(
-        self, student: Splats, targets: Targets, config: RecoverConfig, anchors: Anchors, multiplier: float
+        self,
+        student: Splats,
+        targets: Targets,
+        config: RecoverConfig,
+        anchors: Anchors,
+        multiplier: float,
+        probe: _Probe,
     ) -> None:
         self.targets = targets
         self.config = config
+        self.anchors = anchors
         self.multiplier = multiplier
+        self.probe = probe
         self.engine: Engine = _engine_class(config.engine)(
             student,
             targets.cameras.recentred(student.offset),
@@ -175,9 +199,11 @@ class _Loop:
         self.done = 0
         self.seconds = 0.0
         self.losses: list[float] = []
+        self.geometry: list[dict[str, float]] = []
+        self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised? → steps, seconds
         self.key = _fingerprint(student, targets, config)
 
-    def run(self, checkpoint: Path | None, progress: Progress, stage: str) -> None:
+    def run(self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None) -> None:
         if checkpoint is not None and checkpoint.exists():
             self._resume(checkpoint)
         earlier, began, saved = self.seconds, time.monotonic(), time.monotonic()
@@ -186,7 +212,13 @@ class _Loop:
                 self._step()
                 now = time.monotonic()
                 self.seconds = earlier + now - began
-                self._tell(progress, stage)
+                self._log()
+                if progress is not silent:
+                    self._tell(progress, stage)
+                if watch is not None:
+                    paused = time.monotonic()
+                    watch(self.done, self.seconds, self.engine.splats)
+                    began += time.monotonic() - paused
                 if checkpoint is not None and (interrupted.is_set() or now - saved > checkpoints.PERIOD):
                     self._save(checkpoint)
                     saved = now
@@ -204,8 +236,30 @@ class _Loop:
         rates = config.schedule.at(self._share(), final=config.final, multiplier=self.multiplier)
         view = self._view(step)
         regularize = config.regularizers.active and (step + 1) % config.regularizers.period == 0
+        began = time.monotonic()
         self.losses.append(self.engine.step(view, self.targets[view], rates, regularize=regularize))
+        tally = self._seconds_of[regularize]
+        tally[0] += 1
+        tally[1] += time.monotonic() - began
         self.done += 1
+
+    def _log(self) -> None:
+        """Drift95 and Needle at every tenth of the horizon."""
+        if len(self.geometry) < int(min(1.0, self._share()) * _LOG_POINTS):
+            scene = self.engine.splats()
+            figures = {"drift95": drift95(self.anchors, scene.means), "needle": needle(scene.scales)}
+            self.geometry.append({"step": self.done, **figures})
+
+    @property
+    def regularizers(self) -> dict[str, float]:
+        """How many steps were regularised, and which share of the time that cost above plain steps."""
+        (plain, plain_s), (held, held_s) = self._seconds_of[False], self._seconds_of[True]
+        extra = held_s - held * plain_s / plain if plain and held else 0.0
+        return (
+            {"steps": held, "share": max(0.0, extra) / (plain_s + held_s)}
+            if held
+            else {"steps": 0, "share": 0}
+        )
 
     def _tell(self, progress: Progress, stage: str) -> None:
         speed = self.done / max(self.seconds, 1e-9)
@@ -213,7 +267,9 @@ class _Loop:
         total = self.config.horizon
         if self.config.time_limit is not None:
             total = max(self.done, round(self.done / max(self._share(), 1e-9)))
-        progress(stage, self.done, total, {"loss": f"{recent:.4f}", "steps/s": f"{speed:.1f}"})
+        shown = self.probe.now(self.engine.splats, self.seconds)
+        figures = {"loss": f"{recent:.4f}", "PSNR": f"{shown:.2f}", "steps/s": f"{speed:.1f}"}
+        progress(stage, self.done, total, figures)
 
     def curve(self) -> list[float]:
         """Up to 100 means of the loss over equal stretches of the horizon."""
@@ -226,7 +282,12 @@ class _Loop:
         return int(order[position])
 
     def _save(self, path: Path) -> None:
-        meta = {"done": self.done, "seconds": self.seconds, "multiplier": self.multiplier}
+        meta = {
+            "done": self.done,
+            "seconds": self.seconds,
+            "multiplier": self.multiplier,
+            "geometry": self.geometry,
+        }
         checkpoints.save(path, self.key, meta, {**self.engine.state(), "losses": np.array(self.losses)})
 
     def _resume(self, path: Path) -> None:
@@ -235,6 +296,7 @@ class _Loop:
         self.engine.load(arrays)
         self.done, self.seconds = int(meta["done"]), float(meta["seconds"])
         self.multiplier = float(meta["multiplier"])
+        self.geometry = list(meta["geometry"])
 
 
 def _engine_class(name: str) -> Any:
@@ -249,17 +311,38 @@ def _engine_class(name: str) -> Any:
     raise InputError(f"engine: expected fused or torch, got {name!r}")
 
 
-def _sample_error(splats: Splats, targets: Targets, config: RecoverConfig) -> float:
-    """Mean PSNR over a few evenly spaced training views."""
-    from g2ard.render import render
+class _Probe:
+    """PSNR of a few evenly spaced training views: all at once, or one after the other along the way."""
 
-    count = len(targets.cameras)
-    sample = np.unique(np.linspace(0, count - 1, min(count, _PROBE_VIEWS)).round().astype(int))
-    scores = []
-    for view in sample:
-        image = render(splats, targets.cameras, int(view), background=config.background).image
-        scores.append(psnr(np.clip(image, 0, 1), targets[int(view)]))
-    return float(np.mean(scores))
+    def __init__(self, targets: Targets, config: RecoverConfig) -> None:
+        count = len(targets.cameras)
+        sample = np.linspace(0, count - 1, min(count, _PROBE_VIEWS)).round().astype(int)
+        self._views = [int(view) for view in np.unique(sample)]
+        self._targets, self._background = targets, config.background
+        self._scores: dict[int, float] = {}
+        self._turn = 0
+        self._next = 0.0
+
+    def all_of(self, splats: Splats) -> float:
+        """Mean over all of the views."""
+        self._scores = {view: self._score(splats, view) for view in self._views}
+        return float(np.mean(list(self._scores.values())))
+
+    def now(self, splats: Callable[[], Splats], seconds: float) -> float:
+        """The mean with one view looked at again, unless that would take more than its share of the time."""
+        if seconds >= self._next:
+            began = time.monotonic()
+            view = self._views[self._turn % len(self._views)]
+            self._scores[view] = self._score(splats(), view)
+            self._turn += 1
+            self._next = seconds + (time.monotonic() - began) / _PROBE_SHARE
+        return float(np.mean(list(self._scores.values())))
+
+    def _score(self, splats: Splats, view: int) -> float:
+        from g2ard.render import render
+
+        image = render(splats, self._targets.cameras, view, background=self._background).image
+        return psnr(np.clip(image, 0, 1), self._targets[view])
 
 
 def _fingerprint(student: Splats, targets: Targets, config: RecoverConfig) -> str:

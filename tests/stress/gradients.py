@@ -77,6 +77,13 @@ class _Line:
             self.known[step] = loss, out
         return self.known[step]
 
+    def noise(self, h: float) -> float:
+        """What rounding of the functional's terms, each on its own, leaves uncertain in a slope."""
+        out = self.render(0.0)[1]
+        parts = torch.cat([out.image, out.alpha[..., None], out.depth[..., None]], -1)
+        spread = float((parts * torch.from_numpy(self.problem.weights)).norm())
+        return 2 * float(np.finfo(np.float64).eps) * spread / (h * self.unit)
+
     def slope(self, stencil: tuple[tuple[int, float], ...], h: float) -> float | str:
         """The derivative, or which decision changes within the stencil."""
         total, (start, base) = 0.0, self.render(0.0)
@@ -98,11 +105,14 @@ def _settled(line: _Line, stencil: tuple[tuple[int, float], ...], scale: float) 
         if isinstance(slope, str):
             kind = kind or slope
             continue
+        size = max(abs(slope), scale)
+        if size and line.noise(h) > 0.5 * TWIN_TOLERANCE * size:
+            break  # the smaller steps drown in the rounding of the sums
         slopes.append(slope)
-        if len(slopes) > 1 and abs(slopes[-1] - slopes[-2]) <= 0.1 * TWIN_TOLERANCE * max(abs(slope), scale):
+        if len(slopes) > 1 and abs(slopes[-1] - slopes[-2]) <= 0.1 * TWIN_TOLERANCE * size:
             return slope
     if not slopes:
-        return kind
+        return kind or None
     gaps = np.abs(np.diff(slopes))
     if len(gaps) and gaps.min() <= 0.5 * TWIN_TOLERANCE * max(abs(slopes[int(gaps.argmin())]), scale):
         return slopes[int(gaps.argmin())]

@@ -100,12 +100,12 @@ def distill(
     use_photos = lifted or (pictured if photos is None else photos)
     teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
     colour = background or (0.0, 0.0, 0.0)
-    regularizers, why = preset_for(preset, prior)
+    regularizers, why, measured = preset_for(preset, prior, train)
     run.say(f"{len(prior):,} → {budget:,} Gaussians; {len(train)} views against {against}")
     run.say(f"regularisers: {why}")
     config = DistillConfig(
         method=method,
-        schedule=schedule_named(schedule),
+        schedule=schedule_named(schedule, steps),
         steps=steps,
         time_limit=time_limit,
         regularizers=regularizers,
@@ -122,7 +122,8 @@ def distill(
             run.say(f"stopped; the same command with --resume goes on in {output}")
             raise
         report = _score(run, prior, result, unseen, colour)
-        report |= {"against": against, "preset": why, "rounds": result.report["rounds"]}
+        report |= {"against": against, "preset": why, "prior": measured.as_dict()}
+        report["rounds"] = result.report["rounds"]
         report["seconds"] = {**result.report["seconds"], "total": time.monotonic() - began}
         _write(run, output, result, unseen, colour, report)
     if pool is not None:

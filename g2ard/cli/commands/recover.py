@@ -58,7 +58,7 @@ def recover(
     splats = load_scene(run, student)
     dense = load_scene(run, teacher) if teacher else None
     cameras = load_views(run, views, split, size)
-    regularizers, why = preset_for(preset, splats)
+    regularizers, why, measured = preset_for(preset, dense or splats, cameras)
     run.say(f"regularisers: {why}")
     config = RecoverConfig(
         schedule=schedule_named(schedule),
@@ -89,4 +89,5 @@ def recover(
     run.say(
         f"{output}: {len(splats):,} Gaussians, training views {gain['before']:.2f} → {gain['after']:.2f} dB"
     )
-    run.result({**result.report, "preset": why, "output": str(output)})
+    report = {**result.report, "preset": why, "prior": measured.as_dict()}
+    run.result({**report, "output": str(output)})
