@@ -25,6 +25,9 @@ BACKWARD = tuple((-at, -weight) for at, weight in FORWARD)
 LADDER = (1.0, 0.5, 0.25, 0.125, 1 / 16, 1 / 32, 1 / 64)
 """Steps tried, in the class's own unit, until two of them agree."""
 
+LONGER = (8.0, 4.0, 2.0, *LADDER[:2])
+"""Tried where the shorter ones drown in rounding."""
+
 
 @dataclass
 class Tally:
@@ -96,11 +99,13 @@ class _Line:
         return total / (h * self.unit)
 
 
-def _settled(line: _Line, stencil: tuple[tuple[int, float], ...], scale: float) -> float | str | None:
+def _settled(
+    line: _Line, stencil: tuple[tuple[int, float], ...], scale: float, ladder: tuple[float, ...] = LADDER
+) -> float | str | None:
     """The slope on which two steps of the ladder agree best; None if none do, a kind if all of them cross."""
     slopes: list[float] = []
     kind = ""
-    for h in LADDER:
+    for h in ladder:
         slope = line.slope(stencil, h)
         if isinstance(slope, str):
             kind = kind or slope
@@ -151,11 +156,14 @@ def _check(
         sides = [s for s in (FORWARD, BACKWARD) if not isinstance(line.slope(s, LADDER[0]), str)]
         if not sides:
             return
-        slope = _settled(line, sides[0], scale)
+        stencil = sides[0]
         tally.one_sided += 1
     else:
-        slope = _settled(line, CENTRAL, scale)
+        stencil = CENTRAL
         tally.central += 1
+    slope = _settled(line, stencil, scale)
+    if slope is None:
+        slope = _settled(line, stencil, scale, LONGER)
     if slope is None or isinstance(slope, str):
         tally.unsettled += 1
         return
