@@ -53,8 +53,12 @@ def make_targets(
     run: Run, cameras: Cameras, teacher: Splats | None, background: tuple[float, float, float]
 ) -> Targets:
     """The teacher's renders, or the views' photos where no teacher is given."""
+    from g2ard.io.exposures import find_exposures
     from g2ard.targets import Photos, TeacherRenders
 
     if teacher is None:
-        return Photos(cameras)
+        exposures = find_exposures(cameras)
+        if exposures:
+            run.say(f"exposure.json: {len(exposures)} photos brought to the scene's own colours")
+        return Photos(cameras, exposures=exposures)
     return TeacherRenders(teacher, cameras, background=background, progress=run.progress)

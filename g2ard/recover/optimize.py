@@ -19,7 +19,7 @@ from g2ard.recover import checkpoint as checkpoints
 from g2ard.recover.anchors import PRESETS, Anchors, Regularizers, drift95, needle
 from g2ard.recover.schedule import TUNED, Rates, Schedule, multiplier_for
 from g2ard.splats import Splats
-from g2ard.targets import Targets, fingerprint_of
+from g2ard.targets import Targets, fingerprint_of, mask_of
 
 __all__ = ["RecoverConfig", "Recovered", "Watch", "recover"]
 
@@ -92,7 +92,15 @@ class Recovered:
 class Engine(Protocol):
     """What takes steps: holds parameters and optimiser state."""
 
-    def step(self, view: int, target: NDArray[np.float32], rates: Rates, *, regularize: bool) -> float: ...
+    def step(
+        self,
+        view: int,
+        target: NDArray[np.float32],
+        rates: Rates,
+        *,
+        regularize: bool,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> float: ...
 
     def splats(self) -> Splats: ...
 
@@ -117,8 +125,8 @@ def recover(
 ) -> Recovered:
     """Optimise every attribute of a fixed set of Gaussians against targets (`eq:objective`).
 
-    L = (1−λ)·L1 + λ·(1−SSIM), and every `period` steps + λ_a·L_anchor + λ_s·L_shape. No Gaussian is added
-    or removed.
+    L = (1−λ)·L1 + λ·(1−SSIM), and every `period` steps + `period`·(λ_a·L_anchor + λ_s·L_shape). No
+    Gaussian is added or removed.
 
     Args:
         student: the scene to recover; its offset counts, cameras are in world coordinates.
@@ -191,7 +199,7 @@ class _Loop:
             student,
             targets.cameras.recentred(student.offset),
             anchors=anchors,
-            regularizers=config.regularizers,
+            regularizers=config.regularizers.applied,
             means_in_scales=config.schedule.means_in_scales,
             ssim_weight=config.ssim_weight,
             background=config.background,
@@ -237,7 +245,8 @@ class _Loop:
         view = self._view(step)
         regularize = config.regularizers.active and (step + 1) % config.regularizers.period == 0
         began = time.monotonic()
-        self.losses.append(self.engine.step(view, self.targets[view], rates, regularize=regularize))
+        target, mask = self.targets[view], mask_of(self.targets, view)
+        self.losses.append(self.engine.step(view, target, rates, regularize=regularize, mask=mask))
         tally = self._seconds_of[regularize]
         tally[0] += 1
         tally[1] += time.monotonic() - began
@@ -342,7 +351,7 @@ class _Probe:
         from g2ard.render import render
 
         image = render(splats, self._targets.cameras, view, background=self._background).image
-        return psnr(np.clip(image, 0, 1), self._targets[view])
+        return psnr(np.clip(image, 0, 1), self._targets[view], mask_of(self._targets, view))
 
 
 def _fingerprint(student: Splats, targets: Targets, config: RecoverConfig) -> str:

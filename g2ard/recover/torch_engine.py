@@ -62,7 +62,15 @@ class TorchEngine:
         groups = [{"params": [p], "lr": 0.0} for p in self._parameters.values() if p.numel()]
         self._adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, fused=True)
 
-    def step(self, view: int, target: NDArray[np.float32], rates: Rates, *, regularize: bool) -> float:
+    def step(
+        self,
+        view: int,
+        target: NDArray[np.float32],
+        rates: Rates,
+        *,
+        regularize: bool,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> float:
         """One optimiser step on one view; returns its photometric loss."""
         p = self._parameters
         means = self._base + self._unit * p["means"]
@@ -77,7 +85,11 @@ class TorchEngine:
             view,
             background=self._background,
         )
-        loss = l1_ssim(image, torch.from_numpy(target), self._ssim_weight)
+        wanted, share = torch.from_numpy(target), 1.0
+        if mask is not None:  # nothing differs where nothing counts
+            image = torch.where(torch.from_numpy(mask)[..., None], image, wanted)
+            share = mask.size / max(1, int(mask.sum()))
+        loss = share * l1_ssim(image, wanted, self._ssim_weight)
         total = loss
         if regularize and self._regularizers.active:
             total = loss + regularization(
