@@ -7,7 +7,7 @@ import json
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -40,6 +40,7 @@ class DistillConfig:
         sh_degree: of the result; None keeps the prior's.
         background: RGB behind the scene.
         seed: of the order of views.
+        engine: what takes recovery's steps, see `RecoverConfig`.
     """
 
     method: str = "default"
@@ -50,6 +51,7 @@ class DistillConfig:
     sh_degree: int | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     seed: int = 0
+    engine: Literal["fused", "torch", "gsplat"] = "fused"
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +181,7 @@ class _Rounds:
                 background=self.config.background,
                 final=final,
                 seed=self.config.seed,
+                engine=self.config.engine,
             )
             checkpoint = self.work / f"{name}.checkpoint.npz" if self.work else None
             done = recover(

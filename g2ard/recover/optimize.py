@@ -52,7 +52,8 @@ class RecoverConfig:
         final: whether this is the recovery at the target count; the paper decays rounds differently.
         seed: of the order of views.
         engine: "fused" takes whole steps in Rust; "torch" goes through autograd and torch's Adam, with the
-            same result to rounding but for Gaussians that a view does not touch.
+            same result to rounding but for Gaussians that a view does not touch; "gsplat" is that on an
+            NVIDIA GPU.
     """
 
     schedule: Schedule = TUNED
@@ -64,7 +65,7 @@ class RecoverConfig:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     final: bool = True
     seed: int = 0
-    engine: Literal["fused", "torch"] = "fused"
+    engine: Literal["fused", "torch", "gsplat"] = "fused"
 
     @property
     def horizon(self) -> int:
@@ -317,7 +318,11 @@ def _engine_class(name: str) -> Any:
         from g2ard.recover.torch_engine import TorchEngine
 
         return TorchEngine
-    raise InputError(f"engine: expected fused or torch, got {name!r}")
+    if name == "gsplat":
+        from g2ard.recover.gsplat_engine import GsplatEngine
+
+        return GsplatEngine
+    raise InputError(f"engine: expected fused, torch or gsplat, got {name!r}")
 
 
 class _Probe:

@@ -24,7 +24,7 @@ from g2ard.cli.options import (
     one_budget,
     one_horizon,
 )
-from g2ard.cli.scenes import load_scene, load_splits, load_views, make_targets
+from g2ard.cli.scenes import load_scene, load_splits, load_views, make_targets, recovery_engine
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
@@ -38,7 +38,7 @@ _POOL = 128
 """Poses of a pool made for a scene without views; every 8th is held out for scoring."""
 
 
-@command("distill", example="g2ard distill scene.ply -r 10 -o run/")
+@command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True)
 def distill(
     run: Run,
     scene: Annotated[
@@ -88,6 +88,7 @@ def distill(
     from g2ard.recover.schedule import schedule_named
 
     began = time.monotonic()
+    engine = recovery_engine(run)
     lifted = kind(scene) != "splats"
     if lifted and views is None:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
@@ -112,6 +113,7 @@ def distill(
         sh_degree=sh_degree if sh_degree is not None else (3 if lifted or schedule == "paper" else None),
         background=colour,
         seed=run.seed,
+        engine=engine,
     )
     targets = make_targets(run, train, teacher, colour)
     unseen = make_targets(run, test, teacher, colour)

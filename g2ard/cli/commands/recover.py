@@ -21,7 +21,11 @@ from g2ard.cli.options import (
 )
 
 
-@command("recover", example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply")
+@command(
+    "recover",
+    example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply",
+    cuda=True,
+)
 def recover(
     run: Run,
     student: Annotated[Path, typer.Argument(metavar="STUDENT", help="The compact scene to recover.")],
@@ -44,7 +48,7 @@ def recover(
     background: BackgroundOption = None,
 ) -> None:
     """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
-    from g2ard.cli.scenes import load_scene, load_views, make_targets
+    from g2ard.cli.scenes import load_scene, load_views, make_targets, recovery_engine
     from g2ard.io import write_splats
     from g2ard.io.atomic import check_output
     from g2ard.recover import RecoverConfig
@@ -54,6 +58,7 @@ def recover(
 
     one_horizon(steps, time_limit)
     check_output(output, run.overwrite)
+    engine = recovery_engine(run)
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(run, student)
     dense = load_scene(run, teacher) if teacher else None
@@ -68,6 +73,7 @@ def recover(
         sh_degree=sh_degree,
         background=colour,
         seed=run.seed,
+        engine=engine,
     )
     checkpoint = output.with_name(f".{output.name}.checkpoint.npz")
     if not resume:
