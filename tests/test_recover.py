@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
@@ -17,6 +18,7 @@ from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.evaluate import evaluate
 from g2ard.recover import RecoverConfig, optimize, recover
+from g2ard.recover import checkpoint as checkpoint_module
 from g2ard.recover.anchors import PRESETS, Regularizers
 from g2ard.recover.schedule import PAPER
 from g2ard.simplify import simplify
@@ -102,6 +104,27 @@ def test_ctrl_c_then_resume_is_never_having_stopped(
     resumed = recover(student, targets, config, checkpoint=checkpoint)
     assert_same_bits(whole.splats, resumed.splats)
     assert whole.report["loss"] == resumed.report["loss"]
+    assert whole.report["geometry"] == resumed.report["geometry"]
+
+
+def test_a_run_that_was_killed_goes_on_from_the_last_minute(
+    student: Splats, targets: TeacherRenders, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = RecoverConfig(steps=30, regularizers=replace(PRESETS["lift"], period=10))
+    whole = recover(student, targets, config)
+    monkeypatch.setattr(checkpoint_module, "PERIOD", 0.0)  # a minute has always passed
+
+    def fall_over(stage: str, done: int, total: int, info: Any = None) -> None:
+        if stage == "recover" and done == 21:
+            raise RuntimeError("power cut")
+
+    checkpoint = tmp_path / "c.npz"
+    with pytest.raises(RuntimeError, match="power cut"):
+        recover(student, targets, config, checkpoint=checkpoint, progress=fall_over)
+    meta, _ = checkpoint_module.load(checkpoint, json.loads(str(np.load(checkpoint)["meta"]))["key"])
+    assert meta["done"] == 20
+    resumed = recover(student, targets, config, checkpoint=checkpoint)
+    assert_same_bits(whole.splats, resumed.splats)
     assert whole.report["geometry"] == resumed.report["geometry"]
 
 
