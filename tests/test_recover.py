@@ -17,10 +17,10 @@ from scenes import around, checkered_ball
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.evaluate import evaluate
-from g2ard.recover import RecoverConfig, optimize, recover
+from g2ard.recover import RecoverConfig, probe, recover
 from g2ard.recover import checkpoint as checkpoint_module
 from g2ard.recover.anchors import PRESETS, Regularizers
-from g2ard.recover.schedule import PAPER
+from g2ard.recover.schedule import PAPER, TUNED
 from g2ard.simplify import simplify
 from g2ard.splats import Splats
 from g2ard.targets import TeacherRenders
@@ -91,11 +91,11 @@ class _StopAt:
             os.kill(os.getpid(), signal.SIGINT)
 
 
-@pytest.mark.parametrize("engine", ["fused", "torch"])
+@pytest.mark.parametrize(("engine", "steps"), [("fused", 40), ("torch", 40), ("fused", 110)])
 def test_ctrl_c_then_resume_is_never_having_stopped(
-    student: Splats, targets: TeacherRenders, engine: Any, tmp_path: Path
+    student: Splats, targets: TeacherRenders, engine: Any, steps: int, tmp_path: Path
 ) -> None:
-    config = RecoverConfig(steps=40, engine=engine, regularizers=replace(PRESETS["lift"], period=10))
+    config = RecoverConfig(steps=steps, engine=engine, regularizers=replace(PRESETS["lift"], period=10))
     whole = recover(student, targets, config)
     checkpoint = tmp_path / "c.npz"
     with pytest.raises(KeyboardInterrupt):
@@ -104,6 +104,8 @@ def test_ctrl_c_then_resume_is_never_having_stopped(
     resumed = recover(student, targets, config, checkpoint=checkpoint)
     assert_same_bits(whole.splats, resumed.splats)
     assert whole.report["loss"] == resumed.report["loss"]
+    assert whole.report["trials"] == resumed.report["trials"]
+    assert bool(whole.report["trials"]) == (steps >= 100)
     assert whole.report["geometry"] == resumed.report["geometry"]
 
 
@@ -162,6 +164,24 @@ def test_paper_schedule_runs_with_its_own_rates(student: Splats, targets: Teache
     assert result.report["psnr"]["after"] > result.report["psnr"]["before"]
 
 
+def test_trials_choose_rates_that_suit_the_scene(student: Splats, targets: TeacherRenders) -> None:
+    report = recover(student, targets, RecoverConfig(steps=100)).report
+    best = max(report["trials"], key=lambda trial: trial["psnr"])
+    assert report["multiplier"] == best["multiplier"]
+    assert len(report["trials"]) >= 2
+    nearly = recover(TEACHER, targets, RecoverConfig(steps=100)).report  # nothing to gain: small steps
+    assert nearly["multiplier"] == pytest.approx(1 / 3)
+    fixed = RecoverConfig(schedule=replace(TUNED, multiplier=0.7), steps=100)
+    report = recover(student, targets, fixed).report
+    assert (report["multiplier"], report["trials"]) == (0.7, [])
+
+
+def test_trials_stop_where_the_clock_is_short(student: Splats, targets: TeacherRenders) -> None:
+    report = recover(student, targets, RecoverConfig(time_limit=0.05)).report
+    assert report["trials"] == []
+    assert report["seconds"] < 1
+
+
 def test_a_time_limit_sets_the_horizon(student: Splats, targets: TeacherRenders) -> None:
     report = recover(student, targets, RecoverConfig(time_limit=1.0)).report
     assert report["steps"] > 5
@@ -172,7 +192,7 @@ def test_a_time_limit_sets_the_horizon(student: Splats, targets: TeacherRenders)
 def test_progress_shows_loss_psnr_and_speed(
     student: Splats, targets: TeacherRenders, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(optimize, "_PROBE_SHARE", 0.5)  # these steps are too short for an honest share
+    monkeypatch.setattr(probe, "_SHARE", 0.5)  # these steps are too short for an honest share
     seen: list[Any] = []
     recover(
         student,

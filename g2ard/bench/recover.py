@@ -359,6 +359,7 @@ class _Run:
             background=bench.background,
             seed=self.key[3],
         )
+        self.cpu_began = time.process_time()
         done = recover(start, bench.targets[0], config, progress=progress, watch=self._watch)
         return done.splats, start, [done.report]
 
@@ -384,7 +385,8 @@ class _Run:
     def _watch(self, step: int, seconds: float, splats: Callable[[], Splats]) -> None:
         if step == 1:
             self.before += self.now
-            self.cpu_began = time.process_time()  # what came before was simplification
+            if self.plan.schedule.round_steps:
+                self.cpu_began = time.process_time()  # what came before was simplification, for the most part
         self.now = seconds
         self._count_cpu()
         if step >= _FIRST_LOOK and (step // _FIRST_LOOK).bit_count() == 1 and step % _FIRST_LOOK == 0:

@@ -6,6 +6,7 @@ import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -13,21 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.metrics import psnr
 from g2ard.progress import Progress, silent
 from g2ard.recover import checkpoint as checkpoints
 from g2ard.recover.anchors import PRESETS, Anchors, Regularizers, drift95, needle
+from g2ard.recover.probe import Probe, climb, trial_steps
 from g2ard.recover.schedule import TUNED, Rates, Schedule, multiplier_for
 from g2ard.splats import Splats
 from g2ard.targets import Targets, fingerprint_of, mask_of
 
 __all__ = ["RecoverConfig", "Recovered", "Watch", "recover"]
 
-_PROBE_VIEWS = 8
-"""Views whose error tells how good the start is, and how it comes along."""
-
-_PROBE_SHARE = 0.01
-"""Of the time that looking at a probe view may take while somebody watches the progress."""
+_TRIAL_STEPS = 20
+_TRIAL_SHARE = 0.1
+"""Under a time limit: steps of a trial, and the share of the limit that all trials may take."""
 
 _LOG_POINTS = 10
 """How often Drift95 and Needle are logged over a recovery."""
@@ -82,8 +81,8 @@ class Recovered:
     Args:
         splats: same count and order as the student.
         report: steps, seconds, loss (one mean per 1 % of the horizon), psnr {before, after} over a sample of
-            the training views, multiplier, drift95, needle, geometry (ten of [{step, drift95, needle}] on the
-            way), regularizers {steps, share of the time}, skipped.
+            the training views, multiplier, trials (those that chose it), drift95, needle, geometry (ten of
+            {step, drift95, needle} on the way), regularizers {steps, share of the time}, skipped.
     """
 
     splats: Splats
@@ -153,12 +152,11 @@ def recover(
     if config.sh_degree is not None:
         student = student.with_sh_degree(config.sh_degree)
     anchors = anchors or Anchors.of(student)
-    probe = _Probe(targets, config)
+    probe = Probe(targets, config.background)
     before = probe.all_of(student)
-    multiplier = config.schedule.multiplier
-    if multiplier is None:
-        multiplier = multiplier_for(10 ** (-before / 20))
-    loop = _Loop(student, targets, config, anchors, multiplier, probe)
+    loop = _Loop(student, targets, config, anchors, probe)
+    if checkpoint is None or not checkpoint.exists():
+        loop.choose_multiplier(before)
     loop.run(checkpoint, progress, stage, watch)
     result = loop.engine.splats()
     after = probe.all_of(result)
@@ -169,7 +167,8 @@ def recover(
             "seconds": loop.seconds,
             "loss": loop.curve(),
             "psnr": {"before": before, "after": after},
-            "multiplier": multiplier,
+            "multiplier": loop.multiplier,
+            "trials": loop.trials,
             "drift95": drift95(anchors, result.means),
             "needle": needle(result.scales),
             "geometry": loop.geometry,
@@ -188,29 +187,79 @@ class _Loop:
         targets: Targets,
         config: RecoverConfig,
         anchors: Anchors,
-        multiplier: float,
-        probe: _Probe,
+        probe: Probe,
     ) -> None:
         self.targets = targets
         self.config = config
         self.anchors = anchors
-        self.multiplier = multiplier
+        self.multiplier = 1.0
+        self.trials: list[dict[str, float]] = []
+        self.student = student
         self.probe = probe
-        self.engine: Engine = _engine_class(config.engine)(
-            student,
-            targets.cameras.recentred(student.offset),
-            anchors=anchors,
-            regularizers=config.regularizers.applied,
-            means_in_scales=config.schedule.means_in_scales,
-            ssim_weight=config.ssim_weight,
-            background=config.background,
-        )
         self.done = 0
         self.seconds = 0.0
         self.losses: list[float] = []
         self.geometry: list[dict[str, float]] = []
         self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised? → steps, seconds
         self.key = _fingerprint(student, targets, config)
+
+    @cached_property
+    def engine(self) -> Engine:
+        """Made when first needed: trials need theirs before, and two at once would double the memory."""
+        return self._new_engine()
+
+    def _new_engine(self) -> Engine:
+        config, student = self.config, self.student
+        engine: Engine = _engine_class(config.engine)(
+            student,
+            self.targets.cameras.recentred(student.offset),
+            anchors=self.anchors,
+            regularizers=config.regularizers.applied,
+            means_in_scales=config.schedule.means_in_scales,
+            ssim_weight=config.ssim_weight,
+            background=config.background,
+        )
+        return engine
+
+    def choose_multiplier(self, start: float) -> None:
+        """The schedule's, or the one that short trials from the start like best; their time counts.
+
+        Args:
+            start: PSNR before recovery: where the search begins, and all there is for short horizons.
+        """
+        if self.config.schedule.multiplier is not None:
+            self.multiplier = self.config.schedule.multiplier
+            return
+        guess = multiplier_for(10 ** (-start / 20))
+        limit = self.config.time_limit
+        steps = trial_steps(self.config.horizon) if limit is None else _TRIAL_STEPS
+        self.multiplier = guess
+        if not steps:
+            return
+        began = time.monotonic()
+
+        def score(multiplier: float) -> float:
+            engine = self._new_engine()
+            for step in range(steps):
+                if limit is not None and time.monotonic() - began > _TRIAL_SHARE * limit:
+                    raise TimeoutError
+                self._learn(engine, step, step / steps, multiplier)
+            return self.probe.all_of(engine.splats())
+
+        try:
+            self.multiplier, seen = climb(score, guess)
+            self.trials = [{"multiplier": m, "psnr": value} for m, value in seen.items()]
+        except TimeoutError:
+            pass  # the guess stands
+        self.seconds = time.monotonic() - began
+
+    def _learn(
+        self, engine: Engine, step: int, share: float, multiplier: float, *, regularize: bool = False
+    ) -> float:
+        rates = self.config.schedule.at(share, final=self.config.final, multiplier=multiplier)
+        view = self._view(step)
+        target, mask = self.targets[view], mask_of(self.targets, view)
+        return engine.step(view, target, rates, regularize=regularize, mask=mask)
 
     def run(self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None) -> None:
         if checkpoint is not None and checkpoint.exists():
@@ -242,12 +291,10 @@ class _Loop:
 
     def _step(self) -> None:
         config, step = self.config, self.done
-        rates = config.schedule.at(self._share(), final=config.final, multiplier=self.multiplier)
-        view = self._view(step)
         regularize = config.regularizers.active and (step + 1) % config.regularizers.period == 0
         began = time.monotonic()
-        target, mask = self.targets[view], mask_of(self.targets, view)
-        self.losses.append(self.engine.step(view, target, rates, regularize=regularize, mask=mask))
+        loss = self._learn(self.engine, step, self._share(), self.multiplier, regularize=regularize)
+        self.losses.append(loss)
         tally = self._seconds_of[regularize]
         tally[0] += 1
         tally[1] += time.monotonic() - began
@@ -265,11 +312,7 @@ class _Loop:
         """How many steps were regularised, and which share of the time that cost above plain steps."""
         (plain, plain_s), (held, held_s) = self._seconds_of[False], self._seconds_of[True]
         extra = held_s - held * plain_s / plain if plain and held else 0.0
-        return (
-            {"steps": held, "share": max(0.0, extra) / (plain_s + held_s)}
-            if held
-            else {"steps": 0, "share": 0}
-        )
+        return {"steps": held, "share": max(0.0, extra) / max(plain_s + held_s, 1e-9)}
 
     def _tell(self, progress: Progress, stage: str) -> None:
         speed = self.done / max(self.seconds, 1e-9)
@@ -296,6 +339,7 @@ class _Loop:
             "done": self.done,
             "seconds": self.seconds,
             "multiplier": self.multiplier,
+            "trials": self.trials,
             "geometry": self.geometry,
         }
         checkpoints.save(path, self.key, meta, {**self.engine.state(), "losses": np.array(self.losses)})
@@ -306,7 +350,7 @@ class _Loop:
         self.engine.load(arrays)
         self.done, self.seconds = int(meta["done"]), float(meta["seconds"])
         self.multiplier = float(meta["multiplier"])
-        self.geometry = list(meta["geometry"])
+        self.trials, self.geometry = list(meta["trials"]), list(meta["geometry"])
 
 
 def _engine_class(name: str) -> Any:
@@ -323,40 +367,6 @@ def _engine_class(name: str) -> Any:
 
         return GsplatEngine
     raise InputError(f"engine: expected fused, torch or gsplat, got {name!r}")
-
-
-class _Probe:
-    """PSNR of a few evenly spaced training views: all at once, or one after the other along the way."""
-
-    def __init__(self, targets: Targets, config: RecoverConfig) -> None:
-        count = len(targets.cameras)
-        sample = np.linspace(0, count - 1, min(count, _PROBE_VIEWS)).round().astype(int)
-        self._views = [int(view) for view in np.unique(sample)]
-        self._targets, self._background = targets, config.background
-        self._scores: dict[int, float] = {}
-        self._turn = 0
-        self._next = 0.0
-
-    def all_of(self, splats: Splats) -> float:
-        """Mean over all of the views."""
-        self._scores = {view: self._score(splats, view) for view in self._views}
-        return float(np.mean(list(self._scores.values())))
-
-    def now(self, splats: Callable[[], Splats], seconds: float) -> float:
-        """The mean with one view looked at again, unless that would take more than its share of the time."""
-        if seconds >= self._next:
-            began = time.monotonic()
-            view = self._views[self._turn % len(self._views)]
-            self._scores[view] = self._score(splats(), view)
-            self._turn += 1
-            self._next = seconds + (time.monotonic() - began) / _PROBE_SHARE
-        return float(np.mean(list(self._scores.values())))
-
-    def _score(self, splats: Splats, view: int) -> float:
-        from g2ard.render import render
-
-        image = render(splats, self._targets.cameras, view, background=self._background).image
-        return psnr(np.clip(image, 0, 1), self._targets[view], mask_of(self._targets, view))
 
 
 def _fingerprint(student: Splats, targets: Targets, config: RecoverConfig) -> str:

@@ -54,7 +54,7 @@ class Schedule:
             depend on the scene's unit.
         cosine_floor: every rate follows a cosine down to this share of itself; None keeps geometry constant.
         appearance_decay: (rounds, final) share that appearance rates decay to exponentially; 1 keeps them.
-        multiplier: of all rates; None chooses it from the starting error (see `multiplier_for`).
+        multiplier: of all rates; None chooses it by short trials, which begin at `multiplier_for`.
     """
 
     rates: Rates
@@ -125,7 +125,7 @@ def schedule_named(name: str, steps: int | None = None) -> Schedule:
 
 
 def multiplier_for(start_rmse: float) -> float:
-    """A rate multiplier from the RMSE before recovery: 1 from 0.039 up, a third from 0.013 down.
+    """A guess at the rate multiplier from the RMSE before recovery: 1 from 0.039 up, a third from 0.013 down.
 
     The better a start already is, the smaller the steps that improve it.
 
