@@ -56,6 +56,7 @@ def simplify_pairwise(
     geometric: float,
     dilation: float,
     pixel_scale: float,
+    growth: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]: ...
 

@@ -31,6 +31,8 @@ pub struct Pairwise {
     pub dilation: f64,
     /// Without views: size of a pixel over the median largest scale.
     pub pixel_scale: f64,
+    /// How much larger than its moments say a cluster may be, in area, where α alone cannot hold its mass.
+    pub growth: f64,
 }
 
 impl Default for Pairwise {
@@ -43,6 +45,7 @@ impl Default for Pairwise {
             geometric: 0.03,
             dilation: 0.4,
             pixel_scale: 0.5,
+            growth: 1.5,
         }
     }
 }
@@ -65,8 +68,8 @@ pub struct PairwiseRound {
     pub after: usize,
 }
 
-/// What is not seen counts as if this share of its mass were.
-const UNSEEN: f32 = 0.01;
+/// What a few views do not see counts as if this share of its mass were: other views will see some of it.
+const UNSEEN: f32 = 0.2;
 
 /// Largest scale and coordinate in typical sizes: beyond, f32 products of four of them would overflow.
 const MAX_SCALE: f64 = 1e6;
@@ -115,8 +118,14 @@ impl Pairwise {
         }
         partition.count = nodes.len();
         drop(nodes);
-        let (step, clamped) =
-            partition.assemble(scene, &ordered, &flags, |i| blur[i].into(), control)?;
+        let (step, clamped) = partition.assemble(
+            scene,
+            &ordered,
+            &flags,
+            self.growth,
+            |i| blur[i].into(),
+            control,
+        )?;
         let mut outcome = step.finish(scene, &ordered, rounds);
         outcome.clamped_opacities = clamped;
         Ok(outcome)
@@ -180,8 +189,10 @@ impl Pairwise {
         if self.neighbors == 0 {
             return Err(Error::invalid("neighbors", "at least 1", 0));
         }
-        if self.ladder.is_nan() || self.ladder < 1.0 {
-            return Err(Error::invalid("ladder", "at least 1", self.ladder));
+        for (name, value) in [("ladder", self.ladder), ("max_growth", self.growth)] {
+            if value.is_nan() || value < 1.0 {
+                return Err(Error::invalid(name, "at least 1", value));
+            }
         }
         Ok(())
     }
