@@ -97,6 +97,7 @@ class Trainer:
         ssim_weight: float,
         rates: list[float],
         regularizers: tuple[float, float, bool] | None = None,
+        mask: NDArray[np.bool_] | None = None,
     ) -> tuple[float, int]: ...
     def rehearse(
         self, view: _View, choices: _Choices, background: list[float], target: _F32, ssim_weight: float

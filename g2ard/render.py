@@ -15,7 +15,16 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
 from g2ard.splats import Splats
 
-__all__ = ["RasterSettings", "Rendered", "Visibility", "centred", "looker", "render", "visibility"]
+__all__ = [
+    "RasterSettings",
+    "Rendered",
+    "Visibility",
+    "arrays_of",
+    "centred",
+    "looker",
+    "render",
+    "visibility",
+]
 
 _Floats = NDArray[np.float32]
 View = tuple[list[list[float]], list[float], tuple[int, int], float]

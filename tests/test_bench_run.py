@@ -17,8 +17,8 @@ from scenes import around, checkered_ball
 from g2ard import io
 from g2ard.bench.definition import METHODS, read_definition
 from g2ard.bench.report import write_report
-from g2ard.bench.rows import read_rows
 from g2ard.bench.run import bench_run
+from g2ard.bench.run_rows import read_rows
 from g2ard.bench.score import Scored, ViewFigures, luma
 from g2ard.errors import InputError
 from g2ard.report.charts import Point, chart, pareto

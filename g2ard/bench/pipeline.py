@@ -79,7 +79,7 @@ class Pipeline:
 
     def _regularizers(self, prior: Splats) -> dict[str, Any]:
         method = self.cell.method
-        chosen, _ = preset_for(method.preset, prior)
+        chosen, _, _ = preset_for(method.preset, prior)
         if method.anchor is not None:
             chosen = replace(chosen, anchor=method.anchor)
         if method.shape is not None:

@@ -13,8 +13,8 @@ from PIL import Image
 
 from g2ard import __version__
 from g2ard.bench.definition import Definition, Matched
-from g2ard.bench.rows import Row
 from g2ard.bench.run import cells_of
+from g2ard.bench.run_rows import Row
 from g2ard.bench.simplify import machine
 from g2ard.report.charts import Point, chart, pareto
 from g2ard.report.page import COLORS, Comparison, Page, Shown, legend

@@ -12,7 +12,7 @@ from typing import Any
 from g2ard import __version__, io
 from g2ard.bench.definition import Definition
 from g2ard.bench.pipeline import Cell, Pipeline
-from g2ard.bench.rows import Row, write_csv
+from g2ard.bench.run_rows import Row, write_csv
 from g2ard.bench.score import Scored, pictured, save_jpeg, score
 from g2ard.bench.simplify import machine
 from g2ard.bench.stand import Stand

@@ -14,7 +14,7 @@ from g2ard.lpips import Lpips
 from g2ard.metrics import psnr, ssim
 from g2ard.render import render
 from g2ard.splats import Splats
-from g2ard.targets import Targets
+from g2ard.targets import Targets, mask_of
 
 __all__ = ["Scored", "ViewFigures", "luma", "pictured", "save_jpeg", "score"]
 
@@ -57,13 +57,14 @@ class Scored:
         return float(np.mean([abs(view.luma) for view in self.views]))
 
 
-def luma(image: NDArray[np.float32]) -> float:
-    """Mean Rec. 709 luma of an image in [0, 1].
+def luma(image: NDArray[np.float32], mask: NDArray[np.bool_] | None = None) -> float:
+    """Mean Rec. 709 luma of an image in [0, 1], or of the pixels that count.
 
     >>> round(luma(np.full((2, 2, 3), 0.5, np.float32)), 6)
     0.5
     """
-    return float((image.astype(np.float64) @ _LUMA).mean())
+    pixels = image if mask is None else image[mask]
+    return float((pixels.astype(np.float64) @ _LUMA).mean())
 
 
 def score(
@@ -79,11 +80,11 @@ def score(
     for number, name in enumerate(targets.cameras.names):
         image = np.clip(render(splats, targets.cameras, number, background=background).image, 0, 1)
         target = targets[number]
+        mask = mask_of(targets, number)
+        off = luma(image, mask) - luma(target, mask)
         perceived = {f"lpips_{net}": model(image, target) for net, model in (lpips or {}).items()}
         views.append(
-            ViewFigures(
-                name, psnr(image, target), ssim(image, target), luma(image) - luma(target), **perceived
-            )
+            ViewFigures(name, psnr(image, target, mask), ssim(image, target, mask), off, **perceived)
         )
         if pictures is not None and number in pictured(len(targets.cameras)):
             save_jpeg(pictures / f"{number}.jpg", image)

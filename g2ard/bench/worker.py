@@ -23,7 +23,7 @@ from g2ard.images import to_bytes
 from g2ard.io.atomic import atomic_output
 from g2ard.recover.anchors import Regularizers
 from g2ard.recover.schedule import Rates, Schedule, schedule_named
-from g2ard.targets import CACHE_BYTES, Photos, Targets
+from g2ard.targets import CACHE_BYTES, Photos, Targets, mask_of
 
 __all__ = ["StoredTargets", "store_targets"]
 
@@ -50,6 +50,11 @@ class StoredTargets:
                 self._bytes += image.nbytes
         return image.astype(np.float32) / np.float32(255) if image.dtype == np.uint8 else image
 
+    def mask(self, view: int) -> NDArray[np.bool_] | None:
+        """Where the target counts; None where all of it does."""
+        path = self._paths[view].with_suffix(".mask.npy")
+        return np.load(path) if path.exists() else None
+
 
 def store_targets(targets: Targets, folder: Path) -> None:
     """Put photos (undistorted, at their views' size) or teacher renders where `StoredTargets` finds them."""
@@ -57,6 +62,9 @@ def store_targets(targets: Targets, folder: Path) -> None:
     for view in range(len(targets.cameras)):
         image = targets[view]
         np.save(folder / f"{view}.npy", to_bytes(image) if isinstance(targets, Photos) else image)
+        mask = mask_of(targets, view)
+        if mask is not None:
+            np.save(folder / f"{view}.mask.npy", mask)
     numbers = {name: i for i, name in enumerate(targets.cameras.names)}
     (folder / "names.json").write_text(json.dumps(numbers))
 

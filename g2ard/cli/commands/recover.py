@@ -21,7 +21,11 @@ from g2ard.cli.options import (
 )
 
 
-@command("recover", example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply")
+@command(
+    "recover",
+    example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply",
+    cuda=True,
+)
 def recover(
     run: Run,
     student: Annotated[Path, typer.Argument(metavar="STUDENT", help="The compact scene to recover.")],
@@ -44,7 +48,7 @@ def recover(
     background: BackgroundOption = None,
 ) -> None:
     """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
-    from g2ard.cli.scenes import load_scene, load_views, make_targets
+    from g2ard.cli.scenes import load_scene, load_views, make_targets, recovery_engine
     from g2ard.io import write_splats
     from g2ard.io.atomic import check_output
     from g2ard.recover import RecoverConfig
@@ -54,11 +58,12 @@ def recover(
 
     one_horizon(steps, time_limit)
     check_output(output, run.overwrite)
+    engine = recovery_engine(run)
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(run, student)
     dense = load_scene(run, teacher) if teacher else None
     cameras = load_views(run, views, split, size)
-    regularizers, why = preset_for(preset, splats)
+    regularizers, why, measured = preset_for(preset, dense or splats, cameras)
     run.say(f"regularisers: {why}")
     config = RecoverConfig(
         schedule=schedule_named(schedule),
@@ -68,6 +73,7 @@ def recover(
         sh_degree=sh_degree,
         background=colour,
         seed=run.seed,
+        engine=engine,
     )
     checkpoint = output.with_name(f".{output.name}.checkpoint.npz")
     if not resume:
@@ -89,4 +95,5 @@ def recover(
     run.say(
         f"{output}: {len(splats):,} Gaussians, training views {gain['before']:.2f} → {gain['after']:.2f} dB"
     )
-    run.result({**result.report, "preset": why, "output": str(output)})
+    report = {**result.report, "preset": why, "prior": measured.as_dict()}
+    run.result({**report, "output": str(output)})

@@ -7,6 +7,7 @@
 
 mod adam;
 mod anchors;
+mod mask;
 mod store;
 
 pub use anchors::{Anchors, Regularizers};
@@ -23,6 +24,7 @@ use crate::raster::{
 use crate::ssim::{Loss, Shape};
 use crate::{Error, Result};
 use adam::{Biases, Update};
+use mask::Mask;
 
 /// Adam's learning rate of each attribute.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -44,6 +46,8 @@ pub struct Lesson<'a> {
     pub background: [f32; 3],
     /// height × width × 3.
     pub target: &'a [f32],
+    /// height × width: where the loss counts; `None` means everywhere.
+    pub mask: Option<&'a [bool]>,
     /// λ of (1 − λ)·L1 + λ·(1 − SSIM).
     pub ssim_weight: f32,
     pub rates: Rates,
@@ -201,10 +205,19 @@ impl Trainer {
             &mut image,
         );
         let clock = Instant::now();
+        let pixels = camera.width * camera.height;
+        let mask = lesson.mask.map(|m| Mask::new(m, pixels)).transpose()?;
+        if let Some(mask) = &mask {
+            mask.cover(&mut self.image, lesson.target);
+        }
         let (image, gradient) = (&self.image, &mut self.gradient);
-        let loss = self
-            .loss
-            .l1_ssim(image, lesson.target, shape, lesson.ssim_weight, gradient)?;
+        let mut loss =
+            self.loss
+                .l1_ssim(image, lesson.target, shape, lesson.ssim_weight, gradient)?;
+        if let Some(mask) = &mask {
+            mask.clear(&mut self.gradient);
+            loss *= f64::from(mask.share);
+        }
         Ok((loss, clock.elapsed().as_secs_f64()))
     }
 
