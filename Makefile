@@ -37,6 +37,7 @@ lint: setup
 	$(BIN)/mypy
 
 # Needs a scene: SCENE=path, or real data. Every study runs once, small: one scene, two ratios, few steps.
+# What bench/ and bench.csv hold is not measured again; `make clean` removes them.
 QUICK := --only city,guitar --ratios 10,30 --seeds 0 --size 240 --steps 150 --seconds 12 --adapt-steps 500
 SCENE ?= $(G2ARD_DATA)/playbot/0_0
 bench: setup
@@ -48,4 +49,4 @@ wheel: setup
 	$(BIN)/maturin build --release --out dist
 
 clean:
-	rm -rf $(VENV) target dist demo
+	rm -rf $(VENV) target dist demo bench bench.csv
