@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.cli.frame import Run
+    from g2ard.io import ViewSet
     from g2ard.splats import Splats
     from g2ard.targets import Targets
 
-__all__ = ["load_scene", "load_splits", "load_views", "make_targets"]
+__all__ = ["load_scene", "load_splits", "load_view_sets", "load_views", "make_targets"]
 
 
 def load_scene(run: Run, path: Path) -> Splats:
@@ -39,6 +40,17 @@ def load_splits(run: Run, path: Path, splits: list[str], size: int | None) -> li
     Raises:
         InputError: as `load_views`.
     """
+    return [found.cameras for found in load_view_sets(run, path, splits, size)]
+
+
+def load_view_sets(run: Run, path: Path, splits: list[str], size: int | None) -> list[ViewSet]:
+    """As `load_splits`, with the views' weights where the file has them.
+
+    Raises:
+        InputError: as `load_views`.
+    """
+    from dataclasses import replace
+
     from g2ard.io import read_view_set
     from g2ard.splits import split_mask
 
@@ -46,7 +58,8 @@ def load_splits(run: Run, path: Path, splits: list[str], size: int | None) -> li
     for note in found.notes:
         run.say(f"{path}: {note}")
     masks = [split_mask(path, found.cameras.names, split, stated=found.splits) for split in splits]
-    return [found.cameras.take(mask).resized(size) for mask in masks]
+    parts = [found.take(mask) for mask in masks]
+    return [replace(part, cameras=part.cameras.resized(size)) for part in parts]
 
 
 def make_targets(

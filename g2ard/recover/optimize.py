@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 from g2ard.metrics import psnr
 from g2ard.progress import Progress, silent
 from g2ard.recover import checkpoint as checkpoints
 from g2ard.recover.anchors import PRESETS, Anchors, Regularizers, drift95, needle
+from g2ard.recover.draw import checked_weights, drawn
 from g2ard.recover.schedule import TUNED, Rates, Schedule, multiplier_for
 from g2ard.splats import Splats
 from g2ard.targets import Targets, fingerprint_of
@@ -98,6 +99,7 @@ def recover(
     targets: Targets,
     config: RecoverConfig | None = None,
     *,
+    weights: ArrayLike | None = None,
     anchors: Anchors | None = None,
     checkpoint: Path | None = None,
     progress: Progress = silent,
@@ -112,6 +114,7 @@ def recover(
         student: the scene to recover; its offset counts, cameras are in world coordinates.
         targets: photos or teacher renders with their cameras.
         config: see `RecoverConfig`.
+        weights: (C,) how often each view is drawn, in proportion; None draws all equally often.
         anchors: frozen geometry; None freezes the student as given.
         checkpoint: a file written every minute and at Ctrl-C; if it is there, recovery goes on from it, and
             the result is bitwise that of never having stopped.
@@ -122,7 +125,7 @@ def recover(
         A `Recovered` with as many Gaussians as the student, in its order.
 
     Raises:
-        InputError: no Gaussians, no views, or a checkpoint of another run.
+        InputError: no Gaussians, no views, weights that are none, or a checkpoint of another run.
         KeyboardInterrupt: after Ctrl-C, once the checkpoint is written.
     """
     config = config or RecoverConfig()
@@ -135,7 +138,8 @@ def recover(
     multiplier = config.schedule.multiplier
     if multiplier is None:
         multiplier = multiplier_for(10 ** (-before / 20))
-    loop = _Loop(student, targets, config, anchors, multiplier)
+    often = checked_weights(weights, len(targets.cameras))
+    loop = _Loop(student, targets, config, often, anchors, multiplier)
     loop.run(checkpoint, progress, stage)
     result = loop.engine.splats()
     after = _sample_error(result, targets, config)
@@ -158,10 +162,17 @@ class _Loop:
     """The steps of one recovery; what a resume must bring back lives in `engine`, `done` and `losses`."""
 
     def __init__(
-        self, student: Splats, targets: Targets, config: RecoverConfig, anchors: Anchors, multiplier: float
+        self,
+        student: Splats,
+        targets: Targets,
+        config: RecoverConfig,
+        weights: NDArray[np.float64] | None,
+        anchors: Anchors,
+        multiplier: float,
     ) -> None:
         self.targets = targets
         self.config = config
+        self.weights = weights
         self.multiplier = multiplier
         self.engine: Engine = _engine_class(config.engine)(
             student,
@@ -175,7 +186,7 @@ class _Loop:
         self.done = 0
         self.seconds = 0.0
         self.losses: list[float] = []
-        self.key = _fingerprint(student, targets, config)
+        self.key = _fingerprint(student, targets, config, weights)
 
     def run(self, checkpoint: Path | None, progress: Progress, stage: str) -> None:
         if checkpoint is not None and checkpoint.exists():
@@ -220,10 +231,10 @@ class _Loop:
         return [float(part.mean()) for part in np.array_split(np.array(self.losses), 100) if len(part)]
 
     def _view(self, step: int) -> int:
-        """Views in a fresh random order each time all have been seen; depends on seed and step alone."""
-        epoch, position = divmod(step, len(self.targets.cameras))
-        order = np.random.default_rng((self.config.seed, epoch)).permutation(len(self.targets.cameras))
-        return int(order[position])
+        """Views in a fresh random order each epoch; depends on seed, weights and step alone."""
+        count = len(self.targets.cameras)
+        epoch, position = divmod(step, count)
+        return int(drawn(self.config.seed, epoch, count, self.weights)[position])
 
     def _save(self, path: Path) -> None:
         meta = {"done": self.done, "seconds": self.seconds, "multiplier": self.multiplier}
@@ -262,6 +273,9 @@ def _sample_error(splats: Splats, targets: Targets, config: RecoverConfig) -> fl
     return float(np.mean(scores))
 
 
-def _fingerprint(student: Splats, targets: Targets, config: RecoverConfig) -> str:
-    parts = (repr(config), student.fingerprint(), fingerprint_of(targets))
+def _fingerprint(
+    student: Splats, targets: Targets, config: RecoverConfig, weights: NDArray[np.float64] | None
+) -> str:
+    often = [] if weights is None else [repr(weights.tolist())]
+    parts = (repr(config), student.fingerprint(), fingerprint_of(targets), *often)
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()

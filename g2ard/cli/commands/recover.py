@@ -40,11 +40,14 @@ def recover(
         bool, typer.Option("--resume", help="Go on from the checkpoint of a stopped run.")
     ] = False,
     split: SplitOption = "train",
+    weighted: Annotated[
+        bool, typer.Option("--weights/--no-weights", help="Draw views by the weights they carry, if any.")
+    ] = True,
     size: SizeOption = None,
     background: BackgroundOption = None,
 ) -> None:
     """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
-    from g2ard.cli.scenes import load_scene, load_views, make_targets
+    from g2ard.cli.scenes import load_scene, load_view_sets, make_targets
     from g2ard.io import write_splats
     from g2ard.io.atomic import check_output
     from g2ard.recover import RecoverConfig
@@ -57,7 +60,10 @@ def recover(
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(run, student)
     dense = load_scene(run, teacher) if teacher else None
-    cameras = load_views(run, views, split, size)
+    chosen = load_view_sets(run, views, [split], size)[0]
+    weights = chosen.weights if weighted else None
+    if weights is not None:
+        run.say(f"{len(weights)} views, drawn by their weights")
     regularizers, why = preset_for(preset, splats)
     run.say(f"regularisers: {why}")
     config = RecoverConfig(
@@ -75,8 +81,9 @@ def recover(
     try:
         result = optimize(
             splats,
-            make_targets(run, cameras, dense, colour),
+            make_targets(run, chosen.cameras, dense, colour),
             config,
+            weights=weights,
             checkpoint=checkpoint,
             progress=run.progress,
         )
