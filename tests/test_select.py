@@ -10,11 +10,10 @@ import pytest
 from reference import select as naive
 
 from g2ard import _core
-from g2ard import select as module
 from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
 from g2ard.io import read_view_set, write_splats, write_views
-from g2ard.select import POLICIES, CoverageOptions, Surface, select, surface, visible_cells
+from g2ard.select import POLICIES, CoverageOptions, Surface, poses, select, surface, surfaces, visible_cells
 from g2ard.splats import Splats
 
 SIZE = (96, 72)
@@ -57,14 +56,14 @@ def around(count, seed=0, radius=4.0) -> Cameras:
 
 
 def core_view(cameras, i, origin):
-    return module._views(cameras.take([i]), origin)[0]
+    return surfaces._views(cameras.take([i]), origin)[0]
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (4.4e5, 4.4e6, 1e3)])
 def test_depths_are_the_naive_renderers(offset):
     scene = ball(offset=offset)
     cameras = around(3).recentred(-np.asarray(offset))
-    parts, origin = module._scene(scene)
+    parts, origin = surfaces._scene(scene)
     grid = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)
     for i in range(3):
         got = _core.select_depth(parts, core_view(cameras, i, origin)).ravel()
@@ -163,15 +162,15 @@ def test_lazy_is_plain_greedy_on_fifty_pools():
 def test_auto_is_facility_location():
     scene, cameras = ball(), around(30)
     coarse = surface(scene, 1000)
-    alike = module._likeness(cameras, module._viewing_distances(coarse, cameras))
-    wanted = module._demand(alike)
+    alike = poses.likeness(cameras, poses.viewing_distances(coarse, cameras))
+    wanted = poses.demand(alike)
     np.testing.assert_array_equal(alike, alike.T)
     np.testing.assert_array_equal(np.diag(alike), 1.0)
-    order, gains = module._represent(alike, wanted, np.ones(30, bool))
+    order, gains = poses.represent(alike, wanted, np.ones(30, bool))
     assert order.tolist()[:12] == naive.facility(12, alike, wanted)
     assert gains.sum() == pytest.approx(1.0)
     assert np.all(np.diff(gains) <= 1e-15)
-    np.testing.assert_allclose(module._gains_of(order, alike, wanted), gains, atol=1e-15)
+    np.testing.assert_allclose(poses.gains_of(order, alike, wanted), gains, atol=1e-15)
 
 
 def test_auto_and_diverse_leave_the_crowd():

@@ -1,0 +1,108 @@
+"""Views as poses: how alike two are, which of them stand for the others, and how often to draw each."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.cameras import Cameras
+from g2ard.select.surfaces import Surface
+
+__all__ = ["demand", "draw_weights", "farthest", "gains_of", "likeness", "represent", "viewing_distances"]
+
+Float = NDArray[np.float64]
+Order = NDArray[np.int64]
+
+_BANDWIDTH = 0.35
+"""Of the kernel exp(−(d/0.35)²) between poses: neighbours 20° apart on an orbit are half alike."""
+_COARSE = 20_000
+
+
+def viewing_distances(cells: Surface, cameras: Cameras) -> Float:
+    """(C,) each view's median depth of the cells within its image, 0 where there is none."""
+    local = cameras.recentred(cells.origin)
+    step = max(1, len(cells.centers) // _COARSE)
+    points = cells.centers[::step]
+    out = np.zeros(len(local))
+    for i in range(len(local)):
+        x, y, z = local.viewmats[i, :3, :3] @ points.T + local.viewmats[i, :3, 3:]
+        ahead = z > 0.01
+        z = np.where(ahead, z, 1.0)
+        K = local.Ks[i]
+        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        inside = ahead & (u >= 0) & (u < local.widths[i]) & (v >= 0) & (v < local.heights[i])
+        out[i] = np.median(z[inside]) if inside.any() else 0.0
+    return out
+
+
+def likeness(cameras: Cameras, depths: Float) -> Float:
+    """(C, C) exp(−(d/0.35)²): d² = |Δposition|²/(depth·depth) + |Δdirection|²: parallax and turn."""
+    seen = depths[depths > 0]
+    scale = np.where(depths > 0, depths, np.median(seen) if len(seen) else 1.0)
+    positions = cameras.positions - cameras.positions.mean(0)
+    away = _squares(positions) / (scale[:, None] * scale)
+    return np.exp(-(away + _squares(cameras.forwards)) / _BANDWIDTH**2)
+
+
+def _squares(rows: Float) -> Float:
+    """(n, n) squared distances; exactly 0 between equal rows."""
+    out = np.zeros((len(rows), len(rows)))
+    for column in rows.T:
+        out += (column[:, None] - column) ** 2
+    return out
+
+
+def demand(alike: Float) -> Float:
+    """(C,) how much each pose asks to be represented: less the more poses are like it; sums to 1."""
+    weights = 1 / alike.sum(1)
+    return weights / weights.sum()
+
+
+def represent(alike: Float, wanted: Float, usable: NDArray[np.bool_]) -> tuple[Order, Float]:
+    """Greedy facility location: Σ_u w_u max_{v∈S} alike_uv."""
+    wanted = np.where(usable, wanted, 0.0)
+    best, left = np.zeros(len(alike)), usable.copy()
+    order, gains = [], []
+    for _ in range(int(usable.sum())):
+        gain = wanted @ np.maximum(alike - best[:, None], 0.0)
+        view = int(np.argmax(np.where(left, gain, -1.0)))
+        order.append(view)
+        gains.append(float(gain[view]))
+        best = np.maximum(best, alike[:, view])
+        left[view] = False
+    return np.array(order, np.int64), np.array(gains)
+
+
+def gains_of(order: Order, alike: Float, wanted: Float) -> Float:
+    """What each view of a given order adds to the facility location."""
+    best, gains = np.zeros(len(alike)), []
+    for view in order:
+        gains.append(float(wanted @ np.maximum(alike[:, view] - best, 0.0)))
+        best = np.maximum(best, alike[:, view])
+    return np.array(gains)
+
+
+def farthest(alike: Float, usable: NDArray[np.bool_]) -> tuple[Order, Float]:
+    """Farthest pose next, from the one most like all others; gains are distances to the nearest chosen."""
+    if not usable.any():
+        return np.zeros(0, np.int64), np.zeros(0)
+    away = np.sqrt(-np.log(np.maximum(alike, np.finfo(np.float64).tiny)))
+    first = int(np.argmax(np.where(usable, alike[:, usable].sum(1), -1.0)))
+    order, gains = [first], [float(away[usable, first].max())]
+    nearest = np.where(usable, away[first], -1.0)
+    nearest[first] = -1.0
+    for _ in range(int(usable.sum()) - 1):
+        view = int(np.argmax(nearest))
+        order.append(view)
+        gains.append(float(nearest[view]))
+        nearest = np.where(nearest >= 0, np.minimum(nearest, away[view]), -1.0)
+        nearest[view] = -1.0
+    return np.array(order, np.int64), np.array(gains)
+
+
+def draw_weights(order: Order, alike: Float, wanted: Float) -> Float:
+    """(K,) the demand of the poses that each chosen view is nearest to, mean 1."""
+    nearest = order[np.argmax(alike[:, order], axis=1)]
+    nearest[order] = order  # each stands for itself, equals included
+    weights = np.bincount(nearest, wanted, len(alike))[order]
+    return weights / weights.mean()
