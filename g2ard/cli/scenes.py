@@ -63,11 +63,16 @@ def load_view_sets(run: Run, path: Path, splits: list[str], size: int | None) ->
 
 
 def make_targets(
-    run: Run, cameras: Cameras, teacher: Splats | None, background: tuple[float, float, float]
+    run: Run,
+    cameras: Cameras,
+    teacher: Splats | None,
+    background: tuple[float, float, float],
+    *,
+    lazy: bool = False,
 ) -> Targets:
-    """The teacher's renders, or the views' photos where no teacher is given."""
+    """The teacher's renders (`lazy`: when first asked for), or the photos where no teacher is given."""
     from g2ard.targets import Photos, TeacherRenders
 
     if teacher is None:
         return Photos(cameras)
-    return TeacherRenders(teacher, cameras, background=background, progress=run.progress)
+    return TeacherRenders(teacher, cameras, background=background, lazy=lazy, progress=run.progress)

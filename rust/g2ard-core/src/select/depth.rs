@@ -181,4 +181,58 @@ mod tests {
             }
         }
     }
+
+    #[test]
+    fn blocks_out_of_sight_leave_nothing_out() {
+        let mut state = 5u64;
+        let mut uniform = |low: f64, high: f64| {
+            state = state
+                .wrapping_mul(6364136223846793005)
+                .wrapping_add(1442695040888963407);
+            low + (high - low) * (state >> 11) as f64 / (1u64 << 53) as f64
+        };
+        let n = 6000;
+        let means: Vec<[f64; 3]> = (0..n).map(|_| [0; 3].map(|_| uniform(-9.0, 9.0))).collect();
+        let scales: Vec<[f32; 3]> = (0..n)
+            .map(|_| [0; 3].map(|_| uniform(-4.0, 0.7).exp() as f32))
+            .collect();
+        let scene = Gaussians {
+            means: &means,
+            quats: &vec![[0.3, 0.8, -0.2, 0.5]; n],
+            scales: &scales,
+            opacities: &(0..n).map(|_| uniform(0.0, 1.0) as f32).collect::<Vec<_>>(),
+        };
+        let blocks = Opaque::of(&scene);
+        let mut whole = Opaque::of(&scene);
+        for block in &mut whole.blocks {
+            block.half = [f32::INFINITY; 3];
+        }
+        let mut skipped = 0;
+        for _ in 0..40 {
+            let (a, b) = (uniform(-3.2, 3.2), uniform(-1.5, 1.5));
+            let ((sa, ca), (sb, cb)) = (a.sin_cos(), b.sin_cos());
+            let turn = [
+                [ca, 0.0, -sa],
+                [sa * sb, cb, ca * sb],
+                [sa * cb, -sb, ca * cb],
+            ];
+            let camera = Camera {
+                viewmat: turn.map(|r| [r[0], r[1], r[2], uniform(-6.0, 6.0)]),
+                fx: uniform(20.0, 200.0),
+                fy: uniform(20.0, 200.0),
+                cx: uniform(0.0, 40.0),
+                cy: uniform(0.0, 30.0),
+                width: 40,
+                height: 30,
+                near: 0.01,
+            };
+            let view = Pinhole::of(&camera);
+            skipped += blocks.blocks.iter().filter(|b| view.misses(b)).count();
+            assert_eq!(
+                median_depths(&blocks, &camera),
+                median_depths(&whole, &camera)
+            );
+        }
+        assert!(skipped > 40 * blocks.blocks.len() / 4, "{skipped}");
+    }
 }
