@@ -56,14 +56,14 @@ def around(count, seed=0, radius=4.0) -> Cameras:
 
 
 def core_view(cameras, i, origin):
-    return surfaces._views(cameras.take([i]), origin)[0]
+    return surfaces.core_views(cameras.take([i]), origin)[0]
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (4.4e5, 4.4e6, 1e3)])
 def test_depths_are_the_naive_renderers(offset):
     scene = ball(offset=offset)
     cameras = around(3).recentred(-np.asarray(offset))
-    parts, origin = surfaces._scene(scene)
+    parts, origin = surfaces.core_scene(scene)
     grid = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)
     for i in range(3):
         got = _core.select_depth(parts, core_view(cameras, i, origin)).ravel()
@@ -222,15 +222,20 @@ def test_every_policy_on_every_pool(policy):
         run(away.take([2]), 1)
 
 
-def test_a_view_within_matter_comes_last():
+def test_a_view_within_matter_is_refused(tmp_path):
     rng = np.random.default_rng(5)
     solid = rng.standard_normal((6000, 3))
     solid *= (rng.random(6000) ** (1 / 3) / np.linalg.norm(solid, axis=1))[:, None]
     scene = Splats.create(solid, scales=np.full((6000, 3), 0.04), logit_opacities=np.full(6000, 3.0))
     pool = views([[4.0, 0, 0], [0.2, 0.1, 0], [0, 4.0, 0]], np.array([[0.0, 0, 0], [3, 0, 0.1], [0, 0, 0]]))
-    for policy in ("directional", "coverage"):
+    for policy in POLICIES:
         chosen = select(scene, pool, 3, policy=policy, options=CoverageOptions(cells=1000))
-        assert chosen.order[-1] == 1
+        assert sorted(chosen.order.tolist()) == [0, 2]
+        assert chosen.refused.tolist() == [1]
+    photos = replace(pool, image_paths=(None, tmp_path / "photo.png", None))  # there was a camera
+    assert not len(select(scene, photos, 3).refused)
+    alone = select(scene, pool.take([1]), 1)  # nothing to compare it with
+    assert alone.order.tolist() == [0]
 
 
 def test_auto_k_stops_at_the_bend():

@@ -39,7 +39,7 @@ class Selection:
         weights: (K,) how often to draw each, mean 1: the share of the pool that it stands for, with crowded
             poses counted less.
         left_out: what the candidates not chosen would have added, as a share of the whole.
-        refused: indices of candidates that see nothing of the scene.
+        refused: indices of candidates that see nothing of the scene, or that stand within it.
         evaluations: how often a view's gain was computed; 0 where a policy computes none.
         seconds: by stage.
     """
@@ -105,11 +105,16 @@ def select(
     depths = poses.viewing_distances(coarse, cameras)
     alike = poses.likeness(cameras, depths)
     wanted = poses.demand(alike)
+    usable = (depths > 0) & ~poses.within_matter(splats, cameras, depths, progress)
+    if not usable.any():
+        raise InputError(f"none of the {len(cameras)} candidate views sees the scene")
     seconds["poses"] = time.perf_counter() - began
-    usable = depths > 0
     evaluations = 0
     if policy in ("directional", "coverage"):
-        order, gains, evaluations, usable = greedy(splats, cameras, policy, options, progress, seconds)
+        rows = np.flatnonzero(usable)
+        order, gains, evaluations = greedy(splats, cameras.take(rows), policy, options, progress, seconds)
+        order = rows[order]
+        usable = np.isin(np.arange(len(cameras)), order)
     elif policy == "pose-diverse":
         order, gains = poses.farthest(alike, usable)
     elif policy == "auto":
@@ -118,7 +123,7 @@ def select(
         order = _blind(policy, np.flatnonzero(usable), k, seed)
         gains = poses.gains_of(order, alike, wanted)
     if not len(order):
-        raise InputError(f"none of the {len(cameras)} candidate views sees the scene")
+        raise InputError(f"none of the {len(cameras)} candidate views sees a cell of the surface")
     count = _knee(gains) if k == "auto" else min(k, len(order))
     share = gains / total if (total := gains.sum()) > 0 else np.full(len(gains), 1 / len(gains))
     seconds["total"] = time.perf_counter() - began

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard import _core
 from g2ard.cameras import Cameras
-from g2ard.select.surfaces import Surface
+from g2ard.progress import Progress, counter
+from g2ard.select.surfaces import Surface, core_scene, core_views
+from g2ard.splats import Splats
 
-__all__ = ["demand", "draw_weights", "farthest", "gains_of", "likeness", "represent", "viewing_distances"]
+__all__ = [
+    "demand",
+    "draw_weights",
+    "farthest",
+    "gains_of",
+    "likeness",
+    "represent",
+    "viewing_distances",
+    "within_matter",
+]
 
 Float = NDArray[np.float64]
 Order = NDArray[np.int64]
@@ -16,6 +30,13 @@ Order = NDArray[np.int64]
 _BANDWIDTH = 0.35
 """Of the kernel exp(−(d/0.35)²) between poses: neighbours 20° apart on an orbit are half alike."""
 _COARSE = 20_000
+"""Cells that distances are measured to."""
+_ROWS = 200_000
+"""Gaussians that tell whether a pose is walled in: of more, a fair sample, each as much larger."""
+_GLANCE = 48
+"""Pixels along the longer side of the images that tell it."""
+_WALLED = 0.02
+"""A pose whose image is mostly nearer than this share of what the median pose sees stands within matter."""
 
 
 def viewing_distances(cells: Surface, cameras: Cameras) -> Float:
@@ -33,6 +54,31 @@ def viewing_distances(cells: Surface, cameras: Cameras) -> Float:
         inside = ahead & (u >= 0) & (u < local.widths[i]) & (v >= 0) & (v < local.heights[i])
         out[i] = np.median(z[inside]) if inside.any() else 0.0
     return out
+
+
+def within_matter(splats: Splats, cameras: Cameras, depths: Float, progress: Progress) -> NDArray[np.bool_]:
+    """(C,) whether a pose stands inside geometry: what fills its image is next to its lens.
+
+    A photo's pose is taken at its word: there was a camera.
+
+    Args:
+        splats: the scene.
+        cameras: C views.
+        depths: (C,) see `viewing_distances`.
+        progress: told of the views done.
+    """
+    made = np.array([path is None for path in cameras.image_paths])
+    if not (made.any() and (depths > 0).any()):
+        return np.zeros(len(cameras), bool)
+    step = -(-len(splats) // _ROWS)
+    sample = splats.take(np.arange(0, len(splats), step))
+    sample = replace(sample, scales=sample.scales * np.float32(np.sqrt(step)))
+    scene, origin = core_scene(sample)
+    glances = core_views(cameras.resized(_GLANCE), origin)
+    share, near = _core.select_looks(scene, glances, progress=counter(progress, "poses")).T
+    typical = np.median(np.where(near > 0, near, depths)[depths > 0])
+    walled: NDArray[np.bool_] = made & (share > 0.5) & (near < _WALLED * typical)
+    return walled
 
 
 def likeness(cameras: Cameras, depths: Float) -> Float:

@@ -15,7 +15,16 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
 from g2ard.splats import Splats
 
-__all__ = ["CoverageOptions", "Surface", "Visible", "greedy", "surface", "visible_cells"]
+__all__ = [
+    "CoverageOptions",
+    "Surface",
+    "Visible",
+    "core_scene",
+    "core_views",
+    "greedy",
+    "surface",
+    "visible_cells",
+]
 
 Float = NDArray[np.float64]
 Order = NDArray[np.int64]
@@ -85,7 +94,7 @@ def surface(splats: Splats, cells: int = 300_000) -> Surface:
     """
     if cells < 1:
         raise InputError(f"cells: expected at least 1, got {cells}")
-    scene, origin = _scene(splats)
+    scene, origin = core_scene(splats)
     found = _core.select_surface(scene, cells)
     return Surface(
         found["centers"], found["normals"], found["confidence"], found["weights"], found["size"], origin
@@ -109,14 +118,14 @@ def visible_cells(
     Returns:
         A `Visible`.
     """
-    scene, origin = _scene(splats)
+    scene, origin = core_scene(splats)
     starts, seen = _core.select_visible(
-        scene, cells.parts, _views(cameras, origin), progress=counter(progress, "visibility")
+        scene, cells.parts, core_views(cameras, origin), progress=counter(progress, "visibility")
     )
     return Visible(starts, seen)
 
 
-def _scene(splats: Splats) -> tuple[tuple[Any, ...], Float]:
+def core_scene(splats: Splats) -> tuple[tuple[Any, ...], Float]:
     """What `_core` takes, and the world point it is centred about."""
     if not len(splats):
         raise InputError("the scene is empty")
@@ -126,7 +135,7 @@ def _scene(splats: Splats) -> tuple[tuple[Any, ...], Float]:
     return tuple(np.ascontiguousarray(a) for a in arrays), middle + splats.offset
 
 
-def _views(cameras: Cameras, origin: Float) -> list[tuple[Any, ...]]:
+def core_views(cameras: Cameras, origin: Float) -> list[tuple[Any, ...]]:
     local = cameras.recentred(origin)
     return [
         (
@@ -146,8 +155,8 @@ def greedy(
     options: CoverageOptions | None,
     progress: Progress,
     seconds: dict[str, float],
-) -> tuple[Order, Float, int, NDArray[np.bool_]]:
-    """The whole pool in the greedy's order; views that see no cell are left out."""
+) -> tuple[Order, Float, int]:
+    """The pool in the greedy's order without views that see no cell, what each adds, and evaluations."""
     options = options or CoverageOptions()
     began = time.perf_counter()
     cells = surface(splats, options.cells)
@@ -172,4 +181,4 @@ def greedy(
     )
     seconds["greedy"] = time.perf_counter() - began
     keep = usable[order]
-    return order.astype(np.int64)[keep], gains[keep], evaluations, usable
+    return order.astype(np.int64)[keep], gains[keep], evaluations

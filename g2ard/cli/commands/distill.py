@@ -278,7 +278,7 @@ def _say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:
     if views is None:
         return
     if views["refused"]:
-        run.say(f"{len(views['refused'])} views not used: they see nothing of the scene")
+        run.say(f"{len(views['refused'])} views not used: they see nothing of the scene, or stand within it")
     if chosen:
         run.say(
             f"views: {len(views['chosen'])} of {views['candidates']} by {views['policy']};"

@@ -48,7 +48,7 @@ def select(
     kept = cameras.take(chosen.order)
     write_views(output, kept, weights=chosen.weights, overwrite=run.overwrite)
     if len(chosen.refused):
-        run.say(f"{len(chosen.refused)} views refused: they see nothing of the scene")
+        run.say(f"{len(chosen.refused)} views refused: they see nothing of the scene, or stand within it")
     run.say(
         f"{output}: {len(kept)} of {len(cameras)} views by {policy};"
         f" those left out would add {100 * chosen.left_out:.1f} %"

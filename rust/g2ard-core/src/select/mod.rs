@@ -11,4 +11,4 @@ pub use coverage::{Chosen, Coverage, Problem};
 pub use depth::median_depths;
 pub use opaque::Opaque;
 pub use surface::{Gaussians, Surface};
-pub use visible::visible;
+pub use visible::{looks, visible};

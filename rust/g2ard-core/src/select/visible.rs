@@ -1,4 +1,4 @@
-//! Which surface cells each view sees.
+//! What each view sees: how far, and which surface cells.
 
 use rayon::prelude::*;
 
@@ -8,6 +8,28 @@ use super::opaque::Opaque;
 use super::pinhole::Pinhole;
 use crate::raster::Camera;
 use crate::{Control, Result};
+
+/// For each camera the share of its pixels that show the scene, and the median of their depths (0 without any).
+pub fn looks(scene: &Opaque, cameras: &[Camera], control: &Control) -> Result<Vec<[f32; 2]>> {
+    control.begin(cameras.len() as u64);
+    cameras
+        .par_iter()
+        .map_init(Scratch::default, |scratch, camera| {
+            control.check()?;
+            let view = Pinhole::of(camera);
+            scratch.clear(&view, 1.0);
+            scratch.trace(scene, &view);
+            control.advance(1);
+            let mut depths: Vec<f32> = scratch.depth.iter().copied().filter(|&d| d > 0.0).collect();
+            if depths.is_empty() {
+                return Ok([0.0; 2]);
+            }
+            let share = depths.len() as f32 / scratch.depth.len() as f32;
+            let middle = depths.len() / 2;
+            Ok([share, *depths.select_nth_unstable_by(middle, f32::total_cmp).1])
+        })
+        .collect()
+}
 
 /// For each camera the cells it sees, ascending: the cell's centre falls on the image and lies within
 /// max(cell size, 1 % of its depth) of the median depth in that pixel.
