@@ -7,14 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from realdata import real
+from reference import rays
 from reference import select as naive
 
 from g2ard import _core
 from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
-from g2ard.io import read_view_set, write_splats, write_views
+from g2ard.io import read_splats, read_view_set, write_splats, write_views
+from g2ard.lift import lift
+from g2ard.poses import make_pool
 from g2ard.select import POLICIES, CoverageOptions, Surface, poses, select, surface, surfaces, visible_cells
 from g2ard.splats import Splats
+from g2ard.synth import city
 
 SIZE = (96, 72)
 FOCAL = 80.0
@@ -105,6 +110,30 @@ def test_visibility_is_the_oracles():
         agree, kept, total = agree + int((want == got)[use].sum()), kept + int(use.sum()), total + len(use)
     assert kept > 0.2 * total
     assert agree / kept >= 0.995
+
+
+@pytest.mark.parametrize(
+    ("parts", "every", "cells"),
+    [(("playbot", "0_0"), 40, 100), (("taebak_park", "0_4"), 50, 100), ((), 1, 300)],
+)
+def test_visibility_on_real_scenes_is_a_ray_oracle_s(parts, every, cells):
+    """Slices of real scenes (the city needs no data) against every Gaussian at every ray."""
+    if parts:
+        scene = read_splats(real(*parts))
+        scene = scene.take(np.arange(0, len(scene), every))  # thinner, so each is larger in its stead
+        scene = replace(scene, scales=scene.scales * np.float32(np.sqrt(every)))
+        pool = make_pool(scene, 24, seed=3).take([0, 9, 17]).resized(240)
+    else:
+        town = city(points=8000, views=24, size=(240, 180))
+        scan, pool = town.points(), town.views["train"].take([0, 6, 15])
+        scene = lift(scan.positions, scan.colors)
+    made = surface(scene, 20_000)
+    seen = visible_cells(scene, made, pool)
+    tried = np.random.default_rng(0).choice(len(made.centers), cells, replace=False)
+    agree, kept, total = rays.agreement(scene, made, pool, seen, tried)
+    assert total > cells / 2
+    assert kept > 0.1 * total
+    assert agree >= 0.995 * kept
 
 
 def random_problem(rng, count=12, cells=60):
