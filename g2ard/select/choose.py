@@ -23,6 +23,8 @@ POLICIES = ("auto", "directional", "coverage", "pose-diverse", "random", "unifor
 Float = NDArray[np.float64]
 Order = NDArray[np.int64]
 
+_BEND = 0.02
+"""A curve that nowhere rises this far above its chord is straight: no K is better than another."""
 _COARSE = 20_000
 """Cells that stand for the scene where only distances to it matter."""
 
@@ -39,6 +41,8 @@ class Selection:
         weights: (K,) how often to draw each, mean 1: the share of the pool that it stands for, with crowded
             poses counted less.
         left_out: what the candidates not chosen would have added, as a share of the whole.
+        curve: (n,) what the first 1, 2, … n views of the order reach together, over all usable candidates, as
+            a share of the whole: K can be read off it.
         refused: indices of candidates that see nothing of the scene, or that stand within it.
         evaluations: how often a view's gain was computed; 0 where a policy computes none.
         seconds: by stage.
@@ -49,6 +53,7 @@ class Selection:
     gains: Float
     weights: Float
     left_out: float
+    curve: Float
     refused: Order
     evaluations: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
@@ -69,8 +74,8 @@ def select(
     Args:
         splats: the raw prior; what the views see of it counts, not what they show.
         cameras: C candidates, in world coordinates.
-        k: how many; C or more takes them all, in order of worth. "auto" stops where the curve of gains bends,
-            at the K farthest above the straight line from none to all.
+        k: how many; C or more takes them all, in order of worth. "auto" stops where the curve of gains
+            flattens, at the K farthest above the straight line from none to all; all, if it never bends.
         policy: one of `POLICIES`. auto is facility location on poses: it picks the views that best represent
             all candidates, crowded ones counted less, Σ_u w_u max_{v∈S} exp(−(d_uv/0.35)²). directional is
             the paper's; coverage counts cells seen at all; pose-diverse takes the farthest pose next; random
@@ -133,6 +138,7 @@ def select(
         gains=share[:count],
         weights=poses.draw_weights(order[:count], alike, wanted),
         left_out=float(share[count:].sum()),
+        curve=np.cumsum(share),
         refused=np.flatnonzero(~usable),
         evaluations=evaluations,
         seconds=seconds,
@@ -150,13 +156,13 @@ def _blind(policy: str, rows: Order, k: int | Literal["auto"], seed: int) -> Ord
 
 
 def _knee(gains: Float) -> int:
-    """The count at which the curve of summed gains lies farthest above its chord.
+    """The count at which the curve of summed gains lies farthest above its chord; all if it never bends.
 
-    >>> _knee(np.array([5.0, 4.0, 3.0, 0.1, 0.1, 0.1, 0.1]))
-    3
+    >>> _knee(np.array([5.0, 4.0, 3.0, 0.1, 0.1, 0.1, 0.1])), _knee(np.array([1.0, 1.0, 1.0]))
+    (3, 3)
     """
     total = gains.sum()
     if not total > 0:
         return len(gains)
     above = np.cumsum(gains) / total - np.arange(1, len(gains) + 1) / len(gains)
-    return int(np.argmax(above)) + 1
+    return int(np.argmax(above)) + 1 if above.max() > _BEND else len(gains)

@@ -63,6 +63,7 @@ def select(
                 )
             ],
             "left_out": chosen.left_out,
+            "curve": chosen.curve.tolist(),
             "refused": [cameras.names[i] for i in chosen.refused],
             "evaluations": chosen.evaluations,
             "seconds": chosen.seconds,
