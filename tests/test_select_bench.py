@@ -65,6 +65,8 @@ def test_every_arm_runs_once_and_never_again(scene: Path, tmp_path: Path) -> Non
     before = path.read_bytes()
     assert bench_select([scene], path, **FEW) == read_trials(path)  # type: ignore[arg-type]
     assert path.read_bytes() == before
+    with pytest.raises(InputError, match="4 steps at 48 pixels"):
+        bench_select([scene], path, **{**FEW, "steps": 5})  # type: ignore[arg-type]
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(lines[:1] + lines[4:]))  # as if stopped, three trials short
     again = bench_select([scene], path, cache=cache, **FEW)  # type: ignore[arg-type]
@@ -75,7 +77,7 @@ def test_every_arm_runs_once_and_never_again(scene: Path, tmp_path: Path) -> Non
 
 def test_gains_are_over_random_on_the_same_pool() -> None:
     base = Trial(
-        "s", "even", "random", 10.0, 0, 0, 40, 4, 20.0, 0.5, 18.0, 0.5, None, 0.0, 1.0, 5, 9, "m"
+        "s", "even", "random", 10.0, 0, 0, 40, 4, 20.0, 0.5, 18.0, 0.5, None, 0.0, 1.0, 5, 9, 48, "m"
     )  # fmt: skip
     rows = [
         base,

@@ -54,6 +54,7 @@ class Trial:
         recover_cpu_s: the same of the recovery.
         steps: of the recovery.
         gaussians: recovered.
+        pixels: longer side of the views.
         machine: processor and cores.
     """
 
@@ -74,6 +75,7 @@ class Trial:
     recover_cpu_s: float
     steps: int
     gaussians: int
+    pixels: int
     machine: str
 
     @property
@@ -118,14 +120,20 @@ def bench_select(
         The trials asked for.
 
     Raises:
-        InputError: a scene or the CSV cannot be read, or an unknown arm or pool.
+        InputError: a scene or the CSV cannot be read, an unknown arm or pool, or the CSV holds these scenes'
+            trials at another size or with other steps.
     """
     for name, given, known in (("arms", arms, ARMS), ("pools", pools, KINDS)):
         if unknown := [g for g in given if g not in known]:
             raise InputError(f"{name}: expected some of {', '.join(known)}, got {', '.join(unknown)}")
     size = size or Size()
     done = {trial.key: trial for trial in read_trials(csv_path)}
-    _rewrite(csv_path, list(done.values()))
+    for trial in done.values():
+        if trial.scene in map(label, scenes) and (trial.steps, trial.pixels) != (steps, size.pixels):
+            raise InputError(
+                f"{csv_path}: holds trials of {trial.scene} with {trial.steps} steps at {trial.pixels} pixels,"
+                f" not {steps} at {size.pixels}"
+            )
     wanted = [
         (label(scene), pool, arm, percent, seed, draw)
         for scene in scenes
@@ -133,6 +141,7 @@ def bench_select(
         for pool in pools
         for arm, percent, draw in _plan(arms, percents, draws)
     ]
+    _rewrite(csv_path, list(done.values()))
     finished = sum(key in done for key in wanted)
     for scene in scenes:
         missing = [key for key in wanted if key[0] == label(scene) and key not in done]
@@ -190,7 +199,7 @@ class _Bench:
         crowd = score(Subset(self.stand.targets, pool.crowd))[0] if len(pool.crowd) else None
         return Trial(
             scene, kind, arm, percent, seed, draw, len(pool.rows), len(rows), *inside, *outside, crowd,
-            select_s, recover_s, self.steps, len(result.splats), machine(),
+            select_s, recover_s, self.steps, len(result.splats), self.size.pixels, machine(),
         )  # fmt: skip
 
     def _chosen(
@@ -281,7 +290,7 @@ def read_trials(path: Path) -> list[Trial]:
 
 def _trial(path: Path, line: int, row: dict[str, str]) -> Trial:
     text = {"scene", "pool", "arm", "machine"}
-    whole = {"seed", "draw", "candidates", "k", "steps", "gaussians"}
+    whole = {"seed", "draw", "candidates", "k", "steps", "gaussians", "pixels"}
     try:
         values = {
             name: value if name in text else int(value) if name in whole else float(value) if value else None
