@@ -131,8 +131,8 @@ def bench_select(
     for trial in done.values():
         if trial.scene in map(label, scenes) and (trial.steps, trial.pixels) != (steps, size.pixels):
             raise InputError(
-                f"{csv_path}: holds trials of {trial.scene} with {trial.steps} steps at {trial.pixels} pixels,"
-                f" not {steps} at {size.pixels}"
+                f"{csv_path}: holds trials of {trial.scene} with {trial.steps} steps at {trial.pixels}"
+                f" pixels, not {steps} at {size.pixels}"
             )
     wanted = [
         (label(scene), pool, arm, percent, seed, draw)
@@ -147,7 +147,8 @@ def bench_select(
         missing = [key for key in wanted if key[0] == label(scene) and key not in done]
         if not missing:
             continue
-        folder = cache / f"{label(scene).replace('/', '_')}-{size.pixels}" if cache else None
+        own = f"{label(scene).replace('/', '_')}-{size.candidates}-{size.pixels}"
+        folder = cache / own if cache else None
         bench = _Bench(stand(scene, size, cache=folder, progress=progress), size, steps)
         for key in missing:
             trial = bench.run(*key)

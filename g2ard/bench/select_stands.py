@@ -135,7 +135,7 @@ def pool_of(stand: Stand, kind: str, seed: int) -> Pool:
     """Candidates out of the universe.
 
     even: drawn uniformly. biased: a quarter drawn uniformly, the others out of the sixth of the universe
-    that is nearest to one of its views, as real trajectories crowd somewhere.
+    (a third of a small one) that is nearest to one of its views, as real trajectories crowd somewhere.
     """
     rng = np.random.default_rng([seed, 11])
     free = np.setdiff1d(np.arange(len(stand.targets.cameras)), stand.tests)

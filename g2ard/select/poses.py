@@ -29,8 +29,6 @@ Order = NDArray[np.int64]
 
 _BANDWIDTH = 0.35
 """Of the kernel exp(−(d/0.35)²) between poses: neighbours 20° apart on an orbit are half alike."""
-_COARSE = 20_000
-"""Cells that distances are measured to."""
 _ROWS = 200_000
 """Gaussians that tell whether a pose is walled in: of more, a fair sample, each as much larger."""
 _GLANCE = 48
@@ -42,11 +40,9 @@ _WALLED = 0.02
 def viewing_distances(cells: Surface, cameras: Cameras) -> Float:
     """(C,) each view's median depth of the cells within its image, 0 where there is none."""
     local = cameras.recentred(cells.origin)
-    step = max(1, len(cells.centers) // _COARSE)
-    points = cells.centers[::step]
     out = np.zeros(len(local))
     for i in range(len(local)):
-        x, y, z = local.viewmats[i, :3, :3] @ points.T + local.viewmats[i, :3, 3:]
+        x, y, z = local.viewmats[i, :3, :3] @ cells.centers.T + local.viewmats[i, :3, 3:]
         ahead = z > 0.01
         z = np.where(ahead, z, 1.0)
         K = local.Ks[i]
