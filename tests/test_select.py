@@ -188,18 +188,35 @@ def test_lazy_is_plain_greedy_on_fifty_pools():
     assert saved > 10
 
 
-def test_auto_is_facility_location():
-    scene, cameras = ball(), around(30)
+@pytest.mark.parametrize("count", [30, 9])
+def test_auto_reaches_every_pose_and_then_represents(count):
+    scene, cameras = ball(), around(count)
     coarse = surface(scene, 1000)
     alike = poses.likeness(cameras, poses.viewing_distances(coarse, cameras))
     wanted = poses.demand(alike)
     np.testing.assert_array_equal(alike, alike.T)
     np.testing.assert_array_equal(np.diag(alike), 1.0)
-    order, gains = poses.represent(alike, wanted, np.ones(30, bool))
-    assert order.tolist()[:12] == naive.facility(12, alike, wanted)
+    order, gains = poses.represent(alike, wanted, np.ones(count, bool))
+    assert order.tolist() == naive.represent(count, alike, wanted)
     assert gains.sum() == pytest.approx(1.0)
-    assert np.all(np.diff(gains) <= 1e-15)
+    assert gains.min() >= 0
     np.testing.assert_allclose(poses.gains_of(order, alike, wanted), gains, atol=1e-15)
+
+
+def test_auto_reaches_first():
+    """Two poses far from a crowd: both are chosen before any second one of the crowd."""
+    rng = np.random.default_rng(8)
+    crowd = np.array([4.0, 0, 0]) + 0.3 * rng.standard_normal((30, 3))
+    far = np.array([[-4.0, 0, 0], [0, 0, 4.0]])
+    chosen = select(ball(), views(np.concatenate([crowd, far])), 3)
+    assert set(chosen.order.tolist()) >= {30, 31}
+    unreached = poses.represent(np.eye(5), np.full(5, 0.2), np.array([1, 1, 0, 1, 1], bool))
+    assert unreached[0].tolist() == [
+        0,
+        1,
+        3,
+        4,
+    ]  # nothing like anything: in the order given, usable ones only
 
 
 def test_auto_and_diverse_leave_the_crowd():

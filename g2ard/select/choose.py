@@ -76,10 +76,11 @@ def select(
         cameras: C candidates, in world coordinates.
         k: how many; C or more takes them all, in order of worth. "auto" stops where the curve of gains
             flattens, at the K farthest above the straight line from none to all; all, if it never bends.
-        policy: one of `POLICIES`. auto is facility location on poses: it picks the views that best represent
-            all candidates, crowded ones counted less, Σ_u w_u max_{v∈S} exp(−(d_uv/0.35)²). directional is
-            the paper's; coverage counts cells seen at all; pose-diverse takes the farthest pose next; random
-            and uniform (evenly along the candidates' order) look at nothing.
+        policy: one of `POLICIES`. auto works on poses: first the farthest next, until all are within reach,
+            then those that best represent all candidates, crowded ones counted less, by facility location
+            Σ_u w_u max_{v∈S} exp(−(d_uv/0.35)²). directional is the paper's; coverage counts cells seen at
+            all; pose-diverse takes the farthest pose next; random and uniform (evenly along the candidates'
+            order) look at nothing.
         seed: of random.
         options: of directional and coverage.
         progress: told of the views rasterised.

@@ -29,6 +29,8 @@ Order = NDArray[np.int64]
 
 _BANDWIDTH = 0.35
 """Of the kernel exp(−(d/0.35)²) between poses: neighbours 20° apart on an orbit are half alike."""
+_REACH = 2.0
+"""Bandwidths within which a chosen view says something of a pose: beyond, they are less than 2 % alike."""
 _ROWS = 200_000
 """Gaussians that tell whether a pose is walled in: of more, a fair sample, each as much larger."""
 _GLANCE = 48
@@ -101,18 +103,42 @@ def demand(alike: Float) -> Float:
 
 
 def represent(alike: Float, wanted: Float, usable: NDArray[np.bool_]) -> tuple[Order, Float]:
-    """Greedy facility location: Σ_u w_u max_{v∈S} alike_uv."""
-    wanted = np.where(usable, wanted, 0.0)
+    """Views that stand for the others: first reach every pose, then represent as many as well as can be.
+
+    From the pose nearest to all by demand on, the farthest comes next while any is more than two bandwidths
+    from all chosen: there a kernel says nothing about who stands for whom. Then greedy facility location.
+
+    Args:
+        alike: (C, C) see `likeness`.
+        wanted: (C,) see `demand`.
+        usable: (C,) which may be chosen; the others ask for nothing.
+
+    Returns:
+        The usable views in order, and what each adds to Σ_u w_u max_{v∈S} alike_uv.
+    """
+    wanted, away = np.where(usable, wanted, 0.0), _bandwidths_apart(alike)
     best, left = np.zeros(len(alike)), usable.copy()
-    order, gains = [], []
+    nearest = np.where(usable, np.inf, -np.inf)
+    order: list[int] = []
+    gains: list[float] = []
     for _ in range(int(usable.sum())):
-        gain = wanted @ np.maximum(alike - best[:, None], 0.0)
-        view = int(np.argmax(np.where(left, gain, -1.0)))
+        if not order:
+            view = int(np.argmin(np.where(left, wanted @ away, np.inf)))
+        elif nearest.max() > _REACH:
+            view = int(np.argmax(nearest))
+        else:
+            view = int(np.argmax(np.where(left, wanted @ np.maximum(alike - best[:, None], 0.0), -1.0)))
         order.append(view)
-        gains.append(float(gain[view]))
+        gains.append(float(wanted @ np.maximum(alike[:, view] - best, 0.0)))
         best = np.maximum(best, alike[:, view])
+        nearest = np.minimum(nearest, away[view])
         left[view] = False
     return np.array(order, np.int64), np.array(gains)
+
+
+def _bandwidths_apart(alike: Float) -> Float:
+    """(C, C) distances in bandwidths of the kernel."""
+    return np.asarray(np.sqrt(-np.log(np.maximum(alike, np.finfo(np.float64).tiny))))
 
 
 def gains_of(order: Order, alike: Float, wanted: Float) -> Float:
@@ -128,7 +154,7 @@ def farthest(alike: Float, usable: NDArray[np.bool_]) -> tuple[Order, Float]:
     """Farthest pose next, from the one most like all others; gains are distances to the nearest chosen."""
     if not usable.any():
         return np.zeros(0, np.int64), np.zeros(0)
-    away = np.sqrt(-np.log(np.maximum(alike, np.finfo(np.float64).tiny)))
+    away = _bandwidths_apart(alike)
     first = int(np.argmax(np.where(usable, alike[:, usable].sum(1), -1.0)))
     order, gains = [first], [float(away[usable, first].max())]
     nearest = np.where(usable, away[first], -1.0)
