@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 RUST := $(shell find rust -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml) Cargo.toml Cargo.lock
 
-.PHONY: demo test lint bench wheel setup clean
+.PHONY: demo test lint stress bench wheel setup clean
 
 setup: $(VENV)/.built
 
@@ -24,6 +24,10 @@ demo: setup
 test: setup
 	cargo test --quiet --workspace
 	$(BIN)/python -m pytest
+
+# Over 10,000 random gradient cases; a slice of them is in `make test`.
+stress: setup
+	$(BIN)/python tests/stress/run.py
 
 lint: setup
 	cargo fmt --all --check

@@ -56,6 +56,7 @@ def simplify_pairwise(
     geometric: float,
     dilation: float,
     pixel_scale: float,
+    growth: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]: ...
 
@@ -96,6 +97,7 @@ class Trainer:
         ssim_weight: float,
         rates: list[float],
         regularizers: tuple[float, float, bool] | None = None,
+        mask: NDArray[np.bool_] | None = None,
     ) -> tuple[float, int]: ...
     def rehearse(
         self, view: _View, choices: _Choices, background: list[float], target: _F32, ssim_weight: float
@@ -107,6 +109,7 @@ class Trainer:
     def skipped(self) -> int: ...
     @property
     def isa(self) -> str: ...
+    def memory(self) -> dict[str, int]: ...
     def passes(self) -> dict[str, float]: ...
 
 def accumulate(

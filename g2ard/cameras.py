@@ -26,6 +26,7 @@ class Cameras:
         heights: (C,) int64 pixels.
         names: C unique names (of photos, or of poses).
         image_paths: C paths, None where a view has no photo.
+        mask_paths: C paths of masks, None where all of a photo counts.
         distortions: (C, 5) float64, OpenCV k1 k2 p1 p2 k3 of the *photo*; `g2ard.images` undistorts on
             loading, to these very Ks. Zero for a pinhole photo.
 
@@ -40,11 +41,14 @@ class Cameras:
     names: tuple[str, ...]
     image_paths: tuple[Path | None, ...] = ()
     distortions: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 5)))
+    mask_paths: tuple[Path | None, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.viewmats)
         if not self.image_paths:
             object.__setattr__(self, "image_paths", (None,) * n)
+        if not self.mask_paths:
+            object.__setattr__(self, "mask_paths", (None,) * n)
         if not len(self.distortions):
             object.__setattr__(self, "distortions", np.zeros((n, 5)))
         for name, shape in (
@@ -57,7 +61,7 @@ class Cameras:
             got = getattr(self, name).shape
             if got != shape:
                 raise InputError(f"{name}: expected shape {shape}, got {got}")
-        for name in ("names", "image_paths"):
+        for name in ("names", "image_paths", "mask_paths"):
             if len(getattr(self, name)) != n:
                 raise InputError(f"{name}: expected {n}, got {len(getattr(self, name))}")
         for i in range(n):
@@ -96,6 +100,7 @@ class Cameras:
             heights=self.heights[rows],
             names=tuple(self.names[i] for i in rows),
             image_paths=tuple(self.image_paths[i] for i in rows),
+            mask_paths=tuple(self.mask_paths[i] for i in rows),
             distortions=self.distortions[rows],
         )
 
@@ -127,6 +132,7 @@ class Cameras:
         names: Sequence[str],
         image_paths: Sequence[Path | None] = (),
         distortions: Sequence[Any] = (),
+        mask_paths: Sequence[Path | None] = (),
     ) -> Cameras:
         """Stack per-view lists; `sizes` holds (width, height)."""
         n = len(viewmats)
@@ -138,6 +144,7 @@ class Cameras:
             names=tuple(names),
             image_paths=tuple(image_paths),
             distortions=np.asarray(distortions, np.float64).reshape(-1, 5),
+            mask_paths=tuple(mask_paths),
         )
 
 

@@ -7,7 +7,7 @@ import json
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,6 +21,9 @@ from g2ard.recover.schedule import TUNED, Schedule
 from g2ard.splats import Splats
 from g2ard.targets import Subset, Targets, fingerprint_of
 
+if TYPE_CHECKING:
+    from g2ard.recover.optimize import Watch
+
 __all__ = ["DistillConfig", "Distilled", "distill"]
 
 
@@ -33,7 +36,8 @@ class DistillConfig:
         schedule: recovery's; one with `round_steps` recovers after every round of 75 % (the paper), without
             them the reduction is one shot and all recovery happens at the target count.
         steps: overrides the schedule's final horizon.
-        time_limit: seconds for the final recovery; its horizon becomes what fits into them.
+        time_limit: seconds for all recovery, shared out over rounds in proportion to their steps; horizons
+            become what fits into them.
         regularizers: weights of L_anchor and L_shape.
         sh_degree: of the result; None keeps the prior's.
         background: RGB behind the scene.
@@ -44,6 +48,7 @@ class DistillConfig:
             pool drawn by weight beats every choice of fewer views (`docs/benchmarks.md`).
         reselect: choose again from every round's scene; else once, from the raw prior.
         seed: of the order of views, and of the policy "random".
+        engine: what takes recovery's steps, see `RecoverConfig`.
     """
 
     method: str = "default"
@@ -58,6 +63,7 @@ class DistillConfig:
     weighted: bool = True
     reselect: bool = False
     seed: int = 0
+    engine: Literal["fused", "torch", "gsplat"] = "fused"
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +93,7 @@ def distill(
     weights: ArrayLike | None = None,
     work: Path | None = None,
     progress: Progress = silent,
+    watch: Watch | None = None,
 ) -> Distilled:
     """Distil a dense prior into exactly `budget` Gaussians.
 
@@ -101,6 +108,7 @@ def distill(
         weights: (C,) how often to draw each view, where that is known already; None weighs them here.
         work: a folder for finished rounds and checkpoints; a second call with the same inputs goes on there.
         progress: told of all stages.
+        watch: called after every step of every recovery, see `g2ard.recover.recover`.
 
     Returns:
         A `Distilled`.
@@ -114,7 +122,7 @@ def distill(
     config = config or DistillConfig()
     many = config.schedule.round_steps > 0
     counts = counts_of(len(prior), budget) if many else [budget]
-    rounds = _Rounds(prior, budget, targets, config, weights, work, progress)
+    rounds = _Rounds(prior, budget, targets, config, len(counts), weights, work, progress, watch)
     for number, count in enumerate(counts, start=1):
         rounds.advance(number, count, final=number == len(counts))
     report = {"rounds": rounds.log, "seconds": rounds.seconds, "views": rounds.supervision.report}
@@ -175,12 +183,14 @@ class _Rounds:
         budget: int,
         targets: Targets,
         config: DistillConfig,
+        count: int,
         weights: ArrayLike | None,
         work: Path | None,
         progress: Progress,
+        watch: Watch | None,
     ) -> None:
         self.prior, self.budget, self.targets, self.config = prior, budget, targets, config
-        self.work, self.progress = work, progress
+        self.count, self.work, self.progress, self.watch = count, work, progress, watch
         self.state = self.simplified = prior
         self.protected: Any = None
         self.log: list[dict[str, Any]] = []
@@ -241,11 +251,12 @@ class _Rounds:
             config = RecoverConfig(
                 schedule=self.config.schedule,
                 steps=self.config.steps if final else None,
-                time_limit=self.config.time_limit if final else None,
+                time_limit=self._seconds(final),
                 regularizers=self.config.regularizers,
                 background=self.config.background,
                 final=final,
                 seed=self.config.seed,
+                engine=self.config.engine,
             )
             checkpoint = self.work / f"{name}.checkpoint.npz" if self.work else None
             done = recover(
@@ -256,6 +267,7 @@ class _Rounds:
                 checkpoint=checkpoint,
                 progress=self.progress,
                 stage="recover" if final else f"recover {name}",
+                watch=self.watch,
             )
             self.state = done.splats
             entry.setdefault("recover", []).append(done.report)
@@ -263,6 +275,15 @@ class _Rounds:
             if checkpoint is not None:
                 checkpoint.unlink(missing_ok=True)
         self.seconds["recover"] += entry["recover"][-1]["seconds"]
+
+    def _seconds(self, final: bool) -> float | None:
+        """This recovery's part of the time limit."""
+        if self.config.time_limit is None:
+            return None
+        schedule = self.config.schedule
+        last = schedule.steps if self.config.steps is None else self.config.steps
+        whole = last + self.count * schedule.round_steps
+        return self.config.time_limit * (last if final else schedule.round_steps) / whole
 
     def _save(self, name: str, entry: dict[str, Any]) -> None:
         if self.work is None:

@@ -10,7 +10,7 @@ import numpy as np
 from g2ard.metrics import psnr, ssim
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
-from g2ard.targets import Targets
+from g2ard.targets import Targets, mask_of
 
 __all__ = ["Evaluation", "ViewScore", "evaluate"]
 
@@ -71,7 +71,7 @@ def evaluate(
     """Render every view of `targets` and score it.
 
     Renders are clamped to [0, 1] without 8-bit rounding; SSIM has an 11×11 Gaussian window, σ 1.5,
-    zero-padded.
+    zero-padded. Where a photo has a mask, only its pixels count.
 
     Args:
         splats: the scene; its offset counts, cameras are in world coordinates.
@@ -93,6 +93,7 @@ def evaluate(
     for view, name in enumerate(cameras.names):
         image = np.clip(render(splats, cameras, view, background=background).image, 0, 1)
         target = targets[view]
-        scores.append(ViewScore(name, psnr(image, target), ssim(image, target)))
+        mask = mask_of(targets, view)
+        scores.append(ViewScore(name, psnr(image, target, mask), ssim(image, target, mask)))
         progress(stage, view + 1, len(cameras))
     return Evaluation(len(splats), splats.nbytes, tuple(scores))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.progress import Progress, silent
 
-__all__ = ["contact_sheet", "load_image", "load_images", "to_bytes", "write_png"]
+__all__ = ["contact_sheet", "load_image", "load_images", "load_mask", "to_bytes", "write_png"]
 
 _ASPECT_SLACK = 0.02
 """Relative difference of aspect ratio that rounding a resized photo may cause; more is another photo."""
@@ -57,6 +58,26 @@ def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
         K = cameras.Ks[index] * np.array([[width / target[0]], [height / target[1]], [1.0]])
         image = _undistorted(image, K, distortion)
     return _resized(image, target)
+
+
+def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
+    """Where the photo of one view counts, in the pixels of `load_image`.
+
+    Args:
+        cameras: C views.
+        index: which one.
+
+    Returns:
+        (H, W), true where the mask is brighter than half; None if the view has no mask.
+
+    Raises:
+        InputError: as `load_image`, of the mask.
+    """
+    path = cameras.mask_paths[index]
+    if path is None:
+        return None
+    image = load_image(replace(cameras, image_paths=cameras.mask_paths), index)
+    return np.ascontiguousarray(image.mean(2) > 0.5)
 
 
 def load_images(cameras: Cameras, progress: Progress = silent) -> list[NDArray[np.float32]]:

@@ -14,12 +14,13 @@ __all__ = ["psnr", "ssim"]
 _Image = NDArray[np.floating[Any]]
 
 
-def psnr(image: _Image, target: _Image) -> float:
+def psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
     """−10·log10 of the mean squared difference, peak 1; at most 100 dB, which identical images reach.
 
     Args:
         image: (H, W, C) in [0, 1].
         target: of the same shape.
+        mask: (H, W), where to look; None means everywhere.
 
     Returns:
         dB.
@@ -30,15 +31,19 @@ def psnr(image: _Image, target: _Image) -> float:
     >>> round(psnr(np.full((2, 2, 3), 0.5), np.full((2, 2, 3), 0.6)), 4)
     20.0
     """
+    if mask is not None:
+        image, target = image[mask][:, None], target[mask][:, None]
     return min(100.0, _core.psnr(_float32(image), _float32(target)))
 
 
-def ssim(image: _Image, target: _Image) -> float:
+def ssim(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
     """Mean structural similarity: 11×11 Gaussian window, σ 1.5, zero-padded, range 0–1 (INRIA's).
 
     Args:
         image: (H, W, C) in [0, 1].
         target: of the same shape.
+        mask: (H, W), where to look: elsewhere both are taken to be equal, and the shortfall from 1 is
+            averaged over these pixels only; None means everywhere.
 
     Returns:
         Mean over pixels and channels, at most 1.
@@ -49,6 +54,9 @@ def ssim(image: _Image, target: _Image) -> float:
     >>> round(ssim(np.eye(16)[:, :, None], np.eye(16)[:, :, None]), 6)
     1.0
     """
+    if mask is not None:
+        short = 1 - _core.ssim(_float32(np.where(mask[..., None], image, target)), _float32(target))
+        return 1 - short * mask.size / max(1, int(mask.sum()))
     return _core.ssim(_float32(image), _float32(target))
 
 

@@ -15,7 +15,16 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
 from g2ard.splats import Splats
 
-__all__ = ["RasterSettings", "Rendered", "Visibility", "looker", "render", "visibility"]
+__all__ = [
+    "RasterSettings",
+    "Rendered",
+    "Visibility",
+    "arrays_of",
+    "centred",
+    "looker",
+    "render",
+    "visibility",
+]
 
 _Floats = NDArray[np.float32]
 View = tuple[list[list[float]], list[float], tuple[int, int], float]
@@ -90,7 +99,7 @@ def arrays_of(splats: Splats) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floa
     return a, b, c, d, e, f
 
 
-def _centred(splats: Splats, cameras: Cameras) -> tuple[Splats, Cameras]:
+def centred(splats: Splats, cameras: Cameras) -> tuple[Splats, Cameras]:
     """Both about a point that float32 means can be taken from: float64 means may be map coordinates."""
     cameras = cameras.recentred(splats.offset)
     if splats.means.dtype == np.float32 or not len(splats):
@@ -157,7 +166,7 @@ def render(
     colour = [float(c) for c in background]
     if len(colour) != 3:
         raise InputError(f"background: expected 3 numbers, got {len(colour)}")
-    splats, cameras = _centred(splats, cameras)
+    splats, cameras = centred(splats, cameras)
     image, alpha, depth, mid = _core.Rasterizer().forward(
         arrays_of(splats), view_of(cameras, index, settings), settings.choices, colour, True, median
     )
@@ -208,7 +217,7 @@ def visibility(
     (True, [0.04, 0.22])
     """
     settings = settings or RasterSettings()
-    splats, cameras = _centred(splats, cameras)
+    splats, cameras = centred(splats, cameras)
     views = [view_of(cameras, i, settings) for i in range(len(cameras))]
     sums: dict[str, Any] = _core.accumulate(
         arrays_of(splats), views, settings.choices, counter(progress, "visibility")

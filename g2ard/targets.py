@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,7 +15,7 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
 
-__all__ = ["CACHE_BYTES", "Photos", "Subset", "Targets", "TeacherRenders", "fingerprint_of"]
+__all__ = ["CACHE_BYTES", "Photos", "Subset", "Targets", "TeacherRenders", "fingerprint_of", "mask_of"]
 
 CACHE_BYTES = 2_000_000_000
 """Targets are kept in memory up to this many bytes; beyond it they are made again when they are asked for."""
@@ -26,6 +27,12 @@ class Targets(Protocol):
     cameras: Cameras
 
     def __getitem__(self, view: int) -> NDArray[np.float32]: ...
+
+
+def mask_of(targets: Targets, view: int) -> NDArray[np.bool_] | None:
+    """(H, W), where a target counts; None where all of it does, which is the rule."""
+    masks = getattr(targets, "mask", None)
+    return None if masks is None else masks(view)
 
 
 def fingerprint_of(targets: Targets) -> str:
@@ -52,6 +59,10 @@ class Subset:
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         return self._targets[int(self._rows[view])]
+
+    def mask(self, view: int) -> NDArray[np.bool_] | None:
+        """See `mask_of`."""
+        return mask_of(self._targets, int(self._rows[view]))
 
 
 class _Cached(ABC):
@@ -86,9 +97,28 @@ class _Cached(ABC):
 
 
 class Photos(_Cached):
-    """The photos of `cameras`, undistorted and at each camera's size; kept as 8-bit."""
+    """The photos of `cameras`, undistorted and at each camera's size; kept as 8-bit.
 
-    def __init__(self, cameras: Cameras, *, limit: int = CACHE_BYTES) -> None:
+    A photo whose camera has a mask counts only where the mask is bright, and is black elsewhere. A photo
+    with an exposure, the affine colour transform C that trainers fit (photo = C·render), is undone to what
+    the scene shows.
+
+    Args:
+        cameras: every one with a photo.
+        exposures: (3, 4) of the photos that have one, by view name.
+        limit: bytes kept in memory.
+
+    Raises:
+        InputError: a view without a photo, an exposure that cannot be undone.
+    """
+
+    def __init__(
+        self,
+        cameras: Cameras,
+        *,
+        exposures: Mapping[str, NDArray[np.float64]] | None = None,
+        limit: int = CACHE_BYTES,
+    ) -> None:
         missing = next(
             (n for n, p in zip(cameras.names, cameras.image_paths, strict=True) if p is None), None
         )
@@ -96,6 +126,24 @@ class Photos(_Cached):
             raise InputError(f"view {missing}: has no photo, and no teacher stands in for it")
         super().__init__(cameras, limit)
         self.source = "photos " + " ".join(str(path) for path in cameras.image_paths)
+        if any(cameras.mask_paths):
+            self.source += " masks " + " ".join(str(path) for path in cameras.mask_paths)
+        self._masks: dict[int, NDArray[np.bool_] | None] = {}
+        self._undo = {
+            view: _inverse(name, exposures[name])
+            for view, name in enumerate(cameras.names)
+            if exposures and name in exposures
+        }
+        if self._undo:
+            self.source += f" exposures {[(v, m.tolist()) for v, m in self._undo.items()]}"
+
+    def mask(self, view: int) -> NDArray[np.bool_] | None:
+        """Where the photo counts; None if it has no mask."""
+        if view not in self._masks:
+            from g2ard.images import load_mask
+
+            self._masks[view] = load_mask(self.cameras, view)
+        return self._masks[view]
 
     def _make(self, view: int) -> NDArray[np.uint8]:
         from g2ard.images import load_image
@@ -103,7 +151,22 @@ class Photos(_Cached):
         return np.rint(load_image(self.cameras, view) * 255).astype(np.uint8)
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
-        return self._stored(view).astype(np.float32) / np.float32(255)
+        photo = self._stored(view).astype(np.float32) / np.float32(255)
+        undo = self._undo.get(view)
+        if undo is not None:
+            photo = np.ascontiguousarray(photo @ undo[:, :3].T + undo[:, 3], dtype=np.float32)
+        mask = self.mask(view)
+        if mask is not None:  # SSIM's window reaches over the mask's edge: what lies there must not matter
+            photo[~mask] = 0
+        return photo
+
+
+def _inverse(name: str, exposure: NDArray[np.float64]) -> NDArray[np.float32]:
+    matrix = np.asarray(exposure, np.float64)
+    if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:, :3])) < 1e-6:
+        raise InputError(f"exposure of {name}: expected an invertible 3×4 matrix")
+    inverse = np.linalg.inv(matrix[:, :3])
+    return np.hstack([inverse, -inverse @ matrix[:, 3:]]).astype(np.float32)
 
 
 class TeacherRenders(_Cached):

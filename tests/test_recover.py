@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +17,10 @@ from scenes import around, checkered_ball
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.evaluate import evaluate
-from g2ard.recover import RecoverConfig, recover
+from g2ard.recover import RecoverConfig, probe, recover
+from g2ard.recover import checkpoint as checkpoint_module
 from g2ard.recover.anchors import PRESETS, Regularizers
-from g2ard.recover.schedule import PAPER
+from g2ard.recover.schedule import PAPER, TUNED
 from g2ard.simplify import simplify
 from g2ard.splats import Splats
 from g2ard.targets import TeacherRenders
@@ -50,6 +53,9 @@ def test_recovery_lifts_unseen_views(student: Splats, targets: TeacherRenders, e
     assert evaluate(result.splats, unseen).psnr > evaluate(student, unseen).psnr + 3
     assert result.report["psnr"]["after"] > result.report["psnr"]["before"] + 3
     assert len(result.report["loss"]) == 100
+    assert [point["step"] for point in result.report["geometry"]] == [15 * k for k in range(1, 11)]
+    assert result.report["geometry"][-1]["drift95"] == result.report["drift95"]
+    assert result.report["regularizers"]["steps"] == 1
 
 
 def test_both_engines_take_the_same_way(student: Splats, targets: TeacherRenders) -> None:
@@ -85,11 +91,11 @@ class _StopAt:
             os.kill(os.getpid(), signal.SIGINT)
 
 
-@pytest.mark.parametrize("engine", ["fused", "torch"])
+@pytest.mark.parametrize(("engine", "steps"), [("fused", 40), ("torch", 40), ("fused", 110)])
 def test_ctrl_c_then_resume_is_never_having_stopped(
-    student: Splats, targets: TeacherRenders, engine: Any, tmp_path: Path
+    student: Splats, targets: TeacherRenders, engine: Any, steps: int, tmp_path: Path
 ) -> None:
-    config = RecoverConfig(steps=40, engine=engine, regularizers=replace(PRESETS["lift"], period=10))
+    config = RecoverConfig(steps=steps, engine=engine, regularizers=replace(PRESETS["lift"], period=10))
     whole = recover(student, targets, config)
     checkpoint = tmp_path / "c.npz"
     with pytest.raises(KeyboardInterrupt):
@@ -98,6 +104,30 @@ def test_ctrl_c_then_resume_is_never_having_stopped(
     resumed = recover(student, targets, config, checkpoint=checkpoint)
     assert_same_bits(whole.splats, resumed.splats)
     assert whole.report["loss"] == resumed.report["loss"]
+    assert whole.report["trials"] == resumed.report["trials"]
+    assert bool(whole.report["trials"]) == (steps >= 100)
+    assert whole.report["geometry"] == resumed.report["geometry"]
+
+
+def test_a_run_that_was_killed_goes_on_from_the_last_minute(
+    student: Splats, targets: TeacherRenders, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = RecoverConfig(steps=30, regularizers=replace(PRESETS["lift"], period=10))
+    whole = recover(student, targets, config)
+    monkeypatch.setattr(checkpoint_module, "PERIOD", 0.0)  # a minute has always passed
+
+    def fall_over(stage: str, done: int, total: int, info: Any = None) -> None:
+        if stage == "recover" and done == 21:
+            raise RuntimeError("power cut")
+
+    checkpoint = tmp_path / "c.npz"
+    with pytest.raises(RuntimeError, match="power cut"):
+        recover(student, targets, config, checkpoint=checkpoint, progress=fall_over)
+    meta, _ = checkpoint_module.load(checkpoint, json.loads(str(np.load(checkpoint)["meta"]))["key"])
+    assert meta["done"] == 20
+    resumed = recover(student, targets, config, checkpoint=checkpoint)
+    assert_same_bits(whole.splats, resumed.splats)
+    assert whole.report["geometry"] == resumed.report["geometry"]
 
 
 def test_resume_refuses_other_options(student: Splats, targets: TeacherRenders, tmp_path: Path) -> None:
@@ -134,11 +164,60 @@ def test_paper_schedule_runs_with_its_own_rates(student: Splats, targets: Teache
     assert result.report["psnr"]["after"] > result.report["psnr"]["before"]
 
 
+def test_trials_choose_rates_that_suit_the_scene(student: Splats, targets: TeacherRenders) -> None:
+    report = recover(student, targets, RecoverConfig(steps=100)).report
+    best = max(report["trials"], key=lambda trial: trial["psnr"])
+    assert report["multiplier"] == best["multiplier"]
+    assert len(report["trials"]) >= 2
+    nearly = recover(TEACHER, targets, RecoverConfig(steps=100)).report  # nothing to gain: small steps
+    assert nearly["multiplier"] == pytest.approx(1 / 3)
+    fixed = RecoverConfig(schedule=replace(TUNED, multiplier=0.7), steps=100)
+    report = recover(student, targets, fixed).report
+    assert (report["multiplier"], report["trials"]) == (0.7, [])
+
+
+def test_trials_stop_where_the_clock_is_short(student: Splats, targets: TeacherRenders) -> None:
+    report = recover(student, targets, RecoverConfig(time_limit=0.05)).report
+    assert report["trials"] == []
+    assert report["seconds"] < 1
+
+
 def test_a_time_limit_sets_the_horizon(student: Splats, targets: TeacherRenders) -> None:
     report = recover(student, targets, RecoverConfig(time_limit=1.0)).report
     assert report["steps"] > 5
     assert report["seconds"] >= 1.0
     assert report["psnr"]["after"] > report["psnr"]["before"] + 1
+
+
+def test_progress_shows_loss_psnr_and_speed(
+    student: Splats, targets: TeacherRenders, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(probe, "_SHARE", 0.5)  # these steps are too short for an honest share
+    seen: list[Any] = []
+    recover(
+        student,
+        targets,
+        RecoverConfig(steps=60),
+        progress=lambda *a: seen.append(a) if a[0] == "recover" else None,
+    )
+    assert [a[1] for a in seen] == list(range(1, 61))
+    assert set(seen[-1][3]) == {"loss", "PSNR", "steps/s"}
+    assert float(seen[-1][3]["PSNR"]) > float(seen[0][3]["PSNR"])
+
+
+def test_watching_costs_no_time_and_changes_no_bit(student: Splats, targets: TeacherRenders) -> None:
+    counts: list[tuple[int, float]] = []
+
+    def watch(step: int, seconds: float, splats: Any) -> None:
+        time.sleep(0.02)
+        if step == 20:
+            counts.append((len(splats()), seconds))
+
+    plain = recover(student, targets, RecoverConfig(steps=20))
+    watched = recover(student, targets, RecoverConfig(steps=20), watch=watch)
+    assert_same_bits(plain.splats, watched.splats)
+    assert counts[0][0] == len(student)
+    assert counts[0][1] == watched.report["seconds"] < plain.report["seconds"] + 0.2
 
 
 def test_a_far_offset_changes_nothing_but_the_offset(student: Splats, targets: TeacherRenders) -> None:

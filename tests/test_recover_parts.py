@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from scenes import around, checkered_ball
 
 from g2ard.errors import InputError
 from g2ard.recover import checkpoint
 from g2ard.recover.anchors import PRESETS, Anchors, Regularizers, drift95, effective_rank, needle
-from g2ard.recover.presets import preset_for
+from g2ard.recover.presets import preset_for, view_consistency
 from g2ard.recover.regularize import TorchAnchors, anchor_loss, regularization, shape_loss
 from g2ard.recover.schedule import PAPER, TUNED, schedule_named
 from g2ard.splats import Splats
@@ -165,8 +167,41 @@ def test_auto_preset_tells_lift_trained_and_noisy_apart() -> None:
     assert preset_for("auto", lift)[0] == PRESETS["lift"]
     assert preset_for("auto", noisy)[0] == PRESETS["noisy"]
     assert preset_for("auto", round_)[0] == PRESETS["trained"]
+    weights, why, measured = preset_for("lift", noisy)
+    assert weights == PRESETS["lift"]
+    assert why == "lift (as asked)"
+    assert measured.needle == 1
+    assert measured.consistency is None
     with pytest.raises(InputError, match="preset"):
         preset_for("gentle", trained)
+
+
+def test_views_that_see_through_each_other_s_surfaces_make_a_prior_noisy() -> None:
+    ball, views = checkered_ball(), around(40, (96, 72))
+    rng = np.random.default_rng(0)
+    strewn = ball.means.copy()
+    rows = rng.permutation(len(ball))[:1200]
+    strewn[rows] = rng.normal(0, 0.8, (1200, 3))
+    foggy = replace(ball, means=strewn, logit_opacities=np.full(len(ball), 3, np.float32))
+    sound, loose = view_consistency(ball, views), view_consistency(foggy, views)
+    assert sound is not None
+    assert loose is not None
+    assert loose < 0.92 < 0.97 < sound
+    assert preset_for("auto", ball, views)[0] == PRESETS["trained"]
+    weights, why, _ = preset_for("auto", foggy, views)
+    assert weights == PRESETS["noisy"]
+    assert "see through" in why
+    far = np.array([447_000.0, 5_411_000.0, 130.0])
+    moved = view_consistency(replace(ball, offset=ball.offset + far), views.recentred(-far))
+    assert moved == pytest.approx(sound, abs=0.01)
+    assert view_consistency(ball, views.take([0])) is None
+
+
+def test_a_scaled_schedule_keeps_its_proportions() -> None:
+    small = schedule_named("paper", 3000)
+    assert (small.steps, small.round_steps) == (3000, 800)
+    assert small.rates == PAPER.rates
+    assert schedule_named("fast", 50).round_steps == 0
 
 
 def test_checkpoint_round_trips_and_refuses_another_run(tmp_path: Path) -> None:

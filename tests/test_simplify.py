@@ -165,7 +165,7 @@ def test_odd_scenes(method, name):
 @pytest.mark.parametrize("method", METHODS)
 def test_identical_gaussians_keep_their_shape(method):
     prior = scene(500).take(np.zeros(1000, int))
-    out = simplify(prior, 1, method=method).splats
+    out = simplify(prior, 1, method=method, config=SimplifyConfig(max_growth=1)).splats
     np.testing.assert_array_equal(out.means, prior.means[:1])
     np.testing.assert_allclose(np.sort(out.scales[0]), np.sort(prior.scales[0]), rtol=1e-5)
     np.testing.assert_allclose(out.sh0, prior.sh0[:1], rtol=1e-6)
@@ -327,7 +327,7 @@ def test_what_is_seen_is_kept_finer(method):
     seen = Views(np.where(left, 100.0, 0.0), np.where(left, 0.01, np.inf))
     out = simplify(prior, 400, method=method, visibility=seen)
     assert_sound(out, 4000, 400)
-    assert (out.splats.means[:, 0] < 0).mean() > 0.75
+    assert (out.splats.means[:, 0] < 0).mean() > 0.6
     with pytest.raises(InputError, match=r"visibility.weight: expected shape \(4000,\)"):
         simplify(prior, 400, method=method, visibility=Views(np.ones(3), np.ones(4000)))
 
@@ -341,15 +341,18 @@ def test_a_function_of_visibility_is_asked_again_as_the_scene_shrinks():
 
     out = simplify(prior, 100, visibility=look, protected=np.ones(4000, bool))
     assert_sound(out, 4000, 100)
-    assert asked == [4000, 1200, 360]
+    assert asked == [4000, 1200, 360, 100, 100]  # the last two to resize what was merged
     assert out.protected.all()
 
 
+@pytest.mark.parametrize("growth", [1.0, 1.5])
 @pytest.mark.parametrize("method", ["default", "fast"])
-def test_clusters_conserve_mass_mean_and_covariance(method):
+def test_clusters_conserve_mass_mean_and_covariance(method, growth):
     prior = scene(3000, dtype=np.float64)
+    config = SimplifyConfig(max_growth=growth)
     e2 = (0.4 * 0.01) ** 2
-    out = simplify(prior, 1500, method=method, visibility=Views(np.ones(3000), np.full(3000, 0.01)))
+    seen = Views(np.ones(3000), np.full(3000, 0.01))
+    out = simplify(prior, 1500, method=method, visibility=seen, config=config)
     small = out.splats
     for p in range(0, 1500, 7):
         rows = np.flatnonzero(out.parents == p)
@@ -357,8 +360,38 @@ def test_clusters_conserve_mass_mean_and_covariance(method):
             for name in ARRAYS:
                 np.testing.assert_array_equal(getattr(small, name)[p], getattr(prior, name)[rows[0]])
             continue
-        mean, cov, alpha, sh = naive.merge_as_rendered(prior, rows, e2)
+        mean, cov, alpha, sh = naive.merge_as_rendered(prior, rows, e2, growth)
         np.testing.assert_allclose(small.means[p], mean, rtol=0, atol=1e-7)  # blur and α are float32
         np.testing.assert_allclose(naive.covariance(small, p), cov, rtol=0, atol=1e-6 * np.trace(cov))
         np.testing.assert_allclose(small.opacities[p], alpha, rtol=1e-4)
         np.testing.assert_allclose(np.r_[small.sh0[p], small.shN[p]], sh, rtol=0, atol=1e-5)
+
+
+def opaque_wall():
+    """1,600 opaque discs, thin along z, that overlap into a wall; a view of it."""
+    from g2ard.cameras import Cameras, look_at
+
+    x, y = np.meshgrid(np.linspace(-1, 1, 40), np.linspace(-1, 1, 40))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(1600)], 1)
+    wall = Splats.create(
+        points, scales=np.tile([0.04, 0.04, 0.002], (1600, 1)), logit_opacities=np.full(1600, 6)
+    )
+    eyes = [[0, 0, -3], [0.5, 0.2, -3], [-0.4, 0.3, -2.8]]
+    pose = [look_at(eye, [0, 0, 0], up=(0, -1, 0)) for eye in eyes]
+    K = [[150, 0, 40], [0, 150, 30], [0, 0, 1]]
+    return wall, Cameras.from_lists(pose, [K] * 3, [(80, 60)] * 3, ["a", "b", "c"])
+
+
+@pytest.mark.parametrize("method", ["default", "fast"])
+def test_an_opaque_wall_stays_opaque_and_thin(method):
+    from g2ard.render import looker, render
+
+    wall, cameras = opaque_wall()
+    alpha = {}
+    for growth in (1.0, 1.5):
+        out = simplify(wall, 80, method=method, config=SimplifyConfig(max_growth=growth)).splats
+        alpha[growth] = render(out, cameras, 0).alpha[15:45, 20:60].mean()
+        assert out.scales.min(axis=1).max() < 0.0025
+    assert alpha[1.5] > alpha[1.0] + 0.05
+    seen = simplify(wall, 80, method=method, visibility=looker(cameras)).splats
+    assert render(seen, cameras, 0).alpha[15:45, 20:60].mean() > alpha[1.5]

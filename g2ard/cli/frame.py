@@ -152,8 +152,10 @@ def group(name: str, text: str) -> typer.Typer:
     return sub
 
 
-def command(name: str, *, example: str, parent: typer.Typer = app) -> Callable[[Any], Any]:
-    """Register `fn(run, **options)` as a command; `example` ends its help."""
+def command(
+    name: str, *, example: str, parent: typer.Typer = app, cuda: bool = False
+) -> Callable[[Any], Any]:
+    """Register `fn(run, **options)` as a command; `example` ends its help; `cuda`: it knows --device cuda."""
 
     def register(fn: Callable[..., None]) -> Callable[..., None]:
         own = list(inspect.signature(fn, eval_str=True).parameters.values())[1:]
@@ -164,7 +166,7 @@ def command(name: str, *, example: str, parent: typer.Typer = app) -> Callable[[
 
         def call(**values: Any) -> None:
             shared = {key: values.pop(key) for key in _COMMON}
-            _execute(Run(name, shared, dict(values)), fn, values)
+            _execute(Run(name, shared, dict(values)), fn, values, cuda)
 
         parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own] + common
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -176,12 +178,12 @@ def command(name: str, *, example: str, parent: typer.Typer = app) -> Callable[[
     return register
 
 
-def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None:
+def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: bool) -> None:
     if run.device not in ("auto", "cpu", "gpu", "cuda"):
         raise typer.BadParameter(f"--device: auto, cpu, gpu or cuda, not {run.device!r}")
     if run.json not in (None, "-") and Path(str(run.json)) == options.get("output"):
         raise typer.BadParameter(f"--json and --output are both {run.json}")
-    if run.device in ("gpu", "cuda"):
+    if run.device == "gpu" or (run.device == "cuda" and not cuda):
         run.say(f"--device {run.device}: this build computes on the CPU only, and does")
     try:
         if run.json not in (None, "-"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
@@ -12,7 +12,21 @@ if TYPE_CHECKING:
     from g2ard.splats import Splats
     from g2ard.targets import Targets
 
-__all__ = ["load_scene", "load_splits", "load_view_sets", "load_views", "make_targets"]
+__all__ = ["load_scene", "load_splits", "load_view_sets", "load_views", "make_targets", "recovery_engine"]
+
+
+def recovery_engine(run: Run) -> Literal["fused", "gsplat"]:
+    """What takes recovery's steps on the device asked for.
+
+    Raises:
+        InputError: CUDA was asked for and is not to be had.
+    """
+    if run.device != "cuda":
+        return "fused"
+    from g2ard.recover.gsplat_engine import check_cuda
+
+    check_cuda()
+    return "gsplat"
 
 
 def load_scene(run: Run, path: Path) -> Splats:
@@ -71,8 +85,12 @@ def make_targets(
     lazy: bool = False,
 ) -> Targets:
     """The teacher's renders (`lazy`: when first asked for), or the photos where no teacher is given."""
+    from g2ard.io.exposures import find_exposures
     from g2ard.targets import Photos, TeacherRenders
 
     if teacher is None:
-        return Photos(cameras)
+        exposures = find_exposures(cameras)
+        if exposures:
+            run.say(f"exposure.json: {len(exposures)} photos brought to the scene's own colours")
+        return Photos(cameras, exposures=exposures)
     return TeacherRenders(teacher, cameras, background=background, lazy=lazy, progress=run.progress)

@@ -31,6 +31,7 @@ class Frame(NamedTuple):
     distortion: tuple[float, ...] = (0.0,) * 5
     split: str | None = None
     weight: float | None = None
+    mask: Path | None = None
 
 
 def find_photo(path: Path) -> Path:
@@ -67,9 +68,19 @@ def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
             [f.name for f in frames],
             [f.photo for f in frames],
             [f.distortion for f in frames],
+            [_mask(f) for f in frames],
         )
     except (InputError, OverflowError) as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def _mask(frame: Frame) -> Path | None:
+    """The frame's own mask, else one of the photo's name in a folder `masks` beside the photos' folder."""
+    if frame.mask is not None or frame.photo is None:
+        return frame.mask
+    folder = frame.photo.parent.parent / "masks"
+    names = (frame.photo.name, f"{frame.photo.name}.png", f"{frame.photo.stem}.png")
+    return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
 def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
@@ -101,6 +112,11 @@ def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
         )
         frames = [frame._replace(photo=None) for frame in frames]
     cameras = _cameras(path, frames)
+    masked = sum(mask is not None for mask in cameras.mask_paths)
+    if masked:
+        notes.append(
+            Note("masks", masked, f"{plural(masked, 'photo')} of {len(frames)} counted in part: masks")
+        )
     splits = tuple(f.split for f in frames)
     weights = [f.weight for f in frames]
     return ViewSet(

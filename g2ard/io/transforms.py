@@ -46,11 +46,13 @@ def _frame(path: Path, index: int, content: dict[str, Any], frame: Any, images: 
     try:
         file_path = str(frame["file_path"])
         world_from_camera = np.array(frame["transform_matrix"], np.float64)
+        mask = frame.get("mask_path")
         photo = find_photo(images / Path(file_path).name if images else path.parent / file_path)
         return Frame(
             name=file_path.removeprefix("./").removeprefix("images/"),
             viewmat=_camera_from_world(rigid(where, world_from_camera)),
             photo=photo,
+            mask=None if mask is None else _there(where, path.parent / str(mask)),
             **_intrinsics(where, {**content, **frame}, photo),
         )
     except KeyError as error:
@@ -59,6 +61,12 @@ def _frame(path: Path, index: int, content: dict[str, Any], frame: Any, images: 
         if isinstance(error, InputError):
             raise
         raise InputError(f"{where}: malformed ({error})") from error
+
+
+def _there(where: str, mask: Path) -> Path:
+    if not mask.is_file():
+        raise InputError(f"{where}: its mask {mask} does not exist")
+    return mask
 
 
 def _camera_from_world(world_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:

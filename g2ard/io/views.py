@@ -51,6 +51,7 @@ def _frame(path: Path, index: int, view: Any, images: Path | None) -> Frame:
         photo = view.get("image")
         if photo is not None:
             photo = images / Path(photo).name if images else path.parent / photo
+        mask = view.get("mask")
         weight = view.get("weight")
         if weight is not None and not (np.isfinite(weight) and weight >= 0):
             raise InputError(f"{where}: weight {weight!r} is not a number ≥ 0")
@@ -60,6 +61,7 @@ def _frame(path: Path, index: int, view: Any, images: Path | None) -> Frame:
             K=np.array(view["K"], np.float64).reshape(3, 3),
             size=(int(view["width"]), int(view["height"])),
             photo=photo,
+            mask=None if mask is None else path.parent / mask,
             distortion=tuple(map(float, (*view.get("distortion", ()), 0, 0, 0, 0, 0)[:5])),
             split=view.get("split"),
             weight=weight,
@@ -114,6 +116,7 @@ def write(
             "camera_from_world": cameras.viewmats[i].tolist(),
             "distortion": cameras.distortions[i].tolist() if cameras.distortions[i].any() else None,
             "image": _relative(cameras.image_paths[i], path),
+            "mask": _relative(cameras.mask_paths[i], path),
             "split": parts[i],
             "weight": drawn[i],
         }

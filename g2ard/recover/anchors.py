@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ NEEDLE_RANK = 1.1
 
 @dataclass(frozen=True)
 class Regularizers:
-    """Weights of the paper's `eq:objective`: λ_a·L_anchor + λ_s·L_shape, every `period` steps."""
+    """Weights of the paper's `eq:objective`: λ_a·L_anchor + λ_s·L_shape, looked at every `period` steps."""
 
     anchor: float
     shape: float
@@ -28,6 +28,11 @@ class Regularizers:
     def active(self) -> bool:
         """Whether any term has weight."""
         return self.anchor > 0 or self.shape > 0
+
+    @property
+    def applied(self) -> Regularizers:
+        """The weights where they are applied: × `period`, so that on average λ is what the objective says."""
+        return replace(self, anchor=self.anchor * self.period, shape=self.shape * self.period)
 
 
 PRESETS = {

@@ -47,7 +47,15 @@ class FusedEngine:
         )
         self._trainer.anchor(*self._anchors)
 
-    def step(self, view: int, target: NDArray[np.float32], rates: Rates, *, regularize: bool) -> float:
+    def step(
+        self,
+        view: int,
+        target: NDArray[np.float32],
+        rates: Rates,
+        *,
+        regularize: bool,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> float:
         """One optimiser step on one view; returns its photometric loss."""
         loss, _ = self._trainer.step(
             view_of(self._cameras, view, self._settings),
@@ -64,6 +72,7 @@ class FusedEngine:
                 rates.shN,
             ],
             self._weights if regularize else None,
+            mask,
         )
         return loss
 

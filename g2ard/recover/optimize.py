@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -12,19 +14,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
-from g2ard.metrics import psnr
 from g2ard.progress import Progress, silent
 from g2ard.recover import checkpoint as checkpoints
 from g2ard.recover.anchors import PRESETS, Anchors, Regularizers, drift95, needle
 from g2ard.recover.draw import checked_weights, drawn
+from g2ard.recover.probe import Probe, climb, trial_steps
 from g2ard.recover.schedule import TUNED, Rates, Schedule, multiplier_for
 from g2ard.splats import Splats
-from g2ard.targets import Targets, fingerprint_of
+from g2ard.targets import Targets, fingerprint_of, mask_of
 
-__all__ = ["RecoverConfig", "Recovered", "recover"]
+__all__ = ["RecoverConfig", "Recovered", "Watch", "recover"]
 
-_PROBE_VIEWS = 8
-"""Views whose error tells how good the start is."""
+_TRIAL_STEPS = 20
+_TRIAL_SHARE = 0.1
+"""Under a time limit: steps of a trial, and the share of the limit that all trials may take."""
+
+_LOG_POINTS = 10
+"""How often Drift95 and Needle are logged over a recovery."""
+
+Watch = Callable[[int, float, Callable[[], Splats]], None]
+"""Called after every step with its number, the seconds so far and what gives the scene as it stands."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +52,8 @@ class RecoverConfig:
         final: whether this is the recovery at the target count; the paper decays rounds differently.
         seed: of the order of views.
         engine: "fused" takes whole steps in Rust; "torch" goes through autograd and torch's Adam, with the
-            same result to rounding but for Gaussians that a view does not touch.
+            same result to rounding but for Gaussians that a view does not touch; "gsplat" is that on an
+            NVIDIA GPU.
     """
 
     schedule: Schedule = TUNED
@@ -55,7 +65,7 @@ class RecoverConfig:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     final: bool = True
     seed: int = 0
-    engine: Literal["fused", "torch"] = "fused"
+    engine: Literal["fused", "torch", "gsplat"] = "fused"
 
     @property
     def horizon(self) -> int:
@@ -72,7 +82,8 @@ class Recovered:
     Args:
         splats: same count and order as the student.
         report: steps, seconds, loss (one mean per 1 % of the horizon), psnr {before, after} over a sample of
-            the training views, multiplier, drift95, needle, skipped.
+            the training views, multiplier, trials (those that chose it), drift95, needle, geometry (ten of
+            {step, drift95, needle} on the way), regularizers {steps, share of the time}, skipped.
     """
 
     splats: Splats
@@ -82,7 +93,15 @@ class Recovered:
 class Engine(Protocol):
     """What takes steps: holds parameters and optimiser state."""
 
-    def step(self, view: int, target: NDArray[np.float32], rates: Rates, *, regularize: bool) -> float: ...
+    def step(
+        self,
+        view: int,
+        target: NDArray[np.float32],
+        rates: Rates,
+        *,
+        regularize: bool,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> float: ...
 
     def splats(self) -> Splats: ...
 
@@ -104,11 +123,12 @@ def recover(
     checkpoint: Path | None = None,
     progress: Progress = silent,
     stage: str = "recover",
+    watch: Watch | None = None,
 ) -> Recovered:
     """Optimise every attribute of a fixed set of Gaussians against targets (`eq:objective`).
 
-    L = (1−λ)·L1 + λ·(1−SSIM), and every `period` steps + λ_a·L_anchor + λ_s·L_shape. No Gaussian is added
-    or removed.
+    L = (1−λ)·L1 + λ·(1−SSIM), and every `period` steps + `period`·(λ_a·L_anchor + λ_s·L_shape). No
+    Gaussian is added or removed.
 
     Args:
         student: the scene to recover; its offset counts, cameras are in world coordinates.
@@ -118,8 +138,9 @@ def recover(
         anchors: frozen geometry; None freezes the student as given.
         checkpoint: a file written every minute and at Ctrl-C; if it is there, recovery goes on from it, and
             the result is bitwise that of never having stopped.
-        progress: told of every step, with loss, PSNR of the step's view and steps/s.
+        progress: told of every step, with loss, PSNR of a few training views and steps/s.
         stage: the name progress is reported under.
+        watch: called after every step; the time it takes does not count.
 
     Returns:
         A `Recovered` with as many Gaussians as the student, in its order.
@@ -134,15 +155,15 @@ def recover(
     if config.sh_degree is not None:
         student = student.with_sh_degree(config.sh_degree)
     anchors = anchors or Anchors.of(student)
-    before = _sample_error(student, targets, config)
-    multiplier = config.schedule.multiplier
-    if multiplier is None:
-        multiplier = multiplier_for(10 ** (-before / 20))
+    probe = Probe(targets, config.background)
+    before = probe.all_of(student)
     often = checked_weights(weights, len(targets.cameras))
-    loop = _Loop(student, targets, config, often, anchors, multiplier)
-    loop.run(checkpoint, progress, stage)
+    loop = _Loop(student, targets, config, often, anchors, probe)
+    if checkpoint is None or not checkpoint.exists():
+        loop.choose_multiplier(before)
+    loop.run(checkpoint, progress, stage, watch)
     result = loop.engine.splats()
-    after = _sample_error(result, targets, config)
+    after = probe.all_of(result)
     return Recovered(
         result,
         {
@@ -150,9 +171,12 @@ def recover(
             "seconds": loop.seconds,
             "loss": loop.curve(),
             "psnr": {"before": before, "after": after},
-            "multiplier": multiplier,
+            "multiplier": loop.multiplier,
+            "trials": loop.trials,
             "drift95": drift95(anchors, result.means),
             "needle": needle(result.scales),
+            "geometry": loop.geometry,
+            "regularizers": loop.regularizers,
             "skipped": {"non_finite": loop.engine.skipped},
         },
     )
@@ -168,27 +192,82 @@ class _Loop:
         config: RecoverConfig,
         weights: NDArray[np.float64] | None,
         anchors: Anchors,
-        multiplier: float,
+        probe: Probe,
     ) -> None:
         self.targets = targets
         self.config = config
         self.weights = weights
-        self.multiplier = multiplier
-        self.engine: Engine = _engine_class(config.engine)(
+        self.anchors = anchors
+        self.multiplier = 1.0
+        self.trials: list[dict[str, float]] = []
+        self.student = student
+        self.probe = probe
+        self.done = 0
+        self.seconds = 0.0
+        self.losses: list[float] = []
+        self.geometry: list[dict[str, float]] = []
+        self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised? → steps, seconds
+        self.key = _fingerprint(student, targets, config, weights)
+
+    @cached_property
+    def engine(self) -> Engine:
+        """Made when first needed: trials need theirs before, and two at once would double the memory."""
+        return self._new_engine()
+
+    def _new_engine(self) -> Engine:
+        config, student = self.config, self.student
+        engine: Engine = _engine_class(config.engine)(
             student,
-            targets.cameras.recentred(student.offset),
-            anchors=anchors,
-            regularizers=config.regularizers,
+            self.targets.cameras.recentred(student.offset),
+            anchors=self.anchors,
+            regularizers=config.regularizers.applied,
             means_in_scales=config.schedule.means_in_scales,
             ssim_weight=config.ssim_weight,
             background=config.background,
         )
-        self.done = 0
-        self.seconds = 0.0
-        self.losses: list[float] = []
-        self.key = _fingerprint(student, targets, config, weights)
+        return engine
 
-    def run(self, checkpoint: Path | None, progress: Progress, stage: str) -> None:
+    def choose_multiplier(self, start: float) -> None:
+        """The schedule's, or the one that short trials from the start like best; their time counts.
+
+        Args:
+            start: PSNR before recovery: where the search begins, and all there is for short horizons.
+        """
+        if self.config.schedule.multiplier is not None:
+            self.multiplier = self.config.schedule.multiplier
+            return
+        guess = multiplier_for(10 ** (-start / 20))
+        limit = self.config.time_limit
+        steps = trial_steps(self.config.horizon) if limit is None else _TRIAL_STEPS
+        self.multiplier = guess
+        if not steps:
+            return
+        began = time.monotonic()
+
+        def score(multiplier: float) -> float:
+            engine = self._new_engine()
+            for step in range(steps):
+                if limit is not None and time.monotonic() - began > _TRIAL_SHARE * limit:
+                    raise TimeoutError
+                self._learn(engine, step, step / steps, multiplier)
+            return self.probe.all_of(engine.splats())
+
+        try:
+            self.multiplier, seen = climb(score, guess)
+            self.trials = [{"multiplier": m, "psnr": value} for m, value in seen.items()]
+        except TimeoutError:
+            pass  # the guess stands
+        self.seconds = time.monotonic() - began
+
+    def _learn(
+        self, engine: Engine, step: int, share: float, multiplier: float, *, regularize: bool = False
+    ) -> float:
+        rates = self.config.schedule.at(share, final=self.config.final, multiplier=multiplier)
+        view = self._view(step)
+        target, mask = self.targets[view], mask_of(self.targets, view)
+        return engine.step(view, target, rates, regularize=regularize, mask=mask)
+
+    def run(self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None) -> None:
         if checkpoint is not None and checkpoint.exists():
             self._resume(checkpoint)
         earlier, began, saved = self.seconds, time.monotonic(), time.monotonic()
@@ -197,7 +276,13 @@ class _Loop:
                 self._step()
                 now = time.monotonic()
                 self.seconds = earlier + now - began
-                self._tell(progress, stage)
+                self._log()
+                if progress is not silent:
+                    self._tell(progress, stage)
+                if watch is not None:
+                    paused = time.monotonic()
+                    watch(self.done, self.seconds, self.engine.splats)
+                    began += time.monotonic() - paused
                 if checkpoint is not None and (interrupted.is_set() or now - saved > checkpoints.PERIOD):
                     self._save(checkpoint)
                     saved = now
@@ -212,11 +297,28 @@ class _Loop:
 
     def _step(self) -> None:
         config, step = self.config, self.done
-        rates = config.schedule.at(self._share(), final=config.final, multiplier=self.multiplier)
-        view = self._view(step)
         regularize = config.regularizers.active and (step + 1) % config.regularizers.period == 0
-        self.losses.append(self.engine.step(view, self.targets[view], rates, regularize=regularize))
+        began = time.monotonic()
+        loss = self._learn(self.engine, step, self._share(), self.multiplier, regularize=regularize)
+        self.losses.append(loss)
+        tally = self._seconds_of[regularize]
+        tally[0] += 1
+        tally[1] += time.monotonic() - began
         self.done += 1
+
+    def _log(self) -> None:
+        """Drift95 and Needle at every tenth of the horizon."""
+        if len(self.geometry) < int(min(1.0, self._share()) * _LOG_POINTS):
+            scene = self.engine.splats()
+            figures = {"drift95": drift95(self.anchors, scene.means), "needle": needle(scene.scales)}
+            self.geometry.append({"step": self.done, **figures})
+
+    @property
+    def regularizers(self) -> dict[str, float]:
+        """How many steps were regularised, and which share of the time that cost above plain steps."""
+        (plain, plain_s), (held, held_s) = self._seconds_of[False], self._seconds_of[True]
+        extra = held_s - held * plain_s / plain if plain and held else 0.0
+        return {"steps": held, "share": max(0.0, extra) / max(plain_s + held_s, 1e-9)}
 
     def _tell(self, progress: Progress, stage: str) -> None:
         speed = self.done / max(self.seconds, 1e-9)
@@ -224,7 +326,9 @@ class _Loop:
         total = self.config.horizon
         if self.config.time_limit is not None:
             total = max(self.done, round(self.done / max(self._share(), 1e-9)))
-        progress(stage, self.done, total, {"loss": f"{recent:.4f}", "steps/s": f"{speed:.1f}"})
+        shown = self.probe.now(self.engine.splats, self.seconds)
+        figures = {"loss": f"{recent:.4f}", "PSNR": f"{shown:.2f}", "steps/s": f"{speed:.1f}"}
+        progress(stage, self.done, total, figures)
 
     def curve(self) -> list[float]:
         """Up to 100 means of the loss over equal stretches of the horizon."""
@@ -237,7 +341,13 @@ class _Loop:
         return int(drawn(self.config.seed, epoch, count, self.weights)[position])
 
     def _save(self, path: Path) -> None:
-        meta = {"done": self.done, "seconds": self.seconds, "multiplier": self.multiplier}
+        meta = {
+            "done": self.done,
+            "seconds": self.seconds,
+            "multiplier": self.multiplier,
+            "trials": self.trials,
+            "geometry": self.geometry,
+        }
         checkpoints.save(path, self.key, meta, {**self.engine.state(), "losses": np.array(self.losses)})
 
     def _resume(self, path: Path) -> None:
@@ -246,6 +356,7 @@ class _Loop:
         self.engine.load(arrays)
         self.done, self.seconds = int(meta["done"]), float(meta["seconds"])
         self.multiplier = float(meta["multiplier"])
+        self.trials, self.geometry = list(meta["trials"]), list(meta["geometry"])
 
 
 def _engine_class(name: str) -> Any:
@@ -257,20 +368,11 @@ def _engine_class(name: str) -> Any:
         from g2ard.recover.torch_engine import TorchEngine
 
         return TorchEngine
-    raise InputError(f"engine: expected fused or torch, got {name!r}")
+    if name == "gsplat":
+        from g2ard.recover.gsplat_engine import GsplatEngine
 
-
-def _sample_error(splats: Splats, targets: Targets, config: RecoverConfig) -> float:
-    """Mean PSNR over a few evenly spaced training views."""
-    from g2ard.render import render
-
-    count = len(targets.cameras)
-    sample = np.unique(np.linspace(0, count - 1, min(count, _PROBE_VIEWS)).round().astype(int))
-    scores = []
-    for view in sample:
-        image = render(splats, targets.cameras, int(view), background=config.background).image
-        scores.append(psnr(np.clip(image, 0, 1), targets[int(view)]))
-    return float(np.mean(scores))
+        return GsplatEngine
+    raise InputError(f"engine: expected fused, torch or gsplat, got {name!r}")
 
 
 def _fingerprint(

@@ -22,6 +22,12 @@ class TorchAnchors:
         self.r_parallel = torch.from_numpy(anchors.r_parallel)
         self.r_perp = torch.from_numpy(anchors.r_perp)
 
+    def to(self, device: torch.device) -> TorchAnchors:
+        """Itself, moved."""
+        for name, value in vars(self).items():
+            setattr(self, name, value.to(device))
+        return self
+
 
 def anchor_loss(means: Tensor, anchors: TorchAnchors) -> Tensor:
     """(1/N) Σ log(1 + [D² − 1]₊): nothing inside the trust region, robust outside it."""

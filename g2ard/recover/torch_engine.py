@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from g2ard.cameras import Cameras
 from g2ard.recover.anchors import Anchors, Regularizers
@@ -26,7 +27,10 @@ class TorchEngine:
 
     With `means_in_scales` the means are optimised as multiples of each Gaussian's largest initial scale: Adam
     is indifferent to the scale of a gradient, so a rate of 0.05 moves a Gaussian by 5 % of its own size.
+    Rendering, loss and device are what subclasses change.
     """
+
+    device = torch.device("cpu")
 
     def __init__(
         self,
@@ -41,15 +45,15 @@ class TorchEngine:
     ) -> None:
         self._template = splats
         self._cameras = cameras
-        self._anchors = TorchAnchors(anchors)
+        self._anchors = TorchAnchors(anchors).to(self.device)
         self._regularizers = regularizers
         self._ssim_weight = ssim_weight
         self._background = background
-        self._base = torch.from_numpy(splats.means.astype(np.float32))
+        self._base = torch.from_numpy(splats.means.astype(np.float32)).to(self.device)
         unit = (
             splats.scales.max(1, keepdims=True) if means_in_scales else np.ones((len(splats), 1), np.float32)
         )
-        self._unit = torch.from_numpy(np.ascontiguousarray(unit))
+        self._unit = torch.from_numpy(np.ascontiguousarray(unit)).to(self.device)
         start = {
             "means": np.zeros((len(splats), 3), np.float32),
             "log_scales": splats.log_scales,
@@ -58,26 +62,30 @@ class TorchEngine:
             "sh0": splats.sh0,
             "shN": splats.shN,
         }
-        self._parameters = {name: torch.from_numpy(start[name].copy()).requires_grad_() for name in _NAMES}
+        self._parameters = {
+            name: torch.from_numpy(start[name].copy()).to(self.device).requires_grad_() for name in _NAMES
+        }
         groups = [{"params": [p], "lr": 0.0} for p in self._parameters.values() if p.numel()]
         self._adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, fused=True)
 
-    def step(self, view: int, target: NDArray[np.float32], rates: Rates, *, regularize: bool) -> float:
+    def step(
+        self,
+        view: int,
+        target: NDArray[np.float32],
+        rates: Rates,
+        *,
+        regularize: bool,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> float:
         """One optimiser step on one view; returns its photometric loss."""
         p = self._parameters
         means = self._base + self._unit * p["means"]
-        image, _, _ = rasterize(
-            means,
-            p["quats"],
-            p["log_scales"],
-            p["logit_opacities"],
-            p["sh0"],
-            p["shN"],
-            self._cameras,
-            view,
-            background=self._background,
-        )
-        loss = l1_ssim(image, torch.from_numpy(target), self._ssim_weight)
+        image = self._render(means, view)
+        wanted, share = torch.from_numpy(target).to(self.device), 1.0
+        if mask is not None:  # nothing differs where nothing counts
+            image = torch.where(torch.from_numpy(mask).to(self.device)[..., None], image, wanted)
+            share = mask.size / max(1, int(mask.sum()))
+        loss = share * self._loss(image, wanted)
         total = loss
         if regularize and self._regularizers.active:
             total = loss + regularization(
@@ -91,11 +99,30 @@ class TorchEngine:
         self._adam.step()
         return float(loss.detach())
 
+    def _render(self, means: Tensor, view: int) -> Tensor:
+        """(H, W, 3) of one view, differentiable."""
+        p = self._parameters
+        image, _, _ = rasterize(
+            means,
+            p["quats"],
+            p["log_scales"],
+            p["logit_opacities"],
+            p["sh0"],
+            p["shN"],
+            self._cameras,
+            view,
+            background=self._background,
+        )
+        return image
+
+    def _loss(self, image: Tensor, target: Tensor) -> Tensor:
+        return l1_ssim(image, target, self._ssim_weight)
+
     def splats(self) -> Splats:
         """The scene as it stands, quaternions normalised."""
-        p = {name: value.detach() for name, value in self._parameters.items()}
+        p = {name: value.detach().cpu() for name, value in self._parameters.items()}
         return Splats(
-            means=(self._base + self._unit * p["means"]).numpy().copy(),
+            means=(self._base.cpu() + self._unit.cpu() * p["means"]).numpy().copy(),
             quats=torch.nn.functional.normalize(p["quats"], dim=1).numpy().copy(),
             scales=p["log_scales"].double().exp().float().numpy(),
             logit_opacities=p["logit_opacities"].numpy().copy(),
@@ -106,10 +133,10 @@ class TorchEngine:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Everything a bitwise resume needs."""
-        arrays = {f"p.{name}": value.detach().numpy() for name, value in self._parameters.items()}
-        arrays["base"], arrays["unit"] = self._base.numpy(), self._unit.numpy()
+        arrays = {f"p.{name}": value.detach().cpu().numpy() for name, value in self._parameters.items()}
+        arrays["base"], arrays["unit"] = self._base.cpu().numpy(), self._unit.cpu().numpy()
         for i, entry in self._adam.state_dict()["state"].items():
-            arrays.update({f"adam.{i}.{key}": value.numpy() for key, value in entry.items()})
+            arrays.update({f"adam.{i}.{key}": value.cpu().numpy() for key, value in entry.items()})
         return arrays
 
     def load(self, state: dict[str, NDArray[Any]]) -> None:
@@ -117,7 +144,8 @@ class TorchEngine:
         with torch.no_grad():
             for name, parameter in self._parameters.items():
                 parameter.copy_(torch.from_numpy(state[f"p.{name}"]))
-        self._base, self._unit = torch.from_numpy(state["base"]), torch.from_numpy(state["unit"])
+        self._base = torch.from_numpy(state["base"]).to(self.device)
+        self._unit = torch.from_numpy(state["unit"]).to(self.device)
         adam = self._adam.state_dict()
         for key, value in state.items():
             if key.startswith("adam."):

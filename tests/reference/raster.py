@@ -28,6 +28,8 @@ class Oracle:
     """(N, P) transmittance in front, where hit, else 0."""
     doubtful: Tensor
     """(P,) pixels where rounding may decide a skip, a clip, a stop or the order."""
+    decisions: dict[str, Tensor]
+    """Everything discrete: between two points where all of it is equal, the outputs are smooth."""
 
 
 def sh_basis(d: Tensor, count: int) -> Tensor:
@@ -69,8 +71,12 @@ def render(
     antialiased: bool = False,
     inria: bool = False,
     alpha_max: float = 0.99,
+    clip_margin: float = 1e-4,
 ) -> Oracle:
-    """All arguments float64. Returns flat pixels (P = H·W) in `Oracle.weight`, images otherwise."""
+    """All arguments float64. Returns flat pixels (P = H·W) in `Oracle.weight`, images otherwise.
+
+    `clip_margin`: how near, relatively, to `alpha_max` an α makes its pixel doubtful.
+    """
     W, t = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     camera = means @ W.T + t
@@ -84,6 +90,7 @@ def render(
     tan_x, tan_y = 0.5 * width / fx, 0.5 * height / fy
     tx = (x / z).clamp(-cx / fx - 0.3 * tan_x, (width - cx) / fx + 0.3 * tan_x)
     ty = (y / z).clamp(-cy / fy - 0.3 * tan_y, (height - cy) / fy + 0.3 * tan_y)
+    clamped = [tx != x / z, ty != y / z]
     zero = torch.zeros_like(x)
     J = torch.stack([fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z], -1).reshape(-1, 2, 3)
     M = J @ W @ rotations(quats[rows]) * log_scales[rows].exp()[:, None]
@@ -96,6 +103,7 @@ def render(
     opacity = torch.sigmoid(logit_opacities[rows])
     if antialiased:
         ratio = det0 / det
+        clamped.append(ratio < 2.5e-5 if inria else torch.zeros_like(clamped[0]))
         opacity = opacity * (ratio.clamp(min=2.5e-5) if inria else ratio).sqrt()
 
     py, px = torch.meshgrid(
@@ -106,8 +114,10 @@ def render(
     raw = opacity[:, None] * torch.exp(-0.5 * q)
     alpha = raw.clamp(max=alpha_max)
     hit = alpha >= ALPHA_MIN
+    decisions = {"order": rows, "skip": hit}
     if inria:
-        hit = hit & inria_tiles(u, v, A, C, det, width, height)
+        decisions["tile"] = inria_tiles(u, v, A, C, det, width, height)
+        hit = hit & decisions["tile"]
     alpha = torch.where(hit, alpha, torch.zeros_like(alpha))
     after = torch.cumprod(1 - alpha, 0)
     going = after.detach() > STOP
@@ -122,13 +132,16 @@ def render(
     direction = means[rows] - position
     direction = direction / direction.norm(dim=-1, keepdim=True).clamp(min=1e-15)
     sh = torch.cat([sh0.reshape(-1, 1, 3), shN], 1)[rows]
-    rgb = (0.5 + (sh_basis(direction, sh.shape[1])[..., None] * sh).sum(1)).clamp(min=0)
+    rgb = 0.5 + (sh_basis(direction, sh.shape[1])[..., None] * sh).sum(1)
+    decisions |= {"stop": going, "clip": hit & going & (raw > alpha_max), "dark": rgb < 0}
+    decisions["clamp"] = torch.stack(clamped)
+    rgb = rgb.clamp(min=0)
     bg = torch.tensor(background, dtype=means.dtype)
     image = weight.T @ rgb + left[:, None] * bg
     crossing = (weight > 0) & (before >= 0.5) & (after < 0.5)
     median = torch.where(crossing, z[:, None], torch.zeros_like(weight)).sum(0)
 
-    near_edge = ((raw / ALPHA_MIN - 1).abs() < 1e-4) | ((raw / alpha_max - 1).abs() < 1e-4)
+    near_edge = ((raw / ALPHA_MIN - 1).abs() < 1e-4) | ((raw / alpha_max - 1).abs() < clip_margin)
     near_stop = (
         (torch.cumprod(1 - torch.where(hit, raw.clamp(max=alpha_max), 0 * raw), 0) / STOP) - 1
     ).abs() < 1e-3
@@ -145,6 +158,7 @@ def render(
         weight=full,
         before=full_before,
         doubtful=(near_edge | near_stop).any(0).reshape(height, width),
+        decisions=decisions,
     )
 
 

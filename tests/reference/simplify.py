@@ -75,8 +75,9 @@ def rendered_area(cov, e2):
     return np.sqrt(a * b + b * c + a * c)
 
 
-def merge_as_rendered(splats, rows, e2):
-    """(mean, covariance, α, sh (K, 3)) with mass α·A as rendered conserved."""
+def merge_as_rendered(splats, rows, e2, growth):
+    """(mean, covariance, α, sh (K, 3)) with mass α·A as rendered conserved; past α = 0.99 the two longer
+    axes take it, up to `growth` times the area."""
     alphas = np.minimum(0.99, 1 / (1 + np.exp(-splats.logit_opacities[rows].astype(np.float64))))
     covs = [covariance(splats, i) for i in rows]
     m = alphas * [rendered_area(cov, e2) for cov in covs]
@@ -85,4 +86,7 @@ def merge_as_rendered(splats, rows, e2):
     mean = w @ x
     cov = sum(w[k] * (covs[k] + np.outer(x[k] - mean, x[k] - mean)) for k in range(len(rows)))
     sh = np.concatenate([splats.sh0[rows], splats.shN[rows]], 1).astype(np.float64)
-    return mean, cov, min(0.99, m.sum() / rendered_area(cov, e2)), np.einsum("i,ikc->kc", w, sh)
+    alpha = m.sum() / rendered_area(cov, e2)
+    values, axes = np.linalg.eigh(cov)
+    grown = values * [1, *2 * [np.clip(alpha / 0.99, 1, growth)]]
+    return mean, (axes * grown) @ axes.T, min(0.99, alpha), np.einsum("i,ikc->kc", w, sh)

@@ -27,7 +27,7 @@ from g2ard.cli.options import (
     one_horizon,
     views_count,
 )
-from g2ard.cli.scenes import load_scene, load_view_sets, make_targets
+from g2ard.cli.scenes import load_scene, load_view_sets, make_targets, recovery_engine
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
@@ -42,7 +42,7 @@ _POOL = 128
 """Poses of a pool made for a scene without views; every 8th is held out for scoring."""
 
 
-@command("distill", example="g2ard distill scene.ply -r 10 -o run/")
+@command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True)
 def distill(
     run: Run,
     scene: Annotated[
@@ -111,6 +111,7 @@ def distill(
     from g2ard.recover.schedule import schedule_named
 
     began = time.monotonic()
+    engine = recovery_engine(run)
     lifted = kind(scene) != "splats"
     if lifted and views is None:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
@@ -124,12 +125,12 @@ def distill(
     use_photos = lifted or (pictured if photos is None else photos)
     teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
     colour = background or (0.0, 0.0, 0.0)
-    regularizers, why = preset_for(preset, prior)
+    regularizers, why, measured = preset_for(preset, prior, train)
     run.say(f"{len(prior):,} → {budget:,} Gaussians; {len(train)} views against {against}")
     run.say(f"regularisers: {why}")
     config = DistillConfig(
         method=method,
-        schedule=schedule_named(schedule),
+        schedule=schedule_named(schedule, steps),
         steps=steps,
         time_limit=time_limit,
         regularizers=regularizers,
@@ -140,6 +141,7 @@ def distill(
         weighted=weighted,
         reselect=reselect,
         seed=run.seed,
+        engine=engine,
     )
     targets = make_targets(run, train, teacher, colour, lazy=k is not None)
     unseen = make_targets(run, test, teacher, colour)
@@ -158,7 +160,7 @@ def distill(
             run.say(f"stopped; the same command with --resume goes on in {output}")
             raise
         report = _score(run, prior, result, unseen, colour)
-        report |= {"against": against, "preset": why}
+        report |= {"against": against, "preset": why, "prior": measured.as_dict()}
         report |= {key: result.report[key] for key in ("rounds", "views")}
         report["seconds"] = {**result.report["seconds"], "total": time.monotonic() - began}
         _write(run, output, result, unseen, colour, report)

@@ -21,7 +21,11 @@ from g2ard.cli.options import (
 )
 
 
-@command("recover", example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply")
+@command(
+    "recover",
+    example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply",
+    cuda=True,
+)
 def recover(
     run: Run,
     student: Annotated[Path, typer.Argument(metavar="STUDENT", help="The compact scene to recover.")],
@@ -47,7 +51,7 @@ def recover(
     background: BackgroundOption = None,
 ) -> None:
     """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
-    from g2ard.cli.scenes import load_scene, load_view_sets, make_targets
+    from g2ard.cli.scenes import load_scene, load_view_sets, make_targets, recovery_engine
     from g2ard.io import write_splats
     from g2ard.io.atomic import check_output
     from g2ard.recover import RecoverConfig
@@ -57,6 +61,7 @@ def recover(
 
     one_horizon(steps, time_limit)
     check_output(output, run.overwrite)
+    engine = recovery_engine(run)
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(run, student)
     dense = load_scene(run, teacher) if teacher else None
@@ -64,7 +69,7 @@ def recover(
     weights = chosen.weights if weighted else None
     if weights is not None:
         run.say(f"{len(weights)} views, drawn by their weights")
-    regularizers, why = preset_for(preset, splats)
+    regularizers, why, measured = preset_for(preset, dense or splats, chosen.cameras)
     run.say(f"regularisers: {why}")
     config = RecoverConfig(
         schedule=schedule_named(schedule),
@@ -74,6 +79,7 @@ def recover(
         sh_degree=sh_degree,
         background=colour,
         seed=run.seed,
+        engine=engine,
     )
     checkpoint = output.with_name(f".{output.name}.checkpoint.npz")
     if not resume:
@@ -96,4 +102,5 @@ def recover(
     run.say(
         f"{output}: {len(splats):,} Gaussians, training views {gain['before']:.2f} → {gain['after']:.2f} dB"
     )
-    run.result({**result.report, "preset": why, "output": str(output)})
+    report = {**result.report, "preset": why, "prior": measured.as_dict()}
+    run.result({**report, "output": str(output)})

@@ -120,7 +120,7 @@ fn simplify_paper<'py>(
 #[pyfunction]
 #[pyo3(signature = (
     scene, schedule, *, protected, weight, pixel_size, min_opacity, ladder, ladder_steps, neighbors, geometric, dilation,
-    pixel_scale, progress=None
+    pixel_scale, growth, progress=None
 ))]
 fn simplify_pairwise<'py>(
     py: Python<'py>,
@@ -136,6 +136,7 @@ fn simplify_pairwise<'py>(
     geometric: f64,
     dilation: f64,
     pixel_scale: f64,
+    growth: f64,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let scene = scene.borrow()?;
@@ -162,6 +163,7 @@ fn simplify_pairwise<'py>(
         geometric,
         dilation,
         pixel_scale,
+        growth,
     };
     let outcome = long(py, progress, |control| {
         policy.run(&scene, seen, protected, &schedule, control)

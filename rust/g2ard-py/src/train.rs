@@ -3,7 +3,8 @@
 use g2ard_core::raster::Isa;
 use g2ard_core::train::{Exported, Lesson, Rates, Regularizers, Trainer};
 use numpy::{
-    IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray3,
+    IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
+    PyReadonlyArray3,
 };
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -54,8 +55,9 @@ impl PyTrainer {
     }
 
     /// One step: (photometric loss before it, Gaussians moved). `rates`: means, quats, log_scales, logit_opacities,
-    /// sh0, shN. `regularizers`: (λ_anchor, λ_shape, effective rank too) or None.
-    #[pyo3(signature = (view, choices, background, target, ssim_weight, rates, regularizers = None))]
+    /// sh0, shN. `regularizers`: (λ_anchor, λ_shape, effective rank too) or None. `mask`: where the loss counts.
+    #[pyo3(signature = (view, choices, background, target, ssim_weight, rates, regularizers = None, mask = None))]
+    #[allow(clippy::too_many_arguments)] // all of them by name from one place in Python
     fn step(
         &mut self,
         py: Python<'_>,
@@ -66,6 +68,7 @@ impl PyTrainer {
         ssim_weight: f32,
         rates: [f32; 6],
         regularizers: Option<(f32, f32, bool)>,
+        mask: Option<PyReadonlyArray2<'_, bool>>,
     ) -> PyResult<(f64, usize)> {
         let [means, quats, log_scales, logit_opacities, sh0, sh_n] = rates;
         let lesson = Lesson {
@@ -73,6 +76,7 @@ impl PyTrainer {
             settings: &choices.settings()?,
             background,
             target: values(&target)?,
+            mask: mask.as_ref().map(covered).transpose()?,
             ssim_weight,
             rates: Rates {
                 means,
@@ -110,6 +114,7 @@ impl PyTrainer {
             settings: &choices.settings()?,
             background,
             target: values(&target)?,
+            mask: None,
             ssim_weight,
             rates: Rates::default(),
             regularizers: None,
@@ -181,6 +186,15 @@ impl PyTrainer {
         self.isa.name()
     }
 
+    /// Bytes held: "gaussians" by what grows with them, "images" by what grows with the image.
+    fn memory<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let memory = self.inner.memory();
+        let dict = PyDict::new(py);
+        dict.set_item("gaussians", memory.gaussians)?;
+        dict.set_item("images", memory.images)?;
+        Ok(dict)
+    }
+
     /// Seconds of the last step by pass; "gather" holds Adam.
     fn passes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let dict = crate::raster::passes(py, &self.inner.passes())?;
@@ -195,6 +209,11 @@ fn values<'a>(target: &'a PyReadonlyArray3<'_, f32>) -> PyResult<&'a [f32]> {
         .as_slice()
         .map_err(layout)
         .map_err(crate::error::to_py)
+}
+
+fn covered<'a>(mask: &'a PyReadonlyArray2<'_, bool>) -> PyResult<&'a [bool]> {
+    let layout = |_| g2ard_core::Error::invalid("mask", "a C-contiguous array", "another layout");
+    mask.as_slice().map_err(layout).map_err(crate::error::to_py)
 }
 
 fn vector<T: numpy::Element + Clone>(

@@ -35,12 +35,14 @@ impl Partition {
     /// One Gaussian per cluster, in the order of the clusters; a cluster of one is a copy of its member.
     ///
     /// Mass is α·A as rendered, A with the row's dilation `blur` (a variance), and is conserved: α of a
-    /// cluster is Σm / A. Returns also how many clusters reached α = 0.99 and lost mass.
+    /// cluster is Σm / A. Where that passes 0.99, the cluster grows instead along its two longer axes, to at
+    /// most `growth` times the area. Returns also how many clusters reached α = 0.99.
     pub fn assemble(
         &self,
         scene: &SceneRef,
         ordered: &Ordered,
         flags: &[bool],
+        growth: f64,
         blur: impl Fn(usize) -> f64 + Sync,
         control: &Control,
     ) -> Result<(Step, usize)> {
@@ -52,7 +54,7 @@ impl Partition {
                 let here = chunk * CHUNK..((chunk + 1) * CHUNK).min(self.count);
                 let members = |c: usize| &rows[starts[c] as usize..starts[c + 1] as usize];
                 Ok(here
-                    .map(|c| make(scene, ordered, members(c), &blur))
+                    .map(|c| make(scene, ordered, members(c), growth, &blur))
                     .collect())
             })
             .collect::<Result<_>>()?;
@@ -95,7 +97,13 @@ struct Made {
     clamped: bool,
 }
 
-fn make(scene: &SceneRef, ordered: &Ordered, members: &[u32], blur: impl Fn(usize) -> f64) -> Made {
+fn make(
+    scene: &SceneRef,
+    ordered: &Ordered,
+    members: &[u32],
+    growth: f64,
+    blur: impl Fn(usize) -> f64,
+) -> Made {
     if let [only] = members {
         let row = ordered.rows[*only as usize] as usize;
         return Made {
@@ -126,7 +134,8 @@ fn make(scene: &SceneRef, ordered: &Ordered, members: &[u32], blur: impl Fn(usiz
     let (mean, cov) = pool(&parts);
     let alpha = mass / rendered_area(&cov, least);
     let total: f64 = parts.iter().map(|p| p.0).sum();
-    let gaussian = Gaussian::from_moments(mean, &cov);
+    let mut gaussian = Gaussian::from_moments(mean, &cov);
+    gaussian.widen((alpha / MAX_OPACITY).clamp(1.0, growth));
     Made {
         mean: ordered.on_grid(mean),
         quat: gaussian.quat(),

@@ -91,6 +91,13 @@ impl Gaussian {
         order
     }
 
+    /// Makes the area `ratio` times as large along the two longer axes; the surface stays as thin.
+    pub fn widen(&mut self, ratio: f64) {
+        let [a, b, _] = self.axes_by_scale();
+        self.scales[a] *= ratio.sqrt();
+        self.scales[b] *= ratio.sqrt();
+    }
+
     pub fn axis(&self, k: usize) -> [f64; 3] {
         self.rotation.map(|row| row[k])
     }

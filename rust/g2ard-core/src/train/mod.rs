@@ -7,6 +7,7 @@
 
 mod adam;
 mod anchors;
+mod mask;
 mod store;
 
 pub use anchors::{Anchors, Regularizers};
@@ -14,13 +15,16 @@ pub use store::{Exported, Store};
 
 use std::time::Instant;
 
-use crate::raster::frame::ChunkSums;
+use crate::raster::frame::{ChunkSums, bytes};
 use crate::raster::gradients::Discard;
 use crate::raster::simd::dispatch;
-use crate::raster::{Camera, Image, ImageGradients, Isa, Params, Passes, Rasterizer, Settings};
+use crate::raster::{
+    Camera, Image, ImageGradients, Isa, Memory, Params, Passes, Rasterizer, Settings,
+};
 use crate::ssim::{Loss, Shape};
 use crate::{Error, Result};
 use adam::{Biases, Update};
+use mask::Mask;
 
 /// Adam's learning rate of each attribute.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -42,6 +46,8 @@ pub struct Lesson<'a> {
     pub background: [f32; 3],
     /// height × width × 3.
     pub target: &'a [f32],
+    /// height × width: where the loss counts; `None` means everywhere.
+    pub mask: Option<&'a [bool]>,
     /// λ of (1 − λ)·L1 + λ·(1 − SSIM).
     pub ssim_weight: f32,
     pub rates: Rates,
@@ -122,6 +128,16 @@ impl Trainer {
         self.rasterizer.passes()
     }
 
+    /// What the parameters, the moments and all buffers hold now; without anchors.
+    pub fn memory(&self) -> Memory {
+        let rasterizer = self.rasterizer.memory();
+        let planes = [&self.image, &self.alpha, &self.gradient].map(bytes);
+        Memory {
+            gaussians: rasterizer.gaussians + self.store.bytes(),
+            images: rasterizer.images + planes.iter().sum::<usize>() + self.loss.bytes(),
+        }
+    }
+
     /// Renders the view, compares, goes back and takes one Adam step.
     pub fn step(&mut self, lesson: &Lesson) -> Result<Report> {
         let (loss, seconds_loss) = self.compare(lesson)?;
@@ -189,10 +205,19 @@ impl Trainer {
             &mut image,
         );
         let clock = Instant::now();
+        let pixels = camera.width * camera.height;
+        let mask = lesson.mask.map(|m| Mask::new(m, pixels)).transpose()?;
+        if let Some(mask) = &mask {
+            mask.cover(&mut self.image, lesson.target);
+        }
         let (image, gradient) = (&self.image, &mut self.gradient);
-        let loss = self
-            .loss
-            .l1_ssim(image, lesson.target, shape, lesson.ssim_weight, gradient)?;
+        let mut loss =
+            self.loss
+                .l1_ssim(image, lesson.target, shape, lesson.ssim_weight, gradient)?;
+        if let Some(mask) = &mask {
+            mask.clear(&mut self.gradient);
+            loss *= f64::from(mask.share);
+        }
         Ok((loss, clock.elapsed().as_secs_f64()))
     }
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,104 +11,11 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
+from g2ard.simplify.config import METHODS, SimplifyConfig, schedule
+from g2ard.simplify.pairs import Seen, Visibility, merge, rows_of, splats_of
 from g2ard.splats import Splats
 
 __all__ = ["METHODS", "Seen", "Simplified", "SimplifyConfig", "flag", "schedule", "simplify"]
-
-METHODS = ("default", "fast", "paper")
-"""The policies."""
-
-_RETENTION = {"default": 0.65, "fast": 0.65, "paper": 0.75}
-_MIN_OPACITY = {"default": 0.004, "fast": 0.004, "paper": 0.01}
-_LADDER = {"default": (3.0, 1), "fast": (1.0, 3)}
-"""Down to how many times the budget rows merge along Morton order, and in how many steps."""
-
-_REFRESH = 0.3
-"""Visibility is looked at again when the count has fallen to this share of what it was."""
-
-_FOLD = 0.05
-"""A last cut smaller than this is folded into the round before."""
-
-
-class Seen(Protocol):
-    """What views say of N Gaussians, such as `g2ard.render.visibility` returns."""
-
-    @property
-    def weight(self) -> NDArray[Any]:
-        """(N,) Σ αT over the pixels of the views."""
-
-    @property
-    def pixel_size(self) -> NDArray[Any]:
-        """(N,) the size of a pixel there, scene units; ∞ where no view looks."""
-
-
-Visibility = Seen | Callable[[Splats], Seen]
-
-
-@dataclass(frozen=True)
-class SimplifyConfig:
-    """The constants of simplification: `paper`'s are the paper's (`tab:s_config`), the others measured.
-
-    Args:
-        retention: share of the Gaussians that a round keeps; None means the method's own, 0.75 in the paper,
-            0.65 for the others (fewer rounds, as good).
-        min_opacity: below this α a Gaussian is dropped; None means the method's own, 0.01 in the paper, 0.004
-            (what no renderer draws) for the others.
-        neighbors: `default`: nearest clusters that one may merge with. More lets far ones in: 16 is worse.
-        geometric_weight: of `default` and `fast`: weight of the error of coverage beside that of colour.
-        dilation: of `default` and `fast`: standard deviation of the blur that renderers add, in pixels
-            (√0.3 would be all of it; 0.4 measured best).
-        pixel_scale: of `default` and `fast` without views: the size of a pixel over the median of the largest
-            scales.
-        color_bin: `paper`: edge of the colour bins within a cell, in colour units (0–1).
-        max_energy: `paper`: largest affine energy of a merged group, colour units squared.
-        min_coverage: `paper`: least share of the members' footprint that the merged footprint covers.
-        flag_threshold: ε_h, the affine residual of a cell above which its Gaussians are protected.
-        protection: `paper`: λ_h, what a protected Gaussian's priority π is raised by.
-    """
-
-    retention: float | None = None
-    min_opacity: float | None = None
-    neighbors: int = 6
-    geometric_weight: float = 0.03
-    dilation: float = 0.4
-    pixel_scale: float = 0.5
-    color_bin: float = 0.25
-    max_energy: float = 0.01
-    min_coverage: float = 0.6
-    flag_threshold: float = 0.01
-    protection: float = 10.0
-
-    def __post_init__(self) -> None:
-        if self.retention is not None and not 0 < self.retention < 1:
-            raise InputError(f"retention: expected a number between 0 and 1, got {self.retention}")
-        if self.neighbors < 1:
-            raise InputError(f"neighbors: expected at least 1, got {self.neighbors}")
-        for name in ("color_bin", "pixel_scale"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise InputError(f"{name}: expected a positive number, got {value}")
-        for name in (
-            "min_opacity",
-            "geometric_weight",
-            "dilation",
-            "max_energy",
-            "min_coverage",
-            "flag_threshold",
-            "protection",
-        ):
-            value = getattr(self, name)
-            if value is not None and not value >= 0:
-                raise InputError(f"{name}: expected a number ≥ 0, got {value}")
-
-    def retention_of(self, method: str) -> float:
-        """The share a round of `method` keeps."""
-        return _RETENTION[method] if self.retention is None else self.retention
-
-    def min_opacity_of(self, method: str) -> float:
-        """The α below which `method` drops."""
-        return _MIN_OPACITY[method] if self.min_opacity is None else self.min_opacity
-
 
 _DEFAULTS = SimplifyConfig()
 
@@ -132,23 +37,6 @@ class Simplified:
     parents: NDArray[np.int64]
     protected: NDArray[np.bool_]
     report: dict[str, Any] = field(default_factory=dict)
-
-
-def schedule(count: int, budget: int, retention: float = 0.75) -> list[int]:
-    """Counts after each round: N_r = max(N_S, ⌈retention·N_{r−1}⌉), a last cut under 5 % folded in.
-
-    >>> schedule(500_000, 50_000)
-    [375000, 281250, 210938, 158204, 118653, 88990, 66743, 50000]
-    >>> schedule(10, 10)
-    []
-    """
-    rounds: list[int] = []
-    while count > budget:
-        count = max(budget, min(count - 1, math.ceil(retention * count)))
-        if budget > (1 - _FOLD) * count:
-            count = budget
-        rounds.append(count)
-    return rounds
 
 
 def flag(
@@ -251,8 +139,8 @@ def simplify(
         out = _paper(scene, budget, flags, flag_budget or budget, config, progress)
     else:
         if visibility is not None and not callable(visibility):
-            visibility = _rows_of(visibility, len(splats), finite)
-        out = _pairwise(scene, budget, method, visibility, flags, config, progress)
+            visibility = rows_of(visibility, len(splats), finite)
+        out = merge(scene, budget, method, visibility, flags, config, progress)
     return _simplified(splats, finite, out)
 
 
@@ -277,65 +165,6 @@ def _paper(
         protection=config.protection,
         progress=counter(progress, "simplify"),
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _Views:
-    weight: NDArray[np.float32]
-    pixel_size: NDArray[np.float32]
-
-
-def _rows_of(seen: Seen, count: int, finite: NDArray[np.bool_] | slice) -> _Views:
-    for name in ("weight", "pixel_size"):
-        shape = getattr(seen, name).shape
-        if shape != (count,):
-            raise InputError(f"visibility.{name}: expected shape ({count},), got {shape}")
-    weight, pixel = (np.asarray(a, np.float32)[finite] for a in (seen.weight, seen.pixel_size))
-    return _Views(np.ascontiguousarray(weight), np.ascontiguousarray(pixel))
-
-
-def _pairwise(
-    scene: Splats,
-    budget: int,
-    method: str,
-    visibility: Visibility | None,
-    flags: NDArray[np.bool_] | None,
-    config: SimplifyConfig,
-    progress: Progress,
-) -> dict[str, Any]:
-    """One stage, or with a function of visibility as many as the refreshes it is worth."""
-    start, parents, rounds = len(scene), None, []
-    clamped = {"clamped_logits": 0, "clamped_opacities": 0}
-    while True:
-        staged = callable(visibility) and 2 * budget < _REFRESH * len(scene)  # else not worth it
-        target = math.ceil(_REFRESH * len(scene)) if staged else budget
-        seen = _rows_of(visibility(scene), len(scene), slice(None)) if callable(visibility) else visibility
-        out = _core.simplify_pairwise(
-            scene,
-            schedule(len(scene), target, config.retention_of(method)),
-            protected=flags,
-            weight=None if seen is None else seen.weight,
-            pixel_size=None if seen is None else seen.pixel_size,
-            min_opacity=config.min_opacity_of(method),
-            ladder=_LADDER[method][0],
-            ladder_steps=_LADDER[method][1],
-            neighbors=config.neighbors,
-            geometric=config.geometric_weight,
-            dilation=config.dilation,
-            pixel_scale=config.pixel_scale,
-            progress=_shifted(counter(progress, "simplify"), start - len(scene), start - budget),
-        )
-        rounds += out["rounds"]
-        clamped = {key: count + out[key] for key, count in clamped.items()}
-        parents = out["parents"] if parents is None else np.where(parents < 0, -1, out["parents"][parents])
-        if target == budget:
-            return {**out, **clamped, "parents": parents, "rounds": rounds}
-        scene = _splats_of(scene, out)
-        flags = None if flags is None else out["protected"]
-
-
-def _shifted(tell: Callable[[int, int], None], done: int, total: int) -> Callable[[int, int], None]:
-    return lambda here, _: tell(done + here, total)
 
 
 def _check_budget(budget: int, count: int | None) -> None:
@@ -375,23 +204,10 @@ def _clean(splats: Splats) -> tuple[Splats, NDArray[np.bool_] | slice]:
     return scene, slice(None) if everything else finite
 
 
-def _splats_of(like: Splats, out: dict[str, Any]) -> Splats:
-    sh: NDArray[np.float32] = out["sh"]
-    return Splats(
-        means=out["means"].astype(like.means.dtype, copy=False),
-        quats=out["quats"],
-        scales=out["scales"],
-        logit_opacities=out["logit_opacities"],
-        sh0=np.ascontiguousarray(sh[:, :1]),
-        shN=np.ascontiguousarray(sh[:, 1:]),
-        offset=like.offset,
-    )
-
-
 def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str, Any]) -> Simplified:
     parents = np.full(len(splats), -1, np.int64)
     parents[finite] = out["parents"]
-    small = _splats_of(splats, out)
+    small = splats_of(splats, out)
     protected: NDArray[np.bool_] = out["protected"]
     report = {
         "input_count": len(splats),

@@ -1,0 +1,495 @@
+"""Recovery under study: error on unseen views against seconds, schedules and regularisers side by side."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from g2ard import __version__, io
+from g2ard.bench import rows
+from g2ard.bench.simplify import machine, scene_label
+from g2ard.cameras import Cameras
+from g2ard.distill import DistillConfig, distill
+from g2ard.errors import InputError
+from g2ard.evaluate import evaluate
+from g2ard.lift import lift
+from g2ard.poses import make_pool
+from g2ard.progress import Progress, silent
+from g2ard.recover import RecoverConfig, recover
+from g2ard.recover.anchors import Anchors, Regularizers, drift95, needle
+from g2ard.recover.presets import preset_for
+from g2ard.recover.schedule import PAPER, TUNED, Schedule
+from g2ard.render import looker
+from g2ard.simplify import simplify
+from g2ard.splats import Splats
+from g2ard.splits import HOLD_OUT, split_mask
+from g2ard.targets import Photos, Targets, TeacherRenders
+
+__all__ = ["STUDIES", "Look", "RecoverBench", "Speedup", "bench_recover", "speedups"]
+
+_POOL = 128
+_FIRST_LOOK = 25
+"""Unseen views are looked at after this many steps of a recovery, then after twice as many, and so on."""
+
+_PAPER_FINAL = 3_000
+"""The paper's 30,000 and 8,000 steps, at a tenth."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """One look at the unseen views; a row of the CSV.
+
+    Args:
+        study: of `STUDIES`.
+        scene: its label.
+        ratio: prior over budget.
+        seed: of the order of views.
+        variant: what is compared within the study.
+        budget: Gaussians at the end.
+        count: Gaussians at this look; more than `budget` before the last round.
+        step: of the recovery in progress.
+        seconds: of recovery so far, over all rounds, looks left out.
+        cpu_s: the same in CPU seconds of all threads.
+        simplify_s: seconds of simplification; 0 until the end.
+        psnr: mean over unseen views, dB.
+        ssim: the same.
+        drift95: against the anchors of the last recovery; None before the end.
+        needle: share of needles.
+        reg_share: share of recovery's time that regularisers took; None before the end.
+        skipped: steps of single Gaussians left out as not finite; None before the end.
+        final: 1 for the result, 0 on the way.
+        version: of g2ard.
+        machine: processor and cores.
+    """
+
+    study: str
+    scene: str
+    ratio: float
+    seed: int
+    variant: str
+    budget: int
+    count: int
+    step: int
+    seconds: float
+    cpu_s: float
+    simplify_s: float
+    psnr: float
+    ssim: float
+    drift95: float | None
+    needle: float
+    reg_share: float | None
+    skipped: int | None
+    final: int
+    version: str
+    machine: str
+
+    @property
+    def key(self) -> tuple[str, str, float, int, str]:
+        """The run it belongs to."""
+        return self.study, self.scene, self.ratio, self.seed, self.variant
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What a variant does."""
+
+    schedule: Schedule
+    steps: int | None = None
+    time_limit: float | None = None
+    regularizers: Regularizers | None = None
+
+
+def _curves(steps: Sequence[int], seconds: float, preset: Regularizers) -> dict[str, _Plan]:
+    """The default over several horizons, the paper's schedule at a tenth, and that with a decay."""
+    paper = PAPER.scaled(_PAPER_FINAL)
+    plans = {f"default@{n}": _Plan(TUNED, steps=n) for n in steps}
+    plans["paper/10"] = _Plan(paper)
+    plans["paper/10-decay"] = _Plan(replace(paper, cosine_floor=TUNED.cosine_floor))
+    return plans
+
+
+def _regularizers(steps: Sequence[int], seconds: float, preset: Regularizers) -> dict[str, _Plan]:
+    parts = {
+        "full": preset,
+        "-anchor": replace(preset, anchor=0.0),
+        "-shape": replace(preset, shape=0.0),
+        "none": replace(preset, anchor=0.0, shape=0.0),
+    }
+    return {name: _Plan(TUNED, steps=steps[-1], regularizers=weights) for name, weights in parts.items()}
+
+
+def _rounds(steps: Sequence[int], seconds: float, preset: Regularizers) -> dict[str, _Plan]:
+    """Equal recovery seconds: one shot, or shared with rounds in the paper's proportion or a lighter one."""
+    shares = {"one-shot": 0.0, "rounds": PAPER.round_steps / PAPER.steps, "light-rounds": 0.05}
+    return {
+        name: _Plan(replace(TUNED, round_steps=round(share * TUNED.steps)), time_limit=seconds)
+        for name, share in shares.items()
+    }
+
+
+def _multiplier(steps: Sequence[int], seconds: float, preset: Regularizers) -> dict[str, _Plan]:
+    fixed = {"×0.33": 1 / 3, "×0.58": 3**-0.5, "×1": 1.0, "×1.73": 3**0.5}
+    plans = {name: _Plan(replace(TUNED, multiplier=m), steps=steps[-1]) for name, m in fixed.items()}
+    return {**plans, "chosen": _Plan(TUNED, steps=steps[-1])}
+
+
+def _endurance(steps: Sequence[int], seconds: float, preset: Regularizers) -> dict[str, _Plan]:
+    return {"default": _Plan(TUNED, steps=5000)}
+
+
+def _paper(steps: Sequence[int], seconds: float, preset: Regularizers) -> dict[str, _Plan]:
+    return {"paper": _Plan(PAPER), **{f"default@{n}": _Plan(TUNED, steps=n) for n in steps}}
+
+
+STUDIES: dict[str, Callable[[Sequence[int], float, Regularizers], dict[str, _Plan]]] = {
+    "curves": _curves,
+    "regularizers": _regularizers,
+    "rounds": _rounds,
+    "multiplier": _multiplier,
+    "endurance": _endurance,
+    "paper": _paper,
+}
+"""curves: against the paper's schedule at a tenth; paper: against all of it; rounds: at equal seconds;
+endurance: 5,000 steps, fails on a value that is not finite."""
+
+
+@dataclass(frozen=True)
+class RecoverBench:
+    """A scene with its views, as every study needs it.
+
+    Args:
+        scene: a trained scene, or a coloured cloud, which is lifted and needs photos.
+        views: to recover on and, without `held_out`, to score on; None makes a pool of 128 poses.
+        held_out: views to score on.
+        photos: whether the views' photos are the targets; None means if it is a cloud.
+        size: shrink views to this longer side.
+        background: RGB behind the scene.
+        pool_seed: of the pool.
+    """
+
+    scene: Path
+    views: Path | None = None
+    held_out: Path | None = None
+    photos: bool | None = None
+    size: int | None = None
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pool_seed: int = 0
+    _starts: dict[int, tuple[Splats, float]] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def label(self) -> str:
+        """Its name in the CSV; the size belongs to it, for decibels depend on it."""
+        name = f"{self.scene.absolute().parent.name}/{self.scene.stem}"
+        if not self.lifted or self.scene.is_dir():
+            name = scene_label(self.scene)
+        return name + (f" {self.size}px" if self.size else "")
+
+    @cached_property
+    def lifted(self) -> bool:
+        """Whether the prior is a lifted cloud."""
+        return io.kind(self.scene) != "splats"
+
+    @cached_property
+    def prior(self) -> Splats:
+        """The dense scene."""
+        if not self.lifted:
+            return io.read_splats(self.scene)
+        cloud = io.read_cloud(self.scene).points
+        return lift(cloud.positions, cloud.colors)
+
+    @cached_property
+    def cameras(self) -> tuple[Cameras, Cameras]:
+        """Views to recover on, and unseen ones."""
+        if self.views is None:
+            pool = make_pool(self.prior, _POOL, seed=self.pool_seed).resized(self.size)
+            unseen = np.arange(len(pool)) % HOLD_OUT == 0
+            return pool.take(~unseen), pool.take(unseen)
+        found = io.read_view_set(self.views)
+        if self.held_out is not None:
+            return found.cameras.resized(self.size), io.read_view_set(self.held_out).cameras.resized(
+                self.size
+            )
+        masks = (
+            split_mask(self.views, found.cameras.names, split, stated=found.splits)
+            for split in ("train", "test")
+        )
+        train, test = (found.cameras.take(mask).resized(self.size) for mask in masks)
+        return train, test
+
+    @cached_property
+    def targets(self) -> tuple[Targets, Targets]:
+        """What both kinds of views show."""
+        train, test = self.cameras
+        if self.lifted if self.photos is None else self.photos:
+            return Photos(train), Photos(test)
+        teach = partial(TeacherRenders, self.prior, background=self.background)
+        return teach(train), teach(test)
+
+    @property
+    def sh_degree(self) -> int | None:
+        """Of the results: 3 from a cloud, else the scene's own."""
+        return 3 if self.lifted else None
+
+    def start(self, budget: int, progress: Progress) -> tuple[Splats, float]:
+        """What all one-shot runs of a budget start from, and the seconds it took to make."""
+        if budget not in self._starts:
+            began = time.monotonic()
+            look = looker(self.cameras[0], progress=progress)
+            small = simplify(self.prior, budget, visibility=look, progress=progress).splats
+            if self.sh_degree is not None:
+                small = small.with_sh_degree(self.sh_degree)
+            self._starts[budget] = small, time.monotonic() - began
+        return self._starts[budget]
+
+
+def bench_recover(
+    bench: RecoverBench,
+    study: str,
+    csv_path: Path,
+    *,
+    ratios: Sequence[float] = (10,),
+    seeds: Sequence[int] = (0,),
+    steps: Sequence[int] = (100, 300, 1000),
+    seconds: float = 30.0,
+    variants: Sequence[str] | None = None,
+    progress: Progress = silent,
+) -> list[Look]:
+    """Run every ratio × variant × seed of a study that `csv_path` does not hold whole; rows are appended.
+
+    Every run starts from the same `g2ard simplify` of the prior, looking through the training views, and is
+    scored on unseen views along the way; the looks do not count as time.
+
+    Args:
+        bench: the scene.
+        study: of `STUDIES`.
+        csv_path: where the rows go. Whole runs are kept; rows of runs that were stopped are dropped.
+        ratios: the budget is round(N / ratio).
+        seeds: of the order of views.
+        steps: horizons of the default schedule in `curves` and `paper`; other studies use the last.
+        seconds: of recovery, in `rounds`.
+        variants: of the study's; None runs all.
+        progress: told after each run, and by the runs.
+
+    Returns:
+        The rows of these ratios, seeds and variants.
+
+    Raises:
+        InputError: an unknown study or variant, a scene or views that cannot be read, or a result with a
+            value that is not finite.
+    """
+    if study not in STUDIES:
+        raise InputError(f"study: expected one of {', '.join(STUDIES)}, got {study!r}")
+    kept = _whole(rows.read(csv_path, Look))
+    rows.rewrite(csv_path, kept, Look)
+    preset = preset_for("auto", bench.prior, bench.cameras[0])[0]
+    plans = STUDIES[study](steps, seconds, preset)
+    unknown = [v for v in variants or () if v not in plans]
+    if unknown:
+        raise InputError(f"variants: expected some of {', '.join(plans)}, got {', '.join(unknown)}")
+    wanted = [
+        (study, bench.label, float(ratio), seed, variant)
+        for ratio in ratios
+        for variant in variants or plans
+        for seed in seeds
+    ]
+    done = {look.key for look in kept}
+    for number, key in enumerate(wanted, 1):
+        if key not in done:
+            plan = plans[key[4]]
+            run = _Run(bench, key, replace(plan, regularizers=plan.regularizers or preset))
+            found = run.looks(progress)
+            rows.append(csv_path, found)
+            kept += found
+        progress("bench recover", number, len(wanted), {key[1]: f"{key[2]:g}× {key[4]}"})
+    return [look for look in kept if look.key in set(wanted)]
+
+
+def _whole(looks: Sequence[Look]) -> list[Look]:
+    ended = {look.key for look in looks if look.final}
+    return [look for look in looks if look.key in ended]
+
+
+class _Run:
+    """One recovery, or a chain of them, with its looks."""
+
+    def __init__(self, bench: RecoverBench, key: tuple[str, str, float, int, str], plan: _Plan) -> None:
+        self.bench, self.key, self.plan = bench, key, plan
+        self.budget = max(1, int(np.floor(len(bench.prior) / key[2] + 0.5)))
+        self.found: list[Look] = []
+        self.simplify_s = 0.0
+        self.before = self.now = 0.0  # seconds of finished recoveries, and of the one in progress
+        self.cpu, self.cpu_began = 0.0, time.process_time()
+
+    def looks(self, progress: Progress) -> list[Look]:
+        """Run it.
+
+        Raises:
+            InputError: a loss or a value of the result is not finite.
+        """
+        way = self._chain if self.plan.schedule.round_steps else self._once
+        done, started, reports = way(progress)
+        self._count_cpu()
+        _check_finite(done, [loss for report in reports for loss in report["loss"]])
+        spent = sum(report["seconds"] for report in reports)
+        extra = sum(report["seconds"] * report["regularizers"]["share"] for report in reports)
+        last = replace(
+            self._look(done, reports[-1]["steps"], spent, final=1),
+            simplify_s=self.simplify_s,
+            drift95=drift95(Anchors.of(started), done.means),
+            reg_share=extra / max(spent, 1e-9),
+            skipped=sum(report["skipped"]["non_finite"] for report in reports),
+        )
+        return [*self.found, last]
+
+    def _once(self, progress: Progress) -> tuple[Splats, Splats, list[dict[str, Any]]]:
+        plan, bench = self.plan, self.bench
+        start, self.simplify_s = bench.start(self.budget, progress)
+        assert plan.regularizers is not None
+        config = RecoverConfig(
+            schedule=plan.schedule,
+            steps=plan.steps,
+            time_limit=plan.time_limit,
+            regularizers=plan.regularizers,
+            background=bench.background,
+            seed=self.key[3],
+        )
+        self.cpu_began = time.process_time()
+        done = recover(start, bench.targets[0], config, progress=progress, watch=self._watch)
+        return done.splats, start, [done.report]
+
+    def _chain(self, progress: Progress) -> tuple[Splats, Splats, list[dict[str, Any]]]:
+        plan, bench = self.plan, self.bench
+        assert plan.regularizers is not None
+        config = DistillConfig(
+            schedule=plan.schedule,
+            steps=plan.steps,
+            time_limit=plan.time_limit,
+            regularizers=plan.regularizers,
+            sh_degree=bench.sh_degree,
+            background=bench.background,
+            seed=self.key[3],
+        )
+        done = distill(
+            bench.prior, self.budget, bench.targets[0], config, progress=progress, watch=self._watch
+        )
+        self.simplify_s = done.report["seconds"]["simplify"]
+        reports = [report for entry in done.report["rounds"] for report in entry["recover"]]
+        return done.splats, done.simplified, reports
+
+    def _watch(self, step: int, seconds: float, splats: Callable[[], Splats]) -> None:
+        if step == 1:
+            self.before += self.now
+            if self.plan.schedule.round_steps:
+                self.cpu_began = time.process_time()  # what came before was simplification, for the most part
+        self.now = seconds
+        self._count_cpu()
+        if step >= _FIRST_LOOK and (step // _FIRST_LOOK).bit_count() == 1 and step % _FIRST_LOOK == 0:
+            self.found.append(self._look(splats(), step, self.before + seconds))
+        self.cpu_began = time.process_time()
+
+    def _count_cpu(self) -> None:
+        now = time.process_time()
+        self.cpu += now - self.cpu_began
+        self.cpu_began = now
+
+    def _look(self, splats: Splats, step: int, seconds: float, *, final: int = 0) -> Look:
+        study, scene, ratio, seed, variant = self.key
+        score = evaluate(splats, self.bench.targets[1], background=self.bench.background)
+        return Look(
+            study=study,
+            scene=scene,
+            ratio=ratio,
+            seed=seed,
+            variant=variant,
+            budget=self.budget,
+            count=len(splats),
+            step=step,
+            seconds=seconds,
+            cpu_s=self.cpu,
+            simplify_s=0.0,
+            psnr=score.psnr,
+            ssim=score.ssim,
+            drift95=None,
+            needle=needle(splats.scales),
+            reg_share=None,
+            skipped=None,
+            final=final,
+            version=f"g2ard {__version__}",
+            machine=machine(),
+        )
+
+
+def _check_finite(splats: Splats, losses: Sequence[float]) -> None:
+    bad = [
+        name
+        for name in ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+        if not np.isfinite(getattr(splats, name)).all()
+    ]
+    if bad or not np.isfinite(losses).all():
+        raise InputError(f"recovery: not finite: {', '.join(bad) or 'the loss'}")
+
+
+@dataclass(frozen=True)
+class Speedup:
+    """How soon the default is as good as another schedule's result.
+
+    Args:
+        scene: its label.
+        ratio: prior over budget.
+        seed: of the order of views.
+        against: the other variant.
+        psnr: its result.
+        seconds: it took.
+        reached_s: seconds of the fastest default run at its first look that is as good; None if none is.
+        best_psnr: of the default runs.
+    """
+
+    scene: str
+    ratio: float
+    seed: int
+    against: str
+    psnr: float
+    seconds: float
+    reached_s: float | None
+    best_psnr: float
+
+    @property
+    def share(self) -> float | None:
+        """Of the other's time."""
+        return None if self.reached_s is None else self.reached_s / self.seconds
+
+
+def speedups(looks: Sequence[Look]) -> list[Speedup]:
+    """Each final row of a variant not called default@…, against the default rows of its scene."""
+    found = []
+    for other in looks:
+        if not other.final or other.variant.startswith("default@"):
+            continue
+        rivals = [
+            look
+            for look in looks
+            if look.variant.startswith("default@")
+            and look.count == look.budget
+            and look.key[:4] == other.key[:4]
+        ]
+        if rivals:
+            reached = [look.seconds for look in rivals if look.psnr >= other.psnr]
+            found.append(
+                Speedup(
+                    other.scene,
+                    other.ratio,
+                    other.seed,
+                    other.variant,
+                    other.psnr,
+                    other.seconds,
+                    min(reached, default=None),
+                    max(look.psnr for look in rivals),
+                )
+            )
+    return found

@@ -1,0 +1,85 @@
+"""How fast a scene wants to learn: PSNR of a few views, and the rate multiplier that short trials choose."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from g2ard.metrics import psnr
+from g2ard.splats import Splats
+from g2ard.targets import Targets, mask_of
+
+__all__ = ["MULTIPLIERS", "Probe", "climb", "trial_steps"]
+
+MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
+"""Of all rates; trained scenes want 1 or less, lifts more."""
+
+_VIEWS = 8
+_SHARE = 0.01
+"""Of the time that looking at a view may take while somebody watches the progress."""
+_FEWEST, _MOST, _PART = 10, 60, 50
+_SHORTEST_HORIZON = 100
+
+
+def trial_steps(horizon: int) -> int:
+    """Steps of one trial: a fiftieth of the horizon, 10 to 60; 0 where trials would not pay.
+
+    >>> trial_steps(50), trial_steps(300), trial_steps(1000), trial_steps(6000)
+    (0, 10, 20, 60)
+    """
+    return 0 if horizon < _SHORTEST_HORIZON else min(_MOST, max(_FEWEST, horizon // _PART))
+
+
+def climb(score: Callable[[float], float], start: float) -> tuple[float, dict[float, float]]:
+    """The best of `MULTIPLIERS`, walking uphill from the one nearest to `start`, and all scores seen.
+
+    >>> climb(lambda m: -abs(m - 1), 0.2)[0]
+    1.0
+    """
+    at = min(range(len(MULTIPLIERS)), key=lambda i: abs(math.log(MULTIPLIERS[i] / start)))
+    seen = {at: score(MULTIPLIERS[at])}
+    for way in (-1, 1):
+        while 0 <= at + way < len(MULTIPLIERS):
+            if at + way not in seen:
+                seen[at + way] = score(MULTIPLIERS[at + way])
+            if seen[at + way] <= seen[at]:
+                break
+            at += way
+    return MULTIPLIERS[at], {MULTIPLIERS[i]: value for i, value in sorted(seen.items())}
+
+
+class Probe:
+    """PSNR of a few evenly spaced training views: all at once, or one after the other along the way."""
+
+    def __init__(self, targets: Targets, background: tuple[float, float, float]) -> None:
+        count = len(targets.cameras)
+        sample = np.linspace(0, count - 1, min(count, _VIEWS)).round().astype(int)
+        self._views = [int(view) for view in np.unique(sample)]
+        self._targets, self._background = targets, background
+        self._scores: dict[int, float] = {}
+        self._turn = 0
+        self._next = 0.0
+
+    def all_of(self, splats: Splats) -> float:
+        """Mean over all of the views."""
+        self._scores = {view: self._score(splats, view) for view in self._views}
+        return float(np.mean(list(self._scores.values())))
+
+    def now(self, splats: Callable[[], Splats], seconds: float) -> float:
+        """The mean with one view looked at again, unless that would take more than its share of the time."""
+        if seconds >= self._next:
+            began = time.monotonic()
+            view = self._views[self._turn % len(self._views)]
+            self._scores[view] = self._score(splats(), view)
+            self._turn += 1
+            self._next = seconds + (time.monotonic() - began) / _SHARE
+        return float(np.mean(list(self._scores.values())))
+
+    def _score(self, splats: Splats, view: int) -> float:
+        from g2ard.render import render
+
+        image = render(splats, self._targets.cameras, view, background=self._background).image
+        return psnr(np.clip(image, 0, 1), self._targets[view], mask_of(self._targets, view))

@@ -1,0 +1,107 @@
+"""What the policies of simplification share: their constants and the counts of their rounds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from g2ard.errors import InputError
+
+__all__ = ["METHODS", "SimplifyConfig", "schedule"]
+
+METHODS = ("default", "fast", "paper")
+"""The policies."""
+
+_RETENTION = {"default": 0.65, "fast": 0.65, "paper": 0.75}
+_MIN_OPACITY = {"default": 0.004, "fast": 0.004, "paper": 0.01}
+
+_FOLD = 0.05
+"""A last cut smaller than this is folded into the round before."""
+
+
+@dataclass(frozen=True)
+class SimplifyConfig:
+    """The constants of simplification: `paper`'s are the paper's (`tab:s_config`), the others measured.
+
+    Args:
+        retention: share of the Gaussians that a round keeps; None means the method's own, 0.75 in the paper,
+            0.65 for the others (fewer rounds, as good).
+        min_opacity: below this α a Gaussian is dropped; None means the method's own, 0.01 in the paper, 0.004
+            (what no renderer draws) for the others.
+        neighbors: `default`: nearest clusters that one may merge with. More lets far ones in: 16 is worse.
+        geometric_weight: of `default` and `fast`: weight of the error of coverage beside that of colour.
+        dilation: of `default` and `fast`: standard deviation of the blur that renderers add, in pixels
+            (√0.3 would be all of it; 0.4 measured best).
+        pixel_scale: of `default` and `fast` without views: the size of a pixel over the median of the largest
+            scales.
+        max_growth: of `default` and `fast`: how many times the area that its moments say a cluster may take,
+            along its two longer axes, where α ≤ 0.99 alone cannot hold its mass. At 1 opaque surfaces show
+            gaps.
+        color_bin: `paper`: edge of the colour bins within a cell, in colour units (0–1).
+        max_energy: `paper`: largest affine energy of a merged group, colour units squared.
+        min_coverage: `paper`: least share of the members' footprint that the merged footprint covers.
+        flag_threshold: ε_h, the affine residual of a cell above which its Gaussians are protected.
+        protection: `paper`: λ_h, what a protected Gaussian's priority π is raised by.
+    """
+
+    retention: float | None = None
+    min_opacity: float | None = None
+    neighbors: int = 6
+    geometric_weight: float = 0.03
+    dilation: float = 0.4
+    pixel_scale: float = 0.5
+    max_growth: float = 1.5
+    color_bin: float = 0.25
+    max_energy: float = 0.01
+    min_coverage: float = 0.6
+    flag_threshold: float = 0.01
+    protection: float = 10.0
+
+    def __post_init__(self) -> None:
+        if self.retention is not None and not 0 < self.retention < 1:
+            raise InputError(f"retention: expected a number between 0 and 1, got {self.retention}")
+        if not self.max_growth >= 1:
+            raise InputError(f"max_growth: expected at least 1, got {self.max_growth}")
+        if self.neighbors < 1:
+            raise InputError(f"neighbors: expected at least 1, got {self.neighbors}")
+        for name in ("color_bin", "pixel_scale"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise InputError(f"{name}: expected a positive number, got {value}")
+        for name in (
+            "min_opacity",
+            "geometric_weight",
+            "dilation",
+            "max_energy",
+            "min_coverage",
+            "flag_threshold",
+            "protection",
+        ):
+            value = getattr(self, name)
+            if value is not None and not value >= 0:
+                raise InputError(f"{name}: expected a number ≥ 0, got {value}")
+
+    def retention_of(self, method: str) -> float:
+        """The share a round of `method` keeps."""
+        return _RETENTION[method] if self.retention is None else self.retention
+
+    def min_opacity_of(self, method: str) -> float:
+        """The α below which `method` drops."""
+        return _MIN_OPACITY[method] if self.min_opacity is None else self.min_opacity
+
+
+def schedule(count: int, budget: int, retention: float = 0.75) -> list[int]:
+    """Counts after each round: N_r = max(N_S, ⌈retention·N_{r−1}⌉), a last cut under 5 % folded in.
+
+    >>> schedule(500_000, 50_000)
+    [375000, 281250, 210938, 158204, 118653, 88990, 66743, 50000]
+    >>> schedule(10, 10)
+    []
+    """
+    rounds: list[int] = []
+    while count > budget:
+        count = max(budget, min(count - 1, math.ceil(retention * count)))
+        if budget > (1 - _FOLD) * count:
+            count = budget
+        rounds.append(count)
+    return rounds

@@ -1,0 +1,41 @@
+//! A loss over some of the pixels only, made of the loss over all of them.
+
+use crate::{Error, Result};
+
+/// Pixels that count, and how many.
+#[derive(Debug, Clone, Copy)]
+pub struct Mask<'a> {
+    counts: &'a [bool],
+    /// All pixels over those that count: turns a mean over all into one over these.
+    pub share: f32,
+}
+
+impl<'a> Mask<'a> {
+    pub fn new(counts: &'a [bool], pixels: usize) -> Result<Self> {
+        if counts.len() != pixels {
+            let expected = format!("{pixels} values");
+            return Err(Error::invalid("mask", expected, counts.len()));
+        }
+        let count = counts.iter().filter(|counts| **counts).count();
+        let share = pixels as f32 / count.max(1) as f32;
+        Ok(Self { counts, share })
+    }
+
+    /// Makes the image equal to the target where nothing counts, so that nothing differs there.
+    pub fn cover(&self, image: &mut [f32], target: &[f32]) {
+        let pixels = image.chunks_exact_mut(3).zip(target.chunks_exact(3));
+        for ((pixel, wanted), _) in pixels.zip(self.counts).filter(|(_, counts)| !**counts) {
+            pixel.copy_from_slice(wanted);
+        }
+    }
+
+    /// The gradient of the mean over the pixels that count, from that over all.
+    pub fn clear(&self, gradient: &mut [f32]) {
+        for (pixel, counts) in gradient.chunks_exact_mut(3).zip(self.counts) {
+            let factor = if *counts { self.share } else { 0.0 };
+            for value in pixel {
+                *value *= factor;
+            }
+        }
+    }
+}

@@ -1,0 +1,68 @@
+"""The same bits for 1, 2 and 8 threads: renders, gradients and whole recovery steps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from g2ard import _core
+from g2ard.render import view_of
+from stress.scenes import NAMES, Problem, random_problem
+
+__all__ = ["THREADS", "differing", "large_problem"]
+
+THREADS = (1, 2, 8)
+
+
+def large_problem(seed: int, count: int = 12_000) -> Problem:
+    """A problem's camera and conventions over enough Gaussians and tiles for every thread to have work."""
+    small, rng = random_problem(seed), np.random.default_rng((seed, 2))
+    rest = small.params["shN"].shape[1]
+    params = {
+        "means": rng.normal(size=(count, 3)),
+        "quats": rng.normal(size=(count, 4)),
+        "log_scales": rng.normal(-3.5, 0.8, (count, 3)),
+        "logit_opacities": rng.normal(0, 2, count),
+        "sh0": rng.normal(size=(count, 1, 3)),
+        "shN": rng.normal(0, 0.3, (count, rest, 3)),
+    }
+    cameras = small.cameras.take([0])
+    cameras.Ks[:, :2] *= 6
+    cameras.widths[:] *= 6
+    cameras.heights[:] *= 6
+    weights = np.zeros((int(cameras.heights[0]), int(cameras.widths[0]), 5))
+    params = {k: v.astype(np.float32) for k, v in params.items()}
+    return Problem(params, cameras, small.settings, small.background, weights)
+
+
+def differing(problem: Problem) -> list[str]:
+    """What differs between thread counts; nothing, if all is well."""
+    before = _core.num_threads()
+    try:
+        found = []
+        for threads in THREADS:
+            _core.set_num_threads(threads)
+            found.append(_everything(problem))
+    finally:
+        _core.set_num_threads(before)
+    return [name for name in found[0] if any(other[name] != found[0][name] for other in found[1:])]
+
+
+def _everything(problem: Problem) -> dict[str, bytes]:
+    arrays = tuple(problem.params[name] for name in NAMES)
+    width, height = problem.size
+    view, choices = view_of(problem.cameras, 0, problem.settings), problem.settings.choices
+    background = [float(c) for c in problem.background]
+    rng = np.random.default_rng(0)
+    target = rng.random((height, width, 3)).astype(np.float32)
+    gradient = rng.normal(size=(height, width, 5)).astype(np.float32)
+    rasterizer = _core.Rasterizer()
+    image, alpha, depth, _ = rasterizer.forward(arrays, view, choices, background, True)
+    assert depth is not None
+    planes = [np.ascontiguousarray(gradient[..., part]) for part in (slice(0, 3), 3, 4)]
+    found = {"image": image, "alpha": alpha, "depth": depth}
+    found |= dict(zip(NAMES, rasterizer.backward(arrays, *planes), strict=True))
+    trainer = _core.Trainer(arrays)
+    for _ in range(2):
+        trainer.step(view, choices, background, target, 0.2, [1e-2] * 6)
+    found |= {f"trained {name}": array for name, array in trainer.state().items()}
+    return {name: array.tobytes() for name, array in found.items()}
