@@ -44,8 +44,8 @@ class DistillConfig:
         views: how many of the targets' views recovery looks at, best first; "auto" takes as many as the
             curve of gains asks for, None all that see the scene.
         policy: how views are chosen, see `g2ard.select`.
-        weighted: draw views by the weights of the selection, so that crowded poses do not rule; the whole
-            pool drawn by weight beats every choice of fewer views (`docs/benchmarks.md`).
+        weighted: draw views by the weights of the selection, so that crowded poses do not rule: on a
+            crowded pool all views drawn so beat an even draw, and every choice of a tenth of them.
         reselect: choose again from every round's scene; else once, from the raw prior.
         seed: of the order of views, and of the policy "random".
         engine: what takes recovery's steps, see `RecoverConfig`.

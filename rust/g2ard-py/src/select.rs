@@ -1,7 +1,9 @@
 //! `g2ard.select`.
 
 use g2ard_core::raster::Camera;
-use g2ard_core::select::{Coverage, Gaussians, Opaque, Problem, Surface, looks, median_depths, visible};
+use g2ard_core::select::{
+    Coverage, Gaussians, Opaque, Problem, Surface, looks, median_depths, visible,
+};
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;

@@ -26,7 +26,10 @@ pub fn looks(scene: &Opaque, cameras: &[Camera], control: &Control) -> Result<Ve
             }
             let share = depths.len() as f32 / scratch.depth.len() as f32;
             let middle = depths.len() / 2;
-            Ok([share, *depths.select_nth_unstable_by(middle, f32::total_cmp).1])
+            Ok([
+                share,
+                *depths.select_nth_unstable_by(middle, f32::total_cmp).1,
+            ])
         })
         .collect()
 }
