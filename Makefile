@@ -36,14 +36,17 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Needs a scene: SCENE=path, or real data.
+# Needs a scene: SCENE=path, or real data. Every study runs once, small: one scene, two ratios, few steps.
+# What bench/ and bench.csv hold is not measured again; `make clean` removes them.
+QUICK := --only city,guitar --ratios 10,30 --seeds 0 --size 240 --steps 150 --seconds 12 --adapt-steps 500
 SCENE ?= $(G2ARD_DATA)/playbot/0_0
 bench: setup
 	$(BIN)/g2ard bench raster $(SCENE)
 	$(BIN)/g2ard bench simplify $(SCENE) --ratios 10,30 --csv bench.csv
+	$(BIN)/g2ard bench run benches/definitions/*.toml -o bench $(QUICK)
 
 wheel: setup
 	$(BIN)/maturin build --release --out dist
 
 clean:
-	rm -rf $(VENV) target dist demo
+	rm -rf $(VENV) target dist demo bench bench.csv

@@ -9,6 +9,7 @@ Each stage is a module with a function of its name, or nearly so:
 | `g2ard.poses` | `make_pool`: views for a scene that has none |
 | `g2ard.select` | `select`: the views worth having |
 | `g2ard.recover` | `recover`: a fixed set of Gaussians against photos or a teacher's renders |
+| `g2ard.adapt` | `adapt`: new appearance on frozen geometry |
 | `g2ard.distill` | `distill`: all of it |
 | `g2ard.render`, `g2ard.evaluate` | `render`, `visibility`; `evaluate` |
 | `g2ard.synth` | `city`: a procedural city |

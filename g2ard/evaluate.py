@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from g2ard.lpips import Lpips
 from g2ard.metrics import psnr, ssim
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
@@ -17,11 +19,12 @@ __all__ = ["Evaluation", "ViewScore", "evaluate"]
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One view's figures."""
+    """One view's figures; LPIPS by network, empty without weights."""
 
     name: str
     psnr: float
     ssim: float
+    lpips: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,11 @@ class Evaluation:
         """Mean of the views' SSIM."""
         return float(np.mean([v.ssim for v in self.views]))
 
+    @property
+    def lpips(self) -> dict[str, float]:
+        """Mean of the views' LPIPS, by network."""
+        return {net: float(np.mean([v.lpips[net] for v in self.views])) for net in self.views[0].lpips}
+
     def as_dict(self) -> dict[str, Any]:
         """The keys of `g2ard evaluate --json`."""
         return {
@@ -55,7 +63,7 @@ class Evaluation:
             "bytes": self.bytes,
             "psnr": self.psnr,
             "ssim": self.ssim,
-            "lpips": None,
+            "lpips": self.lpips or None,
             "views": [{"name": v.name, "psnr": v.psnr, "ssim": v.ssim} for v in self.views],
         }
 
@@ -65,6 +73,7 @@ def evaluate(
     targets: Targets,
     *,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    lpips: Mapping[str, Lpips] | None = None,
     progress: Progress = silent,
     stage: str = "evaluate",
 ) -> Evaluation:
@@ -77,6 +86,7 @@ def evaluate(
         splats: the scene; its offset counts, cameras are in world coordinates.
         targets: photos or teacher renders; photo-relative and teacher-relative figures never mix.
         background: RGB behind the scene.
+        lpips: networks to score with as well, as `g2ard.lpips.load_lpips` finds them.
         progress: told after each view.
         stage: the name progress is reported under.
 
@@ -93,7 +103,8 @@ def evaluate(
     for view, name in enumerate(cameras.names):
         image = np.clip(render(splats, cameras, view, background=background).image, 0, 1)
         target = targets[view]
+        perceived = {net: model(image, target) for net, model in (lpips or {}).items()}
         mask = mask_of(targets, view)
-        scores.append(ViewScore(name, psnr(image, target, mask), ssim(image, target, mask)))
+        scores.append(ViewScore(name, psnr(image, target, mask), ssim(image, target, mask), perceived))
         progress(stage, view + 1, len(cameras))
     return Evaluation(len(splats), splats.nbytes, tuple(scores))

@@ -91,7 +91,7 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
     assert report["scores"]["recovered"]["psnr"] > report["scores"]["simplified"]["psnr"]
     assert report["against"] == "teacher renders"
     left = sorted(p.name for p in (tmp_path / "run").iterdir())
-    assert left == ["preview.png", "report.json", "scene.ply", "views.json"]
+    assert left == ["preview.png", "report.html", "report.json", "scene.ply", "views.json"]
     status, _, error = command_line(*ask, cwd=tmp_path)
     assert status == 1
     assert "run" in error

@@ -11,7 +11,7 @@ from g2ard import io
 from g2ard.bench.simplify import Cell, bench_simplify, find_splat_transform, read_cells
 from g2ard.errors import InputError
 
-METHODS = ("default", "fast", "paper", "nanogs")
+METHODS = ("default", "fast", "paper", "nanogs", "lightgaussian")
 
 
 def test_measures_writes_and_resumes(tmp_path: Path) -> None:
@@ -30,9 +30,9 @@ def test_measures_writes_and_resumes(tmp_path: Path) -> None:
     lines = csv.read_text().splitlines()
     again = bench_simplify([scene], csv, ratios=[4], methods=[*METHODS, "splat-transform"], views=views)
     assert csv.read_text().splitlines()[: len(lines)] == lines  # nothing was measured twice
-    assert again[:4] == [_rounded(c) for c in cells]
-    assert again[4].error == "splat-transform: not found"
-    assert again[4].psnr is None
+    assert again[:5] == [_rounded(c) for c in cells]
+    assert again[5].error == "splat-transform: not found"
+    assert again[5].psnr is None
 
     program = tmp_path / "broken"
     program.write_text("#!/bin/sh\necho it broke 1.2 >&2\nexit 7\n")
@@ -42,7 +42,7 @@ def test_measures_writes_and_resumes(tmp_path: Path) -> None:
     )
     assert failed.error == "exit status 7: it broke 1.2"
     assert failed.version == "it broke 1.2"
-    assert len(read_cells(csv)) == 5  # in the old failure's place
+    assert len(read_cells(csv)) == 6  # in the old failure's place
 
 
 def _rounded(cell: Cell) -> Cell:

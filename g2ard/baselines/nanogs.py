@@ -7,16 +7,14 @@ standard-normal sample a component" is read as one draw for each of a pair's two
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.errors import G2ardError, InputError
+from g2ard.errors import InputError
 from g2ard.recover.anchors import rotation_matrices
 from g2ard.splats import Splats
 
@@ -209,18 +207,3 @@ def _quats(axes: _Floats) -> _Floats:
         k[:, a + 1, a + 1] = r[:, a, a] - r[:, b, b] - r[:, c, c]
         k[:, b + 1, c + 1] = k[:, c + 1, b + 1] = r[:, b, c] + r[:, c, b]
     return np.linalg.eigh(k)[1][:, :, 3]
-
-
-def _main(arguments: list[str]) -> None:
-    """`python -m g2ard.baselines.nanogs SCENE COUNT OUT.ply`: a whole command, to be timed as one."""
-    from g2ard import io
-
-    try:
-        source, count, output = arguments
-        io.write_splats(Path(output), nanogs(io.read_splats(source), int(count)))
-    except (G2ardError, OSError, ValueError) as e:
-        sys.exit(f"nanogs: {e}")
-
-
-if __name__ == "__main__":
-    _main(sys.argv[1:])

@@ -12,11 +12,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from g2ard import __version__, io
+from g2ard import __version__, baselines, io
+from g2ard.bench.process import measured
 from g2ard.bench.raster import cpu_name
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
@@ -44,21 +44,11 @@ METHODS = (
     "paper",
     "splat-transform",
     "splat-transform-adaptive",
-    "nanogs",
+    *baselines.METHODS,
 )
 _POOL = 128
 _MAX_LOGIT = 20.0
 """An opacity of exactly 1 has no finite logit; here it is 1 − 2e-9, which every peer can read."""
-_LAUNCHER = """
-import os, sys, time
-began = time.perf_counter()
-to_log = [(os.POSIX_SPAWN_DUP2, 2, 1)]
-pid = os.posix_spawnp(sys.argv[1], sys.argv[1:], os.environ, file_actions=to_log)
-_, status, usage = os.wait4(pid, 0)
-cpu, wall = usage.ru_utime + usage.ru_stime, time.perf_counter() - began
-print(os.waitstatus_to_exitcode(status), cpu, wall, usage.ru_maxrss)
-"""
-"""Between us and the child: Linux counts the memory of whoever starts a process as the process's own peak."""
 
 
 @dataclass(frozen=True)
@@ -197,13 +187,13 @@ class _Stand:
         output = self.folder / "out.ply"
         output.unlink(missing_ok=True)
         try:
-            usage = _run(self.command(method, budget, output), self.folder / "log")
+            usage = measured(self.command(method, budget, output), self.folder / "log")
             small = io.read_splats(output)
             score = evaluate(small, self.targets)
         except (InputError, OSError) as e:
             return replace(cell, error=" ".join(str(e).split()))
         return replace(
-            cell, **usage, count=len(small), psnr=score.psnr, ssim=score.ssim, views=len(score.views)
+            cell, **asdict(usage), count=len(small), psnr=score.psnr, ssim=score.ssim, views=len(score.views)
         )
 
     def command(self, method: str, budget: int, output: Path) -> list[str]:
@@ -214,8 +204,9 @@ class _Stand:
             mode = "--decimate-adaptive" if method.endswith("adaptive") else "--decimate"
             options = [str(self.splat_transform), "-q", "-w", "-g", "cpu"]
             return [*options, source, mode, str(budget), str(output)]
-        if method == "nanogs":
-            return [*python, "g2ard.baselines.nanogs", source, str(budget), str(output)]
+        if method in baselines.METHODS:
+            views = ["--views", str(self.views)] if method in baselines.NEED_VIEWS else []
+            return [*python, "g2ard.baselines", method, source, str(budget), str(output), *views]
         flags = {
             "default": ["--views", str(self.views)],
             "no-views": ["--no-views"],
@@ -223,28 +214,6 @@ class _Stand:
             "paper": ["--method", "paper"],
         }[method]
         return [*python, "g2ard", "simplify", source, "-n", str(budget), "-o", str(output), "-q", *flags]
-
-
-def _run(command: Sequence[str], log: Path) -> dict[str, Any]:
-    """Seconds and memory of a child process.
-
-    Raises:
-        InputError: it failed; the message is its last line.
-    """
-    with log.open("wb") as out:
-        launched = [sys.executable, "-I", "-S", "-c", _LAUNCHER, *command]
-        told = subprocess.run(
-            launched, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=out, check=False
-        ).stdout.split()
-    said = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    last = said[-1] if said else "it said nothing"
-    if len(told) != 4:
-        raise InputError(f"{command[0]}: did not start: {last}")
-    status, cpu, wall, peak = (float(value) for value in told)
-    if status:
-        raise InputError(f"exit status {status:.0f}: {last}")
-    unit = 1 if sys.platform == "darwin" else 1024
-    return {"cpu_s": cpu, "wall_s": wall, "peak_mb": peak * unit / 1e6}
 
 
 def _readable(scene: Path) -> Splats:

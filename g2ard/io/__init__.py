@@ -4,7 +4,7 @@
 |---|---|
 | `read_splats`, `read_scene` | 3DGS .ply, .compressed.ply, SOG folder or .sog, .spz, .splat |
 | `read_points`, `read_cloud` | .ply, .las, .laz, COLMAP points3D |
-| `read_views`, `read_view_set` | COLMAP folder, transforms.json, g2ard's own .json |
+| `read_views`, `read_view_set` | COLMAP folder, transforms.json, Cambridge Landmarks, g2ard's own .json |
 
 The short forms return the data; the long ones also say what was noticed (`Note`). Nothing heavy is imported
 until a function is called.
@@ -195,7 +195,8 @@ def read_views(path: str | Path, *, images: str | Path | None = None, split: str
     """Read views; `read_view_set` also says what was noticed, and per view its split and weight.
 
     Args:
-        path: a COLMAP folder, a transforms.json or its folder, or a .json that g2ard wrote.
+        path: a COLMAP folder (or its images_4), a transforms.json or its folder, a Cambridge Landmarks
+            scene, or a .json that g2ard wrote.
         images: the folder of the photos, where they are not where the file says.
         split: "train", "test", or "all"; see `g2ard.splits.split_mask`.
 
@@ -230,7 +231,7 @@ def read_view_set(path: str | Path, *, images: str | Path | None = None, split: 
     from g2ard.splits import split_mask
 
     path, found = Path(path), file_format(path)
-    if found not in ("colmap", "transforms", "views"):
+    if found not in ("colmap", "transforms", "cambridge", "views"):
         raise InputError(f"{path}: views are needed (a COLMAP folder, transforms.json, g2ard's .json)")
     if images is not None and not Path(images).is_dir():
         raise InputError(f"{images}: no such folder of photos")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from g2ard.io.types import ViewSet
 
-__all__ = ["model_folder", "parsing", "read", "text_lines"]
+__all__ = ["model_folder", "parsing", "photos_beside", "read", "text_lines"]
 
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
@@ -31,6 +31,15 @@ class _Camera(NamedTuple):
     size: tuple[int, int]
     K: NDArray[np.float64]
     distortion: tuple[float, ...]
+
+    def at(self, size: tuple[int, int]) -> _Camera:
+        """The same lens where its photos were resized."""
+        if size == self.size:
+            return self
+        K = self.K.copy()
+        K[0] *= size[0] / self.size[0]
+        K[1] *= size[1] / self.size[1]
+        return self._replace(size=size, K=K)
 
 
 class _Image(NamedTuple):
@@ -48,6 +57,13 @@ def model_folder(path: Path) -> Path | None:
     path = path.parent if path.is_file() else path
     places = (path, path / "sparse" / "0", path / "sparse", path / "colmap" / "sparse" / "0")
     return next((folder for folder in places if _tables(folder)), None)
+
+
+def photos_beside(path: Path) -> tuple[Path, Path] | None:
+    """(project, photos) where `path` is a folder of photos beside a model, as images_4 is; else None."""
+    if not path.is_dir() or model_folder(path) is not None or not path.name.startswith("images"):
+        return None
+    return (path.parent, path) if model_folder(path.parent) is not None else None
 
 
 def _tables(folder: Path) -> tuple[Path, Path] | None:
@@ -78,15 +94,19 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     """Read the registered images of a COLMAP model as views, sorted by name.
 
     Args:
-        path: the project folder, the model's folder, or one of its files.
-        images: the folder of the photos; None looks for `images` beside the model or above it.
+        path: the project folder, the model's folder, one of its files, or a folder of photos beside the
+            model, such as images_4.
+        images: the folder of the photos; None looks for `images` beside the model or above it. Photos of
+            another size than the model's (Mip-NeRF 360's images_2, images_4) shrink their cameras.
 
     Raises:
         InputError: no model there, a truncated file, a camera model that is not pinhole with OpenCV
             distortion, or no registered image.
     """
-    from g2ard.io.photos import Frame, view_set
+    from g2ard.io.photos import Frame, photo_size, view_set
 
+    if images is None and (beside := photos_beside(path)):
+        path, images = beside
     folder = model_folder(path)
     tables = _tables(folder) if folder else None
     if folder is None or tables is None:
@@ -98,11 +118,16 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
         found = (_images_bin if binary else _images_txt)(tables[1])
     photos = images or _photo_folder(path, folder)
     frames = []
+    sizes: dict[int, tuple[int, int]] = {}
     for image in sorted(found, key=lambda i: i.name):
         if image.camera not in cameras:
             raise InputError(f"{tables[1]}: {image.name!r} names camera {image.camera}, which is absent")
         camera = cameras[image.camera]
         photo = photos / image.name if photos else None
+        if images is not None and photo is not None and photo.is_file():
+            if image.camera not in sizes:  # one lens, one size
+                sizes[image.camera] = photo_size(photo)
+            camera = camera.at(sizes[image.camera])
         frames.append(
             Frame(image.name, _viewmat(tables[1], image), camera.K, camera.size, photo, camera.distortion)
         )
@@ -117,16 +142,12 @@ def _photo_folder(path: Path, model: Path) -> Path | None:
 def _viewmat(path: Path, image: _Image) -> NDArray[np.float64]:
     import numpy as np
 
-    q = np.array(image.quat)
-    if not np.linalg.norm(q) > 0:
+    from g2ard.io.photos import rotation
+
+    if not np.linalg.norm(image.quat) > 0:
         raise InputError(f"{path}: {image.name!r}: its quaternion is zero")
-    w, x, y, z = q / np.linalg.norm(q)
     view = np.eye(4)
-    view[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    view[:3, :3] = rotation(image.quat)
     view[:3, 3] = image.translation
     return view
 

@@ -20,6 +20,7 @@ Format = Literal[
     "points3d",
     "colmap",
     "transforms",
+    "cambridge",
     "views",
 ]
 Kind = Literal["splats", "points", "views"]
@@ -27,7 +28,7 @@ Kind = Literal["splats", "points", "views"]
 _KINDS: dict[str, Kind] = {
     **dict.fromkeys(("ply", "compressed_ply", "sog", "spz", "splat"), "splats"),
     **dict.fromkeys(("cloud_ply", "las", "points3d"), "points"),
-    **dict.fromkeys(("colmap", "transforms", "views"), "views"),
+    **dict.fromkeys(("colmap", "transforms", "cambridge", "views"), "views"),
 }
 
 
@@ -80,18 +81,24 @@ def file_format(path: str | Path) -> Format:
 
 
 def _folder_format(path: Path) -> Format:
-    from g2ard.io.colmap import model_folder
+    from g2ard.io.cambridge import is_cambridge
+    from g2ard.io.colmap import model_folder, photos_beside
     from g2ard.io.sog import chunks_of
+    from g2ard.io.transforms import files_of
 
     if chunks_of(path):
         return "sog"
     if model_folder(path) is not None:
         return "colmap"
-    if (path / "transforms.json").is_file():
+    if files_of(path):
         return "transforms"
+    if is_cambridge(path):
+        return "cambridge"
+    if photos_beside(path):
+        return "colmap"
     raise InputError(
         f"{path}: nothing known in this folder "
-        "(looked for SOG's meta.json, a COLMAP sparse/0, transforms.json)"
+        "(looked for SOG's meta.json, a COLMAP sparse/0, transforms.json, Cambridge's dataset_train.txt)"
     )
 
 

@@ -15,7 +15,7 @@ from g2ard.errors import InputError
 from g2ard.io.clean import plural
 from g2ard.io.types import Note, ViewSet
 
-__all__ = ["Frame", "find_photo", "rigid", "view_set"]
+__all__ = ["Frame", "find_photo", "photo_size", "rigid", "rotation", "view_set"]
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 
@@ -40,6 +40,33 @@ def find_photo(path: Path) -> Path:
         return path
     tried = (path.with_name(path.name + suffix) for suffix in _SUFFIXES)
     return next((p for p in tried if p.is_file()), path)
+
+
+def photo_size(path: Path) -> tuple[int, int]:
+    """Width and height of a photo, from its header.
+
+    Raises:
+        InputError: it is not an image.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (OSError, UnidentifiedImageError) as error:
+        raise InputError(f"{path}: not a whole image ({error})") from error
+
+
+def rotation(quat: Sequence[float]) -> NDArray[np.float64]:
+    """(3, 3) of a wxyz quaternion of any length but 0."""
+    w, x, y, z = np.asarray(quat, np.float64) / np.linalg.norm(quat)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def rigid(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import read_json
-from g2ard.io.photos import Frame, find_photo, rigid, view_set
+from g2ard.io.photos import Frame, find_photo, photo_size, rigid, view_set
 from g2ard.io.types import ViewSet
 
-__all__ = ["read"]
+__all__ = ["files_of", "read"]
 
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
@@ -26,24 +26,43 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     """Read frames, their intrinsics (a frame's own win over the file's) and photos.
 
     Args:
-        path: the JSON, or the folder that holds transforms.json.
+        path: the JSON, or the folder that holds transforms.json, or transforms_train.json and
+            transforms_test.json, whose views then state their split.
         images: a folder to look for photos in, by their file names; None takes paths as written, relative
             to the JSON.
 
     Raises:
         InputError: no frames, a pose or intrinsics that make no sense, or a fisheye lens.
     """
-    path = path / "transforms.json" if path.is_dir() else path
+    if path.is_file():
+        return view_set(path, _frames(path, images))
+    found = files_of(path)
+    return view_set(path, [frame for file, split in found.items() for frame in _frames(file, images, split)])
+
+
+def files_of(folder: Path) -> dict[Path, str | None]:
+    """The files of a folder and the split each stands for: transforms.json, else transforms_train.json and
+    its kin (NeRF's synthetic scenes, MatrixCity's pose folders)."""
+    whole = folder / "transforms.json"
+    if whole.is_file():
+        return {whole: None}
+    named = {folder / f"transforms_{split}.json": split for split in ("train", "val", "test")}
+    return {file: split for file, split in named.items() if file.is_file()}
+
+
+def _frames(path: Path, images: Path | None, split: str | None = None) -> list[Frame]:
     content = read_json(path)
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: no views found ('frames' is empty)")
-    return view_set(path, [_frame(path, i, content, frame, images) for i, frame in enumerate(frames)])
+    return [_frame(path, i, content, frame, images)._replace(split=split) for i, frame in enumerate(frames)]
 
 
 def _frame(path: Path, index: int, content: dict[str, Any], frame: Any, images: Path | None) -> Frame:
     where = f"{path}: frame {index}"
     try:
+        if "rot_mat" in frame:
+            frame = _from_matrix_city(path, frame)
         file_path = str(frame["file_path"])
         world_from_camera = np.array(frame["transform_matrix"], np.float64)
         mask = frame.get("mask_path")
@@ -61,6 +80,16 @@ def _frame(path: Path, index: int, content: dict[str, Any], frame: Any, images: 
         if isinstance(error, InputError):
             raise
         raise InputError(f"{where}: malformed ({error})") from error
+
+
+def _from_matrix_city(path: Path, frame: dict[str, Any]) -> dict[str, Any]:
+    """A frame of one of its blocks: photos by number, and rotations a hundredth of what they should be.
+
+    Positions stay as written, metres; its pose folders (transforms_train.json) count in 100 m instead.
+    """
+    name = f"{int(frame['frame_index']):04d}.png"
+    places = [folder for folder in ("", "rgb/", "input/") if (path.parent / folder / name).is_file()]
+    return {**frame, "file_path": (places or [""])[0] + name, "transform_matrix": frame["rot_mat"]}
 
 
 def _there(where: str, mask: Path) -> Path:
@@ -108,8 +137,5 @@ def _size(where: str, values: dict[str, Any], photo: Path) -> tuple[int, int]:
     if "w" in values and "h" in values:
         return round(float(values["w"])), round(float(values["h"]))
     if photo.is_file():
-        from PIL import Image
-
-        with Image.open(photo) as image:
-            return image.size
+        return photo_size(photo)
     raise InputError(f"{where}: neither w and h nor its photo is there to tell the size")

@@ -6,6 +6,7 @@ COMMANDS = (
     "distill",
     "simplify",
     "recover",
+    "adapt",
     "lift",
     "poses",
     "select",

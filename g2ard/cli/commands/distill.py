@@ -109,6 +109,7 @@ def distill(
     from g2ard.io.atomic import check_output
     from g2ard.recover.presets import preset_for
     from g2ard.recover.schedule import schedule_named
+    from g2ard.report.distilled import distill_report
 
     began = time.monotonic()
     engine = recovery_engine(run)
@@ -163,6 +164,14 @@ def distill(
         report |= {"against": against, "preset": why, "prior": measured.as_dict()}
         report |= {key: result.report[key] for key in ("rounds", "views")}
         report["seconds"] = {**result.report["seconds"], "total": time.monotonic() - began}
+        distill_report(
+            output / "report.html",
+            f"{scene.name}: {len(prior):,} → {budget:,}",
+            [("simplified", result.simplified), ("recovered", result.splats)],
+            unseen,
+            report,
+            colour,
+        )
         _write(run, output, result, unseen, colour, report)
     if pool is not None:
         write_views(output / "views.json", pool, overwrite=True)
@@ -170,7 +179,8 @@ def distill(
     _table(run, report)
     _say_views(run, report["views"], k is not None)
     run.say(
-        f"scene: {output / 'scene.ply'}\npicture: {output / 'preview.png'}\nreport: {output / 'report.json'}"
+        f"scene: {output / 'scene.ply'}\npicture: {output / 'preview.png'}\n"
+        f"report: {output / 'report.html'}, {output / 'report.json'}"
     )
     run.result(report)
 

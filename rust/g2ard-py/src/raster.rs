@@ -4,7 +4,7 @@ use g2ard_core::raster::limits::measure;
 use g2ard_core::raster::simd::Isa;
 use g2ard_core::raster::{
     Accumulated, Camera, Convention, Gradients, Image, ImageGradients, Params, Passes, Rasterizer,
-    Settings,
+    SENSITIVITY_TRIANGLE, Settings,
 };
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
@@ -325,9 +325,36 @@ fn accumulate<'py>(
     Ok(dict)
 }
 
+/// (N, 21) upper triangles of Σ g gᵀ over all pixels, channels and `views`, g = ∂C/∂(mean, log scale).
+#[pyfunction]
+#[pyo3(signature = (arrays, views, choices, progress = None))]
+fn sensitivity<'py>(
+    py: Python<'py>,
+    arrays: Arrays<'py>,
+    views: Vec<View>,
+    choices: Choices,
+    progress: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Bound<'py, numpy::PyArray2<f64>>> {
+    let params = arrays.params()?;
+    let settings = choices.settings()?;
+    let sums = work::long(py, progress, |control| {
+        let mut rasterizer = Rasterizer::default();
+        let mut sums = vec![0.0; SENSITIVITY_TRIANGLE * params.len()];
+        control.begin(views.len() as u64);
+        for view in &views {
+            control.check()?;
+            rasterizer.sensitivity(&params, &view.camera(), &settings, &mut sums)?;
+            control.advance(1);
+        }
+        Ok(sums)
+    })?;
+    PyArray1::from_vec(py, sums).reshape([params.len(), SENSITIVITY_TRIANGLE])
+}
+
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<PyRasterizer>()?;
     m.add_function(wrap_pyfunction!(instruction_sets, m)?)?;
     m.add_function(wrap_pyfunction!(machine_limits, m)?)?;
-    m.add_function(wrap_pyfunction!(accumulate, m)?)
+    m.add_function(wrap_pyfunction!(accumulate, m)?)?;
+    m.add_function(wrap_pyfunction!(sensitivity, m)?)
 }

@@ -1,5 +1,6 @@
 //! The passes in order, and the buffers they share: one view's worth, reused from call to call.
 
+mod sensitive;
 mod tiled;
 mod views;
 

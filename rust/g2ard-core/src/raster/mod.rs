@@ -18,6 +18,7 @@ pub mod limits;
 pub(crate) mod order;
 pub(crate) mod params;
 pub(crate) mod project;
+mod sensitivity;
 mod sh;
 pub mod simd;
 mod stage;
@@ -27,6 +28,7 @@ pub use accumulate::Accumulated;
 pub use frame::{Counts, Image, ImageGradients, Memory, Passes, Rasterizer};
 pub use gradients::Gradients;
 pub use params::Params;
+pub use sensitivity::TRIANGLE as SENSITIVITY_TRIANGLE;
 pub use simd::Isa;
 
 use crate::{Error, Result};

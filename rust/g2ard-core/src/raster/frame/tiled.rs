@@ -173,7 +173,7 @@ impl Rasterizer {
     }
 
     /// Slots keep stale sums: `written` says which of them count.
-    fn clear_slots(&mut self) {
+    pub(super) fn clear_slots(&mut self) {
         let pairs = self.bins.pairs.len();
         self.slots.resize(pairs, [0.0; SUMS]);
         self.written.clear();

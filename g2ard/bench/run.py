@@ -1,0 +1,172 @@
+"""Methods on scenes at ratios under matched compute: every cell a row, resumable, with its pictures."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from g2ard import __version__, io
+from g2ard.bench.definition import Definition
+from g2ard.bench.pipeline import Cell, Pipeline
+from g2ard.bench.run_rows import Row, write_csv
+from g2ard.bench.score import Scored, pictured, save_jpeg, score
+from g2ard.bench.simplify import machine
+from g2ard.bench.stand import Stand
+from g2ard.errors import G2ardError, InputError
+from g2ard.io.atomic import atomic_output
+from g2ard.lpips import Lpips, load_lpips
+from g2ard.progress import Progress, silent
+
+__all__ = ["bench_run", "cells_of"]
+
+
+def bench_run(
+    definitions: Sequence[Definition],
+    folder: Path,
+    *,
+    keep: bool = False,
+    progress: Progress = silent,
+) -> list[Row]:
+    """Measure every cell of some studies that `folder` does not hold yet.
+
+    All methods get the same prior, exact budget, training views, optimiser and steps or seconds; each
+    reduction and recovery is a process of its own. What a cell found is written as it is done (cells/,
+    images/); rows.csv is made anew after each. A cell that fails is a row with its error, and is tried again
+    by the next call.
+
+    Args:
+        definitions: the studies.
+        folder: of the run; need not exist.
+        keep: whether intermediate scenes (work/) stay once all cells are done.
+        progress: told of every cell.
+
+    Returns:
+        The rows, in the order of the definitions.
+
+    Raises:
+        InputError: LPIPS weights that cannot be read. Anything else is an error of its cell.
+        KeyboardInterrupt: after Ctrl-C; the next call goes on.
+    """
+    cells = cells_of(definitions)
+    (folder / "cells").mkdir(parents=True, exist_ok=True)
+    weights = {d.lpips: load_lpips(d.folder / d.lpips) for d in definitions if d.lpips is not None}
+    stand: Stand | None = None
+    for number, cell in enumerate(cells):
+        progress("bench", number, len(cells), {"cell": cell.label})
+        if _done(folder, cell):
+            continue
+        try:
+            if stand is None or (stand.definition, stand.scene) != (cell.definition, cell.scene):
+                stand = Stand(folder / "work", cell.definition, cell.scene)
+            answer = _measure(stand, cell, folder, weights.get(cell.definition.lpips or "", {}))
+        except (G2ardError, OSError, MemoryError) as error:
+            stand = None
+            answer = {"rows": [asdict(_failed(cell, error))], "views": {}}
+        _write_json(folder / "cells" / f"{cell.key}.json", {**answer, "label": cell.label})
+        write_csv(folder / "rows.csv", _rows(folder, cells))
+    progress("bench", len(cells), len(cells), {})
+    rows = _rows(folder, cells)
+    write_csv(folder / "rows.csv", rows)
+    if not keep and not any(row.error for row in rows):
+        shutil.rmtree(folder / "work", ignore_errors=True)
+    return rows
+
+
+def cells_of(definitions: Sequence[Definition]) -> list[Cell]:
+    """All cells of some studies, in the order they are measured."""
+    return [Cell(d, *what) for d in definitions for what in d.cells()]
+
+
+def _done(folder: Path, cell: Cell) -> bool:
+    rows = _read_cell(folder, cell)
+    return bool(rows) and not any(row.error for row in rows)
+
+
+def _read_cell(folder: Path, cell: Cell) -> list[Row]:
+    path = folder / "cells" / f"{cell.key}.json"
+    return [Row(**row) for row in json.loads(path.read_text())["rows"]] if path.exists() else []
+
+
+def _rows(folder: Path, cells: Sequence[Cell]) -> list[Row]:
+    return [row for cell in cells for row in _read_cell(folder, cell)]
+
+
+def _head(cell: Cell, prior: str, split: str) -> Row:
+    return Row(
+        study=cell.definition.name,
+        scene=cell.scene.name,
+        prior=prior,
+        method=cell.method.name,
+        ratio=cell.ratio,
+        matched=cell.matched.kind,
+        amount=cell.matched.amount,
+        seed=cell.seed,
+        split=split,
+        against=cell.scene.targets,
+        submethod=f"{cell.method.name}-{cell.ratio:g}x-{cell.matched.label.replace(' ', '')}",
+        version=f"g2ard {__version__}",
+        machine=machine(),
+    )
+
+
+def _failed(cell: Cell, error: BaseException) -> Row:
+    text = " ".join(str(error).split()) or type(error).__name__
+    return replace(_head(cell, cell.method.prior or "", ""), error=text)
+
+
+def _measure(stand: Stand, cell: Cell, folder: Path, lpips: dict[str, Lpips]) -> dict[str, Any]:
+    work = Pipeline(stand, cell)
+    result = work.run()
+    splats = io.read_splats(result.output)
+    if len(splats) != work.budget:
+        raise InputError(f"{len(splats)} Gaussians came out, {work.budget} were asked for")
+    figures = {
+        "input_count": work.count,
+        "budget": work.budget,
+        "count": len(splats),
+        "bytes": splats.nbytes,
+        "drift95": work.last.get("drift95"),
+        "needle": work.last.get("needle"),
+        "steps": work.steps,
+        "reduce_cpu_s": work.reducing.cpu,
+        "reduce_wall_s": work.reducing.wall,
+        "reduce_peak_mb": work.reducing.peak,
+        "recover_cpu_s": work.recovering.cpu,
+        "recover_wall_s": work.recovering.wall,
+        "recover_peak_mb": work.recovering.peak,
+        "adapt_cpu_s": work.adapting.cpu if cell.definition.adapt_steps else None,
+        "cpu_s": work.reducing.cpu + work.recovering.cpu,
+        "seconds": work.reducing.wall + work.recovering.wall,
+    }
+    rows, views = [], {}
+    for split, targets in stand.test.items():
+        _picture_targets(folder, stand, split)
+        pictures = folder / "images" / cell.key / split
+        scored = score(splats, targets, cell.scene.background, lpips=lpips, pictures=pictures)
+        measured: dict[str, Any] = {**figures, **_means(scored)}
+        rows.append(asdict(replace(_head(cell, work.prior, split), **measured)))
+        views[split] = [asdict(view) for view in scored.views]
+    return {"rows": rows, "views": views, "scene_key": stand.key}
+
+
+def _means(scored: Scored) -> dict[str, Any]:
+    names = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
+    means: dict[str, Any] = {name: scored.mean(name) for name in names}
+    return {**means, "luma_drift": scored.luma_drift, "views": len(scored.views)}
+
+
+def _picture_targets(folder: Path, stand: Stand, split: str) -> None:
+    targets = stand.test[split]
+    for view in pictured(len(targets.cameras)):
+        path = folder / "images" / stand.key / split / f"{view}.jpg"
+        if not path.exists():
+            save_jpeg(path, targets[view])
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    with atomic_output(path, overwrite=True) as temporary:
+        temporary.write_text(json.dumps(content))

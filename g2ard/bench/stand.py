@@ -1,0 +1,311 @@
+"""Scenes made ready for a study, and stages run on them: each once, whoever asks for it again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from g2ard import __version__, io
+from g2ard.bench.definition import Definition, SceneSpec
+from g2ard.bench.process import Usage, measured
+from g2ard.bench.worker import StoredTargets, store_targets
+from g2ard.cameras import Cameras
+from g2ard.errors import InputError
+from g2ard.progress import Progress, silent
+from g2ard.splats import Splats
+from g2ard.splits import split_mask
+from g2ard.targets import Photos, Targets, TeacherRenders
+
+__all__ = ["Stage", "Stand", "fingerprint"]
+
+_POOL = 128
+_MAX_LOGIT = 20.0
+
+
+def fingerprint(value: Any) -> str:
+    """A short hash of anything that JSON can hold."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage that has run.
+
+    Args:
+        key: of all that went into it.
+        output: its scene or views.
+        usage: of its process.
+        report: what it reported.
+    """
+
+    key: str
+    output: Path
+    usage: Usage
+    report: dict[str, Any]
+
+
+class Stand:
+    """One scene of a definition with its priors, views and targets, and the stages run on it.
+
+    All lives in `folder`; a stage whose key is there already is not run again.
+    """
+
+    def __init__(
+        self, folder: Path, definition: Definition, scene: SceneSpec, progress: Progress = silent
+    ) -> None:
+        self.definition, self.scene, self.progress = definition, scene, progress
+        stated = {**asdict(scene), "size": definition.size, "version": __version__}
+        files = (
+            () if scene.synth is not None else (scene.prior, scene.train, scene.adapt, *scene.score.values())
+        )
+        stamps = [_stamp(definition.folder / file) for file in files if file is not None]
+        self.key = fingerprint({**stated, "files": stamps})
+        self.folder = folder / f"{scene.name.replace('/', '_')}-{self.key}"
+        self.folder.mkdir(parents=True, exist_ok=True)
+
+    @cached_property
+    def place(self) -> Path:
+        """What the definition's paths are relative to; a city is made here."""
+        if self.scene.synth is None:
+            return self.definition.folder
+        from g2ard.synth import CityConfig, write_city
+
+        town = self.folder / "city"
+        if not town.is_dir():
+            options = dict(self.scene.synth)
+            if "size" in options:
+                options["size"] = tuple(options["size"])
+            write_city(town, CityConfig(sky=self.scene.background, **options), progress=self.progress)
+        return town
+
+    @cached_property
+    def kinds(self) -> tuple[str, ...]:
+        """The priors there are, the usual one first."""
+        if io.kind(self.place / self.scene.prior) == "splats":
+            return ("given",)
+        if self.scene.targets == "teacher":
+            raise InputError(f"scene {self.scene.name}: a cloud is no teacher: targets must be photos")
+        return ("trained", "lift") if self.scene.train_prior else ("lift",)
+
+    def prior(self, kind: str | None) -> Stage:
+        """A prior, written out as .ply.
+
+        Raises:
+            InputError: the scene has no prior of that kind.
+        """
+        kind = kind or self.kinds[0]
+        if kind not in self.kinds:
+            raise InputError(f"scene {self.scene.name}: no {kind} prior (it has {', '.join(self.kinds)})")
+        if kind == "trained":
+            return self._trained()
+        path = self.folder / "prior.ply"
+        if not path.exists():
+            source = self.place / self.scene.prior
+            splats = _readable(source) if kind == "given" else _lifted(source)
+            io.write_splats(path, splats)
+        return Stage(f"{self.key}-{kind}", path, Usage(0, 0, 0), {})
+
+    def _trained(self) -> Stage:
+        from g2ard.recover.anchors import PRESETS
+
+        lift = self.prior("lift")
+        return self.recover(
+            lift,
+            self.train,
+            {
+                "schedule": "default",
+                "steps": self.scene.train_prior,
+                "seconds": None,
+                "regularizers": asdict(PRESETS["lift"]),
+                "sh_degree": 3,
+                "final": True,
+                "seed": 0,
+            },
+        )
+
+    @cached_property
+    def train(self) -> Path:
+        """Training views, at the study's size, photos named by absolute path."""
+        path = self.folder / "train.json"
+        if not path.exists():
+            if self.scene.train is None:
+                cameras = self._pool("train")
+            else:
+                whole = self.place / self.scene.train
+                cameras = self._views(whole, "all" if self.scene.score else "train")
+            io.write_views(path, cameras)
+        return path
+
+    def adaptation(self, split: str) -> Cameras:
+        """Views of new appearance: "train" to adapt on, "test" held out from them."""
+        if self.scene.adapt is None:
+            raise InputError(f"scene {self.scene.name}: the study adapts, and it has no `adapt` views")
+        return self._views(self.place / self.scene.adapt, split)
+
+    @cached_property
+    def adapt(self) -> Path:
+        """The views to adapt on, written out."""
+        path = self.folder / "adapt.json"
+        if not path.exists():
+            io.write_views(path, self.adaptation("train"))
+        return path
+
+    def _views(self, path: Path, split: str) -> Cameras:
+        found = io.read_view_set(path)
+        mask = split_mask(path, found.cameras.names, split, stated=found.splits)
+        return found.cameras.take(mask).resized(self.definition.size)
+
+    def _pool(self, split: str) -> Cameras:
+        """A pool made for the scene; every 8th pose is scored."""
+        path = self.folder / "pool.json"
+        if not path.exists():
+            from g2ard.poses import make_pool
+
+            io.write_views(path, make_pool(io.read_splats(self.prior(None).output), _POOL, seed=0))
+        return self._views(path, split)
+
+    @cached_property
+    def test(self) -> dict[str, Targets]:
+        """Split → targets to score against."""
+        spec = self.scene
+        if spec.score:
+            views = {name: self._views(self.place / path, "all") for name, path in spec.score.items()}
+        elif spec.train is not None:
+            views = {"test": self._views(self.place / spec.train, "test")}
+        else:
+            views = {"test": self._pool("test")}
+        if self.definition.adapt_steps:
+            views["adapt-val"] = self.adaptation("test")
+        return {name: self._scored(name, cameras) for name, cameras in views.items()}
+
+    def _scored(self, name: str, cameras: Cameras) -> Targets:
+        return StoredTargets(cameras, self._stored(f"targets-{name}", cameras))
+
+    @cached_property
+    def train_targets(self) -> Path:
+        """Where the targets of the training views lie."""
+        return self._stored("targets-train", io.read_views(self.train))
+
+    def _stored(self, name: str, cameras: Cameras) -> Path:
+        folder = self.folder / name
+        if not (folder / "names.json").exists():  # written last
+            store_targets(self._made(cameras), folder)
+        return folder
+
+    def _made(self, cameras: Cameras) -> Targets:
+        if self.scene.targets == "photos":
+            return Photos(cameras, limit=0)
+        teacher = io.read_splats(self.prior(None).output)
+        return TeacherRenders(teacher, cameras, background=self.scene.background, limit=0)
+
+    def reduce(self, source: Stage, views: Path, options: dict[str, Any], flags: Path | None = None) -> Stage:
+        """Fewer Gaussians; `options` are those of the worker's job."""
+        if options["method"].startswith("splat-transform"):
+            return self._rival(source, options)
+        job = {"kind": "reduce", **options, "indoor": self.scene.indoor}
+        files = {"scene": source.output, "views": views, **({"flags": flags} if flags else {})}
+        return self._run(job, source.key, "out.ply", files)
+
+    def _rival(self, source: Stage, options: dict[str, Any]) -> Stage:
+        program = shutil.which("splat-transform")
+        if program is None:
+            raise InputError("splat-transform: not on PATH (npm i -g @playcanvas/splat-transform)")
+        mode = "--decimate-adaptive" if options["method"].endswith("adaptive") else "--decimate"
+
+        def command(output: Path) -> list[str]:
+            given = [program, "-q", "-w", "-g", "cpu", str(source.output), mode]
+            return [*given, str(options["count"]), str(output)]
+
+        return self._run({"kind": "rival", **options}, source.key, "out.ply", {}, command)
+
+    def select(self, source: Stage, policy: str, k: float, seed: int) -> Path:
+        """Part of the training views, chosen by what the prior shows."""
+        count = max(1, round(k * len(io.read_views(self.train))))
+        job = {"kind": "select", "policy": policy, "k": count, "seed": seed}
+        files = {"scene": source.output, "views": self.train}
+        return self._run(job, source.key, "views.json", files).output
+
+    def recover(self, source: Stage, views: Path, options: dict[str, Any]) -> Stage:
+        """Recovery against the training targets."""
+        job = {"kind": "recover", **options, "background": list(self.scene.background)}
+        return self._run(job, source.key, "out.ply", self._inputs(source, views))
+
+    def readapt(self, source: Stage, sh_degree: int | None, seed: int) -> Stage:
+        """New appearance on frozen geometry."""
+        job = {
+            "kind": "adapt",
+            "steps": self.definition.adapt_steps,
+            "sh_degree": sh_degree,
+            "seed": seed,
+            "background": list(self.scene.background),
+        }
+        files = {"scene": source.output, "views": self.adapt, "targets": self._adapt_targets}
+        return self._run(job, source.key, "out.ply", files)
+
+    @cached_property
+    def _adapt_targets(self) -> Path:
+        return self._stored("targets-adapt", self.adaptation("train"))
+
+    def _inputs(self, source: Stage, views: Path) -> dict[str, Path]:
+        return {"scene": source.output, "views": views, "targets": self.train_targets}
+
+    def _run(
+        self,
+        job: dict[str, Any],
+        upstream: str,
+        output: str,
+        files: dict[str, Path],
+        command: Callable[[Path], list[str]] | None = None,
+    ) -> Stage:
+        views = files.get("views", self.train)
+        chosen = None if views.parent == self.folder else views.read_text(encoding="utf-8")
+        key = fingerprint([job, upstream, chosen, __version__])
+        place = self.folder / "stages" / key
+        made, usage = place / output, place / "usage.json"
+        if not usage.exists():  # written last
+            shutil.rmtree(place, ignore_errors=True)
+            place.mkdir(parents=True)
+            paths = {name: str(path) for name, path in files.items()}
+            (place / "job.json").write_text(json.dumps({**job, **paths, "output": str(made)}))
+            worker = [sys.executable, "-m", "g2ard.bench.worker", str(place / "job.json")]
+            took = measured(worker if command is None else command(made), place / "log")
+            usage.write_text(json.dumps(asdict(took)))
+        report = place / "report.json"
+        return Stage(
+            key,
+            made,
+            Usage(**json.loads(usage.read_text())),
+            json.loads(report.read_text()) if report.exists() else {},
+        )
+
+
+def _stamp(path: Path) -> Any:
+    """What tells one version of a file or folder from another, without reading it."""
+    if not path.exists():
+        return None
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    return [(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in files if f.is_file()]
+
+
+def _readable(path: Path) -> Splats:
+    """The scene as every program can read it: an opacity of exactly 1 has no finite logit."""
+    from dataclasses import replace
+
+    splats = io.read_splats(path)
+    return replace(splats, logit_opacities=np.clip(splats.logit_opacities, -_MAX_LOGIT, _MAX_LOGIT))
+
+
+def _lifted(path: Path) -> Splats:
+    from g2ard.lift import lift
+
+    points = io.read_points(path)
+    return lift(points.positions, points.colors)

@@ -1,0 +1,60 @@
+"""`g2ard adapt`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from g2ard.cli.frame import Run, command
+from g2ard.cli.options import BackgroundOption, OutputOption, SizeOption, SplitOption, TeacherOption
+
+
+@command("adapt", example="g2ard adapt small.ply --views winter/ -o winter.ply")
+def adapt(
+    run: Run,
+    compact: Annotated[Path, typer.Argument(metavar="COMPACT", help="The scene whose geometry stays.")],
+    views: Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")],
+    output: OutputOption,
+    teacher: TeacherOption = None,
+    steps: Annotated[int, typer.Option(min=1, help="At most.")] = 7000,
+    tolerance: Annotated[
+        float, typer.Option(min=0, help="Stop when a stretch gains less, dB; 0 takes all steps.")
+    ] = 0.05,
+    schedule: Annotated[Literal["default", "paper"], typer.Option(help="Rates and decay.")] = "default",
+    sh_degree: Annotated[
+        int | None, typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's if not given.")
+    ] = None,
+    split: SplitOption = "train",
+    size: SizeOption = None,
+    background: BackgroundOption = None,
+) -> None:
+    """Refit colours and opacities to new images; means, rotations and scales stay as they are."""
+    from g2ard.adapt import AdaptConfig
+    from g2ard.adapt import adapt as refit
+    from g2ard.cli.scenes import load_scene, load_views, make_targets
+    from g2ard.io import write_splats
+    from g2ard.io.atomic import check_output
+
+    check_output(output, run.overwrite)
+    colour = background or (0.0, 0.0, 0.0)
+    splats = load_scene(run, compact)
+    dense = load_scene(run, teacher) if teacher else None
+    cameras = load_views(run, views, split, size)
+    config = AdaptConfig(
+        steps=steps,
+        tolerance=tolerance,
+        schedule=schedule,
+        sh_degree=sh_degree,
+        background=colour,
+        seed=run.seed,
+    )
+    result = refit(splats, make_targets(run, cameras, dense, colour), config, progress=run.progress)
+    write_splats(output, result.splats, overwrite=run.overwrite)
+    gain, end = result.report["psnr"], "converged" if result.report["converged"] else "all steps taken"
+    run.say(
+        f"{output}: {len(splats):,} Gaussians, {result.report['steps']:,} steps ({end}), "
+        f"training views {gain['before']:.2f} → {gain['after']:.2f} dB"
+    )
+    run.result({**result.report, "output": str(output)})

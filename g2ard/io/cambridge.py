@@ -1,0 +1,112 @@
+"""Cambridge Landmarks: poses of dataset_*.txt, focal lengths of reconstruction.nvm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from g2ard.errors import InputError
+from g2ard.io.colmap import parsing
+from g2ard.io.photos import Frame, photo_size, rotation, view_set
+from g2ard.io.types import Note, ViewSet
+
+__all__ = ["is_cambridge", "read"]
+
+_SIZE = (1920, 1080)
+"""Of every photo of the data set, which the focal lengths are pixels of; smaller copies shrink them."""
+
+_LISTS = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
+_MODEL = "reconstruction.nvm"
+
+
+class _Lens(NamedTuple):
+    focal: float
+    radial: float
+
+
+def is_cambridge(folder: Path) -> bool:
+    """Whether the folder holds a scene of the data set."""
+    return (folder / _MODEL).is_file() and any((folder / name).is_file() for name in _LISTS.values())
+
+
+def read(path: Path, images: Path | None = None) -> ViewSet:
+    """Read both lists; each view states its split.
+
+    A line is the photo's name, the camera's centre and the quaternion (wxyz) of camera_from_world.
+    VisualSFM's radial parameter r undistorts, m_u = (1 + r·|m|²)·m; OpenCV's k1 distorts, and is −r to first
+    order.
+
+    Args:
+        path: the scene's folder.
+        images: the folder of the photos (with its seq1/ …); None means the scene's.
+
+    Raises:
+        InputError: a line that is not a pose, or no focal length at all.
+    """
+    lenses = _lenses(path / _MODEL)
+    median = _Lens(float(np.median([lens.focal for lens in lenses.values()])), 0.0)
+    frames, guessed = [], 0
+    for split, name in _LISTS.items():
+        if not (path / name).is_file():
+            continue
+        for photo_name, pose in _poses(path / name):
+            lens = lenses.get(_stem(photo_name))
+            guessed += lens is None
+            photo = (images or path) / photo_name
+            frames.append(_frame(photo_name, pose, lens or median, photo, split))
+    found = view_set(path, frames)
+    if not guessed:
+        return found
+    text = f"{guessed} views are not in {_MODEL}: the median focal length, {median.focal:.1f}, stands in"
+    return replace(found, notes=(*found.notes, Note("guessed_focal", guessed, text)))
+
+
+def _frame(name: str, pose: list[float], lens: _Lens, photo: Path, split: str) -> Frame:
+    width, height = photo_size(photo) if photo.is_file() else _SIZE
+    view = np.eye(4)
+    view[:3, :3] = rotation(pose[3:])
+    view[:3, 3] = -view[:3, :3] @ np.array(pose[:3])
+    focal = lens.focal * width / _SIZE[0]
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return Frame(name, view, K, (width, height), photo, (-lens.radial, 0.0, 0.0, 0.0, 0.0), split)
+
+
+def _stem(name: str) -> str:
+    """The model lists .jpg where the photos are .png."""
+    return name.rsplit(".", 1)[0]
+
+
+def _lenses(path: Path) -> dict[str, _Lens]:
+    """Of the first model in an NVM file: name, focal, quaternion, centre, radial distortion, 0."""
+    with parsing(path):
+        lines = path.read_text(encoding="utf-8").splitlines()
+        if not lines or not lines[0].startswith("NVM_V3"):
+            raise InputError(f"{path}: not VisualSFM's NVM_V3")
+        at = next(i for i, line in enumerate(lines[1:], 1) if line.strip())
+        rows = [line.replace("\t", " ").split() for line in lines[at + 1 : at + 1 + int(lines[at])]]
+        lenses = {_stem(row[0]): _Lens(float(row[1]), float(row[9])) for row in rows}
+    if not lenses:
+        raise InputError(f"{path}: lists no camera")
+    return lenses
+
+
+def _poses(path: Path) -> list[tuple[str, list[float]]]:
+    """Three lines of heading, then a pose a line."""
+    out = []
+    with parsing(path):
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines()[3:], 4):
+            words = line.split()
+            if not words:
+                continue
+            if len(words) != 8:
+                raise InputError(
+                    f"{path}: line {number}: expected a name and 7 numbers, got {len(words)} words"
+                )
+            pose = [float(word) for word in words[1:]]
+            if not np.isfinite(pose).all() or not np.linalg.norm(pose[3:]) > 0:
+                raise InputError(f"{path}: line {number}: not a pose")
+            out.append((words[0], pose))
+    return out

@@ -1,0 +1,118 @@
+"""LPIPS (Zhang et al. 2018), version 0.1, from weights that the user gives; nothing is ever downloaded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+
+__all__ = ["Lpips", "load_lpips"]
+
+_MEAN, _STD = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+"""LPIPS's own normalisation of images in [−1, 1]."""
+
+_CONV = {
+    "alex": {0: (4, 2), 3: (1, 2), 6: (1, 1), 8: (1, 1), 10: (1, 1)},
+    "vgg": dict.fromkeys((0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28), (1, 1)),
+}
+"""Convolutions of torchvision's `features`, by index; each with a ReLU behind it. (stride, padding) is read
+below."""
+
+_POOL = {"alex": {2: 3, 5: 3}, "vgg": {4: 2, 9: 2, 16: 2, 23: 2}}
+_TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
+_FILES = {"alex": ("alexnet*.pth", "alex.pth"), "vgg": ("vgg16*.pth", "vgg.pth")}
+
+
+class Lpips:
+    """The distance of one network: 0 for equal images, about 1 at worst.
+
+    Args:
+        net: "alex" or "vgg".
+        backbone: torchvision's state dict of the network: features.N.weight, features.N.bias.
+        linear: LPIPS's own: linN.model.1.weight (1, C, 1, 1).
+
+    Raises:
+        InputError: weights that are missing.
+    """
+
+    def __init__(self, net: str, backbone: dict[str, Any], linear: dict[str, Any]) -> None:
+        self.net = net
+        self._layers: dict[int, tuple[Any, Any]] = {}
+        try:
+            for i in _CONV[net]:
+                self._layers[i] = (backbone[f"features.{i}.weight"], backbone[f"features.{i}.bias"])
+            self._linear = [_linear(linear, i) for i in range(5)]
+        except KeyError as error:
+            raise InputError(f"LPIPS {net}: the weights lack {error}") from None
+
+    def __call__(self, image: NDArray[np.float32], target: NDArray[np.float32]) -> float:
+        """Distance of two (H, W, 3) images in [0, 1]."""
+        import torch
+
+        with torch.inference_mode():
+            total = 0.0
+            for a, b, weight in zip(self._maps(image), self._maps(target), self._linear, strict=True):
+                difference = (_unit(a) - _unit(b)) ** 2
+                total += float((difference * weight.reshape(1, -1, 1, 1)).sum(1).mean())
+        return total
+
+    def _maps(self, image: NDArray[np.float32]) -> list[Any]:
+        import torch
+        from torch.nn import functional
+
+        x = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None] * 2 - 1
+        x = (x - torch.tensor(_MEAN).reshape(1, 3, 1, 1)) / torch.tensor(_STD).reshape(1, 3, 1, 1)
+        taps = []
+        for i in range(_TAPS[self.net][-1] + 1):
+            if i in self._layers:
+                weight, bias = self._layers[i]
+                stride = _CONV[self.net][i][0]
+                padding = _CONV[self.net][i][1]
+                x = functional.conv2d(x, weight, bias, stride=stride, padding=padding)
+            elif i in _POOL[self.net]:
+                x = functional.max_pool2d(x, _POOL[self.net][i], stride=2)
+            else:
+                x = functional.relu(x)
+            if i in _TAPS[self.net]:
+                taps.append(x)
+        return taps
+
+
+def load_lpips(folder: Path) -> dict[str, Lpips]:
+    """The networks whose weights lie in a folder: alexnet*.pth with alex.pth, vgg16*.pth with vgg.pth.
+
+    The former are torchvision's ImageNet weights, the latter LPIPS's linear layers (v0.1), both as published.
+
+    Raises:
+        InputError: the folder holds neither pair, or a file that is no state dict.
+    """
+    import torch
+
+    out = {}
+    for net, (backbone, linear) in _FILES.items():
+        found = sorted(folder.glob(backbone))
+        if not found or not (folder / linear).is_file():
+            continue
+        files = []
+        for path in (found[0], folder / linear):
+            try:
+                files.append(torch.load(path, map_location="cpu", weights_only=True))
+            except Exception as error:  # torch raises whatever the pickle met
+                raise InputError(f"{path}: no weights of torch's ({type(error).__name__})") from None
+        out[net] = Lpips(net, files[0], files[1])
+    if not out:
+        raise InputError(f"{folder}: no LPIPS weights (alexnet*.pth and alex.pth, or vgg16*.pth and vgg.pth)")
+    return out
+
+
+def _linear(weights: dict[str, Any], i: int) -> Any:
+    return weights[f"lin{i}.model.1.weight"].reshape(-1)
+
+
+def _unit(x: Any) -> Any:
+    """Each pixel's features divided by their length."""
+    return x / (x.pow(2).sum(1, keepdim=True).sqrt() + 1e-10)

@@ -1,0 +1,220 @@
+"""Scatter and line charts as SVG text that follows the page's light or dark colours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from itertools import pairwise
+
+__all__ = ["Point", "chart", "pareto", "ticks"]
+
+_WIDTH, _HEIGHT = 560, 340
+_LEFT, _RIGHT, _TOP, _BOTTOM = 54, 14, 12, 44
+_MARKS = ("circle", "square", "diamond", "triangle")
+
+
+@dataclass(frozen=True)
+class Point:
+    """A dot of a chart.
+
+    Args:
+        x: along the axis; positive on a logarithmic one.
+        y: up.
+        series: which colour, a number from 0.
+        mark: which shape, a number from 0.
+        text: what hovering shows.
+        label: written beside it where there is room; "" for none.
+    """
+
+    x: float
+    y: float
+    series: int
+    mark: int = 0
+    text: str = ""
+    label: str = ""
+
+
+def pareto(points: Sequence[Point]) -> list[Point]:
+    """Those that no other point beats: none is both at most as far right and at least as high; left to right.
+
+    >>> [p.x for p in pareto([Point(1, 5, 0), Point(2, 4, 0), Point(3, 9, 0)])]
+    [1, 3]
+    """
+    front: list[Point] = []
+    for point in sorted(points, key=lambda p: (p.x, -p.y)):
+        if not front or point.y > front[-1].y:
+            front.append(point)
+    return front
+
+
+def ticks(low: float, high: float, *, log: bool = False) -> list[float]:
+    """Round values between two ends, about six.
+
+    >>> ticks(0, 10), ticks(0.9, 120, log=True)
+    ([0, 2, 4, 6, 8, 10], [1, 2, 5, 10, 20, 50, 100])
+    """
+    if log:
+        first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+        steps = (1, 2, 5) if last - first <= 4 else (1,)
+        values = [m * 10.0**e for e in range(first, last + 1) for m in steps]
+        return [_neat(v) for v in values if low * 0.999 <= v <= high * 1.001]
+    raw = (high - low) / 5
+    unit = 10.0 ** math.floor(math.log10(raw))
+    step = unit * min((1, 2, 2.5, 5, 10), key=lambda m: abs(m * unit - raw))
+    first = math.ceil(low / step - 1e-9)
+    return [_neat(k * step) for k in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def _neat(value: float) -> float:
+    return int(value) if value == int(value) else round(value, 10)
+
+
+class _Axis:
+    """Values to pixels."""
+
+    def __init__(self, values: Sequence[float], start: float, end: float, *, log: bool) -> None:
+        self.log, self._start, self._end = log, start, end
+        low, high = min(values), max(values)
+        if log:
+            low, high = low / 1.15, high * 1.15
+        else:
+            room = 0.06 * (high - low) or 0.5
+            low, high = low - room, high + room
+        self.low, self.high = low, high
+
+    def __call__(self, value: float) -> float:
+        low, high, at = self.low, self.high, value
+        if self.log:
+            low, high, at = math.log(low), math.log(high), math.log(value)
+        return self._start + (self._end - self._start) * (at - low) / (high - low)
+
+
+def chart(
+    points: Sequence[Point],
+    *,
+    x_label: str,
+    y_label: str,
+    log: bool = False,
+    joined: bool = False,
+    front: bool = False,
+) -> str:
+    """One chart.
+
+    Args:
+        points: the dots.
+        x_label: under the axis.
+        y_label: beside it.
+        log: whether x is logarithmic.
+        joined: whether dots of one series and mark are joined by a line.
+        front: whether the Pareto front (left and up is better) is drawn.
+
+    Returns:
+        An <svg> element; "" where there is no point to draw.
+    """
+    points = [p for p in points if math.isfinite(p.y) and math.isfinite(p.x) and (p.x > 0 or not log)]
+    if not points:
+        return ""
+    x = _Axis([p.x for p in points], _LEFT, _WIDTH - _RIGHT, log=log)
+    y = _Axis([p.y for p in points], _HEIGHT - _BOTTOM, _TOP, log=False)
+    parts = [*_grid(x, y), _caption(x_label, y_label)]
+    if front:
+        parts.append(_front(pareto(points), x, y))
+    if joined:
+        parts += _lines(points, x, y)
+    parts += [_dot(p, x(p.x), y(p.y)) for p in points]
+    parts += _names(points, x, y)
+    return (
+        f'<svg class="chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" '
+        f'aria-label="{escape(y_label)} against {escape(x_label)}">{"".join(parts)}</svg>'
+    )
+
+
+def _grid(x: _Axis, y: _Axis) -> list[str]:
+    out = []
+    for value in ticks(y.low, y.high):
+        at = y(value)
+        out.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>')
+        out.append(f'<text class="tick" x="{_LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{value:g}</text>')
+    for value in ticks(x.low, x.high, log=x.log):
+        at = x(value)
+        bottom = _HEIGHT - _BOTTOM
+        out.append(f'<line class="grid" x1="{at:.1f}" x2="{at:.1f}" y1="{_TOP}" y2="{bottom}"/>')
+        out.append(
+            f'<text class="tick" x="{at:.1f}" y="{bottom + 16}" text-anchor="middle">{_short(value)}</text>'
+        )
+    return out
+
+
+def _short(value: float) -> str:
+    """1500000 → 1.5M: counts and seconds alike."""
+    for size, unit in ((1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:g}{unit}"
+    return f"{value:g}"
+
+
+def _caption(x_label: str, y_label: str) -> str:
+    middle = (_LEFT + _WIDTH - _RIGHT) / 2
+    up = (_TOP + _HEIGHT - _BOTTOM) / 2
+    return (
+        f'<text class="axis" x="{middle}" y="{_HEIGHT - 6}" text-anchor="middle">{escape(x_label)}</text>'
+        f'<text class="axis" x="14" y="{up}" text-anchor="middle" '
+        f'transform="rotate(-90 14 {up})">{escape(y_label)}</text>'
+    )
+
+
+def _front(points: Sequence[Point], x: _Axis, y: _Axis) -> str:
+    """A staircase: between two points of the front, the left one is still the best."""
+    corners = [f"{x(points[0].x):.1f},{y(points[0].y):.1f}"]
+    for before, after in pairwise(points):
+        corners.append(f"{x(after.x):.1f},{y(before.y):.1f}")
+        corners.append(f"{x(after.x):.1f},{y(after.y):.1f}")
+    corners.append(f"{_WIDTH - _RIGHT},{y(points[-1].y):.1f}")
+    return f'<polyline class="front" points="{" ".join(corners)}"/>'
+
+
+def _lines(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
+    groups: dict[tuple[int, int], list[Point]] = {}
+    for point in points:
+        groups.setdefault((point.series, point.mark), []).append(point)
+    out = []
+    for (series, _), members in groups.items():
+        path = " ".join(f"{x(p.x):.1f},{y(p.y):.1f}" for p in sorted(members, key=lambda p: p.x))
+        out.append(f'<polyline class="line s{series}" points="{path}"/>')
+    return out
+
+
+def _dot(point: Point, x: float, y: float) -> str:
+    title = f"<title>{escape(point.text)}</title>"
+    css = f'class="dot s{point.series}"'
+    mark = _MARKS[point.mark % len(_MARKS)]
+    if mark == "circle":
+        return f'<circle {css} cx="{x:.1f}" cy="{y:.1f}" r="5">{title}</circle>'
+    shapes: dict[str, list[tuple[float, float]]] = {
+        "square": [(-4.5, -4.5), (4.5, -4.5), (4.5, 4.5), (-4.5, 4.5)],
+        "diamond": [(0, -6), (6, 0), (0, 6), (-6, 0)],
+        "triangle": [(0, -6), (5.5, 4.5), (-5.5, 4.5)],
+    }
+    corners = " ".join(f"{x + dx:.1f},{y + dy:.1f}" for dx, dy in shapes[mark])
+    return f'<polygon {css} points="{corners}">{title}</polygon>'
+
+
+def _names(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
+    """Labels beside their dots, best first; one that would cover another is left to hovering."""
+    out: list[str] = []
+    taken: list[tuple[float, float, float]] = []
+    for point in sorted((p for p in points if p.label), key=lambda p: -p.y):
+        width, left = 6.2 * len(point.label), x(point.x) + 9
+        anchor, at = "start", left
+        if left + width > _WIDTH - _RIGHT:
+            anchor, at = "end", x(point.x) - 9
+            left = at - width
+        bottom = y(point.y) - 6
+        if any(left < right and start < left + width and abs(bottom - b) < 12 for start, right, b in taken):
+            continue
+        taken.append((left, left + width, bottom))
+        text = escape(point.label)
+        out.append(f'<text class="name" x="{at:.1f}" y="{bottom:.1f}" text-anchor="{anchor}">{text}</text>')
+    return out

@@ -1,0 +1,110 @@
+"""A distillation's report: how close it came and what it took, then the views that came out worst."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from g2ard.images import to_bytes
+from g2ard.render import render
+from g2ard.report.charts import Point, chart
+from g2ard.report.page import Comparison, Page, Shown, legend
+from g2ard.splats import Splats
+from g2ard.targets import Targets
+
+__all__ = ["distill_report"]
+
+_VIEWS = 6
+_STRETCHES = 25
+"""Of the loss: single views differ more than steps do."""
+
+
+def distill_report(
+    path: Path,
+    title: str,
+    scenes: Sequence[tuple[str, Splats]],
+    targets: Targets,
+    report: dict[str, Any],
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> None:
+    """Write an HTML page about one run: error against seconds and count, the loss, worst views first.
+
+    Args:
+        path: the file.
+        title: of the page.
+        scenes: (name, scene) of `simplified` and `recovered`, as `report["scores"]` names them.
+        targets: held-out photos or teacher renders.
+        report: what `g2ard distill` writes as report.json.
+        background: RGB behind the scenes.
+    """
+    against = report["against"]
+    page = Page(title, f"{len(targets.cameras)} unseen views against {against}")
+    scores, seconds = report["scores"], report["seconds"]
+    names = [name for name, _ in scenes]
+    took = [seconds["simplify"], seconds["simplify"] + seconds["recover"]]
+    page.html(legend(names))
+    page.charts([*_error_charts(scenes, scores, took), *_loss_charts(report["rounds"])])
+    page.table(
+        ["scene", "Gaussians", "MB", "PSNR", "SSIM", "seconds"],
+        [
+            [
+                name,
+                f"{len(splats):,}",
+                f"{splats.nbytes / 1e6:.2f}",
+                f"{scores[name]['psnr']:.2f}",
+                f"{scores[name]['ssim']:.4f}",
+                f"{spent:.1f}",
+            ]
+            for (name, splats), spent in zip(scenes, took, strict=True)
+        ],
+        set(),
+    )
+    page.paragraph(
+        f"From {report['input_count']:,} Gaussians ({report['bytes']['input'] / 1e6:.2f} MB). "
+        f"Regularisers: {report['preset']}."
+    )
+    page.heading("Worst views first")
+    last = names[-1]
+    figures = [view["psnr"] for view in scores[last]["views"]]
+    for view in map(int, np.argsort(figures, kind="stable")[:_VIEWS]):
+        shown = []
+        for name, splats in reversed(scenes):
+            image = render(splats, targets.cameras, view, background=background).image
+            shown.append(Shown(name, to_bytes(image), f"{scores[name]['views'][view]['psnr']:.2f} dB"))
+        page.comparison(Comparison(targets.cameras.names[view], to_bytes(targets[view]), shown))
+    page.write(path)
+
+
+def _error_charts(
+    scenes: Sequence[tuple[str, Splats]], scores: dict[str, Any], took: Sequence[float]
+) -> list[tuple[str, str]]:
+    def points(xs: Sequence[float]) -> list[Point]:
+        return [
+            Point(x, scores[name]["psnr"], i, 0, f"{name}: {scores[name]['psnr']:.2f} dB", name)
+            for i, ((name, _), x) in enumerate(zip(scenes, xs, strict=True))
+        ]
+
+    over_time = chart(
+        points([max(t, 1e-3) for t in took]), x_label="seconds", y_label="PSNR, dB", log=True, front=True
+    )
+    over_count = chart(
+        points([len(splats) for _, splats in scenes]), x_label="Gaussians", y_label="PSNR, dB", log=True
+    )
+    return [("Error against time; dashed: the Pareto front", over_time), ("Error against count", over_count)]
+
+
+def _loss_charts(rounds: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
+    """The last recovery's."""
+    runs = [run for entry in rounds for run in entry.get("recover", [])]
+    if not runs or not runs[-1]["loss"]:
+        return []
+    steps = runs[-1]["steps"]
+    parts = np.array_split(np.array(runs[-1]["loss"]), _STRETCHES)
+    curve = [float(part.mean()) for part in parts if len(part)]
+    points = [
+        Point((k + 1) / len(curve) * steps, value, 1, 0, f"{value:.4f}") for k, value in enumerate(curve)
+    ]
+    return [("Loss of the last recovery", chart(points, x_label="step", y_label="loss", joined=True))]

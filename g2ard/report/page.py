@@ -1,0 +1,233 @@
+"""The page: its style, its script, and images that are stored once however often they are shown."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.images import to_bytes
+from g2ard.io.atomic import atomic_output
+
+__all__ = ["COLORS", "Comparison", "Page", "Shown", "legend", "worst_window"]
+
+COLORS = ("#2563eb", "#d97706", "#059669", "#db2777", "#7c3aed", "#64748b", "#0891b2", "#b91c1c", "#65a30d")
+_WINDOW = 0.28
+"""Side of a crop, as a share of the image's."""
+
+_LONGEST = 640
+_QUALITY = 86
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """One rendering of a view: what made it, its picture and its figure."""
+
+    name: str
+    image: NDArray[np.uint8]
+    caption: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A view as it should be and as several methods show it; the first of them is the one looked at."""
+
+    title: str
+    target: NDArray[np.uint8]
+    shown: Sequence[Shown]
+
+
+def worst_window(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> tuple[float, float]:
+    """The middle (x, y), in shares of the image, of the window that differs most.
+
+    >>> target = np.zeros((100, 100, 3), np.uint8)
+    >>> image = target.copy()
+    >>> image[70:80, 20:30] = 255
+    >>> x, y = worst_window(image, target)
+    >>> abs(x - 0.25) < 0.15, abs(y - 0.75) < 0.15
+    (True, True)
+    """
+    error = ((image.astype(np.float64) - target) ** 2).sum(-1)
+    height, width = error.shape
+    rows, columns = max(1, int(_WINDOW * height)), max(1, int(_WINDOW * width))
+    total = np.pad(error, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
+    sums = (
+        total[rows:, columns:] - total[:-rows, columns:] - total[rows:, :-columns] + total[:-rows, :-columns]
+    )
+    top, left = np.unravel_index(int(np.argmax(sums)), sums.shape)
+    return (float(left) + columns / 2) / width, (float(top) + rows / 2) / height
+
+
+class Page:
+    """An HTML page that grows section by section and is written whole."""
+
+    def __init__(self, title: str, subtitle: str = "") -> None:
+        self._title = title
+        self._parts = [f"<h1>{escape(title)}</h1>", f'<p class="sub">{escape(subtitle)}</p>']
+        self._images: list[str] = []
+
+    def html(self, text: str) -> None:
+        """Add markup as it is."""
+        self._parts.append(text)
+
+    def heading(self, text: str, level: int = 2) -> None:
+        """Add a heading."""
+        self._parts.append(f"<h{level}>{escape(text)}</h{level}>")
+
+    def paragraph(self, text: str) -> None:
+        """Add a paragraph."""
+        self._parts.append(f"<p>{escape(text)}</p>")
+
+    def table(
+        self, columns: Sequence[str], rows: Sequence[Sequence[str]], best: set[tuple[int, int]]
+    ) -> None:
+        """Add a table; cells (row, column) in `best` are bold."""
+        head = "".join(f"<th>{escape(name)}</th>" for name in columns)
+        body = []
+        for i, row in enumerate(rows):
+            cells = "".join(
+                f'<td class="best">{escape(cell)}</td>' if (i, j) in best else f"<td>{escape(cell)}</td>"
+                for j, cell in enumerate(row)
+            )
+            body.append(f"<tr>{cells}</tr>")
+        self._parts.append(
+            f'<div class="scroll"><table><thead><tr>{head}</tr></thead>'
+            f"<tbody>{''.join(body)}</tbody></table></div>"
+        )
+
+    def charts(self, charts: Sequence[tuple[str, str]]) -> None:
+        """Add charts side by side, each with its caption."""
+        figures = [
+            f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>"
+            for caption, svg in charts
+            if svg
+        ]
+        self._parts.append(f'<div class="row">{"".join(figures)}</div>')
+
+    def comparison(self, view: Comparison) -> None:
+        """Add a view: a slider between target and any rendering, and the worst window of each."""
+        target = self._image(view.target)
+        numbers = [self._image(shown.image) for shown in view.shown]
+        x, y = worst_window(view.shown[0].image, view.target)
+        height, width = view.target.shape[:2]
+        options = "".join(
+            f'<option value="{n}">{escape(s.name)} {escape(s.caption)}</option>'
+            for n, s in zip(numbers, view.shown, strict=True)
+        )
+        crops = [self._crop(target, "target", "", x, y)]
+        crops += [self._crop(n, s.name, s.caption, x, y) for n, s in zip(numbers, view.shown, strict=True)]
+        self._parts.append(
+            f'<section class="view"><h4>{escape(view.title)}</h4><div class="pair">'
+            f'<div class="slider" style="aspect-ratio:{width}/{height}">'
+            f'<img data-i="{target}" alt="target"><img class="over" data-i="{numbers[0]}" alt="rendering">'
+            f'<span class="tag left">target</span><span class="tag right"></span>'
+            f'<input type="range" min="0" max="100" value="50" aria-label="target or rendering"></div>'
+            f'<label class="pick">right: <select>{options}</select></label></div>'
+            f'<div class="crops" style="--shape:{width}/{height}">{"".join(crops)}</div></section>'
+        )
+
+    def _crop(self, number: int, name: str, caption: str, x: float, y: float) -> str:
+        zoom = 1 / _WINDOW
+        left, top = (0.5 - x * zoom) * 100, (0.5 - y * zoom) * 100
+        return (
+            f'<figure class="crop"><div><img data-i="{number}" alt="{escape(name)}" '
+            f'style="width:{zoom * 100:.0f}%;left:{left:.1f}%;top:{top:.1f}%;height:{zoom * 100:.0f}%"></div>'
+            f"<figcaption>{escape(name)}<br><b>{escape(caption)}</b></figcaption></figure>"
+        )
+
+    def _image(self, image: NDArray[np.uint8]) -> int:
+        from PIL import Image
+
+        picture = Image.fromarray(to_bytes(image))
+        picture.thumbnail((_LONGEST, _LONGEST))
+        buffer = BytesIO()
+        picture.save(buffer, "JPEG", quality=_QUALITY)
+        self._images.append(base64.b64encode(buffer.getvalue()).decode())
+        return len(self._images) - 1
+
+    def text(self) -> str:
+        """The whole page."""
+        colors = "".join(
+            f".s{i}{{--c:{color}}}" for i, color in enumerate(COLORS)
+        )  # one class a series, in charts and legends
+        images = json.dumps(self._images)
+        return (
+            '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+            '<meta name="viewport" content="width=device-width,initial-scale=1">'
+            f"<title>{escape(self._title)}</title><style>{_STYLE}{colors}</style></head><body><main>"
+            f"{''.join(self._parts)}</main>"
+            f'<script type="application/json" id="images">{images}</script>'
+            f"<script>{_SCRIPT}</script></body></html>\n"
+        )
+
+    def write(self, path: Path) -> None:
+        """Write the page, whole or not at all, over what is there."""
+        with atomic_output(path, overwrite=True) as temporary:
+            temporary.write_text(self.text(), encoding="utf-8")
+
+
+def legend(series: Sequence[str], marks: Sequence[str] = ()) -> str:
+    """Which colour is which method, and which shape which budget."""
+    shapes = ("●", "■", "◆", "▲")
+    items = [
+        f'<span><i class="s{i % len(COLORS)}"></i>{escape(name)}</span>' for i, name in enumerate(series)
+    ]
+    items += [f"<span>{shapes[i % len(shapes)]} {escape(name)}</span>" for i, name in enumerate(marks)]
+    return f'<p class="legend">{"".join(items)}</p>'
+
+
+_STYLE = """
+:root{color-scheme:light dark;--bg:#fff;--fg:#1b2430;--soft:#5b6675;--line:#e3e7ec;--card:#f6f8fa}
+@media(prefers-color-scheme:dark){:root{--bg:#12161c;--fg:#e6eaf0;--soft:#98a3b3;--line:#2a313b;--card:#1a2029}}
+body{margin:0;background:var(--bg);color:var(--fg);font:15px/1.5 system-ui,sans-serif}
+main{max-width:1200px;margin:0 auto;padding:24px 20px 80px}
+h1{font-size:26px;margin:0}h2{margin:48px 0 4px;border-top:1px solid var(--line);padding-top:24px}
+h3{margin:28px 0 4px}h4{margin:0 0 8px;font-weight:600}
+.sub,figcaption,.legend{color:var(--soft);font-size:13px}
+.row{display:flex;flex-wrap:wrap;gap:16px}.row figure{flex:1 1 440px;margin:0;min-width:0;max-width:600px}
+.chart{width:100%;height:auto;background:var(--card);border-radius:8px}
+.grid{stroke:var(--line)}.tick,.axis,.name{font-size:11px;fill:var(--soft)}.name{fill:var(--fg)}
+.dot{fill:var(--c);stroke:var(--bg);stroke-width:1.2}.line{fill:none;stroke:var(--c);stroke-width:2}
+.front{fill:none;stroke:var(--soft);stroke-dasharray:5 4;stroke-width:1.3}
+.legend span{margin-right:16px;white-space:nowrap}
+.legend i{display:inline-block;width:11px;height:11px;border-radius:3px;background:var(--c);margin-right:6px}
+.scroll{overflow-x:auto}
+table{border-collapse:collapse;font-size:13px;font-variant-numeric:tabular-nums;margin:8px 0}
+th,td{padding:4px 10px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
+th:first-child,td:first-child{text-align:left}th{color:var(--soft);font-weight:600}.best{font-weight:700}
+.view{background:var(--card);border-radius:8px;padding:14px;margin:14px 0}
+.pair{max-width:640px}.slider{position:relative;overflow:hidden;border-radius:6px}
+.slider img{position:absolute;inset:0;width:100%;height:100%;user-select:none}
+.slider .over{clip-path:inset(0 0 0 50%)}
+.slider input{position:absolute;inset:0;width:100%;height:100%;margin:0;opacity:0;cursor:ew-resize}
+.slider::after{content:"";position:absolute;top:0;bottom:0;left:var(--at,50%);width:2px;background:#fff;
+box-shadow:0 0 3px #000;pointer-events:none}
+.slider:focus-within{outline:2px solid var(--fg)}
+.tag{position:absolute;top:8px;background:#000a;color:#fff;font-size:12px;padding:2px 8px;border-radius:4px}
+.tag.left{left:8px}.tag.right{right:8px}.pick{display:block;margin:8px 0;font-size:13px}
+select{font:inherit;max-width:100%}
+.crops{display:flex;flex-wrap:wrap;gap:10px}.crop{margin:0;width:132px}
+.crop div{position:relative;overflow:hidden;width:132px;aspect-ratio:var(--shape);border-radius:4px}
+.crop img{position:absolute;max-width:none}
+@media(max-width:600px){.row figure{flex-basis:100%}}
+"""
+
+_SCRIPT = """
+const images=JSON.parse(document.getElementById('images').textContent);
+const show=img=>{img.src='data:image/jpeg;base64,'+images[img.dataset.i]};
+document.querySelectorAll('img[data-i]').forEach(show);
+document.querySelectorAll('.view').forEach(view=>{
+const slider=view.querySelector('.slider'),over=view.querySelector('.over'),range=view.querySelector('input'),
+pick=view.querySelector('select'),tag=view.querySelector('.right');
+const move=()=>{over.style.clipPath='inset(0 0 0 '+range.value+'%)';
+slider.style.setProperty('--at',range.value+'%')};
+const swap=()=>{over.dataset.i=pick.value;show(over);tag.textContent=pick.selectedOptions[0].textContent};
+range.addEventListener('input',move);pick.addEventListener('change',swap);move();swap();});
+"""
