@@ -63,7 +63,7 @@ def recover(
     splats = load_scene(run, student)
     dense = load_scene(run, teacher) if teacher else None
     cameras = load_views(run, views, split, size)
-    regularizers, why, measured = preset_for(preset, dense or splats, cameras)
+    regularizers, why, measured = preset_for(preset, dense or splats, cameras, paper=schedule == "paper")
     run.say(f"regularisers: {why}")
     config = RecoverConfig(
         schedule=schedule_named(schedule),
