@@ -34,6 +34,9 @@ def test_figures_hang_together() -> None:
         assert set(parts) == {"project", "sort", "bin", "forward", "backward", "loss", "adam"}
         assert sum(parts.values()) == pytest.approx(s.ms["total"])
         assert 0 < s.limit_share < 1
+        # 3 × 59 values and a step count at the least: parameters, two moments; and not twice what is asked.
+        assert 4 * 178 < s.memory["per_gaussian"] == s.memory["gaussians"] / 1000 < 3000
+        assert s.memory["images"] > 2 * 3 * 4 * 96 * 64
     assert len({s.contributing for s in bench.scenes}) == 1
     assert bench.as_dict()["machine"]["fma_gflops"] > 1
 

@@ -33,6 +33,8 @@ class SceneFigures:
         pairs: (tile, Gaussian) pairs.
         contributing: (pixel, Gaussian) pairs with α ≥ 1/255 in front of a stopped pixel.
         limit_ms: flops over the measured FMA rate; bytes over the measured bandwidth.
+        memory: bytes that a trainer's parameters, moments and buffers hold after a step: "gaussians" in what
+            grows with them (their pairs too), "per_gaussian" that over their count, "images" in the rest.
         limit_share: the larger limit over project + sort + bin + forward + backward.
     """
 
@@ -46,6 +48,7 @@ class SceneFigures:
     contributing: int
     gflops: float
     limit_ms: dict[str, float]
+    memory: dict[str, float]
     limit_share: float
 
 
@@ -175,6 +178,7 @@ def _measure(
         rehearsals.append(trainer.passes())
         trainer.step(*lesson, [0.0] * 6)  # rates of 0: every repeat times the same scene
         steps.append(trainer.passes())
+    memory = trainer.memory()
     again = _core.machine_limits()
     limits = max(limits[0], again[0]), max(limits[1], again[1])
     fastest = min(rehearsals, key=lambda p: sum(p.values()))
@@ -201,6 +205,7 @@ def _measure(
         contributing=contributing,
         gflops=1e-6 * flops / (ms["forward"] + ms["backward"]),
         limit_ms=limit_ms,
+        memory={**memory, "per_gaussian": memory["gaussians"] / len(splats)},
         limit_share=max(limit_ms.values()) / raster,
     )
     return figures, limits

@@ -186,6 +186,15 @@ impl PyTrainer {
         self.isa.name()
     }
 
+    /// Bytes held: "gaussians" by what grows with them, "images" by what grows with the image.
+    fn memory<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let memory = self.inner.memory();
+        let dict = PyDict::new(py);
+        dict.set_item("gaussians", memory.gaussians)?;
+        dict.set_item("images", memory.images)?;
+        Ok(dict)
+    }
+
     /// Seconds of the last step by pass; "gather" holds Adam.
     fn passes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let dict = crate::raster::passes(py, &self.inner.passes())?;

@@ -1,11 +1,14 @@
 //! What each Gaussian contributes to a view: the sums that visibility, pruning and counting are made of.
 
-use super::forward::{BATCH, Place, Staged, alpha, block_coordinates, log2_alpha};
+use rayon::prelude::*;
+
 use super::order::Shared;
+use super::params::Params;
 use super::project::Splat;
 use super::simd::{Kernel, LANES, Lanes, Mask, Row};
+use super::stage::{BATCH, Place, Staged, alpha, block_coordinates, by_pair, log2_alpha};
 use super::tiles::Pair;
-use super::{ALPHA_MIN, BLOCKS, Settings};
+use super::{ALPHA_MIN, BLOCKS, Camera, Settings};
 
 /// Per-Gaussian sums over the pixels of the views added so far.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -84,13 +87,13 @@ impl Kernel for Accumulate<'_> {
         for first in (0..self.pairs.len()).step_by(BATCH) {
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
             self.staged
-                .load(&self.pairs[first..], self.splats, &self.place);
+                .load(self.pairs, first, self.splats, &self.place);
             let s = &*self.staged;
             s.reachable::<F>(pairs.len(), &mut words);
             let masks = by_pair(&words);
             for (p, pair) in pairs.iter().enumerate() {
                 let mut todo = masks[p] & lit;
-                let number = F::splat((first + p) as f32);
+                let number = F::splat(s.near[p].number);
                 let [mut weight, mut light, mut peak] = [F::zero(); 3];
                 let mut hits = 0;
                 while todo != 0 {
@@ -98,7 +101,7 @@ impl Kernel for Accumulate<'_> {
                     todo &= todo - 1;
                     let block = &mut blocks[b];
                     let (x, y) = block_coordinates::<F>(b);
-                    let (_, _, log2) = log2_alpha(s, p, x, y);
+                    let (_, _, log2) = log2_alpha(&s.near[p], x, y);
                     let hit = log2.ge(minimum);
                     let a = alpha(log2).min(clip).only(hit);
                     let t = F::load(&block.unstopped);
@@ -149,20 +152,6 @@ impl Kernel for Accumulate<'_> {
     }
 }
 
-/// The blocks that each pair reaches, from the pairs that reach each block.
-#[inline(always)]
-fn by_pair(words: &[u64; BLOCKS]) -> [u16; BATCH] {
-    let mut masks = [0; BATCH];
-    for (block, &word) in words.iter().enumerate() {
-        let mut word = word;
-        while word != 0 {
-            masks[word.trailing_zeros() as usize] |= 1 << block;
-            word &= word - 1;
-        }
-    }
-    masks
-}
-
 #[inline(always)]
 fn add(a: f32, b: f32) -> f32 {
     a + b
@@ -202,4 +191,29 @@ pub fn total(splat: &Splat, slots: &[Share], written: &[u8]) -> (f64, f64, u64, 
         }
     }
     sum
+}
+
+/// Lowers each row's pixel size to depth / focal length where the mean falls inside the image.
+pub fn smallest_pixels(params: &Params, camera: &Camera, sizes: &mut [f32]) {
+    let focal = camera.fx.max(camera.fy);
+    let (width, height) = (camera.width as f64, camera.height as f64);
+    sizes
+        .par_iter_mut()
+        .zip(params.means.par_chunks_exact(3))
+        .for_each(|(size, mean)| {
+            let p = camera.viewmat.map(|r| {
+                r[0] * f64::from(mean[0])
+                    + r[1] * f64::from(mean[1])
+                    + r[2] * f64::from(mean[2])
+                    + r[3]
+            });
+            if p[2] < f64::from(camera.near) {
+                return;
+            }
+            let x = camera.fx * p[0] / p[2] + camera.cx;
+            let y = camera.fy * p[1] / p[2] + camera.cy;
+            if (0.0..=width).contains(&x) && (0.0..=height).contains(&y) {
+                *size = size.min((p[2] / focal) as f32);
+            }
+        });
 }

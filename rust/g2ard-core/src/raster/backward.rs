@@ -1,9 +1,12 @@
 //! One tile from back to front, Gaussian by Gaussian: every pair's ten sums go to its own slot.
 
-use super::forward::{BATCH, Place, Staged, alpha, block_coordinates, log2_alpha};
-use super::order::Shared;
+use super::order::{Shared, prefetch};
 use super::project::Splat;
 use super::simd::{Kernel, Lanes, Mask, Row};
+use super::stage::{
+    BATCH, Batch, Near, Place, alpha, block_coordinates, by_pair, for_stretches, load_batch,
+    log2_alpha,
+};
 use super::tiles::Pair;
 use super::{ALPHA_MIN, BLOCKS, Settings, TILE};
 
@@ -50,12 +53,26 @@ impl Incoming {
         for y in 0..place.rows {
             let first = ((place.y + y) * width + place.x) * channels;
             let row = &image[first..first + place.columns * channels];
-            for (x, values) in row.chunks_exact(channels).enumerate() {
-                let block = &mut self.0[y / 4 * 4 + x / 4];
-                for (row, value) in block.given[from..].iter_mut().zip(values) {
-                    row.0[y % 4 * 4 + x % 4] = *value;
+            for_stretches(y, place.columns, |x, block, lane, count| {
+                let given = &mut self.0[block].given[from..from + channels];
+                if let (Some(values), [r, g, b]) =
+                    (row[x * channels..].first_chunk::<12>(), &mut *given)
+                    && count == 4
+                {
+                    for i in 0..4 {
+                        r.0[lane + i] = values[3 * i];
+                        g.0[lane + i] = values[3 * i + 1];
+                        b.0[lane + i] = values[3 * i + 2];
+                    }
+                    return;
                 }
-            }
+                let pixels = row[x * channels..].chunks_exact(channels).take(count);
+                for (i, values) in pixels.enumerate() {
+                    for (row, value) in given.iter_mut().zip(values) {
+                        row.0[lane + i] = *value;
+                    }
+                }
+            });
         }
     }
 }
@@ -71,7 +88,7 @@ pub struct Backward<'a, const WITH_DEPTH: bool> {
     pub transmittance: &'a [Row; BLOCKS],
     pub last: &'a [Row; BLOCKS],
     pub incoming: &'a mut Incoming,
-    pub staged: &'a mut Staged,
+    pub batch: &'a mut Batch,
     pub slots: Shared<[f32; SUMS]>,
     pub written: Shared<u8>,
 }
@@ -103,67 +120,144 @@ impl<const WITH_DEPTH: bool> Kernel for Backward<'_, WITH_DEPTH> {
             }
             let first = batch * BATCH;
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
-            self.staged.load(pairs, self.splats, &self.place);
-            let s = &*self.staged;
-            let mut masks = [0u16; BATCH];
-            for block in 0..BLOCKS {
-                let mut word = words[block];
-                while word != 0 {
-                    masks[word.trailing_zeros() as usize] |= 1 << block;
-                    word &= word - 1;
-                }
+            load_batch(self.batch, self.pairs, first, self.splats, &self.place);
+            for pair in pairs {
+                // SAFETY: only its address is asked for.
+                unsafe { prefetch(&*self.slots.at(pair.slot as usize)) };
             }
-            while union != 0 {
-                let p = 63 - union.leading_zeros() as usize;
-                union ^= 1 << p;
-                let mut blocks = u32::from(masks[p]);
-                let number = F::splat((first + p) as f32);
-                let mut sums = [F::zero(); SUMS];
-                while blocks != 0 {
-                    let block = blocks.trailing_zeros() as usize % BLOCKS;
-                    blocks &= blocks - 1;
-                    let g = &mut state[block];
-                    let (x, y) = block_coordinates::<F>(block);
-                    let (u, v, log2) = log2_alpha(s, p, x, y);
-                    let hit = log2.ge(minimum).and(F::load(&g.last).ge(number));
-                    let raw = alpha(log2);
-                    let a = raw.min(clip).only(hit);
-                    let t = F::load(&g.transmittance) * (F::splat(1.0) - a).recip();
-                    t.store(&mut g.transmittance);
-                    let w = a * t;
-                    let mut seen = F::load(&g.given[ALPHA]);
-                    for c in 0..3 {
-                        let d = F::load(&g.given[c]);
-                        seen = F::splat(s.rgb[c][p]).fma(d, seen);
-                        sums[6 + c] = w.fma(d, sums[6 + c]);
+            let s = &*self.batch;
+            let mut list = [0; BATCH * BLOCKS + 1];
+            let count = list_items(words, &mut list);
+            let look = Look {
+                batch: s,
+                minimum,
+                clip,
+            };
+            let mut sums = [F::zero(); SUMS];
+            let mut ahead = look.at(list[0], state);
+            for i in 0..count {
+                let (item, next) = (list[i], list[i + 1]);
+                let now = ahead;
+                // Looked at one item ahead: nothing here depends on what the other pairs of its block leave behind.
+                ahead = look.at(next, state);
+                let (pair, block) = split(item);
+                now.blend::<WITH_DEPTH>(&s[pair], &mut state[block], &mut sums);
+                if split(next).0 != pair {
+                    let slot = pairs[pair].slot as usize;
+                    let total = F::sums(&sums);
+                    sums = [F::zero(); SUMS];
+                    // SAFETY: a slot belongs to one pair, and a pair to one tile.
+                    unsafe {
+                        let out = &mut self.slots.slice(slot, 1)[0];
+                        out.copy_from_slice(&total.0[..SUMS]);
+                        self.written.write(slot, 1);
                     }
-                    if WITH_DEPTH {
-                        let d = F::load(&g.given[DEPTH]);
-                        seen = F::splat(s.depth[p]).fma(d, seen);
-                        sums[9] = w.fma(d, sums[9]);
-                    }
-                    let behind = F::load(&g.behind);
-                    let gain = seen - behind;
-                    a.fma(gain, behind).store(&mut g.behind);
-                    // Where α is clipped it does not follow its arguments.
-                    let h = (w * gain).only(clip.ge(raw));
-                    let (hu, hv) = (h * u, h * v);
-                    sums[0] = sums[0] + h;
-                    sums[1] = sums[1] + hu;
-                    sums[2] = sums[2] + hv;
-                    sums[3] = hu.fma(u, sums[3]);
-                    sums[4] = hu.fma(v, sums[4]);
-                    sums[5] = hv.fma(v, sums[5]);
-                }
-                let total = F::sums(&sums);
-                let slot = pairs[p].slot as usize;
-                // SAFETY: a slot belongs to one pair, and a pair to one tile.
-                unsafe {
-                    let out = &mut self.slots.slice(slot, 1)[0];
-                    out.copy_from_slice(&total.0[..SUMS]);
-                    self.written.write(slot, 1);
                 }
             }
         }
+    }
+}
+
+/// One pair in one block: 16·pair + block.
+type Item = u16;
+
+#[inline(always)]
+fn split(item: Item) -> (usize, usize) {
+    let pair = item as usize / BLOCKS;
+    // The list ends with the place for nothing; the minimum tells the compiler that no other lies past it.
+    (pair.min(BATCH), item as usize % BLOCKS)
+}
+
+/// The items of a batch from its last pair to its first, and one past the end that looks at nothing. Returns how many.
+#[inline(always)]
+fn list_items(words: &[u64; BLOCKS], list: &mut [Item; BATCH * BLOCKS + 1]) -> usize {
+    const PAIRS: usize = u64::BITS as usize / BLOCKS;
+    let masks = by_pair(words);
+    let mut count = 0;
+    for (quad, masks) in masks.as_chunks::<PAIRS>().0.iter().enumerate().rev() {
+        let mut bits = 0;
+        for (i, mask) in masks.iter().enumerate() {
+            bits |= u64::from(*mask) << (BLOCKS * i);
+        }
+        while bits != 0 {
+            let top = 63 - bits.leading_zeros();
+            list[count % (BATCH * BLOCKS)] = (u64::BITS as usize * quad + top as usize) as Item;
+            count += 1;
+            bits ^= 1 << top;
+        }
+    }
+    list[count.min(BATCH * BLOCKS)] = (BATCH * BLOCKS) as Item;
+    count
+}
+
+/// What looking at an item needs that the items of a batch share.
+struct Look<'a, F: Lanes> {
+    batch: &'a Batch,
+    minimum: F,
+    clip: F,
+}
+
+/// An item's α and 1/(1 − α), and where α follows its arguments.
+#[derive(Clone, Copy)]
+struct Seen<F: Lanes> {
+    u: F,
+    v: F,
+    a: F,
+    rest: F,
+    free: F::Mask,
+}
+
+impl<F: Lanes> Look<'_, F> {
+    #[inline(always)]
+    fn at(&self, item: Item, state: &[Block; BLOCKS]) -> Seen<F> {
+        let (p, block) = split(item);
+        let (x, y) = block_coordinates::<F>(block);
+        let near = &self.batch[p];
+        let (u, v, log2) = log2_alpha(near, x, y);
+        let hit = log2
+            .ge(self.minimum)
+            .and(F::load(&state[block].last).ge(F::splat(near.number)));
+        let raw = alpha(log2);
+        let a = raw.min(self.clip).only(hit);
+        Seen {
+            u,
+            v,
+            a,
+            rest: (F::splat(1.0) - a).recip(),
+            free: self.clip.ge(raw),
+        }
+    }
+}
+
+impl<F: Lanes> Seen<F> {
+    /// Steps the block's state to before the pair, and adds to the pair's sums.
+    #[inline(always)]
+    fn blend<const WITH_DEPTH: bool>(self, s: &Near, g: &mut Block, sums: &mut [F; SUMS]) {
+        let t = F::load(&g.transmittance) * self.rest;
+        t.store(&mut g.transmittance);
+        let w = self.a * t;
+        let mut seen = F::load(&g.given[ALPHA]);
+        for c in 0..3 {
+            let d = F::load(&g.given[c]);
+            seen = F::splat(s.rgb[c]).fma(d, seen);
+            sums[6 + c] = w.fma(d, sums[6 + c]);
+        }
+        if WITH_DEPTH {
+            let d = F::load(&g.given[DEPTH]);
+            seen = F::splat(s.depth).fma(d, seen);
+            sums[9] = w.fma(d, sums[9]);
+        }
+        let behind = F::load(&g.behind);
+        let gain = seen - behind;
+        self.a.fma(gain, behind).store(&mut g.behind);
+        // Where α is clipped it does not follow its arguments.
+        let h = (w * gain).only(self.free);
+        let (hu, hv) = (h * self.u, h * self.v);
+        sums[0] = sums[0] + h;
+        sums[1] = sums[1] + hu;
+        sums[2] = sums[2] + hv;
+        sums[3] = hu.fma(self.u, sums[3]);
+        sums[4] = hu.fma(self.v, sums[4]);
+        sums[5] = hv.fma(self.v, sums[5]);
     }
 }

@@ -1,8 +1,8 @@
 //! The tiled differentiable rasteriser: one room per pass.
 //!
-//! [`project`] turns 16 Gaussians at a time into screen splats; [`order`] sorts them by depth once; [`tiles`] scatters
-//! them stably into the 16×16 tiles their ellipse at α = 1/255 really meets; [`forward`] blends each tile, 4×4 pixels to a
-//! register; [`backward`] walks the same pairs from back to front, each pair summing into its own slot; [`gradients`]
+//! [`project`] turns 16 Gaussians at a time into screen splats, and [`covers`] lists the 16×16 tiles that each one's
+//! ellipse at α = 1/255 really meets; [`order`] sorts them by depth once; [`tiles`] scatters them stably into their tiles;
+//! [`stage`] brings a tile's pairs to its own coordinates; [`forward`] blends each tile, 4×4 pixels to a register; [`backward`] walks the same pairs from back to front, each pair summing into its own slot; [`gradients`]
 //! adds a Gaussian's slots in order and goes back through the projection. No atomics: the bits do not depend on threads.
 //!
 //! Conventions (gsplat's by default): pixel centres at +0.5; 0.3 px² dilation; α = min(0.99, opacity·exp(−q)); α < 1/255
@@ -10,6 +10,7 @@
 
 mod accumulate;
 pub(crate) mod backward;
+mod covers;
 mod forward;
 pub(crate) mod frame;
 pub(crate) mod gradients;
@@ -19,10 +20,11 @@ pub(crate) mod params;
 pub(crate) mod project;
 mod sh;
 pub mod simd;
+mod stage;
 mod tiles;
 
 pub use accumulate::Accumulated;
-pub use frame::{Counts, Image, ImageGradients, Passes, Rasterizer};
+pub use frame::{Counts, Image, ImageGradients, Memory, Passes, Rasterizer};
 pub use gradients::Gradients;
 pub use params::Params;
 pub use simd::Isa;

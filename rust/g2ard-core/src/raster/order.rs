@@ -5,13 +5,26 @@ use rayon::prelude::*;
 const BITS: u32 = 11;
 const BINS: usize = 1 << BITS;
 /// Entries per histogram: fixed, so that the passes split alike for any number of threads.
-const CHUNK: usize = 1 << 15;
+const CHUNK: usize = 1 << 14;
 
 /// A splat's depth (positive floats order as their bits) and its index.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Key {
     pub depth: u32,
     pub splat: u32,
+}
+
+/// Asks for what is read soon.
+#[inline(always)]
+pub fn prefetch<T>(value: &T) {
+    #[cfg(target_arch = "x86_64")]
+    // SAFETY: a prefetch of a valid address has no effect but on the cache.
+    unsafe {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast());
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = value;
 }
 
 /// A write target shared by threads that write disjoint elements.

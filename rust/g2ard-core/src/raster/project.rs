@@ -1,9 +1,14 @@
 //! Gaussians → screen splats, sixteen at a time (EWA: Σ₂ = J W R S Sᵀ Rᵀ Wᵀ Jᵀ + 0.3 I).
 
+mod screen;
+mod unproject;
+
 use super::params::Source;
-use super::sh;
-use super::simd::{Kernel, LANES, LOG2_E, Lanes, Mask, Row, Wide};
+use super::simd::{LANES, LOG2_E, Lanes, Mask, Row, Wide};
 use super::{ALPHA_MIN, Camera, Convention, DILATION, Settings};
+
+pub use screen::Project;
+pub use unproject::{RowGradients, ScreenGradients, quaternion_gradient, unproject};
 
 /// ½·log2(e): exponents are kept in powers of two, so exp(−½ dᵀΣ₂⁻¹d) = 2^−(u² + v²).
 pub const HALF_LOG2_E: f32 = 0.5 * LOG2_E;
@@ -79,11 +84,9 @@ pub struct Splat {
     pub depth: f32,
     /// The Gaussian's row.
     pub row: u32,
-    /// Tiles it meets, and the number of its first slot: set by `tiles`.
+    /// Tiles it meets, and the number of its first slot among those of its chunk.
     pub tiles: u32,
     pub slot: u32,
-    /// INRIA: the 3σ radius in pixels; otherwise infinite.
-    pub radius: f32,
 }
 
 /// Everything the forward and the backward projection share.
@@ -351,248 +354,14 @@ pub fn colour<F: Lanes, S: Source>(source: &S, group: usize, basis: &[F; 16]) ->
     rgb
 }
 
-/// Projects the groups `first..last`; visible splats go to the front of `out` in row order. Returns how many.
-pub struct Project<'a, S: Source> {
-    pub view: &'a View,
-    pub source: S,
-    pub first: usize,
-    pub last: usize,
-    pub out: &'a mut [Splat],
-    /// Their half extents.
-    pub halves: &'a mut [[f32; 2]],
-}
-
-impl<S: Source> Kernel for Project<'_, S> {
-    type Output = usize;
-
-    #[inline(always)]
-    fn run<F: Lanes>(self) -> usize {
-        let mut count = 0;
-        for group in self.first..self.last {
-            let p = project::<F, S>(self.view, &self.source, group);
-            let rows = (self.source.len() - group * LANES).min(LANES);
-            let mut bits = u32::from(p.visible.bits()) & ((1u32 << rows) - 1);
-            if bits == 0 {
-                continue;
-            }
-            let (dir, _) = direction::<F, S>(self.view, &self.source, group);
-            let mut basis = [F::zero(); 16];
-            sh::basis(self.source.sh_coeffs(), dir[0], dir[1], dir[2], &mut basis);
-            let rgb = colour::<F, S>(&self.source, group, &basis);
-            let (mut x, mut y) = ([0.0; LANES], [0.0; LANES]);
-            p.x.store(&mut x);
-            p.y.store(&mut y);
-            let mut rows = [Row::default(); 11];
-            let values = [
-                p.a,
-                p.b,
-                p.c,
-                p.log2_opacity,
-                rgb[0].max(F::zero()),
-                rgb[1].max(F::zero()),
-                rgb[2].max(F::zero()),
-                p.depth,
-                p.radius,
-                p.half[0],
-                p.half[1],
-            ];
-            for k in 0..11 {
-                values[k].store(&mut rows[k]);
-            }
-            while bits != 0 {
-                let l = bits.trailing_zeros() as usize;
-                bits &= bits - 1;
-                self.out[count] = Splat {
-                    x: x[l],
-                    y: y[l],
-                    a: rows[0].0[l],
-                    b: rows[1].0[l],
-                    c: rows[2].0[l],
-                    log2_opacity: rows[3].0[l],
-                    rgb: [rows[4].0[l], rows[5].0[l], rows[6].0[l]],
-                    depth: rows[7].0[l],
-                    row: (group * LANES + l) as u32,
-                    tiles: 0,
-                    slot: 0,
-                    radius: rows[8].0[l],
-                };
-                self.halves[count] = [rows[9].0[l], rows[10].0[l]];
-                count += 1;
-            }
-        }
-        count
-    }
-}
-
-/// The gradient with respect to what [`project`] computed for sixteen Gaussians, as [`super::gradients`] gathers it.
-pub struct ScreenGradients<F: Lanes> {
-    /// Σ h·(1, u, v, u², uv, v²) over pixels, h = dL/d(ln α).
-    pub moments: [F; 6],
-    pub rgb: [F; 3],
-    pub depth: F,
-}
-
-/// The gradient with respect to the stored parameters; SH is `basis[k] · rgb[c]`, left unmultiplied.
-pub struct RowGradients<F: Lanes> {
-    pub mean: [F; 3],
-    pub quat: [F; 4],
-    pub log_scale: [F; 3],
-    pub logit_opacity: F,
-    pub basis: [F; 16],
-    pub rgb: [F; 3],
-}
-
-/// Back through the projection of one group. Lanes with zero `moments`, `rgb` and `depth` get zeros.
-#[inline(always)]
-pub fn unproject<F: Lanes, S: Source>(
-    view: &View,
-    source: &S,
-    group: usize,
-    g: &ScreenGradients<F>,
-) -> RowGradients<F> {
-    let p = project::<F, S>(view, source, group);
-    let zero = F::zero();
-    let two = F::splat(2.0);
-    let [h, hu, hv, huu, huv, hvv] = g.moments;
-
-    // In whitened coordinates y = U·d nothing cancels: dL/dmean = Uᵀ Σhy, dL/dΣ₂ = ½ Uᵀ (Σ h y yᵀ) U.
-    let rk = F::splat(1.0 / HALF_LOG2_E);
-    let grad_x = p.a * hu * rk;
-    let grad_y = (p.b * hu + p.c * hv) * rk;
-    let half_rk2 = F::splat(0.5 / (HALF_LOG2_E * HALF_LOG2_E));
-    let (uu, uv, vv) = (huu * half_rk2, huv * half_rk2, hvv * half_rk2);
-    let left = p.b * uu + p.c * uv;
-    let right = p.b * uv + p.c * vv;
-    let gxx = p.a * p.a * uu;
-    let gxy = p.a * left;
-    let gyy = p.b * left + p.c * right;
-
-    let mut dm = [[zero; 3]; 2];
-    for k in 0..3 {
-        dm[0][k] = two * (gxx * p.m[0][k] + gxy * p.m[1][k]);
-        dm[1][k] = two * (gxy * p.m[0][k] + gyy * p.m[1][k]);
-    }
-    if view.antialiased {
-        // ln √(det0 / det), det = det0 + 0.3·tr + 0.09; det0 = |minors|², minors = M₀ × M₁.
-        let mut weight = h;
-        if view.convention == Convention::Inria {
-            weight = h.only((p.det0 / p.det).gt(F::splat(INRIA_FLOOR)));
-        }
-        let r_det = F::splat(1.0) / p.det;
-        let r_det0 = F::splat(1.0) / p.det0.max(F::splat(f32::MIN_POSITIVE));
-        let on_minors = weight * (r_det0 - r_det);
-        let on_trace = weight * F::splat(DILATION) * r_det;
-        for k in 0..3 {
-            let (i, j) = ((k + 1) % 3, (k + 2) % 3);
-            let (ni, nj) = (p.minors[i] * on_minors, p.minors[j] * on_minors);
-            dm[0][k] = dm[0][k] + (p.m[1][i] * nj - p.m[1][j] * ni) - on_trace * p.m[0][k];
-            dm[1][k] = dm[1][k] + (ni * p.m[0][j] - nj * p.m[0][i]) - on_trace * p.m[1][k];
-        }
-    }
-
-    let mut log_scale = [zero; 3];
-    let mut dt = [[zero; 3]; 2];
-    for k in 0..3 {
-        log_scale[k] = dm[0][k].fma(p.m[0][k], dm[1][k] * p.m[1][k]);
-        dt[0][k] = dm[0][k] * p.s[k];
-        dt[1][k] = dm[1][k] * p.s[k];
-    }
-    let mut dr = [[zero; 3]; 3];
-    let mut djw = [[zero; 3]; 2];
-    for a in 0..3 {
-        for k in 0..3 {
-            dr[a][k] = p.jw[0][a] * dt[0][k] + p.jw[1][a] * dt[1][k];
-            for i in 0..2 {
-                djw[i][a] = dt[i][k].fma(p.r[a][k], djw[i][a]);
-            }
-        }
-    }
-    let quat = quaternion_gradient(&p.q, p.rq, &dr);
-
-    // J·W = (f/z)·(Wᵢ − t·W₂): the 1/z in front, then t where it was not clamped.
-    let focal = [F::splat(view.fx as f32), F::splat(view.fy as f32)];
-    let on_screen = [grad_x, grad_y];
-    let mut camera = [zero, zero, g.depth];
-    for i in 0..2 {
-        let mut along = zero;
-        let mut on_t = zero;
-        for k in 0..3 {
-            along = djw[i][k].fma(p.jw[i][k], along);
-            on_t = djw[i][k].fma(p.w[2][k], on_t);
-        }
-        let j = focal[i] * p.rz;
-        let through_t = (-(on_t * j * p.rz)).only(p.inside[i]);
-        let through_ray = on_screen[i] * j;
-        camera[i] = through_t + through_ray;
-        camera[2] = camera[2] - through_t * p.t[i] - through_ray * p.ray[i] - along * p.rz;
-    }
-    let mut mean = [zero; 3];
-    for k in 0..3 {
-        mean[k] = camera[0] * p.w[0][k] + camera[1] * p.w[1][k] + camera[2] * p.w[2][k];
-    }
-
-    let (dir, r_distance) = direction::<F, S>(view, source, group);
-    let coeffs = source.sh_coeffs();
-    let mut basis = [zero; 16];
-    sh::basis(coeffs, dir[0], dir[1], dir[2], &mut basis);
-    let value = colour::<F, S>(source, group, &basis);
-    let mut rgb = g.rgb;
-    for c in 0..3 {
-        rgb[c] = rgb[c].only(value[c].gt(zero));
-    }
-    if coeffs > 1 {
-        let mut weights = [zero; 16];
-        for k in 1..coeffs {
-            for c in 0..3 {
-                weights[k] = source.sh::<F>(group, k, c).fma(rgb[c], weights[k]);
-            }
-        }
-        let d = sh::gradient(coeffs, dir[0], dir[1], dir[2], &weights);
-        let radial = d[0] * dir[0] + d[1] * dir[1] + d[2] * dir[2];
-        for k in 0..3 {
-            mean[k] = mean[k] + (d[k] - dir[k] * radial) * r_distance;
-        }
-    }
-    RowGradients {
-        mean,
-        quat,
-        log_scale,
-        logit_opacity: h * p.rest_opacity,
-        basis,
-        rgb,
-    }
-}
-
-/// dL/dR → dL/dq for R(q/|q|), from the unit quaternion and 1/|q|.
-#[inline(always)]
-pub fn quaternion_gradient<F: Lanes>(q: &[F; 4], rq: F, g: &[[F; 3]; 3]) -> [F; 4] {
-    let [w, x, y, z] = *q;
-    let two = F::splat(2.0);
-    let (sxy, sxz, syz) = (g[0][1] + g[1][0], g[0][2] + g[2][0], g[1][2] + g[2][1]);
-    let (ax, ay, az) = (g[2][1] - g[1][2], g[0][2] - g[2][0], g[1][0] - g[0][1]);
-    let d = [
-        two * (x * ax + y * ay + z * az),
-        two * (w * ax + y * sxy + z * sxz - two * x * (g[1][1] + g[2][2])),
-        two * (w * ay + x * sxy + z * syz - two * y * (g[0][0] + g[2][2])),
-        two * (w * az + x * sxz + y * syz - two * z * (g[0][0] + g[1][1])),
-    ];
-    let radial = w * d[0] + x * d[1] + y * d[2] + z * d[3];
-    let mut out = [F::zero(); 4];
-    for k in 0..4 {
-        out[k] = (d[k] - q[k] * radial) * rq;
-    }
-    out
-}
-
+#[cfg(test)]
 impl Splat {
-    /// u² + v² at α = 1/255, and a little more: kernels test every pixel, so too much costs time, never correctness.
-    #[inline(always)]
+    /// As [`Ellipses::level`].
     pub fn level(&self) -> f32 {
         (self.log2_opacity - ALPHA_MIN.log2()).max(0.0) * 1.000_1 + 1e-4
     }
 
     /// Half the width and height of that ellipse: Σ_xx ∝ (b² + c²)/(a·c)², Σ_yy ∝ 1/c².
-    #[cfg(test)]
     pub fn half_extents(&self) -> [f32; 2] {
         let root = (self.b * self.b + self.c * self.c).sqrt();
         let level = self.level().sqrt();

@@ -7,6 +7,7 @@
 
 use super::clusters::Partition;
 use super::cost::{Node, color_distance};
+use super::rows::Rows;
 
 /// Rows below which a subtree is not worth another task.
 const GRAIN: usize = 4096;
@@ -18,40 +19,35 @@ struct Rung {
     spent: f32,
 }
 
-struct Ladder<'a> {
+struct Ladder<'a, R> {
     codes: &'a [u64],
-    nodes: &'a [Node],
-    sh: &'a [f32],
-    width: usize,
+    rows: &'a R,
     geometric: f32,
 }
 
 /// For every gap between neighbouring rows, the error of merging all that its tree node spans.
 ///
-/// `codes` ascend; `nodes` and `sh` (`width` values a row, band 0 first) are in the same order.
-pub fn climb(codes: &[u64], nodes: &[Node], sh: &[f32], width: usize, geometric: f32) -> Vec<f32> {
-    let mut spent = vec![0.0; nodes.len().saturating_sub(1)];
+/// `codes` ascend; `rows` are in the same order.
+pub fn climb(codes: &[u64], rows: &impl Rows, geometric: f32) -> Vec<f32> {
+    let mut spent = vec![0.0; rows.len().saturating_sub(1)];
     if !spent.is_empty() {
         let ladder = Ladder {
             codes,
-            nodes,
-            sh,
-            width,
+            rows,
             geometric,
         };
-        ladder.climb(0, nodes.len(), &mut spent);
+        ladder.climb(0, rows.len(), &mut spent);
     }
     spent
 }
 
-impl Ladder<'_> {
+impl<R: Rows> Ladder<'_, R> {
     /// Rows `from..to`; `spent` holds their inner gaps.
     fn climb(&self, from: usize, to: usize, spent: &mut [f32]) -> Rung {
         if to - from == 1 {
-            let at = from * self.width;
             return Rung {
-                node: self.nodes[from],
-                color: [self.sh[at], self.sh[at + 1], self.sh[at + 2]],
+                node: self.rows.node(from),
+                color: self.rows.color(from),
                 spent: 0.0,
             };
         }
@@ -144,9 +140,10 @@ pub fn cut(spent: &[f32], count: usize) -> Partition {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::simplify::matching::Nodes;
 
-    fn nodes(n: usize) -> Vec<Node> {
-        (0..n)
+    fn nodes(n: usize) -> Nodes {
+        let geometry = (0..n)
             .map(|i| {
                 let mut node = Node {
                     mean: [i as f32 + (i / 8 * 20) as f32, 0.0, 0.0],
@@ -159,13 +156,18 @@ mod tests {
                 node.seen = node.mass;
                 node
             })
-            .collect()
+            .collect();
+        Nodes {
+            geometry,
+            sh: vec![0.0; 3 * n],
+            width: 3,
+        }
     }
 
     #[test]
     fn any_cut_leaves_whole_subtrees_and_the_exact_count() {
         let codes: Vec<u64> = (0..64).map(|i| i * 3).collect();
-        let spent = climb(&codes, &nodes(64), &[0.0; 192], 3, 0.03);
+        let spent = climb(&codes, &nodes(64), 0.03);
         for count in 1..=64 {
             let p = cut(&spent, count);
             assert_eq!((p.count, p.of.len()), (count, 64));
@@ -173,16 +175,13 @@ mod tests {
         }
         // Groups of eight lie far apart: the cheapest eight clusters are those groups.
         let codes: Vec<u64> = (0..64).collect();
-        let p = cut(&climb(&codes, &nodes(64), &[0.0; 192], 3, 0.03), 8);
+        let p = cut(&climb(&codes, &nodes(64), 0.03), 8);
         assert!((0..64).all(|i| p.of[i] == i as u32 / 8), "{:?}", p.of);
     }
 
     #[test]
     fn one_place_and_one_row() {
-        assert_eq!(
-            cut(&climb(&[5; 9], &nodes(9), &[0.0; 27], 3, 0.03), 4).count,
-            4
-        );
-        assert_eq!(cut(&climb(&[5], &nodes(1), &[0.0; 3], 3, 0.03), 1).count, 1);
+        assert_eq!(cut(&climb(&[5; 9], &nodes(9), 0.03), 4).count, 4);
+        assert_eq!(cut(&climb(&[5], &nodes(1), 0.03), 1).count, 1);
     }
 }

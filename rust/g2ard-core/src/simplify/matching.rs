@@ -6,7 +6,6 @@ use std::collections::BinaryHeap;
 use rayon::prelude::*;
 
 use super::GONE;
-use super::clusters::Partition;
 use super::cost::{Node, color_distance};
 use crate::spatial::{Frame, Tree, codes, order};
 use crate::{Control, Result};
@@ -22,34 +21,6 @@ pub struct Nodes {
 impl Nodes {
     pub fn len(&self) -> usize {
         self.geometry.len()
-    }
-
-    /// Each run of rows as one node.
-    pub fn merge_runs(&mut self, runs: &Partition) {
-        let mut ends: Vec<usize> = (1..runs.of.len())
-            .filter(|&i| runs.of[i] != runs.of[i - 1])
-            .collect();
-        ends.push(runs.of.len());
-        let width = self.width;
-        let mut sh = vec![0.0; runs.count * width];
-        let geometry = sh
-            .par_chunks_mut(width)
-            .enumerate()
-            .map(|(run, out)| {
-                let from = if run == 0 { 0 } else { ends[run - 1] };
-                let mut node = self.geometry[from];
-                out.copy_from_slice(self.sh_of(from));
-                for i in from + 1..ends[run] {
-                    let share = node.share(&self.geometry[i]);
-                    out.iter_mut()
-                        .zip(self.sh_of(i))
-                        .for_each(|(p, q)| *p += share * (q - *p));
-                    node = node.merged(&self.geometry[i]);
-                }
-                node
-            })
-            .collect();
-        (self.geometry, self.sh) = (geometry, sh);
     }
 
     /// Puts the nodes in Morton order on a shifted lattice. Returns where each went, and their codes.

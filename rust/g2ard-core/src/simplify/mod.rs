@@ -14,6 +14,7 @@ mod outcome;
 mod pairwise;
 mod paper;
 mod residual;
+mod rows;
 mod trim;
 
 pub use guards::coverage;

@@ -6,10 +6,10 @@
 use rayon::prelude::*;
 
 use super::clusters::Partition;
-use super::cost::{MAX_ALPHA, Node};
 use super::ladder::{climb, cut};
 use super::matching::{Nodes, candidates, matched};
 use super::moments::sigmoid;
+use super::rows::{Leaves, Rows, median};
 use super::trim::best;
 use super::{GONE, Ordered, Outcome, SceneRef};
 use crate::{Control, Error, Result};
@@ -68,13 +68,6 @@ pub struct PairwiseRound {
     pub after: usize,
 }
 
-/// What a few views do not see counts as if this share of its mass were: other views will see some of it.
-const UNSEEN: f32 = 0.2;
-
-/// Largest scale and coordinate in typical sizes: beyond, f32 products of four of them would overflow.
-const MAX_SCALE: f64 = 1e6;
-const MAX_COORDINATE: f64 = 1e15;
-
 impl Pairwise {
     pub fn run(
         &self,
@@ -91,9 +84,10 @@ impl Pairwise {
         let budget = schedule.last().copied().unwrap_or(scene.len());
         control.begin(scene.len().saturating_sub(budget) as u64);
         let (mut partition, dropped) = self.visible(scene, &ordered, budget);
-        let mut nodes = self.nodes(scene, &ordered, &partition, &blur, seen);
+        let kept = (0..scene.len() as u32).filter(|&i| partition.of[i as usize] != GONE);
+        let leaves = Leaves::new(scene, &ordered, kept.collect(), &blur, seen);
         let mut rounds = Vec::new();
-        self.climb(&ordered, &mut partition, &mut nodes, budget, &mut rounds);
+        let mut nodes = self.climb(leaves, &ordered.codes, &mut partition, budget, &mut rounds);
         for &target in schedule {
             while nodes.len() > target {
                 let before = nodes.len();
@@ -135,44 +129,65 @@ impl Pairwise {
     /// elsewhere, so that what one cut apart the next may join.
     fn climb(
         &self,
-        ordered: &Ordered,
+        leaves: Leaves,
+        codes: &[u64],
         partition: &mut Partition,
-        nodes: &mut Nodes,
         budget: usize,
         rounds: &mut Vec<PairwiseRound>,
-    ) {
-        let last = (self.ladder * budget as f64).min(nodes.len() as f64) as usize;
-        let kept = ordered
-            .codes
-            .iter()
-            .zip(&partition.of)
-            .filter(|(_, c)| **c != GONE);
-        let mut codes: Vec<u64> = kept.map(|(&code, _)| code).collect();
-        for step in (0..self.ladder_steps).rev() {
-            let target = last.saturating_mul(1 << step.min(32));
-            if target >= nodes.len() {
-                continue;
-            }
-            let spent = climb(
+    ) -> Nodes {
+        let last = (self.ladder * budget as f64).min(leaves.len() as f64) as usize;
+        let mut targets = (0..self.ladder_steps)
+            .rev()
+            .map(|step| (step, last.saturating_mul(1 << step.min(32))))
+            .filter(|&(_, target)| target < leaves.len());
+        let Some((step, target)) = targets.next() else {
+            return leaves.nodes();
+        };
+        let codes: Vec<u64> = leaves.kept().iter().map(|&i| codes[i as usize]).collect();
+        let (mut nodes, mut codes) = self.join(
+            &leaves,
+            &codes,
+            LATTICES[step % 3],
+            target,
+            partition,
+            rounds,
+        );
+        for (step, target) in targets {
+            (nodes, codes) = self.join(
+                &nodes,
                 &codes,
-                &nodes.geometry,
-                &nodes.sh,
-                nodes.width,
-                self.geometric as f32,
+                LATTICES[step % 3],
+                target,
+                partition,
+                rounds,
             );
-            let runs = cut(&spent, target);
-            rounds.push(PairwiseRound {
-                before: nodes.len(),
-                merged: nodes.len() - runs.count,
-                after: runs.count,
-                ..PairwiseRound::default()
-            });
-            nodes.merge_runs(&runs);
-            let (map, new) = nodes.sort(LATTICES[step % LATTICES.len()]);
-            codes = new;
-            let of = partition.of.par_iter_mut().filter(|c| **c != GONE);
-            of.for_each(|c| *c = map[runs.of[*c as usize] as usize]);
         }
+        nodes
+    }
+
+    /// Runs of `rows` become nodes, `target` of them, in Morton order on a lattice shifted by `shift`; their
+    /// codes beside them.
+    fn join(
+        &self,
+        rows: &impl Rows,
+        codes: &[u64],
+        shift: [f64; 3],
+        target: usize,
+        partition: &mut Partition,
+        rounds: &mut Vec<PairwiseRound>,
+    ) -> (Nodes, Vec<u64>) {
+        let runs = cut(&climb(codes, rows, self.geometric as f32), target);
+        rounds.push(PairwiseRound {
+            before: rows.len(),
+            merged: rows.len() - runs.count,
+            after: runs.count,
+            ..PairwiseRound::default()
+        });
+        let mut nodes = rows.merged(&runs);
+        let (map, codes) = nodes.sort(shift);
+        let of = partition.of.par_iter_mut().filter(|c| **c != GONE);
+        of.for_each(|c| *c = map[runs.of[*c as usize] as usize]);
+        (nodes, codes)
     }
 
     fn check(&self, scene: &SceneRef, seen: Option<Seen>, flags: Option<&[bool]>) -> Result<()> {
@@ -239,95 +254,6 @@ impl Pairwise {
         let count = keep.len();
         (Partition { of, count }, scores.len() - count)
     }
-
-    fn nodes(
-        &self,
-        scene: &SceneRef,
-        ordered: &Ordered,
-        kept: &Partition,
-        blur: &[f32],
-        seen: Option<Seen>,
-    ) -> Nodes {
-        let unit = typical_size(scene);
-        let rows: Vec<u32> = (0..scene.len() as u32)
-            .filter(|&i| kept.of[i as usize] != GONE)
-            .collect();
-        let mut geometry: Vec<Node> = rows
-            .par_iter()
-            .map(|&i| {
-                node(
-                    scene,
-                    ordered,
-                    i as usize,
-                    unit,
-                    f64::from(blur[i as usize]),
-                )
-            })
-            .collect();
-        if let Some(seen) = seen {
-            let weight = |i: u32| seen.weight[ordered.rows[i as usize] as usize].max(0.0);
-            let total: f64 = rows.iter().map(|&i| f64::from(weight(i))).sum();
-            let mass: f64 = geometry.iter().map(|n| f64::from(n.mass)).sum();
-            let floor = UNSEEN
-                * if total > 0.0 {
-                    (total / mass) as f32
-                } else {
-                    1.0
-                };
-            geometry
-                .par_iter_mut()
-                .zip(&rows)
-                .for_each(|(n, &i)| n.seen = weight(i) + floor * n.mass);
-        }
-        let width = 3 * (scene.rest + 1);
-        let mut sh = vec![0.0; rows.len() * width];
-        sh.par_chunks_mut(width).zip(&rows).for_each(|(out, &i)| {
-            let (dc, rest) = scene.sh_of(ordered.rows[i as usize] as usize);
-            out[..3].copy_from_slice(&dc);
-            out[3..].copy_from_slice(rest.as_flattened());
-        });
-        Nodes {
-            geometry,
-            sh,
-            width,
-        }
-    }
-}
-
-fn median(mut values: Vec<f32>) -> Option<f32> {
-    let middle = values.len().checked_sub(1)? / 2;
-    Some(*values.select_nth_unstable_by(middle, f32::total_cmp).1)
-}
-
-/// A power of two near the median of the middle scale, so that dividing by it rounds nothing.
-fn typical_size(scene: &SceneRef) -> f64 {
-    let middle = |s: &[f32; 3]| s[0].max(s[1]).min(s[2]).max(s[0].min(s[1]));
-    let positive = scene
-        .scales
-        .iter()
-        .map(middle)
-        .filter(|s| *s > 0.0)
-        .collect();
-    let size = f64::from(median(positive).unwrap_or(1.0));
-    f64::from_bits(size.to_bits() & (0x7ff << 52))
-}
-
-fn node(scene: &SceneRef, ordered: &Ordered, i: usize, unit: f64, blur: f64) -> Node {
-    let row = ordered.rows[i] as usize;
-    let mut g = ordered.gaussian(scene, row);
-    g.scales = g.scales.map(|s| (s / unit).min(MAX_SCALE));
-    let mut node = Node {
-        mean: g
-            .mean
-            .map(|v| (v / unit).clamp(-MAX_COORDINATE, MAX_COORDINATE) as f32),
-        cov: g.covariance().map(|v| v as f32),
-        blur: (blur / (unit * unit)) as f32,
-        alpha: (sigmoid(f64::from(scene.logit(row))) as f32).min(MAX_ALPHA),
-        ..Node::default()
-    }
-    .weighed();
-    node.seen = node.mass;
-    node
 }
 
 /// Merges the pairs and puts the nodes that are left in Morton order. Returns where each node went.

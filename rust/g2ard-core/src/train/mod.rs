@@ -15,10 +15,12 @@ pub use store::{Exported, Store};
 
 use std::time::Instant;
 
-use crate::raster::frame::ChunkSums;
+use crate::raster::frame::{ChunkSums, bytes};
 use crate::raster::gradients::Discard;
 use crate::raster::simd::dispatch;
-use crate::raster::{Camera, Image, ImageGradients, Isa, Params, Passes, Rasterizer, Settings};
+use crate::raster::{
+    Camera, Image, ImageGradients, Isa, Memory, Params, Passes, Rasterizer, Settings,
+};
 use crate::ssim::{Loss, Shape};
 use crate::{Error, Result};
 use adam::{Biases, Update};
@@ -124,6 +126,16 @@ impl Trainer {
     /// How long the rasteriser's passes of the last step took; Adam is in `gather`.
     pub fn passes(&self) -> Passes {
         self.rasterizer.passes()
+    }
+
+    /// What the parameters, the moments and all buffers hold now; without anchors.
+    pub fn memory(&self) -> Memory {
+        let rasterizer = self.rasterizer.memory();
+        let planes = [&self.image, &self.alpha, &self.gradient].map(bytes);
+        Memory {
+            gaussians: rasterizer.gaussians + self.store.bytes(),
+            images: rasterizer.images + planes.iter().sum::<usize>() + self.loss.bytes(),
+        }
     }
 
     /// Renders the view, compares, goes back and takes one Adam step.

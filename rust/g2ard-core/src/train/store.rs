@@ -1,6 +1,7 @@
 //! Parameters and moments in blocks of sixteen, attribute after attribute.
 
 use crate::raster::Params;
+use crate::raster::frame::bytes;
 use crate::raster::order::Shared;
 use crate::raster::params::Source;
 use crate::raster::simd::{LANES, Lanes, Row};
@@ -100,6 +101,12 @@ impl Store {
 
     pub fn sh_coeffs(&self) -> usize {
         self.sh_coeffs
+    }
+
+    /// Bytes held.
+    pub(crate) fn bytes(&self) -> usize {
+        let rows = [&self.values, &self.first, &self.second, &self.units].map(bytes);
+        rows.iter().sum::<usize>() + bytes(&self.steps) + bytes(&self.order)
     }
 
     pub(crate) fn attributes(&self) -> usize {

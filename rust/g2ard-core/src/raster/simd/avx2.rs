@@ -3,7 +3,7 @@
 use std::arch::x86_64::*;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use super::{LANES, Lanes, Mask, Row, Wide, exp2_fraction};
+use super::{LANES, Lanes, Mask, Row, TO_NEAREST, Wide, exp2_fraction};
 
 // SAFETY, for every `unsafe` below that gives no other reason: values of these types are only made inside kernels that
 // `dispatch` runs after it found AVX2 and FMA, so the instructions exist.
@@ -276,12 +276,13 @@ impl Lanes for Avx2 {
     }
     #[inline(always)]
     fn exp2(self) -> Self {
-        let n = self.floor();
-        let p = exp2_fraction(self - n);
-        // The fraction's power lies in [1, 2): its exponent can be raised as an integer.
+        let magic = Self::splat(TO_NEAREST);
+        let n = self + magic;
+        let p = exp2_fraction(self - (n - magic));
+        // The fraction's power is normal: its exponent can be raised as an integer.
         unsafe {
-            let low = _mm256_slli_epi32::<23>(_mm256_cvttps_epi32(n.0));
-            let high = _mm256_slli_epi32::<23>(_mm256_cvttps_epi32(n.1));
+            let low = _mm256_slli_epi32::<23>(_mm256_castps_si256(n.0));
+            let high = _mm256_slli_epi32::<23>(_mm256_castps_si256(n.1));
             Self(
                 _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p.0), low)),
                 _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p.1), high)),

@@ -3,7 +3,7 @@
 use std::arch::x86_64::*;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use super::{LANES, Lanes, Mask, Row, Wide, exp2_fraction};
+use super::{LANES, Lanes, Mask, Row, TO_NEAREST, Wide, exp2_fraction};
 
 // SAFETY, for every `unsafe` below that gives no other reason: values of these types are only made inside kernels that
 // `dispatch` runs after it found AVX-512F and DQ, so the instructions exist.
@@ -190,9 +190,17 @@ impl Lanes for Avx512 {
     }
     #[inline(always)]
     fn exp2(self) -> Self {
-        // vreduceps gives x − floor(x); vscalefps floors its own exponent.
-        let fraction = Self(unsafe { _mm512_reduce_ps::<TO_FLOOR>(self.0) });
-        exp2_fraction(fraction).ldexp(self)
+        let magic = Self::splat(TO_NEAREST);
+        let n = self + magic;
+        let p = exp2_fraction(self - (n - magic));
+        // The fraction's power is normal: its exponent can be raised as an integer, on other ports than vscalefps.
+        unsafe {
+            let raise = _mm512_slli_epi32::<23>(_mm512_castps_si512(n.0));
+            Self(_mm512_castsi512_ps(_mm512_add_epi32(
+                _mm512_castps_si512(p.0),
+                raise,
+            )))
+        }
     }
     #[inline(always)]
     fn sums(rows: &[Self; 10]) -> Row {

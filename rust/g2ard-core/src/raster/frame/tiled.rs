@@ -1,0 +1,182 @@
+//! The passes whose pieces of work are tiles.
+
+use rayon::prelude::*;
+
+use super::{Image, ImageGradients, Rasterizer};
+use crate::raster::BLOCKS;
+use crate::raster::accumulate::{Accumulate, Share};
+use crate::raster::backward::{self, Backward, Incoming, SUMS};
+use crate::raster::forward::{Forward, Pixels};
+use crate::raster::order::Shared;
+use crate::raster::simd::{Row, dispatch};
+use crate::raster::stage::{BATCH, Place, Staged, for_stretches};
+
+#[derive(Default)]
+struct Scratch {
+    staged: Staged,
+    pixels: Pixels,
+    incoming: Incoming,
+}
+
+impl Rasterizer {
+    /// Blends every tile into the image.
+    pub(crate) fn blend<const DEPTH: bool>(&mut self, image: &mut Image) {
+        let Some(frame) = &self.frame else { return };
+        let (camera, background) = (frame.camera, frame.background);
+        let tiles_x = camera.tiles().0;
+        let tiles = self.batches.len();
+        self.transmittance.resize(tiles, [Row::default(); BLOCKS]);
+        self.last.resize(tiles, [Row::default(); BLOCKS]);
+        let words = Shared::new(&mut self.words);
+        let rgb = Shared::new(image.rgb);
+        let alpha = Shared::new(image.alpha);
+        let depth = image.depth.as_deref_mut().map(Shared::new);
+        let median = image.median.as_deref_mut().map(Shared::new);
+        let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
+        let tile_states = self
+            .batches
+            .par_iter_mut()
+            .zip(&mut self.transmittance)
+            .zip(&mut self.last);
+        tile_states.enumerate().for_each_init(
+            Scratch::default,
+            |scratch, (tile, ((batch, transmittance), last))| {
+                let pairs = &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize];
+                let place = Place::of(tile, tiles_x, camera.width, camera.height);
+                // SAFETY: every tile has its own batches, and the pixels written below are its own.
+                let words = unsafe { words.slice(batch.0, pairs.len().div_ceil(BATCH)) };
+                let forward = Forward::<DEPTH> {
+                    pairs,
+                    splats,
+                    place,
+                    settings: &frame.settings,
+                    words,
+                    transmittance,
+                    last,
+                    pixels: &mut scratch.pixels,
+                    staged: &mut scratch.staged,
+                };
+                batch.1 = dispatch(isa, forward);
+                let pixels = &scratch.pixels;
+                for y in 0..place.rows {
+                    let first = (place.y + y) * camera.width + place.x;
+                    // SAFETY: as above.
+                    let (rgb, alpha) = unsafe {
+                        (
+                            rgb.slice(3 * first, 3 * place.columns),
+                            alpha.slice(first, place.columns),
+                        )
+                    };
+                    for_stretches(y, place.columns, |x, block, lane, count| {
+                        let light: &[f32; 4] = transmittance[block].0[lane..]
+                            .first_chunk()
+                            .unwrap_or(&[0.0; 4]);
+                        for i in 0..count {
+                            alpha[x + i] = 1.0 - light[i];
+                        }
+                        let mut values = [0.0; 12];
+                        for c in 0..3 {
+                            let channel = &pixels.rgb[c][block].0[lane..lane + 4];
+                            for i in 0..4 {
+                                values[3 * i + c] = channel[i] + light[i] * background[c];
+                            }
+                        }
+                        rgb[3 * x..3 * (x + count)].copy_from_slice(&values[..3 * count]);
+                    });
+                    for (plane, rows) in [(depth, &pixels.depth), (median, &pixels.median)] {
+                        let Some(plane) = plane else { continue };
+                        // SAFETY: as above.
+                        let row = unsafe { plane.slice(first, place.columns) };
+                        for (x, value) in row.iter_mut().enumerate() {
+                            *value = rows[y / 4 * 4 + x / 4].0[y % 4 * 4 + x % 4];
+                        }
+                    }
+                }
+            },
+        );
+    }
+
+    /// Fills the slots with every pair's share of the gradient.
+    pub(super) fn unblend<const DEPTH: bool>(&mut self, image: &ImageGradients) {
+        self.clear_slots();
+        let Some(frame) = &self.frame else { return };
+        let camera = &frame.camera;
+        let tiles_x = camera.tiles().0;
+        let slots = Shared::new(&mut self.slots);
+        let written = Shared::new(&mut self.written);
+        let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
+        let states = self
+            .batches
+            .par_iter()
+            .zip(&self.transmittance)
+            .zip(&self.last);
+        states.enumerate().for_each_init(
+            Scratch::default,
+            |scratch, (tile, ((batch, transmittance), last))| {
+                let pairs = &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize];
+                if pairs.is_empty() {
+                    return;
+                }
+                let place = Place::of(tile, tiles_x, camera.width, camera.height);
+                let incoming = &mut scratch.incoming;
+                incoming.load(backward::RGB, image.rgb, 3, camera.width, &place);
+                if let Some(alpha) = image.alpha {
+                    incoming.load(backward::ALPHA, alpha, 1, camera.width, &place);
+                }
+                if let Some(depth) = image.depth {
+                    incoming.load(backward::DEPTH, depth, 1, camera.width, &place);
+                }
+                let backward = Backward::<DEPTH> {
+                    pairs,
+                    splats,
+                    place,
+                    settings: &frame.settings,
+                    background: frame.background,
+                    words: &self.words[batch.0..batch.0 + batch.1],
+                    transmittance,
+                    last,
+                    incoming,
+                    batch: &mut scratch.staged.near,
+                    slots,
+                    written,
+                };
+                dispatch(isa, backward);
+            },
+        );
+    }
+
+    pub(super) fn accumulate_tiles(&mut self) {
+        let pairs = self.bins.pairs.len();
+        self.shares.resize(pairs, Share::default());
+        self.written.clear();
+        self.written.resize(pairs, 0);
+        let Some(frame) = &self.frame else { return };
+        let camera = &frame.camera;
+        let tiles_x = camera.tiles().0;
+        let slots = Shared::new(&mut self.shares);
+        let written = Shared::new(&mut self.written);
+        let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
+        (0..self.batches.len())
+            .into_par_iter()
+            .for_each_init(Staged::default, |staged, tile| {
+                let accumulate = Accumulate {
+                    pairs: &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize],
+                    splats,
+                    place: Place::of(tile, tiles_x, camera.width, camera.height),
+                    settings: &frame.settings,
+                    staged,
+                    slots,
+                    written,
+                };
+                dispatch(isa, accumulate);
+            });
+    }
+
+    /// Slots keep stale sums: `written` says which of them count.
+    fn clear_slots(&mut self) {
+        let pairs = self.bins.pairs.len();
+        self.slots.resize(pairs, [0.0; SUMS]);
+        self.written.clear();
+        self.written.resize(pairs, 0);
+    }
+}

@@ -1,0 +1,103 @@
+//! A chunk of Gaussians' splats, written out.
+
+use super::{Projected, Splat, View, colour, direction, project};
+use crate::raster::covers::{Cover, Ellipses, Lister};
+use crate::raster::params::Source;
+use crate::raster::simd::{Kernel, LANES, Lanes, Mask, Row, Wide};
+use crate::raster::{ALPHA_MIN, Convention, sh};
+
+/// Projects the groups `first..last`; visible splats go to the front of `out` in row order, each with
+/// its cover. Returns how many.
+pub struct Project<'a, S: Source> {
+    pub view: &'a View,
+    pub source: S,
+    pub first: usize,
+    pub last: usize,
+    pub tiles: (usize, usize),
+    pub out: &'a mut [Splat],
+    pub covers: &'a mut [Cover],
+    pub lister: &'a mut Lister,
+}
+
+impl<S: Source> Kernel for Project<'_, S> {
+    type Output = usize;
+
+    #[inline(always)]
+    fn run<F: Lanes>(self) -> usize {
+        let mut count = 0;
+        self.lister.clear();
+        for group in self.first..self.last {
+            let p = project::<F, S>(self.view, &self.source, group);
+            let rows = (self.source.len() - group * LANES).min(LANES);
+            let bits = u32::from(p.visible.bits()) & ((1u32 << rows) - 1);
+            if bits == 0 {
+                continue;
+            }
+            let some = count + bits.count_ones() as usize;
+            let covers = &mut self.covers[count..some];
+            p.ellipses(self.view)
+                .covers(bits, self.tiles, self.lister, covers);
+            let (dir, _) = direction::<F, S>(self.view, &self.source, group);
+            let mut basis = [F::zero(); 16];
+            sh::basis(self.source.sh_coeffs(), dir[0], dir[1], dir[2], &mut basis);
+            let rgb = colour::<F, S>(&self.source, group, &basis);
+            let (mut x, mut y) = ([0.0; LANES], [0.0; LANES]);
+            p.x.store(&mut x);
+            p.y.store(&mut y);
+            let mut rows = [Row::default(); 8];
+            let values = [
+                p.a,
+                p.b,
+                p.c,
+                p.log2_opacity,
+                rgb[0].max(F::zero()),
+                rgb[1].max(F::zero()),
+                rgb[2].max(F::zero()),
+                p.depth,
+            ];
+            for k in 0..8 {
+                values[k].store(&mut rows[k]);
+            }
+            let mut todo = bits;
+            for (splat, cover) in self.out[count..some].iter_mut().zip(covers) {
+                let l = todo.trailing_zeros() as usize;
+                todo &= todo - 1;
+                *splat = Splat {
+                    x: x[l],
+                    y: y[l],
+                    a: rows[0].0[l],
+                    b: rows[1].0[l],
+                    c: rows[2].0[l],
+                    log2_opacity: rows[3].0[l],
+                    rgb: [rows[4].0[l], rows[5].0[l], rows[6].0[l]],
+                    depth: rows[7].0[l],
+                    row: (group * LANES + l) as u32,
+                    tiles: cover.tiles,
+                    slot: cover.slot,
+                };
+            }
+            count = some;
+        }
+        count
+    }
+}
+
+impl<F: Lanes> Projected<F> {
+    #[inline(always)]
+    fn ellipses(&self, view: &View) -> Ellipses<F> {
+        let reach = (self.log2_opacity - F::splat(ALPHA_MIN.log2())).max(F::zero());
+        Ellipses {
+            x: F::narrow(self.x),
+            y: F::narrow(self.y),
+            a: self.a,
+            b: self.b,
+            c: self.c,
+            level: reach.fma(F::splat(1.000_1), F::splat(1e-4)),
+            half: self.half,
+            radius: match view.convention {
+                Convention::Gsplat => None,
+                Convention::Inria => Some(self.radius),
+            },
+        }
+    }
+}
