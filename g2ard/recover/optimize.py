@@ -127,8 +127,8 @@ def recover(
 ) -> Recovered:
     """Optimise every attribute of a fixed set of Gaussians against targets (`eq:objective`).
 
-    L = (1−λ)·L1 + λ·(1−SSIM), and every `period` steps + `period`·(λ_a·L_anchor + λ_s·L_shape). No
-    Gaussian is added or removed.
+    L = (1−λ)·L1 + λ·(1−SSIM), and every `period` steps + λ_a·L_anchor + λ_s·L_shape. No Gaussian is added
+    or removed.
 
     Args:
         student: the scene to recover; its offset counts, cameras are in world coordinates.
@@ -220,7 +220,7 @@ class _Loop:
             student,
             self.targets.cameras.recentred(student.offset),
             anchors=self.anchors,
-            regularizers=config.regularizers.applied,
+            regularizers=config.regularizers,
             means_in_scales=config.schedule.means_in_scales,
             ssim_weight=config.ssim_weight,
             background=config.background,

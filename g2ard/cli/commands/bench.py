@@ -413,7 +413,7 @@ def recover(
     columns = ["scene", "ratio", "variant", "seed", "steps", "seconds", "CPU s", "PSNR", "SSIM"]
     run.console.table(
         f"{machine()}; unseen views at the end of each run",
-        [*columns, "Drift95", "needles", "regularisers"],
+        [*columns, "Drift95", "needles", "rank p1", "regularisers"],
         [_result(look) for look in looks if look.final],
     )
     faster = speedups(looks)
@@ -467,6 +467,7 @@ def _result(look: Look) -> list[str]:
         f"{look.psnr:.2f}",
         f"{look.ssim:.4f}",
         f"{look.drift95:.2f}",
-        f"{look.needle:.2%}",
+        f"{look.needle:.3%}",
+        f"{look.rank_p1:.3f}",
         f"{look.reg_share:.2%}",
     ]

@@ -126,7 +126,7 @@ def distill(
     use_photos = lifted or (pictured if photos is None else photos)
     teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
     colour = background or (0.0, 0.0, 0.0)
-    regularizers, why, measured = preset_for(preset, prior, train)
+    regularizers, why, measured = preset_for(preset, prior, train, paper=schedule == "paper")
     run.say(f"{len(prior):,} → {budget:,} Gaussians; {len(train)} views against {against}")
     run.say(f"regularisers: {why}")
     config = DistillConfig(

@@ -69,7 +69,9 @@ def recover(
     weights = chosen.weights if weighted else None
     if weights is not None:
         run.say(f"{len(weights)} views, drawn by their weights")
-    regularizers, why, measured = preset_for(preset, dense or splats, chosen.cameras)
+    regularizers, why, measured = preset_for(
+        preset, dense or splats, chosen.cameras, paper=schedule == "paper"
+    )
     run.say(f"regularisers: {why}")
     config = RecoverConfig(
         schedule=schedule_named(schedule),
