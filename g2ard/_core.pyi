@@ -134,6 +134,11 @@ _Scene = tuple[NDArray[Any], ...]
 
 def select_surface(scene: _Scene, cells: int) -> dict[str, Any]: ...
 def select_depth(scene: _Scene, view: tuple[Any, ...]) -> _F32: ...
+def select_looks(
+    scene: _Scene,
+    views: list[tuple[Any, ...]],
+    progress: Callable[[int, int], None] | None = None,
+) -> _F32: ...
 def select_visible(
     scene: _Scene,
     surface: _Surface,

@@ -1,4 +1,4 @@
-"""The whole pipeline: simplify, freeze anchors, recover, by rounds; the only module that joins the stages."""
+"""The whole pipeline: select, simplify, freeze anchors, recover, by rounds; it alone joins the stages."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.progress import Progress, silent
 from g2ard.recover.anchors import PRESETS, Regularizers
+from g2ard.recover.draw import checked_weights
 from g2ard.recover.schedule import TUNED, Schedule
 from g2ard.splats import Splats
-from g2ard.targets import Targets, fingerprint_of
+from g2ard.targets import Subset, Targets, fingerprint_of
 
 if TYPE_CHECKING:
     from g2ard.recover.optimize import Watch
@@ -39,7 +41,13 @@ class DistillConfig:
         regularizers: weights of L_anchor and L_shape.
         sh_degree: of the result; None keeps the prior's.
         background: RGB behind the scene.
-        seed: of the order of views.
+        views: how many of the targets' views recovery looks at, best first; "auto" takes as many as the
+            curve of gains asks for, None all that see the scene.
+        policy: how views are chosen, see `g2ard.select`.
+        weighted: draw views by the weights of the selection, so that crowded poses do not rule: on a
+            crowded pool all views drawn so beat an even draw, and every choice of a tenth of them.
+        reselect: choose again from every round's scene; else once, from the raw prior.
+        seed: of the order of views, and of the policy "random".
         engine: what takes recovery's steps, see `RecoverConfig`.
     """
 
@@ -50,6 +58,10 @@ class DistillConfig:
     regularizers: Regularizers = PRESETS["trained"]
     sh_degree: int | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    views: int | Literal["auto"] | None = None
+    policy: str = "auto"
+    weighted: bool = True
+    reselect: bool = False
     seed: int = 0
     engine: Literal["fused", "torch", "gsplat"] = "fused"
 
@@ -61,7 +73,10 @@ class Distilled:
     Args:
         splats: exactly `budget` Gaussians.
         simplified: the same Gaussians before their last recovery: its anchors.
-        report: rounds [{simplify, recover}], seconds {simplify, recover}.
+        report: rounds [{simplify, recover}], seconds {select, simplify, recover}, and views {policy,
+            candidates, chosen [names], weighted, refused [names], left_out}: the last is what the views not
+            chosen would have added to the policy's objective, as a share of the whole pool's; None where
+            nothing was selected.
     """
 
     splats: Splats
@@ -75,6 +90,7 @@ def distill(
     targets: Targets,
     config: DistillConfig | None = None,
     *,
+    weights: ArrayLike | None = None,
     work: Path | None = None,
     progress: Progress = silent,
     watch: Watch | None = None,
@@ -89,6 +105,7 @@ def distill(
         budget: N_S, at most the prior's count.
         targets: photos, or the prior's own renders.
         config: see `DistillConfig`.
+        weights: (C,) how often to draw each view, where that is known already; None weighs them here.
         work: a folder for finished rounds and checkpoints; a second call with the same inputs goes on there.
         progress: told of all stages.
         watch: called after every step of every recovery, see `g2ard.recover.recover`.
@@ -97,7 +114,7 @@ def distill(
         A `Distilled`.
 
     Raises:
-        InputError: the budget does not fit, or `work` belongs to another run.
+        InputError: the budget does not fit, no view sees the prior, or `work` belongs to another run.
         KeyboardInterrupt: after Ctrl-C, with `work` ready for a resume.
     """
     from g2ard.simplify import schedule as counts_of
@@ -105,10 +122,56 @@ def distill(
     config = config or DistillConfig()
     many = config.schedule.round_steps > 0
     counts = counts_of(len(prior), budget) if many else [budget]
-    rounds = _Rounds(prior, budget, targets, config, len(counts), work, progress, watch)
+    rounds = _Rounds(prior, budget, targets, config, len(counts), weights, work, progress, watch)
     for number, count in enumerate(counts, start=1):
         rounds.advance(number, count, final=number == len(counts))
-    return Distilled(rounds.state, rounds.simplified, {"rounds": rounds.log, "seconds": rounds.seconds})
+    report = {"rounds": rounds.log, "seconds": rounds.seconds, "views": rounds.supervision.report}
+    return Distilled(rounds.state, rounds.simplified, report)
+
+
+@dataclass(frozen=True, eq=False)
+class _Supervision:
+    """What recovery looks at, how often, and why."""
+
+    targets: Targets
+    weights: Any
+    report: dict[str, Any] | None
+
+    @classmethod
+    def of(
+        cls, scene: Splats, targets: Targets, config: DistillConfig, weights: Any, progress: Progress
+    ) -> _Supervision:
+        """The views worth having of `scene`; `weights` that are given stand, over what selection says."""
+        from g2ard.select import select
+
+        cameras = targets.cameras
+        if config.views is None and (weights is not None or not config.weighted):
+            return cls(targets, weights, None)
+        wanted = len(cameras) if config.views is None else config.views
+        policy = config.policy if config.views is not None else "auto"
+        chosen = select(scene, cameras, wanted, policy=policy, seed=config.seed, progress=progress)
+        rows = np.argsort(chosen.order)
+        subset = Subset(targets, chosen.order[rows])
+        if weights is not None:
+            weights = weights[chosen.order[rows]]
+        elif config.weighted:
+            weights = chosen.weights[rows]
+        report = {
+            "policy": policy,
+            "candidates": len(cameras),
+            "chosen": [cameras.names[i] for i in chosen.order],
+            "weighted": weights is not None,
+            "refused": [cameras.names[i] for i in chosen.refused],
+            "left_out": chosen.left_out,
+        }
+        return cls(subset, weights, report)
+
+    def fill(self, progress: Progress) -> None:
+        """Have every target at hand, so that later steps take equal time."""
+        count = len(self.targets.cameras)
+        for view in range(count):
+            self.targets[view]
+            progress("targets", view + 1, count)
 
 
 class _Rounds:
@@ -121,6 +184,7 @@ class _Rounds:
         targets: Targets,
         config: DistillConfig,
         count: int,
+        weights: ArrayLike | None,
         work: Path | None,
         progress: Progress,
         watch: Watch | None,
@@ -130,18 +194,29 @@ class _Rounds:
         self.state = self.simplified = prior
         self.protected: Any = None
         self.log: list[dict[str, Any]] = []
-        self.seconds = {"simplify": 0.0, "recover": 0.0}
-        self.key = _fingerprint(prior, budget, targets, config)
+        self.seconds = {"select": 0.0, "simplify": 0.0, "recover": 0.0}
+        self.weights = checked_weights(weights, len(targets.cameras))
+        self.key = _fingerprint(prior, budget, targets, config, self.weights)
+        self._select(prior)
 
     def advance(self, number: int, count: int, *, final: bool) -> None:
         """One round: simplify to `count`, recover; the final one recovers for the final horizon as well."""
         entry: dict[str, Any] = {"count": count}
+        if self.config.reselect and number > 1:
+            self._select(self.state)
         self._simplify(number, count, entry)
         if self.config.schedule.round_steps > 0:
             self._recover(f"round-{number}", entry, final=False)
         if final:
             self._recover("final", entry, final=True)
         self.log.append(entry)
+
+    def _select(self, scene: Splats) -> None:
+        began = time.monotonic()
+        self.supervision = _Supervision.of(scene, self.targets, self.config, self.weights, self.progress)
+        self.seconds["select"] += time.monotonic() - began
+        if self.config.views is not None:
+            self.supervision.fill(self.progress)
 
     def _simplify(self, number: int, count: int, entry: dict[str, Any]) -> None:
         from g2ard.render import looker
@@ -186,8 +261,9 @@ class _Rounds:
             checkpoint = self.work / f"{name}.checkpoint.npz" if self.work else None
             done = recover(
                 self.state,
-                self.targets,
+                self.supervision.targets,
                 config,
+                weights=self.supervision.weights,
                 checkpoint=checkpoint,
                 progress=self.progress,
                 stage="recover" if final else f"recover {name}",
@@ -248,6 +324,7 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-def _fingerprint(prior: Splats, budget: int, targets: Targets, config: DistillConfig) -> str:
-    parts = (repr((budget, config)), prior.fingerprint(), fingerprint_of(targets))
+def _fingerprint(prior: Splats, budget: int, targets: Targets, config: DistillConfig, weights: Any) -> str:
+    given = None if weights is None else weights.tolist()
+    parts = (repr((budget, config, given)), prior.fingerprint(), fingerprint_of(targets))
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()

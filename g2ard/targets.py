@@ -8,14 +8,14 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
 
-__all__ = ["CACHE_BYTES", "Photos", "Targets", "TeacherRenders", "fingerprint_of", "mask_of"]
+__all__ = ["CACHE_BYTES", "Photos", "Subset", "Targets", "TeacherRenders", "fingerprint_of", "mask_of"]
 
 CACHE_BYTES = 2_000_000_000
 """Targets are kept in memory up to this many bytes; beyond it they are made again when they are asked for."""
@@ -42,6 +42,27 @@ def fingerprint_of(targets: Targets) -> str:
     for array in (cameras.viewmats, cameras.Ks, cameras.widths, cameras.heights):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
+
+
+class Subset:
+    """Some of other targets.
+
+    Args:
+        targets: all of them.
+        rows: which, in which order.
+    """
+
+    def __init__(self, targets: Targets, rows: ArrayLike) -> None:
+        self._targets, self._rows = targets, np.asarray(rows, np.int64)
+        self.cameras = targets.cameras.take(self._rows)
+        self.source = getattr(targets, "source", type(targets).__name__)
+
+    def __getitem__(self, view: int) -> NDArray[np.float32]:
+        return self._targets[int(self._rows[view])]
+
+    def mask(self, view: int) -> NDArray[np.bool_] | None:
+        """See `mask_of`."""
+        return mask_of(self._targets, int(self._rows[view]))
 
 
 class _Cached(ABC):
@@ -149,7 +170,7 @@ def _inverse(name: str, exposure: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 class TeacherRenders(_Cached):
-    """The dense scene rendered into each view, clamped to [0, 1], in float32."""
+    """The dense scene rendered into each view, in [0, 1] and float32; `lazy`, when first asked for."""
 
     def __init__(
         self,
@@ -158,13 +179,15 @@ class TeacherRenders(_Cached):
         *,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         limit: int = CACHE_BYTES,
+        lazy: bool = False,
         progress: Progress = silent,
     ) -> None:
         super().__init__(cameras, limit)
         self._teacher = teacher
         self._background = background
         self.source = f"teacher {teacher.fingerprint()} {background}"
-        self.fill(progress, "teacher")
+        if not lazy:
+            self.fill(progress, "teacher")
 
     def _make(self, view: int) -> NDArray[np.float32]:
         from g2ard.render import render

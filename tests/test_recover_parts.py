@@ -13,7 +13,15 @@ from scenes import around, checkered_ball
 
 from g2ard.errors import InputError
 from g2ard.recover import checkpoint
-from g2ard.recover.anchors import PRESETS, Anchors, Regularizers, drift95, effective_rank, needle
+from g2ard.recover.anchors import (
+    PAPER_PRESETS,
+    PRESETS,
+    Anchors,
+    Regularizers,
+    drift95,
+    effective_rank,
+    needle,
+)
 from g2ard.recover.presets import preset_for, view_consistency
 from g2ard.recover.regularize import TorchAnchors, anchor_loss, regularization, shape_loss
 from g2ard.recover.schedule import PAPER, TUNED, schedule_named
@@ -170,6 +178,7 @@ def test_auto_preset_tells_lift_trained_and_noisy_apart() -> None:
     weights, why, measured = preset_for("lift", noisy)
     assert weights == PRESETS["lift"]
     assert why == "lift (as asked)"
+    assert preset_for("auto", lift, paper=True)[0] == PAPER_PRESETS["lift"] == Regularizers(1e-3, 1e-4, True)
     assert measured.needle == 1
     assert measured.consistency is None
     with pytest.raises(InputError, match="preset"):

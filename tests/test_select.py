@@ -7,15 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from realdata import real
+from reference import rays
 from reference import select as naive
 
 from g2ard import _core
-from g2ard import select as module
 from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
-from g2ard.io import read_view_set, write_splats, write_views
-from g2ard.select import POLICIES, CoverageOptions, Surface, select, surface, visible_cells
+from g2ard.io import read_splats, read_view_set, write_splats, write_views
+from g2ard.lift import lift
+from g2ard.poses import make_pool
+from g2ard.select import POLICIES, CoverageOptions, Surface, poses, select, surface, surfaces, visible_cells
 from g2ard.splats import Splats
+from g2ard.synth import city
 
 SIZE = (96, 72)
 FOCAL = 80.0
@@ -57,14 +61,14 @@ def around(count, seed=0, radius=4.0) -> Cameras:
 
 
 def core_view(cameras, i, origin):
-    return module._views(cameras.take([i]), origin)[0]
+    return surfaces.core_views(cameras.take([i]), origin)[0]
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (4.4e5, 4.4e6, 1e3)])
 def test_depths_are_the_naive_renderers(offset):
     scene = ball(offset=offset)
     cameras = around(3).recentred(-np.asarray(offset))
-    parts, origin = module._scene(scene)
+    parts, origin = surfaces.core_scene(scene)
     grid = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)
     for i in range(3):
         got = _core.select_depth(parts, core_view(cameras, i, origin)).ravel()
@@ -106,6 +110,30 @@ def test_visibility_is_the_oracles():
         agree, kept, total = agree + int((want == got)[use].sum()), kept + int(use.sum()), total + len(use)
     assert kept > 0.2 * total
     assert agree / kept >= 0.995
+
+
+@pytest.mark.parametrize(
+    ("parts", "every", "cells"),
+    [(("playbot", "0_0"), 40, 100), (("taebak_park", "0_4"), 50, 100), ((), 1, 300)],
+)
+def test_visibility_on_real_scenes_is_a_ray_oracle_s(parts, every, cells):
+    """Slices of real scenes (the city needs no data) against every Gaussian at every ray."""
+    if parts:
+        scene = read_splats(real(*parts))
+        scene = scene.take(np.arange(0, len(scene), every))  # thinner, so each is larger in its stead
+        scene = replace(scene, scales=scene.scales * np.float32(np.sqrt(every)))
+        pool = make_pool(scene, 24, seed=3).take([0, 9, 17]).resized(240)
+    else:
+        town = city(points=8000, views=24, size=(240, 180))
+        scan, pool = town.points(), town.views["train"].take([0, 6, 15])
+        scene = lift(scan.positions, scan.colors)
+    made = surface(scene, 20_000)
+    seen = visible_cells(scene, made, pool)
+    tried = np.random.default_rng(0).choice(len(made.centers), cells, replace=False)
+    agree, kept, total = rays.agreement(scene, made, pool, seen, tried)
+    assert total > cells / 2
+    assert kept > 0.1 * total
+    assert agree >= 0.995 * kept
 
 
 def random_problem(rng, count=12, cells=60):
@@ -160,18 +188,35 @@ def test_lazy_is_plain_greedy_on_fifty_pools():
     assert saved > 10
 
 
-def test_auto_is_facility_location():
-    scene, cameras = ball(), around(30)
+@pytest.mark.parametrize("count", [30, 9])
+def test_auto_reaches_every_pose_and_then_represents(count):
+    scene, cameras = ball(), around(count)
     coarse = surface(scene, 1000)
-    alike = module._likeness(cameras, module._viewing_distances(coarse, cameras))
-    wanted = module._demand(alike)
+    alike = poses.likeness(cameras, poses.viewing_distances(coarse, cameras))
+    wanted = poses.demand(alike)
     np.testing.assert_array_equal(alike, alike.T)
     np.testing.assert_array_equal(np.diag(alike), 1.0)
-    order, gains = module._represent(alike, wanted, np.ones(30, bool))
-    assert order.tolist()[:12] == naive.facility(12, alike, wanted)
+    order, gains = poses.represent(alike, wanted, np.ones(count, bool))
+    assert order.tolist() == naive.represent(count, alike, wanted)
     assert gains.sum() == pytest.approx(1.0)
-    assert np.all(np.diff(gains) <= 1e-15)
-    np.testing.assert_allclose(module._gains_of(order, alike, wanted), gains, atol=1e-15)
+    assert gains.min() >= 0
+    np.testing.assert_allclose(poses.gains_of(order, alike, wanted), gains, atol=1e-15)
+
+
+def test_auto_reaches_first():
+    """Two poses far from a crowd: both are chosen before any second one of the crowd."""
+    rng = np.random.default_rng(8)
+    crowd = np.array([4.0, 0, 0]) + 0.3 * rng.standard_normal((30, 3))
+    far = np.array([[-4.0, 0, 0], [0, 0, 4.0]])
+    chosen = select(ball(), views(np.concatenate([crowd, far])), 3)
+    assert set(chosen.order.tolist()) >= {30, 31}
+    unreached = poses.represent(np.eye(5), np.full(5, 0.2), np.array([1, 1, 0, 1, 1], bool))
+    assert unreached[0].tolist() == [
+        0,
+        1,
+        3,
+        4,
+    ]  # nothing like anything: in the order given, usable ones only
 
 
 def test_auto_and_diverse_leave_the_crowd():
@@ -223,15 +268,20 @@ def test_every_policy_on_every_pool(policy):
         run(away.take([2]), 1)
 
 
-def test_a_view_within_matter_comes_last():
+def test_a_view_within_matter_is_refused(tmp_path):
     rng = np.random.default_rng(5)
     solid = rng.standard_normal((6000, 3))
     solid *= (rng.random(6000) ** (1 / 3) / np.linalg.norm(solid, axis=1))[:, None]
     scene = Splats.create(solid, scales=np.full((6000, 3), 0.04), logit_opacities=np.full(6000, 3.0))
     pool = views([[4.0, 0, 0], [0.2, 0.1, 0], [0, 4.0, 0]], np.array([[0.0, 0, 0], [3, 0, 0.1], [0, 0, 0]]))
-    for policy in ("directional", "coverage"):
+    for policy in POLICIES:
         chosen = select(scene, pool, 3, policy=policy, options=CoverageOptions(cells=1000))
-        assert chosen.order[-1] == 1
+        assert sorted(chosen.order.tolist()) == [0, 2]
+        assert chosen.refused.tolist() == [1]
+    photos = replace(pool, image_paths=(None, tmp_path / "photo.png", None))  # there was a camera
+    assert not len(select(scene, photos, 3).refused)
+    alone = select(scene, pool.take([1]), 1)  # nothing to compare it with
+    assert alone.order.tolist() == [0]
 
 
 def test_auto_k_stops_at_the_bend():

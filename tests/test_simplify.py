@@ -341,7 +341,7 @@ def test_a_function_of_visibility_is_asked_again_as_the_scene_shrinks():
 
     out = simplify(prior, 100, visibility=look, protected=np.ones(4000, bool))
     assert_sound(out, 4000, 100)
-    assert asked == [4000, 1200, 360, 100, 100]  # the last two to resize what was merged
+    assert asked == [4000, 1200, 360, 100]  # the last to resize what was merged
     assert out.protected.all()
 
 

@@ -22,7 +22,7 @@ from g2ard.lift import lift
 from g2ard.poses import make_pool
 from g2ard.progress import Progress, silent
 from g2ard.recover import RecoverConfig, recover
-from g2ard.recover.anchors import Anchors, Regularizers, drift95, needle
+from g2ard.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, drift95, effective_rank, needle
 from g2ard.recover.presets import preset_for
 from g2ard.recover.schedule import PAPER, TUNED, Schedule
 from g2ard.render import looker
@@ -61,6 +61,7 @@ class Look:
         ssim: the same.
         drift95: against the anchors of the last recovery; None before the end.
         needle: share of needles.
+        rank_p1: the first percentile of effective ranks, which moves before there are needles.
         reg_share: share of recovery's time that regularisers took; None before the end.
         skipped: steps of single Gaussians left out as not finite; None before the end.
         final: 1 for the result, 0 on the way.
@@ -83,6 +84,7 @@ class Look:
     ssim: float
     drift95: float | None
     needle: float
+    rank_p1: float
     reg_share: float | None
     skipped: int | None
     final: int
@@ -287,8 +289,9 @@ def bench_recover(
         raise InputError(f"study: expected one of {', '.join(STUDIES)}, got {study!r}")
     kept = _whole(rows.read(csv_path, Look))
     rows.rewrite(csv_path, kept, Look)
-    preset = preset_for("auto", bench.prior, bench.cameras[0])[0]
+    preset, why, _ = preset_for("auto", bench.prior, bench.cameras[0])
     plans = STUDIES[study](steps, seconds, preset)
+    papers = PAPER_PRESETS[why.split()[0]]
     unknown = [v for v in variants or () if v not in plans]
     if unknown:
         raise InputError(f"variants: expected some of {', '.join(plans)}, got {', '.join(unknown)}")
@@ -302,7 +305,8 @@ def bench_recover(
     for number, key in enumerate(wanted, 1):
         if key not in done:
             plan = plans[key[4]]
-            run = _Run(bench, key, replace(plan, regularizers=plan.regularizers or preset))
+            weights = plan.regularizers or (papers if plan.schedule.rates == PAPER.rates else preset)
+            run = _Run(bench, key, replace(plan, regularizers=weights))
             found = run.looks(progress)
             rows.append(csv_path, found)
             kept += found
@@ -417,6 +421,7 @@ class _Run:
             ssim=score.ssim,
             drift95=None,
             needle=needle(splats.scales),
+            rank_p1=float(np.percentile(effective_rank(splats.scales), 1)),
             reg_share=None,
             skipped=None,
             final=final,

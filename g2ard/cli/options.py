@@ -14,6 +14,7 @@ __all__ = [
     "Count",
     "CountOption",
     "OutputOption",
+    "PolicyOption",
     "RatioOption",
     "SceneArgument",
     "Triple",
@@ -21,6 +22,7 @@ __all__ = [
     "budget_of",
     "one_budget",
     "parse_ratio",
+    "views_count",
 ]
 
 _COUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmM%]?)")
@@ -169,6 +171,25 @@ def _duration(text: str) -> float:
 TimeLimitOption = Annotated[
     float | None,
     typer.Option("--time-limit", parser=_duration, metavar="TIME", help="Fit recovery into 90s, 2m or 1h."),
+]
+
+
+_POLICIES = "auto|directional|coverage|pose-diverse|random|uniform"
+
+
+def views_count(text: str) -> Count | str:
+    """Read K: a count, a share, or auto."""
+    return "auto" if text.strip() == "auto" else Count.parse(text)
+
+
+def _policy(text: str) -> str:
+    if text not in _POLICIES.split("|"):
+        raise typer.BadParameter(f"one of {_POLICIES.replace('|', ', ')}, not {text!r}")
+    return text
+
+
+PolicyOption = Annotated[
+    str, typer.Option("--policy", parser=_policy, metavar=_POLICIES, help="What makes views good.")
 ]
 
 

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.cli.frame import Run
+    from g2ard.io import ViewSet
     from g2ard.splats import Splats
     from g2ard.targets import Targets
 
-__all__ = ["load_scene", "load_splits", "load_views", "make_targets", "recovery_engine"]
+__all__ = ["load_scene", "load_splits", "load_view_sets", "load_views", "make_targets", "recovery_engine"]
 
 
 def recovery_engine(run: Run) -> Literal["fused", "gsplat"]:
@@ -53,6 +54,17 @@ def load_splits(run: Run, path: Path, splits: list[str], size: int | None) -> li
     Raises:
         InputError: as `load_views`.
     """
+    return [found.cameras for found in load_view_sets(run, path, splits, size)]
+
+
+def load_view_sets(run: Run, path: Path, splits: list[str], size: int | None) -> list[ViewSet]:
+    """As `load_splits`, with the views' weights where the file has them.
+
+    Raises:
+        InputError: as `load_views`.
+    """
+    from dataclasses import replace
+
     from g2ard.io import read_view_set
     from g2ard.splits import split_mask
 
@@ -60,13 +72,19 @@ def load_splits(run: Run, path: Path, splits: list[str], size: int | None) -> li
     for note in found.notes:
         run.say(f"{path}: {note}")
     masks = [split_mask(path, found.cameras.names, split, stated=found.splits) for split in splits]
-    return [found.cameras.take(mask).resized(size) for mask in masks]
+    parts = [found.take(mask) for mask in masks]
+    return [replace(part, cameras=part.cameras.resized(size)) for part in parts]
 
 
 def make_targets(
-    run: Run, cameras: Cameras, teacher: Splats | None, background: tuple[float, float, float]
+    run: Run,
+    cameras: Cameras,
+    teacher: Splats | None,
+    background: tuple[float, float, float],
+    *,
+    lazy: bool = False,
 ) -> Targets:
-    """The teacher's renders, or the views' photos where no teacher is given."""
+    """The teacher's renders (`lazy`: when first asked for), or the photos where no teacher is given."""
     from g2ard.io.exposures import find_exposures
     from g2ard.targets import Photos, TeacherRenders
 
@@ -75,4 +93,4 @@ def make_targets(
         if exposures:
             run.say(f"exposure.json: {len(exposures)} photos brought to the scene's own colours")
         return Photos(cameras, exposures=exposures)
-    return TeacherRenders(teacher, cameras, background=background, progress=run.progress)
+    return TeacherRenders(teacher, cameras, background=background, lazy=lazy, progress=run.progress)

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.recover import checkpoint as checkpoints
 from g2ard.recover.anchors import PRESETS, Anchors, Regularizers, drift95, needle
+from g2ard.recover.draw import checked_weights, drawn
 from g2ard.recover.probe import Probe, climb, trial_steps
 from g2ard.recover.schedule import TUNED, Rates, Schedule, multiplier_for
 from g2ard.splats import Splats
@@ -117,6 +118,7 @@ def recover(
     targets: Targets,
     config: RecoverConfig | None = None,
     *,
+    weights: ArrayLike | None = None,
     anchors: Anchors | None = None,
     checkpoint: Path | None = None,
     progress: Progress = silent,
@@ -125,13 +127,14 @@ def recover(
 ) -> Recovered:
     """Optimise every attribute of a fixed set of Gaussians against targets (`eq:objective`).
 
-    L = (1−λ)·L1 + λ·(1−SSIM), and every `period` steps + `period`·(λ_a·L_anchor + λ_s·L_shape). No
-    Gaussian is added or removed.
+    L = (1−λ)·L1 + λ·(1−SSIM), and every `period` steps + λ_a·L_anchor + λ_s·L_shape. No Gaussian is added
+    or removed.
 
     Args:
         student: the scene to recover; its offset counts, cameras are in world coordinates.
         targets: photos or teacher renders with their cameras.
         config: see `RecoverConfig`.
+        weights: (C,) how often each view is drawn, in proportion; None draws all equally often.
         anchors: frozen geometry; None freezes the student as given.
         checkpoint: a file written every minute and at Ctrl-C; if it is there, recovery goes on from it, and
             the result is bitwise that of never having stopped.
@@ -143,7 +146,7 @@ def recover(
         A `Recovered` with as many Gaussians as the student, in its order.
 
     Raises:
-        InputError: no Gaussians, no views, or a checkpoint of another run.
+        InputError: no Gaussians, no views, weights that are none, or a checkpoint of another run.
         KeyboardInterrupt: after Ctrl-C, once the checkpoint is written.
     """
     config = config or RecoverConfig()
@@ -154,7 +157,8 @@ def recover(
     anchors = anchors or Anchors.of(student)
     probe = Probe(targets, config.background)
     before = probe.all_of(student)
-    loop = _Loop(student, targets, config, anchors, probe)
+    often = checked_weights(weights, len(targets.cameras))
+    loop = _Loop(student, targets, config, often, anchors, probe)
     if checkpoint is None or not checkpoint.exists():
         loop.choose_multiplier(before)
     loop.run(checkpoint, progress, stage, watch)
@@ -186,11 +190,13 @@ class _Loop:
         student: Splats,
         targets: Targets,
         config: RecoverConfig,
+        weights: NDArray[np.float64] | None,
         anchors: Anchors,
         probe: Probe,
     ) -> None:
         self.targets = targets
         self.config = config
+        self.weights = weights
         self.anchors = anchors
         self.multiplier = 1.0
         self.trials: list[dict[str, float]] = []
@@ -201,7 +207,7 @@ class _Loop:
         self.losses: list[float] = []
         self.geometry: list[dict[str, float]] = []
         self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised? → steps, seconds
-        self.key = _fingerprint(student, targets, config)
+        self.key = _fingerprint(student, targets, config, weights)
 
     @cached_property
     def engine(self) -> Engine:
@@ -214,7 +220,7 @@ class _Loop:
             student,
             self.targets.cameras.recentred(student.offset),
             anchors=self.anchors,
-            regularizers=config.regularizers.applied,
+            regularizers=config.regularizers,
             means_in_scales=config.schedule.means_in_scales,
             ssim_weight=config.ssim_weight,
             background=config.background,
@@ -329,10 +335,10 @@ class _Loop:
         return [float(part.mean()) for part in np.array_split(np.array(self.losses), 100) if len(part)]
 
     def _view(self, step: int) -> int:
-        """Views in a fresh random order each time all have been seen; depends on seed and step alone."""
-        epoch, position = divmod(step, len(self.targets.cameras))
-        order = np.random.default_rng((self.config.seed, epoch)).permutation(len(self.targets.cameras))
-        return int(order[position])
+        """Views in a fresh random order each epoch; depends on seed, weights and step alone."""
+        count = len(self.targets.cameras)
+        epoch, position = divmod(step, count)
+        return int(drawn(self.config.seed, epoch, count, self.weights)[position])
 
     def _save(self, path: Path) -> None:
         meta = {
@@ -369,6 +375,9 @@ def _engine_class(name: str) -> Any:
     raise InputError(f"engine: expected fused, torch or gsplat, got {name!r}")
 
 
-def _fingerprint(student: Splats, targets: Targets, config: RecoverConfig) -> str:
-    parts = (repr(config), student.fingerprint(), fingerprint_of(targets))
+def _fingerprint(
+    student: Splats, targets: Targets, config: RecoverConfig, weights: NDArray[np.float64] | None
+) -> str:
+    often = [] if weights is None else [repr(weights.tolist())]
+    parts = (repr(config), student.fingerprint(), fingerprint_of(targets), *often)
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()

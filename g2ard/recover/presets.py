@@ -8,7 +8,7 @@ import numpy as np
 
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.recover.anchors import PRESETS, Regularizers, needle
+from g2ard.recover.anchors import PAPER_PRESETS, PRESETS, Regularizers, needle
 from g2ard.splats import Splats
 
 __all__ = ["PriorMeasures", "measure_prior", "preset_for", "view_consistency"]
@@ -129,7 +129,7 @@ def _carried(
 
 
 def preset_for(
-    name: str, prior: Splats, cameras: Cameras | None = None
+    name: str, prior: Splats, cameras: Cameras | None = None, *, paper: bool = False
 ) -> tuple[Regularizers, str, PriorMeasures]:
     """The regularisers of preset `name`, a line that says which and why, and what was measured.
 
@@ -141,6 +141,7 @@ def preset_for(
         name: auto, trained, lift or noisy.
         prior: the scene the anchors come from, before simplification where it is at hand.
         cameras: views to measure consistency in; None leaves that out.
+        paper: take the paper's weights, which go with its schedule.
 
     Returns:
         The weights, the reason and the measures.
@@ -151,10 +152,8 @@ def preset_for(
     if name != "auto" and name not in PRESETS:
         raise InputError(f"preset: expected auto, {', '.join(PRESETS)}, got {name!r}")
     found = measure_prior(prior, cameras)
-    if name != "auto":
-        return PRESETS[name], f"{name} (as asked)", found
-    kind, why = _judged(found)
-    return PRESETS[kind], f"{kind} ({why})", found
+    kind, why = (name, "as asked") if name != "auto" else _judged(found)
+    return (PAPER_PRESETS if paper else PRESETS)[kind], f"{kind} ({why})", found
 
 
 def _judged(m: PriorMeasures) -> tuple[str, str]:

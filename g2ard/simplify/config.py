@@ -50,7 +50,7 @@ class SimplifyConfig:
     geometric_weight: float = 0.03
     dilation: float = 0.4
     pixel_scale: float = 0.5
-    max_growth: float = 1.5
+    max_growth: float = 1.25
     color_bin: float = 0.25
     max_energy: float = 0.01
     min_coverage: float = 0.6

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -24,9 +24,6 @@ last does so all the way."""
 
 _REFRESH = 0.3
 """Visibility is looked at again when the count has fallen to this share of what it was."""
-
-_RESIZES = 2
-"""How often the merged are resized to what views see of them; a third time gains nothing."""
 
 
 class Seen(Protocol):
@@ -99,9 +96,7 @@ def merge(
         if target == budget:
             break
     if callable(visibility) and first is not None:
-        for _ in range(_RESIZES):
-            out["scales"] = _resized(scene, stages.parents, first.weight, visibility(scene).weight)
-            scene = replace(scene, scales=out["scales"])
+        out["scales"] = _resized(scene, stages.parents, first.weight, visibility(scene).weight)
     return {**out, **stages.clamped, "parents": stages.parents, "rounds": stages.rounds}
 
 

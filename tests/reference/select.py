@@ -95,10 +95,17 @@ def greedy(k, surface, seen, positions, **options):
     return chosen, gains
 
 
-def facility(k, alike, wanted):
-    """Greedy facility location, by computing the objective from scratch."""
-    chosen = []
-    for _ in range(k):
+def represent(k, alike, wanted):
+    """Farthest first while a pose is over two bandwidths away, then greedy facility location."""
+    away = np.sqrt(-np.log(np.maximum(alike, np.finfo(float).tiny)))
+    chosen = [
+        int(np.argmin([sum(wanted[u] * away[u, v] for u in range(len(alike))) for v in range(len(alike))]))
+    ]
+    while len(chosen) < k:
+        reach = away[:, chosen].min(1)
+        if reach.max() > 2:
+            chosen.append(int(np.argmax(reach)))
+            continue
         tried = [-1 if v in chosen else wanted @ alike[:, [*chosen, v]].max(1) for v in range(len(alike))]
         chosen.append(int(np.argmax(np.round(tried, 14))))
     return chosen

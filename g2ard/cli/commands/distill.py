@@ -12,8 +12,10 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
+    Count,
     CountOption,
     Method,
+    PolicyOption,
     PresetOption,
     RatioOption,
     ScheduleName,
@@ -23,12 +25,14 @@ from g2ard.cli.options import (
     budget_of,
     one_budget,
     one_horizon,
+    views_count,
 )
-from g2ard.cli.scenes import load_scene, load_splits, load_views, make_targets, recovery_engine
+from g2ard.cli.scenes import load_scene, load_view_sets, make_targets, recovery_engine
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.distill import Distilled
+    from g2ard.io import ViewSet
     from g2ard.splats import Splats
     from g2ard.targets import Targets
 
@@ -59,6 +63,25 @@ def distill(
         Path | None,
         typer.Option(metavar="VIEWS", help="Score on these; --views is then all for recovery."),
     ] = None,
+    k: Annotated[
+        Count | None,
+        typer.Option(
+            "-k",
+            "--views-count",
+            parser=views_count,
+            metavar="K",
+            help="Views that recovery looks at: 100, 25% or auto; all if not given.",
+        ),
+    ] = None,
+    policy: PolicyOption = "auto",
+    weighted: Annotated[
+        bool,
+        typer.Option("--weights/--no-weights", help="Draw views by weight: their own, or the selection's."),
+    ] = True,
+    reselect: Annotated[
+        bool,
+        typer.Option("--reselect", help="Choose views again from every round's scene, not just the first."),
+    ] = False,
     method: Annotated[Method, typer.Option(help="How to simplify.")] = "default",
     preset: PresetOption = "auto",
     schedule: Annotated[
@@ -97,12 +120,13 @@ def distill(
     check_output(output, run.overwrite or stopped, folder=True)
     prior = _lift(run, scene) if lifted else load_scene(run, scene)
     budget = budget_of(scene, count, ratio, len(prior))
-    train, test, pool = _views(run, prior, views, held_out, size)
+    candidates, test, pool = _views(run, prior, views, held_out, size)
+    train = candidates.cameras
     pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
     use_photos = lifted or (pictured if photos is None else photos)
     teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
     colour = background or (0.0, 0.0, 0.0)
-    regularizers, why, measured = preset_for(preset, prior, train)
+    regularizers, why, measured = preset_for(preset, prior, train, paper=schedule == "paper")
     run.say(f"{len(prior):,} → {budget:,} Gaussians; {len(train)} views against {against}")
     run.say(f"regularisers: {why}")
     config = DistillConfig(
@@ -113,20 +137,32 @@ def distill(
         regularizers=regularizers,
         sh_degree=sh_degree if sh_degree is not None else (3 if lifted or schedule == "paper" else None),
         background=colour,
+        views=k.of(len(train)) if isinstance(k, Count) else "auto" if k else None,
+        policy=policy,
+        weighted=weighted,
+        reselect=reselect,
         seed=run.seed,
         engine=engine,
     )
-    targets = make_targets(run, train, teacher, colour)
+    targets = make_targets(run, train, teacher, colour, lazy=k is not None)
     unseen = make_targets(run, test, teacher, colour)
     with _work_folder(output, resume) as work:
         try:
-            result = pipeline(prior, budget, targets, config, work=work, progress=run.progress)
+            result = pipeline(
+                prior,
+                budget,
+                targets,
+                config,
+                weights=candidates.weights if weighted else None,
+                work=work,
+                progress=run.progress,
+            )
         except KeyboardInterrupt:
             run.say(f"stopped; the same command with --resume goes on in {output}")
             raise
         report = _score(run, prior, result, unseen, colour)
         report |= {"against": against, "preset": why, "prior": measured.as_dict()}
-        report["rounds"] = result.report["rounds"]
+        report |= {key: result.report[key] for key in ("rounds", "views")}
         report["seconds"] = {**result.report["seconds"], "total": time.monotonic() - began}
         distill_report(
             output / "report.html",
@@ -141,6 +177,7 @@ def distill(
         write_views(output / "views.json", pool, overwrite=True)
     shutil.rmtree(output / "work")
     _table(run, report)
+    _say_views(run, report["views"], k is not None)
     run.say(
         f"scene: {output / 'scene.ply'}\npicture: {output / 'preview.png'}\n"
         f"report: {output / 'report.html'}, {output / 'report.json'}"
@@ -177,23 +214,25 @@ def _lift(run: Run, path: Path) -> Splats:
 
 def _views(
     run: Run, prior: Splats, views: Path | None, held_out: Path | None, size: int | None
-) -> tuple[Cameras, Cameras, Cameras | None]:
+) -> tuple[ViewSet, Cameras, Cameras | None]:
     """Views for recovery, views for scoring, and the pool both came from where one had to be made."""
+    from g2ard.io import ViewSet
     from g2ard.poses import plan_pool
     from g2ard.splits import split_mask
 
     if views is not None:
         if held_out is not None:
-            return load_views(run, views, "all", size), load_views(run, held_out, "all", size), None
-        train, test = load_splits(run, views, ["train", "test"], size)
-        return train, test, None
+            train, test = (load_view_sets(run, path, ["all"], size)[0] for path in (views, held_out))
+        else:
+            train, test = load_view_sets(run, views, ["train", "test"], size)
+        return train, test.cameras, None
     planned = plan_pool(prior, _POOL, seed=run.seed, progress=run.progress)
     pool = planned.cameras
     run.say(f"poses: {planned.kind} ({planned.why})")
     if held_out is not None:
-        return pool.resized(size), load_views(run, held_out, "all", size), pool
+        return ViewSet(pool.resized(size)), load_view_sets(run, held_out, ["all"], size)[0].cameras, pool
     unseen = split_mask("views.json", pool.names, "test")
-    return pool.take(~unseen).resized(size), pool.take(unseen).resized(size), pool
+    return ViewSet(pool.take(~unseen).resized(size)), pool.take(unseen).resized(size), pool
 
 
 def _score(run: Run, prior: Splats, result: Distilled, unseen: Targets, colour: Colour) -> dict[str, Any]:
@@ -244,3 +283,16 @@ def _table(run: Run, report: dict[str, Any]) -> None:
             row("recovered", report["output_count"], size["output"], scores["recovered"]),
         ],
     )
+
+
+def _say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:
+    """What was made of the candidates, where it is not simply all of them."""
+    if views is None:
+        return
+    if views["refused"]:
+        run.say(f"{len(views['refused'])} views not used: they see nothing of the scene, or stand within it")
+    if chosen:
+        run.say(
+            f"views: {len(views['chosen'])} of {views['candidates']} by {views['policy']};"
+            f" those left out would have added {100 * views['left_out']:.1f} %"
+        )

@@ -44,11 +44,14 @@ def recover(
         bool, typer.Option("--resume", help="Go on from the checkpoint of a stopped run.")
     ] = False,
     split: SplitOption = "train",
+    weighted: Annotated[
+        bool, typer.Option("--weights/--no-weights", help="Draw views by the weights they carry, if any.")
+    ] = True,
     size: SizeOption = None,
     background: BackgroundOption = None,
 ) -> None:
     """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
-    from g2ard.cli.scenes import load_scene, load_views, make_targets, recovery_engine
+    from g2ard.cli.scenes import load_scene, load_view_sets, make_targets, recovery_engine
     from g2ard.io import write_splats
     from g2ard.io.atomic import check_output
     from g2ard.recover import RecoverConfig
@@ -62,8 +65,13 @@ def recover(
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(run, student)
     dense = load_scene(run, teacher) if teacher else None
-    cameras = load_views(run, views, split, size)
-    regularizers, why, measured = preset_for(preset, dense or splats, cameras)
+    chosen = load_view_sets(run, views, [split], size)[0]
+    weights = chosen.weights if weighted else None
+    if weights is not None:
+        run.say(f"{len(weights)} views, drawn by their weights")
+    regularizers, why, measured = preset_for(
+        preset, dense or splats, chosen.cameras, paper=schedule == "paper"
+    )
     run.say(f"regularisers: {why}")
     config = RecoverConfig(
         schedule=schedule_named(schedule),
@@ -81,8 +89,9 @@ def recover(
     try:
         result = optimize(
             splats,
-            make_targets(run, cameras, dense, colour),
+            make_targets(run, chosen.cameras, dense, colour),
             config,
+            weights=weights,
             checkpoint=checkpoint,
             progress=run.progress,
         )

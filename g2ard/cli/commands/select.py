@@ -7,19 +7,7 @@ from typing import Annotated
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import Count, OutputOption, SceneArgument, ViewsOption
-
-_POLICIES = "auto|directional|coverage|pose-diverse|random|uniform"
-
-
-def _count(text: str) -> Count | str:
-    return "auto" if text.strip() == "auto" else Count.parse(text)
-
-
-def _policy(text: str) -> str:
-    if text not in _POLICIES.split("|"):
-        raise typer.BadParameter(f"one of {_POLICIES.replace('|', ', ')}, not {text!r}")
-    return text
+from g2ard.cli.options import Count, OutputOption, PolicyOption, SceneArgument, ViewsOption, views_count
 
 
 @command("select", example="g2ard select scene.ply --views poses.json -k 100 -o chosen.json")
@@ -30,13 +18,11 @@ def select(
     k: Annotated[
         Count,
         typer.Option(
-            "-k", parser=_count, metavar="K", help="How many: 100, 25%, or auto (where the curve bends)."
+            "-k", parser=views_count, metavar="K", help="How many: 100, 25%, or auto (where the curve bends)."
         ),
     ],
     views: ViewsOption = None,
-    policy: Annotated[
-        str, typer.Option(parser=_policy, metavar=_POLICIES, help="What makes views good.")
-    ] = "auto",
+    policy: PolicyOption = "auto",
     cells: Annotated[int, typer.Option(min=1, help="Surface cells, of directional and coverage.")] = 300_000,
 ) -> None:
     """Choose the views worth having, best first, with a weight for how often to draw each."""
@@ -62,7 +48,7 @@ def select(
     kept = cameras.take(chosen.order)
     write_views(output, kept, weights=chosen.weights, overwrite=run.overwrite)
     if len(chosen.refused):
-        run.say(f"{len(chosen.refused)} views refused: they see nothing of the scene")
+        run.say(f"{len(chosen.refused)} views refused: they see nothing of the scene, or stand within it")
     run.say(
         f"{output}: {len(kept)} of {len(cameras)} views by {policy};"
         f" those left out would add {100 * chosen.left_out:.1f} %"
@@ -77,6 +63,7 @@ def select(
                 )
             ],
             "left_out": chosen.left_out,
+            "curve": chosen.curve.tolist(),
             "refused": [cameras.names[i] for i in chosen.refused],
             "evaluations": chosen.evaluations,
             "seconds": chosen.seconds,

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from g2ard.simplify import Simplified
     from g2ard.splats import Splats
 
-_VIEWS = 16
-"""Poses of a pool of its own: 112 were no better."""
+_VIEWS = 48
+"""Poses of a pool of its own; as many of them are used as the scene needs."""
 
 _ROWS = 100_000
 """Gaussians that those are planned on."""

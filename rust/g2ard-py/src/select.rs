@@ -1,7 +1,9 @@
 //! `g2ard.select`.
 
 use g2ard_core::raster::Camera;
-use g2ard_core::select::{Coverage, Gaussians, Opaque, Problem, Surface, median_depths, visible};
+use g2ard_core::select::{
+    Coverage, Gaussians, Opaque, Problem, Surface, looks, median_depths, visible,
+};
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -81,6 +83,23 @@ fn select_depth<'py>(
     let (scene, camera) = (scene.borrow()?, view.camera());
     let depth = quick(py, || Ok(median_depths(&Opaque::of(&scene), &camera)))?;
     PyArray1::from_vec(py, depth).reshape([camera.height, camera.width])
+}
+
+/// (C, 2): the share of each view's pixels that show the scene, and the median of their depths.
+#[pyfunction]
+#[pyo3(signature = (scene, views, progress=None))]
+fn select_looks<'py>(
+    py: Python<'py>,
+    scene: Scene<'py>,
+    views: Vec<View>,
+    progress: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Bound<'py, PyArray2<f32>>> {
+    let scene = scene.borrow()?;
+    let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
+    let found = long(py, progress, |control| {
+        looks(&Opaque::of(&scene), &cameras, control)
+    })?;
+    arrays::matrix(py, found)
 }
 
 type Surfaces<'py> = (
@@ -203,6 +222,7 @@ fn select_greedy<'py>(
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(select_surface, m)?)?;
     m.add_function(wrap_pyfunction!(select_depth, m)?)?;
+    m.add_function(wrap_pyfunction!(select_looks, m)?)?;
     m.add_function(wrap_pyfunction!(select_visible, m)?)?;
     m.add_function(wrap_pyfunction!(select_greedy, m)?)
 }

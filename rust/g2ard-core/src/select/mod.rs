@@ -2,8 +2,13 @@
 
 mod coverage;
 mod depth;
+mod opaque;
+mod pinhole;
 mod surface;
+mod visible;
 
 pub use coverage::{Chosen, Coverage, Problem};
-pub use depth::{Opaque, median_depths, visible};
+pub use depth::median_depths;
+pub use opaque::Opaque;
 pub use surface::{Gaussians, Surface};
+pub use visible::{looks, visible};

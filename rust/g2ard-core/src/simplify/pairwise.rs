@@ -45,7 +45,7 @@ impl Default for Pairwise {
             geometric: 0.03,
             dilation: 0.4,
             pixel_scale: 0.5,
-            growth: 1.5,
+            growth: 1.25,
         }
     }
 }

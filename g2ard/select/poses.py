@@ -1,0 +1,176 @@
+"""Views as poses: how alike two are, which of them stand for the others, and how often to draw each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.cameras import Cameras
+from g2ard.progress import Progress, counter
+from g2ard.select.surfaces import Surface, core_scene, core_views
+from g2ard.splats import Splats
+
+__all__ = [
+    "demand",
+    "draw_weights",
+    "farthest",
+    "gains_of",
+    "likeness",
+    "represent",
+    "viewing_distances",
+    "within_matter",
+]
+
+Float = NDArray[np.float64]
+Order = NDArray[np.int64]
+
+_BANDWIDTH = 0.35
+"""Of the kernel exp(−(d/0.35)²) between poses: neighbours 20° apart on an orbit are half alike."""
+_REACH = 2.0
+"""Bandwidths within which a chosen view says something of a pose: beyond, they are less than 2 % alike."""
+_ROWS = 200_000
+"""Gaussians that tell whether a pose is walled in: of more, a fair sample, each as much larger."""
+_GLANCE = 48
+"""Pixels along the longer side of the images that tell it."""
+_WALLED = 0.02
+"""A pose whose image is mostly nearer than this share of what the median pose sees stands within matter."""
+
+
+def viewing_distances(cells: Surface, cameras: Cameras) -> Float:
+    """(C,) each view's median depth of the cells within its image, 0 where there is none."""
+    local = cameras.recentred(cells.origin)
+    out = np.zeros(len(local))
+    for i in range(len(local)):
+        x, y, z = local.viewmats[i, :3, :3] @ cells.centers.T + local.viewmats[i, :3, 3:]
+        ahead = z > 0.01
+        z = np.where(ahead, z, 1.0)
+        K = local.Ks[i]
+        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        inside = ahead & (u >= 0) & (u < local.widths[i]) & (v >= 0) & (v < local.heights[i])
+        out[i] = np.median(z[inside]) if inside.any() else 0.0
+    return out
+
+
+def within_matter(splats: Splats, cameras: Cameras, depths: Float, progress: Progress) -> NDArray[np.bool_]:
+    """(C,) whether a pose stands inside geometry: what fills its image is next to its lens.
+
+    A photo's pose is taken at its word: there was a camera.
+
+    Args:
+        splats: the scene.
+        cameras: C views.
+        depths: (C,) see `viewing_distances`.
+        progress: told of the views done.
+    """
+    made = np.array([path is None for path in cameras.image_paths])
+    if not (made.any() and (depths > 0).any()):
+        return np.zeros(len(cameras), bool)
+    step = -(-len(splats) // _ROWS)
+    sample = splats.take(np.arange(0, len(splats), step))
+    sample = replace(sample, scales=sample.scales * np.float32(np.sqrt(step)))
+    scene, origin = core_scene(sample)
+    glances = core_views(cameras.resized(_GLANCE), origin)
+    share, near = _core.select_looks(scene, glances, progress=counter(progress, "poses")).T
+    typical = np.median(np.where(near > 0, near, depths)[depths > 0])
+    walled: NDArray[np.bool_] = made & (share > 0.5) & (near < _WALLED * typical)
+    return walled
+
+
+def likeness(cameras: Cameras, depths: Float) -> Float:
+    """(C, C) exp(−(d/0.35)²): d² = |Δposition|²/(depth·depth) + |Δdirection|²: parallax and turn."""
+    seen = depths[depths > 0]
+    scale = np.where(depths > 0, depths, np.median(seen) if len(seen) else 1.0)
+    positions = cameras.positions - cameras.positions.mean(0)
+    away = _squares(positions) / (scale[:, None] * scale)
+    return np.exp(-(away + _squares(cameras.forwards)) / _BANDWIDTH**2)
+
+
+def _squares(rows: Float) -> Float:
+    """(n, n) squared distances; exactly 0 between equal rows."""
+    out = np.zeros((len(rows), len(rows)))
+    for column in rows.T:
+        out += (column[:, None] - column) ** 2
+    return out
+
+
+def demand(alike: Float) -> Float:
+    """(C,) how much each pose asks to be represented: less the more poses are like it; sums to 1."""
+    weights = 1 / alike.sum(1)
+    return weights / weights.sum()
+
+
+def represent(alike: Float, wanted: Float, usable: NDArray[np.bool_]) -> tuple[Order, Float]:
+    """Views that stand for the others: first reach every pose, then represent as many as well as can be.
+
+    From the pose nearest to all by demand on, the farthest comes next while any is more than two bandwidths
+    from all chosen: there a kernel says nothing about who stands for whom. Then greedy facility location.
+
+    Args:
+        alike: (C, C) see `likeness`.
+        wanted: (C,) see `demand`.
+        usable: (C,) which may be chosen; the others ask for nothing.
+
+    Returns:
+        The usable views in order, and what each adds to Σ_u w_u max_{v∈S} alike_uv.
+    """
+    wanted, away = np.where(usable, wanted, 0.0), _bandwidths_apart(alike)
+    best, left = np.zeros(len(alike)), usable.copy()
+    nearest = np.where(usable, np.inf, -np.inf)
+    order: list[int] = []
+    gains: list[float] = []
+    for _ in range(int(usable.sum())):
+        if not order:
+            view = int(np.argmin(np.where(left, wanted @ away, np.inf)))
+        elif nearest.max() > _REACH:
+            view = int(np.argmax(nearest))
+        else:
+            view = int(np.argmax(np.where(left, wanted @ np.maximum(alike - best[:, None], 0.0), -1.0)))
+        order.append(view)
+        gains.append(float(wanted @ np.maximum(alike[:, view] - best, 0.0)))
+        best = np.maximum(best, alike[:, view])
+        nearest = np.minimum(nearest, away[view])
+        left[view] = False
+    return np.array(order, np.int64), np.array(gains)
+
+
+def _bandwidths_apart(alike: Float) -> Float:
+    """(C, C) distances in bandwidths of the kernel."""
+    return np.asarray(np.sqrt(-np.log(np.maximum(alike, np.finfo(np.float64).tiny))))
+
+
+def gains_of(order: Order, alike: Float, wanted: Float) -> Float:
+    """What each view of a given order adds to the facility location."""
+    best, gains = np.zeros(len(alike)), []
+    for view in order:
+        gains.append(float(wanted @ np.maximum(alike[:, view] - best, 0.0)))
+        best = np.maximum(best, alike[:, view])
+    return np.array(gains)
+
+
+def farthest(alike: Float, usable: NDArray[np.bool_]) -> tuple[Order, Float]:
+    """Farthest pose next, from the one most like all others; gains are distances to the nearest chosen."""
+    if not usable.any():
+        return np.zeros(0, np.int64), np.zeros(0)
+    away = _bandwidths_apart(alike)
+    first = int(np.argmax(np.where(usable, alike[:, usable].sum(1), -1.0)))
+    order, gains = [first], [float(away[usable, first].max())]
+    nearest = np.where(usable, away[first], -1.0)
+    nearest[first] = -1.0
+    for _ in range(int(usable.sum()) - 1):
+        view = int(np.argmax(nearest))
+        order.append(view)
+        gains.append(float(nearest[view]))
+        nearest = np.where(nearest >= 0, np.minimum(nearest, away[view]), -1.0)
+        nearest[view] = -1.0
+    return np.array(order, np.int64), np.array(gains)
+
+
+def draw_weights(order: Order, alike: Float, wanted: Float) -> Float:
+    """(K,) the demand of the poses that each chosen view is nearest to, mean 1."""
+    nearest = order[np.argmax(alike[:, order], axis=1)]
+    nearest[order] = order  # each stands for itself, equals included
+    weights = np.bincount(nearest, wanted, len(alike))[order]
+    return weights / weights.mean()

@@ -1,0 +1,73 @@
+//! What each view sees: how far, and which surface cells.
+
+use rayon::prelude::*;
+
+use super::Surface;
+use super::depth::Scratch;
+use super::opaque::Opaque;
+use super::pinhole::Pinhole;
+use crate::raster::Camera;
+use crate::{Control, Result};
+
+/// For each camera the share of its pixels that show the scene, and the median of their depths (0 without any).
+pub fn looks(scene: &Opaque, cameras: &[Camera], control: &Control) -> Result<Vec<[f32; 2]>> {
+    control.begin(cameras.len() as u64);
+    cameras
+        .par_iter()
+        .map_init(Scratch::default, |scratch, camera| {
+            control.check()?;
+            let view = Pinhole::of(camera);
+            scratch.clear(&view, 1.0);
+            scratch.trace(scene, &view);
+            control.advance(1);
+            let mut depths: Vec<f32> = scratch.depth.iter().copied().filter(|&d| d > 0.0).collect();
+            if depths.is_empty() {
+                return Ok([0.0; 2]);
+            }
+            let share = depths.len() as f32 / scratch.depth.len() as f32;
+            let middle = depths.len() / 2;
+            Ok([
+                share,
+                *depths.select_nth_unstable_by(middle, f32::total_cmp).1,
+            ])
+        })
+        .collect()
+}
+
+/// For each camera the cells it sees, ascending: the cell's centre falls on the image and lies within
+/// max(cell size, 1 % of its depth) of the median depth in that pixel.
+pub fn visible(
+    scene: &Opaque,
+    surface: &Surface,
+    cameras: &[Camera],
+    control: &Control,
+) -> Result<Vec<Vec<u32>>> {
+    control.begin(cameras.len() as u64);
+    let centers: Vec<[f32; 3]> = surface
+        .centers
+        .iter()
+        .map(|c| c.map(|v| v as f32))
+        .collect();
+    cameras
+        .par_iter()
+        .map_init(Scratch::default, |scratch, camera| {
+            control.check()?;
+            let view = Pinhole::of(camera);
+            scratch.clear(&view, 0.0);
+            let mut cells: Vec<(u32, u32, f32)> = Vec::new();
+            for (cell, &center) in centers.iter().enumerate() {
+                if let Some((pixel, z)) = view.pixel(center) {
+                    scratch.light[pixel as usize] = 1.0;
+                    cells.push((cell as u32, pixel, z));
+                }
+            }
+            scratch.trace(scene, &view);
+            control.advance(1);
+            let near = |&(_, pixel, z): &(u32, u32, f32)| {
+                let median = scratch.depth[pixel as usize];
+                median > 0.0 && (z - median).abs() <= (surface.size as f32).max(0.01 * z)
+            };
+            Ok(cells.iter().filter(|c| near(c)).map(|c| c.0).collect())
+        })
+        .collect()
+}
