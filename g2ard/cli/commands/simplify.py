@@ -102,14 +102,15 @@ def simplify(
 
 def _cameras(run: Run, splats: Splats, views: Path | None, method: str) -> Cameras | None:
     """The views given, or a few of its own where the scene leaves room for them."""
-    from g2ard.cli.scenes import load_views
-    from g2ard.errors import InputError
-    from g2ard.poses import make_pool
-
     if method == "paper" or (method == "fast" and views is None):
         return None
     if views is not None:
+        from g2ard.cli.scenes import load_views
+
         return load_views(run, views, "train", None)
+    from g2ard.errors import InputError
+    from g2ard.poses import make_pool
+
     try:
         return make_pool(splats, _VIEWS, seed=run.seed, rows=_ROWS, progress=run.progress)
     except InputError as e:
