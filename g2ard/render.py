@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +19,7 @@ from g2ard.splats import Splats
 __all__ = [
     "RasterSettings",
     "Rendered",
+    "Seen",
     "Visibility",
     "arrays_of",
     "centred",
@@ -196,17 +197,6 @@ class Visibility:
     peak: _Floats
     pixel_size: _Floats
 
-    def with_views(self, other: Visibility) -> Visibility:
-        """The same of both sets of views together."""
-        return Visibility(
-            weight=self.weight + other.weight,
-            transmittance=self.transmittance + other.transmittance,
-            hits=self.hits + other.hits,
-            dominant=self.dominant + other.dominant,
-            peak=np.maximum(self.peak, other.peak),
-            pixel_size=np.minimum(self.pixel_size, other.pixel_size),
-        )
-
 
 def visibility(
     splats: Splats,
@@ -237,9 +227,22 @@ def visibility(
     return Visibility(**sums)
 
 
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What `looker` keeps of a visibility.
+
+    Args:
+        weight: (N,) float64, Σ αT.
+        pixel_size: (N,) float32, that of the full image, scene units; ∞ where no view looks.
+    """
+
+    weight: NDArray[np.float64]
+    pixel_size: _Floats
+
+
 def looker(
     cameras: Cameras, *, views: int = 48, longest: int = 300, progress: Progress = silent
-) -> Callable[[Splats], Visibility]:
+) -> Callable[[Splats], Seen]:
     """A function that tells what a few small renders see of a scene, as `g2ard.simplify.simplify` takes it.
 
     It looks from eight views at a time until the next eight find under 2 % more of the Gaussians: an object
@@ -253,7 +256,7 @@ def looker(
         progress: told after each view.
 
     Returns:
-        scene → `Visibility`.
+        scene → `Seen`.
     """
     sample = np.unique(np.linspace(0, len(cameras) - 1, min(views, len(cameras))).round().astype(int))
     full = cameras.take(sample)
@@ -264,17 +267,22 @@ def looker(
 
     enough = 0
 
-    def look(scene: Splats) -> Visibility:
+    def glance(scene: Splats, number: int) -> Seen:
+        sums = visibility(scene, glances[number], progress)
+        return Seen(sums.weight, sums.pixel_size * factor)
+
+    def look(scene: Splats) -> Seen:
         nonlocal enough
-        seen, done = visibility(scene, glances[0], progress), 1
+        seen, done = glance(scene, 0), 1
         while done < (enough or len(glances)):
-            more = visibility(scene, glances[done], progress)
+            more = glance(scene, done)
             new = np.count_nonzero((more.weight > 0) & (seen.weight == 0))
-            seen, done = seen.with_views(more), done + 1
+            seen = Seen(seen.weight + more.weight, np.minimum(seen.pixel_size, more.pixel_size))
+            done += 1
             if not enough and new < _CONVERGED * len(scene):
                 break
         enough = done
-        return replace(seen, pixel_size=seen.pixel_size * factor)
+        return seen
 
     return look
 

@@ -23,14 +23,9 @@ impl Nodes {
         self.geometry.len()
     }
 
-    /// Puts the nodes in Morton order on a shifted lattice. Returns where each went, and their codes.
-    pub fn sort(&mut self, shift: [f64; 3]) -> (Vec<u32>, Vec<u64>) {
-        self.pick(&(0..self.len() as u32).collect::<Vec<_>>(), shift)
-    }
-
-    /// Keeps the nodes `left`, in Morton order on a lattice shifted by shares of the frame's radius. Returns
-    /// where each went, and their codes.
-    pub fn pick(&mut self, left: &[u32], shift: [f64; 3]) -> (Vec<u32>, Vec<u64>) {
+    /// The rows of `left` in Morton order on a lattice shifted by shares of the frame's radius, where each node
+    /// then is ([`GONE`] if not in `left`), and the codes in that order.
+    pub fn morton(&self, left: &[u32], shift: [f64; 3]) -> (Vec<u32>, Vec<u32>, Vec<u64>) {
         let means: Vec<[f64; 3]> = left
             .par_iter()
             .map(|&i| self.geometry[i as usize].mean.map(f64::from))
@@ -44,19 +39,21 @@ impl Nodes {
         from.iter()
             .enumerate()
             .for_each(|(to, &i)| map[i as usize] = to as u32);
+        let keys = sorted.par_iter().map(|&at| keys[at as usize]).collect();
+        (from, map, keys)
+    }
+
+    /// Keeps the nodes `from`, in that order.
+    pub fn gather(&mut self, from: &[u32]) {
         let width = self.width;
         let mut sh = vec![0.0; from.len() * width];
-        let rows = sh.par_chunks_mut(width).zip(&from);
+        let rows = sh.par_chunks_mut(width).zip(from);
         rows.for_each(|(out, &i)| out.copy_from_slice(self.sh_of(i as usize)));
         self.geometry = from
             .par_iter()
             .map(|&i| self.geometry[i as usize])
             .collect();
         self.sh = sh;
-        (
-            map,
-            sorted.par_iter().map(|&at| keys[at as usize]).collect(),
-        )
     }
 
     fn sh_of(&self, i: usize) -> &[f32] {

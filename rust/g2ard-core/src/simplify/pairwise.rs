@@ -9,7 +9,7 @@ use super::clusters::Partition;
 use super::ladder::{climb, cut};
 use super::matching::{Nodes, candidates, matched};
 use super::moments::sigmoid;
-use super::rows::{Leaves, Rows, median};
+use super::rows::{Leaves, Rows, Shuffled, median};
 use super::trim::best;
 use super::{GONE, Ordered, Outcome, SceneRef};
 use crate::{Control, Error, Result};
@@ -144,7 +144,7 @@ impl Pairwise {
             return leaves.nodes();
         };
         let codes: Vec<u64> = leaves.kept().iter().map(|&i| codes[i as usize]).collect();
-        let (mut nodes, mut codes) = self.join(
+        let (mut rows, mut codes) = self.join(
             &leaves,
             &codes,
             LATTICES[step % 3],
@@ -153,16 +153,9 @@ impl Pairwise {
             rounds,
         );
         for (step, target) in targets {
-            (nodes, codes) = self.join(
-                &nodes,
-                &codes,
-                LATTICES[step % 3],
-                target,
-                partition,
-                rounds,
-            );
+            (rows, codes) = self.join(&rows, &codes, LATTICES[step % 3], target, partition, rounds);
         }
-        nodes
+        rows.settled()
     }
 
     /// Runs of `rows` become nodes, `target` of them, in Morton order on a lattice shifted by `shift`; their
@@ -175,7 +168,7 @@ impl Pairwise {
         target: usize,
         partition: &mut Partition,
         rounds: &mut Vec<PairwiseRound>,
-    ) -> (Nodes, Vec<u64>) {
+    ) -> (Shuffled, Vec<u64>) {
         let runs = cut(&climb(codes, rows, self.geometric as f32), target);
         rounds.push(PairwiseRound {
             before: rows.len(),
@@ -183,11 +176,12 @@ impl Pairwise {
             after: runs.count,
             ..PairwiseRound::default()
         });
-        let mut nodes = rows.merged(&runs);
-        let (map, codes) = nodes.sort(shift);
+        let nodes = rows.merged(&runs);
+        let every: Vec<u32> = (0..nodes.len() as u32).collect();
+        let (at, map, codes) = nodes.morton(&every, shift);
         let of = partition.of.par_iter_mut().filter(|c| **c != GONE);
         of.for_each(|c| *c = map[runs.of[*c as usize] as usize]);
-        (nodes, codes)
+        (Shuffled::new(nodes, at), codes)
     }
 
     fn check(&self, scene: &SceneRef, seen: Option<Seen>, flags: Option<&[bool]>) -> Result<()> {
@@ -274,7 +268,8 @@ fn merge(nodes: &mut Nodes, pairs: &[(u32, u32)]) -> Vec<u32> {
     let left: Vec<u32> = (0..nodes.len() as u32)
         .filter(|&i| into[i as usize] == GONE)
         .collect();
-    let (mut map, _) = nodes.pick(&left, [0.0; 3]);
+    let (from, mut map, _) = nodes.morton(&left, [0.0; 3]);
+    nodes.gather(&from);
     for i in 0..into.len() {
         if into[i] != GONE {
             map[i] = map[into[i] as usize];

@@ -82,6 +82,46 @@ impl Rows for Nodes {
     }
 }
 
+/// Nodes in another order than they lie in: at 13 million, to move them would take half the memory of all.
+pub struct Shuffled {
+    nodes: Nodes,
+    at: Vec<u32>,
+}
+
+impl Shuffled {
+    pub fn new(nodes: Nodes, at: Vec<u32>) -> Self {
+        Self { nodes, at }
+    }
+
+    /// The nodes, moved to their places.
+    pub fn settled(mut self) -> Nodes {
+        self.nodes.gather(&self.at);
+        self.nodes
+    }
+}
+
+impl Rows for Shuffled {
+    fn len(&self) -> usize {
+        self.at.len()
+    }
+
+    fn width(&self) -> usize {
+        self.nodes.width
+    }
+
+    fn node(&self, i: usize) -> Node {
+        self.nodes.node(self.at[i] as usize)
+    }
+
+    fn color(&self, i: usize) -> [f32; 3] {
+        self.nodes.color(self.at[i] as usize)
+    }
+
+    fn read_sh(&self, i: usize, out: &mut [f32]) {
+        self.nodes.read_sh(self.at[i] as usize, out);
+    }
+}
+
 /// What a few views do not see counts as if this share of its mass were: other views will see some of it.
 const UNSEEN: f32 = 0.2;
 
