@@ -59,6 +59,19 @@ def simplify_pairwise(
     growth: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]: ...
+def simplify_order(scene: Splats) -> NDArray[np.uint32]: ...
+def simplify_pool(
+    scene: Splats,
+    parents: NDArray[np.int64],
+    count: int,
+    *,
+    protected: NDArray[np.bool_] | None,
+    weight: NDArray[np.float32],
+    pixel_size: NDArray[np.float32],
+    dilation: float,
+    pixel_scale: float,
+    growth: float,
+) -> dict[str, Any]: ...
 
 _F32 = NDArray[np.float32]
 _Arrays = tuple[_F32, ...]

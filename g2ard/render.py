@@ -265,14 +265,18 @@ def looker(
     apart = max(1, math.ceil(len(small) / _GLANCE))
     glances = [small.take(np.arange(first, len(small), apart)) for first in _spread(apart)]
 
-    enough = 0
+    enough, settings = 0, RasterSettings()
 
     def glance(scene: Splats, number: int) -> Seen:
-        sums = visibility(scene, glances[number], progress)
+        sums = visibility(scene, glances[number], progress, settings=settings)
         return Seen(sums.weight, sums.pixel_size * factor)
 
     def look(scene: Splats) -> Seen:
-        nonlocal enough
+        nonlocal enough, settings
+        if not enough:  # a near plane in the scene's own unit
+            middle = np.median(scene.means[:: max(1, len(scene) // 4096)], axis=0) + scene.offset
+            distance = np.median(np.linalg.norm(full.positions - middle, axis=1))
+            settings = RasterSettings(near=_NEAR * float(distance) or None)
         seen, done = glance(scene, 0), 1
         while done < (enough or len(glances)):
             more = glance(scene, done)
@@ -289,6 +293,9 @@ def looker(
 
 _GLANCE = 8
 """Views looked from at a time."""
+
+_NEAR = 1e-3
+"""Nearest depth that counts, over the median distance of the cameras from the scene's middle."""
 
 _CONVERGED = 0.02
 """Glances that find a smaller share of the Gaussians for the first time are the last."""

@@ -395,3 +395,51 @@ def test_an_opaque_wall_stays_opaque_and_thin(method):
     assert alpha[1.5] > alpha[1.0] + 0.05
     seen = simplify(wall, 80, method=method, visibility=looker(cameras)).splats
     assert render(seen, cameras, 0).alpha[15:45, 20:60].mean() > alpha[1.5]
+
+
+def all_alike(splats):
+    """Views that see every Gaussian alike."""
+    return Views(np.ones(len(splats)), np.full(len(splats), 0.01))
+
+
+def test_stages_join_raw_members():
+    prior = scene(4000, dtype=np.float64)
+    config = SimplifyConfig(max_growth=1)
+    out = simplify(prior, 100, visibility=all_alike, config=config)
+    assert out.report["resized"] > 50
+    for p in range(0, 100, 7):
+        rows = np.flatnonzero(out.parents == p)
+        if len(rows) > 1:
+            mean, _, alpha, sh = naive.merge_as_rendered(prior, rows, (0.4 * 0.01) ** 2, 1.0)
+            np.testing.assert_allclose(out.splats.means[p], mean, rtol=0, atol=1e-7)
+            np.testing.assert_allclose(out.splats.opacities[p], alpha, rtol=1e-4)
+            np.testing.assert_allclose(np.r_[out.splats.sh0[p], out.splats.shN[p]], sh, rtol=0, atol=1e-5)
+
+
+def test_stages_drop_no_merged_cluster():
+    rng = np.random.default_rng(4)
+    prior = Splats.create(
+        rng.uniform(0, 100, (2000, 3)), scales=np.full((2000, 3), 0.01), logit_opacities=np.full(2000, 2)
+    )
+    out = simplify(prior, 200, visibility=all_alike)
+    assert_sound(out, 2000, 200)
+    assert (out.parents >= 0).all()
+
+
+@pytest.mark.parametrize("method", ["default", "fast"])
+@pytest.mark.parametrize("scale", [1.0, 2.0**-10])
+def test_what_is_seen_does_not_depend_on_the_order_of_rows(method, scale):
+    from g2ard.render import looker
+
+    wall, cameras = opaque_wall()
+    viewmats = cameras.viewmats.copy()
+    viewmats[:, :3, 3] *= scale
+    cameras = replace(cameras, viewmats=viewmats)
+    wall = replace(wall, means=wall.means * np.float32(scale), scales=wall.scales * np.float32(scale))
+    shuffled = np.random.default_rng(8).permutation(len(wall))
+    a = simplify(wall, 80, method=method, visibility=looker(cameras))
+    b = simplify(wall.take(shuffled), 80, method=method, visibility=looker(cameras))
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(a.splats, name), getattr(b.splats, name), err_msg=name)
+    np.testing.assert_array_equal(a.parents[shuffled], b.parents)
+    assert a.report["resized"] > 40

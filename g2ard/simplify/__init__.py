@@ -12,7 +12,7 @@ from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
 from g2ard.simplify.config import METHODS, SimplifyConfig, schedule
-from g2ard.simplify.pairs import Seen, Visibility, merge, rows_of, splats_of
+from g2ard.simplify.pairs import Seen, Visibility, merge, merge_looking, rows_of, splats_of
 from g2ard.splats import Splats
 
 __all__ = ["METHODS", "Seen", "Simplified", "SimplifyConfig", "flag", "schedule", "simplify"]
@@ -30,7 +30,8 @@ class Simplified:
         parents: (N,) int64, the output row each input row went to; −1 if it was dropped or trimmed.
         protected: (M,) bool, flags inherited by OR from everything merged into the row.
         report: `input_count`, `output_count`, `rounds` (one dict each), `protected`, `nonfinite_rows`,
-            `clamped_logits` (infinite ones), `clamped_opacities` (merged α that reached 0.99 and lost mass).
+            `clamped_logits` (infinite ones), `clamped_opacities` (merged α that reached
+            0.99: what `max_growth` could not take was lost), `resized` (rows fitted to what views see).
     """
 
     splats: Splats
@@ -91,7 +92,8 @@ def simplify(
     wherever that costs least; then, in rounds that lock what they merge, the cheapest pairs of neighbours
     become one. Mean, covariance and SH are averaged by mass, and mass m = α·A *as rendered* is conserved,
     with A = √tr adj(Σ + e²I) and e the blur of a renderer. A merge costs the squared error of its projections
-    times how much of it the views see. Without `visibility` it needs no cameras at all.
+    times how much of it the views see. Without `visibility` it needs no cameras at all; with a function
+    of it the rows' two longer axes are fitted last, within a fifth, to what the views see of them.
 
     `fast` merges along Morton order all the way, on three lattices in turn: no graph of neighbours.
 
@@ -138,10 +140,25 @@ def simplify(
     if method == "paper":
         out = _paper(scene, budget, flags, flag_budget or budget, config, progress)
     else:
-        if visibility is not None and not callable(visibility):
-            visibility = rows_of(visibility, len(splats), finite)
-        out = merge(scene, budget, method, visibility, flags, config, progress)
+        out = _pairs(scene, budget, method, visibility, len(splats), finite, flags, config, progress)
     return _simplified(splats, finite, out)
+
+
+def _pairs(
+    scene: Splats,
+    budget: int,
+    method: str,
+    visibility: Visibility | None,
+    count: int,
+    finite: NDArray[np.bool_] | slice,
+    flags: NDArray[np.bool_] | None,
+    config: SimplifyConfig,
+    progress: Progress,
+) -> dict[str, Any]:
+    if callable(visibility):
+        return merge_looking(scene, budget, method, visibility, flags, config, progress)
+    seen = None if visibility is None else rows_of(visibility, count, finite)
+    return merge(scene, budget, method, seen, flags, config, counter(progress, "simplify"))
 
 
 def _paper(
@@ -217,5 +234,6 @@ def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str
         "nonfinite_rows": 0 if isinstance(finite, slice) else len(splats) - int(np.count_nonzero(finite)),
         "clamped_logits": out["clamped_logits"],
         "clamped_opacities": out["clamped_opacities"],
+        "resized": out.get("resized", 0),
     }
     return Simplified(small, parents, protected, report)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from g2ard.progress import Progress, counter
 from g2ard.simplify.config import SimplifyConfig, schedule
 from g2ard.splats import Splats
 
-__all__ = ["Seen", "Visibility", "merge", "rows_of", "splats_of"]
+__all__ = ["Seen", "Visibility", "merge", "merge_looking", "rows_of", "splats_of"]
 
 _LADDER = {"default": (3.0, 1), "fast": (1.0, 3)}
 """Down to how many times the budget rows merge along Morton order, and in how many steps. A stage before the
@@ -60,59 +61,84 @@ def merge(
     scene: Splats,
     budget: int,
     method: str,
-    visibility: Visibility | None,
+    seen: Seen | None,
+    flags: NDArray[np.bool_] | None,
+    config: SimplifyConfig,
+    tell: Callable[[int, int], None],
+    *,
+    stage: int = 0,
+    last: bool = True,
+) -> dict[str, Any]:
+    """One stage of `default` or `fast`; `seen` has a row for each of the scene's."""
+    ladder, steps = _LADDER[method]
+    return _core.simplify_pairwise(
+        scene,
+        schedule(len(scene), budget, config.retention_of(method)),
+        protected=flags,
+        weight=None if seen is None else seen.weight,
+        pixel_size=None if seen is None else seen.pixel_size,
+        min_opacity=0.0 if stage else config.min_opacity_of(method),  # merged clusters are no chaff
+        ladder=ladder if last else 1.0,
+        ladder_steps=steps,
+        neighbors=config.neighbors,
+        geometric=config.geometric_weight,
+        dilation=config.dilation,
+        pixel_scale=config.pixel_scale,
+        growth=config.max_growth,
+        progress=tell,
+    )
+
+
+def merge_looking(
+    scene: Splats,
+    budget: int,
+    method: str,
+    look: Callable[[Splats], Seen],
     flags: NDArray[np.bool_] | None,
     config: SimplifyConfig,
     progress: Progress,
 ) -> dict[str, Any]:
-    """One stage, or with a function of visibility as many as the refreshes it is worth."""
-    start, stages = len(scene), _Stages()
-    first = seen = None
-    while True:
-        staged = callable(visibility) and 2 * budget < _REFRESH * len(scene)  # else not worth it
-        target = math.ceil(_REFRESH * len(scene)) if staged else budget
-        seen = rows_of(visibility(scene), len(scene), slice(None)) if callable(visibility) else visibility
-        first = seen if first is None else first
-        ladder, steps = _LADDER[method]
-        out = _core.simplify_pairwise(
-            scene,
-            schedule(len(scene), target, config.retention_of(method)),
-            protected=flags,
-            weight=None if seen is None else seen.weight,
-            pixel_size=None if seen is None else seen.pixel_size,
-            min_opacity=config.min_opacity_of(method),
-            ladder=1.0 if staged else ladder,
-            ladder_steps=steps,
-            neighbors=config.neighbors,
-            geometric=config.geometric_weight,
+    """As many stages as the refreshes are worth; what they join is then made of its raw members.
+
+    The scene is looked at in an order that only its content decides: of equals at one depth the first hides
+    the others.
+    """
+    order = _core.simplify_order(scene)
+    whole = scene = scene.take(order)
+    sorted_flags = part = None if flags is None else np.ascontiguousarray(flags[order])
+    tell = counter(progress, "simplify")
+    first = seen = rows_of(look(scene), len(scene), slice(None))
+    parents = np.arange(len(scene))
+    rounds: list[dict[str, int]] = []
+    for stage in itertools.count():
+        last = 2 * budget >= _REFRESH * len(scene)  # else not worth it
+        target = budget if last else math.ceil(_REFRESH * len(scene))
+        shifted = _shifted(tell, len(whole) - len(scene), len(whole) - budget)
+        out = merge(scene, target, method, seen, part, config, shifted, stage=stage, last=last)
+        rounds += out["rounds"]
+        parents = np.where(parents < 0, -1, out["parents"][parents])
+        if last:
+            break
+        scene, part = splats_of(scene, out), None if part is None else out["protected"]
+        seen = rows_of(look(scene), len(scene), slice(None))
+    if stage:
+        out = _core.simplify_pool(
+            whole,
+            parents,
+            budget,
+            protected=sorted_flags,
+            weight=first.weight,
+            pixel_size=first.pixel_size,
             dilation=config.dilation,
             pixel_scale=config.pixel_scale,
             growth=config.max_growth,
-            progress=_shifted(counter(progress, "simplify"), start - len(scene), start - budget),
         )
-        stages.add(out)
-        scene = splats_of(scene, out)
-        flags = None if flags is None else out["protected"]
-        if target == budget:
-            break
-    if callable(visibility) and first is not None:
-        out["scales"] = _resized(scene, stages.parents, first.weight, visibility(scene).weight)
-    return {**out, **stages.clamped, "parents": stages.parents, "rounds": stages.rounds}
-
-
-class _Stages:
-    """What the stages did, as if they had been one."""
-
-    def __init__(self) -> None:
-        self.parents: NDArray[np.int64] = np.empty(0, np.int64)
-        self.rounds: list[dict[str, int]] = []
-        self.clamped = {"clamped_logits": 0, "clamped_opacities": 0}
-
-    def add(self, out: dict[str, Any]) -> None:
-        before, now = self.parents, out["parents"]
-        self.parents = np.where(before < 0, -1, now[before]) if self.rounds else now
-        self.rounds += out["rounds"]
-        self.clamped = {key: count + out[key] for key, count in self.clamped.items()}
+    merged = splats_of(whole, out)
+    scales = _resized(merged, parents, first.weight, look(merged).weight)
+    resized = int(np.count_nonzero((scales != merged.scales).any(axis=1)))
+    by_row = np.empty(len(whole), np.int64)
+    by_row[order] = parents
+    return {**out, "scales": scales, "parents": by_row, "rounds": rounds, "resized": resized}
 
 
 def _resized(

@@ -176,6 +176,56 @@ fn simplify_pairwise<'py>(
     outcome_dict(py, outcome, rounds)
 }
 
+/// The rows of a scene in the order that only its content decides.
+#[pyfunction]
+fn simplify_order<'py>(
+    py: Python<'py>,
+    scene: PyScene<'py>,
+) -> PyResult<Bound<'py, PyArray1<u32>>> {
+    let scene = scene.borrow()?;
+    let ordered = long(py, None, |_| Ordered::new(&scene))?;
+    Ok(PyArray1::from_vec(py, ordered.rows))
+}
+
+/// One Gaussian for each cluster of `parents`, from its raw members.
+#[pyfunction]
+#[pyo3(signature = (
+    scene, parents, count, *, protected, weight, pixel_size, dilation, pixel_scale, growth
+))]
+fn simplify_pool<'py>(
+    py: Python<'py>,
+    scene: PyScene<'py>,
+    parents: PyReadonlyArray1<'py, i64>,
+    count: usize,
+    protected: Option<PyReadonlyArray1<'py, bool>>,
+    weight: PyReadonlyArray1<'py, f32>,
+    pixel_size: PyReadonlyArray1<'py, f32>,
+    dilation: f64,
+    pixel_scale: f64,
+    growth: f64,
+) -> PyResult<Bound<'py, PyDict>> {
+    let scene = scene.borrow()?;
+    let parents = arrays::flat("parents", &parents)?;
+    let protected = protected
+        .as_ref()
+        .map(|p| arrays::flat("protected", p))
+        .transpose()?;
+    let seen = Seen {
+        weight: arrays::flat("weight", &weight)?,
+        pixel: arrays::flat("pixel_size", &pixel_size)?,
+    };
+    let policy = Pairwise {
+        dilation,
+        pixel_scale,
+        growth,
+        ..Pairwise::default()
+    };
+    let outcome = long(py, None, |control| {
+        policy.pool(&scene, Some(seen), protected, parents, count, control)
+    })?;
+    outcome_dict(py, outcome, Vec::new())
+}
+
 fn pairwise_dict<'py>(py: Python<'py>, r: &PairwiseRound) -> PyResult<Bound<'py, PyDict>> {
     let round = PyDict::new(py);
     for (key, value) in [
@@ -239,5 +289,7 @@ fn outcome_dict<'py, R>(
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(simplify_flags, m)?)?;
     m.add_function(wrap_pyfunction!(simplify_paper, m)?)?;
+    m.add_function(wrap_pyfunction!(simplify_order, m)?)?;
+    m.add_function(wrap_pyfunction!(simplify_pool, m)?)?;
     m.add_function(wrap_pyfunction!(simplify_pairwise, m)?)
 }
