@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _VIEWS = 48
 """Poses of a pool of its own; as many of them are used as the scene needs."""
 
-_ROWS = 100_000
+_ROWS = 30_000
 """Gaussians that those are planned on."""
 
 
