@@ -158,6 +158,8 @@ class Splats:
         if degree not in range(4):
             raise InputError(f"SH degree: expected 0 to 3, got {degree}")
         rest = (degree + 1) ** 2 - 1
+        if rest == self.shN.shape[1]:
+            return self
         shN = np.zeros((len(self), rest, 3), np.float32)
         keep = min(rest, self.shN.shape[1])
         shN[:, :keep] = self.shN[:, :keep]

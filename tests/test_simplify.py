@@ -443,3 +443,14 @@ def test_what_is_seen_does_not_depend_on_the_order_of_rows(method, scale):
         np.testing.assert_array_equal(getattr(a.splats, name), getattr(b.splats, name), err_msg=name)
     np.testing.assert_array_equal(a.parents[shuffled], b.parents)
     assert a.report["resized"] > 40
+
+
+def test_bands_of_zeros_are_skipped_and_come_back():
+    prior = scene(600).with_sh_degree(1)
+    padded = prior.with_sh_degree(3)
+    a, b = simplify(prior, 60), simplify(padded, 60)
+    np.testing.assert_array_equal(a.splats.shN, b.splats.shN[:, :3])
+    assert b.splats.shN.shape == (60, 15, 3)
+    assert not b.splats.shN[:, 3:].any()
+    assert (a.report["skipped"]["sh_bands"], b.report["skipped"]["sh_bands"]) == (0, 2)
+    assert b.report["skipped"]["alone"] == (np.bincount(b.parents[b.parents >= 0]) == 1).sum()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -31,7 +32,8 @@ class Simplified:
         protected: (M,) bool, flags inherited by OR from everything merged into the row.
         report: `input_count`, `output_count`, `rounds` (one dict each), `protected`, `nonfinite_rows`,
             `clamped_logits` (infinite ones), `clamped_opacities` (merged α that reached
-            0.99: what `max_growth` could not take was lost), `resized` (rows fitted to what views see).
+            0.99: what `max_growth` could not take was lost), `resized` (rows fitted to what views see),
+            `skipped` (`alone`: rows passed on as they were; `sh_bands`: of zeros, left out of all sums).
     """
 
     splats: Splats
@@ -133,6 +135,7 @@ def simplify(
     if method not in METHODS:
         raise InputError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
     scene, finite = _clean(splats)
+    scene = scene.with_sh_degree(_used_degree(scene))
     _check_budget(budget, len(scene))
     flags = _check_flags(protected, len(splats))
     if flags is not None:
@@ -221,10 +224,22 @@ def _clean(splats: Splats) -> tuple[Splats, NDArray[np.bool_] | slice]:
     return scene, slice(None) if everything else finite
 
 
+def _used_degree(scene: Splats) -> int:
+    """The highest SH degree that any Gaussian has a coefficient of."""
+    degree = scene.sh_degree
+    while degree > 0:
+        band = scene.shN[:, degree**2 - 1 :]
+        if band[:1024].any() or band.any():
+            break
+        degree -= 1
+    return degree
+
+
 def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str, Any]) -> Simplified:
     parents = np.full(len(splats), -1, np.int64)
     parents[finite] = out["parents"]
-    small = splats_of(splats, out)
+    small = splats_of(splats, out).with_sh_degree(splats.sh_degree)
+    alone = np.bincount(out["parents"][out["parents"] >= 0], minlength=len(small)) == 1
     protected: NDArray[np.bool_] = out["protected"]
     report = {
         "input_count": len(splats),
@@ -235,5 +250,9 @@ def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str
         "clamped_logits": out["clamped_logits"],
         "clamped_opacities": out["clamped_opacities"],
         "resized": out.get("resized", 0),
+        "skipped": {
+            "alone": int(np.count_nonzero(alone)),
+            "sh_bands": splats.sh_degree - math.isqrt(out["sh"].shape[1]) + 1,
+        },
     }
     return Simplified(small, parents, protected, report)

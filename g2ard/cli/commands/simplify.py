@@ -102,12 +102,14 @@ def simplify(
 
 def _cameras(run: Run, splats: Splats, views: Path | None, method: str) -> Cameras | None:
     """The views given, or a few of its own where the scene leaves room for them."""
-    if method == "paper" or (method == "fast" and views is None):
-        return None
     if views is not None:
         from g2ard.cli.scenes import load_views
 
+        if method == "paper":
+            run.say("paper uses no views")
         return load_views(run, views, "train", None)
+    if method != "default":
+        return None
     from g2ard.errors import InputError
     from g2ard.poses import make_pool
 
