@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 RUST := $(shell find rust -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml) Cargo.toml Cargo.lock
 
-.PHONY: demo test lint stress bench wheel setup clean
+.PHONY: demo test lint stress bench bench-kernels wheel setup clean
 
 setup: $(VENV)/.built
 
@@ -44,6 +44,10 @@ bench: setup
 	$(BIN)/g2ard bench raster $(SCENE)
 	$(BIN)/g2ard bench simplify $(SCENE) --ratios 10,30 --csv bench.csv
 	$(BIN)/g2ard bench run benches/definitions/*.toml -o bench $(QUICK)
+
+# The core's kernels alone, on synthetic scenes: no Python, no data, under a minute once built.
+bench-kernels:
+	cargo bench --quiet -p g2ard-core
 
 wheel: setup
 	$(BIN)/maturin build --release --out dist
