@@ -98,14 +98,8 @@ def merge_looking(
     config: SimplifyConfig,
     progress: Progress,
 ) -> dict[str, Any]:
-    """As many stages as the refreshes are worth; what they join is then made of its raw members.
-
-    The scene is looked at in an order that only its content decides: of equals at one depth the first hides
-    the others.
-    """
-    order = _core.simplify_order(scene)
-    whole = scene = scene.take(order)
-    sorted_flags = part = None if flags is None else np.ascontiguousarray(flags[order])
+    """As many stages as the refreshes are worth; what they join is then made of its raw members."""
+    whole, part = scene, flags
     tell = counter(progress, "simplify")
     first = seen = rows_of(look(scene), len(scene), slice(None))
     parents = np.arange(len(scene))
@@ -126,7 +120,7 @@ def merge_looking(
             whole,
             parents,
             budget,
-            protected=sorted_flags,
+            protected=flags,
             weight=first.weight,
             pixel_size=first.pixel_size,
             dilation=config.dilation,
@@ -134,11 +128,10 @@ def merge_looking(
             growth=config.max_growth,
         )
     merged = splats_of(whole, out)
-    scales = _resized(merged, parents, first.weight, look(merged).weight)
+    order = _core.simplify_order(whole)  # sums round alike whatever the order of the rows
+    scales = _resized(merged, parents[order], first.weight[order], look(merged).weight)
     resized = int(np.count_nonzero((scales != merged.scales).any(axis=1)))
-    by_row = np.empty(len(whole), np.int64)
-    by_row[order] = parents
-    return {**out, "scales": scales, "parents": by_row, "rounds": rounds, "resized": resized}
+    return {**out, "scales": scales, "parents": parents, "rounds": rounds, "resized": resized}
 
 
 def _resized(

@@ -41,6 +41,42 @@ impl Accumulated {
     }
 }
 
+/// Sums that threads add to, each to rows of its own.
+#[derive(Clone, Copy)]
+pub(super) struct SharedSums {
+    weight: Shared<f64>,
+    transmittance: Shared<f64>,
+    hits: Shared<u64>,
+    dominant: Shared<u64>,
+    peak: Shared<f32>,
+}
+
+impl SharedSums {
+    pub fn new(sums: &mut Accumulated) -> Self {
+        Self {
+            weight: Shared::new(&mut sums.weight),
+            transmittance: Shared::new(&mut sums.transmittance),
+            hits: Shared::new(&mut sums.hits),
+            dominant: Shared::new(&mut sums.dominant),
+            peak: Shared::new(&mut sums.peak),
+        }
+    }
+
+    /// # Safety
+    /// The sums are still there, have the row, and no other thread touches it meanwhile.
+    pub unsafe fn add(self, row: usize, total: &Total) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            *self.weight.at(row) += total.weight;
+            *self.transmittance.at(row) += total.transmittance;
+            *self.hits.at(row) += total.hits;
+            *self.dominant.at(row) += total.dominant;
+            let peak = self.peak.at(row);
+            *peak = (*peak).max(total.peak);
+        }
+    }
+}
+
 /// One pair's sums: weight, transmittance, hits, dominant, peak.
 pub type Share = [f32; 5];
 
@@ -177,20 +213,32 @@ fn folded<F: Lanes>(lanes: F, with: impl Fn(f32, f32) -> f32) -> f32 {
     row.0[0]
 }
 
-/// Adds one splat's slots to its row, in slot order. Returns (weight, transmittance, hits, dominant, peak).
-pub fn total(splat: &Splat, slots: &[Share], written: &[u8]) -> (f64, f64, u64, u64, f32) {
-    let mut sum = (0.0, 0.0, 0, 0, 0f32);
-    for slot in splat.slot as usize..(splat.slot + splat.tiles) as usize {
-        if written[slot] != 0 {
-            let s = &slots[slot];
-            sum.0 += f64::from(s[0]);
-            sum.1 += f64::from(s[1]);
-            sum.2 += s[2] as u64;
-            sum.3 += s[3] as u64;
-            sum.4 = sum.4.max(s[4]);
+/// One Gaussian's sums over a view: see [`Accumulated`].
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Total {
+    pub weight: f64,
+    pub transmittance: f64,
+    pub hits: u64,
+    pub dominant: u64,
+    pub peak: f32,
+}
+
+impl Total {
+    /// Adds up one splat's slots, in slot order.
+    pub fn of(splat: &Splat, slots: &[Share], written: &[u8]) -> Self {
+        let mut sum = Self::default();
+        for slot in splat.slot as usize..(splat.slot + splat.tiles) as usize {
+            if written[slot] != 0 {
+                let s = &slots[slot];
+                sum.weight += f64::from(s[0]);
+                sum.transmittance += f64::from(s[1]);
+                sum.hits += s[2] as u64;
+                sum.dominant += s[3] as u64;
+                sum.peak = sum.peak.max(s[4]);
+            }
         }
+        sum
     }
-    sum
 }
 
 /// Lowers each row's pixel size to depth / focal length where the mean falls inside the image.
