@@ -264,7 +264,7 @@ def looker(
     small = full.resized(longest)
     factor = np.float32((small.widths / full.widths).mean())
     apart = max(1, math.ceil(len(small) / _GLANCE))
-    glances = [np.arange(first, len(small), apart) for first in _spread(apart)]
+    glances = [range(first, len(small), apart) for first in _spread(apart)]
     enough, settings = 0, RasterSettings()
 
     def look(scene: Splats) -> Seen:

@@ -1,7 +1,8 @@
 //! `g2ard.simplify`.
 
 use g2ard_core::simplify::{
-    Look, Means, Ordered, Outcome, Pairwise, PairwiseRound, Paper, PaperRound, SceneRef, Seen, flags,
+    Look, Means, Ordered, Outcome, Pairwise, PairwiseRound, Paper, PaperRound, SceneRef, Seen,
+    flags,
 };
 use numpy::{
     PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
@@ -234,7 +235,10 @@ impl PyLook {
         py: Python<'py>,
     ) -> (Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<f32>>) {
         let (weight, pixel) = self.0.by_row();
-        (PyArray1::from_vec(py, weight), PyArray1::from_vec(py, pixel))
+        (
+            PyArray1::from_vec(py, weight),
+            PyArray1::from_vec(py, pixel),
+        )
     }
 }
 

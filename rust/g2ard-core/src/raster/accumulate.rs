@@ -77,8 +77,9 @@ impl SharedSums {
     }
 }
 
-/// One pair's sums: weight, transmittance, hits, dominant, peak.
-pub type Share = [f32; 5];
+/// How many sums a pair has: its weight alone, or transmittance, hits, dominant and peak as well.
+pub const WEIGHT: usize = 1;
+pub const ALL: usize = 5;
 
 /// A block's state from front to back; what a pair touches lies side by side.
 #[derive(Clone, Copy)]
@@ -90,18 +91,18 @@ struct Block {
     winner: Row,
 }
 
-/// Blends one tile from front to back without an image: only every pair's sums, each in its own slot.
-pub struct Accumulate<'a> {
+/// Blends one tile from front to back without an image: only every pair's `KINDS` sums, each in its own slot.
+pub struct Accumulate<'a, const KINDS: usize> {
     pub pairs: &'a [Pair],
     pub splats: &'a [Splat],
     pub place: Place,
     pub settings: &'a Settings,
     pub staged: &'a mut Staged,
-    pub slots: Shared<Share>,
+    pub slots: Shared<[f32; KINDS]>,
     pub written: Shared<u8>,
 }
 
-impl Kernel for Accumulate<'_> {
+impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
     type Output = ();
 
     #[inline(always)]
@@ -150,23 +151,25 @@ impl Kernel for Accumulate<'_> {
                     }
                     let go = hit.and(going);
                     let w = (a * t).only(go);
-                    let most = F::load(&block.most);
-                    let winner = F::load(&block.winner);
-                    F::select(w.gt(most), number, winner).store(&mut block.winner);
-                    most.max(w).store(&mut block.most);
                     weight = weight + w;
-                    light = light + t.only(go);
-                    peak = peak.max(w);
                     hits += go.bits().count_ones();
+                    if KINDS == ALL {
+                        let most = F::load(&block.most);
+                        let winner = F::load(&block.winner);
+                        F::select(w.gt(most), number, winner).store(&mut block.winner);
+                        most.max(w).store(&mut block.most);
+                        light = light + t.only(go);
+                        peak = peak.max(w);
+                    }
                 }
                 if hits > 0 {
-                    let share = [
-                        folded(weight, add),
-                        folded(light, add),
-                        hits as f32,
-                        0.0,
-                        folded(peak, larger),
-                    ];
+                    let mut share = [folded(weight, add); KINDS];
+                    if KINDS == ALL {
+                        share[1] = folded(light, add);
+                        share[2] = hits as f32;
+                        share[3] = 0.0;
+                        share[4] = folded(peak, larger);
+                    }
                     // SAFETY: a slot belongs to one pair, and a pair to one tile.
                     unsafe {
                         self.slots.write(pair.slot as usize, share);
@@ -179,7 +182,7 @@ impl Kernel for Accumulate<'_> {
             }
         }
         for number in blocks.iter().flat_map(|block| block.winner.0) {
-            if number >= 0.0 {
+            if KINDS == ALL && number >= 0.0 {
                 let slot = self.pairs[number as usize].slot as usize;
                 // SAFETY: as above.
                 unsafe { self.slots.slice(slot, 1)[0][3] += 1.0 };
@@ -213,7 +216,7 @@ fn folded<F: Lanes>(lanes: F, with: impl Fn(f32, f32) -> f32) -> f32 {
     row.0[0]
 }
 
-/// One Gaussian's sums over a view: see [`Accumulated`].
+/// One Gaussian's sums over a view: see [`Accumulated`]. Zero but for the weight if no others were asked for.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Total {
     pub weight: f64,
@@ -225,16 +228,18 @@ pub struct Total {
 
 impl Total {
     /// Adds up one splat's slots, in slot order.
-    pub fn of(splat: &Splat, slots: &[Share], written: &[u8]) -> Self {
+    pub fn of<const KINDS: usize>(splat: &Splat, slots: &[[f32; KINDS]], written: &[u8]) -> Self {
         let mut sum = Self::default();
         for slot in splat.slot as usize..(splat.slot + splat.tiles) as usize {
             if written[slot] != 0 {
                 let s = &slots[slot];
                 sum.weight += f64::from(s[0]);
-                sum.transmittance += f64::from(s[1]);
-                sum.hits += s[2] as u64;
-                sum.dominant += s[3] as u64;
-                sum.peak = sum.peak.max(s[4]);
+                if KINDS == ALL {
+                    sum.transmittance += f64::from(s[1]);
+                    sum.hits += s[2] as u64;
+                    sum.dominant += s[3] as u64;
+                    sum.peak = sum.peak.max(s[4]);
+                }
             }
         }
         sum

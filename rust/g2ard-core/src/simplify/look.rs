@@ -3,11 +3,12 @@
 use rayon::prelude::*;
 
 use super::{Means, Ordered, SceneRef};
+use crate::Result;
+use crate::raster::accumulate::WEIGHT;
 use crate::raster::order::Shared;
 use crate::raster::params::{Source, check_count};
 use crate::raster::simd::{LANES, Lanes, Row};
 use crate::raster::{Camera, DILATION, Rasterizer, Settings};
-use crate::Result;
 
 /// Standard deviations at which an opacity of 1 falls to α = 1/255, and a little more.
 const REACH: f64 = 3.4;
@@ -80,7 +81,7 @@ impl Look {
         };
         let weight = Shared::new(&mut self.weight);
         self.rasterizer
-            .accumulate_from(source, &camera, settings, |row, total| {
+            .accumulate_from::<WEIGHT, _>(source, &camera, settings, |row, total| {
                 let row = live[row / LANES] as usize * LANES + row % LANES;
                 // SAFETY: every row is told of once in a view.
                 unsafe { *weight.at(row) += total.weight };
@@ -279,8 +280,10 @@ mod tests {
     use super::*;
     use crate::raster::{Accumulated, Params};
 
-    /// 1,003 Gaussians of very different sizes around the origin.
-    fn scene() -> (Vec<[f32; 3]>, Vec<[f32; 4]>, Vec<[f32; 3]>, Vec<f32>) {
+    type Arrays = (Vec<[f32; 3]>, Vec<[f32; 4]>, Vec<[f32; 3]>, Vec<f32>);
+
+    /// 1,003 Gaussians of very different sizes around the origin: means, quaternions, scales, logits.
+    fn scene() -> Arrays {
         let mut state = 7u64;
         let mut random = || {
             state = state
@@ -354,7 +357,10 @@ mod tests {
         let expected: Vec<f32> = whole.weight.iter().map(|&w| w as f32).collect();
         assert_eq!((weight, pixel), (expected, whole.pixel_size));
         assert!(met < 12 * look.groups.len() * 9 / 10, "{met} groups met");
-        assert_eq!(look.seen(), whole.weight.iter().filter(|w| **w > 0.0).count());
+        assert_eq!(
+            look.seen(),
+            whole.weight.iter().filter(|w| **w > 0.0).count()
+        );
     }
 
     #[test]
