@@ -23,6 +23,9 @@ _LADDER = {"default": (3.0, 1), "fast": (1.0, 3)}
 """Down to how many times the budget rows merge along Morton order, and in how many steps. A stage before the
 last does so all the way."""
 
+_BLIND = 1 / 3
+"""How much of its weight the error of coverage has where nothing is known of what views see."""
+
 _REFRESH = 0.3
 """Visibility is looked at again when the count has fallen to this share of what it was."""
 
@@ -81,7 +84,7 @@ def merge(
         ladder=ladder if last else 1.0,
         ladder_steps=steps,
         neighbors=config.neighbors,
-        geometric=config.geometric_weight,
+        geometric=config.geometric_weight * (_BLIND if seen is None else 1.0),
         dilation=config.dilation,
         pixel_scale=config.pixel_scale,
         growth=config.max_growth,
