@@ -394,8 +394,9 @@ def recover(
     paper: beside all of it. regularizers: with and without each. rounds: against one shot in equal time
     (--time-limit). multiplier: of the rates. endurance: 5,000 steps.
     """
-    from g2ard.bench.recover import RecoverBench, bench_recover, speedups
+    from g2ard.bench.recover import RecoverBench, bench_recover
     from g2ard.bench.simplify import machine
+    from g2ard.bench.speedup import speedups
     from g2ard.cli.options import parse_ratio
 
     colour = background or (0.0, 0.0, 0.0)
