@@ -85,7 +85,7 @@ class Schedule:
 
 
 TUNED = Schedule(
-    rates=Rates(means=0.05, log_scales=3e-2, quats=1.5e-2, logit_opacities=7e-2, sh0=3e-2, shN=3e-3),
+    rates=Rates(means=0.05, log_scales=6e-2, quats=1.5e-2, logit_opacities=7e-2, sh0=3e-2, shN=3e-3),
     steps=1000,
 )
 """Rates in the Gaussian's own unit and a cosine to 1 %; `docs/decisions.md` holds the figures behind it."""
