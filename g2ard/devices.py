@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 from g2ard import _core
@@ -52,6 +53,7 @@ class State:
 
 def adapters() -> list[Adapter] | None:
     """Every adapter, the one to use first; None where this build has no GPU kernels."""
+    _hush()
     found = _core.adapters()
     return None if found is None else [Adapter(**row) for row in found]
 
@@ -76,7 +78,14 @@ def use(device: str) -> None:
     """
     if device not in ("cpu", "gpu", "auto"):
         raise InputError(f"device: expected cpu, gpu or auto, got {device!r}")
+    _hush()
     _core.set_device(device)
+
+
+def _hush() -> None:
+    """Where there is no desktop, a layer of Mesa that asks it for the preferred GPU complains on stderr."""
+    if "XDG_RUNTIME_DIR" not in os.environ:
+        os.environ.setdefault("NODEVICE_SELECT", "1")
 
 
 def state() -> State:

@@ -27,6 +27,9 @@ const SEGMENT: usize = 3;
 /// More rows than this would keep one thread busy while all others wait: such groups are rare, and the CPU's.
 const LARGEST: usize = 1024;
 
+/// Rounds of loops that a row takes at most, all fits without a row of leverage 1 counted.
+const ROUNDS: usize = 375;
+
 /// Rows of a batch: enough to fill a device, few enough that drivers do not lose patience.
 const ROWS: usize = 1 << 19;
 
@@ -63,7 +66,9 @@ pub fn run(
 ) -> Result<Found> {
     let most_words = gpu.max_words().min(ROWS * twin.member);
     let most_groups = gpu.max_words() / twin.answer.max(SEGMENT);
-    let largest = LARGEST.min(most_words / twin.member);
+    let largest = LARGEST
+        .min(most_words / twin.member)
+        .min(gpu.max_rounds() / ROUNDS);
     let mut found = Found {
         answers: vec![0; count * twin.answer],
         large: Vec::new(),

@@ -86,6 +86,15 @@ impl Gpu {
         usize::try_from(self.max_binding / 4).unwrap_or(usize::MAX)
     }
 
+    /// Rounds that all loops of one thread may take together. Mesa's llvmpipe ends them, silently, at 65,535.
+    pub fn max_rounds(&self) -> usize {
+        if self.adapter.is_software() {
+            48_000
+        } else {
+            usize::MAX
+        }
+    }
+
     /// Whether everything so far went well; tells of a failure once.
     pub fn check(&self) -> Result<()> {
         if lock(&self.health).is_none() {

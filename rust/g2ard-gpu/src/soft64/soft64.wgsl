@@ -127,6 +127,17 @@ fn mul(a: F64, b: F64) -> F64 {
     return pack(sign, exponent(a) + exponent(b) - 1023 + i32(top), left64(high, 2u - top));
 }
 
+// A word times 64 bits, the lower 64 of it.
+fn times64(a: vec2<u32>, n: u32) -> vec2<u32> {
+    let low = wide(a.x, n);
+    return vec2(low.x, low.y + a.y * n);
+}
+
+fn rough(a: vec2<u32>) -> f32 { return f32(a.y) * 4294967296.0 + f32(a.x); }
+
+fn negative(a: vec2<u32>) -> bool { return (a.y >> 31u) != 0u; }
+
+// Eleven bits at a time: f32 guesses them, at most one off, and what is left over puts that right.
 fn div(a: F64, b: F64) -> F64 {
     let sign = (a.y ^ b.y) & 0x80000000u;
     if exponent(a) == 0 { return F64(0u, sign); }
@@ -138,40 +149,57 @@ fn div(a: F64, b: F64) -> F64 {
         rest = left64(rest, 1u);
         e -= 1;
     }
-    var quotient = vec2(0u, 0u);
-    for (var i = 0; i < 55; i++) {
-        quotient = left64(quotient, 1u);
-        if !below(rest, by) {
+    rest = minus64(rest, by);
+    var quotient = vec2(1u, 0u);
+    let scale = 2048.0 / rough(by);
+    for (var i = 0; i < 5; i++) {
+        var digit = u32(rough(rest) * scale);
+        rest = minus64(left64(rest, 11u), times64(by, digit));
+        if negative(rest) {
+            digit -= 1u;
+            rest = plus64(rest, by);
+        } else if !below(rest, by) {
+            digit += 1u;
             rest = minus64(rest, by);
-            quotient.x |= 1u;
         }
-        rest = left64(rest, 1u);
+        quotient = plus64(left64(quotient, 11u), vec2(digit, 0u));
     }
-    quotient = left64(quotient, 8u);
+    quotient = left64(quotient, 7u); // 56 bits so far
     quotient.x |= u32((rest.x | rest.y) != 0u);
     return pack(sign, e, quotient);
 }
 
-// Of what is not negative.
+// Of what is not negative. Eleven bits at a time, as `div`; what is left over fits into 64 bits at every step,
+// though what it is the difference of may not.
 fn root(a: F64) -> F64 {
     if exponent(a) == 0 { return a; }
     let even = exponent(a) - 1023;
     let odd = u32(even & 1);
-    var bits = left64(mantissa(a), 10u + odd); // the radicand's first bit pair is at the top
+    var bits = left64(mantissa(a), 10u + odd); // the radicand's first two bits are at the top
     var rest = vec2(0u, 0u);
     var value = vec2(0u, 0u);
-    for (var i = 0; i < 55; i++) {
-        rest = left64(rest, 2u);
-        rest.x |= bits.y >> 30u;
-        bits = left64(bits, 2u);
-        let trial = vec2((value.x << 2u) | 1u, (value.y << 2u) | (value.x >> 30u));
-        value = left64(value, 1u);
-        if !below(rest, trial) {
-            rest = minus64(rest, trial);
-            value.x |= 1u;
+    for (var i = 0; i < 5; i++) {
+        let next = bits.y >> 10u;
+        bits = left64(bits, 22u);
+        let radicand = rough(rest) * 4194304.0 + f32(next);
+        var digit = u32(select(radicand / (4096.0 * rough(value)), sqrt(radicand), i == 0));
+        let twice = left64(value, 12u);
+        rest = plus64(left64(rest, 22u), vec2(next, 0u));
+        rest = minus64(rest, times64(plus64(twice, vec2(digit, 0u)), digit));
+        for (var k = 0; k < 2; k++) {
+            if negative(rest) {
+                rest = plus64(rest, plus64(twice, vec2(2u * digit - 1u, 0u)));
+                digit -= 1u;
+            }
         }
+        let more = plus64(twice, vec2(2u * digit + 1u, 0u));
+        if !negative(rest) && !below(rest, more) {
+            rest = minus64(rest, more);
+            digit += 1u;
+        }
+        value = plus64(left64(value, 11u), vec2(digit, 0u));
     }
-    value = left64(value, 8u);
+    value = left64(value, 8u); // 55 bits so far
     value.x |= u32((rest.x | rest.y) != 0u);
     return pack(0u, ((even - i32(odd)) / 2) + 1023, value);
 }

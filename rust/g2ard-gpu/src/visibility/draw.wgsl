@@ -1,5 +1,6 @@
 // The median depth: a workgroup takes a tile, a thread a pixel. It goes through the tile's splats, nearest first,
-// until less than half the light is left. Pixels that nobody asks for start without any.
+// until less than half the light is left. Pixels that nobody asks for start without any. A dispatch draws the
+// view.count splats of each tile from the view.first-th on.
 
 @group(0) @binding(1) var<storage, read> splats: array<Splat>;
 @group(0) @binding(2) var<storage, read> drawn: array<u32>;
@@ -26,7 +27,10 @@ fn draw(
     var left = light[at];
     if left < 0.5 { return; }
     let range = bounds[tile];
-    for (var i = range.x; i < range.y; i++) {
+    if view.first >= range.y - range.x { return; }
+    let first = range.x + view.first;
+    let end = first + min(view.count, range.y - first);
+    for (var i = first; i < end; i++) {
         let s = splats[drawn[i]];
         if !within(pixel.x, s.columns) || !within(pixel.y, s.rows) { continue; }
         let dx = f32(pixel.x) + 0.5 - s.x;

@@ -480,6 +480,43 @@ mod tests {
     }
 
     #[test]
+    fn a_crowded_tile_is_drawn_to_its_end() {
+        let Some(gpu) = gpu("a crowded tile") else {
+            return;
+        };
+        // A crowd in one corner, and behind it what fills the image.
+        let mut means = vec![[-0.49, -0.49, 0.0]; 70_000];
+        means.push([0.0, 0.0, 1.0]);
+        let n = means.len();
+        let mut scales = vec![[0.01f32; 3]; n];
+        scales[n - 1] = [2.0, 2.0, 0.01];
+        let scene = Gaussians {
+            means: &means,
+            quats: &vec![[1.0, 0.0, 0.0, 0.0]; n],
+            scales: &scales,
+            opacities: &vec![0.9; n],
+        };
+        let camera = Camera {
+            viewmat: [
+                [1.0, 0.0, 0.0, 0.0],
+                [0.0, 1.0, 0.0, 0.0],
+                [0.0, 0.0, 1.0, 1.0],
+            ],
+            fx: 16.0,
+            fy: 16.0,
+            cx: 8.0,
+            cy: 8.0,
+            width: 16,
+            height: 16,
+            near: 0.01,
+        };
+        let control = Control::default();
+        let want = Cpu.looks(&scene, &[camera], &control).unwrap();
+        assert_eq!(want, [[1.0, 2.0]]);
+        assert_eq!(looks(&gpu, &scene, &[camera], &control).unwrap(), want);
+    }
+
+    #[test]
     fn the_same_twice() {
         let Some(gpu) = gpu("visibility, twice") else {
             return;

@@ -94,7 +94,14 @@ impl<'a> Scene<'a> {
             let bound = [(4, &keyed.keys), (6, &bounds)];
             work.run_at(&RANGES, groups, &constants, &bound)?;
             let bound = [&records, &keyed.words, &bounds, light, depth];
-            work.run(&DRAW, tiles, &constants, &bound)?;
+            let rounds = gpu.max_rounds().min(count);
+            for first in (0..count).step_by(rounds) {
+                let constants = Constants {
+                    first,
+                    ..Constants::new(view, rounds)
+                };
+                work.run(&DRAW, tiles, &constants.words(), &bound)?;
+            }
         }
         Ok(())
     }
