@@ -44,11 +44,13 @@ class State:
         adapter: the name of the adapter in use; None on the CPU, and before the first kernel that asks for one.
         served: how many kernels it has run.
         notes: lines for the user since last asked, such as why the CPU took over.
+        seconds: on the device by kernel since last asked, where `use` was told to keep time.
     """
 
     adapter: str | None
     served: int
     notes: list[str]
+    seconds: dict[str, float]
 
 
 def adapters() -> list[Adapter] | None:
@@ -58,7 +60,7 @@ def adapters() -> list[Adapter] | None:
     return None if found is None else [Adapter(**row) for row in found]
 
 
-def use(device: str) -> None:
+def use(device: str, *, timed: bool = False) -> None:
     """Choose where kernels run from now on, in all threads of this process.
 
     Twins of the kernels exist for `simplify` by the paper's method and for what `select` looks at; all others
@@ -68,6 +70,7 @@ def use(device: str) -> None:
         device: "cpu", which is what a process starts with; "gpu", the best adapter there is, even a software
             one; "auto", a real GPU if the scene is large and a quick probe shows that the GPU computes the same
             and is faster.
+        timed: keep time of every kernel, where the adapter can.
 
     Raises:
         InputError: another name.
@@ -79,7 +82,7 @@ def use(device: str) -> None:
     if device not in ("cpu", "gpu", "auto"):
         raise InputError(f"device: expected cpu, gpu or auto, got {device!r}")
     _hush()
-    _core.set_device(device)
+    _core.set_device(device, timed=timed)
 
 
 def _hush() -> None:

@@ -129,7 +129,7 @@ def test_software_is_never_chosen_by_itself(gpu: None) -> None:
     rng = np.random.default_rng(0)
     prior = Splats.create(rng.normal(size=(200_001, 3)), scales=np.full((200_001, 3), 0.01))
     surface(prior, 1000)
-    assert devices.state() == devices.State(None, 0, [])
+    assert devices.state() == devices.State(None, 0, [], {})
 
 
 def test_refuses_other_names() -> None:

@@ -220,7 +220,7 @@ def _device(run: Run) -> Iterator[None]:
         return
     from g2ard import devices
 
-    devices.use(run.device)
+    devices.use(run.device, timed=run.verbose)
     try:
         yield
     finally:
@@ -230,7 +230,9 @@ def _device(run: Run) -> Iterator[None]:
         if run.device == "gpu" and not (state.served or state.notes):
             run.say("--device gpu: nothing here has GPU kernels; all ran on the CPU")
         elif state.served and run.verbose:
-            run.say(f"GPU: {state.served} kernels on {state.adapter}")
+            longest = sorted(state.seconds.items(), key=lambda item: -item[1])[:6]
+            took = "".join(f", {name} {seconds:.3f} s" for name, seconds in longest)
+            run.say(f"GPU: {state.served} kernels on {state.adapter}{took}")
 
 
 def _one_line(error: BaseException) -> str:

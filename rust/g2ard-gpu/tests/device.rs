@@ -85,8 +85,21 @@ fn the_papers_policy_is_the_same_scene() {
         return;
     }
     let scene = scene(5000);
-    let device = Device::new(Choice::Gpu, Options::default());
+    let device = Device::new(
+        Choice::Gpu,
+        Options {
+            timed: true,
+            ..Options::default()
+        },
+    );
     let (want, got) = (simplify(&scene, &Cpu), simplify(&scene, &device));
+    let gpu = device.gpu().expect("an open device");
+    let seconds = gpu.timings();
+    assert_eq!(seconds.is_empty(), !gpu.adapter.timestamps);
+    assert!(
+        seconds.values().all(|s| (0.0..60.0).contains(s)),
+        "{seconds:?}"
+    );
     assert_eq!(device.notes(), Vec::<String>::new());
     assert!(device.served() >= 10, "{}", device.served());
     let refused: usize = want
@@ -125,13 +138,14 @@ fn tiny_buffers_work_in_pieces_or_go_to_the_cpu() {
     if !adapter("tiny buffers") {
         return;
     }
-    let scene = scene(1000);
+    let scene = scene(700);
     let want = simplify(&scene, &Cpu);
-    for (bytes, refused) in [(1 << 13, false), (1 << 7, true)] {
+    for (bytes, refused) in [(1 << 14, false), (1 << 7, true)] {
         let device = Device::new(
             Choice::Gpu,
             Options {
                 max_binding: Some(bytes),
+                ..Options::default()
             },
         );
         assert_eq!(simplify(&scene, &device), want);
@@ -153,6 +167,7 @@ fn buffers_beyond_the_limit_are_refused_by_name() {
         true,
         Options {
             max_binding: Some(1024),
+            ..Options::default()
         },
     )
     .unwrap();

@@ -31,18 +31,19 @@ pub fn backend(kernels: &Arc<Kernels>) -> &dyn Backend {
     &**kernels
 }
 
-/// Chooses cpu, gpu or auto for every kernel from now on; `max_binding` bytes bound at once at most (for tests).
+/// Chooses cpu, gpu or auto for every kernel from now on; `max_binding` bytes bound at once at most (for tests);
+/// `timed` keeps time of every kernel.
 #[cfg(feature = "gpu")]
 #[pyfunction]
-#[pyo3(signature = (name, max_binding=None))]
-fn set_device(name: &str, max_binding: Option<u64>) -> PyResult<()> {
+#[pyo3(signature = (name, max_binding=None, timed=false))]
+fn set_device(name: &str, max_binding: Option<u64>, timed: bool) -> PyResult<()> {
     let choice = match name {
         "cpu" => Choice::Cpu,
         "gpu" => Choice::Gpu,
         "auto" => Choice::Auto,
         _ => return Err(unknown(name)),
     };
-    let device = Device::new(choice, runtime::Options { max_binding });
+    let device = Device::new(choice, runtime::Options { max_binding, timed });
     *KERNELS.write().unwrap_or_else(PoisonError::into_inner) = Some(Arc::new(device));
     Ok(())
 }
@@ -50,9 +51,9 @@ fn set_device(name: &str, max_binding: Option<u64>) -> PyResult<()> {
 /// There is only the CPU in this build.
 #[cfg(not(feature = "gpu"))]
 #[pyfunction]
-#[pyo3(signature = (name, max_binding=None))]
-fn set_device(name: &str, max_binding: Option<u64>) -> PyResult<()> {
-    let _ = max_binding;
+#[pyo3(signature = (name, max_binding=None, timed=false))]
+fn set_device(name: &str, max_binding: Option<u64>, timed: bool) -> PyResult<()> {
+    let _ = (max_binding, timed);
     if ["cpu", "gpu", "auto"].contains(&name) {
         Ok(())
     } else {
@@ -64,7 +65,8 @@ fn unknown(name: &str) -> PyErr {
     PyValueError::new_err(format!("device: expected cpu, gpu or auto, got {name:?}"))
 }
 
-/// {adapter, served, notes}: what is in use, how many kernels it ran, and lines for the user since last asked.
+/// {adapter, served, notes, seconds}: what is in use, how many kernels it ran, and since last asked lines for the
+/// user, and seconds by kernel.
 #[pyfunction]
 fn device_state(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
     let out = PyDict::new(py);
@@ -74,12 +76,15 @@ fn device_state(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
         out.set_item("adapter", kernels.adapter().map(|a| a.name))?;
         out.set_item("served", kernels.served())?;
         out.set_item("notes", kernels.notes())?;
+        let seconds = kernels.gpu().map(|gpu| gpu.timings());
+        out.set_item("seconds", seconds.unwrap_or_default())?;
     }
     #[cfg(not(feature = "gpu"))]
     {
         out.set_item("adapter", None::<String>)?;
         out.set_item("served", 0)?;
         out.set_item("notes", Vec::<String>::new())?;
+        out.set_item("seconds", PyDict::new(py))?;
     }
     Ok(out)
 }

@@ -174,7 +174,13 @@ mod tests {
     #[test]
     fn energies_and_merges_are_the_cpus_in_pieces() {
         let max_binding = Some(1 << 14);
-        let Some(gpu) = gpu_with("groups in pieces", Options { max_binding }) else {
+        let Some(gpu) = gpu_with(
+            "groups in pieces",
+            Options {
+                max_binding,
+                ..Options::default()
+            },
+        ) else {
             return;
         };
         compare(&gpu, "groups in pieces");

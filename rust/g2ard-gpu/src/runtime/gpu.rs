@@ -1,6 +1,6 @@
 //! An open device: its buffers, its pipelines, and whether it is still well.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use wgpu::{BufferDescriptor, BufferUsages, ComputePipeline, ComputePipelineDescriptor};
@@ -13,6 +13,8 @@ use super::{Error, Result};
 pub struct Options {
     /// Binds no more than this many bytes, as if the adapter could not.
     pub max_binding: Option<u64>,
+    /// Keeps time of every kernel, where the adapter can.
+    pub timed: bool,
 }
 
 /// One entry point of a shader: the sources are joined in order.
@@ -47,7 +49,8 @@ pub struct Gpu {
     pipelines: Mutex<HashMap<&'static str, ComputePipeline>>,
     health: Health,
     max_binding: u64,
-    pub(super) timings: Mutex<Vec<(&'static str, f64)>>,
+    pub(super) timed: bool,
+    timings: Mutex<BTreeMap<&'static str, f64>>,
 }
 
 impl Gpu {
@@ -72,6 +75,7 @@ impl Gpu {
         let offered = adapter.max_binding.min(adapter.max_buffer) & !255;
         Ok(Self {
             max_binding: options.max_binding.map_or(offered, |m| m.min(offered)),
+            timed: options.timed && adapter.timestamps,
             adapter,
             device,
             queue,
@@ -184,9 +188,13 @@ impl Gpu {
         self.device.destroy();
     }
 
-    /// Seconds on the device by kernel since last asked, where it keeps time.
-    pub fn timings(&self) -> Vec<(&'static str, f64)> {
+    /// Seconds on the device by kernel since last asked, where time is kept.
+    pub fn timings(&self) -> BTreeMap<&'static str, f64> {
         std::mem::take(&mut *lock(&self.timings))
+    }
+
+    pub(super) fn took(&self, kernel: &'static str, seconds: f64) {
+        *lock(&self.timings).entry(kernel).or_default() += seconds;
     }
 
     pub(super) fn fail(&self, error: Error) {
@@ -216,6 +224,6 @@ fn one_line(text: &str) -> String {
 }
 
 /// Nothing panics while it holds these locks, and what they guard is whole at every step.
-pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

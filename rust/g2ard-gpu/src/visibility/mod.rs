@@ -473,7 +473,13 @@ mod tests {
     #[test]
     fn views_see_the_same_in_pieces_and_slabs() {
         let max_binding = Some(1 << 16);
-        let Some(gpu) = gpu_with("visibility in pieces", Options { max_binding }) else {
+        let Some(gpu) = gpu_with(
+            "visibility in pieces",
+            Options {
+                max_binding,
+                ..Options::default()
+            },
+        ) else {
             return;
         };
         compare(&gpu, "visibility in pieces");

@@ -288,7 +288,13 @@ mod tests {
     #[test]
     fn cells_are_the_cpus_in_pieces() {
         let max_binding = Some(1 << 17);
-        let Some(gpu) = gpu_with("voxels in pieces", Options { max_binding }) else {
+        let Some(gpu) = gpu_with(
+            "voxels in pieces",
+            Options {
+                max_binding,
+                ..Options::default()
+            },
+        ) else {
             return;
         };
         compare(&gpu, "voxels in pieces");
