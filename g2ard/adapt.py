@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
-from g2ard.recover import RecoverConfig, recover
+from g2ard.recover import RecoverConfig, checkpoint, recover
 from g2ard.recover.anchors import Regularizers
 from g2ard.recover.schedule import PAPER, TUNED, Schedule
 from g2ard.splats import Splats
-from g2ard.targets import Targets
+from g2ard.targets import Targets, fingerprint_of
 
 __all__ = ["AdaptConfig", "Adapted", "adapt"]
 
@@ -80,8 +82,37 @@ class Adapted:
     report: dict[str, Any] = field(default_factory=dict)
 
 
+@dataclass
+class _State:
+    """What a resume must bring back between two stretches."""
+
+    splats: Splats
+    first: float | None = None
+    seconds: float = 0.0
+    converged: bool = False
+    stretches: list[dict[str, Any]] = field(default_factory=list)
+
+    _ARRAYS: ClassVar = ("logit_opacities", "sh0", "shN")
+
+    def save(self, path: Path, key: str) -> None:
+        meta = {"first": self.first, "seconds": self.seconds, "converged": self.converged}
+        arrays = {name: getattr(self.splats, name) for name in self._ARRAYS}
+        checkpoint.save(path, key, {**meta, "stretches": self.stretches}, arrays)
+
+    def load(self, path: Path, key: str) -> None:
+        meta, arrays = checkpoint.load(path, key)
+        self.splats = replace(self.splats, **arrays)
+        self.first, self.seconds = meta["first"], meta["seconds"]
+        self.converged, self.stretches = meta["converged"], meta["stretches"]
+
+
 def adapt(
-    compact: Splats, targets: Targets, config: AdaptConfig | None = None, *, progress: Progress = silent
+    compact: Splats,
+    targets: Targets,
+    config: AdaptConfig | None = None,
+    *,
+    work: Path | None = None,
+    progress: Progress = silent,
 ) -> Adapted:
     """Refit spherical harmonics and opacities to targets; means, rotations and scales stay.
 
@@ -92,53 +123,69 @@ def adapt(
         compact: the scene; its offset counts, cameras are in world coordinates.
         targets: photos, or renders of a scene with the wanted appearance.
         config: see `AdaptConfig`.
+        work: a folder that exists, for checkpoints: after every stretch, every minute and at Ctrl-C. Where it
+            holds some, adaptation goes on from them, and ends as if it had never stopped.
         progress: told of every step.
 
     Returns:
         An `Adapted` with as many Gaussians, in their order.
 
     Raises:
-        InputError: no Gaussians or no views.
+        InputError: no Gaussians, no views, or checkpoints of another run.
+        KeyboardInterrupt: after Ctrl-C, once the checkpoint is written.
     """
     config = config or AdaptConfig()
-    base = PAPER if config.schedule == "paper" else TUNED
-    state = compact if config.sh_degree is None else compact.with_sh_degree(config.sh_degree)
-    first: float | None = None
-    stretches: list[dict[str, Any]] = []
-    seconds, converged = 0.0, False
+    state = _State(compact if config.sh_degree is None else compact.with_sh_degree(config.sh_degree))
+    parts = (repr(config), compact.fingerprint(), fingerprint_of(targets))
+    key = hashlib.sha256("\n".join(parts).encode()).hexdigest()
+    done, within = (work / "stretches.npz", work / "steps.npz") if work else (None, None)
+    if done and done.exists():
+        state.load(done, key)
     lengths = config.stretches()
-    for number, steps in enumerate(lengths):
-        done = recover(
-            state,
-            targets,
-            RecoverConfig(
-                schedule=_appearance_only(base),
-                steps=steps,
-                regularizers=_FREE,
-                background=config.background,
-                seed=config.seed + number,
-            ),
-            progress=progress,
-            stage="adapt",
-        )
-        before, after = done.report["psnr"]["before"], done.report["psnr"]["after"]
-        first = before if first is None else first
-        state = replace(done.splats, means=compact.means, quats=compact.quats, scales=compact.scales)
-        stretches.append({"steps": steps, "psnr": after})
-        seconds += done.report["seconds"]
-        converged = after - before < config.tolerance
-        if converged:
-            break
+    while len(state.stretches) < len(lengths) and not state.converged:
+        number = len(state.stretches)
+        _stretch(state, compact, targets, config, lengths[number], number, within, progress)
+        if done and within:
+            state.save(done, key)
+            within.unlink(missing_ok=True)
     return Adapted(
-        state,
+        state.splats,
         {
-            "steps": sum(s["steps"] for s in stretches),
-            "seconds": seconds,
-            "converged": converged,
-            "psnr": {"before": first, "after": stretches[-1]["psnr"]},
-            "stretches": stretches,
+            "steps": sum(s["steps"] for s in state.stretches),
+            "seconds": state.seconds,
+            "converged": state.converged,
+            "psnr": {"before": state.first, "after": state.stretches[-1]["psnr"]},
+            "stretches": state.stretches,
         },
     )
+
+
+def _stretch(
+    state: _State,
+    compact: Splats,
+    targets: Targets,
+    config: AdaptConfig,
+    steps: int,
+    number: int,
+    within: Path | None,
+    progress: Progress,
+) -> None:
+    """Steps under one cosine."""
+    base = PAPER if config.schedule == "paper" else TUNED
+    recovery = RecoverConfig(
+        schedule=_appearance_only(base),
+        steps=steps,
+        regularizers=_FREE,
+        background=config.background,
+        seed=config.seed + number,
+    )
+    found = recover(state.splats, targets, recovery, checkpoint=within, progress=progress, stage="adapt")
+    before, after = found.report["psnr"]["before"], found.report["psnr"]["after"]
+    state.first = before if state.first is None else state.first
+    state.splats = replace(found.splats, means=compact.means, quats=compact.quats, scales=compact.scales)
+    state.stretches.append({"steps": steps, "psnr": after})
+    state.seconds += found.report["seconds"]
+    state.converged = after - before < config.tolerance
 
 
 def _appearance_only(schedule: Schedule) -> Schedule:

@@ -232,11 +232,11 @@ class Seen:
     """What `looker` keeps of a visibility.
 
     Args:
-        weight: (N,) float64, Σ αT.
+        weight: (N,) float32, Σ αT.
         pixel_size: (N,) float32, that of the full image, scene units; ∞ where no view looks.
     """
 
-    weight: NDArray[np.float64]
+    weight: _Floats
     pixel_size: _Floats
 
 
@@ -247,7 +247,8 @@ def looker(
 
     It looks from eight views at a time until the next eight find under 2 % more of the Gaussians: an object
     takes 16 views, a park 32 (`docs/benchmarks.md`). The first scene decides how many; for the later ones the
-    views stay the same, so that the sums compare.
+    views stay the same, so that the sums compare. What it tells depends on the scene's content alone, not on
+    the order of its rows.
 
     Args:
         cameras: at most `views` of them are used, evenly spaced.
@@ -256,37 +257,33 @@ def looker(
         progress: told after each view.
 
     Returns:
-        scene → `Seen`.
+        scene → `Seen`; the scene's arrays are C-contiguous and float32, but for its means.
     """
     sample = np.unique(np.linspace(0, len(cameras) - 1, min(views, len(cameras))).round().astype(int))
     full = cameras.take(sample)
     small = full.resized(longest)
-    factor = float((small.widths / full.widths).mean())
+    factor = np.float32((small.widths / full.widths).mean())
     apart = max(1, math.ceil(len(small) / _GLANCE))
-    glances = [small.take(np.arange(first, len(small), apart)) for first in _spread(apart)]
-
+    glances = [range(first, len(small), apart) for first in _spread(apart)]
     enough, settings = 0, RasterSettings()
-
-    def glance(scene: Splats, number: int) -> Seen:
-        sums = visibility(scene, glances[number], progress, settings=settings)
-        return Seen(sums.weight, sums.pixel_size * factor)
 
     def look(scene: Splats) -> Seen:
         nonlocal enough, settings
+        sums = _core.Look(scene)
+        here = small.recentred(scene.offset)
         if not enough:  # a near plane in the scene's own unit
-            middle = np.median(scene.means[:: max(1, len(scene) // 4096)], axis=0) + scene.offset
-            distance = np.median(np.linalg.norm(full.positions - middle, axis=1))
+            distance = np.median(np.linalg.norm(here.positions - sums.origin, axis=1))
             settings = RasterSettings(near=_NEAR * float(distance) or None)
-        seen, done = glance(scene, 0), 1
-        while done < (enough or len(glances)):
-            more = glance(scene, done)
-            new = np.count_nonzero((more.weight > 0) & (seen.weight == 0))
-            seen = Seen(seen.weight + more.weight, np.minimum(seen.pixel_size, more.pixel_size))
-            done += 1
-            if not enough and new < _CONVERGED * len(scene):
+        seen = 0
+        for number, glance in enumerate(glances, 1):
+            views = [view_of(here, i, settings) for i in glance]
+            before, seen = seen, sums.add(views, settings.choices, counter(progress, "visibility"))
+            converged = number > 1 and seen - before < _CONVERGED * len(scene)
+            if number == enough or (not enough and converged):
                 break
-        enough = done
-        return seen
+        enough = number
+        weight, pixel_size = sums.by_row()
+        return Seen(weight, pixel_size * factor)
 
     return look
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -58,6 +60,31 @@ def test_gives_a_flat_scene_bands_of_its_own() -> None:
     found = adapt(flat, TeacherRenders(ball, TRAIN), AdaptConfig(steps=200, sh_degree=2))
     assert found.splats.sh_degree == 2
     assert found.splats.shN.any()
+
+
+@pytest.mark.parametrize("stop", [7, 520])
+def test_ctrl_c_then_resume_is_never_having_stopped(stop: int, tmp_path: Path) -> None:
+    ball = checkered_ball(200)
+    start, targets = pale(ball), TeacherRenders(ball, TRAIN.resized(24))
+    config = AdaptConfig(steps=1500, tolerance=0)
+    whole = adapt(start, targets, config)
+    told = 0
+
+    def stop_there(stage: str, done: int, total: int, info: object = None) -> None:
+        nonlocal told
+        told += 1
+        if told == stop:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        adapt(start, targets, config, work=tmp_path, progress=stop_there)
+    assert (tmp_path / "stretches.npz").exists() == (stop > 500)
+    resumed = adapt(start, targets, config, work=tmp_path)
+    for name in ("logit_opacities", "sh0", "shN", "means"):
+        np.testing.assert_array_equal(getattr(resumed.splats, name), getattr(whole.splats, name))
+    assert resumed.report["stretches"] == whole.report["stretches"]
+    with pytest.raises(InputError, match="other options"):
+        adapt(start, targets, replace(config, seed=1), work=tmp_path)
 
 
 def test_refuses_what_makes_no_sense() -> None:

@@ -13,7 +13,8 @@ from scenes import around, checkered_ball
 
 from g2ard import io
 from g2ard.bench import rows
-from g2ard.bench.recover import Look, RecoverBench, bench_recover, speedups
+from g2ard.bench.recover import Look, RecoverBench, bench_recover
+from g2ard.bench.speedup import speedups
 from g2ard.errors import InputError
 
 

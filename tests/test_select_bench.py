@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from scenes import checkered_ball
 
-from g2ard.bench.select import ARMS, Trial, bench_select, read_trials, summary
+from g2ard.bench import rows as table
+from g2ard.bench.select import ARMS, Trial, bench_select, summary
 from g2ard.bench.select_stands import Size, Stand, pool_of, stand
 from g2ard.errors import InputError
 from g2ard.io import write_splats
@@ -63,14 +64,14 @@ def test_every_arm_runs_once_and_never_again(scene: Path, tmp_path: Path) -> Non
         assert (t.psnr_crowd is None) == (t.pool == "even")
     assert any(cache.rglob("*.npy"))
     before = path.read_bytes()
-    assert bench_select([scene], path, **FEW) == read_trials(path)  # type: ignore[arg-type]
+    assert bench_select([scene], path, **FEW) == table.read(path, Trial)  # type: ignore[arg-type]
     assert path.read_bytes() == before
     with pytest.raises(InputError, match="4 steps at 48 pixels"):
         bench_select([scene], path, **{**FEW, "steps": 5})  # type: ignore[arg-type]
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(lines[:1] + lines[4:]))  # as if stopped, three trials short
     again = bench_select([scene], path, cache=cache, **FEW)  # type: ignore[arg-type]
-    assert len(read_trials(path)) == len(trials)
+    assert len(table.read(path, Trial)) == len(trials)
     figures = [(t.key, round(t.psnr_in, 4), round(t.ssim_out, 4)) for t in trials]
     assert [(t.key, round(t.psnr_in, 4), round(t.ssim_out, 4)) for t in again] == figures
 
@@ -118,4 +119,4 @@ def test_the_command_prints_gains(scene: Path, tmp_path: Path, command_line: Com
     )  # fmt: skip
     assert status == 0, error
     assert "auto" in out + error
-    assert len(read_trials(tmp_path / "s.csv")) == 3
+    assert len(table.read(tmp_path / "s.csv", Trial)) == 3

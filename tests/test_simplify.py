@@ -169,6 +169,10 @@ def test_identical_gaussians_keep_their_shape(method):
     np.testing.assert_array_equal(out.means, prior.means[:1])
     np.testing.assert_allclose(np.sort(out.scales[0]), np.sort(prior.scales[0]), rtol=1e-5)
     np.testing.assert_allclose(out.sh0, prior.sh0[:1], rtol=1e-6)
+    grown = simplify(prior, 1, method=method).splats  # α = 0.99 cannot hold the mass of a thousand
+    factors = np.sort(grown.scales[0]) / np.sort(prior.scales[0])
+    growth = 1.0 if method == "paper" else 1.25**0.5
+    np.testing.assert_allclose(factors, [1, growth, growth], rtol=1e-5)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -327,7 +331,10 @@ def test_what_is_seen_is_kept_finer(method):
     seen = Views(np.where(left, 100.0, 0.0), np.where(left, 0.01, np.inf))
     out = simplify(prior, 400, method=method, visibility=seen)
     assert_sound(out, 4000, 400)
-    assert (out.splats.means[:, 0] < 0).mean() > 0.6
+    blind = simplify(prior, 400, method=method).splats
+    share, unguided = (np.mean(s.means[:, 0] < 0) for s in (out.splats, blind))
+    assert share > 0.6
+    assert share > 5 * unguided  # detail draws the blind one to the other half
     with pytest.raises(InputError, match=r"visibility.weight: expected shape \(4000,\)"):
         simplify(prior, 400, method=method, visibility=Views(np.ones(3), np.ones(4000)))
 

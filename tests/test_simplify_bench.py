@@ -8,7 +8,8 @@ import pytest
 from scenes import around, checkered_ball
 
 from g2ard import io
-from g2ard.bench.simplify import Cell, bench_simplify, find_splat_transform, read_cells
+from g2ard.bench import rows as table
+from g2ard.bench.simplify import Cell, bench_simplify, find_splat_transform
 from g2ard.errors import InputError
 
 METHODS = ("default", "fast", "paper", "nanogs", "lightgaussian")
@@ -19,7 +20,7 @@ def test_measures_writes_and_resumes(tmp_path: Path) -> None:
     io.write_splats(scene, checkered_ball(2000))
     io.write_views(views, around(16))
     cells = bench_simplify([scene], csv, ratios=[4], methods=METHODS, views=views)
-    assert read_cells(csv) == [_rounded(c) for c in cells]
+    assert table.read(csv, Cell) == [_rounded(c) for c in cells]
     assert [c.key for c in cells] == [("ball", 4.0, m) for m in METHODS]
     for c in cells:
         assert (c.error, c.input_count, c.budget, c.count, c.views) == ("", 2000, 500, 500, 2)
@@ -42,17 +43,17 @@ def test_measures_writes_and_resumes(tmp_path: Path) -> None:
     )
     assert failed.error == "exit status 7: it broke 1.2"
     assert failed.version == "it broke 1.2"
-    assert len(read_cells(csv)) == 6  # in the old failure's place
+    assert len(table.read(csv, Cell)) == 6  # in the old failure's place
 
 
 def _rounded(cell: Cell) -> Cell:
-    return Cell(**{k: round(v, 4) if isinstance(v, float) else v for k, v in vars(cell).items()})
+    return Cell(**{k: round(v, 6) if isinstance(v, float) else v for k, v in vars(cell).items()})
 
 
 def test_refuses_a_foreign_file_an_unknown_method_and_an_absent_program(tmp_path: Path) -> None:
     csv = tmp_path / "mine.csv"
     csv.write_text("a,b\n1,2\n")
-    with pytest.raises(InputError, match="not a CSV"):
+    with pytest.raises(InputError, match="other columns"):
         bench_simplify([], csv)
     assert csv.read_text() == "a,b\n1,2\n"
     with pytest.raises(InputError, match="magic"):

@@ -13,6 +13,7 @@ import numpy as np
 
 from g2ard import __version__, io
 from g2ard.bench import rows
+from g2ard.bench.recover_studies import STUDIES, Plan
 from g2ard.bench.simplify import machine, scene_label
 from g2ard.cameras import Cameras
 from g2ard.distill import DistillConfig, distill
@@ -22,23 +23,20 @@ from g2ard.lift import lift
 from g2ard.poses import make_pool
 from g2ard.progress import Progress, silent
 from g2ard.recover import RecoverConfig, recover
-from g2ard.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, drift95, effective_rank, needle
+from g2ard.recover.anchors import PAPER_PRESETS, Anchors, drift95, effective_rank, needle
 from g2ard.recover.presets import preset_for
-from g2ard.recover.schedule import PAPER, TUNED, Schedule
+from g2ard.recover.schedule import PAPER
 from g2ard.render import looker
 from g2ard.simplify import simplify
 from g2ard.splats import Splats
 from g2ard.splits import HOLD_OUT, split_mask
 from g2ard.targets import Photos, Targets, TeacherRenders
 
-__all__ = ["STUDIES", "Look", "RecoverBench", "Speedup", "bench_recover", "speedups"]
+__all__ = ["STUDIES", "Look", "RecoverBench", "bench_recover"]
 
 _POOL = 128
 _FIRST_LOOK = 25
 """Unseen views are looked at after this many steps of a recovery, then after twice as many, and so on."""
-
-_PAPER_FINAL = 3_000
-"""The paper's 30,000 and 8,000 steps, at a tenth."""
 
 
 @dataclass(frozen=True)
@@ -95,70 +93,6 @@ class Look:
     def key(self) -> tuple[str, str, float, int, str]:
         """The run it belongs to."""
         return self.study, self.scene, self.ratio, self.seed, self.variant
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """What a variant does."""
-
-    schedule: Schedule
-    steps: int | None = None
-    time_limit: float | None = None
-    regularizers: Regularizers | None = None
-
-
-def _curves(steps: Sequence[int], seconds: float, preset: Regularizers) -> dict[str, _Plan]:
-    """The default over several horizons, the paper's schedule at a tenth, and that with a decay."""
-    paper = PAPER.scaled(_PAPER_FINAL)
-    plans = {f"default@{n}": _Plan(TUNED, steps=n) for n in steps}
-    plans["paper/10"] = _Plan(paper)
-    plans["paper/10-decay"] = _Plan(replace(paper, cosine_floor=TUNED.cosine_floor))
-    return plans
-
-
-def _regularizers(steps: Sequence[int], seconds: float, preset: Regularizers) -> dict[str, _Plan]:
-    parts = {
-        "full": preset,
-        "-anchor": replace(preset, anchor=0.0),
-        "-shape": replace(preset, shape=0.0),
-        "none": replace(preset, anchor=0.0, shape=0.0),
-    }
-    return {name: _Plan(TUNED, steps=steps[-1], regularizers=weights) for name, weights in parts.items()}
-
-
-def _rounds(steps: Sequence[int], seconds: float, preset: Regularizers) -> dict[str, _Plan]:
-    """Equal recovery seconds: one shot, or shared with rounds in the paper's proportion or a lighter one."""
-    shares = {"one-shot": 0.0, "rounds": PAPER.round_steps / PAPER.steps, "light-rounds": 0.05}
-    return {
-        name: _Plan(replace(TUNED, round_steps=round(share * TUNED.steps)), time_limit=seconds)
-        for name, share in shares.items()
-    }
-
-
-def _multiplier(steps: Sequence[int], seconds: float, preset: Regularizers) -> dict[str, _Plan]:
-    fixed = {"×0.33": 1 / 3, "×0.58": 3**-0.5, "×1": 1.0, "×1.73": 3**0.5}
-    plans = {name: _Plan(replace(TUNED, multiplier=m), steps=steps[-1]) for name, m in fixed.items()}
-    return {**plans, "chosen": _Plan(TUNED, steps=steps[-1])}
-
-
-def _endurance(steps: Sequence[int], seconds: float, preset: Regularizers) -> dict[str, _Plan]:
-    return {"default": _Plan(TUNED, steps=5000)}
-
-
-def _paper(steps: Sequence[int], seconds: float, preset: Regularizers) -> dict[str, _Plan]:
-    return {"paper": _Plan(PAPER), **{f"default@{n}": _Plan(TUNED, steps=n) for n in steps}}
-
-
-STUDIES: dict[str, Callable[[Sequence[int], float, Regularizers], dict[str, _Plan]]] = {
-    "curves": _curves,
-    "regularizers": _regularizers,
-    "rounds": _rounds,
-    "multiplier": _multiplier,
-    "endurance": _endurance,
-    "paper": _paper,
-}
-"""curves: against the paper's schedule at a tenth; paper: against all of it; rounds: at equal seconds;
-endurance: 5,000 steps, fails on a value that is not finite."""
 
 
 @dataclass(frozen=True)
@@ -322,7 +256,7 @@ def _whole(looks: Sequence[Look]) -> list[Look]:
 class _Run:
     """One recovery, or a chain of them, with its looks."""
 
-    def __init__(self, bench: RecoverBench, key: tuple[str, str, float, int, str], plan: _Plan) -> None:
+    def __init__(self, bench: RecoverBench, key: tuple[str, str, float, int, str], plan: Plan) -> None:
         self.bench, self.key, self.plan = bench, key, plan
         self.budget = max(1, int(np.floor(len(bench.prior) / key[2] + 0.5)))
         self.found: list[Look] = []
@@ -438,63 +372,3 @@ def _check_finite(splats: Splats, losses: Sequence[float]) -> None:
     ]
     if bad or not np.isfinite(losses).all():
         raise InputError(f"recovery: not finite: {', '.join(bad) or 'the loss'}")
-
-
-@dataclass(frozen=True)
-class Speedup:
-    """How soon the default is as good as another schedule's result.
-
-    Args:
-        scene: its label.
-        ratio: prior over budget.
-        seed: of the order of views.
-        against: the other variant.
-        psnr: its result.
-        seconds: it took.
-        reached_s: seconds of the fastest default run at its first look that is as good; None if none is.
-        best_psnr: of the default runs.
-    """
-
-    scene: str
-    ratio: float
-    seed: int
-    against: str
-    psnr: float
-    seconds: float
-    reached_s: float | None
-    best_psnr: float
-
-    @property
-    def share(self) -> float | None:
-        """Of the other's time."""
-        return None if self.reached_s is None else self.reached_s / self.seconds
-
-
-def speedups(looks: Sequence[Look]) -> list[Speedup]:
-    """Each final row of a variant not called default@…, against the default rows of its scene."""
-    found = []
-    for other in looks:
-        if not other.final or other.variant.startswith("default@"):
-            continue
-        rivals = [
-            look
-            for look in looks
-            if look.variant.startswith("default@")
-            and look.count == look.budget
-            and look.key[:4] == other.key[:4]
-        ]
-        if rivals:
-            reached = [look.seconds for look in rivals if look.psnr >= other.psnr]
-            found.append(
-                Speedup(
-                    other.scene,
-                    other.ratio,
-                    other.seed,
-                    other.variant,
-                    other.psnr,
-                    other.seconds,
-                    min(reached, default=None),
-                    max(look.psnr for look in rivals),
-                )
-            )
-    return found

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.bench import rows as table
 from g2ard.bench.select_stands import KINDS, Pool, Size, Stand, label, pool_of, stand
 from g2ard.bench.simplify import machine
 from g2ard.errors import InputError
 from g2ard.evaluate import evaluate
-from g2ard.io.atomic import atomic_output
 from g2ard.progress import Progress, silent
 from g2ard.recover import RecoverConfig, recover
 from g2ard.select import POLICIES, CoverageOptions, Selection, select
 from g2ard.targets import Subset, Targets
 
-__all__ = ["ARMS", "Trial", "bench_select", "read_trials", "summary"]
+__all__ = ["ARMS", "Trial", "bench_select", "summary"]
 
 ARMS = ("random", "pose-diverse", "coverage", "directional", "auto", "auto+weights", "pool", "pool+weights")
 """Policies, "+weights" where recovery draws by the selection's weights; pool is all candidates."""
@@ -127,7 +126,7 @@ def bench_select(
         if unknown := [g for g in given if g not in known]:
             raise InputError(f"{name}: expected some of {', '.join(known)}, got {', '.join(unknown)}")
     size = size or Size()
-    done = {trial.key: trial for trial in read_trials(csv_path)}
+    done = {trial.key: trial for trial in table.read(csv_path, Trial)}
     for trial in done.values():
         if trial.scene in map(label, scenes) and (trial.steps, trial.pixels) != (steps, size.pixels):
             raise InputError(
@@ -141,7 +140,7 @@ def bench_select(
         for pool in pools
         for arm, percent, draw in _plan(arms, percents, draws)
     ]
-    _rewrite(csv_path, list(done.values()))
+    table.rewrite(csv_path, done.values(), Trial)
     finished = sum(key in done for key in wanted)
     for scene in scenes:
         missing = [key for key in wanted if key[0] == label(scene) and key not in done]
@@ -152,7 +151,7 @@ def bench_select(
         bench = _Bench(stand(scene, size, cache=folder, progress=progress), size, steps)
         for key in missing:
             trial = bench.run(*key)
-            _append(csv_path, trial)
+            table.append(csv_path, [trial])
             done[key] = trial
             finished += 1
             progress("bench select", finished, len(wanted), {key[0]: f"{key[1]} {key[2]} {key[3]:g} %"})
@@ -272,47 +271,3 @@ def summary(trials: Sequence[Trial]) -> list[dict[str, float | str]]:
 
 def _both(trial: Trial) -> NDArray[np.float64]:
     return np.array([trial.psnr_in, trial.psnr_out])
-
-
-def read_trials(path: Path) -> list[Trial]:
-    """The rows of a CSV; none if there is no such file.
-
-    Raises:
-        InputError: it is not one that `bench_select` wrote.
-    """
-    if not path.exists():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = csv.DictReader(file)
-        if rows.fieldnames != [f.name for f in fields(Trial)]:
-            raise InputError(f"{path}: not a CSV of `g2ard bench select`")
-        return [_trial(path, number, row) for number, row in enumerate(rows, 2)]
-
-
-def _trial(path: Path, line: int, row: dict[str, str]) -> Trial:
-    text = {"scene", "pool", "arm", "machine"}
-    whole = {"seed", "draw", "candidates", "k", "steps", "gaussians", "pixels"}
-    try:
-        values = {
-            name: value if name in text else int(value) if name in whole else float(value) if value else None
-            for name, value in row.items()
-        }
-        return Trial(**values)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        raise InputError(f"{path}: line {line}: not a row of `g2ard bench select`") from None
-
-
-def _line(trial: Trial) -> dict[str, object]:
-    return {k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(trial).items()}
-
-
-def _rewrite(path: Path, trials: Sequence[Trial]) -> None:
-    with atomic_output(path, overwrite=True) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [f.name for f in fields(Trial)], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(map(_line, trials))
-
-
-def _append(path: Path, trial: Trial) -> None:
-    with path.open("a", newline="", encoding="utf-8") as file:
-        csv.DictWriter(file, [f.name for f in fields(Trial)], lineterminator="\n").writerow(_line(trial))

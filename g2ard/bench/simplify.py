@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from g2ard import __version__, baselines, io
+from g2ard.bench import rows as table
 from g2ard.bench.process import measured
 from g2ard.bench.raster import cpu_name
 from g2ard.cameras import Cameras
@@ -33,7 +33,6 @@ __all__ = [
     "bench_simplify",
     "find_splat_transform",
     "machine",
-    "read_cells",
     "scene_label",
 ]
 
@@ -142,8 +141,8 @@ def bench_simplify(
     unknown = [m for m in methods if m not in METHODS]
     if unknown:
         raise InputError(f"methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown)}")
-    done = {cell.key: cell for cell in read_cells(csv_path) if not cell.error}
-    _rewrite(csv_path, list(done.values()))
+    done = {cell.key: cell for cell in table.read(csv_path, Cell) if not cell.error}
+    table.rewrite(csv_path, done.values(), Cell)
     wanted = [(p, (scene_label(p), float(r), m)) for p in scenes for r in ratios for m in methods]
     total, finished = len(wanted), sum(key in done for _, key in wanted)
     versions = {m: _version(m, splat_transform) for m in methods}
@@ -155,7 +154,7 @@ def bench_simplify(
             stand = _Stand(Path(folder), _readable(scene), views, splat_transform, seed)
             for key in missing:
                 cell = replace(stand.measure(*key), version=versions[key[2]], machine=machine())
-                _append(csv_path, cell)
+                table.append(csv_path, [cell])
                 done[key] = cell
                 finished += 1
                 progress("bench simplify", finished, total, {key[0]: f"{key[1]:g}× {key[2]}"})
@@ -246,52 +245,3 @@ def find_splat_transform(given: Path | None) -> Path | None:
     if given is not None and found is None:
         raise InputError(f"{given}: no such program")
     return Path(found) if found else None
-
-
-def read_cells(path: Path) -> list[Cell]:
-    """The rows of a CSV; none if there is no such file.
-
-    Raises:
-        InputError: it is not one that `bench_simplify` wrote.
-    """
-    if not path.exists():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = csv.DictReader(file)
-        if rows.fieldnames != [f.name for f in fields(Cell)]:
-            raise InputError(f"{path}: not a CSV of `g2ard bench simplify`")
-        return [_cell(path, number, row) for number, row in enumerate(rows, 2)]
-
-
-def _cell(path: Path, line: int, row: dict[str, str]) -> Cell:
-    text = {"scene", "method", "version", "machine", "error"}
-    whole = {"input_count", "budget", "count", "views"}
-    try:
-        return Cell(**{k: v if k in text else _number(v, k in whole) for k, v in row.items()})  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        raise InputError(f"{path}: line {line}: not a row of `g2ard bench simplify`") from None
-
-
-def _number(value: str, whole: bool) -> float | int | None:
-    if not value:
-        return None
-    return int(value) if whole else float(value)
-
-
-def _lines(cells: Sequence[Cell]) -> Iterator[dict[str, object]]:
-    for cell in cells:
-        yield {k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(cell).items()}
-
-
-def _rewrite(path: Path, cells: Sequence[Cell]) -> None:
-    from g2ard.io.atomic import atomic_output
-
-    with atomic_output(path, overwrite=True) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [f.name for f in fields(Cell)], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(_lines(cells))
-
-
-def _append(path: Path, cell: Cell) -> None:
-    with path.open("a", newline="", encoding="utf-8") as file:
-        csv.DictWriter(file, [f.name for f in fields(Cell)], lineterminator="\n").writerows(_lines([cell]))

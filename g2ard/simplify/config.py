@@ -29,7 +29,8 @@ class SimplifyConfig:
         min_opacity: below this α a Gaussian is dropped; None means the method's own, 0.01 in the paper, 0.004
             (what no renderer draws) for the others.
         neighbors: `default`: nearest clusters that one may merge with. More lets far ones in: 16 is worse.
-        geometric_weight: of `default` and `fast`: weight of the error of coverage beside that of colour.
+        geometric_weight: of `default` and `fast`: weight of the error of coverage beside that of colour; a
+            third of it without views, for most of what it would then weigh lies hidden.
         dilation: of `default` and `fast`: standard deviation of the blur that renderers add, in pixels
             (√0.3 would be all of it; 0.4 measured best).
         pixel_scale: of `default` and `fast` without views: the size of a pixel over the median of the largest
@@ -49,7 +50,7 @@ class SimplifyConfig:
     neighbors: int = 6
     geometric_weight: float = 0.03
     dilation: float = 0.4
-    pixel_scale: float = 0.5
+    pixel_scale: float = 0.2
     max_growth: float = 1.25
     color_bin: float = 0.25
     max_energy: float = 0.01

@@ -23,6 +23,9 @@ _LADDER = {"default": (3.0, 1), "fast": (1.0, 3)}
 """Down to how many times the budget rows merge along Morton order, and in how many steps. A stage before the
 last does so all the way."""
 
+_BLIND = 1 / 3
+"""How much of its weight the error of coverage has where nothing is known of what views see."""
+
 _REFRESH = 0.3
 """Visibility is looked at again when the count has fallen to this share of what it was."""
 
@@ -81,7 +84,7 @@ def merge(
         ladder=ladder if last else 1.0,
         ladder_steps=steps,
         neighbors=config.neighbors,
-        geometric=config.geometric_weight,
+        geometric=config.geometric_weight * (_BLIND if seen is None else 1.0),
         dilation=config.dilation,
         pixel_scale=config.pixel_scale,
         growth=config.max_growth,
@@ -98,14 +101,8 @@ def merge_looking(
     config: SimplifyConfig,
     progress: Progress,
 ) -> dict[str, Any]:
-    """As many stages as the refreshes are worth; what they join is then made of its raw members.
-
-    The scene is looked at in an order that only its content decides: of equals at one depth the first hides
-    the others.
-    """
-    order = _core.simplify_order(scene)
-    whole = scene = scene.take(order)
-    sorted_flags = part = None if flags is None else np.ascontiguousarray(flags[order])
+    """As many stages as the refreshes are worth; what they join is then made of its raw members."""
+    whole, part = scene, flags
     tell = counter(progress, "simplify")
     first = seen = rows_of(look(scene), len(scene), slice(None))
     parents = np.arange(len(scene))
@@ -126,7 +123,7 @@ def merge_looking(
             whole,
             parents,
             budget,
-            protected=sorted_flags,
+            protected=flags,
             weight=first.weight,
             pixel_size=first.pixel_size,
             dilation=config.dilation,
@@ -134,11 +131,10 @@ def merge_looking(
             growth=config.max_growth,
         )
     merged = splats_of(whole, out)
-    scales = _resized(merged, parents, first.weight, look(merged).weight)
+    order = _core.simplify_order(whole)  # sums round alike whatever the order of the rows
+    scales = _resized(merged, parents[order], first.weight[order], look(merged).weight)
     resized = int(np.count_nonzero((scales != merged.scales).any(axis=1)))
-    by_row = np.empty(len(whole), np.int64)
-    by_row[order] = parents
-    return {**out, "scales": scales, "parents": by_row, "rounds": rounds, "resized": resized}
+    return {**out, "scales": scales, "parents": parents, "rounds": rounds, "resized": resized}
 
 
 def _resized(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def discs(points, neighbors=10, normal_ratio=0.1, max_anisotropy=4.0, spread=0.75):
+def discs(points, neighbors=10, normal_ratio=0.1, max_anisotropy=4.0, spread=0.94):
     """(normals (N, 3), scales (N, 3)) of points whose neighbourhoods all have an extent."""
     points = np.asarray(points, np.float64)
     normals, scales = np.empty_like(points), np.empty_like(points)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -26,6 +28,7 @@ def adapt(
     sh_degree: Annotated[
         int | None, typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's if not given.")
     ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a stopped run.")] = False,
     split: SplitOption = "train",
     size: SizeOption = None,
     background: BackgroundOption = None,
@@ -50,8 +53,21 @@ def adapt(
         background=colour,
         seed=run.seed,
     )
-    result = refit(splats, make_targets(run, cameras, dense, colour), config, progress=run.progress)
+    work = output.with_name(f".{output.name}.work")
+    if not resume:
+        shutil.rmtree(work, ignore_errors=True)
+    targets = make_targets(run, cameras, dense, colour)
+    work.mkdir(exist_ok=True)
+    try:
+        result = refit(splats, targets, config, work=work, progress=run.progress)
+    except KeyboardInterrupt:
+        run.say(f"stopped; the same command with --resume goes on from {work}")
+        raise
+    finally:
+        with suppress(OSError):  # it stays if it holds a checkpoint
+            work.rmdir()
     write_splats(output, result.splats, overwrite=run.overwrite)
+    shutil.rmtree(work, ignore_errors=True)
     gain, end = result.report["psnr"], "converged" if result.report["converged"] else "all steps taken"
     run.say(
         f"{output}: {len(splats):,} Gaussians, {result.report['steps']:,} steps ({end}), "

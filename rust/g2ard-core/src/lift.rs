@@ -25,7 +25,7 @@ impl Default for LiftConfig {
             neighbors: 10,
             normal_ratio: 0.1,
             max_anisotropy: 4.0,
-            spread: 0.75,
+            spread: 0.94,
         }
     }
 }
@@ -206,7 +206,7 @@ mod tests {
     fn hardly_any_points() {
         assert!(lifted(&[]).quats.is_empty());
         assert_eq!(lifted(&[[5.0; 3]]).scales[0][0], 1.0);
-        assert_eq!(lifted(&[[0.0; 3], [2.0, 0.0, 0.0]]).scales[0][0], 0.75);
+        assert_eq!(lifted(&[[0.0; 3], [2.0, 0.0, 0.0]]).scales[0][0], 0.94);
     }
 
     #[test]

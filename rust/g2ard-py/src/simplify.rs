@@ -1,7 +1,8 @@
 //! `g2ard.simplify`.
 
 use g2ard_core::simplify::{
-    Means, Ordered, Outcome, Pairwise, PairwiseRound, Paper, PaperRound, SceneRef, Seen, flags,
+    Look, Means, Ordered, Outcome, Pairwise, PairwiseRound, Paper, PaperRound, SceneRef, Seen,
+    flags,
 };
 use numpy::{
     PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
@@ -12,6 +13,7 @@ use pyo3::types::PyDict;
 
 use crate::arrays;
 use crate::device::{backend, kernels};
+use crate::raster::{Choices, View};
 use crate::work::long;
 
 /// Means in whichever float the caller holds them.
@@ -192,6 +194,59 @@ fn simplify_order<'py>(
     Ok(PyArray1::from_vec(py, ordered.rows))
 }
 
+/// What views see of a scene, view by view.
+#[pyclass(name = "Look")]
+struct PyLook(Look);
+
+#[pymethods]
+impl PyLook {
+    #[new]
+    fn new(py: Python<'_>, scene: PyScene<'_>) -> PyResult<Self> {
+        let scene = scene.borrow()?;
+        Ok(Self(long(py, None, |_| Look::new(&scene))?))
+    }
+
+    /// The scene's median point.
+    #[getter]
+    fn origin(&self) -> [f64; 3] {
+        self.0.origin()
+    }
+
+    /// Adds views; returns how many rows have been seen so far.
+    #[pyo3(signature = (views, choices, progress = None))]
+    fn add(
+        &mut self,
+        py: Python<'_>,
+        views: Vec<View>,
+        choices: Choices,
+        progress: Option<&Bound<'_, PyAny>>,
+    ) -> PyResult<usize> {
+        let settings = choices.settings()?;
+        let look = &mut self.0;
+        long(py, progress, |control| {
+            control.begin(views.len() as u64);
+            for view in &views {
+                control.check()?;
+                look.add(&view.camera(), &settings)?;
+                control.advance(1);
+            }
+            Ok(look.seen())
+        })
+    }
+
+    /// (N,) Σ αT and (N,) the smallest size of a pixel, ∞ where no view looks.
+    fn by_row<'py>(
+        &self,
+        py: Python<'py>,
+    ) -> (Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<f32>>) {
+        let (weight, pixel) = self.0.by_row();
+        (
+            PyArray1::from_vec(py, weight),
+            PyArray1::from_vec(py, pixel),
+        )
+    }
+}
+
 /// One Gaussian for each cluster of `parents`, from its raw members.
 #[pyfunction]
 #[pyo3(signature = (
@@ -292,6 +347,7 @@ fn outcome_dict<'py, R>(
 }
 
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_class::<PyLook>()?;
     m.add_function(wrap_pyfunction!(simplify_flags, m)?)?;
     m.add_function(wrap_pyfunction!(simplify_paper, m)?)?;
     m.add_function(wrap_pyfunction!(simplify_order, m)?)?;

@@ -41,8 +41,45 @@ impl Accumulated {
     }
 }
 
-/// One pair's sums: weight, transmittance, hits, dominant, peak.
-pub type Share = [f32; 5];
+/// Sums that threads add to, each to rows of its own.
+#[derive(Clone, Copy)]
+pub(super) struct SharedSums {
+    weight: Shared<f64>,
+    transmittance: Shared<f64>,
+    hits: Shared<u64>,
+    dominant: Shared<u64>,
+    peak: Shared<f32>,
+}
+
+impl SharedSums {
+    pub fn new(sums: &mut Accumulated) -> Self {
+        Self {
+            weight: Shared::new(&mut sums.weight),
+            transmittance: Shared::new(&mut sums.transmittance),
+            hits: Shared::new(&mut sums.hits),
+            dominant: Shared::new(&mut sums.dominant),
+            peak: Shared::new(&mut sums.peak),
+        }
+    }
+
+    /// # Safety
+    /// The sums are still there, have the row, and no other thread touches it meanwhile.
+    pub unsafe fn add(self, row: usize, total: &Total) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            *self.weight.at(row) += total.weight;
+            *self.transmittance.at(row) += total.transmittance;
+            *self.hits.at(row) += total.hits;
+            *self.dominant.at(row) += total.dominant;
+            let peak = self.peak.at(row);
+            *peak = (*peak).max(total.peak);
+        }
+    }
+}
+
+/// How many sums a pair has: its weight alone, or transmittance, hits, dominant and peak as well.
+pub const WEIGHT: usize = 1;
+pub const ALL: usize = 5;
 
 /// A block's state from front to back; what a pair touches lies side by side.
 #[derive(Clone, Copy)]
@@ -54,18 +91,18 @@ struct Block {
     winner: Row,
 }
 
-/// Blends one tile from front to back without an image: only every pair's sums, each in its own slot.
-pub struct Accumulate<'a> {
+/// Blends one tile from front to back without an image: only every pair's `KINDS` sums, each in its own slot.
+pub struct Accumulate<'a, const KINDS: usize> {
     pub pairs: &'a [Pair],
     pub splats: &'a [Splat],
     pub place: Place,
     pub settings: &'a Settings,
     pub staged: &'a mut Staged,
-    pub slots: Shared<Share>,
+    pub slots: Shared<[f32; KINDS]>,
     pub written: Shared<u8>,
 }
 
-impl Kernel for Accumulate<'_> {
+impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
     type Output = ();
 
     #[inline(always)]
@@ -114,23 +151,25 @@ impl Kernel for Accumulate<'_> {
                     }
                     let go = hit.and(going);
                     let w = (a * t).only(go);
-                    let most = F::load(&block.most);
-                    let winner = F::load(&block.winner);
-                    F::select(w.gt(most), number, winner).store(&mut block.winner);
-                    most.max(w).store(&mut block.most);
                     weight = weight + w;
-                    light = light + t.only(go);
-                    peak = peak.max(w);
                     hits += go.bits().count_ones();
+                    if KINDS == ALL {
+                        let most = F::load(&block.most);
+                        let winner = F::load(&block.winner);
+                        F::select(w.gt(most), number, winner).store(&mut block.winner);
+                        most.max(w).store(&mut block.most);
+                        light = light + t.only(go);
+                        peak = peak.max(w);
+                    }
                 }
                 if hits > 0 {
-                    let share = [
-                        folded(weight, add),
-                        folded(light, add),
-                        hits as f32,
-                        0.0,
-                        folded(peak, larger),
-                    ];
+                    let mut share = [folded(weight, add); KINDS];
+                    if KINDS == ALL {
+                        share[1] = folded(light, add);
+                        share[2] = hits as f32;
+                        share[3] = 0.0;
+                        share[4] = folded(peak, larger);
+                    }
                     // SAFETY: a slot belongs to one pair, and a pair to one tile.
                     unsafe {
                         self.slots.write(pair.slot as usize, share);
@@ -143,7 +182,7 @@ impl Kernel for Accumulate<'_> {
             }
         }
         for number in blocks.iter().flat_map(|block| block.winner.0) {
-            if number >= 0.0 {
+            if KINDS == ALL && number >= 0.0 {
                 let slot = self.pairs[number as usize].slot as usize;
                 // SAFETY: as above.
                 unsafe { self.slots.slice(slot, 1)[0][3] += 1.0 };
@@ -177,20 +216,34 @@ fn folded<F: Lanes>(lanes: F, with: impl Fn(f32, f32) -> f32) -> f32 {
     row.0[0]
 }
 
-/// Adds one splat's slots to its row, in slot order. Returns (weight, transmittance, hits, dominant, peak).
-pub fn total(splat: &Splat, slots: &[Share], written: &[u8]) -> (f64, f64, u64, u64, f32) {
-    let mut sum = (0.0, 0.0, 0, 0, 0f32);
-    for slot in splat.slot as usize..(splat.slot + splat.tiles) as usize {
-        if written[slot] != 0 {
-            let s = &slots[slot];
-            sum.0 += f64::from(s[0]);
-            sum.1 += f64::from(s[1]);
-            sum.2 += s[2] as u64;
-            sum.3 += s[3] as u64;
-            sum.4 = sum.4.max(s[4]);
+/// One Gaussian's sums over a view: see [`Accumulated`]. Zero but for the weight if no others were asked for.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Total {
+    pub weight: f64,
+    pub transmittance: f64,
+    pub hits: u64,
+    pub dominant: u64,
+    pub peak: f32,
+}
+
+impl Total {
+    /// Adds up one splat's slots, in slot order.
+    pub fn of<const KINDS: usize>(splat: &Splat, slots: &[[f32; KINDS]], written: &[u8]) -> Self {
+        let mut sum = Self::default();
+        for slot in splat.slot as usize..(splat.slot + splat.tiles) as usize {
+            if written[slot] != 0 {
+                let s = &slots[slot];
+                sum.weight += f64::from(s[0]);
+                if KINDS == ALL {
+                    sum.transmittance += f64::from(s[1]);
+                    sum.hits += s[2] as u64;
+                    sum.dominant += s[3] as u64;
+                    sum.peak = sum.peak.max(s[4]);
+                }
+            }
         }
+        sum
     }
-    sum
 }
 
 /// Lowers each row's pixel size to depth / focal length where the mean falls inside the image.

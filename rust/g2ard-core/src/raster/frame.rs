@@ -8,7 +8,7 @@ use std::time::Instant;
 
 use rayon::prelude::*;
 
-use super::accumulate::{Accumulated, Share, smallest_pixels, total};
+use super::accumulate::{ALL, Accumulated, SharedSums, Total, smallest_pixels};
 use super::backward::SUMS;
 use super::covers::{Cover, Lister};
 use super::gradients::{Gather, Gradients, Sink};
@@ -65,7 +65,8 @@ pub struct Rasterizer {
     transmittance: Vec<[Row; BLOCKS]>,
     last: Vec<[Row; BLOCKS]>,
     slots: Vec<[f32; SUMS]>,
-    shares: Vec<Share>,
+    /// The sums of visibility, one pair's after another's.
+    shares: Vec<f32>,
     written: Vec<u8>,
     passes: Passes,
 }
@@ -252,24 +253,35 @@ impl Rasterizer {
             sh_coeffs: 1,
             ..*params
         };
-        self.prepare(colourless, camera, settings, [0.0; 3]);
-        self.accumulate_tiles();
-        for (chunk, &(first, count)) in self.chunks.iter().enumerate() {
-            let slots = self.bins.slots_of(chunk);
-            let (shares, written) = (&self.shares[slots.clone()], &self.written[slots]);
-            for splat in &self.splats[first..first + count] {
-                let (weight, transmittance, hits, dominant, peak) = total(splat, shares, written);
-                let row = splat.row as usize;
-                sums.weight[row] += weight;
-                sums.transmittance[row] += transmittance;
-                sums.hits[row] += hits;
-                sums.dominant[row] += dominant;
-                sums.peak[row] = sums.peak[row].max(peak);
-            }
-        }
+        let rows = SharedSums::new(sums);
+        self.accumulate_from::<ALL, _>(colourless, camera, settings, |row, total| {
+            // SAFETY: every row is told of once.
+            unsafe { rows.add(row, &total) };
+        });
         smallest_pixels(params, camera, &mut sums.pixel_size);
-        self.frame = None; // nothing was blended that a backward pass could go back from
         Ok(())
+    }
+
+    /// Calls `tell(row, its sums)` once for every row that may touch the view's image, in parallel.
+    pub(crate) fn accumulate_from<const KINDS: usize, S: Source>(
+        &mut self,
+        source: S,
+        camera: &Camera,
+        settings: &Settings,
+        tell: impl Fn(usize, Total) + Sync,
+    ) {
+        self.prepare(source, camera, settings, [0.0; 3]);
+        self.accumulate_tiles::<KINDS>();
+        let shares = self.shares.as_chunks::<KINDS>().0;
+        let chunks = self.chunks.par_iter().enumerate();
+        chunks.for_each(|(chunk, &(first, count))| {
+            let slots = self.bins.slots_of(chunk);
+            let (shares, written) = (&shares[slots.clone()], &self.written[slots]);
+            for splat in &self.splats[first..first + count] {
+                tell(splat.row as usize, Total::of(splat, shares, written));
+            }
+        });
+        self.frame = None; // nothing was blended that a backward pass could go back from
     }
 
     /// What the buffers hold now.

@@ -8,7 +8,7 @@
 //! Conventions (gsplat's by default): pixel centres at +0.5; 0.3 px² dilation; α = min(0.99, opacity·exp(−q)); α < 1/255
 //! is skipped; a pixel stops before its transmittance would fall to 1e-4; colour = max(0, 0.5 + SH).
 
-mod accumulate;
+pub(crate) mod accumulate;
 pub(crate) mod backward;
 mod covers;
 mod forward;

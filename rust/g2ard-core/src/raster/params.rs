@@ -41,9 +41,7 @@ impl Params<'_> {
             ));
         }
         let n = self.len();
-        if n > u32::MAX as usize / 64 {
-            return Err(Error::invalid("means", "at most 67 million rows", n));
-        }
+        check_count(n)?;
         for (name, slice, width) in [
             ("means", self.means, 3),
             ("quats", self.quats, 4),
@@ -61,6 +59,14 @@ impl Params<'_> {
         }
         Ok(())
     }
+}
+
+/// Rows and their slots are numbered in 32 bits.
+pub(crate) fn check_count(rows: usize) -> Result<()> {
+    if rows > u32::MAX as usize / 64 {
+        return Err(Error::invalid("means", "at most 67 million rows", rows));
+    }
+    Ok(())
 }
 
 /// Sixteen Gaussians' values by attribute. Lanes past the end repeat the last row.

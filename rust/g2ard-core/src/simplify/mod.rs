@@ -7,6 +7,7 @@ mod clusters;
 mod cost;
 mod guards;
 mod ladder;
+mod look;
 mod matching;
 mod moments;
 mod ordered;
@@ -18,6 +19,7 @@ mod rows;
 mod trim;
 
 pub use guards::{coverage, disc};
+pub use look::Look;
 pub use moments::{Gaussian, MAX_OPACITY, Merged, merge, optical_mass, pool, weights};
 pub use ordered::{Means, Ordered, SceneRef};
 pub use outcome::Outcome;

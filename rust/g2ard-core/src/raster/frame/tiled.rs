@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use super::{Image, ImageGradients, Rasterizer};
 use crate::raster::BLOCKS;
-use crate::raster::accumulate::{Accumulate, Share};
+use crate::raster::accumulate::Accumulate;
 use crate::raster::backward::{self, Backward, Incoming, SUMS};
 use crate::raster::forward::{Forward, Pixels};
 use crate::raster::order::Shared;
@@ -145,15 +145,15 @@ impl Rasterizer {
         );
     }
 
-    pub(super) fn accumulate_tiles(&mut self) {
+    pub(super) fn accumulate_tiles<const KINDS: usize>(&mut self) {
         let pairs = self.bins.pairs.len();
-        self.shares.resize(pairs, Share::default());
+        self.shares.resize(pairs * KINDS, 0.0);
         self.written.clear();
         self.written.resize(pairs, 0);
         let Some(frame) = &self.frame else { return };
         let camera = &frame.camera;
         let tiles_x = camera.tiles().0;
-        let slots = Shared::new(&mut self.shares);
+        let slots = Shared::new(self.shares.as_chunks_mut::<KINDS>().0);
         let written = Shared::new(&mut self.written);
         let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
         (0..self.batches.len())

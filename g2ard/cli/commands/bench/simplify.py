@@ -1,0 +1,83 @@
+"""`g2ard bench simplify`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from g2ard.cli.commands.bench.group import bench
+from g2ard.cli.frame import Run, command
+from g2ard.cli.options import (
+    ViewsOption,
+    parse_ratio,
+)
+
+if TYPE_CHECKING:
+    from g2ard.bench.simplify import Cell
+
+
+@command("simplify", parent=bench, example="g2ard bench simplify scene.ply --ratios 10 --csv figures.csv")
+def simplify(
+    run: Run,
+    scenes: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scenes to reduce.")],
+    ratios: Annotated[str, typer.Option(help="Comma-separated.")] = "5,10,20,30",
+    methods: Annotated[
+        str | None,
+        typer.Option(
+            help="Some of default, no-views, fast, paper, splat-transform, splat-transform-adaptive, "
+            "random, opacity-area, lightgaussian, pup, mini-splatting, nanogs."
+        ),
+    ] = None,
+    views: ViewsOption = None,
+    csv: Annotated[
+        Path, typer.Option("-o", "--csv", metavar="FILE", help="Rows go here; those there are not redone.")
+    ] = Path("bench_simplify.csv"),
+    splat_transform: Annotated[
+        Path | None, typer.Option(metavar="PROGRAM", help="Where splat-transform is, if not on PATH.")
+    ] = None,
+) -> None:
+    """Error on unseen views, CPU seconds and memory of every simplifier, each as a whole command.
+
+    Scored are every 8th of 128 poses made for the scene, or the test split of --views; nothing a method used.
+    """
+    from g2ard.bench.simplify import METHODS, bench_simplify, find_splat_transform, machine
+
+    program = find_splat_transform(splat_transform)
+    chosen = [m.strip() for m in methods.split(",")] if methods else list(METHODS)
+    if program is None and any(m.startswith("splat-transform") for m in chosen):
+        run.say("splat-transform is not on PATH (--splat-transform PROGRAM): left out")
+        chosen = [m for m in chosen if not m.startswith("splat-transform")]
+    cells = bench_simplify(
+        scenes,
+        csv,
+        ratios=[parse_ratio(part) for part in ratios.split(",")],
+        methods=chosen,
+        views=views,
+        splat_transform=program,
+        seed=run.seed,
+        progress=run.progress,
+    )
+    run.console.table(
+        f"{machine()}; PSNR and SSIM on unseen views, CPU seconds and peak MB of the whole command",
+        ["scene", "ratio", "method", "Gaussians", "PSNR", "SSIM", "CPU s", "wall s", "MB"],
+        [_row(cell) for cell in cells],
+    )
+    run.result({"machine": machine(), "rows": [asdict(cell) for cell in cells]})
+
+
+def _row(cell: Cell) -> list[str]:
+    head = [cell.scene, f"{cell.ratio:g}", cell.method]
+    if cell.error:
+        return [*head, cell.error, *[""] * 5]
+    return [
+        *head,
+        f"{cell.count:,}",
+        f"{cell.psnr:.2f}",
+        f"{cell.ssim:.4f}",
+        f"{cell.cpu_s:.1f}",
+        f"{cell.wall_s:.1f}",
+        f"{cell.peak_mb:.0f}",
+    ]
