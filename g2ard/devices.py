@@ -41,7 +41,7 @@ class State:
     """What became of the choice.
 
     Args:
-        adapter: the name of the adapter in use; None on the CPU, and before the first kernel that asks for one.
+        adapter: the name of the adapter in use; None on the CPU, and before a kernel asks for one.
         served: how many kernels it has run.
         notes: lines for the user since last asked, such as why the CPU took over.
         seconds: on the device by kernel since last asked, where `use` was told to keep time.
@@ -67,9 +67,9 @@ def use(device: str, *, timed: bool = False) -> None:
     run on the CPU whatever is chosen. A device that fails is left for good, with a line in `state().notes`.
 
     Args:
-        device: "cpu", which is what a process starts with; "gpu", the best adapter there is, even a software
-            one; "auto", a real GPU if the scene is large and a quick probe shows that the GPU computes the same
-            and is faster.
+        device: "cpu", which is what a process starts with; "gpu", the best adapter there is, even in
+            software; "auto", a real GPU if the scene is large and a quick probe shows it to be right
+            and faster.
         timed: keep time of every kernel, where the adapter can.
 
     Raises:

@@ -143,13 +143,27 @@ def test_command_line(tmp_path: Path, command_line: CommandLine, gpu: None) -> N
     write_splats(tmp_path / "a.ply", checkered_ball(1000))
     write_views(tmp_path / "v.json", around(6))
     paper = ("simplify", "a.ply", "-r", "10", "--method", "paper", "-w", "--json", "-")
-    chosen = ("select", "a.ply", "--views", "v.json", "-k", "3", "--policy", "coverage", "--cells", "300", "-w")
+    chosen = (
+        "select",
+        "a.ply",
+        "--views",
+        "v.json",
+        "-k",
+        "3",
+        "--policy",
+        "coverage",
+        "--cells",
+        "300",
+        "-w",
+    )
     made = {}
     for device in ("cpu", "gpu"):
         status, _, told = command_line(*paper, "-o", f"{device}.ply", "--device", device, "-v", cwd=tmp_path)
         assert status == 0, told
         assert ("kernels on" in told) == (device == "gpu")
-        status, _, told = command_line(*chosen, "-o", f"{device}.json", "--device", device, "-v", cwd=tmp_path)
+        status, _, told = command_line(
+            *chosen, "-o", f"{device}.json", "--device", device, "-v", cwd=tmp_path
+        )
         assert status == 0, told
         assert ("kernels on" in told) == (device == "gpu")
         made[device] = [(tmp_path / f"{device}.{kind}").read_bytes() for kind in ("ply", "json")]
@@ -164,10 +178,12 @@ def test_lists_devices(tmp_path: Path, command_line: CommandLine) -> None:
     assert found["used"]["gpu"] == (names[0] if names else None)
     assert all(a["kind"] != "cpu" or a["name"] != found["used"]["auto"] for a in found["adapters"])
     status, out, _ = command_line("info", "--devices", cwd=tmp_path)
-    assert status == 0 and all(name in out for name in names or ["the CPU"])
+    assert status == 0
+    assert all(name in out for name in names or ["the CPU"])
     for wrong in ((), ("a.ply", "--devices")):
         status, _, told = command_line("info", *wrong, cwd=tmp_path)
-        assert status == 2 and "give a file, or --devices" in told
+        assert status == 2
+        assert "give a file, or --devices" in told
 
 
 def test_without_an_adapter_one_line_and_the_cpu(
@@ -185,17 +201,20 @@ def test_without_an_adapter_one_line_and_the_cpu(
     assert status == 0
     assert [line for line in told.splitlines() if "goes on on the CPU" in line] == [told.splitlines()[-1]]
     status, _, told = command_line(*paper, "-o", "cpu.ply", "--device", "auto", cwd=tmp_path)
-    assert status == 0 and "GPU" not in told
+    assert status == 0
+    assert "GPU" not in told
     assert (tmp_path / "cpu.ply").read_bytes() == (tmp_path / "gpu.ply").read_bytes()
     status, out, _ = command_line("info", "--devices", "--json", "-", cwd=tmp_path)
-    assert status == 0 and json.loads(out) == {**json.loads(out), "adapters": []}
+    assert status == 0
+    assert json.loads(out) == {**json.loads(out), "adapters": []}
 
 
 def test_nothing_to_do_is_said(tmp_path: Path, command_line: CommandLine) -> None:
     write_splats(tmp_path / "a.ply", checkered_ball(500))
     fast = ("simplify", "a.ply", "-r", "5", "--method", "fast", "-o", "b.ply", "--device", "gpu")
     status, _, told = command_line(*fast, cwd=tmp_path)
-    assert status == 0 and "nothing here has GPU kernels; all ran on the CPU" in told
+    assert status == 0
+    assert "nothing here has GPU kernels; all ran on the CPU" in told
 
 
 def _whole() -> None:
@@ -210,10 +229,15 @@ def _whole() -> None:
             made.append(simplify(prior, budget, method="paper"))
             seconds.append(time.perf_counter() - began)
         assert_same(*made)
-        print(f"{'/'.join(parts)}: {len(prior):,} → {budget:,}, all rows, parents and refusals alike; ", end="")
+        print(
+            f"{'/'.join(parts)}: {len(prior):,} → {budget:,}, all rows, parents and refusals alike; ", end=""
+        )
         print(f"cpu {seconds[0]:.1f} s, {devices.state().adapter} {seconds[1]:.1f} s", flush=True)
         every, seen = seen_alike(prior, make_pool(prior, 24).resized(384), min(300_000, len(prior) // 2))
-        print(f"  cells seen: {100 * every:.5f} % alike, {100 * seen:.5f} % of those that either sees", flush=True)
+        print(
+            f"  cells seen: {100 * every:.5f} % alike, {100 * seen:.5f} % of those that either sees",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -53,7 +53,9 @@ def _devices(run: Run) -> None:
             ["", f"buffers to {_size(a.max_buffer)}, bound {_size(a.max_binding)} at a time"],
         ]
     if not found:
-        why = "this build has no GPU kernels" if found is None else "no driver for Vulkan, Metal or DirectX 12"
+        why = (
+            "this build has no GPU kernels" if found is None else "no driver for Vulkan, Metal or DirectX 12"
+        )
         rows.append(["none", why])
     rows.append(["--device gpu", used["gpu"] or "the CPU"])
     probed = f"{real}, for scenes of 200,000 rows and more, if a probe says it is right and faster"

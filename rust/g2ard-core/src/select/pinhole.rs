@@ -20,7 +20,7 @@ pub(super) struct Splat {
 }
 
 /// One camera's numbers.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct Pinhole {
     pub rotation: [[f32; 3]; 3],
     pub translation: [f32; 3],

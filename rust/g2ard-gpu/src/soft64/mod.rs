@@ -96,7 +96,7 @@ mod tests {
         for (pair, got) in numbers.chunks(2).zip(found.chunks(8)) {
             let (a, b) = (pair[0], pair[1]);
             let single = a as f32;
-            let mut want = vec![a + b, a - b, a * b, a / b, a.abs().sqrt()];
+            let mut want = [a + b, a - b, a * b, a / b, a.abs().sqrt()];
             if b == 0.0 {
                 want[3] = f64::INFINITY.copysign(a * b.signum()); // no kernel divides by zero
                 if a == 0.0 {
