@@ -117,9 +117,12 @@ def test_small_buffers_go_in_pieces(gpu: None) -> None:
     _core.set_device("gpu", 1 << 14)
     assert_same(simplify(ball, 500, method="paper"), want)
     assert served() > 10
-    _core.set_device("gpu", 64)  # too small for anything
-    assert_same(simplify(ball, 500, method="paper"), want)
+    few = checkered_ball(60)
+    _core.set_device("gpu", 64)  # too small for the disc that coverage is measured on
+    refused = simplify(few, 20, method="paper")
     assert devices.state().notes[0].endswith("goes on on the CPU")
+    devices.use("cpu")
+    assert_same(simplify(few, 20, method="paper"), refused)
 
 
 def test_software_is_never_chosen_by_itself(gpu: None) -> None:

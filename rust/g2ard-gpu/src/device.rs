@@ -129,7 +129,11 @@ impl Device {
     }
 
     fn note(&self, error: &Error) {
-        lock(&self.notes).push(format!("GPU: {error}; goes on on the CPU"));
+        let line = format!("GPU: {error}; goes on on the CPU");
+        let mut notes = lock(&self.notes);
+        if !notes.contains(&line) {
+            notes.push(line);
+        }
     }
 
     /// `twin` on the device, else `cpu`.
