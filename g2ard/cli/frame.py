@@ -9,7 +9,8 @@ from __future__ import annotations
 import inspect
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -183,8 +184,8 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
         raise typer.BadParameter(f"--device: auto, cpu, gpu or cuda, not {run.device!r}")
     if run.json not in (None, "-") and Path(str(run.json)) == options.get("output"):
         raise typer.BadParameter(f"--json and --output are both {run.json}")
-    if run.device == "gpu" or (run.device == "cuda" and not cuda):
-        run.say(f"--device {run.device}: this build computes on the CPU only, and does")
+    if run.device == "cuda" and not cuda:
+        run.say("--device cuda: this command computes on the CPU only, and does")
     try:
         if run.json not in (None, "-"):
             from g2ard.io.atomic import check_output
@@ -194,7 +195,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
             from g2ard import _core
 
             _core.set_num_threads(run.threads)
-        with run.console:
+        with run.console, _device(run):
             fn(run, **options)
     except KeyboardInterrupt:
         run.console.error("interrupted")
@@ -209,6 +210,29 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
             traceback.print_exc()
         run.console.error(f"internal error, please report it: {type(e).__name__}: {e} (-v shows where)")
         raise typer.Exit(1) from None
+
+
+@contextmanager
+def _device(run: Run) -> Iterator[None]:
+    """Kernels run where --device says; what there is to tell of that is told at the end."""
+    if run.device not in ("auto", "gpu"):
+        yield
+        return
+    from g2ard import devices
+
+    devices.use(run.device, timed=run.verbose)
+    try:
+        yield
+    finally:
+        state = devices.state()
+        for note in state.notes:
+            run.say(note)
+        if run.device == "gpu" and not (state.served or state.notes):
+            run.say("--device gpu: nothing here has GPU kernels; all ran on the CPU")
+        elif state.served and run.verbose:
+            longest = sorted(state.seconds.items(), key=lambda item: -item[1])[:6]
+            took = "".join(f", {name} {seconds:.3f} s" for name, seconds in longest)
+            run.say(f"GPU: {state.served} kernels on {state.adapter}{took}")
 
 
 def _one_line(error: BaseException) -> str:

@@ -14,19 +14,61 @@ from g2ard.cli.frame import Run, command
 def info(
     run: Run,
     path: Annotated[
-        Path, typer.Argument(metavar="SCENE|CLOUD|VIEWS", help="A Gaussian scene, a coloured cloud or views.")
-    ],
+        Path | None,
+        typer.Argument(metavar="SCENE|CLOUD|VIEWS", help="A Gaussian scene, a coloured cloud or views."),
+    ] = None,
+    devices: Annotated[
+        bool, typer.Option("--devices", help="List the GPUs, and which one --device would use.")
+    ] = False,
 ) -> None:
     """Show what is in a file: counts, extents, SH degree, opacities, scales, odd values."""
+    if (path is None) != devices:
+        raise typer.BadParameter("give a file, or --devices")
+    if path is None:
+        _devices(run)
+        return
     from g2ard.io.describe import describe
 
     figures = describe(path)
-    rows = _rows(figures)
-    if run.json == "-":
-        run.console.table(str(path), ["", ""], rows)
-    elif not run.console.quiet:
-        _print(str(path), rows)
+    _show(run, str(path), _rows(figures))
     run.result(figures)
+
+
+def _devices(run: Run) -> None:
+    """Every adapter and its limits, and what --device takes."""
+    from dataclasses import asdict
+
+    from g2ard import devices
+
+    found = devices.adapters()
+    real = next((a.name for a in found or () if a.kind != "cpu"), None)
+    used = {
+        "gpu": found[0].name if found else None,
+        "auto": real,
+    }
+    rows: list[list[str]] = []
+    for a in found or ():
+        rows += [
+            [a.name, f"{a.kind}, {a.backend}, {a.driver}"],
+            ["", f"buffers to {_size(a.max_buffer)}, bound {_size(a.max_binding)} at a time"],
+        ]
+    if not found:
+        why = (
+            "this build has no GPU kernels" if found is None else "no driver for Vulkan, Metal or DirectX 12"
+        )
+        rows.append(["none", why])
+    rows.append(["--device gpu", used["gpu"] or "the CPU"])
+    probed = f"{real}, for scenes of 200,000 rows and more, if a probe says it is right and faster"
+    rows.append(["--device auto", probed if real else "the CPU"])
+    _show(run, "Devices", rows)
+    run.result({"adapters": [asdict(a) for a in found or ()], "used": used})
+
+
+def _show(run: Run, title: str, rows: list[list[str]]) -> None:
+    if run.json == "-":
+        run.console.table(title, ["", ""], rows)
+    elif not run.console.quiet:
+        _print(title, rows)
 
 
 def _print(title: str, rows: list[list[str]]) -> None:

@@ -5,10 +5,10 @@
 mod scene;
 
 use divan::{Bencher, Divan, black_box};
-use g2ard_core::Control;
 use g2ard_core::raster::{
     Accumulated, Camera, Image, ImageGradients, Params, Rasterizer, Settings,
 };
+use g2ard_core::{Control, Cpu};
 use rayon::prelude::*;
 use scene::{Random, Scene, Slopes, cameras};
 
@@ -98,7 +98,7 @@ mod simplify {
     #[divan::bench(args = COUNTS)]
     fn paper_flags(bencher: Bencher, count: usize) {
         let (splats, threshold) = (Scene::of(count).splats(), Paper::default().flag_threshold);
-        let run = || flags(&splats, count / RATIO, threshold, &Control::default());
+        let run = || flags(&splats, count / RATIO, threshold, &Cpu, &Control::default());
         bencher.bench(|| run().expect("never cancelled"));
     }
 
@@ -107,7 +107,16 @@ mod simplify {
     fn paper_policy(bencher: Bencher, count: usize) {
         let (scene, counts) = (Scene::of(count), schedule(count, 0.75));
         let (paper, cells) = (Paper::default(), count / RATIO);
-        let run = || paper.run(&scene.scene(), None, cells, &counts, &Control::default());
+        let run = || {
+            paper.run(
+                &scene.scene(),
+                None,
+                cells,
+                &counts,
+                &Cpu,
+                &Control::default(),
+            )
+        };
         bencher.bench(|| run().expect("a valid scene"));
     }
 }
@@ -220,7 +229,7 @@ mod select {
 
     /// A surface cell for every four Gaussians.
     fn surface(scene: &Scene) -> Surface {
-        Surface::of(&scene.gaussians(), scene.means.len() / 4).expect("a valid scene")
+        Surface::of(&scene.gaussians(), scene.means.len() / 4, &Cpu).expect("a valid scene")
     }
 
     fn seen(scene: &Scene, surface: &Surface, views: &[Camera]) -> Vec<Vec<u32>> {

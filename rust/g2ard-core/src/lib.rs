@@ -3,6 +3,7 @@
 //! Data flows one way: points → [`lift`] → [`splats`] → [`simplify`] → [`raster`] and [`ssim`].
 //! Results never depend on the number of threads: every reduction has a fixed order.
 
+pub mod backend;
 pub mod control;
 pub mod error;
 pub mod lift;
@@ -15,6 +16,7 @@ pub mod splats;
 pub mod ssim;
 pub mod train;
 
+pub use backend::{Backend, Cpu};
 pub use control::Control;
 pub use error::{Error, Result};
 pub use splats::Splats;

@@ -3,6 +3,7 @@
 use pyo3::prelude::*;
 
 mod arrays;
+mod device;
 mod error;
 mod lift;
 mod raster;
@@ -17,6 +18,7 @@ mod work;
 fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("__version__", env!("CARGO_PKG_VERSION"))?;
     work::register(m)?;
+    device::register(m)?;
     lift::register(m)?;
     simplify::register(m)?;
     spatial::register(m)?;

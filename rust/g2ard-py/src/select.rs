@@ -1,14 +1,13 @@
 //! `g2ard.select`.
 
 use g2ard_core::raster::Camera;
-use g2ard_core::select::{
-    Coverage, Gaussians, Opaque, Problem, Surface, looks, median_depths, visible,
-};
+use g2ard_core::select::{Coverage, Gaussians, Opaque, Problem, Surface, median_depths};
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::arrays;
+use crate::device::{backend, kernels};
 use crate::error::to_py;
 use crate::work::{long, quick};
 
@@ -63,7 +62,8 @@ fn select_surface<'py>(
     cells: usize,
 ) -> PyResult<Bound<'py, PyDict>> {
     let scene = scene.borrow()?;
-    let surface = long(py, None, |_| Surface::of(&scene, cells))?;
+    let kernels = kernels();
+    let surface = long(py, None, |_| Surface::of(&scene, cells, backend(&kernels)))?;
     let out = PyDict::new(py);
     out.set_item("size", surface.size)?;
     out.set_item("centers", arrays::matrix(py, surface.centers)?)?;
@@ -96,8 +96,9 @@ fn select_looks<'py>(
 ) -> PyResult<Bound<'py, PyArray2<f32>>> {
     let scene = scene.borrow()?;
     let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
+    let kernels = kernels();
     let found = long(py, progress, |control| {
-        looks(&Opaque::of(&scene), &cameras, control)
+        backend(&kernels).looks(&scene, &cameras, control)
     })?;
     arrays::matrix(py, found)
 }
@@ -149,8 +150,9 @@ fn select_visible<'py>(
 ) -> PyResult<Lists<'py>> {
     let (scene, surface) = (scene.borrow()?, surface_of(&surface)?);
     let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
+    let kernels = kernels();
     let seen = long(py, progress, |control| {
-        visible(&Opaque::of(&scene), &surface, &cameras, control)
+        backend(&kernels).visible(&scene, &surface, &cameras, control)
     })?;
     let mut starts = vec![0u64];
     for cells in &seen {

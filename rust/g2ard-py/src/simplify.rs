@@ -12,6 +12,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::arrays;
+use crate::device::{backend, kernels};
 use crate::raster::{Choices, View};
 use crate::work::long;
 
@@ -62,9 +63,11 @@ fn simplify_flags<'py>(
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyArray1<bool>>> {
     let scene = scene.borrow()?;
+    let kernels = kernels();
     let found = long(py, progress, |control| {
         let ordered = Ordered::new(&scene)?;
-        let found = flags(&ordered.splats(&scene), cells, threshold, control)?;
+        let splats = ordered.splats(&scene);
+        let found = flags(&splats, cells, threshold, backend(&kernels), control)?;
         let mut by_row = vec![false; found.len()];
         for (&row, &flag) in ordered.rows.iter().zip(&found) {
             by_row[row as usize] = flag;
@@ -107,8 +110,10 @@ fn simplify_paper<'py>(
         flag_threshold,
         protection,
     };
+    let kernels = kernels();
     let outcome = long(py, progress, |control| {
-        policy.run(&scene, protected, flag_cells, &schedule, control)
+        let backend = backend(&kernels);
+        policy.run(&scene, protected, flag_cells, &schedule, backend, control)
     })?;
     let rounds = outcome
         .rounds

@@ -9,6 +9,7 @@ mod visible;
 
 pub use coverage::{Chosen, Coverage, Problem};
 pub use depth::median_depths;
-pub use opaque::Opaque;
+pub use opaque::{Opaque, Row};
+pub use pinhole::Pinhole;
 pub use surface::{Gaussians, Surface};
-pub use visible::{looks, visible};
+pub use visible::{look_of, looks, visible};

@@ -12,12 +12,14 @@ const BLOCK: usize = 64;
 /// A scene's Gaussians in Morton order.
 #[derive(Debug)]
 pub struct Opaque {
-    pub(super) rows: Vec<Row>,
+    pub rows: Vec<Row>,
     pub(super) blocks: Vec<Block>,
 }
 
+/// A Gaussian as `Pinhole` projects it.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Row {
+#[repr(C)]
+pub struct Row {
     pub mean: [f32; 3],
     pub opacity: f32,
     pub covariance: [f32; 6],

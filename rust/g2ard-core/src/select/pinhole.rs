@@ -20,13 +20,15 @@ pub(super) struct Splat {
 }
 
 /// One camera's numbers.
-pub(super) struct Pinhole {
-    rotation: [[f32; 3]; 3],
-    translation: [f32; 3],
-    focal: [f32; 2],
-    center: [f32; 2],
-    limits: [[f32; 2]; 2],
-    near: f32,
+#[derive(Debug, Clone)]
+pub struct Pinhole {
+    pub rotation: [[f32; 3]; 3],
+    pub translation: [f32; 3],
+    pub focal: [f32; 2],
+    pub center: [f32; 2],
+    /// Where x/z and y/z are clamped: [low, high] of each.
+    pub limits: [[f32; 2]; 2],
+    pub near: f32,
     pub width: usize,
     pub height: usize,
 }
@@ -63,7 +65,7 @@ impl Pinhole {
     }
 
     /// Whether no row of a block can reach the image; errs on the side of keeping it.
-    pub fn misses(&self, block: &Block) -> bool {
+    pub(super) fn misses(&self, block: &Block) -> bool {
         let at = self.to_camera(block.center);
         let size = |v: &[f32; 3]| v.iter().map(|x| x.abs()).sum::<f32>();
         let slack = ROUNDING * (size(&block.center) + size(&self.translation));
@@ -111,7 +113,7 @@ impl Pinhole {
     }
 
     /// The splat and its depth; None where no pixel can show it.
-    pub fn project(&self, row: &Row) -> Option<(f32, Splat)> {
+    pub(super) fn project(&self, row: &Row) -> Option<(f32, Splat)> {
         let [tx, ty, z] = self.to_camera(row.mean);
         if z <= self.near {
             return None;

@@ -3,8 +3,8 @@
 use rayon::prelude::*;
 
 use crate::linalg::{Sym3, covariance, outer, rotation_from_quat, sub, symmetric_eigen};
-use crate::spatial::{Cells, Frame};
-use crate::{Error, Result};
+use crate::spatial::Frame;
+use crate::{Backend, Error, Result};
 
 /// A scene's geometry, borrowed; means are centred by the caller.
 #[derive(Debug, Clone, Copy)]
@@ -81,9 +81,9 @@ pub struct Surface {
 
 impl Surface {
     /// About `target` adaptive voxels of the scene.
-    pub fn of(scene: &Gaussians<'_>, target: usize) -> Result<Self> {
+    pub fn of(scene: &Gaussians<'_>, target: usize, backend: &dyn Backend) -> Result<Self> {
         scene.validate()?;
-        let cells = Cells::adaptive(scene.means, &Frame::of(scene.means), target);
+        let cells = backend.cells(scene.means, &Frame::of(scene.means), target)?;
         let rows: Vec<_> = (0..cells.len())
             .into_par_iter()
             .map(|c| cell(scene, cells.members_of(c)))
@@ -168,6 +168,7 @@ fn normalise(weights: &mut [f64]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Cpu;
 
     #[test]
     fn a_plane_of_discs_knows_its_normal() {
@@ -188,7 +189,7 @@ mod tests {
             opacities: &opacities,
         };
         for target in [n, 60] {
-            let surface = Surface::of(&scene, target).unwrap();
+            let surface = Surface::of(&scene, target, &Cpu).unwrap();
             assert!((surface.weights.iter().sum::<f64>() - 1.0).abs() < 1e-12);
             for c in 0..surface.len() {
                 assert!(surface.normals[c][2].abs() > 1.0 - 1e-9);
@@ -206,7 +207,7 @@ mod tests {
             scales: &[[1.0; 3]],
             opacities: &[1.0],
         };
-        assert!(Surface::of(&scene, 10).is_err());
+        assert!(Surface::of(&scene, 10, &Cpu).is_err());
         let scene = Gaussians {
             means: &[[0.0, f64::NAN, 0.0]],
             quats: &[[1.0, 0.0, 0.0, 0.0]],
@@ -214,7 +215,7 @@ mod tests {
             opacities: &[1.0],
         };
         assert_eq!(
-            Surface::of(&scene, 10),
+            Surface::of(&scene, 10, &Cpu),
             Err(Error::NonFinite {
                 field: "scene",
                 count: 1,

@@ -9,7 +9,7 @@ use super::pinhole::Pinhole;
 use crate::raster::Camera;
 use crate::{Control, Result};
 
-/// For each camera the share of its pixels that show the scene, and the median of their depths (0 without any).
+/// For each camera what it shows of the scene: see [`look_of`].
 pub fn looks(scene: &Opaque, cameras: &[Camera], control: &Control) -> Result<Vec<[f32; 2]>> {
     control.begin(cameras.len() as u64);
     cameras
@@ -20,18 +20,21 @@ pub fn looks(scene: &Opaque, cameras: &[Camera], control: &Control) -> Result<Ve
             scratch.clear(&view, 1.0);
             scratch.trace(scene, &view);
             control.advance(1);
-            let mut depths: Vec<f32> = scratch.depth.iter().copied().filter(|&d| d > 0.0).collect();
-            if depths.is_empty() {
-                return Ok([0.0; 2]);
-            }
-            let share = depths.len() as f32 / scratch.depth.len() as f32;
-            let middle = depths.len() / 2;
-            Ok([
-                share,
-                *depths.select_nth_unstable_by(middle, f32::total_cmp).1,
-            ])
+            Ok(look_of(&scratch.depth))
         })
         .collect()
+}
+
+/// The share of pixels that show the scene, and the median of their depths (0 without any).
+pub fn look_of(image: &[f32]) -> [f32; 2] {
+    let mut depths: Vec<f32> = image.iter().copied().filter(|&d| d > 0.0).collect();
+    if depths.is_empty() {
+        return [0.0; 2];
+    }
+    let share = depths.len() as f32 / image.len() as f32;
+    let middle = depths.len() / 2;
+    let median = *depths.select_nth_unstable_by(middle, f32::total_cmp).1;
+    [share, median]
 }
 
 /// For each camera the cells it sees, ascending: the cell's centre falls on the image and lies within

@@ -12,7 +12,7 @@ const EDGE: f64 = 1.0;
 const SAMPLES: usize = 16;
 
 /// Points that divide the unit disc into equal areas (sunflower).
-fn disc() -> &'static [[f64; 2]; SAMPLES] {
+pub fn disc() -> &'static [[f64; 2]; SAMPLES] {
     static POINTS: OnceLock<[[f64; 2]; SAMPLES]> = OnceLock::new();
     POINTS.get_or_init(|| {
         let golden = PI * (3.0 - 5f64.sqrt());

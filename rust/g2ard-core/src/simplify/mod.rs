@@ -18,14 +18,14 @@ mod residual;
 mod rows;
 mod trim;
 
-pub use guards::coverage;
+pub use guards::{coverage, disc};
 pub use look::Look;
-pub use moments::{Gaussian, MAX_OPACITY, optical_mass, pool};
+pub use moments::{Gaussian, MAX_OPACITY, Merged, merge, optical_mass, pool, weights};
 pub use ordered::{Means, Ordered, SceneRef};
 pub use outcome::Outcome;
 pub use pairwise::{Pairwise, PairwiseRound, Seen};
 pub use paper::{Paper, PaperRound};
-pub use residual::flags;
+pub use residual::{color, flags};
 
 use crate::Splats;
 

@@ -136,45 +136,69 @@ pub struct Merged {
     pub clamped: bool,
 }
 
-/// Mean, covariance and SH averaged by optical mass; α = 1 − exp(−Σm / A), A the merged footprint.
-/// A group without any mass is averaged evenly.
-pub fn merge(splats: &Splats, rows: &[u32]) -> Merged {
-    let each = rows.iter().map(|&i| Gaussian::of(splats, i as usize));
-    let mut members: Vec<_> = each
-        .zip(rows)
-        .map(|(g, &i)| {
-            let logit = f64::from(splats.logit_opacities[i as usize]);
-            (optical_mass(logit, g.scales), g.mean, g.covariance())
-        })
-        .collect();
-    let mass: f64 = members.iter().map(|m| m.0).sum();
-    if mass <= 0.0 {
-        members.iter_mut().for_each(|m| m.0 = 1.0);
-    }
-    let (mean, cov) = pool(&members);
-    let gaussian = Gaussian::from_moments(mean, &cov);
-    let depth = mass / footprint(gaussian.scales);
-    let limit = softplus((MAX_OPACITY / (1.0 - MAX_OPACITY)).ln());
-    let logit = if depth > 0.0 {
-        depth.min(limit).exp_m1().ln()
-    } else {
-        f64::from(splats.logit_opacities[rows[0] as usize])
+/// What each row weighs in a merged group, and Σm. A group without any mass is averaged evenly.
+pub fn weights(splats: &Splats, rows: &[u32]) -> (Vec<f64>, f64) {
+    let weigh = |&i: &u32| {
+        let logit = f64::from(splats.logit_opacities[i as usize]);
+        optical_mass(logit, splats.scales[i as usize].map(f64::from))
     };
-    Merged {
-        gaussian,
-        logit,
-        sh: average_sh(splats, rows, &members),
-        mass,
-        clamped: depth > limit,
+    let masses: Vec<f64> = rows.iter().map(weigh).collect();
+    let mass: f64 = masses.iter().sum();
+    if mass > 0.0 {
+        (masses, mass)
+    } else {
+        (vec![1.0; rows.len()], mass)
     }
 }
 
-fn average_sh(splats: &Splats, rows: &[u32], members: &[(f64, [f64; 3], Sym3)]) -> Vec<[f32; 3]> {
-    let total: f64 = members.iter().map(|m| m.0).sum();
+/// Mean, covariance and SH averaged by optical mass; α = 1 − exp(−Σm / A), A the merged footprint.
+pub fn merge(splats: &Splats, rows: &[u32]) -> Merged {
+    let (weights, mass) = weights(splats, rows);
+    let members: Vec<_> = rows
+        .iter()
+        .zip(&weights)
+        .map(|(&i, &w)| {
+            let g = Gaussian::of(splats, i as usize);
+            (w, g.mean, g.covariance())
+        })
+        .collect();
+    let (mean, cov) = pool(&members);
+    let gaussian = Gaussian::from_moments(mean, &cov);
+    Merged::of(splats, rows, &weights, mass, gaussian)
+}
+
+impl Merged {
+    /// The rows' opacity and SH for the Gaussian that their moments make.
+    pub fn of(
+        splats: &Splats,
+        rows: &[u32],
+        weights: &[f64],
+        mass: f64,
+        gaussian: Gaussian,
+    ) -> Self {
+        let depth = mass / footprint(gaussian.scales);
+        let limit = softplus((MAX_OPACITY / (1.0 - MAX_OPACITY)).ln());
+        let logit = if depth > 0.0 {
+            depth.min(limit).exp_m1().ln()
+        } else {
+            f64::from(splats.logit_opacities[rows[0] as usize])
+        };
+        Self {
+            gaussian,
+            logit,
+            sh: average_sh(splats, rows, weights),
+            mass,
+            clamped: depth > limit,
+        }
+    }
+}
+
+fn average_sh(splats: &Splats, rows: &[u32], weights: &[f64]) -> Vec<[f32; 3]> {
+    let total: f64 = weights.iter().sum();
     let mut sums = vec![[0.0; 3]; splats.sh_coeffs];
-    for (&i, m) in rows.iter().zip(members) {
+    for (&i, &w) in rows.iter().zip(weights) {
         for (sum, sh) in sums.iter_mut().zip(splats.sh_of(i as usize)) {
-            (0..3).for_each(|k| sum[k] += m.0 * f64::from(sh[k]));
+            (0..3).for_each(|k| sum[k] += w * f64::from(sh[k]));
         }
     }
     sums.into_iter()

@@ -2,14 +2,13 @@
 
 use rayon::prelude::*;
 
-use super::moments::{Gaussian, Merged, merge, optical_mass, sigmoid};
+use super::moments::{Merged, optical_mass, sigmoid};
 use super::outcome::Trail;
 use super::residual::{self, color};
 use super::trim::best;
-use super::{GONE, Ordered, Outcome, SceneRef, Step, coverage};
-use crate::linalg::affine_energy;
-use crate::spatial::{Cells, Frame};
-use crate::{Control, Error, Result, Splats};
+use super::{GONE, Ordered, Outcome, SceneRef, Step};
+use crate::spatial::Frame;
+use crate::{Backend, Control, Error, Result, Splats};
 
 /// Defaults are the paper's (`tab:s_config`).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -62,18 +61,10 @@ pub struct PaperRound {
     pub after: usize,
 }
 
-enum Verdict {
-    Merge(Box<Candidate>),
-    Energy,
-    Coverage,
-}
-
 struct Candidate {
     merged: Merged,
     cost: f64,
 }
-
-const CHUNK: usize = 256;
 
 impl Paper {
     /// Rounds down to each count of `schedule`. Without `flags` they are computed first, on the raw
@@ -84,6 +75,7 @@ impl Paper {
         flags: Option<&[bool]>,
         flag_cells: usize,
         schedule: &[usize],
+        backend: &dyn Backend,
         control: &Control,
     ) -> Result<Outcome<PaperRound>> {
         let ordered = Ordered::new(scene)?;
@@ -97,7 +89,7 @@ impl Paper {
                     flags.len(),
                 ));
             }
-            None => residual::flags(&splats, flag_cells, self.flag_threshold, control)?,
+            None => residual::flags(&splats, flag_cells, self.flag_threshold, backend, control)?,
         };
         let mut trail = Trail::start(splats, flags);
         let mut rounds = Vec::new();
@@ -105,7 +97,8 @@ impl Paper {
         control.begin(shed(schedule.last().copied().unwrap_or(usize::MAX)));
         for &budget in schedule {
             let Step { splats, flags, .. } = &trail.step;
-            let (step, report) = self.round(splats, flags, budget, ordered.grid, control)?;
+            let (step, report) =
+                self.round(splats, flags, budget, ordered.grid, backend, control)?;
             control.advance((report.before - report.after) as u64);
             trail.then(step);
             rounds.push(report);
@@ -126,6 +119,7 @@ impl Paper {
         flags: &[bool],
         budget: usize,
         grid: f64,
+        backend: &dyn Backend,
         control: &Control,
     ) -> Result<(Step, PaperRound)> {
         if flags.len() != splats.len() {
@@ -143,11 +137,11 @@ impl Paper {
         let kept = self.drop_transparent(splats, flags, budget);
         report.dropped = splats.len() - kept.len();
         let groups = if kept.len() > budget {
-            self.groups(splats, &kept, budget, &mut report)
+            self.groups(splats, &kept, budget, backend, &mut report)?
         } else {
             kept.iter().map(|&i| vec![i]).collect()
         };
-        let mut merges = self.judge(splats, &groups, &mut report, control)?;
+        let mut merges = self.judge(splats, &groups, backend, &mut report, control)?;
         undo_costliest(&groups, &mut merges, budget, &mut report);
         let built = build(splats, flags, &groups, merges, grid, &mut report);
         Ok((self.trim(built, budget, &mut report), report))
@@ -182,10 +176,11 @@ impl Paper {
         splats: &Splats,
         kept: &[u32],
         budget: usize,
+        backend: &dyn Backend,
         report: &mut PaperRound,
-    ) -> Vec<Vec<u32>> {
+    ) -> Result<Vec<Vec<u32>>> {
         let points: Vec<_> = kept.iter().map(|&i| splats.means[i as usize]).collect();
-        let cells = Cells::adaptive(&points, &Frame::of(&points), budget);
+        let cells = backend.cells(&points, &Frame::of(&points), budget)?;
         report.cells = cells.len();
         let ids: Vec<usize> = (0..cells.len()).collect();
         let mut groups: Vec<Vec<u32>> = ids
@@ -209,63 +204,47 @@ impl Paper {
             .collect();
         groups.par_sort_unstable_by_key(|g| g[0]);
         report.alone = groups.iter().filter(|g| g.len() == 1).count();
-        groups
+        Ok(groups)
     }
 
     fn bin(&self, color: [f64; 3]) -> [i32; 3] {
         color.map(|c| (c / self.color_bin).floor() as i32)
     }
 
-    /// Each group's merged Gaussian where both guards pass.
+    /// Each group's merged Gaussian where both guards pass: energy is asked first.
     fn judge(
         &self,
         splats: &Splats,
         groups: &[Vec<u32>],
+        backend: &dyn Backend,
         report: &mut PaperRound,
         control: &Control,
     ) -> Result<Vec<Option<Box<Candidate>>>> {
-        let verdicts: Vec<Vec<Option<Verdict>>> = groups
-            .par_chunks(CHUNK)
-            .map(|chunk| {
-                control.check()?;
-                Ok(chunk
-                    .iter()
-                    .map(|g| (g.len() > 1).then(|| self.verdict(splats, g)))
-                    .collect())
-            })
-            .collect::<Result<_>>()?;
-        let accepted = verdicts.into_iter().flatten().map(|v| match v? {
-            Verdict::Merge(candidate) => Some(candidate),
-            Verdict::Energy => {
-                report.refused_energy += 1;
-                None
-            }
-            Verdict::Coverage => {
-                report.refused_coverage += 1;
-                None
-            }
-        });
-        Ok(accepted.collect())
-    }
-
-    fn verdict(&self, splats: &Splats, rows: &[u32]) -> Verdict {
-        let points: Vec<_> = rows.iter().map(|&i| splats.means[i as usize]).collect();
-        let colors: Vec<_> = rows.iter().map(|&i| color(splats, i as usize)).collect();
-        let energy = affine_energy(&points, &colors, rows.len());
-        if energy > self.max_energy {
-            return Verdict::Energy;
-        }
-        let merged = merge(splats, rows);
-        let members: Vec<_> = rows
-            .iter()
-            .map(|&i| Gaussian::of(splats, i as usize))
+        let several: Vec<usize> = (0..groups.len()).filter(|&g| groups[g].len() > 1).collect();
+        let rows = |at: usize, rows: &mut Vec<u32>| {
+            rows.extend_from_slice(&groups[several[at]]);
+            rows.len()
+        };
+        let energies = backend.energies(splats, several.len(), &rows, control)?;
+        let examined = several.len();
+        let smooth: Vec<(usize, f64)> = several
+            .into_iter()
+            .zip(energies)
+            .filter(|&(_, energy)| energy <= self.max_energy)
             .collect();
-        let covered = coverage(&members, &merged.gaussian);
-        if covered < self.min_coverage {
-            return Verdict::Coverage;
+        report.refused_energy = examined - smooth.len();
+        let candidates: Vec<&[u32]> = smooth.iter().map(|&(g, _)| &groups[g][..]).collect();
+        let merges = backend.merges(splats, &candidates, control)?;
+        let mut accepted: Vec<_> = groups.iter().map(|_| None).collect();
+        for (&(g, energy), (merged, covered)) in smooth.iter().zip(merges) {
+            if covered < self.min_coverage {
+                report.refused_coverage += 1;
+                continue;
+            }
+            let cost = merged.mass * (energy + 1.0 - covered);
+            accepted[g] = Some(Box::new(Candidate { merged, cost }));
         }
-        let cost = merged.mass * (energy + 1.0 - covered);
-        Verdict::Merge(Box::new(Candidate { merged, cost }))
+        Ok(accepted)
     }
 
     fn trim(&self, built: Step, budget: usize, report: &mut PaperRound) -> Step {

@@ -7,5 +7,5 @@ mod voxels;
 
 pub use frame::Frame;
 pub use knn::{Neighbor, Tree};
-pub use morton::{codes, order};
-pub use voxels::Cells;
+pub use morton::{BITS, codes, order, unit};
+pub use voxels::{Cells, OCTAVES, first_apart, octave_counts, search_size};

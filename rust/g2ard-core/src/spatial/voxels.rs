@@ -1,5 +1,7 @@
 //! Cells of one size, chosen so that about as many are occupied as asked for.
 
+use std::convert::Infallible;
+
 use rayon::prelude::*;
 
 use super::morton::{BITS, code_inside, decode, encode, unit};
@@ -27,7 +29,16 @@ impl Cells {
     /// The count at every power of two comes from one sort, by Morton prefix; what remains is a
     /// bracketed secant on log count against log size within one octave.
     pub fn adaptive(points: &[[f64; 3]], frame: &Frame, target: usize) -> Self {
-        Self::with_size(points, frame, search_size(points, frame, target.max(1)))
+        let size = match points {
+            [] => frame.radius,
+            _ => {
+                let octaves = counts_by_octave(points, frame);
+                let counted = |size| Ok::<_, Infallible>(count(points, frame, size));
+                let Ok(size) = search_size(frame, &octaves, target, counted);
+                size
+            }
+        };
+        Self::with_size(points, frame, size)
     }
 
     pub fn with_size(points: &[[f64; 3]], frame: &Frame, size: f64) -> Self {
@@ -45,10 +56,21 @@ impl Cells {
             }
         }
         starts.push(points.len() as u32);
+        let members = keyed.into_par_iter().map(|(_, i)| i).collect();
+        Self::from_parts(size, starts, members, keys)
+    }
+
+    /// Cells found elsewhere: `keys` are Morton codes, ascending, None last.
+    pub fn from_parts(
+        size: f64,
+        starts: Vec<u32>,
+        members: Vec<u32>,
+        keys: Vec<Option<u64>>,
+    ) -> Self {
         Self {
             size,
             starts,
-            members: keyed.into_par_iter().map(|(_, i)| i).collect(),
+            members,
             keys,
         }
     }
@@ -98,19 +120,31 @@ fn count(points: &[[f64; 3]], frame: &Frame, size: f64) -> usize {
     distinct + usize::from(!keys.is_empty())
 }
 
-/// Occupied cells of size unit·2^b for every b, from one sort: neighbours in Morton order that first
-/// differ in bit 3b … 3b+2 fall apart at level b and at every finer one.
+/// Occupied cells of size unit·2^b for every b, from one sort.
 fn counts_by_octave(points: &[[f64; 3]], frame: &Frame) -> Vec<usize> {
     let mut sorted = codes(points, frame);
     sorted.par_sort_unstable();
-    let mut apart = vec![0usize; BITS as usize + 1];
+    let mut apart = [0; OCTAVES];
     for w in sorted.windows(2) {
         if w[0] != w[1] {
-            apart[(63 - (w[0] ^ w[1]).leading_zeros()) as usize / 3] += 1;
+            apart[first_apart(w[0], w[1])] += 1;
         }
     }
+    octave_counts(&apart)
+}
+
+/// The octaves of a lattice, its whole cube among them.
+pub const OCTAVES: usize = BITS as usize + 1;
+
+/// Neighbours in Morton order that first differ in bit 3b … 3b+2 fall apart at octave b and at every finer one.
+pub fn first_apart(a: u64, b: u64) -> usize {
+    (63 - (a ^ b).leading_zeros()) as usize / 3
+}
+
+/// Occupied cells by octave, given how many neighbours in Morton order first fall apart at each.
+pub fn octave_counts(apart: &[usize; OCTAVES]) -> Vec<usize> {
     let mut total = 1;
-    let mut counts: Vec<usize> = (0..=BITS as usize)
+    let mut counts: Vec<usize> = (0..OCTAVES)
         .rev()
         .map(|b| {
             total += apart[b];
@@ -121,19 +155,21 @@ fn counts_by_octave(points: &[[f64; 3]], frame: &Frame) -> Vec<usize> {
     counts
 }
 
-fn search_size(points: &[[f64; 3]], frame: &Frame, target: usize) -> f64 {
-    let unit = unit(frame);
-    if points.is_empty() {
-        return frame.radius;
-    }
-    let counts = counts_by_octave(points, frame);
+/// The size at which about `target` cells are occupied, given how many are at each octave, and a way to
+/// count them at any size.
+pub fn search_size<E>(
+    frame: &Frame,
+    counts: &[usize],
+    target: usize,
+    mut count: impl FnMut(f64) -> std::result::Result<usize, E>,
+) -> std::result::Result<f64, E> {
+    let (unit, target) = (unit(frame), target.max(1));
     // The finest octave whose coarse end has too few cells holds the answer.
     let octave = (0..BITS as usize)
         .find(|&b| counts[b + 1] <= target)
         .unwrap_or(BITS as usize - 1);
     let base = unit * (1u64 << octave) as f64;
     let log = |n: usize| (n as f64 / target as f64).ln();
-    let off = |t: f64| log(count(points, frame, base * t.exp2()));
     let (mut low, mut high) = ((0.0, log(counts[octave])), (1.0, log(counts[octave + 1])));
     let mut best = if low.1.abs() < high.1.abs() {
         low
@@ -150,13 +186,13 @@ fn search_size(points: &[[f64; 3]], frame: &Frame, target: usize) -> f64 {
         } else {
             secant
         };
-        let here = (t, off(t));
+        let here = (t, log(count(base * t.exp2())?));
         if here.1.abs() < best.1.abs() {
             best = here;
         }
         *(if here.1 > 0.0 { &mut low } else { &mut high }) = here;
     }
-    base * best.0.exp2()
+    Ok(base * best.0.exp2())
 }
 
 #[cfg(test)]

@@ -1,0 +1,239 @@
+//! The device as policies see it: the twins where they serve, the CPU where they do not, and why.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use g2ard_core::backend::Group;
+use g2ard_core::raster::Camera;
+use g2ard_core::select::{Gaussians, Surface};
+use g2ard_core::simplify::Merged;
+use g2ard_core::spatial::{Cells, Frame};
+use g2ard_core::{Backend, Control, Cpu, Result, Splats};
+
+use crate::runtime::{Adapter, Error, Gpu, Options};
+use crate::{groups, probe, visibility, voxels};
+
+/// Which device to use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Choice {
+    #[default]
+    Cpu,
+    /// The best adapter, software ones too.
+    Gpu,
+    /// A real GPU, for scenes large enough, if it is the faster one on a probe.
+    Auto,
+}
+
+/// Rows below which opening a device takes longer than the CPU needs.
+const WORTH_OPENING: usize = 200_000;
+
+/// A backend that runs the twins and goes on with the CPU, for good, once a device fails it.
+#[derive(Debug, Default)]
+pub struct Device {
+    choice: Choice,
+    options: Options,
+    state: Mutex<State>,
+    notes: Mutex<Vec<String>>,
+    /// Kernels that ran on the GPU.
+    served: AtomicU64,
+}
+
+#[derive(Debug, Clone, Default)]
+enum State {
+    #[default]
+    Untried,
+    Open(Arc<Gpu>),
+    Off,
+}
+
+impl Device {
+    pub fn new(choice: Choice, options: Options) -> Self {
+        Self {
+            choice,
+            options,
+            ..Self::default()
+        }
+    }
+
+    /// The adapter in use; None before the first kernel and on the CPU.
+    pub fn adapter(&self) -> Option<Adapter> {
+        match &*lock(&self.state) {
+            State::Open(gpu) => Some(gpu.adapter.clone()),
+            _ => None,
+        }
+    }
+
+    /// Lines for the user since last asked.
+    pub fn notes(&self) -> Vec<String> {
+        std::mem::take(&mut *lock(&self.notes))
+    }
+
+    /// How many kernels ran on the GPU.
+    pub fn served(&self) -> u64 {
+        self.served.load(Ordering::Relaxed)
+    }
+
+    /// The open device, if there is one.
+    pub fn gpu(&self) -> Option<Arc<Gpu>> {
+        match &*lock(&self.state) {
+            State::Open(gpu) => Some(gpu.clone()),
+            _ => None,
+        }
+    }
+
+    /// The device for work on `rows` rows, opened when first worth it.
+    fn ready(&self, rows: usize) -> Option<Arc<Gpu>> {
+        let mut state = lock(&self.state);
+        match &*state {
+            State::Open(gpu) => return Some(gpu.clone()),
+            State::Off => return None,
+            State::Untried => {}
+        }
+        let found = match self.choice {
+            Choice::Cpu => return None,
+            Choice::Auto if rows < WORTH_OPENING => return None,
+            Choice::Auto => self.worthwhile(),
+            Choice::Gpu => guarded(|| {
+                let gpu = Gpu::open(true, self.options)?;
+                probe::check(&gpu)?;
+                Ok(gpu)
+            })
+            .map(Some),
+        };
+        match found {
+            Ok(Some(gpu)) => {
+                let gpu = Arc::new(gpu);
+                *state = State::Open(gpu.clone());
+                Some(gpu)
+            }
+            Ok(None) => {
+                *state = State::Off;
+                None
+            }
+            Err(error) => {
+                *state = State::Off;
+                self.note(&error);
+                None
+            }
+        }
+    }
+
+    /// A real GPU that is faster than the CPU. Having none is nothing to tell of.
+    fn worthwhile(&self) -> crate::runtime::Result<Option<Gpu>> {
+        guarded(|| match Gpu::open(false, self.options) {
+            Ok(gpu) => Ok(probe::pays(&gpu)?.then_some(gpu)),
+            Err(Error::NoAdapter) => Ok(None),
+            Err(other) => Err(other),
+        })
+    }
+
+    fn note(&self, error: &Error) {
+        let line = format!("GPU: {error}; goes on on the CPU");
+        let mut notes = lock(&self.notes);
+        if !notes.contains(&line) {
+            notes.push(line);
+        }
+    }
+
+    /// `twin` on the device, else `cpu`.
+    fn either<T>(
+        &self,
+        rows: usize,
+        twin: impl FnOnce(&Gpu) -> crate::runtime::Result<T>,
+        cpu: impl FnOnce() -> Result<T>,
+    ) -> Result<T> {
+        let Some(gpu) = self.ready(rows) else {
+            return cpu();
+        };
+        match guarded(|| twin(&gpu)) {
+            Ok(found) => {
+                self.served.fetch_add(1, Ordering::Relaxed);
+                return Ok(found);
+            }
+            Err(Error::Interrupted) => return Err(g2ard_core::Error::Interrupted),
+            Err(error) => {
+                self.note(&error);
+                // What is too large for one kernel says nothing about the next.
+                if !matches!(error, Error::TooLarge { .. }) {
+                    *lock(&self.state) = State::Off;
+                }
+            }
+        }
+        cpu()
+    }
+}
+
+/// A panic of a driver's or of wgpu's is one more way in which a device fails.
+fn guarded<T>(f: impl FnOnce() -> crate::runtime::Result<T>) -> crate::runtime::Result<T> {
+    catch_unwind(AssertUnwindSafe(f))
+        .unwrap_or_else(|_| Err(Error::Refused("it panicked".to_owned())))
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Backend for Device {
+    fn cells(&self, points: &[[f64; 3]], frame: &Frame, target: usize) -> Result<Cells> {
+        self.either(
+            points.len(),
+            |gpu| voxels::adaptive(gpu, points, frame, target),
+            || Cpu.cells(points, frame, target),
+        )
+    }
+
+    fn energies(
+        &self,
+        splats: &Splats,
+        count: usize,
+        group: &Group<'_>,
+        control: &Control,
+    ) -> Result<Vec<f64>> {
+        self.either(
+            splats.len(),
+            |gpu| groups::energies(gpu, splats, count, group, control),
+            || Cpu.energies(splats, count, group, control),
+        )
+    }
+
+    fn merges(
+        &self,
+        splats: &Splats,
+        groups: &[&[u32]],
+        control: &Control,
+    ) -> Result<Vec<(Merged, f64)>> {
+        self.either(
+            splats.len(),
+            |gpu| groups::merges(gpu, splats, groups, control),
+            || Cpu.merges(splats, groups, control),
+        )
+    }
+
+    fn looks(
+        &self,
+        scene: &Gaussians<'_>,
+        cameras: &[Camera],
+        control: &Control,
+    ) -> Result<Vec<[f32; 2]>> {
+        self.either(
+            scene.means.len(),
+            |gpu| visibility::looks(gpu, scene, cameras, control),
+            || Cpu.looks(scene, cameras, control),
+        )
+    }
+
+    fn visible(
+        &self,
+        scene: &Gaussians<'_>,
+        surface: &Surface,
+        cameras: &[Camera],
+        control: &Control,
+    ) -> Result<Vec<Vec<u32>>> {
+        self.either(
+            scene.means.len(),
+            |gpu| visibility::visible(gpu, scene, surface, cameras, control),
+            || Cpu.visible(scene, surface, cameras, control),
+        )
+    }
+}

@@ -1,0 +1,23 @@
+//! Compute-shader twins of g2ard-core's kernels, for any GPU that speaks Vulkan, Metal or DirectX 12.
+//!
+//! [`Device`] is a [`g2ard_core::Backend`]: policies call it as they call the CPU, and get the same answers. Each
+//! twin has a room of its own, WGSL beside Rust; `runtime` is the one door to wgpu.
+
+mod device;
+mod groups;
+mod probe;
+pub mod runtime;
+mod scan;
+mod soft64;
+mod sort;
+#[cfg(test)]
+mod testing;
+mod visibility;
+mod voxels;
+
+pub use device::{Choice, Device};
+
+/// Doubles as kernels take them.
+fn words(values: &[f64]) -> Vec<u32> {
+    bytemuck::pod_collect_to_vec(values)
+}

@@ -1,0 +1,83 @@
+//! Whether a device computes rightly, and whether it is worth using.
+
+use std::time::{Duration, Instant};
+
+use g2ard_core::{Backend, Control, Cpu, Splats};
+
+use crate::groups;
+use crate::runtime::{Error, Gpu, Result};
+
+/// Groups of a check, and of a race; rows of each.
+const FEW: usize = 128;
+const MANY: usize = 1 << 15;
+const ROWS: usize = 8;
+
+/// The CPU must need this many times as long: below, what is sent to and fro outweighs what is gained.
+const PAYS: f64 = 1.5;
+
+/// Whether the device's answers are the CPU's, bit for bit.
+pub fn check(gpu: &Gpu) -> Result<()> {
+    race(gpu, FEW).map(|_| ())
+}
+
+/// Whether it is also faster, once its kernels are compiled.
+pub fn pays(gpu: &Gpu) -> Result<bool> {
+    check(gpu)?;
+    let (here, there) = race(gpu, MANY)?;
+    Ok(here.as_secs_f64() > PAYS * there.as_secs_f64())
+}
+
+/// Seconds of the CPU and of the device over the same groups.
+fn race(gpu: &Gpu, groups: usize) -> Result<(Duration, Duration)> {
+    let splats = sample(groups * ROWS);
+    let control = Control::default();
+    let group = |g: usize, rows: &mut Vec<u32>| {
+        rows.extend((g * ROWS) as u32..((g + 1) * ROWS) as u32);
+        ROWS
+    };
+    let began = Instant::now();
+    let want = Cpu.energies(&splats, groups, &group, &control)?;
+    let here = began.elapsed();
+    let began = Instant::now();
+    let got = groups::energies(gpu, &splats, groups, &group, &control)?;
+    let there = began.elapsed();
+    if want
+        .iter()
+        .zip(&got)
+        .any(|(a, b)| a.to_bits() != b.to_bits())
+    {
+        return Err(Error::Wrong(gpu.adapter.name.clone()));
+    }
+    Ok((here, there))
+}
+
+/// Rows without any pattern.
+fn sample(count: usize) -> Splats {
+    let mut state = 1u64;
+    let mut next = || {
+        state = state
+            .wrapping_mul(6364136223846793005)
+            .wrapping_add(1442695040888963407);
+        (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
+    };
+    Splats {
+        means: (0..count).map(|_| [next(), next(), next()]).collect(),
+        sh: (0..count)
+            .map(|_| [next() as f32, next() as f32, next() as f32])
+            .collect(),
+        sh_coeffs: 1,
+        ..Splats::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::gpu;
+
+    #[test]
+    fn software_is_right() {
+        let Some(gpu) = gpu("probe") else { return };
+        check(&gpu).unwrap();
+    }
+}

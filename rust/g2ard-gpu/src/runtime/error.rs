@@ -1,0 +1,42 @@
+//! What can go wrong on a device. Every case ends on the CPU path; none panics.
+
+/// One line each: the program shows it before it goes on without the device.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Error {
+    #[error("no adapter: no graphics driver that speaks Vulkan, Metal or DirectX 12 was found")]
+    NoAdapter,
+    #[error("{name}: the driver opened no device ({why})")]
+    NoDevice { name: String, why: String },
+    #[error("{what} needs a buffer of {bytes} bytes; the device binds {limit} at most")]
+    TooLarge {
+        what: &'static str,
+        bytes: u64,
+        limit: u64,
+    },
+    #[error("the device is out of memory")]
+    OutOfMemory,
+    #[error("the device was lost ({0})")]
+    Lost(String),
+    #[error("the device did not answer within {0} s")]
+    Timeout(u64),
+    #[error("the driver refused a kernel ({0})")]
+    Refused(String),
+    /// A kernel's answers differ from the CPU's on the probe.
+    #[error("{0} computes wrongly: its answers differ from the CPU's")]
+    Wrong(String),
+    /// The caller asked to stop.
+    #[error("interrupted")]
+    Interrupted,
+}
+
+pub type Result<T> = std::result::Result<T, Error>;
+
+impl From<g2ard_core::Error> for Error {
+    /// Of the core's errors only this one can come out of a twin: inputs were checked before.
+    fn from(error: g2ard_core::Error) -> Self {
+        match error {
+            g2ard_core::Error::Interrupted => Self::Interrupted,
+            other => Self::Refused(other.to_string()),
+        }
+    }
+}

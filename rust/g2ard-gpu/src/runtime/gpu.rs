@@ -1,0 +1,229 @@
+//! An open device: its buffers, its pipelines, and whether it is still well.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use wgpu::{BufferDescriptor, BufferUsages, ComputePipeline, ComputePipelineDescriptor};
+
+use super::adapters::{self, Adapter};
+use super::{Error, Result};
+
+/// How a device is opened; the default takes what the adapter offers.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Options {
+    /// Binds no more than this many bytes, as if the adapter could not.
+    pub max_binding: Option<u64>,
+    /// Keeps time of every kernel, where the adapter can.
+    pub timed: bool,
+}
+
+/// One entry point of a shader: the sources are joined in order.
+#[derive(Debug, Clone, Copy)]
+pub struct Kernel {
+    pub name: &'static str,
+    pub sources: &'static [&'static str],
+    pub entry: &'static str,
+}
+
+/// Words on the device.
+#[derive(Debug, Clone)]
+pub struct Buffer {
+    pub(super) inner: wgpu::Buffer,
+    words: usize,
+}
+
+impl Buffer {
+    pub fn words(&self) -> usize {
+        self.words
+    }
+}
+
+/// The first thing that went wrong since it was last asked.
+type Health = Arc<Mutex<Option<Error>>>;
+
+#[derive(Debug)]
+pub struct Gpu {
+    pub adapter: Adapter,
+    pub(super) device: wgpu::Device,
+    pub(super) queue: wgpu::Queue,
+    pipelines: Mutex<HashMap<&'static str, ComputePipeline>>,
+    health: Health,
+    max_binding: u64,
+    pub(super) timed: bool,
+    timings: Mutex<BTreeMap<&'static str, f64>>,
+}
+
+impl Gpu {
+    /// Opens the best adapter; software ones only where `software` allows them.
+    pub fn open(software: bool, options: Options) -> Result<Self> {
+        let (adapter, inner) = adapters::found()
+            .into_iter()
+            .find(|(adapter, _)| software || !adapter.is_software())
+            .ok_or(Error::NoAdapter)?;
+        let request = inner.request_device(&wgpu::DeviceDescriptor {
+            label: Some("g2ard"),
+            required_features: inner.features() & wgpu::Features::TIMESTAMP_QUERY,
+            required_limits: inner.limits(),
+            ..Default::default()
+        });
+        let (device, queue) = pollster::block_on(request).map_err(|e| Error::NoDevice {
+            name: adapter.name.clone(),
+            why: one_line(&e.to_string()),
+        })?;
+        let health = Health::default();
+        watch(&device, &health);
+        let offered = adapter.max_binding.min(adapter.max_buffer) & !255;
+        Ok(Self {
+            max_binding: options.max_binding.map_or(offered, |m| m.min(offered)),
+            timed: options.timed && adapter.timestamps,
+            adapter,
+            device,
+            queue,
+            pipelines: Mutex::default(),
+            health,
+            timings: Mutex::default(),
+        })
+    }
+
+    /// Words that one buffer may hold.
+    pub fn max_words(&self) -> usize {
+        usize::try_from(self.max_binding / 4).unwrap_or(usize::MAX)
+    }
+
+    /// Rounds that all loops of one thread may take together. Mesa's llvmpipe ends them, silently, at 65,535.
+    pub fn max_rounds(&self) -> usize {
+        if self.adapter.is_software() {
+            48_000
+        } else {
+            usize::MAX
+        }
+    }
+
+    /// Whether everything so far went well; tells of a failure once.
+    pub fn check(&self) -> Result<()> {
+        if lock(&self.health).is_none() {
+            return Ok(());
+        }
+        // What fails on a lost device says that it is invalid; that it is lost is only told when polled.
+        let _ = self.device.poll(wgpu::PollType::Poll);
+        lock(&self.health).take().map_or(Ok(()), Err)
+    }
+
+    /// A buffer of zeros; at least one word, for empty ones cannot be bound.
+    pub fn buffer(&self, what: &'static str, words: usize) -> Result<Buffer> {
+        let bytes = 4 * words.max(1) as u64;
+        if bytes > self.max_binding {
+            return Err(Error::TooLarge {
+                what,
+                bytes,
+                limit: self.max_binding,
+            });
+        }
+        let inner = self.device.create_buffer(&BufferDescriptor {
+            label: Some(what),
+            size: bytes,
+            usage: BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        self.check()?;
+        Ok(Buffer { inner, words })
+    }
+
+    /// A buffer that holds `data`.
+    pub fn upload<T: bytemuck::NoUninit>(&self, what: &'static str, data: &[T]) -> Result<Buffer> {
+        let bytes: &[u8] = bytemuck::cast_slice(data);
+        let buffer = self.buffer(what, bytes.len() / 4)?;
+        self.queue.write_buffer(&buffer.inner, 0, bytes);
+        self.check()?;
+        Ok(buffer)
+    }
+
+    /// Small constants of one dispatch.
+    pub(super) fn constants(&self, values: &[u32]) -> wgpu::Buffer {
+        let buffer = self.device.create_buffer(&BufferDescriptor {
+            label: Some("constants"),
+            size: 4 * values.len().next_multiple_of(4) as u64,
+            usage: BufferUsages::UNIFORM | BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        self.queue
+            .write_buffer(&buffer, 0, bytemuck::cast_slice(values));
+        buffer
+    }
+
+    /// The pipeline of a kernel, compiled when first asked for.
+    pub(super) fn pipeline(&self, kernel: &Kernel) -> Result<ComputePipeline> {
+        let mut pipelines = lock(&self.pipelines);
+        if let Some(pipeline) = pipelines.get(kernel.name) {
+            return Ok(pipeline.clone());
+        }
+        let module = self
+            .device
+            .create_shader_module(wgpu::ShaderModuleDescriptor {
+                label: Some(kernel.name),
+                source: wgpu::ShaderSource::Wgsl(kernel.sources.concat().into()),
+            });
+        self.check()?;
+        let pipeline = self
+            .device
+            .create_compute_pipeline(&ComputePipelineDescriptor {
+                label: Some(kernel.name),
+                layout: None,
+                module: &module,
+                entry_point: Some(kernel.entry),
+                compilation_options: wgpu::PipelineCompilationOptions {
+                    // Kernels write all of the workgroup memory that they read.
+                    zero_initialize_workgroup_memory: false,
+                    ..Default::default()
+                },
+                cache: None,
+            });
+        self.check()?;
+        pipelines.insert(kernel.name, pipeline.clone());
+        Ok(pipeline)
+    }
+
+    /// Loses the device, as a driver's reset would.
+    pub fn lose(&self) {
+        self.device.destroy();
+    }
+
+    /// Seconds on the device by kernel since last asked, where time is kept.
+    pub fn timings(&self) -> BTreeMap<&'static str, f64> {
+        std::mem::take(&mut *lock(&self.timings))
+    }
+
+    pub(super) fn took(&self, kernel: &'static str, seconds: f64) {
+        *lock(&self.timings).entry(kernel).or_default() += seconds;
+    }
+
+    pub(super) fn fail(&self, error: Error) {
+        lock(&self.health).get_or_insert(error);
+    }
+}
+
+/// Errors come out of `check`, never out of a panic.
+fn watch(device: &wgpu::Device, health: &Health) {
+    let seen = health.clone();
+    device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
+        let error = match error {
+            wgpu::Error::OutOfMemory { .. } => Error::OutOfMemory,
+            other => Error::Refused(one_line(&other.to_string())),
+        };
+        lock(&seen).get_or_insert(error);
+    }));
+    let seen = health.clone();
+    device.set_device_lost_callback(move |reason, message| {
+        let text = format!("{reason:?} {message}").to_lowercase();
+        *lock(&seen) = Some(Error::Lost(one_line(&text)));
+    });
+}
+
+fn one_line(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+/// Nothing panics while it holds these locks, and what they guard is whole at every step.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

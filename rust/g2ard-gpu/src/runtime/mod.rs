@@ -1,0 +1,11 @@
+//! The one door to a device: adapters, buffers, pipelines, work, and what went wrong.
+
+mod adapters;
+mod error;
+mod gpu;
+mod work;
+
+pub use adapters::{Adapter, list};
+pub use error::{Error, Result};
+pub use gpu::{Buffer, Gpu, Kernel, Options};
+pub use work::{Pending, Work};

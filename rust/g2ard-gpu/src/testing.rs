@@ -1,0 +1,145 @@
+//! What the tests of twins share.
+
+use g2ard_core::Splats;
+
+use crate::runtime::{Error, Gpu, Options};
+
+/// Any adapter, software too; says that a test skips where there is none.
+pub fn gpu(what: &str) -> Option<Gpu> {
+    gpu_with(what, Options::default())
+}
+
+pub fn gpu_with(what: &str, options: Options) -> Option<Gpu> {
+    match Gpu::open(true, options) {
+        Ok(gpu) => Some(gpu),
+        Err(Error::NoAdapter) => {
+            eprintln!("skipped: {what}: no adapter on this machine");
+            None
+        }
+        Err(other) => panic!("{what}: {other}"),
+    }
+}
+
+/// The same numbers in every run.
+pub struct Random(u64);
+
+impl Random {
+    pub fn new(seed: u64) -> Self {
+        Self(seed)
+    }
+
+    pub fn below(&mut self, count: u64) -> u64 {
+        (self.unit() * count as f64) as u64
+    }
+
+    /// In [0, 1).
+    pub fn unit(&mut self) -> f64 {
+        self.0 = self
+            .0
+            .wrapping_mul(6364136223846793005)
+            .wrapping_add(1442695040888963407);
+        (self.0 >> 11) as f64 / (1u64 << 53) as f64
+    }
+}
+
+/// Share of entries that are equal.
+pub fn share<T: PartialEq>(a: &[T], b: &[T]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    let equal = a.iter().zip(b).filter(|(x, y)| x == y).count();
+    equal as f64 / a.len().max(1) as f64
+}
+
+/// Discs on two wavy sheets with noise, of a few large and many small ones.
+fn sheets(count: usize, random: &mut Random) -> Splats {
+    let mut splats = Splats {
+        sh_coeffs: 4,
+        ..Splats::default()
+    };
+    for _ in 0..count {
+        let (x, y) = (10.0 * random.unit() - 5.0, 10.0 * random.unit() - 5.0);
+        let sheet = random.below(2) as f64;
+        let z = sheet + 0.3 * (1.7 * x).sin() * (1.1 * y).cos() + 0.01 * random.unit();
+        splats.means.push([x, y, z].map(|v| f64::from(v as f32)));
+        splats
+            .quats
+            .push([0; 4].map(|_| (random.unit() - 0.5) as f32));
+        let size = 0.02 * (3.0 * random.unit()).exp();
+        splats
+            .scales
+            .push([1.0, 0.3 + 0.7 * random.unit(), 0.02].map(|s| (s * size) as f32));
+        splats
+            .logit_opacities
+            .push((8.0 * random.unit() - 3.0) as f32);
+        for k in 0..splats.sh_coeffs {
+            let smooth = if k == 0 { x.sin() + sheet } else { 0.0 };
+            splats
+                .sh
+                .push([0; 3].map(|_| (smooth + 0.3 * (random.unit() - 0.5)) as f32));
+        }
+    }
+    splats
+}
+
+/// Scenes that hurt: each kernel is held against its CPU twin on all of them.
+pub fn scenes(count: usize) -> Vec<(&'static str, Splats)> {
+    let mut random = Random::new(11);
+    let plain = sheets(count, &mut random);
+    let with = |change: &dyn Fn(usize, &mut Splats)| {
+        let mut splats = plain.clone();
+        (0..splats.len()).for_each(|i| change(i, &mut splats));
+        splats
+    };
+    let utm = with(&|i, s| {
+        let m = s.means[i];
+        s.means[i] = [m[0] + 691_234.567, m[1] + 5_334_567.891, m[2] + 512.3];
+    });
+    let collinear = with(&|i, s| {
+        let t = s.means[i][0];
+        s.means[i] = [t, 2.0 * t, -0.5 * t];
+    });
+    let identical = with(&|i, s| {
+        s.means[i] = [1.0, 2.0, 3.0];
+        s.quats[i] = s.quats[0];
+        s.scales[i] = s.scales[0];
+    });
+    let flat = with(&|i, s| s.means[i][2] = 0.0);
+    // Fits that rest on one row alone: they are made anew without it.
+    let spikes = with(&|i, s| {
+        s.means[i][2] = if i % 9 == 0 {
+            0.02 + 1e-3 * i as f64
+        } else {
+            0.0
+        }
+    });
+    let wild = with(&|i, s| {
+        let power = 2f32.powi((i % 61) as i32 - 40);
+        s.scales[i] = s.scales[i].map(|v| v * power);
+        s.logit_opacities[i] *= 6.0;
+        if i % 500 == 1 {
+            s.means[i] = s.means[i].map(|v| v * 2e4);
+        }
+        if i % 97 == 0 {
+            s.quats[i] = [0.0; 4];
+            s.scales[i][2] = 0.0;
+        }
+        if i % 5 == 0 && i > 0 {
+            s.means[i] = s.means[i - 1];
+        }
+    });
+    let small = |n: usize| {
+        let mut random = Random::new(7);
+        sheets(n, &mut random)
+    };
+    vec![
+        ("sheets", plain),
+        ("at UTM offsets", utm),
+        ("collinear", collinear),
+        ("identical", identical),
+        ("flat", flat),
+        ("flat with spikes", spikes),
+        ("wild scales, floaters, duplicates", wild),
+        ("one row", small(1)),
+        ("two rows", small(2)),
+        ("nine rows", small(9)),
+    ]
+}

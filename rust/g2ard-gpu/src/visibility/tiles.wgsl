@@ -1,0 +1,48 @@
+// Splats, nearest first, to the tiles that they touch. `count`: a thread counts a splat's tiles. `expand`: the
+// counts summed, a thread makes one pair of tile and splat; its number says which. `ranges`: sorted by tile,
+// where each tile's pairs lie.
+
+@group(0) @binding(1) var<storage, read> splats: array<Splat>;
+@group(0) @binding(2) var<storage, read> order: array<u32>;
+@group(0) @binding(3) var<storage, read_write> before: array<u32>;
+@group(0) @binding(4) var<storage, read_write> keys: array<vec2<u32>>;
+@group(0) @binding(5) var<storage, read_write> drawn: array<u32>;
+@group(0) @binding(6) var<storage, read_write> bounds: array<vec2<u32>>;
+
+fn thread(id: vec3<u32>, groups: vec3<u32>) -> u32 { return id.y * groups.x * 64u + id.x; }
+
+@compute @workgroup_size(64)
+fn count(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let i = thread(id, groups);
+    if i < view.count { before[i] = tile_count(splats[order[i]]); }
+}
+
+// Pairs view.first … view.first + view.end − 1 of all; view.count splats.
+@compute @workgroup_size(64)
+fn expand(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let i = thread(id, groups);
+    if i >= view.end { return; }
+    let pair = view.first + i;
+    // The last splat with no more pairs before it.
+    var low = 0u;
+    var high = view.count;
+    while high - low > 1u {
+        let middle = (low + high) / 2u;
+        if before[middle] <= pair { low = middle; } else { high = middle; }
+    }
+    let s = splats[order[low]];
+    let columns = tile_span(s.columns);
+    let nth = pair - before[low];
+    let row = tile_span(s.rows).x + nth / columns.y;
+    keys[i] = vec2(row * tiles_across() + columns.x + nth % columns.y, 0u);
+    drawn[i] = order[low];
+}
+
+@compute @workgroup_size(64)
+fn ranges(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
+    let i = thread(id, groups);
+    if i >= view.end { return; }
+    let tile = keys[i].x;
+    if i == 0u || keys[i - 1u].x != tile { bounds[tile].x = i; }
+    if i + 1u == view.end || keys[i + 1u].x != tile { bounds[tile].y = i + 1u; }
+}

@@ -1,0 +1,124 @@
+//! `g2ard.devices`: which device the kernels run on, for the whole process as their threads are.
+
+use std::sync::{Arc, PoisonError, RwLock};
+
+use g2ard_core::Backend;
+#[cfg(not(feature = "gpu"))]
+use g2ard_core::Cpu;
+#[cfg(feature = "gpu")]
+use g2ard_gpu::{Choice, Device, runtime};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+#[cfg(feature = "gpu")]
+use crate::work::quick;
+
+#[cfg(feature = "gpu")]
+type Kernels = Device;
+#[cfg(not(feature = "gpu"))]
+type Kernels = Cpu;
+
+static KERNELS: RwLock<Option<Arc<Kernels>>> = RwLock::new(None);
+
+/// The kernels to call: the CPU's until somebody asks for others.
+pub fn kernels() -> Arc<Kernels> {
+    let chosen = KERNELS.read().unwrap_or_else(PoisonError::into_inner);
+    chosen.clone().unwrap_or_default()
+}
+
+/// As policies take them.
+pub fn backend(kernels: &Arc<Kernels>) -> &dyn Backend {
+    &**kernels
+}
+
+/// Chooses cpu, gpu or auto for every kernel from now on; `max_binding` bytes bound at once at most (for tests);
+/// `timed` keeps time of every kernel.
+#[cfg(feature = "gpu")]
+#[pyfunction]
+#[pyo3(signature = (name, max_binding=None, timed=false))]
+fn set_device(name: &str, max_binding: Option<u64>, timed: bool) -> PyResult<()> {
+    let choice = match name {
+        "cpu" => Choice::Cpu,
+        "gpu" => Choice::Gpu,
+        "auto" => Choice::Auto,
+        _ => return Err(unknown(name)),
+    };
+    let device = Device::new(choice, runtime::Options { max_binding, timed });
+    *KERNELS.write().unwrap_or_else(PoisonError::into_inner) = Some(Arc::new(device));
+    Ok(())
+}
+
+/// There is only the CPU in this build.
+#[cfg(not(feature = "gpu"))]
+#[pyfunction]
+#[pyo3(signature = (name, max_binding=None, timed=false))]
+fn set_device(name: &str, max_binding: Option<u64>, timed: bool) -> PyResult<()> {
+    let _ = (max_binding, timed);
+    if ["cpu", "gpu", "auto"].contains(&name) {
+        Ok(())
+    } else {
+        Err(unknown(name))
+    }
+}
+
+fn unknown(name: &str) -> PyErr {
+    PyValueError::new_err(format!("device: expected cpu, gpu or auto, got {name:?}"))
+}
+
+/// {adapter, served, notes, seconds}: what is in use, how many kernels it ran, and since last asked lines for the
+/// user, and seconds by kernel.
+#[pyfunction]
+fn device_state(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
+    let out = PyDict::new(py);
+    #[cfg(feature = "gpu")]
+    {
+        let kernels = kernels();
+        out.set_item("adapter", kernels.adapter().map(|a| a.name))?;
+        out.set_item("served", kernels.served())?;
+        out.set_item("notes", kernels.notes())?;
+        let seconds = kernels.gpu().map(|gpu| gpu.timings());
+        out.set_item("seconds", seconds.unwrap_or_default())?;
+    }
+    #[cfg(not(feature = "gpu"))]
+    {
+        out.set_item("adapter", None::<String>)?;
+        out.set_item("served", 0)?;
+        out.set_item("notes", Vec::<String>::new())?;
+        out.set_item("seconds", PyDict::new(py))?;
+    }
+    Ok(out)
+}
+
+/// Every adapter, the one to use first; None where this build has no GPU kernels.
+#[pyfunction]
+fn adapters(py: Python<'_>) -> PyResult<Option<Vec<Bound<'_, PyDict>>>> {
+    #[cfg(feature = "gpu")]
+    {
+        let found = quick(py, || Ok(runtime::list()))?;
+        let rows = found.into_iter().map(|a| {
+            let out = PyDict::new(py);
+            out.set_item("name", a.name)?;
+            out.set_item("kind", a.kind)?;
+            out.set_item("backend", a.backend)?;
+            out.set_item("driver", a.driver)?;
+            out.set_item("max_buffer", a.max_buffer)?;
+            out.set_item("max_binding", a.max_binding)?;
+            out.set_item("max_workgroup_memory", a.max_workgroup_memory)?;
+            out.set_item("timestamps", a.timestamps)?;
+            Ok(out)
+        });
+        rows.collect::<PyResult<_>>().map(Some)
+    }
+    #[cfg(not(feature = "gpu"))]
+    {
+        let _ = py;
+        Ok(None)
+    }
+}
+
+pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_function(wrap_pyfunction!(set_device, m)?)?;
+    m.add_function(wrap_pyfunction!(device_state, m)?)?;
+    m.add_function(wrap_pyfunction!(adapters, m)?)
+}
