@@ -114,3 +114,26 @@ def test_quiet_says_errors_only(capsys: pytest.CaptureFixture[str]) -> None:
     console.table("t", ["a"], [["1"]])
     console.error("bad")
     assert capsys.readouterr().err == "g2ard: bad\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["simplify", "absent.ply", "-r", "2", "-o", "out.spz"], "out.spz: scenes are written as"),
+        (["lift", "absent.ply", "-o", "out.sog"], "out.sog: scenes are written as"),
+        (["recover", "absent.ply", "--views", "v.json", "-o", "out.spz"], "out.spz: scenes are written as"),
+        (["adapt", "absent.ply", "--views", "v.json", "-o", "out.spz"], "out.spz: scenes are written as"),
+        (
+            ["select", "absent.ply", "--views", "v.json", "-k", "2", "-o", "out.txt"],
+            "out.txt: views are written",
+        ),
+        (["poses", "absent.ply", "-n", "2", "-o", "out.txt"], "out.txt: views are written"),
+    ],
+)
+def test_a_format_that_is_not_written_is_refused_before_the_work(
+    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path, arguments: list[str], words: str
+) -> None:
+    status, _, error = command_line(*arguments, cwd=tmp_path)
+    assert status == 1
+    assert words in error
+    assert len(error.splitlines()) == 1

@@ -105,6 +105,7 @@ def test_ctrl_c_then_resume_is_never_having_stopped(
     assert_same_bits(whole.splats, resumed.splats)
     assert whole.report["loss"] == resumed.report["loss"]
     assert whole.report["trials"] == resumed.report["trials"]
+    assert whole.report["regularizers"]["steps"] == resumed.report["regularizers"]["steps"]
     assert bool(whole.report["trials"]) == (steps >= 100)
     assert whole.report["geometry"] == resumed.report["geometry"]
 

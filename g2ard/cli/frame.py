@@ -221,14 +221,16 @@ def _device(run: Run) -> Iterator[None]:
     from g2ard import devices
 
     devices.use(run.device, timed=run.verbose)
+    ended = False
     try:
         yield
+        ended = True
     finally:
         state = devices.state()
         for note in state.notes:
             run.say(note)
-        if run.device == "gpu" and not (state.served or state.notes):
-            run.say("--device gpu: nothing here has GPU kernels; all ran on the CPU")
+        if ended and run.device == "gpu" and not (state.served or state.notes):
+            run.say("--device gpu: only `simplify --method paper` and `select` use one; all ran on the CPU")
         elif state.served and run.verbose:
             longest = sorted(state.seconds.items(), key=lambda item: -item[1])[:6]
             took = "".join(f", {name} {seconds:.3f} s" for name, seconds in longest)

@@ -36,6 +36,8 @@ __all__ = [
     "atomic_folder",
     "atomic_output",
     "check_output",
+    "check_scene_output",
+    "check_views_output",
     "kind",
     "read_cloud",
     "read_points",
@@ -104,6 +106,34 @@ def read_scene(path: str | Path) -> Scene:
     return import_module(f"g2ard.io.{found}").read(path)
 
 
+def _named(path: str | Path, suffixes: tuple[str, ...], rule: str) -> Path:
+    """`path`, if its name ends in one of `suffixes`."""
+    from g2ard.errors import OutputError
+
+    path = Path(path)
+    if path.suffix not in suffixes or path.name.endswith(".compressed.ply"):
+        raise OutputError(f"{path}: {rule}")
+    return path
+
+
+def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
+    """As `check_output`, for a scene: its format must be one that `write_splats` knows.
+
+    Raises:
+        OutputError: as `write_splats` would, before the work rather than after it.
+    """
+    return check_output(_named(path, (".ply", ".splat"), "scenes are written as .ply or .splat"), overwrite)
+
+
+def check_views_output(path: str | Path, overwrite: bool = False) -> Path:
+    """As `check_output`, for views: their format must be one that `write_views` knows.
+
+    Raises:
+        OutputError: as `write_views` would, before the work rather than after it.
+    """
+    return check_output(_named(path, (".json",), "views are written as .json"), overwrite)
+
+
 def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, **options: Any) -> None:
     """Write a Gaussian scene, whole or not at all.
 
@@ -120,11 +150,7 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
     """
     from importlib import import_module
 
-    from g2ard.errors import OutputError
-
-    path = Path(path)
-    if path.suffix not in (".ply", ".splat") or path.name.endswith(".compressed.ply"):
-        raise OutputError(f"{path}: scenes are written as .ply or .splat")
+    path = _named(path, (".ply", ".splat"), "scenes are written as .ply or .splat")
     import_module(f"g2ard.io.{path.suffix[1:]}").write(path, splats, overwrite=overwrite, **options)
 
 
@@ -260,10 +286,8 @@ def write_views(
         OutputError: it exists, cannot be written, or is not a .json.
         InputError: no views, or splits or weights of another length.
     """
-    from g2ard.errors import OutputError
     from g2ard.io import views
 
     path = Path(path)
-    if path.suffix != ".json":
-        raise OutputError(f"{path}: views are written as .json")
+    _named(path, (".json",), "views are written as .json")
     views.write(path, cameras, splits=splits, weights=weights, overwrite=overwrite)

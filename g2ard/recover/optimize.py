@@ -347,6 +347,7 @@ class _Loop:
             "multiplier": self.multiplier,
             "trials": self.trials,
             "geometry": self.geometry,
+            "seconds_of": [self._seconds_of[False], self._seconds_of[True]],
         }
         checkpoints.save(path, self.key, meta, {**self.engine.state(), "losses": np.array(self.losses)})
 
@@ -357,6 +358,7 @@ class _Loop:
         self.done, self.seconds = int(meta["done"]), float(meta["seconds"])
         self.multiplier = float(meta["multiplier"])
         self.trials, self.geometry = list(meta["trials"]), list(meta["geometry"])
+        self._seconds_of = dict(zip((False, True), meta["seconds_of"], strict=True))
 
 
 def _engine_class(name: str) -> Any:

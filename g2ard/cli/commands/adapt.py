@@ -37,10 +37,9 @@ def adapt(
     from g2ard.adapt import AdaptConfig
     from g2ard.adapt import adapt as refit
     from g2ard.cli.scenes import load_scene, load_views, make_targets
-    from g2ard.io import write_splats
-    from g2ard.io.atomic import check_output
+    from g2ard.io import check_scene_output, write_splats
 
-    check_output(output, run.overwrite)
+    check_scene_output(output, run.overwrite)
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(run, compact)
     dense = load_scene(run, teacher) if teacher else None
@@ -56,12 +55,15 @@ def adapt(
     work = output.with_name(f".{output.name}.work")
     if not resume:
         shutil.rmtree(work, ignore_errors=True)
+    elif not work.is_dir():
+        run.say(f"nothing to go on from ({work}): starts anew")
     targets = make_targets(run, cameras, dense, colour)
     work.mkdir(exist_ok=True)
     try:
         result = refit(splats, targets, config, work=work, progress=run.progress)
     except KeyboardInterrupt:
-        run.say(f"stopped; the same command with --resume goes on from {work}")
+        if any(work.iterdir()):
+            run.say(f"stopped; the same command with --resume goes on from {work}")
         raise
     finally:
         with suppress(OSError):  # it stays if it holds a checkpoint

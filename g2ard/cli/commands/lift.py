@@ -29,7 +29,7 @@ def lift(
     from g2ard import io
     from g2ard.lift import lift as lift_points
 
-    io.check_output(output, overwrite=run.overwrite)
+    io.check_scene_output(output, run.overwrite)
     began = time.perf_counter()
     found = io.read_cloud(cloud)
     for note in found.notes:

@@ -69,10 +69,10 @@ def poses(
 ) -> None:
     """Make a pool of candidate views for a scene without photos: poses in free space that see it well."""
     from g2ard.cli.scenes import load_scene
-    from g2ard.io import check_output, write_views
+    from g2ard.io import check_views_output, write_views
     from g2ard.poses import plan_pool
 
-    check_output(output, overwrite=run.overwrite)
+    check_views_output(output, run.overwrite)
     splats = load_scene(run, scene)
     pool = plan_pool(
         splats,

@@ -52,15 +52,14 @@ def recover(
 ) -> None:
     """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
     from g2ard.cli.scenes import load_scene, load_view_sets, make_targets, recovery_engine
-    from g2ard.io import write_splats
-    from g2ard.io.atomic import check_output
+    from g2ard.io import check_scene_output, write_splats
     from g2ard.recover import RecoverConfig
     from g2ard.recover import recover as optimize
     from g2ard.recover.presets import preset_for
     from g2ard.recover.schedule import schedule_named
 
     one_horizon(steps, time_limit)
-    check_output(output, run.overwrite)
+    check_scene_output(output, run.overwrite)
     engine = recovery_engine(run)
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(run, student)
@@ -86,6 +85,8 @@ def recover(
     checkpoint = output.with_name(f".{output.name}.checkpoint.npz")
     if not resume:
         checkpoint.unlink(missing_ok=True)
+    elif not checkpoint.exists():
+        run.say(f"nothing to go on from ({checkpoint}): starts anew")
     try:
         result = optimize(
             splats,
@@ -96,7 +97,8 @@ def recover(
             progress=run.progress,
         )
     except KeyboardInterrupt:
-        run.say(f"stopped; the same command with --resume goes on from {checkpoint}")
+        if checkpoint.exists():
+            run.say(f"stopped; the same command with --resume goes on from {checkpoint}")
         raise
     write_splats(output, result.splats, overwrite=run.overwrite)
     checkpoint.unlink(missing_ok=True)

@@ -27,13 +27,13 @@ def select(
 ) -> None:
     """Choose the views worth having, best first, with a weight for how often to draw each."""
     from g2ard.cli.scenes import load_scene, load_views
-    from g2ard.io import check_output, write_views
+    from g2ard.io import check_views_output, write_views
     from g2ard.select import CoverageOptions
     from g2ard.select import select as choose
 
     if views is None:
         raise typer.BadParameter("--views VIEWS: the candidates to select from")
-    check_output(output, run.overwrite)
+    check_views_output(output, run.overwrite)
     splats = load_scene(run, scene)
     cameras = load_views(run, views, "all", None)
     chosen = choose(

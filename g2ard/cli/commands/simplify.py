@@ -63,7 +63,7 @@ def simplify(
     one_budget(count, ratio)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other")
-    io.check_output(output, overwrite=run.overwrite)
+    io.check_scene_output(output, run.overwrite)
     began = time.perf_counter()
     found = io.read_scene(scene)
     for note in found.notes:

@@ -1,6 +1,7 @@
 //! The exact budget: which rows stay when there are too many.
 
-/// The `keep` rows of highest score, ascending; between equals the earlier row stays.
+/// The `keep` rows of highest score, ascending. Which of equals stay is as good as random, but always the same: rows
+/// are in Morton order, and the first of them would be one corner of the scene.
 pub fn best(scores: &[f64], keep: usize) -> Vec<u32> {
     let mut rows: Vec<u32> = (0..scores.len() as u32).collect();
     if keep < rows.len() {
@@ -8,7 +9,7 @@ pub fn best(scores: &[f64], keep: usize) -> Vec<u32> {
             rows.select_nth_unstable_by(keep - 1, |&a, &b| {
                 scores[b as usize]
                     .total_cmp(&scores[a as usize])
-                    .then(a.cmp(&b))
+                    .then(mixed(a).cmp(&mixed(b)))
             });
         }
         rows.truncate(keep);
@@ -17,14 +18,27 @@ pub fn best(scores: &[f64], keep: usize) -> Vec<u32> {
     rows
 }
 
+/// One-to-one, with neighbours sent far apart (the finaliser of MurmurHash3).
+fn mixed(row: u32) -> u32 {
+    let mut h = row;
+    h = (h ^ (h >> 16)).wrapping_mul(0x85eb_ca6b);
+    h = (h ^ (h >> 13)).wrapping_mul(0xc2b2_ae35);
+    h ^ (h >> 16)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn keeps_the_highest_and_of_equals_the_first() {
+    fn keeps_the_highest_and_of_equals_some_everywhere() {
         assert_eq!(best(&[1.0, 3.0, 2.0, 3.0], 2), [1, 3]);
-        assert_eq!(best(&[1.0; 5], 3), [0, 1, 2]);
+        let kept = best(&[1.0; 1000], 100);
+        assert_eq!(kept.len(), 100);
+        for part in 0..10u32 {
+            let here = kept.iter().filter(|&&row| row / 100 == part).count();
+            assert!((3..=20).contains(&here), "{here} of part {part}");
+        }
         assert_eq!(best(&[1.0, 2.0], 5), [0, 1]);
         assert_eq!(best(&[1.0, 2.0], 0), [0u32; 0]);
     }
