@@ -237,3 +237,62 @@ impl Backend for Device {
         )
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn whatever_a_twin_ends_in_the_cpu_answers_and_one_line_says_why() {
+        let name = || "a device".to_owned();
+        let failures = [
+            Error::NoDevice {
+                name: name(),
+                why: name(),
+            },
+            Error::OutOfMemory,
+            Error::Lost(name()),
+            Error::Timeout(30),
+            Error::Refused(name()),
+            Error::Wrong(name()),
+        ];
+        for failure in failures {
+            let device = Device::new(Choice::Gpu, Options::default());
+            if device.ready(1).is_none() {
+                eprintln!("skipped: no adapter on this machine");
+                return;
+            }
+            let why = failure.to_string();
+            let twin = |_: &Gpu| -> crate::runtime::Result<u8> { Err(failure) };
+            assert_eq!(device.either(1, twin, || Ok(7)).unwrap(), 7);
+            assert_eq!(device.notes(), [format!("GPU: {why}; goes on on the CPU")]);
+            assert!(device.gpu().is_none(), "left for good");
+            assert_eq!(device.served(), 0);
+        }
+    }
+
+    #[test]
+    fn a_panic_of_a_driver_s_stays_within() {
+        let device = Device::new(Choice::Gpu, Options::default());
+        if device.ready(1).is_none() {
+            eprintln!("skipped: no adapter on this machine");
+            return;
+        }
+        let twin = |_: &Gpu| -> crate::runtime::Result<u8> { panic!("a driver's") };
+        assert_eq!(device.either(1, twin, || Ok(7)).unwrap(), 7);
+        assert!(device.notes()[0].contains("panicked"));
+    }
+
+    #[test]
+    fn a_stop_is_no_failure() {
+        let device = Device::new(Choice::Gpu, Options::default());
+        if device.ready(1).is_none() {
+            eprintln!("skipped: no adapter on this machine");
+            return;
+        }
+        let twin = |_: &Gpu| -> crate::runtime::Result<u8> { Err(Error::Interrupted) };
+        let found = device.either(1, twin, || Ok(7));
+        assert_eq!(found.unwrap_err(), g2ard_core::Error::Interrupted);
+        assert!(device.notes().is_empty());
+    }
+}
