@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from g2ard import _core
 from g2ard.errors import InputError
 
-__all__ = ["Adapter", "State", "adapters", "state", "use"]
+__all__ = ["Adapter", "State", "adapters", "notes", "state", "use"]
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,13 @@ class State:
     Args:
         adapter: the name of the adapter in use; None on the CPU, and before a kernel asks for one.
         served: how many kernels it has run.
-        notes: lines for the user since last asked, such as why the CPU took over.
-        seconds: on the device by kernel since last asked, where `use` was told to keep time.
+        uploaded_bytes: what it was sent for them; 0 again once it is left.
+        seconds: on the device by kernel, where `use` was told to keep time.
     """
 
     adapter: str | None
     served: int
-    notes: list[str]
+    uploaded_bytes: int
     seconds: dict[str, float]
 
 
@@ -64,7 +64,7 @@ def use(device: str, *, timed: bool = False) -> None:
     """Choose where kernels run from now on, in all threads of this process.
 
     Twins of the kernels exist for `simplify` by the paper's method and for what `select` looks at; all others
-    run on the CPU whatever is chosen. A device that fails is left for good, with a line in `state().notes`.
+    run on the CPU whatever is chosen. A device that fails is left for good, with a line in `notes()`.
 
     Args:
         device: "cpu", which is what a process starts with; "gpu", the best adapter there is, even in
@@ -94,3 +94,8 @@ def _hush() -> None:
 def state() -> State:
     """Where kernels run, and what there is to tell."""
     return State(**_core.device_state())
+
+
+def notes() -> list[str]:
+    """Lines for the user since last asked, such as why the CPU took over."""
+    return _core.device_notes()

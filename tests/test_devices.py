@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 from realdata import real
 from scenes import around, checkered_ball
 
 from g2ard import _core, devices
 from g2ard.cameras import Cameras
+from g2ard.cli.frame import Run
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.poses import make_pool
@@ -40,9 +44,8 @@ def gpu() -> Iterator[None]:
 
 def served() -> int:
     """How many kernels ran on the GPU; none of them failed."""
-    state = devices.state()
-    assert state.notes == []
-    return state.served
+    assert devices.notes() == []
+    return devices.state().served
 
 
 def assert_same(a: Simplified, b: Simplified) -> None:
@@ -90,6 +93,18 @@ def test_the_papers_policy_makes_the_same_scene(offset: tuple[float, float, floa
     np.testing.assert_array_equal(flag(prior, 300), flags)
 
 
+def test_rows_are_sent_once(gpu: None) -> None:
+    """72 bytes a row when it comes into being; then four for each time it is in a group or a cell's list."""
+    ball = checkered_ball(4000)
+    rounds = simplify(ball, 400, method="paper").report["rounds"]
+    assert len(rounds) > 3
+    rows = len(ball) + sum(r["merged_groups"] for r in rounds)
+    looked_at = 10 * len(ball) + sum(3 * r["before"] for r in rounds)  # flags borrow neighbours
+    small = 64 * 1024  # constants of dispatches
+    assert devices.state().uploaded_bytes < 72 * rows + (4 + 8) * looked_at + small * (len(rounds) + 1)
+    assert devices.state().uploaded_bytes > 72 * len(ball)
+
+
 def test_views_see_the_same_cells(gpu: None) -> None:
     every, seen = seen_alike(checkered_ball(3000), around(12, (120, 90)), 1500)
     assert min(every, seen) >= SEEN_ALIKE
@@ -120,7 +135,7 @@ def test_small_buffers_go_in_pieces(gpu: None) -> None:
     few = checkered_ball(60)
     _core.set_device("gpu", 64)  # too small for the disc that coverage is measured on
     refused = simplify(few, 20, method="paper")
-    assert devices.state().notes[0].endswith("goes on on the CPU")
+    assert devices.notes()[0].endswith("goes on on the CPU")
     devices.use("cpu")
     assert_same(simplify(few, 20, method="paper"), refused)
 
@@ -132,7 +147,8 @@ def test_software_is_never_chosen_by_itself(gpu: None) -> None:
     rng = np.random.default_rng(0)
     prior = Splats.create(rng.normal(size=(200_001, 3)), scales=np.full((200_001, 3), 0.01))
     surface(prior, 1000)
-    assert devices.state() == devices.State(None, 0, [], {})
+    assert devices.state() == devices.State(None, 0, 0, {})
+    assert devices.notes() == []
 
 
 def test_refuses_other_names() -> None:
@@ -173,9 +189,62 @@ def test_command_line(tmp_path: Path, command_line: CommandLine, gpu: None) -> N
     assert made["cpu"] == made["gpu"]
 
 
+def test_the_report_says_what_was_sent(tmp_path: Path, command_line: CommandLine, gpu: None) -> None:
+    write_splats(tmp_path / "a.ply", checkered_ball(1000))
+    paper = ("simplify", "a.ply", "-r", "10", "--method", "paper", "-o", "b.ply", "-w", "--json", "-")
+    _, out, _ = command_line(*paper, "--device", "gpu", cwd=tmp_path)
+    used = json.loads(out)["device"]
+    assert used["adapter"] == devices.adapters()[0].name  # type: ignore[index]
+    assert used["kernels"] > 10
+    assert used["uploaded_bytes"] > 72_000
+    _, out, _ = command_line(*paper, "--device", "cpu", cwd=tmp_path)
+    assert "device" not in json.loads(out)
+
+
+def test_failures_are_told_when_they_happen(capsys: pytest.CaptureFixture, gpu: None) -> None:
+    common = dict.fromkeys(("overwrite", "verbose", "quiet", "json")) | {"seed": 0, "threads": 0}
+    run = Run("simplify", {**common, "device": "gpu"}, {})
+    _core.set_device("gpu", 64)  # too small for the disc that coverage is measured on
+    simplify(checkered_ball(60), 20, method="paper")
+    run.progress("simplify", 1, 2)
+    assert capsys.readouterr().err.startswith("GPU: ")
+    run.progress("simplify", 2, 2)
+    assert "GPU" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kilobytes", [600_000, 900_000, 1_400_000, 2_000_000, 3_000_000])
+def test_little_address_space_ends_on_the_cpu(kilobytes: int, tmp_path: Path, gpu: None) -> None:
+    """Drivers that run out of it end the process, so they are not asked."""
+    if sys.platform != "linux":
+        pytest.skip("only Linux tells how much is left")
+    write_splats(tmp_path / "a.ply", checkered_ball(1000))
+    command = f'ulimit -v {kilobytes}; exec "$0" -m g2ard simplify a.ply -r 10 --method paper "$@"'
+    outputs = []
+    for device in ("cpu", "gpu"):
+        name = f"{device}.ply"
+        done = subprocess.run(
+            ["sh", "-c", command, sys.executable, "-o", name, "--device", device, "--threads", "2"],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        assert done.returncode == 0, done.stderr
+        outputs.append((tmp_path / name).read_bytes())
+        notes = [line for line in done.stderr.splitlines() if "goes on on the CPU" in line]
+        if device == "gpu" and kilobytes < 1_000_000:
+            assert len(notes) == 1
+            assert "MB of address space" in notes[0]
+    assert outputs[0] == outputs[1]
+
+
 def test_lists_devices(tmp_path: Path, command_line: CommandLine) -> None:
     status, out, told = command_line("info", "--devices", "--json", "-", cwd=tmp_path)
     assert status == 0, told
+    assert told.splitlines()[0].strip() == "Devices"
+    assert "--device gpu" in told
+    assert "┡" not in told  # what ends a header
     found = json.loads(out)
     names = [a["name"] for a in found["adapters"]]
     assert found["used"]["gpu"] == (names[0] if names else None)

@@ -60,14 +60,14 @@ class Console:
         print(f"g2ard: {text}", file=sys.stderr, flush=True)
 
     def table(self, title: str, columns: list[str], rows: list[list[str]]) -> None:
-        """A table on stderr; the first column is left-aligned, figures right-aligned."""
+        """A table on stderr; the first column is left-aligned, figures right-aligned; no names, no header."""
         if self.quiet:
             return
         self._end_bars()
         from rich.console import Console as Rich
         from rich.table import Table
 
-        table = Table(title=title, title_justify="left")
+        table = Table(title=title, title_justify="left", show_header=any(columns))
         for i, name in enumerate(columns):
             table.add_column(name, justify="left" if i == 0 else "right")
         for row in rows:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -110,12 +110,22 @@ class Run:
         self.verbose: bool = common["verbose"]
         self.json: str | None = common["json"]
         self.console = Console(quiet=common["quiet"])
+        self.noted = False  # whether a GPU failed
         self.config = {**options, "seed": self.seed, "threads": self.threads, "device": self.device}
 
-    @property
-    def progress(self) -> Console:
-        """The callback that stages report to."""
-        return self.console
+    def progress(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
+        """The callback that stages report to; what befell the GPU in the meantime is told first."""
+        self.tell_notes()
+        self.console(stage, done, total, info)
+
+    def tell_notes(self) -> None:
+        """Why the CPU took over from a GPU, if it has since last told."""
+        if self.device in ("auto", "gpu"):
+            from g2ard import devices
+
+            for note in devices.notes():
+                self.noted = True
+                self.say(note)
 
     def say(self, text: str) -> None:
         """A line of status on stderr, unless --quiet."""
@@ -127,7 +137,7 @@ class Run:
             return
         import json
 
-        text = json.dumps({**data, "config": self.config}, indent=2, default=_plain)
+        text = json.dumps({**data, **self._used(), "config": self.config}, indent=2, default=_plain)
         if self.json == "-":
             sys.stdout.write(text + "\n")
             return
@@ -135,6 +145,18 @@ class Run:
 
         with atomic_output(Path(self.json), overwrite=self.overwrite) as temporary:
             temporary.write_text(text + "\n")
+
+    def _used(self) -> dict[str, Any]:
+        """What ran on a GPU, if anything did."""
+        if self.device not in ("auto", "gpu"):
+            return {}
+        from g2ard import devices
+
+        state = devices.state()
+        if not state.served:
+            return {}
+        used = {"adapter": state.adapter, "kernels": state.served, "uploaded_bytes": state.uploaded_bytes}
+        return {"device": used}
 
     def unmet(self, requirement: str) -> NoReturn:
         """End with status 3: all is written, but a stated requirement was not met."""
@@ -214,7 +236,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
 
 @contextmanager
 def _device(run: Run) -> Iterator[None]:
-    """Kernels run where --device says; what there is to tell of that is told at the end."""
+    """Kernels run where --device says."""
     if run.device not in ("auto", "gpu"):
         yield
         return
@@ -226,10 +248,9 @@ def _device(run: Run) -> Iterator[None]:
         yield
         ended = True
     finally:
+        run.tell_notes()
         state = devices.state()
-        for note in state.notes:
-            run.say(note)
-        if ended and run.device == "gpu" and not (state.served or state.notes):
+        if ended and run.device == "gpu" and not (state.served or run.noted):
             run.say("--device gpu: only `simplify --method paper` and `select` use one; all ran on the CPU")
         elif state.served and run.verbose:
             longest = sorted(state.seconds.items(), key=lambda item: -item[1])[:6]

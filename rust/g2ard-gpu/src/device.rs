@@ -1,17 +1,17 @@
 //! The device as policies see it: the twins where they serve, the CPU where they do not, and why.
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use g2ard_core::backend::Group;
+use g2ard_core::backend::{Group, Numbered, Run};
 use g2ard_core::raster::Camera;
 use g2ard_core::select::{Gaussians, Surface};
 use g2ard_core::simplify::Merged;
 use g2ard_core::spatial::{Cells, Frame};
-use g2ard_core::{Backend, Control, Cpu, Result, Splats};
+use g2ard_core::{Backend, Control, Cpu, Result};
 
-use crate::runtime::{Adapter, Error, Gpu, Options};
+use crate::rows::Rows;
+use crate::runtime::{Adapter, Error, Gpu, Options, guarded};
 use crate::{groups, probe, visibility, voxels};
 
 /// Which device to use.
@@ -119,11 +119,11 @@ impl Device {
         }
     }
 
-    /// A real GPU that is faster than the CPU. Having none is nothing to tell of.
+    /// A real GPU that is faster than the CPU. Having none, or no room for one, is nothing to tell of.
     fn worthwhile(&self) -> crate::runtime::Result<Option<Gpu>> {
         guarded(|| match Gpu::open(false, self.options) {
             Ok(gpu) => Ok(probe::pays(&gpu)?.then_some(gpu)),
-            Err(Error::NoAdapter) => Ok(None),
+            Err(Error::NoAdapter | Error::NoRoom { .. }) => Ok(None),
             Err(other) => Err(other),
         })
     }
@@ -154,20 +154,13 @@ impl Device {
             Err(Error::Interrupted) => return Err(g2ard_core::Error::Interrupted),
             Err(error) => {
                 self.note(&error);
-                // What is too large for one kernel says nothing about the next.
-                if !matches!(error, Error::TooLarge { .. }) {
+                if !error.is_of_size() {
                     *lock(&self.state) = State::Off;
                 }
             }
         }
         cpu()
     }
-}
-
-/// A panic of a driver's or of wgpu's is one more way in which a device fails.
-fn guarded<T>(f: impl FnOnce() -> crate::runtime::Result<T>) -> crate::runtime::Result<T> {
-    catch_unwind(AssertUnwindSafe(f))
-        .unwrap_or_else(|_| Err(Error::Refused("it panicked".to_owned())))
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -179,35 +172,15 @@ impl Backend for Device {
         self.either(
             points.len(),
             |gpu| voxels::adaptive(gpu, points, frame, target),
-            || Cpu.cells(points, frame, target),
+            || Backend::cells(&Cpu, points, frame, target),
         )
     }
 
-    fn energies(
-        &self,
-        splats: &Splats,
-        count: usize,
-        group: &Group<'_>,
-        control: &Control,
-    ) -> Result<Vec<f64>> {
-        self.either(
-            splats.len(),
-            |gpu| groups::energies(gpu, splats, count, group, control),
-            || Cpu.energies(splats, count, group, control),
-        )
-    }
-
-    fn merges(
-        &self,
-        splats: &Splats,
-        groups: &[&[u32]],
-        control: &Control,
-    ) -> Result<Vec<(Merged, f64)>> {
-        self.either(
-            splats.len(),
-            |gpu| groups::merges(gpu, splats, groups, control),
-            || Cpu.merges(splats, groups, control),
-        )
+    fn run(&self) -> Box<dyn Run + '_> {
+        Box::new(OnDevice {
+            device: self,
+            held: Mutex::default(),
+        })
     }
 
     fn looks(
@@ -238,6 +211,66 @@ impl Backend for Device {
     }
 }
 
+/// One run of simplification: the rows that the device holds for it go with it.
+struct OnDevice<'a> {
+    device: &'a Device,
+    held: Mutex<Rows>,
+}
+
+impl OnDevice<'_> {
+    /// `twin` on the device, which has been sent what it lacked of the rows; else `cpu`.
+    fn either<T>(
+        &self,
+        rows: Numbered<'_>,
+        twin: impl FnOnce(&Gpu, &Rows) -> crate::runtime::Result<T>,
+        cpu: impl FnOnce() -> Result<T>,
+    ) -> Result<T> {
+        let with_rows = |gpu: &Gpu| {
+            let mut held = lock(&self.held);
+            held.follow(gpu, rows)?;
+            twin(gpu, &held)
+        };
+        self.device.either(rows.splats.len(), with_rows, cpu)
+    }
+}
+
+impl Run for OnDevice<'_> {
+    fn cells(&self, rows: Numbered<'_>, kept: &[u32], target: usize) -> Result<Cells> {
+        self.either(
+            rows,
+            |gpu, held| voxels::of_rows(gpu, held, rows, kept, target),
+            || Run::cells(&Cpu, rows, kept, target),
+        )
+    }
+
+    fn energies(
+        &self,
+        rows: Numbered<'_>,
+        count: usize,
+        group: &Group<'_>,
+        control: &Control,
+    ) -> Result<Vec<f64>> {
+        self.either(
+            rows,
+            |gpu, held| groups::energies(gpu, held, rows, count, group, control),
+            || Cpu.energies(rows, count, group, control),
+        )
+    }
+
+    fn merges(
+        &self,
+        rows: Numbered<'_>,
+        groups: &[&[u32]],
+        control: &Control,
+    ) -> Result<Vec<(Merged, f64)>> {
+        self.either(
+            rows,
+            |gpu, held| groups::merges(gpu, held, rows, groups, control),
+            || Cpu.merges(rows, groups, control),
+        )
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -251,9 +284,11 @@ mod tests {
                 why: name(),
             },
             Error::OutOfMemory,
+            Error::NoRoom { bytes: 2, left: 1 },
             Error::Lost(name()),
             Error::Timeout(30),
             Error::Refused(name()),
+            Error::Panicked(name()),
             Error::Wrong(name()),
         ];
         for failure in failures {
@@ -280,7 +315,35 @@ mod tests {
         }
         let twin = |_: &Gpu| -> crate::runtime::Result<u8> { panic!("a driver's") };
         assert_eq!(device.either(1, twin, || Ok(7)).unwrap(), 7);
-        assert!(device.notes()[0].contains("panicked"));
+        assert!(device.notes()[0].contains("the driver panicked (a driver's)"));
+    }
+
+    #[test]
+    fn what_is_too_large_for_one_kernel_is_no_reason_to_leave() {
+        let (what, limit) = ("rows", 3);
+        let large = Error::TooLarge {
+            what,
+            bytes: 4,
+            limit,
+        };
+        let many = Error::TooMany {
+            what,
+            count: 4,
+            limit,
+        };
+        let told = "4 rows are too many for the device, which takes 3 at most";
+        assert_eq!(many.to_string(), told);
+        for failure in [large, many] {
+            let device = Device::new(Choice::Gpu, Options::default());
+            if device.ready(1).is_none() {
+                eprintln!("skipped: no adapter on this machine");
+                return;
+            }
+            let twin = |_: &Gpu| -> crate::runtime::Result<u8> { Err(failure) };
+            assert_eq!(device.either(1, twin, || Ok(7)).unwrap(), 7);
+            assert_eq!(device.notes().len(), 1);
+            assert_eq!(device.either(1, |_| Ok(8), || Ok(7)).unwrap(), 8);
+        }
     }
 
     #[test]

@@ -6,6 +6,7 @@
 mod device;
 mod groups;
 mod probe;
+mod rows;
 pub mod runtime;
 mod scan;
 mod soft64;

@@ -2,9 +2,11 @@
 
 use std::time::{Duration, Instant};
 
-use g2ard_core::{Backend, Control, Cpu, Splats};
+use g2ard_core::backend::{Numbered, Run};
+use g2ard_core::{Control, Cpu, Splats};
 
 use crate::groups;
+use crate::rows::Rows;
 use crate::runtime::{Error, Gpu, Result};
 
 /// Groups of a check, and of a race; rows of each.
@@ -30,16 +32,23 @@ pub fn pays(gpu: &Gpu) -> Result<bool> {
 /// Seconds of the CPU and of the device over the same groups.
 fn race(gpu: &Gpu, groups: usize) -> Result<(Duration, Duration)> {
     let splats = sample(groups * ROWS);
+    let numbers: Vec<u32> = (0..splats.len() as u32).collect();
+    let rows = Numbered {
+        splats: &splats,
+        numbers: &numbers,
+    };
     let control = Control::default();
     let group = |g: usize, rows: &mut Vec<u32>| {
         rows.extend((g * ROWS) as u32..((g + 1) * ROWS) as u32);
         ROWS
     };
     let began = Instant::now();
-    let want = Cpu.energies(&splats, groups, &group, &control)?;
+    let want = Cpu.energies(rows, groups, &group, &control)?;
     let here = began.elapsed();
     let began = Instant::now();
-    let got = groups::energies(gpu, &splats, groups, &group, &control)?;
+    let mut held = Rows::default();
+    held.follow(gpu, rows)?;
+    let got = groups::energies(gpu, &held, rows, groups, &group, &control)?;
     let there = began.elapsed();
     if want
         .iter()
@@ -66,7 +75,9 @@ fn sample(count: usize) -> Splats {
             .map(|_| [next() as f32, next() as f32, next() as f32])
             .collect(),
         sh_coeffs: 1,
-        ..Splats::default()
+        quats: vec![[1.0, 0.0, 0.0, 0.0]; count],
+        scales: vec![[1.0; 3]; count],
+        logit_opacities: vec![0.0; count],
     }
 }
 

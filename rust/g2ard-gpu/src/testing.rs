@@ -126,6 +126,8 @@ pub fn scenes(count: usize) -> Vec<(&'static str, Splats)> {
             s.means[i] = s.means[i - 1];
         }
     });
+    // Nothing that merging could weigh by.
+    let massless = with(&|i, s| s.scales[i] = [s.scales[i][0], 0.0, 0.0]);
     let small = |n: usize| {
         let mut random = Random::new(7);
         sheets(n, &mut random)
@@ -138,6 +140,7 @@ pub fn scenes(count: usize) -> Vec<(&'static str, Splats)> {
         ("flat", flat),
         ("flat with spikes", spikes),
         ("wild scales, floaters, duplicates", wild),
+        ("of no area", massless),
         ("one row", small(1)),
         ("two rows", small(2)),
         ("nine rows", small(9)),

@@ -66,28 +66,37 @@ fn unknown(name: &str) -> PyErr {
     PyValueError::new_err(format!("device: expected cpu, gpu or auto, got {name:?}"))
 }
 
-/// {adapter, served, notes, seconds}: what is in use, how many kernels it ran, and since last asked lines for the
-/// user, and seconds by kernel.
+/// {adapter, served, uploaded_bytes, seconds}: what is in use, how many kernels it ran, what was sent for them, and
+/// seconds by kernel.
 #[pyfunction]
 fn device_state(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
     let out = PyDict::new(py);
     #[cfg(feature = "gpu")]
     {
         let kernels = kernels();
-        out.set_item("adapter", kernels.adapter().map(|a| a.name))?;
+        let gpu = kernels.gpu();
+        out.set_item("adapter", gpu.as_ref().map(|g| g.adapter.name.clone()))?;
         out.set_item("served", kernels.served())?;
-        out.set_item("notes", kernels.notes())?;
-        let seconds = kernels.gpu().map(|gpu| gpu.timings());
-        out.set_item("seconds", seconds.unwrap_or_default())?;
+        out.set_item("uploaded_bytes", gpu.as_ref().map_or(0, |g| g.sent()))?;
+        out.set_item("seconds", gpu.map(|g| g.timings()).unwrap_or_default())?;
     }
     #[cfg(not(feature = "gpu"))]
     {
         out.set_item("adapter", None::<String>)?;
         out.set_item("served", 0)?;
-        out.set_item("notes", Vec::<String>::new())?;
+        out.set_item("uploaded_bytes", 0)?;
         out.set_item("seconds", PyDict::new(py))?;
     }
     Ok(out)
+}
+
+/// Lines for the user since last asked.
+#[pyfunction]
+fn device_notes() -> Vec<String> {
+    #[cfg(feature = "gpu")]
+    return kernels().notes();
+    #[cfg(not(feature = "gpu"))]
+    Vec::new()
 }
 
 /// Every adapter, the one to use first; None where this build has no GPU kernels.
@@ -120,5 +129,6 @@ fn adapters(py: Python<'_>) -> PyResult<Option<Vec<Bound<'_, PyDict>>>> {
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(set_device, m)?)?;
     m.add_function(wrap_pyfunction!(device_state, m)?)?;
+    m.add_function(wrap_pyfunction!(device_notes, m)?)?;
     m.add_function(wrap_pyfunction!(adapters, m)?)
 }

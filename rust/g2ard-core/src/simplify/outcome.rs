@@ -2,6 +2,7 @@
 
 use super::{GONE, Ordered, SceneRef, Step};
 use crate::Splats;
+use crate::backend::Numbered;
 
 /// The simplified scene in the caller's coordinates, and what became of each of its rows.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,19 +21,32 @@ pub struct Outcome<R> {
 /// Follows parents and copies through successive steps.
 pub struct Trail {
     pub step: Step,
+    /// See [`Numbered`].
+    numbers: Vec<u32>,
+    /// The number that the next new row gets.
+    next: u32,
 }
 
 impl Trail {
-    /// Before the first round: every row is a copy of itself.
-    pub fn start(splats: Splats, flags: Vec<bool>) -> Self {
+    /// Before the first round: every row is a copy of itself, and none is flagged.
+    pub fn start(splats: Splats) -> Self {
         let rows: Vec<u32> = (0..splats.len() as u32).collect();
         Self {
+            numbers: rows.clone(),
+            next: rows.len() as u32,
             step: Step {
-                splats,
                 parents: rows.clone(),
-                flags,
+                flags: vec![false; rows.len()],
                 copied: rows,
+                splats,
             },
+        }
+    }
+
+    pub fn rows(&self) -> Numbered<'_> {
+        Numbered {
+            splats: &self.step.splats,
+            numbers: &self.numbers,
         }
     }
 
@@ -41,6 +55,14 @@ impl Trail {
             let follow = |&p: &u32| if p == GONE { GONE } else { map[p as usize] };
             rows.iter().map(follow).collect()
         };
+        let number = |&source: &u32| {
+            if source != GONE {
+                return self.numbers[source as usize];
+            }
+            self.next += 1;
+            self.next - 1
+        };
+        self.numbers = next.copied.iter().map(number).collect();
         self.step = Step {
             parents: through(&self.step.parents, &next.parents),
             copied: through(&next.copied, &self.step.copied),
@@ -87,5 +109,30 @@ impl Step {
             clamped_opacities: 0,
             clamped_logits: ordered.clamped_logits,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn copies_keep_their_numbers_and_new_rows_get_new_ones() {
+        let step = |copied: Vec<u32>, parents: Vec<u32>| Step {
+            splats: Splats {
+                means: vec![[0.0; 3]; copied.len()],
+                ..Splats::default()
+            },
+            flags: vec![false; copied.len()],
+            parents,
+            copied,
+        };
+        let mut trail = Trail::start(step(vec![0; 4], Vec::new()).splats);
+        assert_eq!(trail.rows().numbers, [0, 1, 2, 3]);
+        trail.then(step(vec![GONE, 3, GONE], vec![0, 0, 2, 1]));
+        assert_eq!(trail.rows().numbers, [4, 3, 5]);
+        trail.then(step(vec![2, GONE], vec![1, 1, 0]));
+        assert_eq!(trail.rows().numbers, [5, 6]);
+        assert_eq!(trail.step.parents, [1, 1, 0, 1]);
     }
 }

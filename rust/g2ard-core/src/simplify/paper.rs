@@ -4,10 +4,10 @@ use rayon::prelude::*;
 
 use super::moments::{Merged, optical_mass, sigmoid};
 use super::outcome::Trail;
-use super::residual::{self, color};
+use super::residual::{color, flags_in};
 use super::trim::best;
 use super::{GONE, Ordered, Outcome, SceneRef, Step};
-use crate::spatial::Frame;
+use crate::backend::{Numbered, Run};
 use crate::{Backend, Control, Error, Result, Splats};
 
 /// Defaults are the paper's (`tab:s_config`).
@@ -79,26 +79,27 @@ impl Paper {
         control: &Control,
     ) -> Result<Outcome<PaperRound>> {
         let ordered = Ordered::new(scene)?;
-        let splats = ordered.splats(scene);
-        let flags = match flags {
-            Some(flags) if flags.len() == splats.len() => ordered.sorted(flags),
+        let run = &*backend.run();
+        let mut trail = Trail::start(ordered.splats(scene));
+        let rows = trail.rows();
+        trail.step.flags = match flags {
+            Some(flags) if flags.len() == ordered.rows.len() => ordered.sorted(flags),
             Some(flags) => {
                 return Err(Error::invalid(
                     "protected",
-                    format!("{} rows", splats.len()),
+                    format!("{} rows", ordered.rows.len()),
                     flags.len(),
                 ));
             }
-            None => residual::flags(&splats, flag_cells, self.flag_threshold, backend, control)?,
+            None => flags_in(rows, flag_cells, self.flag_threshold, run, control)?,
         };
-        let mut trail = Trail::start(splats, flags);
         let mut rounds = Vec::new();
         let shed = |budget: usize| ordered.rows.len().saturating_sub(budget) as u64;
         control.begin(shed(schedule.last().copied().unwrap_or(usize::MAX)));
         for &budget in schedule {
-            let Step { splats, flags, .. } = &trail.step;
+            let flags = &trail.step.flags;
             let (step, report) =
-                self.round(splats, flags, budget, ordered.grid, backend, control)?;
+                self.round(trail.rows(), flags, budget, ordered.grid, run, control)?;
             control.advance((report.before - report.after) as u64);
             trail.then(step);
             rounds.push(report);
@@ -115,20 +116,14 @@ impl Paper {
     /// One round, to exactly `budget` rows (all of them when there are no more than that).
     fn round(
         &self,
-        splats: &Splats,
+        rows: Numbered<'_>,
         flags: &[bool],
         budget: usize,
         grid: f64,
-        backend: &dyn Backend,
+        run: &dyn Run,
         control: &Control,
     ) -> Result<(Step, PaperRound)> {
-        if flags.len() != splats.len() {
-            return Err(Error::invalid(
-                "protected",
-                format!("{} rows", splats.len()),
-                flags.len(),
-            ));
-        }
+        let splats = rows.splats;
         let mut report = PaperRound {
             before: splats.len(),
             after: splats.len().min(budget),
@@ -137,11 +132,11 @@ impl Paper {
         let kept = self.drop_transparent(splats, flags, budget);
         report.dropped = splats.len() - kept.len();
         let groups = if kept.len() > budget {
-            self.groups(splats, &kept, budget, backend, &mut report)?
+            self.groups(rows, &kept, budget, run, &mut report)?
         } else {
             kept.iter().map(|&i| vec![i]).collect()
         };
-        let mut merges = self.judge(splats, &groups, backend, &mut report, control)?;
+        let mut merges = self.judge(rows, &groups, run, &mut report, control)?;
         undo_costliest(&groups, &mut merges, budget, &mut report);
         let built = build(splats, flags, &groups, merges, grid, &mut report);
         Ok((self.trim(built, budget, &mut report), report))
@@ -173,14 +168,13 @@ impl Paper {
     /// Rows that share a cell and a colour bin; groups in order of their first row.
     fn groups(
         &self,
-        splats: &Splats,
+        rows: Numbered<'_>,
         kept: &[u32],
         budget: usize,
-        backend: &dyn Backend,
+        run: &dyn Run,
         report: &mut PaperRound,
     ) -> Result<Vec<Vec<u32>>> {
-        let points: Vec<_> = kept.iter().map(|&i| splats.means[i as usize]).collect();
-        let cells = backend.cells(&points, &Frame::of(&points), budget)?;
+        let cells = run.cells(rows, kept, budget)?;
         report.cells = cells.len();
         let ids: Vec<usize> = (0..cells.len()).collect();
         let mut groups: Vec<Vec<u32>> = ids
@@ -191,7 +185,7 @@ impl Paper {
                     .iter()
                     .map(|&at| {
                         (
-                            self.bin(color(splats, kept[at as usize] as usize)),
+                            self.bin(color(rows.splats, kept[at as usize] as usize)),
                             kept[at as usize],
                         )
                     })
@@ -214,18 +208,18 @@ impl Paper {
     /// Each group's merged Gaussian where both guards pass: energy is asked first.
     fn judge(
         &self,
-        splats: &Splats,
+        rows: Numbered<'_>,
         groups: &[Vec<u32>],
-        backend: &dyn Backend,
+        run: &dyn Run,
         report: &mut PaperRound,
         control: &Control,
     ) -> Result<Vec<Option<Box<Candidate>>>> {
         let several: Vec<usize> = (0..groups.len()).filter(|&g| groups[g].len() > 1).collect();
-        let rows = |at: usize, rows: &mut Vec<u32>| {
+        let group = |at: usize, rows: &mut Vec<u32>| {
             rows.extend_from_slice(&groups[several[at]]);
             rows.len()
         };
-        let energies = backend.energies(splats, several.len(), &rows, control)?;
+        let energies = run.energies(rows, several.len(), &group, control)?;
         let examined = several.len();
         let smooth: Vec<(usize, f64)> = several
             .into_iter()
@@ -234,7 +228,7 @@ impl Paper {
             .collect();
         report.refused_energy = examined - smooth.len();
         let candidates: Vec<&[u32]> = smooth.iter().map(|&(g, _)| &groups[g][..]).collect();
-        let merges = backend.merges(splats, &candidates, control)?;
+        let merges = run.merges(rows, &candidates, control)?;
         let mut accepted: Vec<_> = groups.iter().map(|_| None).collect();
         for (&(g, energy), (merged, covered)) in smooth.iter().zip(merges) {
             if covered < self.min_coverage {

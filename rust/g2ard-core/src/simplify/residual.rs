@@ -1,6 +1,6 @@
 //! Protection flags: where an affine function of position cannot predict colour.
 
-use crate::spatial::Frame;
+use crate::backend::{Numbered, Run};
 use crate::{Backend, Control, Result, Splats};
 
 /// Band-0 spherical harmonic: colour = 0.5 + SH_C0·sh0.
@@ -22,7 +22,24 @@ pub fn flags(
     backend: &dyn Backend,
     control: &Control,
 ) -> Result<Vec<bool>> {
-    let grid = backend.cells(&splats.means, &Frame::of(&splats.means), cells)?;
+    let numbers: Vec<u32> = (0..splats.len() as u32).collect();
+    let rows = Numbered {
+        splats,
+        numbers: &numbers,
+    };
+    flags_in(rows, cells, threshold, &*backend.run(), control)
+}
+
+/// The same within a run.
+pub(super) fn flags_in(
+    rows: Numbered<'_>,
+    cells: usize,
+    threshold: f64,
+    run: &dyn Run,
+    control: &Control,
+) -> Result<Vec<bool>> {
+    let all: Vec<u32> = (0..rows.splats.len() as u32).collect();
+    let grid = run.cells(rows, &all, cells)?;
     let group = |cell: usize, rows: &mut Vec<u32>| {
         let own = grid.members_of(cell);
         rows.extend_from_slice(own);
@@ -31,8 +48,8 @@ pub fn flags(
         }
         own.len()
     };
-    let energies = backend.energies(splats, grid.len(), &group, control)?;
-    let mut out = vec![false; splats.len()];
+    let energies = run.energies(rows, grid.len(), &group, control)?;
+    let mut out = vec![false; all.len()];
     for cell in (0..grid.len()).filter(|&c| energies[c] > threshold) {
         grid.members_of(cell)
             .iter()

@@ -4,14 +4,24 @@ use g2ard_core::Control;
 use g2ard_core::backend::Group;
 use rayon::prelude::*;
 
+use crate::rows::{Gather, Rows};
 use crate::runtime::{Buffer, Gpu, Kernel, Pending, Result, Work};
 
 /// A kernel with one thread for each group.
 pub struct Twin {
     pub kernel: Kernel,
-    /// Words of a member, and of an answer.
-    pub member: usize,
+    /// What it reads of the members.
+    pub gather: Gather,
+    /// Words of an answer.
     pub answer: usize,
+}
+
+/// Rows as the device has them, the numbers they go by, and what else a kernel reads.
+#[derive(Clone, Copy)]
+pub struct Source<'a> {
+    pub rows: &'a Rows,
+    pub numbers: &'a [u32],
+    pub extra: Option<&'a Buffer>,
 }
 
 pub struct Found {
@@ -22,7 +32,7 @@ pub struct Found {
 }
 
 /// Words that say where a group is.
-const SEGMENT: usize = 3;
+const SEGMENT: usize = 2;
 
 /// More rows than this would keep one thread busy while all others wait: such groups are rare, and the CPU's.
 const LARGEST: usize = 1024;
@@ -42,7 +52,8 @@ const THREADS: usize = 64;
 
 #[derive(Default)]
 struct Batch {
-    words: Vec<u32>,
+    /// The rows of its groups, one group after the other.
+    rows: Vec<u32>,
     groups: Vec<Segment>,
 }
 
@@ -54,21 +65,18 @@ struct Segment {
     own: u32,
 }
 
-/// Runs a kernel over all groups. `fill` writes the words of a group's rows.
+/// Runs a kernel over all groups.
 pub fn run(
     gpu: &Gpu,
     twin: &Twin,
+    source: Source<'_>,
     count: usize,
     group: &Group<'_>,
-    fill: &(dyn Fn(&[u32], &mut Vec<u32>) + Sync),
-    extra: &[&Buffer],
     control: &Control,
 ) -> Result<Found> {
-    let most_words = gpu.max_words().min(ROWS * twin.member);
+    let most_rows = (gpu.max_words() / twin.gather.words).min(ROWS);
     let most_groups = gpu.max_words() / twin.answer.max(SEGMENT);
-    let largest = LARGEST
-        .min(most_words / twin.member)
-        .min(gpu.max_rounds() / ROUNDS);
+    let largest = LARGEST.min(most_rows).min(gpu.max_rounds() / ROUNDS);
     let mut found = Found {
         answers: vec![0; count * twin.answer],
         large: Vec::new(),
@@ -79,33 +87,28 @@ pub fn run(
         let ids: Vec<usize> = (first..count.min(first + CHUNK)).collect();
         let parts: Vec<_> = ids
             .par_chunks(TASK)
-            .map(|ids| part(ids, largest, group, fill))
+            .map(|ids| part(ids, largest, group))
             .collect();
         for (part, large) in parts {
             found.large.extend(large);
             let mut from = 0;
             for segment in part.groups {
-                let to = from + segment.count as usize * twin.member;
-                if batch.words.len() + to - from > most_words || batch.groups.len() == most_groups {
-                    batch.start(gpu, twin, extra, &mut flight, &mut found)?;
+                let to = from + segment.count as usize;
+                if batch.rows.len() + to - from > most_rows || batch.groups.len() == most_groups {
+                    batch.start(gpu, twin, source, &mut flight, &mut found)?;
                 }
-                batch.push(twin, segment, &part.words[from..to]);
+                batch.push(segment.id, segment.own, &part.rows[from..to]);
                 from = to;
             }
         }
     }
-    batch.start(gpu, twin, extra, &mut flight, &mut found)?;
+    batch.start(gpu, twin, source, &mut flight, &mut found)?;
     land(twin, &mut flight, &mut found)?;
     Ok(found)
 }
 
-/// Some groups' words, and those that are too large.
-fn part(
-    ids: &[usize],
-    largest: usize,
-    group: &Group<'_>,
-    fill: &(dyn Fn(&[u32], &mut Vec<u32>) + Sync),
-) -> (Batch, Vec<usize>) {
+/// Some groups, and those that are too large.
+fn part(ids: &[usize], largest: usize, group: &Group<'_>) -> (Batch, Vec<usize>) {
     let (mut batch, mut large, mut rows) = (Batch::default(), Vec::new(), Vec::new());
     for &id in ids {
         rows.clear();
@@ -114,13 +117,7 @@ fn part(
             large.push(id);
             continue;
         }
-        fill(&rows, &mut batch.words);
-        batch.groups.push(Segment {
-            id,
-            first: 0,
-            count: rows.len() as u32,
-            own: own as u32,
-        });
+        batch.push(id, own as u32, &rows);
     }
     (batch, large)
 }
@@ -129,10 +126,14 @@ fn part(
 type Flight<'a> = Option<(Vec<usize>, Pending<'a>)>;
 
 impl Batch {
-    fn push(&mut self, twin: &Twin, segment: Segment, words: &[u32]) {
-        let first = (self.words.len() / twin.member) as u32;
-        self.groups.push(Segment { first, ..segment });
-        self.words.extend_from_slice(words);
+    fn push(&mut self, id: usize, own: u32, rows: &[u32]) {
+        self.groups.push(Segment {
+            id,
+            first: self.rows.len() as u32,
+            count: rows.len() as u32,
+            own,
+        });
+        self.rows.extend_from_slice(rows);
     }
 
     /// Sends the batch off and takes in the one before.
@@ -140,24 +141,27 @@ impl Batch {
         &mut self,
         gpu: &'a Gpu,
         twin: &Twin,
-        extra: &[&Buffer],
+        source: Source<'_>,
         flight: &mut Flight<'a>,
         found: &mut Found,
     ) -> Result<()> {
-        let Self { words, mut groups } = std::mem::take(self);
+        let Self { rows, mut groups } = std::mem::take(self);
         if groups.is_empty() {
             return Ok(());
         }
         // Threads that run side by side take equally long.
         groups.sort_by_key(|g| std::cmp::Reverse(g.count));
-        let segments: Vec<[u32; SEGMENT]> =
-            groups.iter().map(|g| [g.first, g.count, g.own]).collect();
-        let members = gpu.upload("members", &words)?;
+        let segments: Vec<[u32; SEGMENT]> = groups
+            .iter()
+            .map(|g| [g.first, g.own << 16 | g.count])
+            .collect();
+        let numbers: Vec<u32> = rows.iter().map(|&i| source.numbers[i as usize]).collect();
+        let mut work = Work::new(gpu);
+        let members = source.rows.gather(gpu, &mut work, &twin.gather, &numbers)?;
         let segments = gpu.upload("groups", segments.as_flattened())?;
         let answers = gpu.buffer("answers", groups.len() * twin.answer)?;
         let mut buffers = vec![&members, &segments, &answers];
-        buffers.extend_from_slice(extra);
-        let mut work = Work::new(gpu);
+        buffers.extend(source.extra);
         let constants = [groups.len() as u32, 0, 0, 0];
         work.run(
             &twin.kernel,

@@ -7,15 +7,9 @@ struct Member {
     color: array<F64, 3>,
 }
 
-struct Group {
-    first: u32,
-    count: u32,
-    own: u32,
-}
-
 @group(0) @binding(0) var<uniform> groups: vec4<u32>; // how many
 @group(0) @binding(1) var<storage, read> members: array<Member>;
-@group(0) @binding(2) var<storage, read> segments: array<Group>;
+@group(0) @binding(2) var<storage, read> segments: array<vec2<u32>>;
 @group(0) @binding(3) var<storage, read_write> energies: array<F64>;
 
 const RANK_FLOOR = F64(0x812dea11u, 0x3d719799u); // 1e-12
@@ -104,9 +98,9 @@ fn energy(
     @builtin(global_invocation_id) id: vec3<u32>,
     @builtin(num_workgroups) size: vec3<u32>,
 ) {
-    let at = id.y * size.x * 64u + id.x;
+    let at = thread_of(id, size, 64u);
     if at >= groups.x { return; }
-    let g = segments[at];
+    let g = group_of(segments[at]);
     if g.count < 2u || g.own == 0u {
         energies[at] = ZERO;
         return;

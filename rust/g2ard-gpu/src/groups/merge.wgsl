@@ -9,12 +9,6 @@ struct Member {
     spare: u32,
 }
 
-struct Group {
-    first: u32,
-    count: u32,
-    own: u32,
-}
-
 struct Merged {
     mean: array<F64, 3>,
     axes: array<array<F64, 3>, 3>, // in order of descending scale
@@ -24,7 +18,7 @@ struct Merged {
 
 @group(0) @binding(0) var<uniform> groups: vec4<u32>; // how many
 @group(0) @binding(1) var<storage, read> members: array<Member>;
-@group(0) @binding(2) var<storage, read> segments: array<Group>;
+@group(0) @binding(2) var<storage, read> segments: array<vec2<u32>>;
 @group(0) @binding(3) var<storage, read_write> merged: array<Merged>;
 @group(0) @binding(4) var<storage, read> disc: array<array<F64, 2>, 16>;
 
@@ -148,17 +142,19 @@ fn merge(
     @builtin(global_invocation_id) id: vec3<u32>,
     @builtin(num_workgroups) size: vec3<u32>,
 ) {
-    let at = id.y * size.x * 64u + id.x;
+    let at = thread_of(id, size, 64u);
     if at >= groups.x { return; }
-    let g = segments[at];
+    let g = group_of(segments[at]);
     let end = g.first + g.count;
     var m: Merged;
     let base = members[g.first].mean;
     var total = ZERO;
+    for (var i = g.first; i < end; i++) { total = add(total, members[i].weight); }
+    let massless = is_zero(total); // averaged evenly
+    if massless { total = from_count(g.count); }
     var shift: array<F64, 3>;
     for (var i = g.first; i < end; i++) {
-        let w = members[i].weight;
-        total = add(total, w);
+        let w = select(members[i].weight, ONE, massless);
         let d = sub3(members[i].mean, base);
         for (var k = 0; k < 3; k++) { shift[k] = add(shift[k], mul(w, d[k])); }
     }
@@ -177,7 +173,7 @@ fn merge(
             if phase == 0 {
                 let c = covariance(r, scales);
                 let o = outer(offset);
-                let w = members[i].weight;
+                let w = select(members[i].weight, ONE, massless);
                 for (var k = 0; k < 6; k++) { cov[k] = add(cov[k], mul(w, add(c[k], o[k]))); }
                 continue;
             }

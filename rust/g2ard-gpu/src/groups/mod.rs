@@ -2,82 +2,83 @@
 
 mod batch;
 
-use g2ard_core::backend::Group;
+use g2ard_core::backend::{Group, Numbered, Run};
 use g2ard_core::linalg::Mat3;
-use g2ard_core::simplify::{Gaussian, Merged, color, disc, weights};
-use g2ard_core::{Backend, Control, Cpu, Splats};
+use g2ard_core::simplify::{Gaussian, Merged, disc, weights};
+use g2ard_core::{Control, Cpu};
 use rayon::prelude::*;
 
+use crate::rows::{COLORED, Rows, WEIGHED};
 use crate::runtime::{Gpu, Kernel, Result};
 use crate::soft64::{LINEAR, SOFT64};
-use batch::{Twin, run};
+use batch::{Source, Twin, run};
+
+const SEGMENT: &str = include_str!("segment.wgsl");
 
 const ENERGY: Twin = Twin {
     kernel: Kernel {
         name: "groups.energy",
-        sources: &[SOFT64, LINEAR, include_str!("energy.wgsl")],
+        sources: &[SOFT64, LINEAR, SEGMENT, include_str!("energy.wgsl")],
         entry: "energy",
     },
-    member: 12,
+    gather: COLORED,
     answer: 2,
 };
 
 const MERGE: Twin = Twin {
     kernel: Kernel {
         name: "groups.merge",
-        sources: &[SOFT64, LINEAR, include_str!("merge.wgsl")],
+        sources: &[SOFT64, LINEAR, SEGMENT, include_str!("merge.wgsl")],
         entry: "merge",
     },
-    member: 16,
+    gather: WEIGHED,
     answer: 32,
 };
 
-/// See [`Backend::energies`].
+/// See [`Run::energies`].
 pub fn energies(
     gpu: &Gpu,
-    splats: &Splats,
+    held: &Rows,
+    rows: Numbered<'_>,
     count: usize,
     group: &Group<'_>,
     control: &Control,
 ) -> Result<Vec<f64>> {
-    let fill = |rows: &[u32], out: &mut Vec<u32>| {
-        for &i in rows {
-            let numbers = [splats.means[i as usize], color(splats, i as usize)];
-            out.extend_from_slice(bytemuck::cast_slice(&numbers));
-        }
+    let source = Source {
+        rows: held,
+        numbers: rows.numbers,
+        extra: None,
     };
-    let found = run(gpu, &ENERGY, count, group, &fill, &[], control)?;
+    let found = run(gpu, &ENERGY, source, count, group, control)?;
     let mut energies: Vec<f64> = bytemuck::pod_collect_to_vec(&found.answers);
     let large = &found.large;
     let again = |at: usize, rows: &mut Vec<u32>| group(large[at], rows);
-    let rest = Cpu.energies(splats, large.len(), &again, control)?;
+    let rest = Cpu.energies(rows, large.len(), &again, control)?;
     large.iter().zip(rest).for_each(|(&g, e)| energies[g] = e);
     Ok(energies)
 }
 
-/// See [`Backend::merges`]. Opacity and SH are averaged here: to send a row's 180 bytes of SH to a device takes
+/// See [`Run::merges`]. Opacity and SH are averaged here: to send a row's 180 bytes of SH to a device takes
 /// longer than to add them up.
 pub fn merges(
     gpu: &Gpu,
-    splats: &Splats,
+    held: &Rows,
+    rows: Numbered<'_>,
     groups: &[&[u32]],
     control: &Control,
 ) -> Result<Vec<(Merged, f64)>> {
-    let fill = |rows: &[u32], out: &mut Vec<u32>| {
-        for (&i, &w) in rows.iter().zip(&weights(splats, rows).0) {
-            let ([x, y, z], i) = (splats.means[i as usize], i as usize);
-            out.extend_from_slice(bytemuck::cast_slice(&[x, y, z, w]));
-            out.extend(splats.quats[i].map(f32::to_bits));
-            out.extend(splats.scales[i].map(f32::to_bits));
-            out.push(0);
-        }
-    };
     let group = |at: usize, rows: &mut Vec<u32>| {
         rows.extend_from_slice(groups[at]);
-        rows.len()
+        groups[at].len()
     };
     let disc = gpu.upload("disc", disc().as_flattened())?;
-    let found = run(gpu, &MERGE, groups.len(), &group, &fill, &[&disc], control)?;
+    let source = Source {
+        rows: held,
+        numbers: rows.numbers,
+        extra: Some(&disc),
+    };
+    let found = run(gpu, &MERGE, source, groups.len(), &group, control)?;
+    let splats = rows.splats;
     let mut merges: Vec<_> = found
         .answers
         .par_chunks(MERGE.answer)
@@ -93,7 +94,7 @@ pub fn merges(
         })
         .collect();
     let large: Vec<&[u32]> = found.large.iter().map(|&g| groups[g]).collect();
-    let rest = Cpu.merges(splats, &large, control)?;
+    let rest = Cpu.merges(rows, &large, control)?;
     found
         .large
         .iter()
@@ -118,6 +119,7 @@ mod tests {
     use super::*;
     use crate::runtime::Options;
     use crate::testing::{gpu, gpu_with, scenes, share};
+    use g2ard_core::Splats;
     use g2ard_core::spatial::{Cells, Frame};
 
     /// Groups of a few rows and of many, with and without borrowed ones.
@@ -142,18 +144,24 @@ mod tests {
                 }
                 own
             };
-            let want = Cpu
-                .energies(&splats, cells.len() + 9, &own, &control)
-                .unwrap();
-            let got = energies(gpu, &splats, cells.len() + 9, &own, &control).unwrap();
+            let numbers: Vec<u32> = (0..splats.len() as u32).collect();
+            let numbered = Numbered {
+                splats: &splats,
+                numbers: &numbers,
+            };
+            let mut held = Rows::default();
+            held.follow(gpu, numbered).unwrap();
+            let count = cells.len() + 9;
+            let want = Cpu.energies(numbered, count, &own, &control).unwrap();
+            let got = energies(gpu, &held, numbered, count, &own, &control).unwrap();
             let bits = |v: &[f64]| v.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
             let energy = share(&bits(&want), &bits(&got));
             let mut groups: Vec<&[u32]> = (0..cells.len()).map(|c| cells.members_of(c)).collect();
             let rows: Vec<u32> = (0..splats.len() as u32).collect();
             groups.extend(rows.chunks(700)); // of every size up to those that are left to the CPU
             groups.extend(rows[..splats.len().min(900)].chunks(125));
-            let want = Cpu.merges(&splats, &groups, &control).unwrap();
-            let got = merges(gpu, &splats, &groups, &control).unwrap();
+            let want = Cpu.merges(numbered, &groups, &control).unwrap();
+            let got = merges(gpu, &held, numbered, &groups, &control).unwrap();
             let merge = share(&want, &got);
             eprintln!(
                 "{what} {name}: {:.4} % of {} energies and {:.4} % of merges are the same bits",

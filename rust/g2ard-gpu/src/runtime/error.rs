@@ -13,6 +13,15 @@ pub enum Error {
         bytes: u64,
         limit: u64,
     },
+    #[error("{count} {what} are too many for the device, which takes {limit} at most")]
+    TooMany {
+        what: &'static str,
+        count: u64,
+        limit: u64,
+    },
+    /// The process's own limit (`ulimit -v`), not the device's.
+    #[error("it may need {} MB of address space, and of what is allowed {} MB are left", bytes >> 20, left >> 20)]
+    NoRoom { bytes: u64, left: u64 },
     #[error("the device is out of memory")]
     OutOfMemory,
     #[error("the device was lost ({0})")]
@@ -21,12 +30,21 @@ pub enum Error {
     Timeout(u64),
     #[error("the driver refused a kernel ({0})")]
     Refused(String),
+    #[error("the driver panicked ({0})")]
+    Panicked(String),
     /// A kernel's answers differ from the CPU's on the probe.
     #[error("{0} computes wrongly: its answers differ from the CPU's")]
     Wrong(String),
     /// The caller asked to stop.
     #[error("interrupted")]
     Interrupted,
+}
+
+impl Error {
+    /// Whether it says nothing about the next kernel, which may be asked for less.
+    pub fn is_of_size(&self) -> bool {
+        matches!(self, Self::TooLarge { .. } | Self::TooMany { .. })
+    }
 }
 
 pub type Result<T> = std::result::Result<T, Error>;

@@ -1,11 +1,13 @@
 //! An open device: its buffers, its pipelines, and whether it is still well.
 
 use std::collections::{BTreeMap, HashMap};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use wgpu::{BufferDescriptor, BufferUsages, ComputePipeline, ComputePipelineDescriptor};
 
 use super::adapters::{self, Adapter};
+use super::room::{RESERVE, Room, TO_OPEN};
 use super::{Error, Result};
 
 /// How a device is opened; the default takes what the adapter offers.
@@ -17,7 +19,10 @@ pub struct Options {
     pub timed: bool,
 }
 
-/// One entry point of a shader: the sources are joined in order.
+/// Stands before every kernel.
+const DISPATCH: &str = include_str!("dispatch.wgsl");
+
+/// One entry point of a shader: the sources are joined in order, behind dispatch.wgsl.
 #[derive(Debug, Clone, Copy)]
 pub struct Kernel {
     pub name: &'static str,
@@ -48,14 +53,19 @@ pub struct Gpu {
     pub(super) queue: wgpu::Queue,
     pipelines: Mutex<HashMap<&'static str, ComputePipeline>>,
     health: Health,
+    room: Room,
     max_binding: u64,
     pub(super) timed: bool,
     timings: Mutex<BTreeMap<&'static str, f64>>,
+    /// Bytes sent so far.
+    sent: AtomicU64,
 }
 
 impl Gpu {
     /// Opens the best adapter; software ones only where `software` allows them.
     pub fn open(software: bool, options: Options) -> Result<Self> {
+        let room = Room::of_process();
+        room.check(TO_OPEN)?;
         let (adapter, inner) = adapters::found()
             .into_iter()
             .find(|(adapter, _)| software || !adapter.is_software())
@@ -81,7 +91,9 @@ impl Gpu {
             queue,
             pipelines: Mutex::default(),
             health,
+            room,
             timings: Mutex::default(),
+            sent: AtomicU64::new(0),
         })
     }
 
@@ -119,6 +131,7 @@ impl Gpu {
                 limit: self.max_binding,
             });
         }
+        self.room.check(bytes + RESERVE)?;
         let inner = self.device.create_buffer(&BufferDescriptor {
             label: Some(what),
             size: bytes,
@@ -133,7 +146,7 @@ impl Gpu {
     pub fn upload<T: bytemuck::NoUninit>(&self, what: &'static str, data: &[T]) -> Result<Buffer> {
         let bytes: &[u8] = bytemuck::cast_slice(data);
         let buffer = self.buffer(what, bytes.len() / 4)?;
-        self.queue.write_buffer(&buffer.inner, 0, bytes);
+        self.write(&buffer.inner, bytes);
         self.check()?;
         Ok(buffer)
     }
@@ -146,9 +159,18 @@ impl Gpu {
             usage: BufferUsages::UNIFORM | BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
-        self.queue
-            .write_buffer(&buffer, 0, bytemuck::cast_slice(values));
+        self.write(&buffer, bytemuck::cast_slice(values));
         buffer
+    }
+
+    fn write(&self, buffer: &wgpu::Buffer, bytes: &[u8]) {
+        self.queue.write_buffer(buffer, 0, bytes);
+        self.sent.fetch_add(bytes.len() as u64, Ordering::Relaxed);
+    }
+
+    /// Bytes sent to the device so far.
+    pub fn sent(&self) -> u64 {
+        self.sent.load(Ordering::Relaxed)
     }
 
     /// The pipeline of a kernel, compiled when first asked for.
@@ -157,11 +179,14 @@ impl Gpu {
         if let Some(pipeline) = pipelines.get(kernel.name) {
             return Ok(pipeline.clone());
         }
+        self.room.check(RESERVE)?;
         let module = self
             .device
             .create_shader_module(wgpu::ShaderModuleDescriptor {
                 label: Some(kernel.name),
-                source: wgpu::ShaderSource::Wgsl(kernel.sources.concat().into()),
+                source: wgpu::ShaderSource::Wgsl(
+                    (DISPATCH.to_owned() + &kernel.sources.concat()).into(),
+                ),
             });
         self.check()?;
         let pipeline = self
@@ -188,9 +213,9 @@ impl Gpu {
         self.device.destroy();
     }
 
-    /// Seconds on the device by kernel since last asked, where time is kept.
+    /// Seconds on the device by kernel, where time is kept.
     pub fn timings(&self) -> BTreeMap<&'static str, f64> {
-        std::mem::take(&mut *lock(&self.timings))
+        lock(&self.timings).clone()
     }
 
     pub(super) fn took(&self, kernel: &'static str, seconds: f64) {

@@ -3,9 +3,12 @@
 mod adapters;
 mod error;
 mod gpu;
+mod panics;
+mod room;
 mod work;
 
 pub use adapters::{Adapter, list};
 pub use error::{Error, Result};
 pub use gpu::{Buffer, Gpu, Kernel, Options};
+pub use panics::guarded;
 pub use work::{Pending, Work};

@@ -13,7 +13,7 @@ fn scan(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) t: u32,
 ) {
-    let block = group.y * groups.x + group.x;
+    let block = block_of(group, groups);
     let first = 1024u * block + 4u * t;
     var mine: array<u32, 4>;
     var sum = 0u;
@@ -43,7 +43,7 @@ fn add_totals(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) t: u32,
 ) {
-    let block = group.y * groups.x + group.x;
+    let block = block_of(group, groups);
     if 1024u * block >= count.x { return; }
     let before = totals[block];
     for (var k = 0u; k < 4u; k++) {

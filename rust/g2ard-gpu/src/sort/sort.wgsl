@@ -31,7 +31,7 @@ fn count_digits(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) t: u32,
 ) {
-    let block = group.y * groups.x + group.x;
+    let block = block_of(group, groups);
     if t < 16u { atomicStore(&digits[t], 0u); }
     workgroupBarrier();
     for (var k = 0u; k < 4u; k++) {
@@ -48,7 +48,7 @@ fn scatter(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) t: u32,
 ) {
-    let block = group.y * groups.x + group.x;
+    let block = block_of(group, groups);
     let first = 1024u * block + 4u * t;
     var mine: array<vec2<u32>, 4>;
     var own: array<u32, 8>;

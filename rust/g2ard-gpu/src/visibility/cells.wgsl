@@ -12,7 +12,7 @@ fn center(i: u32) -> vec3<f32> { return to_camera(vec3(centers[i][0], centers[i]
 
 @compute @workgroup_size(64)
 fn want(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let i = id.y * groups.x * 64u + id.x;
+    let i = thread_of(id, groups, 64u);
     if i >= view.count { return; }
     let pixel = pixel_of(center(i));
     if pixel != NOWHERE { atomicStore(&light[pixel], bitcast<u32>(1.0)); }
@@ -20,7 +20,7 @@ fn want(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
 
 @compute @workgroup_size(64)
 fn seen(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let word = id.y * groups.x * 64u + id.x;
+    let word = thread_of(id, groups, 64u);
     if 32u * word >= view.count { return; }
     var found = 0u;
     for (var bit = 0u; bit < min(32u, view.count - 32u * word); bit++) {

@@ -19,7 +19,7 @@ fn draw(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_id) local: vec3<u32>,
 ) {
-    let tile = group.y * groups.x + group.x;
+    let tile = block_of(group, groups);
     let across = tiles_across();
     let pixel = TILE * vec2(tile % across, tile / across) + local.xy;
     if any(pixel >= view.size) { return; }

@@ -80,7 +80,7 @@ fn look(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) t: u32,
 ) {
-    let block = group.y * groups.x + group.x;
+    let block = block_of(group, groups);
     let i = 256u * block + t;
     if t == 0u { atomicStore(&sum, 0u); }
     workgroupBarrier();
@@ -100,7 +100,7 @@ fn depths(
     @builtin(global_invocation_id) id: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
 ) {
-    let i = id.y * groups.x * 256u + id.x;
+    let i = thread_of(id, groups, 256u);
     if i >= view.count { return; }
     let s = project(rows[i]);
     if s.rows != 0u { atomicAdd(&histogram[bitcast<u32>(s.z) >> 19u], 1u); }
@@ -112,7 +112,7 @@ fn gather(
     @builtin(global_invocation_id) id: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
 ) {
-    let i = id.y * groups.x * 256u + id.x;
+    let i = thread_of(id, groups, 256u);
     if i >= view.count { return; }
     let at = view.first + i;
     let to = marks[at];

@@ -2,11 +2,19 @@
 
 use g2ard_core::select::Pinhole;
 
-use super::{BLOCK, Constants, GATHER, SPLAT, Scene, THREADS};
+use super::marks::{LOOK, Marks};
+use super::scene::Scene;
+use super::view::Constants;
+use super::{BLOCK, SPLAT, THREADS};
 use crate::runtime::{Buffer, Kernel, Result, Work};
 use crate::scan;
 use crate::sort::{Keyed, sort};
 
+const GATHER: Kernel = Kernel {
+    name: "visibility.gather",
+    sources: LOOK,
+    entry: "gather",
+};
 const TILES: &[&str] = &[include_str!("pinhole.wgsl"), include_str!("tiles.wgsl")];
 const COUNT: Kernel = Kernel {
     name: "visibility.count",
@@ -36,16 +44,16 @@ const TILE: usize = 16;
 const DEPTH_BITS: usize = 32;
 
 impl<'a> Scene<'a> {
-    /// Draws `splats` marked rows, which make `pairs` pairs with tiles, onto what is left of the light. Pairs that
-    /// do not fit at once are drawn in turns: the nearer before the farther.
-    pub(super) fn draw(
+    /// Draws the marked rows onto what is left of the light. Pairs that do not fit at once are drawn in turns: the
+    /// nearer before the farther.
+    pub fn draw(
         &self,
         work: &mut Work<'a>,
         view: &Pinhole,
-        marks: &Buffer,
-        (splats, pairs): (usize, u64),
+        marks: &Marks,
         [light, depth]: [&Buffer; 2],
     ) -> Result<()> {
+        let splats = marks.splats;
         if splats == 0 {
             return Ok(());
         }
@@ -59,7 +67,7 @@ impl<'a> Scene<'a> {
             };
             let bound = [
                 (1, piece),
-                (2, marks),
+                (2, &marks.sums),
                 (5, &records),
                 (6, &keyed.keys),
                 (7, &keyed.words),
@@ -76,7 +84,7 @@ impl<'a> Scene<'a> {
         let tiles = view.width.div_ceil(TILE) * view.height.div_ceil(TILE);
         let bounds = gpu.buffer("tile bounds", 2 * tiles)?;
         let bits = (usize::BITS - tiles.leading_zeros()) as usize;
-        let (turn, pairs) = (gpu.max_words() / 2, pairs as usize);
+        let (turn, pairs) = (gpu.max_words() / 2, marks.pairs as usize);
         for first in (0..pairs).step_by(turn) {
             let count = turn.min(pairs - first);
             let constants = Constants {

@@ -9,18 +9,16 @@
 @group(0) @binding(5) var<storage, read_write> drawn: array<u32>;
 @group(0) @binding(6) var<storage, read_write> bounds: array<vec2<u32>>;
 
-fn thread(id: vec3<u32>, groups: vec3<u32>) -> u32 { return id.y * groups.x * 64u + id.x; }
-
 @compute @workgroup_size(64)
 fn count(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let i = thread(id, groups);
+    let i = thread_of(id, groups, 64u);
     if i < view.count { before[i] = tile_count(splats[order[i]]); }
 }
 
 // Pairs view.first … view.first + view.end − 1 of all; view.count splats.
 @compute @workgroup_size(64)
 fn expand(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let i = thread(id, groups);
+    let i = thread_of(id, groups, 64u);
     if i >= view.end { return; }
     let pair = view.first + i;
     // The last splat with no more pairs before it.
@@ -40,7 +38,7 @@ fn expand(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups)
 
 @compute @workgroup_size(64)
 fn ranges(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let i = thread(id, groups);
+    let i = thread_of(id, groups, 64u);
     if i >= view.end { return; }
     let tile = keys[i].x;
     if i == 0u || keys[i - 1u].x != tile { bounds[tile].x = i; }

@@ -18,7 +18,7 @@ fn octaves(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) t: u32,
 ) {
-    let block = group.y * groups.x + group.x;
+    let block = block_of(group, groups);
     if t < 22u { atomicStore(&apart[t], 0u); }
     workgroupBarrier();
     for (var k = 0u; k < 4u; k++) {
@@ -45,7 +45,7 @@ fn edges(
     @builtin(global_invocation_id) id: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
 ) {
-    let i = id.y * groups.x * 64u + id.x;
+    let i = thread_of(id, groups, 64u);
     if i < count.x { ranks[i] = u32(begins(i)); }
 }
 
@@ -54,7 +54,7 @@ fn compact(
     @builtin(global_invocation_id) id: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
 ) {
-    let i = id.y * groups.x * 64u + id.x;
+    let i = thread_of(id, groups, 64u);
     if i < count.x && begins(i) {
         starts[ranks[i]] = i;
         codes[ranks[i]] = keys[i];

@@ -1,10 +1,12 @@
 //! Twin of `g2ard_core::spatial::Cells::adaptive`: the same cells, bit for bit.
 
+use g2ard_core::backend::Numbered;
 use g2ard_core::spatial::{
     BITS, Cells, Frame, OCTAVES, first_apart, octave_counts, search_size, unit,
 };
 use rayon::prelude::*;
 
+use crate::rows::{POINTS, Rows};
 use crate::runtime::{Buffer, Gpu, Kernel, Result, Work};
 use crate::soft64::SOFT64;
 use crate::sort::{Keyed, sort};
@@ -45,10 +47,55 @@ const OUTSIDE: u64 = u64::MAX;
 
 /// See [`Cells::adaptive`].
 pub fn adaptive(gpu: &Gpu, points: &[[f64; 3]], frame: &Frame, target: usize) -> Result<Cells> {
+    let pieces = points
+        .chunks(most_points(gpu))
+        .map(|piece| gpu.upload("positions", piece));
+    let pieces = pieces.collect::<Result<_>>()?;
+    cells(gpu, pieces, points, frame, target)
+}
+
+/// See [`Run::cells`](g2ard_core::backend::Run::cells).
+pub fn of_rows(
+    gpu: &Gpu,
+    held: &Rows,
+    rows: Numbered<'_>,
+    kept: &[u32],
+    target: usize,
+) -> Result<Cells> {
+    let points = rows.points(kept);
+    let numbers: Vec<u32> = kept.iter().map(|&i| rows.numbers[i as usize]).collect();
+    let pieces = match held.all_means(&numbers) {
+        Some(pieces) => pieces,
+        None => {
+            let mut work = Work::new(gpu);
+            let pieces = numbers
+                .chunks(most_points(gpu))
+                .map(|numbers| held.gather(gpu, &mut work, &POINTS, numbers))
+                .collect::<Result<_>>()?;
+            work.submit(&[])?;
+            pieces
+        }
+    };
+    cells(gpu, pieces, &points, &Frame::of(&points), target)
+}
+
+/// Points that one buffer may hold.
+fn most_points(gpu: &Gpu) -> usize {
+    (gpu.max_words() / POINT).max(1)
+}
+
+/// The cells of points that the device has.
+fn cells(
+    gpu: &Gpu,
+    pieces: Vec<Buffer>,
+    points: &[[f64; 3]],
+    frame: &Frame,
+    target: usize,
+) -> Result<Cells> {
     if points.is_empty() {
         return Ok(Cells::with_size(points, frame, frame.radius));
     }
-    let lattice = Lattice::upload(gpu, points, *frame)?;
+    let lattice = Lattice::new(gpu, pieces, points, *frame);
     let octaves = octave_counts(&lattice.apart()?);
     let size = search_size(frame, &octaves, target, |size| lattice.count(size))?;
     lattice.cells(size)
@@ -71,33 +118,34 @@ struct Run {
 }
 
 impl<'a> Lattice<'a> {
-    fn upload(gpu: &'a Gpu, points: &[[f64; 3]], frame: Frame) -> Result<Self> {
-        let piece = (gpu.max_words() / POINT).max(1);
-        let run = piece * (POINT / KEY);
+    fn new(gpu: &'a Gpu, pieces: Vec<Buffer>, points: &[[f64; 3]], frame: Frame) -> Self {
+        let mut runs: Vec<Run> = Vec::new();
         let mut first = 0;
-        let runs = points
-            .chunks(run)
-            .map(|rows| {
-                let pieces = rows.chunks(piece).map(|p| gpu.upload("positions", p));
-                let pieces = pieces.collect::<Result<_>>()?;
-                first += rows.len();
-                Ok(Run {
-                    first: first - rows.len(),
-                    count: rows.len(),
-                    pieces,
-                })
-            })
-            .collect::<Result<_>>()?;
+        for piece in pieces {
+            let count = piece.words() / POINT;
+            match runs.last_mut() {
+                Some(run) if KEY * (run.count + count) <= gpu.max_words() => {
+                    run.count += count;
+                    run.pieces.push(piece);
+                }
+                _ => runs.push(Run {
+                    first,
+                    count,
+                    pieces: vec![piece],
+                }),
+            }
+            first += count;
+        }
         let reach = |p: &[f64; 3]| {
             let from_corner = [0, 1, 2].map(|k| p[k] - frame.origin[k] + frame.radius);
             from_corner.into_iter().fold(0.0, f64::max)
         };
-        Ok(Self {
+        Self {
             gpu,
             frame,
             reach: points.par_iter().map(reach).reduce(|| 0.0, f64::max),
             runs,
-        })
+        }
     }
 
     /// A run's keys, sorted, with its rows (counted from the run's first).

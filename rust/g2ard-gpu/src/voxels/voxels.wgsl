@@ -49,7 +49,7 @@ fn find_keys(
     @builtin(global_invocation_id) id: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
 ) {
-    let i = id.y * groups.x * 64u + id.x;
+    let i = thread_of(id, groups, 64u);
     if i >= lattice.count { return; }
     var origin = array<F64, 3>(lattice.origin[0].xy, lattice.origin[0].zw, lattice.origin[1].xy);
     let radius = lattice.origin[1].zw;

@@ -1,0 +1,158 @@
+//! The rows of a run on the device. Each is sent once, when it comes into being, and found by its number ever after;
+//! groups are sent as the numbers of their members, whose rows are then brought together there.
+
+use g2ard_core::Splats;
+use g2ard_core::backend::Numbered;
+use g2ard_core::simplify::optical_mass;
+use rayon::prelude::*;
+
+use crate::runtime::{Buffer, Gpu, Kernel, Result, Work};
+use crate::soft64::SOFT64;
+
+const SOURCES: &[&str] = &[SOFT64, include_str!("gather.wgsl")];
+
+/// A kernel that brings rows together in some form.
+pub struct Gather {
+    kernel: Kernel,
+    /// Whether it reads more than means.
+    looks: bool,
+    binding: u32,
+    /// Words of a member.
+    pub words: usize,
+}
+
+pub const POINTS: Gather = Gather {
+    kernel: Kernel {
+        name: "rows.points",
+        sources: SOURCES,
+        entry: "gather_points",
+    },
+    looks: false,
+    binding: 4,
+    words: MEAN,
+};
+pub const COLORED: Gather = Gather {
+    kernel: Kernel {
+        name: "rows.colored",
+        sources: SOURCES,
+        entry: "gather_colored",
+    },
+    looks: true,
+    binding: 5,
+    words: 12,
+};
+pub const WEIGHED: Gather = Gather {
+    kernel: Kernel {
+        name: "rows.weighed",
+        sources: SOURCES,
+        entry: "gather_weighed",
+    },
+    looks: true,
+    binding: 6,
+    words: 16,
+};
+
+/// Words of a mean, and of the rest of a row.
+const MEAN: usize = 6;
+const LOOK: usize = 12;
+const THREADS: usize = 64;
+
+/// Rows that the device has, in pieces that each fit into a buffer.
+#[derive(Debug, Default)]
+pub struct Rows {
+    count: usize,
+    pieces: Vec<Piece>,
+}
+
+#[derive(Debug)]
+struct Piece {
+    first: usize,
+    count: usize,
+    means: Buffer,
+    looks: Buffer,
+}
+
+impl Rows {
+    /// Sends the rows that are new: those whose numbers follow on the last.
+    pub fn follow(&mut self, gpu: &Gpu, rows: Numbered<'_>) -> Result<()> {
+        let known = self.count as u32;
+        let fresh: Vec<u32> = (0..rows.numbers.len() as u32)
+            .filter(|&i| rows.numbers[i as usize] >= known)
+            .collect();
+        debug_assert!(
+            fresh
+                .iter()
+                .zip(known..)
+                .all(|(&i, number)| rows.numbers[i as usize] == number),
+            "new rows are numbered in their order"
+        );
+        let mut first = self.count;
+        let mut pieces = Vec::new();
+        for part in fresh.chunks((gpu.max_words() / LOOK).max(1)) {
+            let looks: Vec<_> = part
+                .par_iter()
+                .map(|&i| look(rows.splats, i as usize))
+                .collect();
+            let means: Vec<_> = part
+                .iter()
+                .map(|&i| rows.splats.means[i as usize])
+                .collect();
+            pieces.push(Piece {
+                first,
+                count: part.len(),
+                means: gpu.upload("means", &means)?,
+                looks: gpu.upload("rows", &looks)?,
+            });
+            first += part.len();
+        }
+        self.pieces.extend(pieces);
+        self.count = first;
+        Ok(())
+    }
+
+    /// The means of all rows in order, if these are their numbers.
+    pub fn all_means(&self, numbers: &[u32]) -> Option<Vec<Buffer>> {
+        let all = numbers.len() == self.count && numbers.is_sorted();
+        all.then(|| self.pieces.iter().map(|p| p.means.clone()).collect())
+    }
+
+    /// The rows of these numbers, in their order.
+    pub fn gather(
+        &self,
+        gpu: &Gpu,
+        work: &mut Work,
+        how: &Gather,
+        numbers: &[u32],
+    ) -> Result<Buffer> {
+        let members = gpu.buffer("members", how.words * numbers.len())?;
+        let order = gpu.upload("order", numbers)?;
+        for piece in &self.pieces {
+            let constants = [
+                piece.first as u32,
+                piece.count as u32,
+                numbers.len() as u32,
+                0,
+            ];
+            let mut bound = vec![(1, &piece.means), (3, &order), (how.binding, &members)];
+            if how.looks {
+                bound.push((2, &piece.looks));
+            }
+            let groups = numbers.len().div_ceil(THREADS);
+            work.run_at(&how.kernel, groups, &constants, &bound)?;
+        }
+        Ok(members)
+    }
+}
+
+/// `Look` of gather.wgsl.
+fn look(splats: &Splats, i: usize) -> [u32; LOOK] {
+    let mass = optical_mass(
+        f64::from(splats.logit_opacities[i]),
+        splats.scales[i].map(f64::from),
+    );
+    let [low, high] = [mass.to_bits() as u32, (mass.to_bits() >> 32) as u32];
+    let [r, g, b] = splats.sh_of(i)[0].map(f32::to_bits);
+    let [x, y, z] = splats.scales[i].map(f32::to_bits);
+    let [p, q, s, t] = splats.quats[i].map(f32::to_bits);
+    [low, high, r, g, b, x, y, z, p, q, s, t]
+}

@@ -1,0 +1,161 @@
+use super::*;
+use crate::runtime::{Error, Options};
+use crate::testing::{gpu, gpu_with, scenes};
+use g2ard_core::{Backend, Cpu};
+
+/// Looks from all around, from within, and from far away.
+fn cameras(center: [f64; 3], radius: f64) -> Vec<Camera> {
+    (0..6)
+        .map(|i| {
+            let (a, d) = (f64::from(i) * 1.1, radius * [2.0, 1.2, 0.3][i as usize % 3]);
+            let (s, c) = a.sin_cos();
+            let turn = [
+                [c, -s, 0.0],
+                [-0.3 * s, -0.3 * c, -0.954],
+                [0.954 * s, 0.954 * c, -0.3],
+            ];
+            let shift = |r: usize| {
+                let at: f64 = (0..3).map(|k| turn[r][k] * center[k]).sum();
+                if r == 2 { d - at } else { -at }
+            };
+            Camera {
+                viewmat: [0, 1, 2].map(|r| [turn[r][0], turn[r][1], turn[r][2], shift(r)]),
+                fx: 150.0,
+                fy: 160.0,
+                cx: 71.0,
+                cy: 49.5,
+                width: 150,
+                height: 101,
+                near: 0.01,
+            }
+        })
+        .collect()
+}
+
+fn compare(gpu: &Gpu, what: &str) {
+    let control = Control::default();
+    let (mut same, mut all) = (0, 0);
+    for (name, splats) in scenes(6000) {
+        let (center, radius) = match name {
+            "at UTM offsets" => continue, // callers centre the scene
+            _ => ([0.0, 0.0, 0.5], 5.0),
+        };
+        let opacities: Vec<f32> = splats
+            .logit_opacities
+            .iter()
+            .map(|&x| 1.0 / (1.0 + (-x).exp()))
+            .collect();
+        let scene = Gaussians {
+            means: &splats.means,
+            quats: &splats.quats,
+            scales: &splats.scales,
+            opacities: &opacities,
+        };
+        let surface = Surface::of(&scene, 2000, &Cpu).unwrap();
+        let cameras = cameras(center, radius);
+        let want = Cpu.visible(&scene, &surface, &cameras, &control).unwrap();
+        let got = visible(gpu, &scene, &surface, &cameras, &control);
+        if name == "identical" && matches!(got, Err(Error::TooMany { .. })) {
+            continue; // no slab is thin enough: the CPU's
+        }
+        let got = got.unwrap();
+        let equal: usize = want
+            .iter()
+            .zip(&got)
+            .map(|(a, b)| {
+                let (a, b): (std::collections::HashSet<_>, std::collections::HashSet<_>) =
+                    (a.iter().collect(), b.iter().collect());
+                surface.len() - a.symmetric_difference(&b).count()
+            })
+            .sum();
+        let cells = surface.len() * cameras.len();
+        let seen: usize = want.iter().map(Vec::len).sum();
+        eprintln!("{what} {name}: {equal} of {cells} cells alike, {seen} of them seen");
+        same += equal;
+        all += cells;
+        let want = Cpu.looks(&scene, &cameras, &control).unwrap();
+        let got = looks(gpu, &scene, &cameras, &control).unwrap();
+        for (a, b) in want.iter().zip(&got) {
+            let close = |k: usize| (a[k] - b[k]).abs() <= 1e-4 * a[k].abs();
+            assert!(close(0) && close(1), "{name}: {a:?} {b:?}");
+        }
+    }
+    let share = same as f64 / all as f64;
+    eprintln!("{what}: {:.4} % of visible sets equal", 100.0 * share);
+    assert!(share >= 0.9999);
+}
+
+#[test]
+fn views_see_the_cells_they_see_on_the_cpu() {
+    let Some(gpu) = gpu("visibility") else { return };
+    compare(&gpu, "visibility");
+}
+
+#[test]
+fn views_see_the_same_in_pieces_and_slabs() {
+    let max_binding = Some(1 << 16);
+    let Some(gpu) = gpu_with(
+        "visibility in pieces",
+        Options {
+            max_binding,
+            ..Options::default()
+        },
+    ) else {
+        return;
+    };
+    compare(&gpu, "visibility in pieces");
+}
+
+#[test]
+fn a_crowded_tile_is_drawn_to_its_end() {
+    let Some(gpu) = gpu("a crowded tile") else {
+        return;
+    };
+    // A crowd in one corner, and behind it what fills the image.
+    let mut means = vec![[-0.49, -0.49, 0.0]; 70_000];
+    means.push([0.0, 0.0, 1.0]);
+    let n = means.len();
+    let mut scales = vec![[0.01f32; 3]; n];
+    scales[n - 1] = [2.0, 2.0, 0.01];
+    let scene = Gaussians {
+        means: &means,
+        quats: &vec![[1.0, 0.0, 0.0, 0.0]; n],
+        scales: &scales,
+        opacities: &vec![0.9; n],
+    };
+    let camera = Camera {
+        viewmat: [
+            [1.0, 0.0, 0.0, 0.0],
+            [0.0, 1.0, 0.0, 0.0],
+            [0.0, 0.0, 1.0, 1.0],
+        ],
+        fx: 16.0,
+        fy: 16.0,
+        cx: 8.0,
+        cy: 8.0,
+        width: 16,
+        height: 16,
+        near: 0.01,
+    };
+    let control = Control::default();
+    let want = Cpu.looks(&scene, &[camera], &control).unwrap();
+    assert_eq!(want, [[1.0, 2.0]]);
+    assert_eq!(looks(&gpu, &scene, &[camera], &control).unwrap(), want);
+}
+
+#[test]
+fn the_same_twice() {
+    let Some(gpu) = gpu("visibility, twice") else {
+        return;
+    };
+    let (_, splats) = scenes(3000).swap_remove(0);
+    let scene = Gaussians {
+        means: &splats.means,
+        quats: &splats.quats,
+        scales: &splats.scales,
+        opacities: &vec![0.4; splats.len()],
+    };
+    let cameras = cameras([0.0; 3], 5.0);
+    let look = || looks(&gpu, &scene, &cameras, &Control::default()).unwrap();
+    assert_eq!(look(), look());
+}
