@@ -271,7 +271,9 @@ def test_without_an_adapter_one_line_and_the_cpu(
     if "no adapter" not in told:
         pytest.skip("this machine's driver is not Vulkan's")
     assert status == 0
-    assert [line for line in told.splitlines() if "goes on on the CPU" in line] == [told.splitlines()[-1]]
+    lines = told.splitlines()
+    assert [line for line in lines if "goes on on the CPU" in line] == [lines[0]]  # before the summary
+    assert lines[1].startswith("gpu.ply")
     status, _, told = command_line(*paper, "-o", "cpu.ply", "--device", "auto", cwd=tmp_path)
     assert status == 0
     assert "GPU" not in told

@@ -125,10 +125,11 @@ class Run:
 
             for note in devices.notes():
                 self.noted = True
-                self.say(note)
+                self.console.say(note)
 
     def say(self, text: str) -> None:
         """A line of status on stderr, unless --quiet."""
+        self.tell_notes()
         self.console.say(text)
 
     def result(self, data: dict[str, Any]) -> None:

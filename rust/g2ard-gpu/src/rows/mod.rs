@@ -156,3 +156,82 @@ fn look(splats: &Splats, i: usize) -> [u32; LOOK] {
     let [p, q, s, t] = splats.quats[i].map(f32::to_bits);
     [low, high, r, g, b, x, y, z, p, q, s, t]
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::runtime::Options;
+    use crate::testing::{gpu_with, scenes};
+    use g2ard_core::simplify::{color, weights};
+
+    /// Rows of a scene, in any order, under other numbers.
+    fn some(splats: &Splats, rows: &[usize]) -> Splats {
+        let mut out = Splats {
+            sh_coeffs: splats.sh_coeffs,
+            ..Splats::default()
+        };
+        for &i in rows {
+            out.means.push(splats.means[i]);
+            out.quats.push(splats.quats[i]);
+            out.scales.push(splats.scales[i]);
+            out.logit_opacities.push(splats.logit_opacities[i]);
+            out.sh.extend_from_slice(splats.sh_of(i));
+        }
+        out
+    }
+
+    #[test]
+    fn only_new_rows_are_sent_and_all_are_found() {
+        let (_, scene) = scenes(900).swap_remove(0);
+        for max_binding in [None, Some(1 << 10)] {
+            let options = Options {
+                max_binding,
+                ..Options::default()
+            };
+            let Some(gpu) = gpu_with("rows", options) else {
+                return;
+            };
+            let mut held = Rows::default();
+            let mut sent = |splats: &Splats, numbers: &[u32]| {
+                let before = gpu.sent();
+                held.follow(&gpu, Numbered { splats, numbers }).unwrap();
+                (gpu.sent() - before) as usize
+            };
+            let bytes = 4 * (MEAN + LOOK);
+            let first: Vec<usize> = (0..700).collect();
+            let numbers: Vec<u32> = (0..700).collect();
+            let splats = some(&scene, &first);
+            assert_eq!(sent(&splats, &numbers), 700 * bytes);
+            assert_eq!(sent(&splats, &numbers), 0);
+            // A few stay, two come into being.
+            let numbers = [699, 700, 3, 701, 42];
+            let splats = some(&scene, &[699, 800, 3, 801, 42]);
+            assert_eq!(sent(&splats, &numbers), 2 * bytes);
+            assert_eq!(sent(&splats, &numbers), 0);
+            assert!(held.all_means(&numbers).is_none());
+
+            let wanted = [42, 701, 3, 3, 700];
+            let sources = [42, 801, 3, 3, 800];
+            let read = |how: &Gather| {
+                let mut work = Work::new(&gpu);
+                let found = held.gather(&gpu, &mut work, how, &wanted).unwrap();
+                let words = work.submit(&[(&found, found.words())]).unwrap().take();
+                words.unwrap().swap_remove(0)
+            };
+            let (points, colored, weighed) = (read(&POINTS), read(&COLORED), read(&WEIGHED));
+            for (at, &row) in sources.iter().enumerate() {
+                let words = |numbers: &[f64]| -> Vec<u32> { bytemuck::pod_collect_to_vec(numbers) };
+                let part = |all: &[u32], how: &Gather| all[at * how.words..][..how.words].to_vec();
+                let mean = words(&scene.means[row]);
+                assert_eq!(part(&points, &POINTS), mean);
+                let color = words(&color(&scene, row));
+                assert_eq!(part(&colored, &COLORED), [mean.clone(), color].concat());
+                let mass = words(&weights(&scene, &[row as u32]).0);
+                let quat = scene.quats[row].map(f32::to_bits);
+                let scales = scene.scales[row].map(f32::to_bits);
+                let want = [&mean[..], &mass, &quat, &scales, &[0]].concat();
+                assert_eq!(part(&weighed, &WEIGHED), want);
+            }
+        }
+    }
+}

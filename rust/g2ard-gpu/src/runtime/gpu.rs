@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use wgpu::{BufferDescriptor, BufferUsages, ComputePipeline, ComputePipelineDescriptor};
 
 use super::adapters::{self, Adapter};
-use super::room::{RESERVE, Room, TO_OPEN};
+use super::room::{RESERVE, Room, to_open};
 use super::{Error, Result};
 
 /// How a device is opened; the default takes what the adapter offers.
@@ -65,7 +65,7 @@ impl Gpu {
     /// Opens the best adapter; software ones only where `software` allows them.
     pub fn open(software: bool, options: Options) -> Result<Self> {
         let room = Room::of_process();
-        room.check(TO_OPEN)?;
+        room.check(to_open())?;
         let (adapter, inner) = adapters::found()
             .into_iter()
             .find(|(adapter, _)| software || !adapter.is_software())

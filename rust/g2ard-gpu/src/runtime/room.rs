@@ -2,11 +2,17 @@
 //! report it: they end the process. So what they need is looked for before.
 
 use std::fs::read_to_string;
+use std::num::NonZero;
+use std::thread::available_parallelism;
 
 use super::{Error, Result};
 
-/// What opening a device, and the threads, compilers and heaps behind it, may take: 0.85 GB were seen with Mesa's llvmpipe.
-pub const TO_OPEN: u64 = 1 << 30;
+/// What opening a device and its first kernels may take: 0.72 GB were seen with Mesa's llvmpipe on one thread, and
+/// 0.15 GB more for the stack and the heap of each further one.
+pub fn to_open() -> u64 {
+    let threads = available_parallelism().map_or(1, NonZero::get);
+    (640 + 192 * threads as u64) << 20
+}
 
 /// What must stay free for whatever a driver does beside what it is asked for.
 pub const RESERVE: u64 = 256 << 20;
