@@ -230,7 +230,13 @@ impl OnDevice<'_> {
             held.follow(gpu, rows)?;
             twin(gpu, &held)
         };
-        self.device.either(rows.splats.len(), with_rows, cpu)
+        let without = || {
+            if self.device.gpu().is_none() {
+                *lock(&self.held) = Rows::default(); // nobody comes back to a device that was left
+            }
+            cpu()
+        };
+        self.device.either(rows.splats.len(), with_rows, without)
     }
 }
 
