@@ -159,7 +159,7 @@ def test_odd_scenes(method, name):
         out = simplify(prior, budget, method=method)
         assert_sound(out, len(prior), budget)
         infinite = int(np.isinf(prior.logit_opacities).sum())
-        assert out.report["clamped_logits"] == infinite
+        assert out.report["infinite_logits"] == infinite
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -209,14 +209,37 @@ def test_schedule():
     assert schedule(100, 1, 0.999)[-1] == 1
 
 
-def test_paper_rounds_report_adds_up():
+@pytest.mark.parametrize("method", METHODS)
+def test_the_report_adds_up(method):
     prior = scene(5000)
-    out = simplify(prior, 600, method="paper")
+    out = simplify(prior, 600, method=method, visibility=None if method == "paper" else all_alike)
     rounds = out.report["rounds"]
-    assert [r["after"] for r in rounds] == schedule(5000, 600)
-    for r in rounds:
-        merged = r["merged_members"] - r["merged_groups"]
-        assert r["after"] == r["before"] - r["dropped"] - merged - r["trimmed"]
+    for r, before in zip(rounds, [5000, *(r["after"] for r in rounds)], strict=False):
+        assert r["before"] == before
+        assert r["after"] == r["before"] - r["dropped"] - r["merged"] - r["trimmed"]
+    assert rounds[-1]["after"] == 600
+    members = [np.count_nonzero(out.parents == p) for p in range(600)]
+    assert out.report["merged_members"] == sum(m for m in members if m > 1)
+    assert out.report["skipped"]["alone"] == members.count(1)
+    assert sum(r["merged"] for r in rounds) >= out.report["merged_members"] - sum(m > 1 for m in members)
+
+
+def test_paper_goes_by_the_schedule():
+    out = simplify(scene(5000), 600, method="paper")
+    assert [r["after"] for r in out.report["rounds"]] == schedule(5000, 600)
+
+
+@pytest.mark.parametrize("logit", [-16, -1e4, -np.inf])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_scene_of_which_nothing_shows_shrinks_evenly(method, logit):
+    rng = np.random.default_rng(6)
+    prior = Splats.create(
+        rng.uniform(-1, 1, (2000, 3)), scales=np.full((2000, 3), 0.05), logit_opacities=np.full(2000, logit)
+    )
+    out = simplify(prior, 1000, method=method)
+    assert_sound(out, 2000, 1000)
+    octants = np.bincount((out.splats.means > 0) @ [1, 2, 4], minlength=8)
+    assert octants.min() > 80  # of 125
 
 
 def test_paper_merges_as_the_naive_twin_and_conserves_moments():
