@@ -9,6 +9,7 @@ import typer
 
 from g2ard.cli import commands  # importing it registers every command on the app
 from g2ard.cli.frame import app
+from g2ard.cli.usage import usage_line
 
 __all__ = ["app", "commands", "main"]
 
@@ -22,7 +23,7 @@ def main() -> None:
     except typer.Abort:
         status = 130
     except typer.TyperException as e:
-        message = " ".join(e.format_message().split())
+        message = usage_line(e)
         where = getattr(getattr(e, "ctx", None), "command_path", "g2ard")
         if message:  # empty when a group without arguments has already shown its help
             print(f"{where}: {message} (see {where} --help)", file=sys.stderr)

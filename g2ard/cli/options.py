@@ -20,6 +20,7 @@ __all__ = [
     "Triple",
     "ViewsOption",
     "budget_of",
+    "can_judge",
     "one_budget",
     "parse_ratio",
     "views_count",
@@ -191,6 +192,12 @@ def _policy(text: str) -> str:
 PolicyOption = Annotated[
     str, typer.Option("--policy", parser=_policy, metavar=_POLICIES, help="What makes views good.")
 ]
+
+
+def can_judge(k: Count | str | None, policy: str) -> None:
+    """Usage check: `-k auto` needs a policy that measures what views add."""
+    if k == "auto" and policy in ("random", "uniform"):
+        raise typer.BadParameter(f"-k auto: --policy {policy} does not measure what views add; give a count")
 
 
 def one_horizon(steps: int | None, time_limit: float | None) -> None:

@@ -23,6 +23,7 @@ from g2ard.cli.options import (
     TimeLimitOption,
     ViewsOption,
     budget_of,
+    can_judge,
     one_budget,
     one_horizon,
     views_count,
@@ -100,6 +101,8 @@ def distill(
     """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget."""
     one_budget(count, ratio)
     one_horizon(steps, time_limit)
+    can_judge(k, policy)
+    run.spare_inputs(output / "scene.ply", *([output / "views.json"] if views is None else []))
     import shutil
     import time
 
