@@ -255,6 +255,8 @@ BAD: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
     (lambda c: c["frames"][0].update(transform_matrix="x"), "frame 0: malformed"),
     (lambda c: c.pop("fl_x"), "no focal length"),
     (lambda c: c.pop("w"), "tell the size"),
+    (lambda c: c.update(w=8.5), "frame 0: 'w' is 8.5, not a whole number"),
+    (lambda c: c["frames"][1].update(h=6.25), "frame 1: 'h' is 6.25, not a whole number"),
     (lambda c: c.update(fl_x=-3), "focal length must be positive"),
     (lambda c: c.update(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE"),
     (lambda c: c.update(is_fisheye=True), "fisheye"),
@@ -367,6 +369,8 @@ def test_own_views_name_photos_splits_and_weights(tmp_path: Path) -> None:
         (lambda c: c["views"][0].pop("K"), "view 0: lacks 'K'"),
         (lambda c: c["views"][1].update(K=[1, 2]), "view 1: malformed"),
         (lambda c: c["views"][1].update(weight=-1), "view 1: weight -1"),
+        (lambda c: c["views"][1].update(width=80.5), r"view 1: 'width' is 80\.5, not a whole number"),
+        (lambda c: c["views"][0].update(height=math.inf), "view 0: 'height' is inf, not a whole number"),
         (lambda c: c.update(views=[]), "no views found"),
         (lambda c: c["views"][0].update(camera_from_world=np.zeros((4, 4)).tolist()), "not a rotation"),
     ],
@@ -376,6 +380,12 @@ def test_bad_own_views(tmp_path: Path, change: Callable[[dict[str, Any]], Any], 
     edit(tmp_path / "a.json", change)
     with pytest.raises(InputError, match=message):
         read_views(tmp_path / "a.json")
+
+
+def test_a_whole_width_may_be_a_float(tmp_path: Path) -> None:
+    write_views(tmp_path / "a.json", views(2))
+    edit(tmp_path / "a.json", lambda c: c["views"][1].update(width=80.0))
+    assert read_views(tmp_path / "a.json").widths.tolist() == [8, 80]
 
 
 def test_own_views_refuse_what_does_not_fit(tmp_path: Path) -> None:

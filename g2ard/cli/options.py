@@ -13,6 +13,7 @@ import typer
 __all__ = [
     "Count",
     "CountOption",
+    "LookOption",
     "OutputOption",
     "PolicyOption",
     "RatioOption",
@@ -95,6 +96,7 @@ ViewsOption = Annotated[
     Path | None,
     typer.Option("--views", metavar="VIEWS", help="A COLMAP folder, a transforms.json or g2ard's own .json."),
 ]
+LookOption = Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")]
 OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Where the result goes.")]
 
 
@@ -142,6 +144,11 @@ def _colour(text: str) -> Triple:
 SplitOption = Annotated[
     str, typer.Option(metavar="train|test|all", help="By the views' split file, else every 8th name is test.")
 ]
+ShDegreeOption = Annotated[
+    int | None,
+    typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own if not given."),
+]
+ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on with a stopped run.")]
 SizeOption = Annotated[
     int | None, typer.Option(min=16, metavar="PIXELS", help="Shrink views to this longer side.")
 ]
