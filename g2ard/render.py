@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -25,6 +25,7 @@ __all__ = [
     "centred",
     "looker",
     "render",
+    "settings_for",
     "visibility",
 ]
 
@@ -42,8 +43,8 @@ class RasterSettings:
             the tiles its 3σ square touches).
         antialiased: opacity × √(det Σ₂ / det(Σ₂ + 0.3 I)), Mip-Splatting's factor; for scenes trained so.
         alpha_max: α is clipped here. 0.99 as in 3DGS; some trainers use 0.999.
-        near: Gaussians nearer than this are left out, scene units; None means the convention's 0.01 or 0.2.
-            A sequence holds one distance per camera.
+        near: Gaussians nearer than this are left out, scene units; None means the convention's 0.01 or 0.2,
+            and less in a small scene (`settings_for`). A sequence holds one distance per camera.
 
     Raises:
         InputError: a value out of range.
@@ -75,6 +76,29 @@ class RasterSettings:
     def choices(self) -> Choices:
         """As `_core` takes them."""
         return self.convention, self.antialiased, self.alpha_max
+
+
+def settings_for(means: NDArray[Any], settings: RasterSettings | None = None) -> RasterSettings:
+    """`settings` whose near plane does not depend on how small a unit the scene is in.
+
+    The conventions' near planes are lengths, made for scenes of some units. Where half of the Gaussians lie
+    within r < ½ of their middle, the near plane is 2 r times the convention's.
+
+    Args:
+        means: (N, 3) scene units.
+        settings: None means gsplat's convention. A near plane that is given stays.
+
+    >>> import numpy as np
+    >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    >>> settings_for(corners).near_of(0), round(settings_for(corners / 1024).near_of(0), 9)
+    (0.01, 1.6915e-05)
+    """
+    settings = settings or RasterSettings()
+    if settings.near is not None or not len(means):
+        return settings
+    sample = means[:: -(-len(means) // _NEAR_SAMPLE)].astype(np.float64)
+    radius = float(np.median(np.linalg.norm(sample - np.median(sample, axis=0), axis=1)))
+    return replace(settings, near=settings.near_of(0) * min(1.0, 2 * radius or 1.0))
 
 
 def view_of(cameras: Cameras, index: int, settings: RasterSettings) -> View:
@@ -162,13 +186,13 @@ def render(
     >>> out.image.shape, bool(out.alpha[12, 16] > 0.9), out.image[0, 0].tolist()
     ((24, 32, 3), True, [1.0, 1.0, 1.0])
     """
-    settings = settings or RasterSettings()
     if not 0 <= index < len(cameras):
         raise InputError(f"view {index}: there are {len(cameras)} views")
     colour = [float(c) for c in background]
     if len(colour) != 3:
         raise InputError(f"background: expected 3 numbers, got {len(colour)}")
     splats, cameras = centred(splats, cameras)
+    settings = settings_for(splats.means, settings)
     image, alpha, depth, mid = _core.Rasterizer().forward(
         arrays_of(splats), view_of(cameras, index, settings), settings.choices, colour, True, median
     )
@@ -218,8 +242,8 @@ def visibility(
     >>> bool(seen.weight[0] > 30 * seen.weight[1]), np.round(seen.pixel_size.astype(float), 3).tolist()
     (True, [0.04, 0.22])
     """
-    settings = settings or RasterSettings()
     splats, cameras = centred(splats, cameras)
+    settings = settings_for(splats.means, settings)
     views = [view_of(cameras, i, settings) for i in range(len(cameras))]
     sums: dict[str, Any] = _core.accumulate(
         arrays_of(splats), views, settings.choices, counter(progress, "visibility")
@@ -290,6 +314,9 @@ def looker(
 
 _GLANCE = 8
 """Views looked from at a time."""
+
+_NEAR_SAMPLE = 65_536
+"""Gaussians, at most, that tell how large a scene is."""
 
 _NEAR = 1e-3
 """Nearest depth that counts, over the median distance of the cameras from the scene's middle."""

@@ -60,8 +60,8 @@ def around(count, seed=0, radius=4.0) -> Cameras:
     return views(radius * d / np.linalg.norm(d, axis=1)[:, None])
 
 
-def core_view(cameras, i, origin):
-    return surfaces.core_views(cameras.take([i]), origin)[0]
+def core_view(cameras, i, origin, parts):
+    return surfaces.core_views(cameras.take([i]), origin, parts)[0]
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (4.4e5, 4.4e6, 1e3)])
@@ -71,7 +71,7 @@ def test_depths_are_the_naive_renderers(offset):
     parts, origin = surfaces.core_scene(scene)
     grid = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)
     for i in range(3):
-        got = _core.select_depth(parts, core_view(cameras, i, origin)).ravel()
+        got = _core.select_depth(parts, core_view(cameras, i, origin, parts)).ravel()
         want = naive.median_depth(scene, cameras.viewmats[i], K, grid)
         assert (want > 0).sum() > 800
         near = np.isclose(got, want, rtol=1e-4, atol=1e-6)

@@ -11,7 +11,7 @@ from g2ard import _core
 from g2ard.baselines.ranking import keep_best
 from g2ard.cameras import Cameras
 from g2ard.progress import Progress, counter, silent
-from g2ard.render import RasterSettings, arrays_of, centred, view_of
+from g2ard.render import arrays_of, centred, settings_for, view_of
 from g2ard.splats import Splats
 
 __all__ = ["fisher", "pup", "rounds", "sensitivity"]
@@ -32,8 +32,8 @@ def fisher(splats: Splats, cameras: Cameras, *, progress: Progress = silent) -> 
         cameras: the views, at the size they are to be rendered at.
         progress: told after each view.
     """
-    settings = RasterSettings()
     splats, cameras = centred(splats, cameras)
+    settings = settings_for(splats.means)
     views = [view_of(cameras, i, settings) for i in range(len(cameras))]
     upper = _core.sensitivity(arrays_of(splats), views, settings.choices, counter(progress, "sensitivity"))
     out = np.zeros((len(splats), 6, 6))

@@ -204,25 +204,47 @@ def _rows(chunk: _Chunk, name: str, count: int) -> NDArray[np.uint8]:
 
 
 def _decode(chunk: _Chunk, raw: Raw, at: slice) -> None:
-    import numpy as np
+    from g2ard.io.clean import BLOCK
 
     meta, count = chunk.meta, at.stop - at.start
     with _meta_errors(chunk):
-        low, high = (_rows(chunk, name, count)[:, :3].astype(np.float64) for name in meta["means"]["files"])
-        logs = _lerp(meta["means"], (high * 256 + low) / 65535, slice(3))
-        raw.means[at] = np.sign(logs) * np.expm1(np.abs(logs))  # stored as sign(x)·ln(|x| + 1)
-        raw.quats[at] = _quats(_rows(chunk, meta["quats"]["files"][0], count))
-        scales = _rows(chunk, meta["scales"]["files"][0], count)[:, :3]
-        raw.log_scales[at] = _values(meta["scales"], scales, slice(3))
-        base = _rows(chunk, meta["sh0"]["files"][0], count)
-        raw.sh0[at, 0] = _values(meta["sh0"], base[:, :3], slice(3))
-        if "codebook" in meta["sh0"]:
-            alpha = base[:, 3] / 255
-            with np.errstate(divide="ignore"):
-                raw.logit_opacities[at] = np.log(alpha) - np.log1p(-alpha)
-        else:
-            raw.logit_opacities[at] = _lerp(meta["sh0"], base[:, 3] / 255, 3)
+        low, high, quats, scales, base = (
+            _rows(chunk, name, count)
+            for part, files in (("means", 2), ("quats", 1), ("scales", 1), ("sh0", 1))
+            for name in meta[part]["files"][:files]
+        )
+        positions = _positions(meta["means"])
+        logits = _logits(meta["sh0"])
+        for start in range(0, count, BLOCK):  # what is made in between stays in the cache
+            rows = slice(start, min(start + BLOCK, count))
+            to = slice(at.start + rows.start, at.start + rows.stop)
+            code = low[rows, :3] + (high[rows, :3].astype(int) << 8)
+            for axis in range(3):
+                raw.means[to, axis] = positions[axis][code[:, axis]]
+            raw.quats[to] = _quats(quats[rows])
+            raw.log_scales[to] = _values(meta["scales"], scales[rows, :3], slice(3))
+            raw.sh0[to, 0] = _values(meta["sh0"], base[rows, :3], slice(3))
+            raw.logit_opacities[to] = logits[base[rows, 3]]
         _decode_rest(chunk, raw.shN[at])
+
+
+def _positions(part: dict[str, Any]) -> NDArray[Any]:
+    """(3, 65536) what each code stands for on each axis; stored as sign(x)·ln(|x| + 1)."""
+    import numpy as np
+
+    logs = _lerp(part, np.arange(65536)[:, None] / 65535, slice(3))
+    return (np.sign(logs) * np.expm1(np.abs(logs))).T.astype(np.float32)
+
+
+def _logits(part: dict[str, Any]) -> NDArray[Any]:
+    """(256,) what each byte of opacity stands for: an α (version 2), or a logit (version 1)."""
+    import numpy as np
+
+    alpha = np.arange(256) / 255
+    if "codebook" not in part:
+        return _lerp(part, alpha, 3)
+    with np.errstate(divide="ignore"):
+        return np.log(alpha) - np.log1p(-alpha)
 
 
 def _values(part: dict[str, Any], codes: NDArray[np.uint8], channels: slice) -> NDArray[Any]:
@@ -230,7 +252,7 @@ def _values(part: dict[str, Any], codes: NDArray[np.uint8], channels: slice) -> 
     import numpy as np
 
     if "codebook" in part:
-        return np.asarray(part["codebook"], np.float64)[codes]
+        return np.asarray(part["codebook"], np.float32)[codes]
     return _lerp(part, codes / 255, channels)
 
 
@@ -250,14 +272,12 @@ def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:
     """
     import numpy as np
 
-    three = (codes[:, :3] / 255 - 0.5) * np.sqrt(2)
-    largest = np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))
-    quats = np.zeros((len(codes), 4))
-    for mode in range(4):
-        rows = codes[:, 3] == 252 + mode
-        others = [i for i in range(4) if i != mode]
-        quats[rows, mode] = largest[rows]
-        quats[np.ix_(rows, others)] = three[rows]
+    parts = np.zeros((len(codes), 5))  # the three, the largest, and nothing
+    parts[:, :3] = (codes[:, :3] / 255 - 0.5) * np.sqrt(2)
+    parts[:, 3] = np.sqrt(np.maximum(0, 1 - (parts[:, :3] ** 2).sum(1)))
+    source = np.full((256, 4), 4)
+    source[252:] = [[3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2], [0, 1, 2, 3]]
+    quats: NDArray[Any] = np.take_along_axis(parts, source[codes[:, 3]], axis=1)
     return quats
 
 
@@ -265,8 +285,8 @@ def _decode_rest(chunk: _Chunk, out: NDArray[np.float32]) -> None:
     """Fill (n, K−1, 3): each Gaussian's label picks a palette entry, whose bytes pick values."""
     import numpy as np
 
-    out[:] = 0
     rest = _rest_coefficients(chunk)
+    out[:, rest:] = 0
     if not rest:
         return
     centroids, labels = _sh_files(chunk)
@@ -279,4 +299,4 @@ def _decode_rest(chunk: _Chunk, out: NDArray[np.float32]) -> None:
     if len(index) and index.max() >= len(palette):
         row = int(np.argmax(index >= len(palette)))
         raise InputError(f"{chunk.name}: {labels}: Gaussian {row} names entry {index[row]} of {len(palette)}")
-    out[:, :rest] = palette[index]
+    np.take(palette, index, axis=0, out=out[:, :rest], mode="clip")

@@ -11,7 +11,7 @@ from g2ard import _core
 from g2ard.cameras import Cameras
 from g2ard.recover.anchors import Anchors, Regularizers
 from g2ard.recover.schedule import Rates
-from g2ard.render import RasterSettings, arrays_of, view_of
+from g2ard.render import arrays_of, settings_for, view_of
 from g2ard.splats import Splats
 
 __all__ = ["FusedEngine"]
@@ -33,7 +33,7 @@ class FusedEngine:
     ) -> None:
         self._template = splats
         self._cameras = cameras
-        self._settings = RasterSettings()
+        self._settings = settings_for(anchors.means)
         self._weights = (regularizers.anchor, regularizers.shape, regularizers.effective_rank)
         self._ssim_weight = ssim_weight
         self._background = list(background)

@@ -55,6 +55,7 @@ class GsplatEngine(TorchEngine):
             height=int(self._cameras.heights[view]),
             sh_degree=round(coefficients.shape[1] ** 0.5) - 1,
             backgrounds=torch.tensor([self._background], device=self.device),
+            near_plane=self._settings.near_of(view),
             packed=False,
         )
         return image[0]

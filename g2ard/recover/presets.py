@@ -87,12 +87,12 @@ def view_consistency(scene: Splats, cameras: Cameras) -> float | None:
         Agreeing over agreeing and floating points, in [0, 1]; None if no point is in two views.
     """
     from g2ard import _core
-    from g2ard.render import RasterSettings, arrays_of, centred, view_of
+    from g2ard.render import arrays_of, centred, settings_for, view_of
 
     if len(cameras) < 2 or not len(scene):
         return None
     scene, small = centred(scene, cameras.resized(_SAMPLE_PIXELS))
-    arrays, settings = arrays_of(scene), RasterSettings()
+    arrays, settings = arrays_of(scene), settings_for(scene.means)
     sample = np.unique(np.linspace(0, len(small) - 1, min(len(small), _SAMPLE_VIEWS)).round().astype(int))
     agree = float_ = 0
     for a in sample:

@@ -15,6 +15,7 @@ from g2ard.recover.losses import l1_ssim
 from g2ard.recover.rasterize import rasterize
 from g2ard.recover.regularize import TorchAnchors, regularization
 from g2ard.recover.schedule import Rates
+from g2ard.render import settings_for
 from g2ard.splats import Splats
 
 __all__ = ["TorchEngine"]
@@ -46,6 +47,7 @@ class TorchEngine:
         self._template = splats
         self._cameras = cameras
         self._anchors = TorchAnchors(anchors).to(self.device)
+        self._settings = settings_for(anchors.means)
         self._regularizers = regularizers
         self._ssim_weight = ssim_weight
         self._background = background
@@ -112,6 +114,7 @@ class TorchEngine:
             self._cameras,
             view,
             background=self._background,
+            settings=self._settings,
         )
         return image
 

@@ -45,7 +45,7 @@ def viewing_distances(cells: Surface, cameras: Cameras) -> Float:
     out = np.zeros(len(local))
     for i in range(len(local)):
         x, y, z = local.viewmats[i, :3, :3] @ cells.centers.T + local.viewmats[i, :3, 3:]
-        ahead = z > 0.01
+        ahead = z > 0
         z = np.where(ahead, z, 1.0)
         K = local.Ks[i]
         u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
@@ -72,7 +72,7 @@ def within_matter(splats: Splats, cameras: Cameras, depths: Float, progress: Pro
     sample = splats.take(np.arange(0, len(splats), step))
     sample = replace(sample, scales=sample.scales * np.float32(np.sqrt(step)))
     scene, origin = core_scene(sample)
-    glances = core_views(cameras.resized(_GLANCE), origin)
+    glances = core_views(cameras.resized(_GLANCE), origin, scene)
     share, near = _core.select_looks(scene, glances, progress=counter(progress, "poses")).T
     typical = np.median(np.where(near > 0, near, depths)[depths > 0])
     walled: NDArray[np.bool_] = made & (share > 0.5) & (near < _WALLED * typical)

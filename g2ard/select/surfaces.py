@@ -13,6 +13,7 @@ from g2ard import _core
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
+from g2ard.render import settings_for
 from g2ard.splats import Splats
 
 __all__ = [
@@ -120,7 +121,7 @@ def visible_cells(
     """
     scene, origin = core_scene(splats)
     starts, seen = _core.select_visible(
-        scene, cells.parts, core_views(cameras, origin), progress=counter(progress, "visibility")
+        scene, cells.parts, core_views(cameras, origin, scene), progress=counter(progress, "visibility")
     )
     return Visible(starts, seen)
 
@@ -135,14 +136,16 @@ def core_scene(splats: Splats) -> tuple[tuple[Any, ...], Float]:
     return tuple(np.ascontiguousarray(a) for a in arrays), middle + splats.offset
 
 
-def core_views(cameras: Cameras, origin: Float) -> list[tuple[Any, ...]]:
+def core_views(cameras: Cameras, origin: Float, scene: tuple[Any, ...]) -> list[tuple[Any, ...]]:
+    """The cameras as `_core` takes them, about the origin of a `core_scene`."""
+    near = settings_for(scene[0]).near_of(0)
     local = cameras.recentred(origin)
     return [
         (
             local.viewmats[i].tolist(),
             [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
             (int(local.widths[i]), int(local.heights[i])),
-            0.01,
+            near,
         )
         for i, K in enumerate(local.Ks)
     ]

@@ -75,7 +75,7 @@ pub(crate) trait Source: Copy + Sync {
     fn sh_coeffs(&self) -> usize;
     fn mean<F: Lanes>(&self, group: usize, axis: usize) -> F;
     fn quat<F: Lanes>(&self, group: usize, part: usize) -> F;
-    fn log_scale<F: Lanes>(&self, group: usize, axis: usize) -> F;
+    fn scale<F: Lanes>(&self, group: usize, axis: usize) -> F;
     fn logit_opacity<F: Lanes>(&self, group: usize) -> F;
     /// Coefficient `k` (0 is the base colour) of channel `c`.
     fn sh<F: Lanes>(&self, group: usize, k: usize, c: usize) -> F;
@@ -118,8 +118,8 @@ impl Source for Params<'_> {
         strided(self.quats, group, 4, part)
     }
     #[inline(always)]
-    fn log_scale<F: Lanes>(&self, group: usize, axis: usize) -> F {
-        strided(self.log_scales, group, 3, axis)
+    fn scale<F: Lanes>(&self, group: usize, axis: usize) -> F {
+        strided::<F>(self.log_scales, group, 3, axis).exp()
     }
     #[inline(always)]
     fn logit_opacity<F: Lanes>(&self, group: usize) -> F {

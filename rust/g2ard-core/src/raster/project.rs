@@ -188,7 +188,7 @@ pub fn project<F: Lanes, S: Source>(view: &View, source: &S, group: usize) -> Pr
     let r = rotation(&q);
     let mut s = [F::zero(); 3];
     for k in 0..3 {
-        s[k] = source.log_scale::<F>(group, k).exp();
+        s[k] = source.scale(group, k);
     }
     let mut m = [[F::zero(); 3]; 2];
     for i in 0..2 {

@@ -12,8 +12,8 @@ use crate::raster::{Camera, DILATION, Rasterizer, Settings};
 
 /// Standard deviations at which an opacity of 1 falls to α = 1/255, and a little more.
 const REACH: f64 = 3.4;
-/// log scales and logits are cut to where f32 can follow them.
-const LOGS: (f32, f32) = (-80.0, 40.0);
+/// Scales and logits are cut to where f32 can follow their squares and exponentials.
+const SCALES: (f32, f32) = (1.8e-35, 2.3e17);
 const LOGITS: (f32, f32) = (-80.0, 80.0);
 
 /// Σ αT and the smallest pixels of N Gaussians over the views added so far. Neither the order of the rows nor the
@@ -132,7 +132,7 @@ impl Look {
 
 /// Sixteen rows, and the box that holds what they can show.
 struct Group {
-    /// Mean, quaternion, log scales, logit; the last row again in lanes past the end.
+    /// Mean, quaternion, scales (linear, so that a unit twice as long rounds alike), logit; the last row again in lanes past the end.
     values: [Row; 11],
     centre: [f32; 3],
     /// Half the sides of the means' box.
@@ -153,9 +153,9 @@ impl Group {
                 let m = (mean[k] - shift[k]) as f32;
                 values[k].0[l] = m;
                 (low[k], high[k]) = (low[k].min(m), high[k].max(m));
-                let log = scene.scales[row][k].ln().clamp(LOGS.0, LOGS.1);
-                values[7 + k].0[l] = log;
-                scale = scale.max(log.exp());
+                let s = scene.scales[row][k].clamp(SCALES.0, SCALES.1);
+                values[7 + k].0[l] = s;
+                scale = scale.max(s);
             }
             for k in 0..4 {
                 values[3 + k].0[l] = scene.quats[row][k];
@@ -205,7 +205,7 @@ impl Source for Packed<'_> {
         self.value(group, 3 + part)
     }
     #[inline(always)]
-    fn log_scale<F: Lanes>(&self, group: usize, axis: usize) -> F {
+    fn scale<F: Lanes>(&self, group: usize, axis: usize) -> F {
         self.value(group, 7 + axis)
     }
     #[inline(always)]
@@ -354,13 +354,54 @@ mod tests {
             met += look.groups.iter().filter(|g| frustum.meets(g)).count();
         }
         let (weight, pixel) = look.by_row();
-        let expected: Vec<f32> = whole.weight.iter().map(|&w| w as f32).collect();
-        assert_eq!((weight, pixel), (expected, whole.pixel_size));
+        assert_eq!(pixel, whole.pixel_size);
+        for (i, (&got, &want)) in weight.iter().zip(&whole.weight).enumerate() {
+            let want = want as f32; // of log scales, which round
+            assert!(
+                (got - want).abs() <= 1e-3 + 1e-4 * want,
+                "{i}: {got} {want}"
+            );
+        }
         assert!(met < 12 * look.groups.len() * 9 / 10, "{met} groups met");
         assert_eq!(
             look.seen(),
             whole.weight.iter().filter(|w| **w > 0.0).count()
         );
+    }
+
+    #[test]
+    fn a_unit_that_is_a_power_of_two_changes_no_bit() {
+        let (means, quats, scales, logits) = scene();
+        let by_row = |unit: f32| {
+            let times = |rows: &[[f32; 3]]| rows.iter().map(|r| r.map(|x| unit * x)).collect();
+            let (means, scales): (Vec<_>, Vec<_>) = (times(&means), times(&scales));
+            let mut look = Look::new(&SceneRef {
+                means: Means::F32(&means),
+                quats: &quats,
+                scales: &scales,
+                logit_opacities: &logits,
+                sh0: &[[0.0; 3]; 1003],
+                sh_rest: &[],
+                rest: 0,
+            })
+            .unwrap();
+            for mut camera in cameras() {
+                for r in &mut camera.viewmat {
+                    r[3] *= f64::from(unit);
+                }
+                camera.near *= unit;
+                look.add(&camera, &Settings::default()).unwrap();
+            }
+            let (weight, pixel) = look.by_row();
+            (
+                weight,
+                pixel.into_iter().map(|p| p / unit).collect::<Vec<_>>(),
+            )
+        };
+        let here = by_row(1.0);
+        for exponent in [-10, -1, 1, 3, 10] {
+            assert_eq!(by_row(2f32.powi(exponent)), here, "2^{exponent}");
+        }
     }
 
     #[test]

@@ -154,7 +154,7 @@ fn thickness<F: Lanes>(
     let mut square = F::zero();
     for k in 0..3 {
         // In units of s̄⊥, whose square may not fit f32.
-        scale[k] = packed.log_scale::<F>(group, k).exp() * F::load(&block[13]);
+        scale[k] = packed.scale::<F>(group, k) * F::load(&block[13]);
         extent[k] = (r[0][k] * normal[0] + r[1][k] * normal[1] + r[2][k] * normal[2]) * scale[k];
         square = extent[k].fma(extent[k], square);
     }

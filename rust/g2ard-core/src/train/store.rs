@@ -263,6 +263,11 @@ impl Packed {
     }
 
     #[inline(always)]
+    pub fn log_scale<F: Lanes>(&self, group: usize, axis: usize) -> F {
+        self.get(group, LOG_SCALE + axis)
+    }
+
+    #[inline(always)]
     pub fn set<F: Lanes>(&self, group: usize, attribute: usize, value: F) {
         // SAFETY: as above, and the group is this thread's.
         unsafe { value.store(&mut *self.values.at(self.index(group, attribute))) }
@@ -287,8 +292,8 @@ impl Source for Packed {
         self.get(group, QUAT + part)
     }
     #[inline(always)]
-    fn log_scale<F: Lanes>(&self, group: usize, axis: usize) -> F {
-        self.get(group, LOG_SCALE + axis)
+    fn scale<F: Lanes>(&self, group: usize, axis: usize) -> F {
+        self.log_scale::<F>(group, axis).exp()
     }
     #[inline(always)]
     fn logit_opacity<F: Lanes>(&self, group: usize) -> F {

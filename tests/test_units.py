@@ -1,0 +1,104 @@
+"""A scene in a small unit is the same scene, through every stage that looks at it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from g2ard.cameras import Cameras, look_at
+from g2ard.render import RasterSettings, looker, render, settings_for, visibility
+from g2ard.select import select
+from g2ard.simplify import simplify
+from g2ard.splats import Splats
+
+ARRAYS = ("means", "scales", "quats", "logit_opacities", "sh0", "shN")
+
+
+def ball(count: int = 3000) -> Splats:
+    """A coloured ball of radius 1, its means on a dyadic lattice."""
+    rng = np.random.default_rng(0)
+    directions = rng.standard_normal((count, 3))
+    means = directions / np.linalg.norm(directions, axis=1)[:, None]
+    return Splats.create(
+        np.round(means * 2**12) / 2**12,
+        scales=rng.uniform(0.02, 0.08, (count, 3)).astype(np.float32),
+        quats=rng.standard_normal((count, 4)),
+        logit_opacities=rng.uniform(-1, 6, count),
+        sh0=np.clip(means, -1, 1)[:, None, :],
+    )
+
+
+def around(count: int = 12) -> Cameras:
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    poses = [look_at([3 * np.cos(a), 3 * np.sin(a), 1], [0, 0, 0]) for a in angles]
+    K = [[90, 0, 40], [0, 90, 30], [0, 0, 1]]
+    return Cameras.from_lists(poses, [K] * count, [(80, 60)] * count, [f"v{i}" for i in range(count)])
+
+
+def in_units(scene: Splats, cameras: Cameras, unit: float) -> tuple[Splats, Cameras]:
+    viewmats = cameras.viewmats.copy()
+    viewmats[:, :3, 3] *= unit
+    factor = scene.means.dtype.type(unit)
+    small = replace(scene, means=scene.means * factor, scales=scene.scales * np.float32(unit))
+    return small, replace(cameras, viewmats=viewmats)
+
+
+@pytest.mark.parametrize("method", ["default", "fast"])
+@pytest.mark.parametrize("unit", [2.0**-10, 0.5, 2.0**9])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_what_views_see_scales_by_powers_of_two_exactly(method, unit, dtype):
+    scene, cameras = replace(ball(), means=ball().means.astype(dtype)), around()
+    small, near = in_units(scene, cameras, unit)
+    here = simplify(scene, 150, method=method, visibility=looker(cameras))
+    there = simplify(small, 150, method=method, visibility=looker(near))
+    assert here.report["resized"] > 50
+    back = in_units(there.splats, near, 1 / unit)[0]
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(back, name), getattr(here.splats, name), err_msg=name)
+    np.testing.assert_array_equal(there.parents, here.parents)
+
+
+def test_an_image_does_not_depend_on_the_unit():
+    scene, cameras = ball(), around()
+    small, near = in_units(scene, cameras, 1e-3)
+    here, there = render(scene, cameras, 0), render(small, near, 0)
+    assert here.alpha.max() > 0.9
+    np.testing.assert_allclose(there.image, here.image, rtol=0, atol=1e-3)
+    seen, same = visibility(scene, cameras), visibility(small, near)
+    assert abs(same.weight.sum() / seen.weight.sum() - 1) < 1e-3
+
+
+def test_the_near_plane_is_the_conventions_in_ordinary_scenes():
+    points = ball().means
+    inria = RasterSettings(convention="inria")
+    assert settings_for(points).near_of(0) == 0.01
+    assert settings_for(1000 * points, inria).near_of(0) == 0.2
+    assert settings_for(points / 1000, inria).near_of(0) == pytest.approx(0.0004, rel=0.02)
+    assert settings_for(points / 1000, RasterSettings(near=0.5)).near_of(0) == 0.5
+    assert settings_for(points[:1]).near_of(0) == 0.01
+
+
+@pytest.mark.parametrize("policy", ["auto", "coverage", "directional"])
+def test_views_are_chosen_in_any_unit(policy):
+    small, near = in_units(ball(), around(), 1e-3)
+    here = select(ball(), around(), 4, policy=policy)
+    np.testing.assert_array_equal(select(small, near, 4, policy=policy).order, here.order)
+
+
+def test_recovery_works_in_any_unit():
+    pytest.importorskip("torch")
+    from g2ard.recover import RecoverConfig, recover
+    from g2ard.targets import TeacherRenders
+
+    figures = []
+    for unit in (1.0, 1e-3):
+        scene, cameras = in_units(ball(), around(), unit)
+        student = simplify(scene, 300).splats
+        done = recover(student, TeacherRenders(scene, cameras), RecoverConfig(steps=30))
+        figures.append((done.report["psnr"]["before"], done.report["psnr"]["after"]))
+    (before, after), (before_small, after_small) = figures
+    assert after > before + 1
+    assert before_small == pytest.approx(before, abs=0.05)
+    assert after_small == pytest.approx(after, abs=0.3)
