@@ -118,6 +118,10 @@ def test_the_folder_one_is_in_can_be_an_output(folder: Path, command_line: Comma
     status, _, error = command_line(*ask, cwd=folder / "out")
     assert status == 0, error
     assert (folder / "out" / "view_000.png").is_file()
+    for command in ("recover", "adapt"):
+        ask = (command, "../a.ply", "--views", "../views.json", "-o", ".")
+        status, _, error = command_line(*ask, cwd=folder / "out")
+        assert (status, error) == (1, "g2ard: .: scenes are written as .ply or .splat\n")
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ def adapt(
     from g2ard.cli.scenes import load_scene, load_views, make_targets, trained_on
     from g2ard.io import check_scene_output, write_splats
 
-    work = output.with_name(f".{output.name}.work")
+    work = output.parent / f".{output.name}.work"
     check_stopped(run, work, resume)
     check_scene_output(output, run.overwrite)
     colour = background or (0.0, 0.0, 0.0)

@@ -58,7 +58,7 @@ def recover(
     from g2ard.recover.schedule import schedule_named
 
     one_horizon(steps, time_limit)
-    checkpoint = output.with_name(f".{output.name}.checkpoint.npz")
+    checkpoint = output.parent / f".{output.name}.checkpoint.npz"
     check_stopped(run, checkpoint, resume)
     check_scene_output(output, run.overwrite)
     engine = recovery_engine(run)
