@@ -264,10 +264,10 @@ def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str
         "input_count": len(splats),
         "output_count": len(small),
         "merged_members": kept - alone,
-        "rounds": [_round(r) for r in out["rounds"]],
+        "rounds": out["rounds"],
         "protected": int(np.count_nonzero(protected)),
         "nonfinite_rows": 0 if isinstance(finite, slice) else len(splats) - int(np.count_nonzero(finite)),
-        "infinite_logits": out["clamped_logits"],
+        "infinite_logits": out["infinite_logits"],
         "clamped_opacities": out["clamped_opacities"],
         "resized": out.get("resized", 0),
         "skipped": {
@@ -276,10 +276,3 @@ def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str
         },
     }
     return Simplified(small, parents, protected, report)
-
-
-def _round(counts: dict[str, Any]) -> dict[str, Any]:
-    """A round's counts, alike for all methods: groups and their members say less than what they shed."""
-    members, groups = counts["merged_members"], counts["merged_groups"]
-    others = {key: value for key, value in counts.items() if key not in ("merged_members", "merged_groups")}
-    return {**others, "merged": members - groups}
