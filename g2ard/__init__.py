@@ -20,10 +20,10 @@ What they pass on, and files, are here: `Splats`, `Cameras`, `read_splats`, `wri
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from g2ard.cameras import Cameras
     from g2ard.io import read_points, read_splats, read_views, write_splats, write_views
     from g2ard.splats import Splats
@@ -46,5 +46,7 @@ _HOMES = {"Splats": "g2ard.splats", "Cameras": "g2ard.cameras"}
 
 def __getattr__(name: str) -> Any:
     if name in __all__:
+        from importlib import import_module
+
         return getattr(import_module(_HOMES.get(name, "g2ard.io")), name)
     raise AttributeError(f"module 'g2ard' has no attribute {name!r}")

@@ -1,5 +1,17 @@
-"""`python -m g2ard`."""
+"""The program: `g2ard`, or `python -m g2ard`."""
 
-from g2ard.cli import main
+from g2ard import interrupt
 
-main()
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Entry point."""
+    interrupt.ends_the_program()
+    from g2ard.cli import main as command_line
+
+    command_line()
+
+
+if __name__ == "__main__":
+    main()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,9 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from g2ard.errors import InputError
-from g2ard.io.atomic import atomic_output
 from g2ard.progress import Progress, silent
+from g2ard.recover import checkpoint as checkpoints
 from g2ard.recover.anchors import PRESETS, Regularizers
 from g2ard.recover.draw import checked_weights
 from g2ard.recover.schedule import TUNED, Schedule
@@ -25,6 +23,8 @@ if TYPE_CHECKING:
     from g2ard.recover.optimize import Watch
 
 __all__ = ["DistillConfig", "Distilled", "distill"]
+
+_ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 
 
 @dataclass(frozen=True)
@@ -288,40 +288,20 @@ class _Rounds:
     def _save(self, name: str, entry: dict[str, Any]) -> None:
         if self.work is None:
             return
-        s = self.state
-        with atomic_output(self.work / f"{name}.npz", overwrite=True) as temporary:
-            np.savez(
-                temporary,
-                meta=np.array(json.dumps({"key": self.key, "entry": entry}, default=_plain)),
-                protected=np.asarray(self.protected),
-                means=s.means,
-                quats=s.quats,
-                scales=s.scales,
-                logit_opacities=s.logit_opacities,
-                sh0=s.sh0,
-                shN=s.shN,
-            )
+        arrays = {name: getattr(self.state, name) for name in _ARRAYS}
+        arrays["protected"] = np.asarray(self.protected)
+        checkpoints.save(self.work / f"{name}.npz", self.key, {"entry": entry}, arrays)
 
     def _restore(self, name: str, entry: dict[str, Any]) -> bool:
         """Take up a finished stage of an earlier run; False where there is none."""
         path = self.work / f"{name}.npz" if self.work else None
         if path is None or not path.exists():
             return False
-        with np.load(path) as data:
-            meta = json.loads(str(data["meta"]))
-            if meta["key"] != self.key:
-                raise InputError(
-                    f"{self.work}: holds another run (other input or options); give -w to start anew"
-                )
-            arrays = {key: data[key] for key in data.files if key not in ("meta", "protected")}
-            self.protected = data["protected"]
+        meta, arrays = checkpoints.load(path, self.key)
+        self.protected = arrays.pop("protected")
         self.state = replace(self.prior, **arrays)
         entry.update(meta["entry"])
         return True
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def _fingerprint(prior: Splats, budget: int, targets: Targets, config: DistillConfig, weights: Any) -> str:

@@ -98,7 +98,7 @@ def test_rows_are_sent_once(gpu: None) -> None:
     ball = checkered_ball(4000)
     rounds = simplify(ball, 400, method="paper").report["rounds"]
     assert len(rounds) > 3
-    rows = len(ball) + sum(r["merged_groups"] for r in rounds)
+    rows = len(ball) + sum(r["merged"] for r in rounds)  # a group sheds one row at least
     looked_at = 10 * len(ball) + sum(3 * r["before"] for r in rounds)  # flags borrow neighbours
     small = 64 * 1024  # constants of dispatches
     assert devices.state().uploaded_bytes < 72 * rows + (4 + 8) * looked_at + small * (len(rounds) + 1)
@@ -202,7 +202,7 @@ def test_the_report_says_what_was_sent(tmp_path: Path, command_line: CommandLine
 
 
 def test_failures_are_told_when_they_happen(capsys: pytest.CaptureFixture, gpu: None) -> None:
-    common = dict.fromkeys(("overwrite", "verbose", "quiet", "json")) | {"seed": 0, "threads": 0}
+    common = dict.fromkeys(("overwrite", "verbose", "quiet", "json", "config")) | {"seed": 0, "threads": 0}
     run = Run("simplify", {**common, "device": "gpu"}, {})
     _core.set_device("gpu", 64)  # too small for the disc that coverage is measured on
     simplify(checkered_ball(60), 20, method="paper")

@@ -62,7 +62,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(targets: TeacherRenders, tm
     resumed = distill(PRIOR, 1000, targets, config, work=tmp_path)
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(whole.splats, name), getattr(resumed.splats, name))
-    with pytest.raises(InputError, match="another run"):
+    with pytest.raises(InputError, match="belongs to a run with another scene"):
         distill(PRIOR, 1000, targets, replace(config, seed=1), work=tmp_path)
 
 

@@ -167,6 +167,44 @@ def test_absurd_chunk_table(tmp_path: Path) -> None:
         read_points(path)
 
 
+@pytest.mark.parametrize(
+    ("at", "content", "message"),
+    [
+        (2, b"\0", "nothing says how its points are compressed"),
+        (54 + 12, struct.pack("<I", 0), "cannot be read as LAS: "),
+        (54 + 12, struct.pack("<I", 0xFFFF_FF50), "broken header: chunks of 4,294,967,120 points"),
+        (54 + 32, b"\0\0", "broken header: compressed points of 0 bytes, not 26"),
+        (54 + 36, b"\x07", "broken header: compressed points of 13 bytes, not 26"),
+        (None, b"\xff", "broken chunk table: chunks of"),
+    ],
+)
+def test_absurd_chunks(tmp_path: Path, at: int | None, content: bytes, message: str) -> None:
+    """Handed to lazrs as they are, some of these would abort the process, others panic."""
+    path = las(tmp_path / "a.laz", np.arange(30.0).reshape(10, 3), np.ones((10, 3), int))
+    data = bytearray(path.read_bytes())
+    (points_at,) = struct.unpack_from("<I", data, 96)
+    (table,) = struct.unpack_from("<q", data, points_at)
+    start = table + 8 if at is None else data.find(b"laszip encoded") - 2 + at
+    data[start : start + len(content)] = content
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=rf"a\.laz: .*{message}"):
+        read_points(path)
+
+
+def test_a_panic_in_lazrs_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = las(tmp_path / "a.laz", np.arange(30.0).reshape(10, 3), np.ones((10, 3), int))
+
+    def fall(*_: object) -> None:
+        raise type("PanicException", (BaseException,), {})("divisor of zero")
+
+    monkeypatch.setattr(laspy.LasReader, "read", fall)
+    with pytest.raises(InputError, match=r"a\.laz: cannot be read as LAS: divisor of zero"):
+        read_points(path)
+    monkeypatch.setattr(laspy.LasReader, "read", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        read_points(path)
+
+
 def test_las_needs_laspy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = las(tmp_path / "a.las", np.zeros((3, 3)), np.ones((3, 3), int))
     monkeypatch.setitem(sys.modules, "laspy", None)

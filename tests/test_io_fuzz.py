@@ -11,7 +11,7 @@ import pytest
 from test_io_clouds import columns, las, ply
 from test_io_packed import compressed, save_spz, truth
 from test_io_sog import parts
-from test_views import colmap, orbit, transforms, views
+from view_files import colmap, orbit, transforms, views
 
 from g2ard.errors import InputError
 from g2ard.io import kind, read_cloud, read_scene, read_view_set, write_splats, write_views

@@ -189,6 +189,14 @@ def test_meaningful_infinities_are_clamped(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.splats.quats[7], [1, 0, 0, 0])
 
 
+def test_a_scene_of_which_nothing_shows_is_noted(tmp_path: Path) -> None:
+    properties = {name: values.copy() for name, values in columns(scene(count=8)).items()}
+    for faintest, codes in ((-6, ["invisible"]), (-5, [])):
+        properties["opacity"][:] = -7
+        properties["opacity"][3] = faintest
+        assert [n.code for n in read_scene(save(tmp_path / "a.ply", properties)).notes] == codes
+
+
 def test_nothing_finite(tmp_path: Path) -> None:
     properties = columns(scene(count=3)) | {"y": np.full(3, np.nan)}
     path = save(tmp_path / "a.ply", properties)

@@ -195,15 +195,21 @@ def test_progress_shows_loss_psnr_and_speed(
 ) -> None:
     monkeypatch.setattr(probe, "_SHARE", 0.5)  # these steps are too short for an honest share
     seen: list[Any] = []
+    scenes: dict[int, Splats] = {}
     recover(
         student,
         targets,
         RecoverConfig(steps=60),
         progress=lambda *a: seen.append(a) if a[0] == "recover" else None,
+        watch=lambda step, _, splats: scenes.update({step: splats()}),
     )
     assert [a[1] for a in seen] == list(range(1, 61))
     assert set(seen[-1][3]) == {"loss", "PSNR", "steps/s"}
-    assert float(seen[-1][3]["PSNR"]) > float(seen[0][3]["PSNR"])
+    shown = {tuple(figures["PSNR"].split(" @")) for *_, figures in seen}
+    assert len(shown) > 2
+    for value, step in shown:  # each is of the step it names
+        want = probe.Probe(targets, (0.0, 0.0, 0.0)).all_of(scenes[int(step)])
+        assert float(value) == pytest.approx(want, abs=0.0051)
 
 
 def test_watching_costs_no_time_and_changes_no_bit(student: Splats, targets: TeacherRenders) -> None:

@@ -7,22 +7,24 @@ import sys
 
 import typer
 
-from g2ard.cli import commands  # importing it registers every command on the app
+from g2ard.cli.commands import register
 from g2ard.cli.frame import app
+from g2ard.cli.usage import usage_line
 
-__all__ = ["app", "commands", "main"]
+__all__ = ["main"]
 
 
 def main() -> None:
     """Entry point of the `g2ard` program: usage errors are one line and exit status 2, as all errors are."""
     # Kernels have threads of their own; those of numpy's BLAS only spin, for a thirtieth of a short command.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    register(next(iter(sys.argv[1:]), None))  # the others would only take time
     try:
         status = app(prog_name="g2ard", standalone_mode=False)
     except typer.Abort:
         status = 130
     except typer.TyperException as e:
-        message = " ".join(e.format_message().split())
+        message = usage_line(e)
         where = getattr(getattr(e, "ctx", None), "command_path", "g2ard")
         if message:  # empty when a group without arguments has already shown its help
             print(f"{where}: {message} (see {where} --help)", file=sys.stderr)

@@ -87,15 +87,19 @@ class Console:
         if self._bars is None:
             from rich.console import Console as Rich
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+            from rich.table import Column
+
+            def whole() -> Column:
+                return Column(min_width=len("0:00:00"))  # in a narrow window the figures are cut, not these
 
             self._bars = Progress(
                 TextColumn("{task.description:<12}"),
                 BarColumn(),
                 TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-                TimeElapsedColumn(),
+                TimeElapsedColumn(table_column=whole()),
                 TextColumn("ETA"),
-                TimeRemainingColumn(),
-                TextColumn("{task.fields[figures]}"),
+                TimeRemainingColumn(table_column=whole()),
+                TextColumn("{task.fields[figures]}", table_column=Column(no_wrap=True)),
                 console=Rich(stderr=True),
             )
             self._bars.start()

@@ -7,7 +7,6 @@ Exit status: 0 done · 1 failed · 2 usage · 3 a stated requirement was not met
 from __future__ import annotations
 
 import inspect
-import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,8 +15,9 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from g2ard import __version__
+from g2ard import __version__, interrupt
 from g2ard.cli.console import Console
+from g2ard.cli.usage import typed
 from g2ard.errors import G2ardError
 
 __all__ = ["Run", "app", "command", "group"]
@@ -54,7 +54,11 @@ def _load_config(ctx: typer.Context, path: Path | None) -> Path | None:
 
     try:
         values = tomllib.loads(path.read_text())
-    except (OSError, tomllib.TOMLDecodeError) as e:
+    except OSError as e:
+        raise typer.BadParameter(f"{path}: {e.strerror}") from None
+    except UnicodeDecodeError:
+        raise typer.BadParameter(f"{path}: not a text file") from None
+    except tomllib.TOMLDecodeError as e:
         raise typer.BadParameter(f"{path}: {e}") from None
     table = values.get(str(ctx.info_name), {k: v for k, v in values.items() if not isinstance(v, dict)})
     table = {key.replace("-", "_"): _as_typed(value) for key, value in table.items()}
@@ -69,7 +73,19 @@ def _as_typed(value: Any) -> Any:
     """A TOML value as it would be typed: options parse text; [1, 1, 1] is 1,1,1."""
     if isinstance(value, list):
         return ",".join(str(item) for item in value)
-    return value if isinstance(value, bool) else str(value)
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+_RIVALS = (("count", "ratio"), ("steps", "time_limit"), ("views", "no_views"))
+"""Options that exclude each other."""
+
+
+def _flags_win(ctx: typer.Context, values: dict[str, Any], defaults: dict[str, Any]) -> None:
+    """Forget what the config file says where a flag that excludes it was typed."""
+    for pair in _RIVALS:
+        for flag, other in (pair, pair[::-1]):
+            if typed(ctx, flag) and not typed(ctx, other) and other in defaults:
+                values[other] = defaults[other]
 
 
 _COMMON: dict[str, tuple[Any, Any]] = {
@@ -111,6 +127,9 @@ class Run:
         self.json: str | None = common["json"]
         self.console = Console(quiet=common["quiet"])
         self.noted = False  # whether a GPU failed
+        given = (*options.values(), common["config"])
+        paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
+        self._inputs = [p for p in paths if isinstance(p, Path) and p is not options.get("output")]
         self.config = {**options, "seed": self.seed, "threads": self.threads, "device": self.device}
 
     def progress(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
@@ -140,7 +159,7 @@ class Run:
 
         text = json.dumps({**data, **self._used(), "config": self.config}, indent=2, default=_plain)
         if self.json == "-":
-            sys.stdout.write(text + "\n")
+            print(text, flush=True)
             return
         from g2ard.io.atomic import atomic_output
 
@@ -158,6 +177,15 @@ class Run:
             return {}
         used = {"adapter": state.adapter, "kernels": state.served, "uploaded_bytes": state.uploaded_bytes}
         return {"device": used}
+
+    def spare_inputs(self, *outputs: Path) -> None:
+        """Usage check: nothing is written over what is read, not even under --overwrite."""
+        taken = {path.resolve() for path in self._inputs}
+        for output in outputs:
+            if output.resolve() in taken:
+                raise typer.BadParameter(
+                    f"{output} would be written over, and is an input; name another output"
+                )
 
     def unmet(self, requirement: str) -> NoReturn:
         """End with status 3: all is written, but a stated requirement was not met."""
@@ -188,11 +216,18 @@ def command(
             for key, (kind, default) in _COMMON.items()
         ]
 
-        def call(**values: Any) -> None:
+        def call(ctx: typer.Context, **values: Any) -> None:
+            _flags_win(ctx, values, {p.name: p.default for p in own})
             shared = {key: values.pop(key) for key in _COMMON}
-            _execute(Run(name, shared, dict(values)), fn, values, cuda)
+            ours = interrupt.raises()
+            try:
+                _execute(Run(name, shared, dict(values)), fn, values, cuda)
+            finally:
+                if ours:
+                    interrupt.ends_the_program()
 
-        parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own] + common
+        context = inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+        parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (context, *own, *common)]
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         call.__annotations__ = {p.name: p.annotation for p in parameters}
         call.__doc__ = fn.__doc__
@@ -205,8 +240,10 @@ def command(
 def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: bool) -> None:
     if run.device not in ("auto", "cpu", "gpu", "cuda"):
         raise typer.BadParameter(f"--device: auto, cpu, gpu or cuda, not {run.device!r}")
-    if run.json not in (None, "-") and Path(str(run.json)) == options.get("output"):
+    outputs = [Path(o) for o in (options.get("output"), run.json) if o not in (None, "-")]
+    if len({output.resolve() for output in outputs}) < len(outputs):
         raise typer.BadParameter(f"--json and --output are both {run.json}")
+    run.spare_inputs(*outputs)
     if run.device == "cuda" and not cuda:
         run.say("--device cuda: this command computes on the CPU only, and does")
     try:

@@ -13,6 +13,7 @@ import typer
 __all__ = [
     "Count",
     "CountOption",
+    "LookOption",
     "OutputOption",
     "PolicyOption",
     "RatioOption",
@@ -20,6 +21,7 @@ __all__ = [
     "Triple",
     "ViewsOption",
     "budget_of",
+    "can_judge",
     "one_budget",
     "parse_ratio",
     "views_count",
@@ -94,6 +96,7 @@ ViewsOption = Annotated[
     Path | None,
     typer.Option("--views", metavar="VIEWS", help="A COLMAP folder, a transforms.json or g2ard's own .json."),
 ]
+LookOption = Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")]
 OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Where the result goes.")]
 
 
@@ -141,6 +144,11 @@ def _colour(text: str) -> Triple:
 SplitOption = Annotated[
     str, typer.Option(metavar="train|test|all", help="By the views' split file, else every 8th name is test.")
 ]
+ShDegreeOption = Annotated[
+    int | None,
+    typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own if not given."),
+]
+ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on with a stopped run.")]
 SizeOption = Annotated[
     int | None, typer.Option(min=16, metavar="PIXELS", help="Shrink views to this longer side.")
 ]
@@ -191,6 +199,12 @@ def _policy(text: str) -> str:
 PolicyOption = Annotated[
     str, typer.Option("--policy", parser=_policy, metavar=_POLICIES, help="What makes views good.")
 ]
+
+
+def can_judge(k: Count | str | None, policy: str) -> None:
+    """Usage check: `-k auto` needs a policy that measures what views add."""
+    if k == "auto" and policy in ("random", "uniform"):
+        raise typer.BadParameter(f"-k auto: --policy {policy} does not measure what views add; give a count")
 
 
 def one_horizon(steps: int | None, time_limit: float | None) -> None:

@@ -12,7 +12,15 @@ if TYPE_CHECKING:
     from g2ard.splats import Splats
     from g2ard.targets import Targets
 
-__all__ = ["load_scene", "load_splits", "load_view_sets", "load_views", "make_targets", "recovery_engine"]
+__all__ = [
+    "load_scene",
+    "load_splits",
+    "load_view_sets",
+    "load_views",
+    "make_targets",
+    "recovery_engine",
+    "trained_on",
+]
 
 
 def recovery_engine(run: Run) -> Literal["fused", "gsplat"]:
@@ -27,6 +35,11 @@ def recovery_engine(run: Run) -> Literal["fused", "gsplat"]:
 
     check_cuda()
     return "gsplat"
+
+
+def trained_on(split: str) -> str:
+    """What to call the views that a command has fitted."""
+    return "training views" if split == "train" else f"{split} views"
 
 
 def load_scene(run: Run, path: Path) -> Splats:

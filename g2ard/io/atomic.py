@@ -58,6 +58,7 @@ def _refuse_existing(path: Path, overwrite: bool, folder: bool) -> None:
 def _beside(path: Path) -> Path:
     """A hidden name in the same folder, so that the rename stays on one disk; the suffix is kept for
     writers that choose a format by it."""
+    path = path.absolute()  # "." has no name
     return path.with_name(f".{path.stem}.{uuid4().hex[:12]}{path.suffix}")
 
 

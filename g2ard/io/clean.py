@@ -22,6 +22,9 @@ LOGIT_LIMIT = 16.0
 """Logits past this are clamped to it: sigmoid(16) = 1 − 1.1e-7, far past the 0.99 at which a rasteriser clips
 and far within an 8-bit step of 1, while −log(1 − α) is still exact enough in float32."""
 
+_DRAWN_LOGIT = -5.54
+"""Below it α < 1/255, which no renderer draws."""
+
 LOG_SCALE_LIMIT = 43.0
 """exp(43)² = 2.2e37 and exp(−43)² = 4.5e-38 are the last squares that are normal float32."""
 
@@ -58,7 +61,7 @@ def cleaned(path: Path, raw: Raw, notes: list[Note] | None = None) -> Scene:
 
     Rows with a NaN, or with an infinity where none has a meaning, are dropped and counted. Infinite or
     extreme logits (|x| > 16) and log-scales (|x| > 43) are clamped, quaternions of length zero become
-    the identity; both counted.
+    the identity; both counted. A scene of which nothing shows is noted.
 
     Raises:
         InputError: no row is left.
@@ -85,6 +88,8 @@ def cleaned(path: Path, raw: Raw, notes: list[Note] | None = None) -> Scene:
     ):
         if tally[key]:
             notes.append(Note(code, tally[key], f"{plural(tally[key], what)} {then}"))
+    if np.max(raw.logit_opacities, where=keep, initial=-np.inf) < _DRAWN_LOGIT:
+        notes.append(Note("invisible", count - dropped, "nothing of it shows: every α is below 1/255"))
     splats = Splats(
         raw.means, raw.quats, raw.log_scales, raw.logit_opacities, raw.sh0, raw.shN, raw.offset
     )  # `log_scales` were exponentiated in place

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from g2ard.io.cloud_ply import finite_cloud
 from g2ard.io.types import Cloud, Note
 
 __all__ = ["read"]
+
+_LARGEST_CHUNK = 1 << 30
+"""Bytes of points that lazrs may make room for where a file has fewer points than a chunk holds."""
 
 
 def read(path: Path) -> Cloud:
@@ -23,7 +27,7 @@ def read(path: Path) -> Cloud:
     """
     try:
         import laspy
-        import lazrs  # noqa: F401 - what laspy reads .laz with
+        import lazrs  # noqa: F401 - what laspy reads .laz with; its absence is told here
     except ImportError as error:
         raise MissingDependencyError(f"{path}: .las and .laz need `pip install g2ard[las]`") from error
     _check_records(path)
@@ -37,13 +41,16 @@ def read(path: Path) -> Cloud:
                 )
             if header.are_points_compressed:
                 _check_chunk_table(path, header.offset_to_point_data, header.point_count)
+                _check_chunks(path, header)
             else:
                 _check_size(path, header.offset_to_point_data, header.point_count, header.point_format.size)
             las = reader.read()
     except InputError:
         raise
-    except Exception as error:  # on damaged headers laspy raises whatever its parsing stumbles over
-        raise InputError(f"{path}: cannot be read as LAS: {error}") from error
+    except BaseException as error:  # on damage laspy raises whatever it stumbles over, and lazrs may panic
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        raise InputError(f"{path}: cannot be read as LAS: {str(error) or type(error).__name__}") from error
     if len(las.points) < header.point_count:
         raise InputError(
             f"{path}: truncated: {header.point_count:,} points promised, {len(las.points):,} there"
@@ -89,3 +96,25 @@ def _check_chunk_table(path: Path, points_at: int, promised: int) -> None:
         _version, chunks = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     if chunks > max(promised, 1):
         raise InputError(f"{path}: broken chunk table: {chunks:,} chunks for {promised:,} points")
+
+
+def _check_chunks(path: Path, header: Any) -> None:
+    """Refuse chunks the file has no room for, or too few points: lazrs would abort for want of memory."""
+    import lazrs
+
+    records = header.vlrs.get("LasZipVlr")
+    if not records:
+        raise InputError(f"{path}: broken header: nothing says how its points are compressed")
+    layout = lazrs.LazVlr(records[0].record_data)
+    size, wanted = layout.item_size(), header.point_format.size
+    if size != wanted:
+        raise InputError(f"{path}: broken header: compressed points of {size} bytes, not {wanted}")
+    if not layout.uses_variable_size_chunks():
+        chunk = layout.chunk_size()
+        if not 0 < chunk * size <= max(_LARGEST_CHUNK, header.point_count * size):
+            raise InputError(f"{path}: broken header: chunks of {chunk:,} points")
+    with path.open("rb") as file:
+        file.seek(header.offset_to_point_data)
+        taken = [count for _, count in lazrs.read_chunk_table(file, layout)]
+    if min(taken, default=0) < 0 or sum(taken) > path.stat().st_size - header.offset_to_point_data:
+        raise InputError(f"{path}: broken chunk table: chunks of {sum(taken):,} bytes")

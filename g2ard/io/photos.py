@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from g2ard.errors import InputError
 from g2ard.io.clean import plural
 from g2ard.io.types import Note, ViewSet
 
-__all__ = ["Frame", "find_photo", "photo_size", "rigid", "rotation", "view_set"]
+__all__ = ["Frame", "find_photo", "photo_size", "pixels", "rigid", "rotation", "view_set"]
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 
@@ -55,6 +55,18 @@ def photo_size(path: Path) -> tuple[int, int]:
             return image.size
     except (OSError, UnidentifiedImageError) as error:
         raise InputError(f"{path}: not a whole image ({error})") from error
+
+
+def pixels(where: str, values: Mapping[str, Any], key: str) -> int:
+    """A side of an image as a file states it, 80 or 80.0.
+
+    Raises:
+        InputError: it is not a whole number.
+    """
+    value = float(values[key])
+    if not value.is_integer():
+        raise InputError(f"{where}: {key!r} is {values[key]!r}, not a whole number of pixels")
+    return int(value)
 
 
 def rotation(quat: Sequence[float]) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import read_json
-from g2ard.io.photos import Frame, find_photo, photo_size, rigid, view_set
+from g2ard.io.photos import Frame, find_photo, photo_size, pixels, rigid, view_set
 from g2ard.io.types import ViewSet
 
 __all__ = ["files_of", "read"]
@@ -135,7 +135,7 @@ def _focal(values: dict[str, Any], axis: str, pixels: int) -> float | None:
 
 def _size(where: str, values: dict[str, Any], photo: Path) -> tuple[int, int]:
     if "w" in values and "h" in values:
-        return round(float(values["w"])), round(float(values["h"]))
+        return pixels(where, values, "w"), pixels(where, values, "h")
     if photo.is_file():
         return photo_size(photo)
     raise InputError(f"{where}: neither w and h nor its photo is there to tell the size")

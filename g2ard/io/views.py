@@ -15,7 +15,7 @@ from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import read_json
-from g2ard.io.photos import Frame, rigid, view_set
+from g2ard.io.photos import Frame, pixels, rigid, view_set
 from g2ard.io.types import ViewSet
 
 __all__ = ["read", "write"]
@@ -59,7 +59,7 @@ def _frame(path: Path, index: int, view: Any, images: Path | None) -> Frame:
             name=str(view["name"]),
             viewmat=_exact(where, np.array(view["camera_from_world"], np.float64)),
             K=np.array(view["K"], np.float64).reshape(3, 3),
-            size=(int(view["width"]), int(view["height"])),
+            size=(pixels(where, view, "width"), pixels(where, view, "height")),
             photo=photo,
             mask=None if mask is None else path.parent / mask,
             distortion=tuple(map(float, (*view.get("distortion", ()), 0, 0, 0, 0, 0)[:5])),

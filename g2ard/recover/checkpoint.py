@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +19,16 @@ from g2ard.io.atomic import atomic_output
 
 __all__ = ["PERIOD", "deferred_interrupt", "load", "save"]
 
+_ANEW = "-w without --resume starts anew"
+
 PERIOD = 60.0
 """Seconds between two checkpoints."""
 
 
 def save(path: Path, key: str, meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
     """Write a checkpoint; `key` says what work it belongs to."""
-    everything: dict[str, Any] = {"meta": np.array(json.dumps({"key": key, **meta})), **arrays}
+    text = json.dumps({"key": key, **meta}, default=_plain)
+    everything: dict[str, Any] = {"meta": np.array(text), **arrays}
     with atomic_output(path, overwrite=True) as temporary:
         np.savez(temporary, **everything)
 
@@ -41,13 +43,16 @@ def load(path: Path, key: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]
         with np.load(path) as data:
             arrays = dict(data)
         meta: dict[str, Any] = json.loads(str(arrays.pop("meta")))
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as e:
-        raise InputError(f"{path}: not a checkpoint of g2ard: {e}") from None
-    if meta.pop("key") != key:
-        raise InputError(
-            f"{path}: belongs to a run with another scene or other options; remove it to start anew"
-        )
+        known = meta.pop("key")
+    except Exception:  # numpy and zipfile raise whatever their parsing stumbles over
+        raise InputError(f"{path}: not a checkpoint of g2ard, or a damaged one; {_ANEW}") from None
+    if known != key:
+        raise InputError(f"{path}: belongs to a run with another scene or other options; {_ANEW}")
     return meta, arrays
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 @contextmanager

@@ -326,8 +326,8 @@ class _Loop:
         total = self.config.horizon
         if self.config.time_limit is not None:
             total = max(self.done, round(self.done / max(self._share(), 1e-9)))
-        shown = self.probe.now(self.engine.splats, self.seconds)
-        figures = {"loss": f"{recent:.4f}", "PSNR": f"{shown:.2f}", "steps/s": f"{speed:.1f}"}
+        shown, at = self.probe.latest(self.engine.splats, self.done, self.seconds)
+        figures = {"loss": f"{recent:.4f}", "PSNR": f"{shown:.2f} @{at}", "steps/s": f"{speed:.1f}"}
         progress(stage, self.done, total, figures)
 
     def curve(self) -> list[float]:

@@ -19,7 +19,7 @@ MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
 
 _VIEWS = 8
 _SHARE = 0.01
-"""Of the time that looking at a view may take while somebody watches the progress."""
+"""Of the time that looking at the views may take while somebody watches the progress."""
 _FEWEST, _MOST, _PART = 10, 60, 50
 _SHORTEST_HORIZON = 100
 
@@ -52,31 +52,33 @@ def climb(score: Callable[[float], float], start: float) -> tuple[float, dict[fl
 
 
 class Probe:
-    """PSNR of a few evenly spaced training views: all at once, or one after the other along the way."""
+    """PSNR of a few evenly spaced training views."""
 
     def __init__(self, targets: Targets, background: tuple[float, float, float]) -> None:
         count = len(targets.cameras)
         sample = np.linspace(0, count - 1, min(count, _VIEWS)).round().astype(int)
         self._views = [int(view) for view in np.unique(sample)]
         self._targets, self._background = targets, background
-        self._scores: dict[int, float] = {}
-        self._turn = 0
         self._next = 0.0
+        self._latest = (float("nan"), 0)
 
     def all_of(self, splats: Splats) -> float:
         """Mean over all of the views."""
-        self._scores = {view: self._score(splats, view) for view in self._views}
-        return float(np.mean(list(self._scores.values())))
+        return float(np.mean([self._score(splats, view) for view in self._views]))
 
-    def now(self, splats: Callable[[], Splats], seconds: float) -> float:
-        """The mean with one view looked at again, unless that would take more than its share of the time."""
+    def latest(self, splats: Callable[[], Splats], step: int, seconds: float) -> tuple[float, int]:
+        """The mean, and the step it is of: an earlier one where looking has had its share of the time.
+
+        Args:
+            splats: gives the scene as it stands.
+            step: how many have been taken.
+            seconds: since recovery began.
+        """
         if seconds >= self._next:
             began = time.monotonic()
-            view = self._views[self._turn % len(self._views)]
-            self._scores[view] = self._score(splats(), view)
-            self._turn += 1
+            self._latest = self.all_of(splats()), step
             self._next = seconds + (time.monotonic() - began) / _SHARE
-        return float(np.mean(list(self._scores.values())))
+        return self._latest
 
     def _score(self, splats: Splats, view: int) -> float:
         from g2ard.render import render

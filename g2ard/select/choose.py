@@ -101,6 +101,8 @@ def select(
     """
     if policy not in POLICIES:
         raise InputError(f"policy: expected {', '.join(POLICIES)}, got {policy!r}")
+    if k == "auto" and policy in ("random", "uniform"):
+        raise InputError(f"k: 'auto' needs a policy that measures what views add, not {policy!r}")
     if k != "auto" and k < 1:
         raise InputError(f"k: expected at least 1 view, got {k}")
     if not len(cameras):
@@ -147,11 +149,9 @@ def select(
 
 
 def _blind(policy: str, rows: Order, k: int | Literal["auto"], seed: int) -> Order:
-    if k == "auto":
-        raise InputError(f"k: 'auto' needs a policy that measures what views add, not {policy!r}")
     if policy == "random":
         return np.random.default_rng([seed, 7]).permutation(rows)
-    count = min(k, len(rows))
+    count = len(rows) if k == "auto" else min(k, len(rows))
     chosen = np.floor((np.arange(count) + 0.5) * len(rows) / max(count, 1)).astype(np.int64)
     return np.concatenate([rows[chosen], np.delete(rows, chosen)])
 

@@ -20,6 +20,9 @@ __all__ = ["METHODS", "Seen", "Simplified", "SimplifyConfig", "flag", "schedule"
 
 _DEFAULTS = SimplifyConfig()
 
+_FAINTEST = np.float32(-16)
+"""A logit; files' readers clamp to it too."""
+
 
 @dataclass(frozen=True, eq=False)
 class Simplified:
@@ -30,8 +33,10 @@ class Simplified:
             geometry is what recovery takes as anchors.
         parents: (N,) int64, the output row each input row went to; −1 if it was dropped or trimmed.
         protected: (M,) bool, flags inherited by OR from everything merged into the row.
-        report: `input_count`, `output_count`, `rounds` (one dict each), `protected`, `nonfinite_rows`,
-            `clamped_logits` (infinite ones), `clamped_opacities` (merged α that reached
+        report: `input_count`, `output_count`, `merged_members` (rows of the input that share an output row),
+            `rounds` (a dict each: `before` − `dropped` − `merged` − `trimmed` = `after`, where `merged` is by
+            how many rows merging shrank the scene), `protected`, `nonfinite_rows`,
+            `infinite_logits` (taken as α = 0 or 1), `clamped_opacities` (merged α that reached
             0.99: what `max_growth` could not take was lost), `resized` (rows fitted to what views see),
             `skipped` (`alone`: rows passed on as they were; `sh_bands`: of zeros, left out of all sums).
     """
@@ -103,6 +108,8 @@ def simplify(
     affine-energy and surface-coverage guards pass, and trims by π = −log(1 − α)·A·(1 + λ_h·p)
     (eq. `importance`).
 
+    Rows below the methods' α are dropped first, unless the budget needs them, or there are no others.
+
     The result does not depend on the order of the rows, the unit, or the number of threads.
 
     Args:
@@ -140,6 +147,8 @@ def simplify(
     flags = _check_flags(protected, len(splats))
     if flags is not None:
         flags = np.ascontiguousarray(flags[finite])
+    if not (scene.opacities >= config.min_opacity_of(method)).any():
+        scene, config = _unseen(scene), replace(config, min_opacity=0.0)
     if method == "paper":
         out = _paper(scene, budget, flags, flag_budget or budget, config, progress)
     else:
@@ -224,6 +233,15 @@ def _clean(splats: Splats) -> tuple[Splats, NDArray[np.bool_] | slice]:
     return scene, slice(None) if everything else finite
 
 
+def _unseen(scene: Splats) -> Splats:
+    """A scene of which nothing shows, with an α that leaves every row some weight in sums.
+
+    Dropping the transparent would leave nothing, and a mass of 0 no reason to keep one place over another.
+    """
+    logits = scene.logit_opacities
+    return replace(scene, logit_opacities=np.where(np.isinf(logits), logits, np.maximum(logits, _FAINTEST)))
+
+
 def _used_degree(scene: Splats) -> int:
     """The highest SH degree that any Gaussian has a coefficient of."""
     degree = scene.sh_degree
@@ -239,19 +257,21 @@ def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str
     parents = np.full(len(splats), -1, np.int64)
     parents[finite] = out["parents"]
     small = splats_of(splats, out).with_sh_degree(splats.sh_degree)
-    alone = np.bincount(out["parents"][out["parents"] >= 0], minlength=len(small)) == 1
+    kept = int(np.count_nonzero(parents >= 0))
+    alone = int(np.count_nonzero(np.bincount(parents[parents >= 0], minlength=len(small)) == 1))
     protected: NDArray[np.bool_] = out["protected"]
     report = {
         "input_count": len(splats),
         "output_count": len(small),
+        "merged_members": kept - alone,
         "rounds": out["rounds"],
         "protected": int(np.count_nonzero(protected)),
         "nonfinite_rows": 0 if isinstance(finite, slice) else len(splats) - int(np.count_nonzero(finite)),
-        "clamped_logits": out["clamped_logits"],
+        "infinite_logits": out["infinite_logits"],
         "clamped_opacities": out["clamped_opacities"],
         "resized": out.get("resized", 0),
         "skipped": {
-            "alone": int(np.count_nonzero(alone)),
+            "alone": alone,
             "sh_bands": splats.sh_degree - math.isqrt(out["sh"].shape[1]) + 1,
         },
     }

@@ -1,6 +1,8 @@
-"""One module per command; importing this package registers them, in the order `g2ard --help` lists them."""
+"""One module per command; importing it registers the command, in the order `g2ard --help` lists them."""
 
 from importlib import import_module
+
+__all__ = ["COMMANDS", "register"]
 
 COMMANDS = (
     "distill",
@@ -17,5 +19,8 @@ COMMANDS = (
     "synth",
 )
 
-for _name in COMMANDS:
-    import_module(f"{__name__}.{_name}")
+
+def register(asked: str | None = None) -> None:
+    """Put the command `asked` on the app; all of them if it is none."""
+    for name in (asked,) if asked in COMMANDS else COMMANDS:
+        import_module(f"{__name__}.{name}")

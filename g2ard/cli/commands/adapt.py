@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-import shutil
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import BackgroundOption, OutputOption, SizeOption, SplitOption, TeacherOption
+from g2ard.cli.options import (
+    BackgroundOption,
+    LookOption,
+    OutputOption,
+    ResumeOption,
+    ShDegreeOption,
+    SizeOption,
+    SplitOption,
+    TeacherOption,
+)
 
 
 @command("adapt", example="g2ard adapt small.ply --views winter/ -o winter.ply")
 def adapt(
     run: Run,
     compact: Annotated[Path, typer.Argument(metavar="COMPACT", help="The scene whose geometry stays.")],
-    views: Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")],
+    views: LookOption,
     output: OutputOption,
     teacher: TeacherOption = None,
     steps: Annotated[int, typer.Option(min=1, help="At most.")] = 7000,
@@ -25,10 +32,8 @@ def adapt(
         float, typer.Option(min=0, help="Stop when a stretch gains less, dB; 0 takes all steps.")
     ] = 0.05,
     schedule: Annotated[Literal["default", "paper"], typer.Option(help="Rates and decay.")] = "default",
-    sh_degree: Annotated[
-        int | None, typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's if not given.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a stopped run.")] = False,
+    sh_degree: ShDegreeOption = None,
+    resume: ResumeOption = False,
     split: SplitOption = "train",
     size: SizeOption = None,
     background: BackgroundOption = None,
@@ -36,9 +41,12 @@ def adapt(
     """Refit colours and opacities to new images; means, rotations and scales stay as they are."""
     from g2ard.adapt import AdaptConfig
     from g2ard.adapt import adapt as refit
-    from g2ard.cli.scenes import load_scene, load_views, make_targets
+    from g2ard.cli.resume import check_stopped, stoppable
+    from g2ard.cli.scenes import load_scene, load_views, make_targets, trained_on
     from g2ard.io import check_scene_output, write_splats
 
+    work = output.parent / f".{output.name}.work"
+    check_stopped(run, work, resume)
     check_scene_output(output, run.overwrite)
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(run, compact)
@@ -52,27 +60,14 @@ def adapt(
         background=colour,
         seed=run.seed,
     )
-    work = output.with_name(f".{output.name}.work")
-    if not resume:
-        shutil.rmtree(work, ignore_errors=True)
-    elif not work.is_dir():
-        run.say(f"nothing to go on from ({work}): starts anew")
     targets = make_targets(run, cameras, dense, colour)
-    work.mkdir(exist_ok=True)
-    try:
+    with stoppable(run, work, resume):
+        work.mkdir(exist_ok=True)
         result = refit(splats, targets, config, work=work, progress=run.progress)
-    except KeyboardInterrupt:
-        if any(work.iterdir()):
-            run.say(f"stopped; the same command with --resume goes on from {work}")
-        raise
-    finally:
-        with suppress(OSError):  # it stays if it holds a checkpoint
-            work.rmdir()
-    write_splats(output, result.splats, overwrite=run.overwrite)
-    shutil.rmtree(work, ignore_errors=True)
+        write_splats(output, result.splats, overwrite=run.overwrite)
     gain, end = result.report["psnr"], "converged" if result.report["converged"] else "all steps taken"
     run.say(
         f"{output}: {len(splats):,} Gaussians, {result.report['steps']:,} steps ({end}), "
-        f"training views {gain['before']:.2f} → {gain['after']:.2f} dB"
+        f"{trained_on(split)} {gain['before']:.2f} → {gain['after']:.2f} dB"
     )
     run.result({**result.report, "output": str(output)})

@@ -18,15 +18,18 @@ from g2ard.cli.options import (
     PolicyOption,
     PresetOption,
     RatioOption,
+    ResumeOption,
     ScheduleName,
     SizeOption,
     TimeLimitOption,
     ViewsOption,
     budget_of,
+    can_judge,
     one_budget,
     one_horizon,
     views_count,
 )
+from g2ard.cli.resume import check_stopped
 from g2ard.cli.scenes import load_scene, load_view_sets, make_targets, recovery_engine
 
 if TYPE_CHECKING:
@@ -93,13 +96,15 @@ def distill(
         int | None,
         typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own, 3 from a cloud."),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a stopped run.")] = False,
+    resume: ResumeOption = False,
     size: SizeOption = None,
     background: BackgroundOption = None,
 ) -> None:
     """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget."""
     one_budget(count, ratio)
     one_horizon(steps, time_limit)
+    can_judge(k, policy)
+    run.spare_inputs(output / "scene.ply", *([output / "views.json"] if views is None else []))
     import shutil
     import time
 
@@ -116,7 +121,7 @@ def distill(
     lifted = kind(scene) != "splats"
     if lifted and views is None:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
-    stopped = resume and (output / "work").is_dir()
+    stopped = check_stopped(run, output / "work", resume)
     check_output(output, run.overwrite or stopped, folder=True)
     prior = _lift(run, scene) if lifted else load_scene(run, scene)
     budget = budget_of(scene, count, ratio, len(prior))

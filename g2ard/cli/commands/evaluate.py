@@ -8,14 +8,14 @@ from typing import Annotated, Any
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import BackgroundOption, SizeOption, SplitOption, TeacherOption
+from g2ard.cli.options import BackgroundOption, LookOption, SizeOption, SplitOption, TeacherOption
 
 
 @command("evaluate", example="g2ard evaluate small.ply --views poses.json --teacher scene.ply --json -")
 def evaluate(
     run: Run,
     scenes: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scenes to score.")],
-    views: Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")],
+    views: LookOption,
     teacher: TeacherOption = None,
     anchors: Annotated[
         Path | None,

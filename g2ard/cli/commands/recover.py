@@ -10,9 +10,12 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
+    LookOption,
     OutputOption,
     PresetOption,
+    ResumeOption,
     ScheduleName,
+    ShDegreeOption,
     SizeOption,
     SplitOption,
     TeacherOption,
@@ -29,20 +32,15 @@ from g2ard.cli.options import (
 def recover(
     run: Run,
     student: Annotated[Path, typer.Argument(metavar="STUDENT", help="The compact scene to recover.")],
-    views: Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")],
+    views: LookOption,
     output: OutputOption,
     teacher: TeacherOption = None,
     preset: PresetOption = "auto",
     schedule: Annotated[ScheduleName, typer.Option(help="Rates, decay and horizon.")] = "default",
     steps: Annotated[int | None, typer.Option(min=1, help="Overrides the schedule's horizon.")] = None,
     time_limit: TimeLimitOption = None,
-    sh_degree: Annotated[
-        int | None,
-        typer.Option("--sh-degree", min=0, max=3, help="Of the result; the student's if not given."),
-    ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the checkpoint of a stopped run.")
-    ] = False,
+    sh_degree: ShDegreeOption = None,
+    resume: ResumeOption = False,
     split: SplitOption = "train",
     weighted: Annotated[
         bool, typer.Option("--weights/--no-weights", help="Draw views by the weights they carry, if any.")
@@ -51,7 +49,8 @@ def recover(
     background: BackgroundOption = None,
 ) -> None:
     """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
-    from g2ard.cli.scenes import load_scene, load_view_sets, make_targets, recovery_engine
+    from g2ard.cli.resume import check_stopped, stoppable
+    from g2ard.cli.scenes import load_scene, load_view_sets, make_targets, recovery_engine, trained_on
     from g2ard.io import check_scene_output, write_splats
     from g2ard.recover import RecoverConfig
     from g2ard.recover import recover as optimize
@@ -59,6 +58,8 @@ def recover(
     from g2ard.recover.schedule import schedule_named
 
     one_horizon(steps, time_limit)
+    checkpoint = output.parent / f".{output.name}.checkpoint.npz"
+    check_stopped(run, checkpoint, resume)
     check_scene_output(output, run.overwrite)
     engine = recovery_engine(run)
     colour = background or (0.0, 0.0, 0.0)
@@ -82,29 +83,16 @@ def recover(
         seed=run.seed,
         engine=engine,
     )
-    checkpoint = output.with_name(f".{output.name}.checkpoint.npz")
-    if not resume:
-        checkpoint.unlink(missing_ok=True)
-    elif not checkpoint.exists():
-        run.say(f"nothing to go on from ({checkpoint}): starts anew")
-    try:
+    targets = make_targets(run, chosen.cameras, dense, colour)
+    with stoppable(run, checkpoint, resume):
         result = optimize(
-            splats,
-            make_targets(run, chosen.cameras, dense, colour),
-            config,
-            weights=weights,
-            checkpoint=checkpoint,
-            progress=run.progress,
+            splats, targets, config, weights=weights, checkpoint=checkpoint, progress=run.progress
         )
-    except KeyboardInterrupt:
-        if checkpoint.exists():
-            run.say(f"stopped; the same command with --resume goes on from {checkpoint}")
-        raise
-    write_splats(output, result.splats, overwrite=run.overwrite)
-    checkpoint.unlink(missing_ok=True)
+        write_splats(output, result.splats, overwrite=run.overwrite)
     gain = result.report["psnr"]
     run.say(
-        f"{output}: {len(splats):,} Gaussians, training views {gain['before']:.2f} → {gain['after']:.2f} dB"
+        f"{output}: {len(splats):,} Gaussians, "
+        f"{trained_on(split)} {gain['before']:.2f} → {gain['after']:.2f} dB"
     )
     report = {**result.report, "preset": why, "prior": measured.as_dict()}
     run.result({**report, "output": str(output)})

@@ -8,14 +8,14 @@ from typing import Annotated
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import BackgroundOption, SceneArgument, SizeOption, SplitOption
+from g2ard.cli.options import BackgroundOption, LookOption, SceneArgument, SizeOption, SplitOption
 
 
 @command("render", example="g2ard render scene.ply --views poses.json -o renders/")
 def render(
     run: Run,
     scene: SceneArgument,
-    views: Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")],
+    views: LookOption,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the PNGs.")],
     depth: Annotated[bool, typer.Option("--depth", help="Also write NAME.depth.npy, scene units.")] = False,
     split: SplitOption = "all",

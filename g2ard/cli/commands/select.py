@@ -7,7 +7,15 @@ from typing import Annotated
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import Count, OutputOption, PolicyOption, SceneArgument, ViewsOption, views_count
+from g2ard.cli.options import (
+    Count,
+    OutputOption,
+    PolicyOption,
+    SceneArgument,
+    ViewsOption,
+    can_judge,
+    views_count,
+)
 
 
 @command("select", example="g2ard select scene.ply --views poses.json -k 100 -o chosen.json")
@@ -33,6 +41,7 @@ def select(
 
     if views is None:
         raise typer.BadParameter("--views VIEWS: the candidates to select from")
+    can_judge(k, policy)
     check_views_output(output, run.overwrite)
     splats = load_scene(run, scene)
     cameras = load_views(run, views, "all", None)

@@ -131,7 +131,7 @@ def _tell(run: Run, small: Simplified) -> None:
             for v in (
                 r["before"],
                 r["dropped"],
-                r["merged_members"] - r["merged_groups"],
+                r["merged"],
                 sum(r.get("refused", {}).values()),
                 r["trimmed"],
                 r["after"],

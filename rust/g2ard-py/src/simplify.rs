@@ -291,8 +291,7 @@ fn pairwise_dict<'py>(py: Python<'py>, r: &PairwiseRound) -> PyResult<Bound<'py,
     for (key, value) in [
         ("before", r.before),
         ("dropped", r.dropped),
-        ("merged_groups", r.merged),
-        ("merged_members", 2 * r.merged),
+        ("merged", r.merged),
         ("trimmed", 0),
         ("after", r.after),
     ] {
@@ -312,8 +311,7 @@ fn round_dict<'py>(py: Python<'py>, r: &PaperRound) -> PyResult<Bound<'py, PyDic
         ("dropped", r.dropped),
         ("cells", r.cells),
         ("skipped_alone", r.alone),
-        ("merged_groups", r.merged_groups),
-        ("merged_members", r.merged_members),
+        ("merged", r.merged_members - r.merged_groups),
         ("undone_groups", r.undone_groups),
         ("clamped_opacities", r.clamped_opacities),
         ("trimmed", r.trimmed),
@@ -341,7 +339,7 @@ fn outcome_dict<'py, R>(
     out.set_item("parents", PyArray1::from_vec(py, outcome.parents))?;
     out.set_item("protected", PyArray1::from_vec(py, outcome.flags))?;
     out.set_item("clamped_opacities", outcome.clamped_opacities)?;
-    out.set_item("clamped_logits", outcome.clamped_logits)?;
+    out.set_item("infinite_logits", outcome.infinite_logits)?;
     out.set_item("rounds", rounds)?;
     Ok(out)
 }

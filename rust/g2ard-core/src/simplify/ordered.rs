@@ -136,7 +136,7 @@ pub struct Ordered {
     /// Spacing of merged means, a power of two.
     pub grid: f64,
     /// Logits that are infinite, and clamped wherever they are used.
-    pub clamped_logits: usize,
+    pub infinite_logits: usize,
 }
 
 impl Ordered {
@@ -155,7 +155,7 @@ impl Ordered {
             rows,
             origin: frame.origin,
             grid: power_of_two_below(frame.radius) * MEAN_GRID,
-            clamped_logits: scene
+            infinite_logits: scene
                 .logit_opacities
                 .iter()
                 .filter(|v| v.is_infinite())
@@ -252,7 +252,7 @@ mod tests {
         let (a, b) = (sorted([0, 1, 2, 3, 4]), sorted([3, 4, 2, 0, 1]));
         assert_eq!(a.0, b.0);
         let (a, b) = (a.1, b.1);
-        assert_eq!(a.clamped_logits, 1);
+        assert_eq!(a.infinite_logits, 1);
         let back: Vec<usize> = b
             .rows
             .iter()

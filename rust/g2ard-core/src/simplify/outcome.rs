@@ -15,7 +15,7 @@ pub struct Outcome<R> {
     /// Merged rows whose α was clipped, so that some of their mass is lost.
     pub clamped_opacities: usize,
     /// Infinite logits, clamped.
-    pub clamped_logits: usize,
+    pub infinite_logits: usize,
 }
 
 /// Follows parents and copies through successive steps.
@@ -107,7 +107,7 @@ impl Step {
             flags,
             rounds,
             clamped_opacities: 0,
-            clamped_logits: ordered.clamped_logits,
+            infinite_logits: ordered.infinite_logits,
         }
     }
 }

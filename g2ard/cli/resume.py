@@ -1,0 +1,56 @@
+"""Commands that can be stopped: what a stopped run left is gone on from, or replaced when -w says so."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from g2ard.cli.frame import Run
+from g2ard.errors import OutputError
+
+__all__ = ["check_stopped", "stoppable"]
+
+
+def check_stopped(run: Run, place: Path, resume: bool) -> bool:
+    """Before the work: whether there is something to go on from at `place`, a checkpoint or a folder of them.
+
+    Raises:
+        OutputError: there is, and neither --resume nor --overwrite says what is to become of it.
+    """
+    left = _left(place)
+    if resume and not left:
+        run.say(f"nothing to go on from ({place}): starts anew")
+    if left and not (resume or run.overwrite):
+        raise OutputError(f"{place}: left by a stopped run; --resume goes on from it, -w starts anew")
+    return resume and left
+
+
+@contextmanager
+def stoppable(run: Run, place: Path, resume: bool) -> Iterator[None]:
+    """While it lasts checkpoints may wait at `place`; its end removes them, Ctrl-C says how to go on."""
+    if not resume:
+        _remove(place)
+    try:
+        yield
+    except KeyboardInterrupt:
+        if _left(place):
+            run.say(f"stopped; the same command with --resume goes on from {place}")
+        raise
+    else:
+        _remove(place)
+    finally:
+        if not _left(place):
+            _remove(place)
+
+
+def _left(place: Path) -> bool:
+    return any(place.iterdir()) if place.is_dir() else place.exists()
+
+
+def _remove(place: Path) -> None:
+    if place.is_dir():
+        shutil.rmtree(place)
+    else:
+        place.unlink(missing_ok=True)

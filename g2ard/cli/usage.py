@@ -1,0 +1,52 @@
+"""What is said of a bad option: its name, what it takes and what it was given, in one line of our own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import typer
+
+__all__ = ["typed", "usage_line"]
+
+
+def usage_line(error: typer.TyperException) -> str:
+    """Typer's message for a usage error; where it quotes the library that checks values, ours."""
+    refused = getattr(error.__cause__, "errors", None)
+    parameter: Any = getattr(error, "param", None)
+    if isinstance(error, typer.BadParameter) and parameter is None:  # a check of several options at once
+        return error.message
+    if refused is None or parameter is None:
+        return " ".join(error.format_message().split())
+    given = refused()[0]["input"]
+    source = _config_of(error, parameter.name)
+    return f"Invalid value for {parameter.get_error_hint()}: {_allowed(parameter)}, not {given!r}{source}"
+
+
+def typed(ctx: typer.Context, name: str) -> bool:
+    """Whether an option stands on the command line, rather than in a config file or nowhere."""
+    return _source(ctx, name) == "COMMANDLINE"
+
+
+def _source(ctx: typer.Context, name: str) -> str:
+    return getattr(ctx.get_parameter_source(name), "name", "")
+
+
+def _config_of(error: typer.TyperException, name: str) -> str:
+    ctx = getattr(error, "ctx", None)
+    return f" (from {ctx.params['config']})" if ctx and _source(ctx, name) == "DEFAULT_MAP" else ""
+
+
+def _allowed(parameter: Any) -> str:
+    """What an option takes: one of several words, yes or no, or a number within bounds."""
+    descriptor = parameter.type_descriptor
+    if descriptor.choices is not None:
+        return f"one of {', '.join(map(str, descriptor.choices))}"
+    kinds = {bool: "true or false", int: "a whole number", float: "a number"}
+    low, high = descriptor.parameter_info.min, descriptor.parameter_info.max
+    bounds = {
+        (True, True): f" from {low} to {high}",
+        (True, False): f" of at least {low}",
+        (False, True): f" of at most {high}",
+        (False, False): "",
+    }
+    return kinds.get(descriptor.annotation, "another value") + bounds[low is not None, high is not None]

@@ -1,0 +1,73 @@
+"""Scenes, views and checks that the tests of simplification share."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from g2ard.splats import Splats
+
+
+def scene(n=2000, rest=3, seed=0, dtype=np.float32):
+    """Discs on a wavy surface, smooth in colour on one half, noisy on the other, on a dyadic lattice."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-4, 4, (2, n))
+    means = np.stack([x, y, 0.3 * np.sin(x)], 1)
+    color = np.stack([0.1 * x, 0.1 * y, 0 * x], 1) + (x > 0)[:, None] * rng.normal(size=(n, 3))
+    return Splats.create(
+        (np.round(means * 2**12) / 2**12).astype(dtype),
+        quats=rng.normal(size=(n, 4)),
+        scales=np.exp(rng.normal(-2.5, 0.3, (n, 3))) * [1, 1, 0.2],
+        logit_opacities=rng.normal(0, 2, n),
+        sh0=color[:, None],
+        shN=rng.normal(0, 0.1, (n, rest, 3)),
+    )
+
+
+ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+
+
+def assert_same(a, b):
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+def assert_sound(result, count, budget):
+    """What every result must be, on any input."""
+    out = result.splats
+    assert len(out) == budget
+    assert np.isfinite(out.logit_opacities).all()
+    assert out.finite_rows().all()
+    assert (out.scales > 0).all()
+    assert result.parents.shape == (count,)
+    assert result.parents.dtype == np.int64
+    used = np.unique(result.parents[result.parents >= 0])
+    np.testing.assert_array_equal(used, np.arange(budget))
+    assert result.protected.shape == (budget,)
+    assert result.report["output_count"] == budget
+
+
+class Views:
+    """What a caller's views see, as `g2ard.render.visibility` returns it."""
+
+    def __init__(self, weight, pixel_size):
+        self.weight, self.pixel_size = np.asarray(weight), np.asarray(pixel_size)
+
+
+def opaque_wall():
+    """1,600 opaque discs, thin along z, that overlap into a wall; a view of it."""
+    from g2ard.cameras import Cameras, look_at
+
+    x, y = np.meshgrid(np.linspace(-1, 1, 40), np.linspace(-1, 1, 40))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(1600)], 1)
+    wall = Splats.create(
+        points, scales=np.tile([0.04, 0.04, 0.002], (1600, 1)), logit_opacities=np.full(1600, 6)
+    )
+    eyes = [[0, 0, -3], [0.5, 0.2, -3], [-0.4, 0.3, -2.8]]
+    pose = [look_at(eye, [0, 0, 0], up=(0, -1, 0)) for eye in eyes]
+    K = [[150, 0, 40], [0, 150, 30], [0, 0, 1]]
+    return wall, Cameras.from_lists(pose, [K] * 3, [(80, 60)] * 3, ["a", "b", "c"])
+
+
+def all_alike(splats):
+    """Views that see every Gaussian alike."""
+    return Views(np.ones(len(splats)), np.full(len(splats), 0.01))

@@ -1,0 +1,141 @@
+"""What is refused of options, config files and outputs, and in which words; Ctrl-C before any command."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from scenes import around, checkered_ball
+
+from g2ard.io import read_splats, write_splats, write_views
+
+CommandLine = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A scene and views of it."""
+    write_splats(tmp_path / "a.ply", checkered_ball(200))
+    write_views(tmp_path / "views.json", around(8, (32, 24)))
+    return tmp_path
+
+
+def refused(command_line: CommandLine, folder: Path, *arguments: object) -> str:
+    status, _, error = command_line(*arguments, cwd=folder)
+    assert status == 2, error
+    assert len(error.splitlines()) == 1
+    return error
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--method", "best", "'--method': one of default, fast, paper, not 'best'"),
+        ("--retention", "x", "'--retention': a number, not 'x'"),
+        ("--seed", "-1", "'--seed': a whole number of at least 0, not '-1'"),
+        ("--seed", "1.5", "'--seed': a whole number of at least 0, not '1.5'"),
+        ("--threads", "1000", "'--threads': a whole number from 0 to 256, not '1000'"),
+    ],
+)
+def test_a_bad_value_is_named_with_what_is_allowed(
+    folder: Path, command_line: CommandLine, option: str, value: str, words: str
+) -> None:
+    simplify = ("simplify", "a.ply", "-n", 5, "-o", "o.ply")
+    assert words in refused(command_line, folder, *simplify, option, value)
+    table = f'[simplify]\n{option[2:]} = "{value}"\n'
+    (folder / "c.toml").write_text(table)
+    assert f"{words} (from c.toml)" in refused(command_line, folder, *simplify, "--config", "c.toml")
+
+
+def test_a_config_that_is_none_is_named(folder: Path, command_line: CommandLine) -> None:
+    (folder / "c.toml").write_text("[simplify]\nretention = true\n")
+    (folder / "d.toml").write_text("[simplify\n")
+    for name, words in (
+        ("absent.toml", "absent.toml: No such file"),
+        ("a.ply", "a.ply: not a text file"),
+        ("c.toml", "'--retention': a number, not 'true'"),
+        ("d.toml", "d.toml: Expected"),
+    ):
+        error = refused(command_line, folder, "simplify", "a.ply", "-n", 5, "-o", "o.ply", "--config", name)
+        assert words in error
+        assert "Errno" not in error
+
+
+def test_a_flag_wins_over_what_it_excludes_in_the_config(folder: Path, command_line: CommandLine) -> None:
+    (folder / "c.toml").write_text("[simplify]\ncount = 50\nno-views = true\n[recover]\nsteps = 100000\n")
+    for arguments, count in ((("-r", 10), 20), ((), 50), (("--views", "views.json"), 50)):
+        ask = ("simplify", "a.ply", *arguments, "-o", "small.ply", "-w", "--config", "c.toml")
+        status, _, error = command_line(*ask, cwd=folder)
+        assert status == 0, error
+        assert len(read_splats(folder / "small.ply")) == count
+    ask = ("simplify", "a.ply", "-r", 10, "-n", 5, "-o", "o.ply", "--config", "c.toml")
+    assert "either -n COUNT or -r RATIO" in refused(command_line, folder, *ask)
+    ask = ("recover", "small.ply", "--views", "views.json", "--teacher", "a.ply", "-o", "o.ply")
+    status, _, error = command_line(*ask, "--config", "c.toml", "--time-limit", "1s", cwd=folder)
+    assert status == 0, error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "output"),
+    [
+        ("simplify a.ply -r 2 -o sub/../a.ply", "sub/../a.ply"),
+        ("simplify sub/link.ply -r 2 -o a.ply", "a.ply"),
+        ("simplify a.ply -r 2 -o o.ply --json a.ply", "a.ply"),
+        ("recover a.ply --views views.json -o a.ply", "a.ply"),
+        ("recover s.ply --views views.json --teacher a.ply -o a.ply", "a.ply"),
+        ("adapt a.ply --views views.json -o a.ply", "a.ply"),
+        ("lift cloud.ply -o cloud.ply", "cloud.ply"),
+        ("select a.ply --views views.json -k 2 -o views.json", "views.json"),
+        ("distill run/scene.ply -r 2 -o run", "run/scene.ply"),
+        ("distill a.ply --held-out run/views.json -r 2 -o run", "run/views.json"),
+        ("evaluate a.ply --views views.json --json a.ply", "a.ply"),
+    ],
+)
+def test_an_input_is_not_written_over(
+    folder: Path, command_line: CommandLine, arguments: str, output: str
+) -> None:
+    (folder / "sub").mkdir()
+    (folder / "sub" / "link.ply").symlink_to("../a.ply")
+    before = {path.name: path.read_bytes() for path in folder.glob("*.*")}
+    error = refused(command_line, folder, *arguments.split(), "-w")
+    assert f"{output} would be written over, and is an input" in error
+    assert {path.name: path.read_bytes() for path in folder.glob("*.*")} == before
+
+
+@pytest.mark.parametrize("policy", ["random", "uniform"])
+def test_auto_needs_a_policy_that_measures(folder: Path, command_line: CommandLine, policy: str) -> None:
+    for ask in (("select", "absent.ply", "--views", "v"), ("distill", "absent.ply", "-r", 2)):
+        error = refused(command_line, folder, *ask, "-k", "auto", "--policy", policy, "-o", "out")
+        assert f"--policy {policy} does not measure" in error
+
+
+def test_the_folder_one_is_in_can_be_an_output(folder: Path, command_line: CommandLine) -> None:
+    (folder / "out").mkdir()
+    ask = ("render", "../a.ply", "--views", "../views.json", "--split", "test", "-o", ".")
+    status, _, error = command_line(*ask, cwd=folder / "out")
+    assert status == 0, error
+    assert (folder / "out" / "view_000.png").is_file()
+    for command in ("recover", "adapt"):
+        ask = (command, "../a.ply", "--views", "../views.json", "-o", ".")
+        status, _, error = command_line(*ask, cwd=folder / "out")
+        assert (status, error) == (1, "g2ard: .: scenes are written as .ply or .splat\n")
+
+
+@pytest.mark.parametrize(
+    "moment",
+    [
+        "class Finder:\n"  # as typer is imported
+        "    def find_spec(name, *rest):\n"
+        "        if name == 'typer': os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Finder)\n",
+        "import typer.main\n"  # as it builds the commands
+        "typer.main.get_group = lambda *a: os.kill(os.getpid(), signal.SIGINT)\n",
+    ],
+)
+def test_ctrl_c_before_a_command_is_one_line(moment: str) -> None:
+    code = f"import os, signal, sys\n{moment}from g2ard.__main__ import main\nmain()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "g2ard: interrupted\n")

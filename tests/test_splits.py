@@ -1,0 +1,41 @@
+"""Which views are for training and which are held out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from g2ard.errors import InputError
+from g2ard.splits import split_mask, split_names
+
+
+def test_every_eighth_sorted_name_is_test() -> None:
+    names = [f"{i:02d}" for i in range(20)][::-1]
+    assert split_names("x", names, "test") == ["16", "08", "00"]
+    assert set(split_names("x", names, "train")) == set(names) - {"16", "08", "00"}
+    assert split_mask("x", names, "all").all()
+
+
+def test_split_file_wins(tmp_path: Path) -> None:
+    split = {"train": ["images/a.jpg", "b.jpg"], "test": ["c.png"], "ood": ["d"]}
+    (tmp_path / "split.json").write_text(json.dumps(split))
+    names = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
+    assert split_names(tmp_path, names, "test") == ["c.jpg"]
+    assert split_names(tmp_path / "transforms.json", names, "ood") == ["d.jpg"]
+    sparse = tmp_path / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    assert split_names(sparse, names, "train") == ["a.jpg", "b.jpg"]
+    assert split_names(tmp_path, ["left/b.jpg", "b.jpg"], "train") == ["b.jpg"]  # stems alone would confuse
+    with pytest.raises(InputError, match=r"no split 'val' \(there are ood, test, train\)"):
+        split_names(tmp_path, names, "val")
+    with pytest.raises(InputError, match="none of the 1 views is in split 'test'"):
+        split_names(tmp_path, ["b.jpg"], "test")
+
+
+@pytest.mark.parametrize("content", ['{"train": [1]}', "{}", "[]"])
+def test_bad_split_file(tmp_path: Path, content: str) -> None:
+    (tmp_path / "split.json").write_text(content)
+    with pytest.raises(InputError, match=r"split\.json"):
+        split_names(tmp_path, ["a"], "train")

@@ -1,0 +1,98 @@
+"""COLMAP's models as views and as points."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from realdata import real
+from view_files import MODELS, colmap, orbit, photo
+
+from g2ard.errors import InputError
+from g2ard.io import kind, read_points, read_views
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("model", range(len(MODELS)))
+def test_colmap(tmp_path: Path, text: bool, model: int) -> None:
+    truth = orbit(5)
+    folder = colmap(tmp_path / "project", truth, text, model)
+    for i in range(5):
+        photo(folder / "images" / f"photo {i}.png")
+    for path in (folder, folder / "sparse" / "0"):
+        cameras = read_views(path)
+        assert cameras.names == tuple(f"photo {i}.png" for i in range(5))
+        np.testing.assert_allclose(cameras.viewmats, truth, atol=1e-12)
+        fx, fy, cx, cy = MODELS[model][3]
+        np.testing.assert_array_equal(cameras.Ks[0], [[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        np.testing.assert_array_equal(cameras.distortions[0], [*MODELS[model][4], 0])
+        assert (cameras.widths == 8).all()
+        assert (cameras.heights == 6).all()
+        assert cameras.image_paths[2] == folder / "images" / "photo 2.png"
+    assert kind(folder) == "views"
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_colmap_points(tmp_path: Path, text: bool) -> None:
+    folder = colmap(tmp_path / "project", orbit(2), text)
+    file = folder / "sparse" / "0" / f"points3D.{'txt' if text else 'bin'}"
+    assert kind(file) == "points"
+    for path in (folder, file):
+        points = read_points(path)
+        np.testing.assert_array_equal(points.positions, [[1.5, 2, 3], [-4, 5, 6]])
+        np.testing.assert_allclose(points.colors * 255, [[255, 128, 0], [0, 1, 2]], atol=1e-4)
+
+
+def test_colmap_photos_elsewhere(tmp_path: Path) -> None:
+    folder = colmap(tmp_path / "project", orbit(2), text=False)
+    for i in range(2):
+        photo(tmp_path / "elsewhere" / f"photo {i}.png")
+    cameras = read_views(folder, images=tmp_path / "elsewhere")
+    assert cameras.image_paths[1] == tmp_path / "elsewhere" / "photo 1.png"
+    assert read_views(folder).image_paths == (None, None)
+    with pytest.raises(InputError, match="no such folder of photos"):
+        read_views(folder, images=tmp_path / "gone")
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+@pytest.mark.parametrize("keep", [4, 30, -10])
+def test_truncated_colmap(tmp_path: Path, name: str, keep: int) -> None:
+    folder = colmap(tmp_path / "project", orbit(3), text=False)
+    path = folder / "sparse" / "0" / name
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(InputError, match=rf"{name}: truncated"):
+        (read_points if "points" in name else read_views)(folder)
+
+
+def test_fisheye_is_refused(tmp_path: Path) -> None:
+    folder = colmap(tmp_path / "project", orbit(2), text=True)
+    cameras = folder / "sparse" / "0" / "cameras.txt"
+    cameras.write_text("7 OPENCV_FISHEYE 8 6 500 500 4 3 0 0 0 0\n")
+    with pytest.raises(InputError, match="OPENCV_FISHEYE is not supported"):
+        read_views(folder)
+    cameras.write_text("9 PINHOLE 8 6 500 500 4 3\n")
+    with pytest.raises(InputError, match="names camera 7, which is absent"):
+        read_views(folder)
+    cameras.write_text("7 PINHOLE 8 six 500 500 4 3\n")
+    with pytest.raises(InputError, match=r"cameras\.txt: malformed"):
+        read_views(folder)
+
+
+def test_caliterra() -> None:
+    folder = real("caliterra")
+    cameras = read_views(folder)
+    assert len(cameras) == 75
+    assert all(p is not None and p.is_file() for p in cameras.image_paths)
+    points = read_points(folder)
+    assert len(points) == 41_590
+    split = json.loads((folder / "split.json").read_text())
+    for which in ("train", "test"):
+        assert sorted(read_views(folder, split=which).names) == sorted(split[which])
+    # every point in front of some camera lands in its image: axes and intrinsics agree
+    X = np.c_[points.positions, np.ones(len(points))] @ cameras.viewmats[30].T
+    seen = X[:, 2] > 0
+    uv = (X[seen, :3] @ cameras.Ks[30].T) / X[seen, 2:3]
+    inside = (uv[:, 0] > 0) & (uv[:, 0] < 1000) & (uv[:, 1] > 0) & (uv[:, 1] < 751)
+    assert inside.sum() > 1000
