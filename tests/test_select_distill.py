@@ -126,7 +126,7 @@ def test_a_stopped_run_goes_on_with_the_same_views(tmp_path: Path) -> None:
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(whole.splats, name), getattr(again.splats, name))
     assert whole.report["views"] == again.report["views"]
-    with pytest.raises(InputError, match="another run"):
+    with pytest.raises(InputError, match="another scene or other options"):
         distill(PRIOR, 600, targets, replace(config, views=7), work=tmp_path)
 
 
