@@ -136,6 +136,7 @@ def test_the_folder_one_is_in_can_be_an_output(folder: Path, command_line: Comma
     ],
 )
 def test_ctrl_c_before_a_command_is_one_line(moment: str) -> None:
-    code = f"import os, signal, sys\n{moment}from g2ard.__main__ import main\nmain()"
+    unignored = "signal.signal(signal.SIGINT, signal.default_int_handler)"  # ignored in background jobs
+    code = f"import os, signal, sys\n{unignored}\n{moment}from g2ard.__main__ import main\nmain()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, "g2ard: interrupted\n")

@@ -194,5 +194,5 @@ def test_the_command_reads_k_off_the_curve(command_line: CommandLine, folder: Pa
     assert said["left_out"] < 0.1
     for policy in ("random", "uniform"):
         status, _, error = ask(command_line, folder, "auto", "-w", "--policy", policy)
-        assert status == 1
+        assert status == 2
         assert policy in error
