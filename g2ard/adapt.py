@@ -7,10 +7,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+import numpy as np
+
+from g2ard.appearance import blended, colour_change, recoloured, views_seeing
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.recover import RecoverConfig, checkpoint, recover
 from g2ard.recover.anchors import Regularizers
+from g2ard.recover.probe import Probe
 from g2ard.recover.schedule import PAPER, TUNED, Schedule
 from g2ard.splats import Splats
 from g2ard.targets import Targets, fingerprint_of
@@ -18,6 +22,8 @@ from g2ard.targets import Targets, fingerprint_of
 __all__ = ["AdaptConfig", "Adapted", "adapt"]
 
 _FIRST_STRETCH = 500
+_WORTH = 0.3
+"""dB that a change of all colours at once must bring on the images."""
 _FREE = Regularizers(anchor=0.0, shape=0.0, effective_rank=False)
 """Geometry that cannot move needs nothing to hold it."""
 
@@ -30,7 +36,10 @@ class AdaptConfig:
         steps: at most; 7,000 as in the paper.
         tolerance: dB; a stretch of steps that gains less on the training views is the last; 0 takes all.
         schedule: "default" takes stretches of 500, 1,000, 2,000 … steps, each under a cosine; "paper" takes
-            all steps at its rates, which decay to a tenth.
+            all steps at its rates, which decay to a tenth, from the scene as it is, and blends nothing.
+        prior_views: what the appearance before the fit weighs, in views. A Gaussian that v views have seen
+            ends v/(v + this) of the way from there to its fit: few images say little of what they hardly
+            see. 0 takes the fit as it is.
         sh_degree: of the result; None keeps the scene's. A scene without higher bands has no place for shine.
         background: RGB behind the scene.
         seed: of the order of views.
@@ -42,6 +51,7 @@ class AdaptConfig:
     steps: int = 7000
     tolerance: float = 0.05
     schedule: Literal["default", "paper"] = "default"
+    prior_views: float = 1.0
     sh_degree: int | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     seed: int = 0
@@ -49,6 +59,8 @@ class AdaptConfig:
     def __post_init__(self) -> None:
         if self.steps < 1 or not self.tolerance >= 0:
             raise InputError(f"adapt: {self.steps} steps, tolerance {self.tolerance}: expected ≥ 1 and ≥ 0")
+        if not 0 <= self.prior_views < float("inf"):
+            raise InputError(f"prior_views: expected a number of views, at least 0, got {self.prior_views}")
         if self.schedule not in ("default", "paper"):
             raise InputError(f"schedule: expected default or paper, got {self.schedule!r}")
 
@@ -74,8 +86,9 @@ class Adapted:
 
     Args:
         splats: means, rotations and scales of the scene given, bit for bit; new SH and opacities.
-        report: steps, seconds, converged, psnr {before, after} over a sample of the training views, and
-            stretches [{steps, psnr}].
+        report: steps, seconds, converged, psnr {before, after} over a sample of the training views,
+            stretches [{steps, psnr}], colour_change {gain, matrix, shift} or None where none is worth it, and
+            prior_share, the mean share of the appearance before the fit.
     """
 
     splats: Splats
@@ -87,7 +100,6 @@ class _State:
     """What a resume must bring back between two stretches."""
 
     splats: Splats
-    first: float | None = None
     seconds: float = 0.0
     converged: bool = False
     stretches: list[dict[str, Any]] = field(default_factory=list)
@@ -95,14 +107,14 @@ class _State:
     _ARRAYS: ClassVar = ("logit_opacities", "sh0", "shN")
 
     def save(self, path: Path, key: str) -> None:
-        meta = {"first": self.first, "seconds": self.seconds, "converged": self.converged}
+        meta = {"seconds": self.seconds, "converged": self.converged}
         arrays = {name: getattr(self.splats, name) for name in self._ARRAYS}
         checkpoint.save(path, key, {**meta, "stretches": self.stretches}, arrays)
 
     def load(self, path: Path, key: str) -> None:
         meta, arrays = checkpoint.load(path, key)
         self.splats = replace(self.splats, **arrays)
-        self.first, self.seconds = meta["first"], meta["seconds"]
+        self.seconds = meta["seconds"]
         self.converged, self.stretches = meta["converged"], meta["stretches"]
 
 
@@ -116,8 +128,11 @@ def adapt(
 ) -> Adapted:
     """Refit spherical harmonics and opacities to targets; means, rotations and scales stay.
 
-    L = (1−λ)·L1 + λ·(1−SSIM) as in recovery; its anchors have nothing to hold here. What the result shows
-    on other trajectories is a direct reading of the geometry's worth.
+    First one affine map of all colours (`g2ard.appearance.colour_change`), where the images ask for it: what
+    changed everywhere is then right where no image looks. From there each Gaussian's own appearance, under
+    L = (1−λ)·L1 + λ·(1−SSIM) as in recovery, whose anchors have nothing to hold here. At last a blend of the
+    two, by how well the images see each Gaussian. What the result shows on other trajectories is a direct
+    reading of the geometry's worth.
 
     Args:
         compact: the scene; its offset counts, cameras are in world coordinates.
@@ -135,7 +150,14 @@ def adapt(
         KeyboardInterrupt: after Ctrl-C, once the checkpoint is written.
     """
     config = config or AdaptConfig()
-    state = _State(compact if config.sh_degree is None else compact.with_sh_degree(config.sh_degree))
+    given = compact if config.sh_degree is None else compact.with_sh_degree(config.sh_degree)
+    probe = Probe(targets, config.background)
+    change, start = None, given
+    if config.schedule == "default" and len(given) and len(targets.cameras):
+        change = colour_change(given, targets, config.background)
+        change = change if change.gain >= _WORTH else None
+        start = given if change is None else recoloured(given, change)
+    state = _State(start)
     parts = (repr(config), compact.fingerprint(), fingerprint_of(targets))
     key = hashlib.sha256("\n".join(parts).encode()).hexdigest()
     done, within = (work / "stretches.npz", work / "steps.npz") if work else (None, None)
@@ -148,16 +170,23 @@ def adapt(
         if done and within:
             state.save(done, key)
             within.unlink(missing_ok=True)
-    return Adapted(
-        state.splats,
-        {
-            "steps": sum(s["steps"] for s in state.stretches),
-            "seconds": state.seconds,
-            "converged": state.converged,
-            "psnr": {"before": state.first, "after": state.stretches[-1]["psnr"]},
-            "stretches": state.stretches,
-        },
-    )
+    share = np.ones(len(given))
+    if config.schedule == "default" and config.prior_views:
+        seen = views_seeing(start, targets.cameras)
+        share = seen / (seen + config.prior_views)
+    result = blended(start, state.splats, share)
+    report = {
+        "steps": sum(s["steps"] for s in state.stretches),
+        "seconds": state.seconds,
+        "converged": state.converged,
+        "psnr": {"before": probe.all_of(given), "after": probe.all_of(result)},
+        "stretches": state.stretches,
+        "colour_change": None
+        if change is None
+        else {k: np.asarray(v).tolist() for k, v in vars(change).items()},
+        "prior_share": float(1 - share.mean()),
+    }
+    return Adapted(result, report)
 
 
 def _stretch(
@@ -181,7 +210,6 @@ def _stretch(
     )
     found = recover(state.splats, targets, recovery, checkpoint=within, progress=progress, stage="adapt")
     before, after = found.report["psnr"]["before"], found.report["psnr"]["after"]
-    state.first = before if state.first is None else state.first
     state.splats = replace(found.splats, means=compact.means, quats=compact.quats, scales=compact.scales)
     state.stretches.append({"steps": steps, "psnr": after})
     state.seconds += found.report["seconds"]

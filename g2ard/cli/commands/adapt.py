@@ -32,6 +32,9 @@ def adapt(
         float, typer.Option(min=0, help="Stop when a stretch gains less, dB; 0 takes all steps.")
     ] = 0.05,
     schedule: Annotated[Literal["default", "paper"], typer.Option(help="Rates and decay.")] = "default",
+    prior_views: Annotated[
+        float, typer.Option(min=0, help="Weight of the old appearance, in views; 0 takes the fit as it is.")
+    ] = 1.0,
     sh_degree: ShDegreeOption = None,
     resume: ResumeOption = False,
     split: SplitOption = "train",
@@ -56,6 +59,7 @@ def adapt(
         steps=steps,
         tolerance=tolerance,
         schedule=schedule,
+        prior_views=prior_views,
         sh_degree=sh_degree,
         background=colour,
         seed=run.seed,
