@@ -193,7 +193,8 @@ def test_a_time_limit_sets_the_horizon(student: Splats, targets: TeacherRenders)
 def test_progress_shows_loss_psnr_and_speed(
     student: Splats, targets: TeacherRenders, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(probe, "_SHARE", 0.5)  # these steps are too short for an honest share
+    for share in ("_SHARE", "_FIRST_SHARE"):  # these steps are too short for honest ones
+        monkeypatch.setattr(probe, share, 0.5)
     seen: list[Any] = []
     scenes: dict[int, Splats] = {}
     recover(

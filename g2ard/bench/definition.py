@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -184,6 +185,26 @@ class Definition:
     lpips: str | None = None
     folder: Path = Path()
 
+    def __post_init__(self) -> None:
+        for key, kind, least in (
+            ("ratios", (int, float), 1),
+            ("seeds", int, 0),
+            ("steps", int, 1),
+            ("seconds", (int, float), 1e-6),
+        ):
+            values = getattr(self, key)
+            if not isinstance(values, tuple):
+                raise InputError(f"{key}: expected a list, got {values!r}")
+            for value in values:
+                if isinstance(value, bool) or not isinstance(value, kind) or not least <= value < math.inf:
+                    raise InputError(f"{key}: expected numbers, at least {least:g}, got {value!r}")
+        for key, least in (("size", 16), ("adapt_steps", 0), ("sh_degree", 0)):
+            value = getattr(self, key)
+            if value is not None and (not isinstance(value, int) or value < least):
+                raise InputError(f"{key}: expected a whole number, at least {least}, got {value!r}")
+        if self.schedule not in ("default", "paper", "fast", "best"):
+            raise InputError(f"schedule: expected default, fast, best or paper, got {self.schedule!r}")
+
     def matched(self, method: MethodSpec) -> list[Matched]:
         """The budgets under which a method is measured."""
         out = [Matched("steps", n) for n in self.steps] + [Matched("seconds", s) for s in self.seconds]
@@ -223,6 +244,8 @@ def read_definition(path: Path) -> Definition:
         own = {name: _method(name, values) for name, values in tables.items()}
         known = {**METHODS, **own}
         names = content.pop("methods", list(own))
+        if not isinstance(names, list):
+            raise InputError(f"methods: expected a list, got {names!r}")
         missing = next((name for name in names if name not in known), None)
         if missing is not None:
             raise InputError(f"methods: no {missing!r} (there are {', '.join(known)})")

@@ -8,11 +8,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from g2ard import __version__, baselines, io
+from g2ard import baselines, io
 from g2ard.baselines.pup import rounds as pup_rounds
 from g2ard.bench.definition import Definition, Matched, MethodSpec, SceneSpec
 from g2ard.bench.process import Usage
-from g2ard.bench.stand import Stage, Stand, fingerprint
+from g2ard.bench.stand import Stage, Stand, fingerprint, scene_key
 from g2ard.recover.presets import preset_for
 from g2ard.simplify import METHODS as SIMPLIFIERS
 from g2ard.simplify import schedule as paper_rounds
@@ -34,11 +34,10 @@ class Cell:
 
     @cached_property
     def key(self) -> str:
-        """Changes with anything that could change the figures."""
+        """Changes with anything that could change the figures, the scene's files included."""
         d = self.definition
-        shared = (d.name, d.schedule, d.size, d.sh_degree, d.adapt_steps, d.lpips, __version__)
-        parts = [asdict(self.scene), asdict(self.method), asdict(self.matched), self.ratio, self.seed]
-        return fingerprint([*shared, *parts])
+        shared = (d.name, d.schedule, d.sh_degree, d.adapt_steps, d.lpips, scene_key(d, self.scene))
+        return fingerprint([*shared, asdict(self.method), asdict(self.matched), self.ratio, self.seed])
 
     @property
     def label(self) -> str:

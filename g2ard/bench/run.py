@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ from g2ard.bench.pipeline import Cell, Pipeline
 from g2ard.bench.run_rows import Row, write_csv
 from g2ard.bench.score import Scored, pictured, save_jpeg, score
 from g2ard.bench.simplify import machine
-from g2ard.bench.stand import Stand
-from g2ard.errors import G2ardError, InputError
+from g2ard.bench.stand import Stand, folder_of
+from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.lpips import Lpips, load_lpips
 from g2ard.progress import Progress, silent
@@ -29,6 +30,7 @@ def bench_run(
     folder: Path,
     *,
     keep: bool = False,
+    again: bool = False,
     progress: Progress = silent,
 ) -> list[Row]:
     """Measure every cell of some studies that `folder` does not hold yet.
@@ -41,14 +43,15 @@ def bench_run(
     Args:
         definitions: the studies.
         folder: of the run; need not exist.
-        keep: whether intermediate scenes (work/) stay once all cells are done.
+        keep: whether these studies' intermediate scenes, in work/, stay once all cells are done.
+        again: measure what `folder` holds anew.
         progress: told of every cell.
 
     Returns:
         The rows, in the order of the definitions.
 
     Raises:
-        InputError: LPIPS weights that cannot be read. Anything else is an error of its cell.
+        InputError: LPIPS weights that cannot be read. What goes wrong in a cell is its row's error.
         KeyboardInterrupt: after Ctrl-C; the next call goes on.
     """
     cells = cells_of(definitions)
@@ -57,22 +60,26 @@ def bench_run(
     stand: Stand | None = None
     for number, cell in enumerate(cells):
         progress("bench", number, len(cells), {"cell": cell.label})
-        if _done(folder, cell):
+        if not again and _done(folder, cell):
             continue
         try:
             if stand is None or (stand.definition, stand.scene) != (cell.definition, cell.scene):
                 stand = Stand(folder / "work", cell.definition, cell.scene)
             answer = _measure(stand, cell, folder, weights.get(cell.definition.lpips or "", {}))
-        except (G2ardError, OSError, MemoryError) as error:
+        except Exception as error:  # one cell must not end hours of others; its row and the exit status tell
             stand = None
             answer = {"rows": [asdict(_failed(cell, error))], "views": {}}
         _write_json(folder / "cells" / f"{cell.key}.json", {**answer, "label": cell.label})
-        write_csv(folder / "rows.csv", _rows(folder, cells))
+        write_csv(folder / "rows.csv", _rows(folder, cells) + _others(folder, definitions))
     progress("bench", len(cells), len(cells), {})
     rows = _rows(folder, cells)
-    write_csv(folder / "rows.csv", rows)
+    write_csv(folder / "rows.csv", rows + _others(folder, definitions))
     if not keep and not any(row.error for row in rows):
-        shutil.rmtree(folder / "work", ignore_errors=True)
+        for definition in definitions:
+            for scene in definition.scenes:
+                shutil.rmtree(folder_of(folder / "work", definition, scene), ignore_errors=True)
+        with suppress(OSError):  # others' work stays
+            (folder / "work").rmdir()
     return rows
 
 
@@ -93,6 +100,14 @@ def _read_cell(folder: Path, cell: Cell) -> list[Row]:
 
 def _rows(folder: Path, cells: Sequence[Cell]) -> list[Row]:
     return [row for cell in cells for row in _read_cell(folder, cell)]
+
+
+def _others(folder: Path, definitions: Sequence[Definition]) -> list[Row]:
+    """Rows of other studies that `folder` holds, by study and label."""
+    ours = {definition.name for definition in definitions}
+    found = [json.loads(path.read_text()) for path in (folder / "cells").glob("*.json")]
+    rows = [(row["study"], cell["label"], Row(**row)) for cell in found for row in cell["rows"]]
+    return [row for study, _, row in sorted(rows, key=lambda r: r[:2]) if study not in ours]
 
 
 def _head(cell: Cell, prior: str, split: str) -> Row:

@@ -25,7 +25,7 @@ from g2ard.splats import Splats
 from g2ard.splits import split_mask
 from g2ard.targets import Photos, Targets, TeacherRenders
 
-__all__ = ["Stage", "Stand", "fingerprint"]
+__all__ = ["Stage", "Stand", "fingerprint", "folder_of", "scene_key"]
 
 _POOL = 128
 _MAX_LOGIT = 20.0
@@ -34,6 +34,19 @@ _MAX_LOGIT = 20.0
 def fingerprint(value: Any) -> str:
     """A short hash of anything that JSON can hold."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def scene_key(definition: Definition, scene: SceneSpec) -> str:
+    """Changes with the scene, its files and the size of its views."""
+    stated = {**asdict(scene), "size": definition.size, "version": __version__}
+    files = () if scene.synth is not None else (scene.prior, scene.train, scene.adapt, *scene.score.values())
+    stamps = [_stamp(definition.folder / file) for file in files if file is not None]
+    return fingerprint({**stated, "files": stamps})
+
+
+def folder_of(work: Path, definition: Definition, scene: SceneSpec) -> Path:
+    """Where a scene's stages lie."""
+    return work / f"{scene.name.replace('/', '_')}-{scene_key(definition, scene)}"
 
 
 @dataclass(frozen=True)
@@ -63,13 +76,8 @@ class Stand:
         self, folder: Path, definition: Definition, scene: SceneSpec, progress: Progress = silent
     ) -> None:
         self.definition, self.scene, self.progress = definition, scene, progress
-        stated = {**asdict(scene), "size": definition.size, "version": __version__}
-        files = (
-            () if scene.synth is not None else (scene.prior, scene.train, scene.adapt, *scene.score.values())
-        )
-        stamps = [_stamp(definition.folder / file) for file in files if file is not None]
-        self.key = fingerprint({**stated, "files": stamps})
-        self.folder = folder / f"{scene.name.replace('/', '_')}-{self.key}"
+        self.key = scene_key(definition, scene)
+        self.folder = folder_of(folder, definition, scene)
         self.folder.mkdir(parents=True, exist_ok=True)
 
     @cached_property

@@ -10,7 +10,7 @@ from pathlib import Path
 from g2ard.cli.frame import Run
 from g2ard.errors import OutputError
 
-__all__ = ["check_stopped", "stoppable"]
+__all__ = ["check_stopped", "left_at", "stoppable"]
 
 
 def check_stopped(run: Run, place: Path, resume: bool) -> bool:
@@ -19,7 +19,7 @@ def check_stopped(run: Run, place: Path, resume: bool) -> bool:
     Raises:
         OutputError: there is, and neither --resume nor --overwrite says what is to become of it.
     """
-    left = _left(place)
+    left = left_at(place)
     if resume and not left:
         run.say(f"nothing to go on from ({place}): starts anew")
     if left and not (resume or run.overwrite):
@@ -35,17 +35,18 @@ def stoppable(run: Run, place: Path, resume: bool) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        if _left(place):
+        if left_at(place):
             run.say(f"stopped; the same command with --resume goes on from {place}")
         raise
     else:
         _remove(place)
     finally:
-        if not _left(place):
+        if not left_at(place):
             _remove(place)
 
 
-def _left(place: Path) -> bool:
+def left_at(place: Path) -> bool:
+    """Whether there is a checkpoint, or a folder that holds some."""
     return any(place.iterdir()) if place.is_dir() else place.exists()
 
 

@@ -18,7 +18,7 @@ from g2ard.progress import Progress, silent
 from g2ard.recover import checkpoint as checkpoints
 from g2ard.recover.anchors import PRESETS, Anchors, Regularizers, drift95, needle
 from g2ard.recover.draw import checked_weights, drawn
-from g2ard.recover.probe import Probe, climb, trial_steps
+from g2ard.recover.probe import Probe, calm, climb, trial_steps
 from g2ard.recover.schedule import TUNED, Rates, Schedule, multiplier_for
 from g2ard.splats import Splats
 from g2ard.targets import Targets, fingerprint_of, mask_of
@@ -54,6 +54,9 @@ class RecoverConfig:
         engine: "fused" takes whole steps in Rust; "torch" goes through autograd and torch's Adam, with the
             same result to rounding but for Gaussians that a view does not touch; "gsplat" is that on an
             NVIDIA GPU.
+
+    Raises:
+        InputError: a value out of range.
     """
 
     schedule: Schedule = TUNED
@@ -66,6 +69,14 @@ class RecoverConfig:
     final: bool = True
     seed: int = 0
     engine: Literal["fused", "torch", "gsplat"] = "fused"
+
+    def __post_init__(self) -> None:
+        if self.steps is not None and self.steps < 1:
+            raise InputError(f"steps: expected at least 1, got {self.steps}")
+        if self.time_limit is not None and not 0 < self.time_limit < float("inf"):
+            raise InputError(f"time_limit: expected seconds, more than 0, got {self.time_limit}")
+        if not 0 <= self.ssim_weight <= 1:
+            raise InputError(f"ssim_weight: expected a value in [0, 1], got {self.ssim_weight}")
 
     @property
     def horizon(self) -> int:
@@ -83,7 +94,8 @@ class Recovered:
         splats: same count and order as the student.
         report: steps, seconds, loss (one mean per 1 % of the horizon), psnr {before, after} over a sample of
             the training views, multiplier, trials (those that chose it), drift95, needle, geometry (ten of
-            {step, drift95, needle} on the way), regularizers {steps, share of the time}, skipped.
+            {step, drift95, needle} on the way), regularizers {steps, share of the time}, skipped, and
+            kept_start: whether the student was better than what came of it, and is the result.
     """
 
     splats: Splats
@@ -128,7 +140,7 @@ def recover(
     """Optimise every attribute of a fixed set of Gaussians against targets (`eq:objective`).
 
     L = (1−λ)·L1 + λ·(1−SSIM), and every `period` steps + λ_a·L_anchor + λ_s·L_shape. No Gaussian is added
-    or removed.
+    or removed. A student that the steps only made worse, by PSNR of the training views, is returned as it is.
 
     Args:
         student: the scene to recover; its offset counts, cameras are in world coordinates.
@@ -164,6 +176,9 @@ def recover(
     loop.run(checkpoint, progress, stage, watch)
     result = loop.engine.splats()
     after = probe.all_of(result)
+    kept_start = after < before
+    if kept_start:
+        result, after = student, before
     return Recovered(
         result,
         {
@@ -177,6 +192,7 @@ def recover(
             "needle": needle(result.scales),
             "geometry": loop.geometry,
             "regularizers": loop.regularizers,
+            "kept_start": kept_start,
             "skipped": {"non_finite": loop.engine.skipped},
         },
     )
@@ -254,6 +270,7 @@ class _Loop:
 
         try:
             self.multiplier, seen = climb(score, guess)
+            self.multiplier, seen = calm(score, self.multiplier, seen, start)
             self.trials = [{"multiplier": m, "psnr": value} for m, value in seen.items()]
         except TimeoutError:
             pass  # the guess stands

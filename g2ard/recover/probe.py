@@ -12,14 +12,18 @@ from g2ard.metrics import psnr
 from g2ard.splats import Splats
 from g2ard.targets import Targets, mask_of
 
-__all__ = ["MULTIPLIERS", "Probe", "climb", "trial_steps"]
+__all__ = ["MULTIPLIERS", "Probe", "calm", "climb", "trial_steps"]
 
 MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
 """Of all rates; trained scenes want 1 or less, lifts more."""
 
+_CALMEST = 0.01
+"""Smaller ones change nothing that 8 bits show."""
 _VIEWS = 8
 _SHARE = 0.01
 """Of the time that looking at the views may take while somebody watches the progress."""
+_FIRST_SHARE = 0.1
+"""The same of the first look, where short runs would end before the second."""
 _FEWEST, _MOST, _PART = 10, 60, 50
 _SHORTEST_HORIZON = 100
 
@@ -51,6 +55,23 @@ def climb(score: Callable[[float], float], start: float) -> tuple[float, dict[fl
     return MULTIPLIERS[at], {MULTIPLIERS[i]: value for i, value in sorted(seen.items())}
 
 
+def calm(
+    score: Callable[[float], float], best: float, seen: dict[float, float], start: float
+) -> tuple[float, dict[float, float]]:
+    """A third of the multiplier, again and again, while the best only makes the start worse.
+
+    >>> calm(lambda m: 50 - 9 * m, 1 / 3, {1 / 3: 47.0}, start=49.5)[0] < 0.06
+    True
+    """
+    seen = dict(seen)
+    while seen[best] < start and best > _CALMEST:
+        seen[best / 3] = score(best / 3)
+        if seen[best / 3] <= seen[best]:
+            break
+        best /= 3
+    return best, seen
+
+
 class Probe:
     """PSNR of a few evenly spaced training views."""
 
@@ -77,7 +98,8 @@ class Probe:
         if seconds >= self._next:
             began = time.monotonic()
             self._latest = self.all_of(splats()), step
-            self._next = seconds + (time.monotonic() - began) / _SHARE
+            first = self._next == 0.0  # half a minute of an old figure tells nobody anything
+            self._next = seconds + (time.monotonic() - began) / (_FIRST_SHARE if first else _SHARE)
         return self._latest
 
     def _score(self, splats: Splats, view: int) -> float:

@@ -29,7 +29,7 @@ from g2ard.cli.options import (
     one_horizon,
     views_count,
 )
-from g2ard.cli.resume import check_stopped
+from g2ard.cli.resume import check_stopped, left_at
 from g2ard.cli.scenes import load_scene, load_view_sets, make_targets, recovery_engine
 
 if TYPE_CHECKING:
@@ -121,8 +121,9 @@ def distill(
     lifted = kind(scene) != "splats"
     if lifted and views is None:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
-    stopped = check_stopped(run, output / "work", resume)
-    check_output(output, run.overwrite or stopped, folder=True)
+    if not left_at(output / "work"):
+        check_output(output, run.overwrite, folder=True)
+    check_stopped(run, output / "work", resume)
     prior = _lift(run, scene) if lifted else load_scene(run, scene)
     budget = budget_of(scene, count, ratio, len(prior))
     candidates, test, pool = _views(run, prior, views, held_out, size)
@@ -151,20 +152,16 @@ def distill(
     )
     targets = make_targets(run, train, teacher, colour, lazy=k is not None)
     unseen = make_targets(run, test, teacher, colour)
-    with _work_folder(output, resume) as work:
-        try:
-            result = pipeline(
-                prior,
-                budget,
-                targets,
-                config,
-                weights=candidates.weights if weighted else None,
-                work=work,
-                progress=run.progress,
-            )
-        except KeyboardInterrupt:
-            run.say(f"stopped; the same command with --resume goes on in {output}")
-            raise
+    with _work_folder(run, output, resume) as work:
+        result = pipeline(
+            prior,
+            budget,
+            targets,
+            config,
+            weights=candidates.weights if weighted else None,
+            work=work,
+            progress=run.progress,
+        )
         report = _score(run, prior, result, unseen, colour)
         report |= {"against": against, "preset": why, "prior": measured.as_dict()}
         report |= {key: result.report[key] for key in ("rounds", "views")}
@@ -191,8 +188,9 @@ def distill(
 
 
 @contextmanager
-def _work_folder(output: Path, resume: bool) -> Iterator[Path]:
-    """Where finished rounds and checkpoints wait for --resume; an error leaves nothing behind."""
+def _work_folder(run: Run, output: Path, resume: bool) -> Iterator[Path]:
+    """Where finished rounds and checkpoints wait for --resume; an error leaves nothing behind, nor does a
+    Ctrl-C before the first of them."""
     import shutil
 
     work, made = output / "work", not output.exists()
@@ -201,8 +199,10 @@ def _work_folder(output: Path, resume: bool) -> Iterator[Path]:
     work.mkdir(parents=True, exist_ok=True)
     try:
         yield work
-    except Exception:
-        if not resume:
+    except (Exception, KeyboardInterrupt) as error:
+        if left_at(work) and (resume or isinstance(error, KeyboardInterrupt)):
+            run.say(f"stopped; the same command with --resume goes on in {output}")
+        else:
             shutil.rmtree(output if made else work, ignore_errors=True)
         raise
 

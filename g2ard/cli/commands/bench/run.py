@@ -59,18 +59,23 @@ def run_(
 ) -> None:
     """Compare methods under matched compute: CSV, and an HTML report of error against time and count.
 
-    A stopped run goes on where it was; a cell that failed is a row with its error, and is tried again.
+    A stopped run goes on where it was, -w measures anew; a cell that failed is a row with its error, and is
+    tried again. DIR/report.html is of the studies named last, DIR/rows.csv of all that DIR holds.
     """
     from g2ard.bench.report import write_report
     from g2ard.bench.run import bench_run
 
     if bool(definitions) == bool(scene):
         raise typer.BadParameter("give either DEFINITION.toml files or --scene SCENE")
+    if scene and (only or adapt_steps):
+        raise typer.BadParameter("--only and --adapt-steps are for studies, not for --scene")
+    if definitions and (views or photos):
+        raise typer.BadParameter("--views and --photos go with --scene: a study names its own")
     options: dict[str, Any] = {
         "ratios": _numbers(ratios, parse_ratio),
         "steps": _numbers(steps, _whole),
         "seconds": _numbers(seconds, float),
-        "seeds": _numbers(seeds, int),
+        "seeds": _numbers(seeds, int) or ((run.seed,) if run.seed else None),
         "released": released,
         "size": size,
         "lpips": None if lpips is None else str(lpips.absolute()),
@@ -81,7 +86,7 @@ def run_(
         studies = [_ad_hoc(scene, views, photos, names, options)]
     else:
         studies = [_narrowed(path, only, names, options) for path in definitions or []]
-    rows = bench_run(studies, output, keep=keep, progress=run.progress)
+    rows = bench_run(studies, output, keep=keep, again=run.overwrite, progress=run.progress)
     write_report(output, studies, rows)
     run.console.table(
         "PSNR and SSIM on unseen views; CPU seconds of reduction and recovery",
