@@ -192,12 +192,13 @@ def test_lazy_is_plain_greedy_on_fifty_pools():
 def test_auto_reaches_every_pose_and_then_represents(count):
     scene, cameras = ball(), around(count)
     coarse = surface(scene, 1000)
-    alike = poses.likeness(cameras, poses.viewing_distances(coarse, cameras))
+    depths, shares = poses.outlooks(coarse, cameras)
+    alike = poses.likeness(cameras, depths)
     wanted = poses.demand(alike)
     np.testing.assert_array_equal(alike, alike.T)
     np.testing.assert_array_equal(np.diag(alike), 1.0)
-    order, gains = poses.represent(alike, wanted, np.ones(count, bool))
-    assert order.tolist() == naive.represent(count, alike, wanted)
+    order, gains = poses.represent(alike, wanted, np.ones(count, bool), shares)
+    assert order.tolist() == naive.represent(count, alike, wanted, shares)
     assert gains.sum() == pytest.approx(1.0)
     assert gains.min() >= 0
     np.testing.assert_allclose(poses.gains_of(order, alike, wanted), gains, atol=1e-15)
@@ -210,13 +211,32 @@ def test_auto_reaches_first():
     far = np.array([[-4.0, 0, 0], [0, 0, 4.0]])
     chosen = select(ball(), views(np.concatenate([crowd, far])), 3)
     assert set(chosen.order.tolist()) >= {30, 31}
-    unreached = poses.represent(np.eye(5), np.full(5, 0.2), np.array([1, 1, 0, 1, 1], bool))
+    unreached = poses.represent(np.eye(5), np.full(5, 0.2), np.array([1, 1, 0, 1, 1], bool), np.ones(5))
     assert unreached[0].tolist() == [
         0,
         1,
         3,
         4,
     ]  # nothing like anything: in the order given, usable ones only
+
+
+def test_of_views_alike_the_one_that_sees_more_is_taken():
+    """Five pairs of twins, of which the second sees more."""
+    alike = np.kron(np.eye(5), np.ones((2, 2)))
+    shares = np.tile([0.2, 0.3], 5)
+    order, _ = poses.represent(alike, np.full(10, 0.1), np.ones(10, bool), shares)
+    assert set(order[:5].tolist()) == {1, 3, 5, 7, 9}
+
+
+def test_outlooks_count_what_lies_in_front():
+    scene = ball()
+    coarse = surface(scene, 2000)
+    facing, back = views([[0, -4.0, 0], [0, -4.0, 0]]), views([[0, -4.0, 0]], targets=[[0, -8.0, 0]])
+    depths, shares = poses.outlooks(coarse, facing)
+    assert depths[0] == depths[1] > 2
+    assert 0.2 < shares[0] < 0.8  # not what the ball's front hides
+    depths, shares = poses.outlooks(coarse, back)
+    assert (depths[0], shares[0]) == (0, 0)
 
 
 def test_auto_and_diverse_leave_the_crowd():
@@ -323,11 +343,20 @@ def test_offset_and_scale_change_nothing():
 
 
 @pytest.mark.parametrize(
-    ("k", "policy", "words"), [(0, "auto", "k"), (3, "best", "policy"), ("auto", "random", "auto")]
+    ("k", "policy", "words"),
+    [(0, "auto", "k"), (2.5, "auto", "k"), (3, "best", "policy"), ("auto", "random", "auto")],
 )
 def test_refuses_nonsense(k, policy, words):
     with pytest.raises(InputError, match=words):
         select(ball(200), around(5), k, policy=policy)
+
+
+@pytest.mark.parametrize("policy", ["auto", "directional"])
+def test_refuses_images_no_raster_takes(policy):
+    pool = around(3)
+    huge = replace(pool, widths=np.array([64, 60_000, 64]))
+    with pytest.raises(InputError, match=r"v001: 60000×\d+ pixels"):
+        select(ball(200), huge, 2, policy=policy)
 
 
 def test_refuses_empty_scenes():

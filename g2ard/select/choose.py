@@ -25,6 +25,8 @@ Order = NDArray[np.int64]
 
 _BEND = 0.02
 """A curve that nowhere rises this far above its chord is straight: no K is better than another."""
+_LARGEST = 32_768
+"""Pixels a side; what a raster takes."""
 _COARSE = 20_000
 """Cells that stand for the scene where only distances to it matter."""
 
@@ -103,6 +105,13 @@ def select(
         raise InputError(f"policy: expected {', '.join(POLICIES)}, got {policy!r}")
     if k == "auto" and policy in ("random", "uniform"):
         raise InputError(f"k: 'auto' needs a policy that measures what views add, not {policy!r}")
+    if k != "auto" and not isinstance(k, int | np.integer):
+        raise InputError(f"k: expected 'auto' or a whole number of views, got {k!r}")
+    large = np.maximum(cameras.widths, cameras.heights) > _LARGEST
+    if large.any():
+        i = int(np.argmax(large))
+        size = f"{cameras.widths[i]}×{cameras.heights[i]}"
+        raise InputError(f"view {cameras.names[i]}: {size} pixels; at most {_LARGEST} a side")
     if k != "auto" and k < 1:
         raise InputError(f"k: expected at least 1 view, got {k}")
     if not len(cameras):
@@ -110,7 +119,7 @@ def select(
     began = time.perf_counter()
     seconds: dict[str, float] = {}
     coarse = surface(splats, min(_COARSE, max(1, len(splats))))
-    depths = poses.viewing_distances(coarse, cameras)
+    depths, shares = poses.outlooks(coarse, cameras)
     alike = poses.likeness(cameras, depths)
     wanted = poses.demand(alike)
     usable = (depths > 0) & ~poses.within_matter(splats, cameras, depths, progress)
@@ -126,7 +135,7 @@ def select(
     elif policy == "pose-diverse":
         order, gains = poses.farthest(alike, usable)
     elif policy == "auto":
-        order, gains = poses.represent(alike, wanted, usable)
+        order, gains = poses.represent(alike, wanted, usable, shares)
     else:
         order = _blind(policy, np.flatnonzero(usable), k, seed)
         gains = poses.gains_of(order, alike, wanted)

@@ -19,8 +19,8 @@ __all__ = [
     "farthest",
     "gains_of",
     "likeness",
+    "outlooks",
     "represent",
-    "viewing_distances",
     "within_matter",
 ]
 
@@ -31,6 +31,11 @@ _BANDWIDTH = 0.35
 """Of the kernel exp(−(d/0.35)²) between poses: neighbours 20° apart on an orbit are half alike."""
 _REACH = 2.0
 """Bandwidths within which a chosen view says something of a pose: beyond, they are less than 2 % alike."""
+_WORTH = 0.25
+"""Power of its share of the scene by which a view's claim to be chosen counts."""
+_GRID = 48, 36
+_BEHIND = 1.15
+"""Times the nearest depth of its place in the grid: what lies farther is hidden."""
 _ROWS = 200_000
 """Gaussians that tell whether a pose is walled in: of more, a fair sample, each as much larger."""
 _GLANCE = 48
@@ -39,10 +44,16 @@ _WALLED = 0.02
 """A pose whose image is mostly nearer than this share of what the median pose sees stands within matter."""
 
 
-def viewing_distances(cells: Surface, cameras: Cameras) -> Float:
-    """(C,) each view's median depth of the cells within its image, 0 where there is none."""
+def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
+    """What each view sees of a coarse surface.
+
+    Returns:
+        (C,) its median depth of the cells within its image, 0 where there is none, and (C,) the share of all
+        cells that lie in front there: not much behind the nearest of theirs in a grid of 48 × 36.
+    """
     local = cameras.recentred(cells.origin)
-    out = np.zeros(len(local))
+    depths, shares = np.zeros(len(local)), np.zeros(len(local))
+    columns, rows = _GRID
     for i in range(len(local)):
         x, y, z = local.viewmats[i, :3, :3] @ cells.centers.T + local.viewmats[i, :3, 3:]
         ahead = z > 0
@@ -50,8 +61,18 @@ def viewing_distances(cells: Surface, cameras: Cameras) -> Float:
         K = local.Ks[i]
         u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
         inside = ahead & (u >= 0) & (u < local.widths[i]) & (v >= 0) & (v < local.heights[i])
-        out[i] = np.median(z[inside]) if inside.any() else 0.0
-    return out
+        if inside.any():
+            u, v, z = u[inside], v[inside], z[inside]
+            row, column = (
+                (v * rows / local.heights[i]).astype(int),
+                (u * columns / local.widths[i]).astype(int),
+            )
+            place = row * columns + column
+            nearest = np.full(columns * rows, np.inf)
+            np.minimum.at(nearest, place, z)
+            depths[i] = np.median(z)
+            shares[i] = np.count_nonzero(z < _BEHIND * nearest[place]) / len(cells.centers)
+    return depths, shares
 
 
 def within_matter(splats: Splats, cameras: Cameras, depths: Float, progress: Progress) -> NDArray[np.bool_]:
@@ -62,7 +83,7 @@ def within_matter(splats: Splats, cameras: Cameras, depths: Float, progress: Pro
     Args:
         splats: the scene.
         cameras: C views.
-        depths: (C,) see `viewing_distances`.
+        depths: (C,) see `outlooks`.
         progress: told of the views done.
     """
     made = np.array([path is None for path in cameras.image_paths])
@@ -83,8 +104,9 @@ def likeness(cameras: Cameras, depths: Float) -> Float:
     """(C, C) exp(−(d/0.35)²): d² = |Δposition|²/(depth·depth) + |Δdirection|²: parallax and turn."""
     seen = depths[depths > 0]
     scale = np.where(depths > 0, depths, np.median(seen) if len(seen) else 1.0)
-    positions = cameras.positions - cameras.positions.mean(0)
-    away = _squares(positions) / (scale[:, None] * scale)
+    positions = cameras.positions - np.median(cameras.positions, axis=0)  # whatever one of them is
+    with np.errstate(over="ignore", invalid="ignore"):  # 1e300 away is as far as can be
+        away = np.nan_to_num(_squares(positions), nan=np.inf) / (scale[:, None] * scale)
     return np.exp(-(away + _squares(cameras.forwards)) / _BANDWIDTH**2)
 
 
@@ -102,32 +124,36 @@ def demand(alike: Float) -> Float:
     return weights / weights.sum()
 
 
-def represent(alike: Float, wanted: Float, usable: NDArray[np.bool_]) -> tuple[Order, Float]:
+def represent(alike: Float, wanted: Float, usable: NDArray[np.bool_], shares: Float) -> tuple[Order, Float]:
     """Views that stand for the others: first reach every pose, then represent as many as well as can be.
 
     From the pose nearest to all by demand on, the farthest comes next while any is more than two bandwidths
     from all chosen: there a kernel says nothing about who stands for whom. Then greedy facility location.
+    Of views that would do alike the one that sees more is taken: each counts times the fourth root of its
+    share of the scene.
 
     Args:
         alike: (C, C) see `likeness`.
         wanted: (C,) see `demand`.
         usable: (C,) which may be chosen; the others ask for nothing.
+        shares: (C,) see `outlooks`.
 
     Returns:
         The usable views in order, and what each adds to Σ_u w_u max_{v∈S} alike_uv.
     """
-    wanted, away = np.where(usable, wanted, 0.0), _bandwidths_apart(alike)
+    wanted, away, worth = np.where(usable, wanted, 0.0), _bandwidths_apart(alike), shares**_WORTH
     best, left = np.zeros(len(alike)), usable.copy()
     nearest = np.where(usable, np.inf, -np.inf)
     order: list[int] = []
     gains: list[float] = []
     for _ in range(int(usable.sum())):
         if not order:
-            view = int(np.argmin(np.where(left, wanted @ away, np.inf)))
+            view = int(np.argmax(np.where(left, worth / np.maximum(wanted @ away, 1e-12), -1.0)))
         elif nearest.max() > _REACH:
-            view = int(np.argmax(nearest))
+            view = int(np.argmax(worth * np.where(nearest > _REACH, nearest, 0.0)))
         else:
-            view = int(np.argmax(np.where(left, wanted @ np.maximum(alike - best[:, None], 0.0), -1.0)))
+            added = wanted @ np.maximum(alike - best[:, None], 0.0)
+            view = int(np.argmax(np.where(left, worth * added, -1.0)))
         order.append(view)
         gains.append(float(wanted @ np.maximum(alike[:, view] - best, 0.0)))
         best = np.maximum(best, alike[:, view])

@@ -95,17 +95,26 @@ def greedy(k, surface, seen, positions, **options):
     return chosen, gains
 
 
-def represent(k, alike, wanted):
-    """Farthest first while a pose is over two bandwidths away, then greedy facility location."""
+def represent(k, alike, wanted, shares):
+    """Farthest first while a pose is over two bandwidths away, then facility location; each times share^¼."""
+    worth = shares**0.25
     away = np.sqrt(-np.log(np.maximum(alike, np.finfo(float).tiny)))
     chosen = [
-        int(np.argmin([sum(wanted[u] * away[u, v] for u in range(len(alike))) for v in range(len(alike))]))
+        int(
+            np.argmax(
+                [worth[v] / sum(wanted[u] * away[u, v] for u in range(len(alike))) for v in range(len(alike))]
+            )
+        )
     ]
     while len(chosen) < k:
         reach = away[:, chosen].min(1)
         if reach.max() > 2:
-            chosen.append(int(np.argmax(reach)))
+            chosen.append(int(np.argmax(np.where(reach > 2, worth * reach, -1))))
             continue
-        tried = [-1 if v in chosen else wanted @ alike[:, [*chosen, v]].max(1) for v in range(len(alike))]
+        now = wanted @ alike[:, chosen].max(1)
+        tried = [
+            -1 if v in chosen else worth[v] * (wanted @ alike[:, [*chosen, v]].max(1) - now)
+            for v in range(len(alike))
+        ]
         chosen.append(int(np.argmax(np.round(tried, 14))))
     return chosen
