@@ -317,3 +317,57 @@ def test_scores_are_those_of_evaluate(tmp_path: Path) -> None:
     scored = score(small, targets, (0.0, 0.0, 0.0), pictures=tmp_path / "p")
     assert scored.mean("psnr") == evaluate(small, targets).psnr
     assert len(list((tmp_path / "p").iterdir())) == 3
+
+
+SMALL = STUDY.replace("seconds = [3]\n", "").replace(
+    'methods = ["g2ard", "pup", "rounds", "nanogs"]', 'methods = ["random"]'
+)
+
+
+def test_a_run_touches_nothing_of_others_and_knows_its_files(tmp_path: Path) -> None:
+    path, out = study(tmp_path, SMALL), tmp_path / "out"
+    thesis = out / "work" / "thesis.txt"
+    thesis.parent.mkdir(parents=True)
+    thesis.write_text("precious")
+    first = bench_run([read_definition(path)], out)
+    assert [p.name for p in (out / "work").iterdir()] == ["thesis.txt"]
+    assert first[0].input_count == 1200
+    io.write_splats(tmp_path / "ball.ply", checkered_ball(800), overwrite=True)
+    second = bench_run([read_definition(path)], out)
+    assert second[0].input_count == 800
+    other = tmp_path / "other.toml"
+    other.write_text(SMALL)
+    bench_run([read_definition(other)], out)
+    assert {row.study for row in read_rows(out / "rows.csv")} == {"balls", "other"}
+
+
+def test_w_measures_again(tmp_path: Path) -> None:
+    path, out = study(tmp_path, SMALL), tmp_path / "out"
+    bench_run([read_definition(path)], out, keep=True)
+    cell = next((out / "cells").iterdir())
+    cell.write_text(cell.read_text().replace('"psnr": ', '"psnr": 1'))
+    wrong = bench_run([read_definition(path)], out, keep=True)[0].psnr
+    assert bench_run([read_definition(path)], out, keep=True, again=True)[0].psnr < wrong - 50
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("ratios = [0]", "ratios"),
+        ('ratios = ["x"]', "ratios"),
+        ("ratios = 10", "ratios: expected a list"),
+        ("steps = [-1]", "steps"),
+        ("steps = [2.5]", "steps"),
+        ("seconds = [nan]", "seconds"),
+        ("seeds = [-1]", "seeds"),
+        ("size = 0", "size"),
+        ('schedule = "nope"', "schedule"),
+        ('methods = "g2ard"', "methods: expected a list"),
+    ],
+)
+def test_a_study_is_checked_before_it_runs(tmp_path: Path, line: str, words: str) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text(line + '\n[[scene]]\nname = "ball"\nprior = "ball.ply"\n')
+    with pytest.raises(InputError, match=words) as error:
+        read_definition(path)
+    assert str(path) in str(error.value)

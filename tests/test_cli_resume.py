@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scenes import around, checkered_ball
 
+from g2ard.cli.commands.distill import _work_folder
 from g2ard.cli.frame import Run
 from g2ard.cli.resume import stoppable
 from g2ard.errors import InputError
@@ -110,3 +111,24 @@ def test_a_file_that_is_no_checkpoint_is_named(tmp_path: Path, content: bytes) -
     with pytest.raises(InputError) as caught:
         checkpoint.load(path, "key")
     assert str(caught.value).startswith(f"{path}: not a checkpoint of g2ard, or a damaged one; ")
+
+
+def test_distill_stopped_before_its_first_checkpoint_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    common = ("overwrite", "seed", "threads", "device", "verbose", "json", "quiet", "config")
+    run, output = Run("distill", dict.fromkeys(common), {}), tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt), _work_folder(run, output, resume=False):
+        raise KeyboardInterrupt
+    assert capsys.readouterr().err == ""
+    assert not output.exists()
+    saved = output / "work" / "simplified-1.npz"
+
+    def stopped_later() -> None:
+        saved.touch()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), _work_folder(run, output, resume=False):
+        stopped_later()
+    assert "--resume goes on in" in capsys.readouterr().err
+    assert saved.exists()

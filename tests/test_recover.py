@@ -243,3 +243,26 @@ def test_nothing_to_do_is_said(student: Splats, targets: TeacherRenders) -> None
         recover(student.take(slice(0, 0)), targets)
     with pytest.raises(InputError, match="engine"):
         recover(student, targets, RecoverConfig(engine="steam"))  # type: ignore[arg-type]
+
+
+def test_a_start_that_cannot_be_bettered_is_kept(targets: TeacherRenders) -> None:
+    ball = checkered_ball(1500)
+    grain = np.random.default_rng(0).normal(0, 1e-3, ball.sh0.shape).astype(np.float32)
+    start = replace(ball, sh0=ball.sh0 + grain)
+    there = TeacherRenders(ball, targets.cameras)
+    done = recover(start, there, RecoverConfig(schedule=replace(TUNED, multiplier=3**0.5), steps=5))
+    assert done.report["kept_start"]
+    np.testing.assert_array_equal(done.splats.means, start.means)
+    np.testing.assert_array_equal(done.splats.sh0, start.sh0)
+    assert done.report["psnr"]["after"] == done.report["psnr"]["before"] < 100
+    calm = recover(start, there, RecoverConfig(steps=100)).report
+    assert calm["multiplier"] < 0.3
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"steps": 0}, {"steps": -1}, {"time_limit": 0.0}, {"time_limit": float("nan")}, {"ssim_weight": 2.0}],
+)
+def test_refuses_a_horizon_that_is_none(wrong: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        RecoverConfig(**wrong)
