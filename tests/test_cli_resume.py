@@ -22,7 +22,7 @@ CommandLine = Callable[..., tuple[int, str, str]]
 LEFT = [
     ("recover a.ply --steps 3 -o out.ply", ".out.ply.checkpoint.npz"),
     ("adapt a.ply --steps 3 -o out.ply", ".out.ply.work/stretches.npz"),
-    ("distill a.ply -r 2 --steps 3 -o run", "run/work/simplified-1.npz"),
+    ("distill a.ply -r 2 --steps 3 -o run", "run/.unfinished/simplified-1.npz"),
 ]
 
 
@@ -122,7 +122,7 @@ def test_distill_stopped_before_its_first_checkpoint_leaves_nothing(
         raise KeyboardInterrupt
     assert capsys.readouterr().err == ""
     assert not output.exists()
-    saved = output / "work" / "simplified-1.npz"
+    saved = output / ".unfinished" / "simplified-1.npz"
 
     def stopped_later() -> None:
         saved.touch()

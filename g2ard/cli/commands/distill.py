@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 
     Colour = tuple[float, float, float]
 
+_WORK = ".unfinished"
+"""In the folder of the run: finished rounds and checkpoints. Nobody else has a folder of this name."""
 _POOL = 128
 """Poses of a pool made for a scene without views; every 8th is held out for scoring."""
 
@@ -121,9 +123,9 @@ def distill(
     lifted = kind(scene) != "splats"
     if lifted and views is None:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
-    if not left_at(output / "work"):
+    if not left_at(output / _WORK):
         check_output(output, run.overwrite, folder=True)
-    check_stopped(run, output / "work", resume)
+    check_stopped(run, output / _WORK, resume)
     prior = _lift(run, scene) if lifted else load_scene(run, scene)
     budget = budget_of(scene, count, ratio, len(prior))
     candidates, test, pool = _views(run, prior, views, held_out, size)
@@ -177,7 +179,7 @@ def distill(
         _write(run, output, result, unseen, colour, report)
     if pool is not None:
         write_views(output / "views.json", pool, overwrite=True)
-    shutil.rmtree(output / "work")
+    shutil.rmtree(output / _WORK)
     _table(run, report)
     _say_views(run, report["views"], k is not None)
     run.say(
@@ -193,7 +195,7 @@ def _work_folder(run: Run, output: Path, resume: bool) -> Iterator[Path]:
     Ctrl-C before the first of them."""
     import shutil
 
-    work, made = output / "work", not output.exists()
+    work, made = output / _WORK, not output.exists()
     if not resume:
         shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True, exist_ok=True)
