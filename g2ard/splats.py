@@ -11,10 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 
-__all__ = ["SH_C0", "Splats"]
+__all__ = ["DRAWN_LOGIT", "SH_C0", "Splats"]
 
 SH_C0 = 0.28209479177387814
 """Band-0 spherical harmonic: colour = 0.5 + SH_C0 · sh0."""
+
+DRAWN_LOGIT = -5.54
+"""Below it α < 1/255, which no renderer draws."""
 
 _DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
 

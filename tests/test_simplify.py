@@ -114,6 +114,27 @@ def test_odd_scenes(method, name):
         assert out.report["infinite_logits"] == infinite
 
 
+def test_floaters_that_fade_are_counted():
+    prior = replace(scene(500), logit_opacities=np.full(500, 3, np.float32))
+    assert simplify(prior, 50).report["faded"] == 0
+    far = prior.means.copy()
+    far[:40] += 160_000 * np.random.default_rng(5).normal(size=(40, 3)).astype(np.float32)
+    out = simplify(replace(prior, means=far), 12)
+    faint = out.splats.opacities < 1 / 255
+    assert out.report["faded"] == np.count_nonzero(faint) > 0
+    assert set(np.flatnonzero(faint)) == set(out.parents[:40][faint[out.parents[:40]]])
+
+
+def test_the_paper_says_what_it_skipped():
+    prior = scene(2000)
+    out = simplify(prior, 1500, method="paper")
+    assert out.report["skipped"]["coverages"] == sum(r["refused"]["energy"] for r in out.report["rounds"])
+    faint = replace(prior, logit_opacities=np.where(np.arange(2000) < 1500, 0, -9).astype(np.float32))
+    dropped = simplify(faint, 1500, method="paper").report["skipped"]
+    assert (dropped["binnings"], dropped["trims"]) == (1, 1)
+    assert "binnings" not in simplify(prior, 200).report["skipped"]
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_identical_gaussians_keep_their_shape(method):
     prior = scene(500).take(np.zeros(1000, int))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 
@@ -18,6 +19,7 @@ def main() -> None:
     """Entry point of the `g2ard` program: usage errors are one line and exit status 2, as all errors are."""
     # Kernels have threads of their own; those of numpy's BLAS only spin, for a thirtieth of a short command.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    gc.set_threshold(50_000)  # importing makes many objects and no garbage: looking for it took a twentieth
     register(next(iter(sys.argv[1:]), None))  # the others would only take time
     try:
         status = app(prog_name="g2ard", standalone_mode=False)
@@ -29,4 +31,5 @@ def main() -> None:
         if message:  # empty when a group without arguments has already shown its help
             print(f"{where}: {message} (see {where} --help)", file=sys.stderr)
         status = e.exit_code
+    gc.freeze()  # nor is there any to look for at the end
     sys.exit(status)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.types import Note, Scene
-from g2ard.splats import Splats
+from g2ard.splats import DRAWN_LOGIT, Splats
 
 __all__ = ["BLOCK", "LOGIT_LIMIT", "LOG_SCALE_LIMIT", "Raw", "cleaned", "plural"]
 
@@ -21,9 +21,6 @@ BLOCK = 8192
 LOGIT_LIMIT = 16.0
 """Logits past this are clamped to it: sigmoid(16) = 1 − 1.1e-7, far past the 0.99 at which a rasteriser clips
 and far within an 8-bit step of 1, while −log(1 − α) is still exact enough in float32."""
-
-_DRAWN_LOGIT = -5.54
-"""Below it α < 1/255, which no renderer draws."""
 
 LOG_SCALE_LIMIT = 43.0
 """exp(43)² = 2.2e37 and exp(−43)² = 4.5e-38 are the last squares that are normal float32."""
@@ -88,7 +85,7 @@ def cleaned(path: Path, raw: Raw, notes: list[Note] | None = None) -> Scene:
     ):
         if tally[key]:
             notes.append(Note(code, tally[key], f"{plural(tally[key], what)} {then}"))
-    if np.max(raw.logit_opacities, where=keep, initial=-np.inf) < _DRAWN_LOGIT:
+    if np.max(raw.logit_opacities, where=keep, initial=-np.inf) < DRAWN_LOGIT:
         notes.append(Note("invisible", count - dropped, "nothing of it shows: every α is below 1/255"))
     splats = Splats(
         raw.means, raw.quats, raw.log_scales, raw.logit_opacities, raw.sh0, raw.shN, raw.offset

@@ -81,13 +81,15 @@ def file_format(path: str | Path) -> Format:
 
 
 def _folder_format(path: Path) -> Format:
-    from g2ard.io.cambridge import is_cambridge
-    from g2ard.io.colmap import model_folder, photos_beside
     from g2ard.io.sog import chunks_of
-    from g2ard.io.transforms import files_of
 
     if chunks_of(path):
         return "sog"
+
+    from g2ard.io.cambridge import is_cambridge
+    from g2ard.io.colmap import model_folder, photos_beside
+    from g2ard.io.transforms import files_of
+
     if model_folder(path) is not None:
         return "colmap"
     if files_of(path):

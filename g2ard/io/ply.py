@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
@@ -106,6 +105,8 @@ def _recentre(rows: NDArray[Any]) -> NDArray[np.float64]:
 def _read_block(
     block: NDArray[Any], raw: Raw, at: slice, rest: list[str], stored: int, shift: NDArray[np.float64]
 ) -> None:
+    from numpy.lib.recfunctions import structured_to_unstructured
+
     means = structured_to_unstructured(block[_MEANS])
     raw.means[at] = means - shift if shift.any() else means
     raw.sh0[at, 0] = structured_to_unstructured(block[_DC])

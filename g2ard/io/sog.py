@@ -184,7 +184,7 @@ def _sh_files(chunk: _Chunk) -> tuple[str, str]:
 def _image(chunk: _Chunk, name: str) -> NDArray[np.uint8]:
     """(height, width, 4) bytes."""
     import numpy as np
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image, UnidentifiedImageError, WebPImagePlugin  # noqa: F401: else Pillow loads all it has
 
     try:
         with Image.open(io.BytesIO(chunk.load(name))) as image:
@@ -285,6 +285,8 @@ def _decode_rest(chunk: _Chunk, out: NDArray[np.float32]) -> None:
     """Fill (n, K−1, 3): each Gaussian's label picks a palette entry, whose bytes pick values."""
     import numpy as np
 
+    from g2ard.io.clean import BLOCK
+
     rest = _rest_coefficients(chunk)
     out[:, rest:] = 0
     if not rest:
@@ -294,9 +296,12 @@ def _decode_rest(chunk: _Chunk, out: NDArray[np.float32]) -> None:
     if image.shape[1] != _PALETTE_COLUMNS * rest:
         raise InputError(f"{chunk.name}: {centroids} is {image.shape[1]} wide, not {_PALETTE_COLUMNS * rest}")
     palette = _values(chunk.meta["shN"], image[:, :, :3].reshape(-1, rest, 3), slice(3)).astype(np.float32)
-    codes = _rows(chunk, labels, len(out)).astype(np.int64)
-    index = codes[:, 0] + (codes[:, 1] << 8)
-    if len(index) and index.max() >= len(palette):
-        row = int(np.argmax(index >= len(palette)))
-        raise InputError(f"{chunk.name}: {labels}: Gaussian {row} names entry {index[row]} of {len(palette)}")
-    np.take(palette, index, axis=0, out=out[:, :rest], mode="clip")
+    codes = _rows(chunk, labels, len(out))
+    for start in range(0, len(out), BLOCK):
+        rows = slice(start, start + BLOCK)
+        index = codes[rows, 0] + (codes[rows, 1].astype(np.intp) << 8)
+        if index.max() >= len(palette):
+            row = int(np.argmax(index >= len(palette)))
+            named = f"Gaussian {start + row} names entry {index[row]} of {len(palette)}"
+            raise InputError(f"{chunk.name}: {labels}: {named}")
+        np.take(palette, index, axis=0, out=out[rows, :rest], mode="clip")

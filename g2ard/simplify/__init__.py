@@ -14,7 +14,7 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
 from g2ard.simplify.config import METHODS, SimplifyConfig, schedule
 from g2ard.simplify.pairs import Seen, Visibility, merge, merge_looking, rows_of, splats_of
-from g2ard.splats import Splats
+from g2ard.splats import DRAWN_LOGIT, Splats
 
 __all__ = ["METHODS", "Seen", "Simplified", "SimplifyConfig", "flag", "schedule", "simplify"]
 
@@ -38,7 +38,9 @@ class Simplified:
             how many rows merging shrank the scene), `protected`, `nonfinite_rows`,
             `infinite_logits` (taken as α = 0 or 1), `clamped_opacities` (merged α that reached
             0.99: what `max_growth` could not take was lost), `resized` (rows fitted to what views see),
-            `skipped` (`alone`: rows passed on as they were; `sh_bands`: of zeros, left out of all sums).
+            `faded` (merged α < 1/255 where a member's was not), `skipped` (`alone`: rows passed on as they
+            were; `sh_bands`: of zeros, left out of all sums; of the paper's, `coverages`: groups that the
+            cheaper guard had refused; rounds without `binnings`, or `trims`, for fewer rows were left already).
     """
 
     splats: Splats
@@ -215,7 +217,7 @@ def _check_flags(protected: NDArray[np.bool_] | None, count: int) -> NDArray[np.
 def _clean(splats: Splats) -> tuple[Splats, NDArray[np.bool_] | slice]:
     """The finite rows, C-contiguous, and which they are."""
     arrays = (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN)
-    everything = all(np.isfinite(a).all() for a in arrays) and not np.isnan(splats.logit_opacities).any()
+    everything = all(_all_finite(a) for a in arrays) and not np.isnan(splats.logit_opacities).any()
     finite = np.ones(len(splats), bool) if everything else splats.finite_rows()
     if not finite.any():
         raise InputError(f"splats: none of {len(splats)} rows is finite")
@@ -231,6 +233,12 @@ def _clean(splats: Splats) -> tuple[Splats, NDArray[np.bool_] | slice]:
         shN=np.ascontiguousarray(scene.shN, np.float32),
     )
     return scene, slice(None) if everything else finite
+
+
+def _all_finite(values: NDArray[Any]) -> bool:
+    """A sum is finite only if all its terms are; where it overflows they are looked at one by one."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.isfinite(values.sum()) or np.isfinite(values).all())
 
 
 def _unseen(scene: Splats) -> Splats:
@@ -270,9 +278,33 @@ def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str
         "infinite_logits": out["infinite_logits"],
         "clamped_opacities": out["clamped_opacities"],
         "resized": out.get("resized", 0),
+        "faded": _faded(splats, small, parents),
         "skipped": {
             "alone": alone,
             "sh_bands": splats.sh_degree - math.isqrt(out["sh"].shape[1]) + 1,
+            **_spared(out["rounds"]),
         },
     }
     return Simplified(small, parents, protected, report)
+
+
+def _faded(splats: Splats, small: Splats, parents: NDArray[np.int64]) -> int:
+    """Merged rows that no renderer draws, though it drew a member: floaters so far apart that their mass,
+    which is conserved, stops no light any more."""
+    faint = small.logit_opacities < DRAWN_LOGIT
+    if not faint.any():
+        return 0
+    drawn = np.zeros(len(small), bool)
+    drawn[parents[(parents >= 0) & (splats.logit_opacities >= DRAWN_LOGIT)]] = True
+    return int(np.count_nonzero(faint & drawn))
+
+
+def _spared(rounds: list[dict[str, Any]]) -> dict[str, int]:
+    """What the paper's rounds need not have done."""
+    if not all("cells" in r for r in rounds):
+        return {}
+    return {
+        "coverages": sum(r["refused"]["energy"] for r in rounds),
+        "binnings": sum(r["cells"] == 0 for r in rounds),
+        "trims": sum(r["trimmed"] == 0 for r in rounds),
+    }

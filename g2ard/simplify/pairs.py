@@ -19,7 +19,7 @@ from g2ard.splats import Splats
 
 __all__ = ["Seen", "Visibility", "merge", "merge_looking", "rows_of", "splats_of"]
 
-_LADDER = {"default": (3.0, 1), "fast": (1.0, 3)}
+_LADDER = {"default": (3.0, 1), "fast": (1.0, 2)}
 """Down to how many times the budget rows merge along Morton order, and in how many steps. A stage before the
 last does so all the way."""
 
