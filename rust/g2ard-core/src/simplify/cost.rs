@@ -189,7 +189,12 @@ impl Node {
     /// colours averaged over directions.
     #[inline(always)]
     pub fn cost(&self, other: &Self, color: f32, geometric: f32) -> f32 {
-        let m = self.merged(other);
+        self.cost_as(other, &self.merged(other), color, geometric)
+    }
+
+    /// The same where `m` is known to be the two merged.
+    #[inline(always)]
+    pub fn cost_as(&self, other: &Self, m: &Self, color: f32, geometric: f32) -> f32 {
         let (a, b, s) = (
             dilated(&self.cov, self.blur),
             dilated(&other.cov, other.blur),

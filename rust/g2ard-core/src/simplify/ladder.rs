@@ -98,11 +98,11 @@ fn join_avx2(a: &Rung, b: &Rung, geometric: f32) -> Rung {
 #[inline(always)]
 fn join(a: &Rung, b: &Rung, geometric: f32) -> Rung {
     let share = a.node.share(&b.node);
-    let cost = a
-        .node
-        .cost(&b.node, color_distance(&a.color, &b.color), geometric);
+    let node = a.node.merged(&b.node);
+    let color = color_distance(&a.color, &b.color);
+    let cost = a.node.cost_as(&b.node, &node, color, geometric);
     Rung {
-        node: a.node.merged(&b.node),
+        node,
         color: [0, 1, 2].map(|k| a.color[k] + share * (b.color[k] - a.color[k])),
         spent: (a.spent + b.spent + cost).min(f32::MAX),
     }
