@@ -7,6 +7,7 @@ Exit status: 0 done · 1 failed · 2 usage · 3 a stated requirement was not met
 from __future__ import annotations
 
 import inspect
+import os
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -255,6 +256,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
             from g2ard import _core
 
             _core.set_num_threads(run.threads)
+            os.environ["RAYON_NUM_THREADS"] = str(run.threads)  # for the processes that benchmarks start
         with run.console, _device(run):
             fn(run, **options)
     except KeyboardInterrupt:
