@@ -17,6 +17,8 @@ __all__ = ["MULTIPLIERS", "Probe", "calm", "climb", "trial_steps"]
 MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
 """Of all rates; trained scenes want 1 or less, lifts more."""
 
+_TIE = 0.1
+"""Gains that differ by less than this share of the smaller multiplier's are nearly the same."""
 _CALMEST = 0.01
 """Smaller ones change nothing that 8 bits show."""
 _VIEWS = 8
@@ -37,35 +39,45 @@ def trial_steps(horizon: int) -> int:
     return 0 if horizon < _SHORTEST_HORIZON else min(_MOST, max(_FEWEST, horizon // _PART))
 
 
-def climb(score: Callable[[float], float], start: float) -> tuple[float, dict[float, float]]:
-    """The best of `MULTIPLIERS`, walking uphill from the one nearest to `start`, and all scores seen.
+def climb(gain: Callable[[float], float], start: float) -> tuple[float, dict[float, float]]:
+    """The best of `MULTIPLIERS`, walking uphill from the one nearest to `start`, and all gains seen.
+
+    Between two that gain nearly the same the larger is better: a long run calms down in the end, a trial has
+    no time for what the larger would yet reach.
+
+    Args:
+        gain: dB over the start that a trial with a multiplier ends at.
+        start: where to begin.
 
     >>> climb(lambda m: -abs(m - 1), 0.2)[0]
     1.0
+    >>> round(climb(lambda m: {1 / 3: 2.0, 3**-0.5: 1.9}.get(m, 0.0), 1 / 3)[0], 3)
+    0.577
     """
     at = min(range(len(MULTIPLIERS)), key=lambda i: abs(math.log(MULTIPLIERS[i] / start)))
-    seen = {at: score(MULTIPLIERS[at])}
+    seen = {at: gain(MULTIPLIERS[at])}
     for way in (-1, 1):
         while 0 <= at + way < len(MULTIPLIERS):
             if at + way not in seen:
-                seen[at + way] = score(MULTIPLIERS[at + way])
-            if seen[at + way] <= seen[at]:
+                seen[at + way] = gain(MULTIPLIERS[at + way])
+            smaller, larger = seen[min(at, at + way)], seen[max(at, at + way)]
+            if (larger >= smaller - _TIE * abs(smaller)) != (way > 0):
                 break
             at += way
     return MULTIPLIERS[at], {MULTIPLIERS[i]: value for i, value in sorted(seen.items())}
 
 
 def calm(
-    score: Callable[[float], float], best: float, seen: dict[float, float], start: float
+    gain: Callable[[float], float], best: float, seen: dict[float, float]
 ) -> tuple[float, dict[float, float]]:
     """A third of the multiplier, again and again, while the best only makes the start worse.
 
-    >>> calm(lambda m: 50 - 9 * m, 1 / 3, {1 / 3: 47.0}, start=49.5)[0] < 0.06
+    >>> calm(lambda m: 0.5 - 9 * m, 1 / 3, {1 / 3: -2.5})[0] < 0.06
     True
     """
     seen = dict(seen)
-    while seen[best] < start and best > _CALMEST:
-        seen[best / 3] = score(best / 3)
+    while seen[best] < 0 and best > _CALMEST:
+        seen[best / 3] = gain(best / 3)
         if seen[best / 3] <= seen[best]:
             break
         best /= 3
