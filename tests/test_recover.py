@@ -167,8 +167,9 @@ def test_paper_schedule_runs_with_its_own_rates(student: Splats, targets: Teache
 
 def test_trials_choose_rates_that_suit_the_scene(student: Splats, targets: TeacherRenders) -> None:
     report = recover(student, targets, RecoverConfig(steps=100)).report
-    best = max(report["trials"], key=lambda trial: trial["psnr"])
-    assert report["multiplier"] == best["multiplier"]
+    most = max(trial["psnr"] for trial in report["trials"]) - report["psnr"]["before"]
+    good = [t for t in report["trials"] if t["psnr"] - report["psnr"]["before"] >= 0.9 * most]
+    assert report["multiplier"] == max(trial["multiplier"] for trial in good)
     assert len(report["trials"]) >= 2
     nearly = recover(TEACHER, targets, RecoverConfig(steps=100)).report  # nothing to gain: small steps
     assert nearly["multiplier"] == pytest.approx(1 / 3)

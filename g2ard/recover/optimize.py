@@ -260,18 +260,18 @@ class _Loop:
             return
         began = time.monotonic()
 
-        def gain(multiplier: float) -> float:
+        def score(multiplier: float) -> float:
             engine = self._new_engine()
             for step in range(steps):
                 if limit is not None and time.monotonic() - began > _TRIAL_SHARE * limit:
                     raise TimeoutError
                 self._learn(engine, step, step / steps, multiplier)
-            return self.probe.all_of(engine.splats()) - start
+            return self.probe.all_of(engine.splats())
 
         try:
-            self.multiplier, seen = climb(gain, guess)
-            self.multiplier, seen = calm(gain, self.multiplier, seen)
-            self.trials = [{"multiplier": m, "psnr": start + value} for m, value in seen.items()]
+            self.multiplier, seen = climb(score, guess, start)
+            self.multiplier, seen = calm(score, self.multiplier, seen, start)
+            self.trials = [{"multiplier": m, "psnr": value} for m, value in seen.items()]
         except TimeoutError:
             pass  # the guess stands
         self.seconds = time.monotonic() - began

@@ -39,45 +39,46 @@ def trial_steps(horizon: int) -> int:
     return 0 if horizon < _SHORTEST_HORIZON else min(_MOST, max(_FEWEST, horizon // _PART))
 
 
-def climb(gain: Callable[[float], float], start: float) -> tuple[float, dict[float, float]]:
-    """The best of `MULTIPLIERS`, walking uphill from the one nearest to `start`, and all gains seen.
+def climb(score: Callable[[float], float], guess: float, start: float) -> tuple[float, dict[float, float]]:
+    """The best of `MULTIPLIERS`, walking uphill from the one nearest to `guess`, and all scores seen.
 
     Between two that gain nearly the same the larger is better: a long run calms down in the end, a trial has
     no time for what the larger would yet reach.
 
     Args:
-        gain: dB over the start that a trial with a multiplier ends at.
-        start: where to begin.
+        score: PSNR that a trial with a multiplier ends at.
+        guess: where to begin.
+        start: PSNR before.
 
-    >>> climb(lambda m: -abs(m - 1), 0.2)[0]
+    >>> climb(lambda m: -abs(m - 1), 0.2, start=0)[0]
     1.0
-    >>> round(climb(lambda m: {1 / 3: 2.0, 3**-0.5: 1.9}.get(m, 0.0), 1 / 3)[0], 3)
+    >>> round(climb(lambda m: {1 / 3: 32.0, 3**-0.5: 31.9}.get(m, 30.0), 1 / 3, start=30)[0], 3)
     0.577
     """
-    at = min(range(len(MULTIPLIERS)), key=lambda i: abs(math.log(MULTIPLIERS[i] / start)))
-    seen = {at: gain(MULTIPLIERS[at])}
+    at = min(range(len(MULTIPLIERS)), key=lambda i: abs(math.log(MULTIPLIERS[i] / guess)))
+    seen = {at: score(MULTIPLIERS[at])}
     for way in (-1, 1):
         while 0 <= at + way < len(MULTIPLIERS):
             if at + way not in seen:
-                seen[at + way] = gain(MULTIPLIERS[at + way])
+                seen[at + way] = score(MULTIPLIERS[at + way])
             smaller, larger = seen[min(at, at + way)], seen[max(at, at + way)]
-            if (larger >= smaller - _TIE * abs(smaller)) != (way > 0):
+            if (larger > smaller - _TIE * max(smaller - start, 0.0)) != (way > 0):
                 break
             at += way
     return MULTIPLIERS[at], {MULTIPLIERS[i]: value for i, value in sorted(seen.items())}
 
 
 def calm(
-    gain: Callable[[float], float], best: float, seen: dict[float, float]
+    score: Callable[[float], float], best: float, seen: dict[float, float], start: float
 ) -> tuple[float, dict[float, float]]:
     """A third of the multiplier, again and again, while the best only makes the start worse.
 
-    >>> calm(lambda m: 0.5 - 9 * m, 1 / 3, {1 / 3: -2.5})[0] < 0.06
+    >>> calm(lambda m: 50 - 9 * m, 1 / 3, {1 / 3: 47.0}, start=49.5)[0] < 0.06
     True
     """
     seen = dict(seen)
-    while seen[best] < 0 and best > _CALMEST:
-        seen[best / 3] = gain(best / 3)
+    while seen[best] < start and best > _CALMEST:
+        seen[best / 3] = score(best / 3)
         if seen[best / 3] <= seen[best]:
             break
         best /= 3
