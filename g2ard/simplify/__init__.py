@@ -104,7 +104,7 @@ def simplify(
     times how much of it the views see. Without `visibility` it needs no cameras at all; with a function
     of it the rows' two longer axes are fitted last, within a fifth, to what the views see of them.
 
-    `fast` merges along Morton order all the way, on three lattices in turn: no graph of neighbours.
+    `fast` merges along Morton order all the way, on two lattices in turn: no graph of neighbours.
 
     `paper`: rounds of 75 %; each drops α < 0.01, merges cell × colour-bin groups by moment matching where the
     affine-energy and surface-coverage guards pass, and trims by π = −log(1 − α)·A·(1 + λ_h·p)
