@@ -184,7 +184,11 @@ def _sh_files(chunk: _Chunk) -> tuple[str, str]:
 def _image(chunk: _Chunk, name: str) -> NDArray[np.uint8]:
     """(height, width, 4) bytes."""
     import numpy as np
-    from PIL import Image, UnidentifiedImageError, WebPImagePlugin  # noqa: F401: else Pillow loads all it has
+    from PIL import (
+        Image,
+        UnidentifiedImageError,
+        WebPImagePlugin,  # noqa: F401  (Pillow would load all its formats to find this one)
+    )
 
     try:
         with Image.open(io.BytesIO(chunk.load(name))) as image:

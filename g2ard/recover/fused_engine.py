@@ -18,7 +18,7 @@ __all__ = ["FusedEngine"]
 
 
 class FusedEngine:
-    """Does what `TorchEngine` does, to rounding, but leaves Gaussians alone that the view did not touch."""
+    """Does what `TorchEngine` does, to rounding."""
 
     def __init__(
         self,

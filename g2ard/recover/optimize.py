@@ -51,9 +51,8 @@ class RecoverConfig:
         background: RGB behind the scene.
         final: whether this is the recovery at the target count; the paper decays rounds differently.
         seed: of the order of views.
-        engine: "fused" takes whole steps in Rust; "torch" goes through autograd and torch's Adam, with the
-            same result to rounding but for Gaussians that a view does not touch; "gsplat" is that on an
-            NVIDIA GPU.
+        engine: "fused" takes whole steps in Rust; "torch" goes through autograd and `RowAdam`, with the
+            same result to rounding; "gsplat" is that on an NVIDIA GPU.
 
     Raises:
         InputError: a value out of range.

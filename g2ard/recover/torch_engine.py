@@ -1,7 +1,8 @@
-"""Recovery steps in torch: autograd over the Rust rasteriser and loss, torch's Adam."""
+"""Recovery steps in torch: autograd over the Rust rasteriser and loss, Adam by rows."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from g2ard.recover.anchors import Anchors, Regularizers
 from g2ard.recover.losses import l1_ssim
 from g2ard.recover.rasterize import rasterize
 from g2ard.recover.regularize import TorchAnchors, regularization
+from g2ard.recover.row_adam import RowAdam
 from g2ard.recover.schedule import Rates
 from g2ard.render import settings_for
 from g2ard.splats import Splats
@@ -24,7 +26,7 @@ _NAMES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 
 
 class TorchEngine:
-    """Holds the parameters and Adam's moments; one `step` a view.
+    """Holds the parameters and `RowAdam`'s moments; one `step` a view.
 
     With `means_in_scales` the means are optimised as multiples of each Gaussian's largest initial scale: Adam
     is indifferent to the scale of a gradient, so a rate of 0.05 moves a Gaussian by 5 % of its own size.
@@ -67,8 +69,7 @@ class TorchEngine:
         self._parameters = {
             name: torch.from_numpy(start[name].copy()).to(self.device).requires_grad_() for name in _NAMES
         }
-        groups = [{"params": [p], "lr": 0.0} for p in self._parameters.values() if p.numel()]
-        self._adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, fused=True)
+        self._adam = RowAdam({name: p for name, p in self._parameters.items() if p.numel()})
 
     def step(
         self,
@@ -95,9 +96,8 @@ class TorchEngine:
             )
         self._adam.zero_grad(set_to_none=True)
         torch.autograd.backward(total)
-        lively = [name for name in _NAMES if p[name].numel()]
-        for group, name in zip(self._adam.param_groups, lively, strict=True):
-            group["lr"] = getattr(rates, name)
+        for group in self._adam.param_groups:
+            group["lr"] = getattr(rates, group["name"])
         self._adam.step()
         return float(loss.detach())
 
@@ -138,8 +138,9 @@ class TorchEngine:
         """Everything a bitwise resume needs."""
         arrays = {f"p.{name}": value.detach().cpu().numpy() for name, value in self._parameters.items()}
         arrays["base"], arrays["unit"] = self._base.cpu().numpy(), self._unit.cpu().numpy()
-        for i, entry in self._adam.state_dict()["state"].items():
-            arrays.update({f"adam.{i}.{key}": value.cpu().numpy() for key, value in entry.items()})
+        arrays["count"], arrays["skipped"] = self._adam.count.cpu().numpy(), np.array(self._adam.skipped)
+        for name, key, moment in self._moments():
+            arrays[f"{key}.{name}"] = moment.cpu().numpy()
         return arrays
 
     def load(self, state: dict[str, NDArray[Any]]) -> None:
@@ -149,14 +150,17 @@ class TorchEngine:
                 parameter.copy_(torch.from_numpy(state[f"p.{name}"]))
         self._base = torch.from_numpy(state["base"]).to(self.device)
         self._unit = torch.from_numpy(state["unit"]).to(self.device)
-        adam = self._adam.state_dict()
-        for key, value in state.items():
-            if key.startswith("adam."):
-                _, i, name = key.split(".")
-                adam["state"].setdefault(int(i), {})[name] = torch.from_numpy(np.asarray(value).copy())
-        self._adam.load_state_dict(adam)
+        self._adam.count.copy_(torch.from_numpy(state["count"]))
+        self._adam.skipped = int(state["skipped"])
+        for name, key, moment in self._moments():
+            moment.copy_(torch.from_numpy(state[f"{key}.{name}"]))
+
+    def _moments(self) -> Iterator[tuple[str, str, Tensor]]:
+        for group in self._adam.param_groups:
+            for key, moment in self._adam.state[group["params"][0]].items():
+                yield group["name"], key, moment
 
     @property
     def skipped(self) -> int:
-        """Torch's Adam leaves nothing out."""
-        return 0
+        """Steps of single Gaussians left out because a gradient was not finite."""
+        return self._adam.skipped

@@ -40,7 +40,7 @@ class Simplified:
             0.99: what `max_growth` could not take was lost), `resized` (rows fitted to what views see),
             `faded` (merged α < 1/255 where a member's was not), `skipped` (`alone`: rows passed on as they
             were; `sh_bands`: of zeros, left out of all sums; of the paper's, `coverages`: groups that the
-            cheaper guard had refused; rounds without `binnings`, or `trims`, for fewer rows were left already).
+            cheaper guard had refused; rounds without `binnings`, or `trims`: few rows were left already).
     """
 
     splats: Splats

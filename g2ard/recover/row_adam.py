@@ -1,0 +1,80 @@
+"""Adam that leaves Gaussians alone that a view did not touch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = ["RowAdam"]
+
+_LARGEST = 1e18
+"""Beyond this the square of a gradient leaves float32."""
+
+
+class RowAdam(torch.optim.Optimizer):
+    """`torch.optim.Adam` row by row, as the fused engine has it: rows are Gaussians, in all parameters alike.
+
+    A row whose gradients are all zero keeps its values and its moments, and each row has a count of steps t
+    of its own: p ← p − lr · m/(1 − β₁ᵗ) / (√(v/(1 − β₂ᵗ)) + ε), with the bias terms in float64. A row with a
+    gradient that is not finite, or over 1e18, is left alone too, and counted.
+
+    Args:
+        parameters: by name, (N, …) each; parameter groups are in this order, with the name and lr 0.
+        betas: β₁ and β₂.
+        eps: ε.
+
+    >>> p = torch.zeros(3, 2, requires_grad=True)
+    >>> adam = RowAdam({"p": p})
+    >>> adam.param_groups[0]["lr"] = 0.1
+    >>> p.grad = torch.tensor([[1.0, -1.0], [0.0, 0.0], [torch.nan, 1.0]])
+    >>> adam.step()
+    >>> [[round(v, 6) + 0.0 for v in row] for row in p.tolist()], adam.skipped
+    ([[-0.1, 0.1], [0.0, 0.0], [0.0, 0.0]], 1)
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Tensor],
+        *,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-15,
+    ) -> None:
+        groups = [{"params": [p], "name": name} for name, p in parameters.items()]
+        super().__init__(groups, {"lr": 0.0, "betas": betas, "eps": eps})
+        first = next(iter(parameters.values()))
+        self.count = torch.zeros(len(first), dtype=torch.int64, device=first.device)
+        self.skipped = 0
+        for p in parameters.values():
+            self.state[p] = {"m": torch.zeros_like(p), "v": torch.zeros_like(p)}
+
+    @torch.no_grad()
+    def step(self, closure: Any = None) -> None:  # type: ignore[override]
+        """One step of every row that has a gradient."""
+        if closure is not None:
+            raise ValueError("RowAdam takes no closure")
+        groups = [group for group in self.param_groups if group["params"][0].grad is not None]
+        touched, sound = (
+            torch.zeros_like(self.count, dtype=torch.bool),
+            torch.ones_like(self.count, dtype=torch.bool),
+        )
+        for group in groups:
+            grad = group["params"][0].grad.reshape(len(touched), -1)
+            touched |= (grad != 0).any(1)
+            sound &= (grad.abs() <= _LARGEST).all(1)
+        self.skipped += int((touched & ~sound).sum())
+        rows = (touched & sound).nonzero()[:, 0]
+        self.count[rows] += 1
+        count = self.count[rows].double()
+        for group in groups:
+            (p,), (beta1, beta2) = group["params"], group["betas"]
+            grad = p.grad[rows]
+            m, v = (self.state[p][key] for key in ("m", "v"))
+            shape = (-1, *[1] * (grad.ndim - 1))
+            bias1, bias2 = ((1 - beta**count).reshape(shape) for beta in (beta1, beta2))
+            m[rows] = m[rows].lerp_(grad, 1 - beta1)
+            v[rows] = v[rows].mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
+            size = v[rows] * (1 / bias2).float()
+            p[rows] -= group["lr"] * (m[rows] * (1 / bias1).float()) / (size.sqrt_() + group["eps"])
