@@ -19,7 +19,7 @@ from g2ard.errors import InputError
 from g2ard.evaluate import evaluate
 from g2ard.recover import RecoverConfig, probe, recover
 from g2ard.recover import checkpoint as checkpoint_module
-from g2ard.recover.anchors import PRESETS, Regularizers
+from g2ard.recover.anchors import PRESETS, Anchors, Regularizers
 from g2ard.recover.schedule import PAPER, TUNED
 from g2ard.simplify import simplify
 from g2ard.splats import Splats
@@ -135,12 +135,15 @@ def test_a_run_that_was_killed_goes_on_from_the_last_minute(
 def test_resume_refuses_other_options(student: Splats, targets: TeacherRenders, tmp_path: Path) -> None:
     checkpoint = tmp_path / "c.npz"
     config = RecoverConfig(steps=40)
+    moved = replace(student, means=student.means + 1)
     with pytest.raises(KeyboardInterrupt):
         recover(student, targets, config, checkpoint=checkpoint, progress=_StopAt(5))
     with pytest.raises(InputError, match="other options"):
         recover(student, targets, replace(config, seed=1), checkpoint=checkpoint)
     with pytest.raises(InputError, match="other options"):  # another teacher, the same views
         recover(student, TeacherRenders(student, VIEWS), config, checkpoint=checkpoint)
+    with pytest.raises(InputError, match="other options"):
+        recover(student, targets, config, checkpoint=checkpoint, anchors=Anchors.of(moved))
 
 
 def test_a_strong_anchor_holds_gaussians_to_their_surface(student: Splats, targets: TeacherRenders) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,14 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.recover import checkpoint as checkpoints
-from g2ard.recover.anchors import PRESETS, Anchors, Regularizers, drift95, needle
+from g2ard.recover.anchors import Anchors, drift95, needle
+from g2ard.recover.config import RecoverConfig
 from g2ard.recover.draw import checked_weights, drawn
 from g2ard.recover.probe import Probe, calm, climb, trial_steps
-from g2ard.recover.schedule import TUNED, Rates, Schedule, multiplier_for
+from g2ard.recover.schedule import Rates, multiplier_for
 from g2ard.splats import Splats
 from g2ard.targets import Targets, fingerprint_of, mask_of
 
-__all__ = ["RecoverConfig", "Recovered", "Watch", "recover"]
+__all__ = ["Recovered", "Watch", "recover"]
 
 _TRIAL_STEPS = 20
 _TRIAL_SHARE = 0.1
@@ -34,55 +35,6 @@ _LOG_POINTS = 10
 
 Watch = Callable[[int, float, Callable[[], Splats]], None]
 """Called after every step with its number, the seconds so far and what gives the scene as it stands."""
-
-
-@dataclass(frozen=True)
-class RecoverConfig:
-    """How recovery goes.
-
-    Args:
-        schedule: rates, horizon and decay.
-        steps: overrides the schedule's horizon.
-        time_limit: seconds; the horizon becomes what fits into them, so that the result depends on the
-            machine's speed.
-        regularizers: weights of L_anchor and L_shape (`tab:s_recovery`).
-        sh_degree: of the result; None keeps the student's.
-        ssim_weight: λ in (1−λ)·L1 + λ·(1−SSIM); 0.2 as 3DGS has it.
-        background: RGB behind the scene.
-        final: whether this is the recovery at the target count; the paper decays rounds differently.
-        seed: of the order of views.
-        engine: "fused" takes whole steps in Rust; "torch" goes through autograd and `RowAdam`, with the
-            same result to rounding; "gsplat" is that on an NVIDIA GPU.
-
-    Raises:
-        InputError: a value out of range.
-    """
-
-    schedule: Schedule = TUNED
-    steps: int | None = None
-    time_limit: float | None = None
-    regularizers: Regularizers = PRESETS["trained"]
-    sh_degree: int | None = None
-    ssim_weight: float = 0.2
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    final: bool = True
-    seed: int = 0
-    engine: Literal["fused", "torch", "gsplat"] = "fused"
-
-    def __post_init__(self) -> None:
-        if self.steps is not None and self.steps < 1:
-            raise InputError(f"steps: expected at least 1, got {self.steps}")
-        if self.time_limit is not None and not 0 < self.time_limit < float("inf"):
-            raise InputError(f"time_limit: expected seconds, more than 0, got {self.time_limit}")
-        if not 0 <= self.ssim_weight <= 1:
-            raise InputError(f"ssim_weight: expected a value in [0, 1], got {self.ssim_weight}")
-
-    @property
-    def horizon(self) -> int:
-        """Steps this recovery takes."""
-        if self.steps is not None:
-            return self.steps
-        return self.schedule.steps if self.final else self.schedule.round_steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +174,7 @@ class _Loop:
         self.losses: list[float] = []
         self.geometry: list[dict[str, float]] = []
         self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised? → steps, seconds
-        self.key = _fingerprint(student, targets, config, weights)
+        self.key = _fingerprint(student, targets, config, weights, anchors)
 
     @cached_property
     def engine(self) -> Engine:
@@ -394,8 +346,15 @@ def _engine_class(name: str) -> Any:
 
 
 def _fingerprint(
-    student: Splats, targets: Targets, config: RecoverConfig, weights: NDArray[np.float64] | None
+    student: Splats,
+    targets: Targets,
+    config: RecoverConfig,
+    weights: NDArray[np.float64] | None,
+    anchors: Anchors,
 ) -> str:
     often = [] if weights is None else [repr(weights.tolist())]
     parts = (repr(config), student.fingerprint(), fingerprint_of(targets), *often)
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+    digest = hashlib.sha256("\n".join(parts).encode())
+    for held in (anchors.means, anchors.frames, anchors.r_parallel, anchors.r_perp):
+        digest.update(np.ascontiguousarray(held).tobytes())
+    return digest.hexdigest()
