@@ -301,6 +301,19 @@ mod tests {
         (means, quats, scales, logits)
     }
 
+    /// A scene of those arrays, but for its means and scales.
+    fn made<'a>(means: Means<'a>, scales: &'a [[f32; 3]], rows: &'a Arrays) -> SceneRef<'a> {
+        SceneRef {
+            means,
+            quats: &rows.1,
+            scales,
+            logit_opacities: &rows.3,
+            sh0: &rows.0,
+            sh_rest: &[],
+            rest: 0,
+        }
+    }
+
     fn cameras() -> Vec<Camera> {
         let turned = |angle: f64, z: f64| {
             let (s, c) = angle.sin_cos();
@@ -322,26 +335,19 @@ mod tests {
 
     #[test]
     fn sees_what_the_whole_raster_sees() {
-        let (means, quats, scales, logits) = scene();
-        let scene = SceneRef {
-            means: Means::F32(&means),
-            quats: &quats,
-            scales: &scales,
-            logit_opacities: &logits,
-            sh0: &means,
-            sh_rest: &[],
-            rest: 0,
-        };
+        let rows = scene();
+        let (means, quats, scales, logits) = &rows;
         let log_scales: Vec<f32> = scales.as_flattened().iter().map(|s| s.ln()).collect();
         let params = Params {
             means: means.as_flattened(),
             quats: quats.as_flattened(),
             log_scales: &log_scales,
-            logit_opacities: &logits,
+            logit_opacities: logits,
             sh0: means.as_flattened(),
             sh_n: &[],
             sh_coeffs: 1,
         };
+        let scene = made(Means::F32(means), scales, &rows);
         let (mut look, mut whole) = (Look::new(&scene).unwrap(), Accumulated::new(means.len()));
         let (mut rasterizer, mut met) = (Rasterizer::default(), 0);
         for camera in cameras() {
@@ -371,20 +377,11 @@ mod tests {
 
     #[test]
     fn a_unit_that_is_a_power_of_two_changes_no_bit() {
-        let (means, quats, scales, logits) = scene();
+        let rows = scene();
         let by_row = |unit: f32| {
             let times = |rows: &[[f32; 3]]| rows.iter().map(|r| r.map(|x| unit * x)).collect();
-            let (means, scales): (Vec<_>, Vec<_>) = (times(&means), times(&scales));
-            let mut look = Look::new(&SceneRef {
-                means: Means::F32(&means),
-                quats: &quats,
-                scales: &scales,
-                logit_opacities: &logits,
-                sh0: &[[0.0; 3]; 1003],
-                sh_rest: &[],
-                rest: 0,
-            })
-            .unwrap();
+            let (means, scales): (Vec<_>, Vec<_>) = (times(&rows.0), times(&rows.2));
+            let mut look = Look::new(&made(Means::F32(&means), &scales, &rows)).unwrap();
             for mut camera in cameras() {
                 for r in &mut camera.viewmat {
                     r[3] *= f64::from(unit);
@@ -406,24 +403,15 @@ mod tests {
 
     #[test]
     fn map_coordinates_are_as_good_as_any() {
-        let (means, quats, scales, logits) = scene();
+        let rows = scene();
         let offset = [400_000.0, 4_000_000.0, 100.0];
-        let moved: Vec<[f64; 3]> = means
+        let here: Vec<[f64; 3]> = rows.0.iter().map(|m| m.map(f64::from)).collect();
+        let moved: Vec<[f64; 3]> = here
             .iter()
-            .map(|m| [0, 1, 2].map(|k| f64::from(m[k]) + offset[k]))
+            .map(|m| [0, 1, 2].map(|k| m[k] + offset[k]))
             .collect();
-        let here: Vec<[f64; 3]> = means.iter().map(|m| m.map(f64::from)).collect();
         let by_row = |means: &[[f64; 3]], shift: [f64; 3]| {
-            let mut look = Look::new(&SceneRef {
-                means: Means::F64(means),
-                quats: &quats,
-                scales: &scales,
-                logit_opacities: &logits,
-                sh0: &[[0.0; 3]; 1003],
-                sh_rest: &[],
-                rest: 0,
-            })
-            .unwrap();
+            let mut look = Look::new(&made(Means::F64(means), &rows.2, &rows)).unwrap();
             for mut camera in cameras() {
                 for r in &mut camera.viewmat {
                     r[3] -= r[0] * shift[0] + r[1] * shift[1] + r[2] * shift[2];
