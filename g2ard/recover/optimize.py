@@ -19,7 +19,7 @@ from g2ard.recover import checkpoint as checkpoints
 from g2ard.recover.anchors import Anchors, drift95, needle
 from g2ard.recover.config import RecoverConfig
 from g2ard.recover.draw import checked_weights, drawn
-from g2ard.recover.probe import Probe, calm, climb, trial_steps
+from g2ard.recover.probe import MULTIPLIERS, Probe, calm, climb, trial_steps
 from g2ard.recover.schedule import Rates, multiplier_for
 from g2ard.splats import Splats
 from g2ard.targets import Targets, fingerprint_of, mask_of
@@ -221,7 +221,10 @@ class _Loop:
 
         try:
             self.multiplier, seen = climb(score, guess, start)
-            self.multiplier, seen = calm(score, self.multiplier, seen, start)
+            if seen[self.multiplier] < start:  # a few steps on photos that are nearly met say nothing
+                self.multiplier = guess
+                if guess <= min(MULTIPLIERS):
+                    self.multiplier, seen = calm(score, min(MULTIPLIERS), seen, start)
             self.trials = [{"multiplier": m, "psnr": value} for m, value in seen.items()]
         except TimeoutError:
             pass  # the guess stands
