@@ -198,6 +198,11 @@ class Definition:
             for value in values:
                 if isinstance(value, bool) or not isinstance(value, kind) or not least <= value < math.inf:
                     raise InputError(f"{key}: expected numbers, at least {least:g}, got {value!r}")
+        for i, scene in enumerate(self.scenes):
+            if scene.name in {other.name for other in self.scenes[:i]}:
+                raise InputError(f"scene {scene.name}: there are two of that name")
+        if not isinstance(self.title, str):
+            raise InputError(f"title: expected text, got {self.title!r}")
         for key, least in (("size", 16), ("adapt_steps", 0), ("sh_degree", 0)):
             value = getattr(self, key)
             if value is not None and (not isinstance(value, int) or value < least):
@@ -251,13 +256,21 @@ def read_definition(path: Path) -> Definition:
             raise InputError(f"methods: no {missing!r} (there are {', '.join(known)})")
         scenes = tuple(_scene(values) for values in content.pop("scene", []))
         values = _checked(Definition, {"title": path.stem, **content}, {"name", "folder", "scenes"})
-        return Definition(
+        made = Definition(
             name=path.stem,
             scenes=scenes,
             methods=tuple(known[name] for name in names),
             folder=path.parent.absolute(),
             **values,
         )
+        lacks = next(
+            (key for key in ("scenes", "methods", "ratios", "seeds") if not getattr(made, key)), None
+        )
+        if lacks is not None or not (made.steps or made.seconds or made.released):
+            raise InputError(
+                f"no {lacks or 'steps, no seconds, and not released'}: there is nothing to measure"
+            )
+        return made
     except (InputError, TypeError) as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -291,4 +304,6 @@ def _checked(kind: type, values: dict[str, Any], withheld: set[str]) -> dict[str
 def _plain(value: Any) -> Any:
     if isinstance(value, list):
         return tuple(_plain(item) for item in value)
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
     return os.path.expandvars(value) if isinstance(value, str) else value

@@ -72,7 +72,7 @@ class Pipeline:
         self.sh_degree = cell.definition.sh_degree
         if self.sh_degree is None and cell.scene.targets == "photos":
             self.sh_degree = 3
-        self.reducing, self.recovering, self.adapting = Spent(), Spent(), Spent()
+        self.selecting, self.reducing, self.recovering, self.adapting = (Spent() for _ in range(4))
         self.steps = 0
         self.last: dict[str, Any] = {}
 
@@ -99,7 +99,9 @@ class Pipeline:
         method, stand = self.cell.method, self.stand
         views = stand.train
         if method.policy is not None:
-            views = stand.select(self.source, method.policy, method.k, self.cell.seed)
+            chosen = stand.select(self.source, method.policy, method.k, self.cell.seed)
+            views = chosen.output
+            self.selecting.add(chosen.usage)
         state, flags = self.source, None
         counts = self.counts()
         for number, count in enumerate(counts):
@@ -153,7 +155,7 @@ class Pipeline:
             each = int(early * matched.amount)
             steps = int(matched.amount) - each * (rounds - 1) if final else each
             return {"schedule": schedule, "steps": steps, "seconds": None} if steps else None
-        left = matched.amount - self.reducing.wall - self.recovering.wall
+        left = matched.amount - self.selecting.wall - self.reducing.wall - self.recovering.wall
         if left <= 0:  # scored as it is: the row's seconds say that they were not enough
             return None
         remaining = 1 - early * number

@@ -30,12 +30,14 @@ _COLUMNS = (
     "MB",
     "PSNR",
     "SSIM",
-    "LPIPS",
+    "LPIPS (VGG)",
+    "LPIPS (Alex)",
     "drift95",
     "needle",
     "luma drift",
     "reduce CPU s",
     "recover CPU s",
+    "seconds",
     "peak MB",
 )
 
@@ -141,7 +143,7 @@ def _cells(row: Row) -> list[str]:
     def figure(value: float | None, form: str) -> str:
         return "–" if value is None else format(value, form)
 
-    lpips = row.lpips_alex if row.lpips_vgg is None else row.lpips_vgg
+    overran = row.matched == "seconds" and not row.steps
     return [
         row.method + (f" (seed {row.seed})" if row.seed else ""),
         Matched(row.matched, row.amount).label,
@@ -149,12 +151,14 @@ def _cells(row: Row) -> list[str]:
         f"{(row.bytes or 0) / 1e6:.2f}",
         figure(row.psnr, ".2f"),
         figure(row.ssim, ".4f"),
-        figure(lpips, ".4f"),
+        figure(row.lpips_vgg, ".4f"),
+        figure(row.lpips_alex, ".4f"),
         figure(row.drift95, ".1f"),
         figure(row.needle, ".1%"),
         figure(row.luma_drift, ".4f"),
         figure(row.reduce_cpu_s, ".1f"),
         figure(row.recover_cpu_s, ".1f"),
+        figure(row.seconds, ".1f") + (" (reduction alone)" if overran else ""),
         figure(max(row.reduce_peak_mb or 0.0, row.recover_peak_mb or 0.0), ".0f"),
     ]
 
@@ -172,7 +176,9 @@ def _views(
         if not pictured:
             continue
         ranked = sorted(pictured, key=lambda view: ours["views"][split][view]["psnr"])
-        page.heading(f"{scene} at {ratio:g}×: worst views first", 4)
+        count = len(ours["views"][split])
+        among = "" if len(pictured) == count else f" (of {len(pictured)} pictured, of {count})"
+        page.heading(f"{scene} at {ratio:g}×: worst views first{among}", 4)
         for view in ranked[:_VIEWS]:
             target = _read(folder / "images" / ours["scene_key"] / split / f"{view}.jpg")
             shown = [

@@ -21,6 +21,7 @@ from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.lpips import Lpips, load_lpips
 from g2ard.progress import Progress, silent
+from g2ard.recover.anchors import needle
 
 __all__ = ["bench_run", "cells_of"]
 
@@ -58,6 +59,10 @@ def bench_run(
     (folder / "cells").mkdir(parents=True, exist_ok=True)
     weights = {d.lpips: load_lpips(d.folder / d.lpips) for d in definitions if d.lpips is not None}
     stand: Stand | None = None
+    if again:
+        for definition in definitions:
+            for scene in definition.scenes:
+                shutil.rmtree(folder_of(folder / "work", definition, scene) / "stages", ignore_errors=True)
     for number, cell in enumerate(cells):
         progress("bench", number, len(cells), {"cell": cell.label})
         if not again and _done(folder, cell):
@@ -70,10 +75,10 @@ def bench_run(
             stand = None
             answer = {"rows": [asdict(_failed(cell, error))], "views": {}}
         _write_json(folder / "cells" / f"{cell.key}.json", {**answer, "label": cell.label})
-        write_csv(folder / "rows.csv", _rows(folder, cells) + _others(folder, definitions))
+        write_csv(folder / "rows.csv", _rows(folder, cells) + _others(folder, cells))
     progress("bench", len(cells), len(cells), {})
     rows = _rows(folder, cells)
-    write_csv(folder / "rows.csv", rows + _others(folder, definitions))
+    write_csv(folder / "rows.csv", rows + _others(folder, cells))
     if not keep and not any(row.error for row in rows):
         for definition in definitions:
             for scene in definition.scenes:
@@ -102,12 +107,16 @@ def _rows(folder: Path, cells: Sequence[Cell]) -> list[Row]:
     return [row for cell in cells for row in _read_cell(folder, cell)]
 
 
-def _others(folder: Path, definitions: Sequence[Definition]) -> list[Row]:
-    """Rows of other studies that `folder` holds, by study and label."""
-    ours = {definition.name for definition in definitions}
-    found = [json.loads(path.read_text()) for path in (folder / "cells").glob("*.json")]
-    rows = [(row["study"], cell["label"], Row(**row)) for cell in found for row in cell["rows"]]
-    return [row for study, _, row in sorted(rows, key=lambda r: r[:2]) if study not in ours]
+def _others(folder: Path, cells: Sequence[Cell]) -> list[Row]:
+    """Rows of what else `folder` holds, by study and label; of one cell measured on other files, the last."""
+    ours = {(cell.definition.name, cell.label, cell.seed) for cell in cells}
+    found: dict[tuple[str, str, int], list[Row]] = {}
+    for path in sorted((folder / "cells").glob("*.json"), key=lambda p: p.stat().st_mtime_ns):
+        held = json.loads(path.read_text())
+        rows = [Row(**row) for row in held["rows"]]
+        if rows:
+            found[rows[0].study, held["label"], rows[0].seed] = rows
+    return [row for key in sorted(found) if key not in ours for row in found[key]]
 
 
 def _head(cell: Cell, prior: str, split: str) -> Row:
@@ -144,8 +153,8 @@ def _measure(stand: Stand, cell: Cell, folder: Path, lpips: dict[str, Lpips]) ->
         "budget": work.budget,
         "count": len(splats),
         "bytes": splats.nbytes,
-        "drift95": work.last.get("drift95"),
-        "needle": work.last.get("needle"),
+        "drift95": work.last.get("drift95", 0.0),  # what was not recovered has not moved
+        "needle": needle(splats.scales),
         "steps": work.steps,
         "reduce_cpu_s": work.reducing.cpu,
         "reduce_wall_s": work.reducing.wall,
@@ -153,9 +162,12 @@ def _measure(stand: Stand, cell: Cell, folder: Path, lpips: dict[str, Lpips]) ->
         "recover_cpu_s": work.recovering.cpu,
         "recover_wall_s": work.recovering.wall,
         "recover_peak_mb": work.recovering.peak,
+        "select_cpu_s": work.selecting.cpu if cell.method.policy else None,
+        "select_peak_mb": work.selecting.peak if cell.method.policy else None,
         "adapt_cpu_s": work.adapting.cpu if cell.definition.adapt_steps else None,
-        "cpu_s": work.reducing.cpu + work.recovering.cpu,
-        "seconds": work.reducing.wall + work.recovering.wall,
+        "adapt_peak_mb": work.adapting.peak if cell.definition.adapt_steps else None,
+        "cpu_s": work.selecting.cpu + work.reducing.cpu + work.recovering.cpu,
+        "seconds": work.selecting.wall + work.reducing.wall + work.recovering.wall,
     }
     rows, views = [], {}
     for split, targets in stand.test.items():

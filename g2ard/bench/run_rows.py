@@ -49,7 +49,7 @@ class Row:
         lpips_vgg: the same; None without weights.
         lpips_alex: the same.
         luma_drift: mean of |mean luma of the render − the target's|.
-        drift95: of the last recovery, in thicknesses of its anchors.
+        drift95: of the last recovery, in thicknesses of its anchors; 0 without one.
         needle: share of needles.
         views: how many were scored.
         steps: optimiser steps taken.
@@ -60,10 +60,13 @@ class Row:
         recover_cpu_s: of all recoveries, whole processes.
         recover_wall_s: of their loops alone, which is what a limit in seconds counts.
         recover_peak_mb: of the largest.
-        adapt_cpu_s: of the adaptation.
-        cpu_s: of reductions and recoveries.
-        seconds: reduce_wall_s + recover_wall_s; above `amount` where reduction alone took longer, and
-            nothing was recovered.
+        select_cpu_s: of the selection of views, a whole process; None without one.
+        select_peak_mb: its.
+        adapt_cpu_s: of the adaptation, the same.
+        adapt_peak_mb: its.
+        cpu_s: of selection, reductions and recoveries.
+        seconds: the selection's, reduce_wall_s and recover_wall_s; above `amount` where reduction alone
+            took longer, and nothing was recovered.
         version: of g2ard.
         machine: processor and cores.
         error: why there are no figures; "" if there are.
@@ -99,7 +102,10 @@ class Row:
     recover_cpu_s: float | None = None
     recover_wall_s: float | None = None
     recover_peak_mb: float | None = None
+    select_cpu_s: float | None = None
+    select_peak_mb: float | None = None
     adapt_cpu_s: float | None = None
+    adapt_peak_mb: float | None = None
     cpu_s: float | None = None
     seconds: float | None = None
     version: str = ""

@@ -19,7 +19,7 @@ from g2ard.targets import Targets, mask_of
 __all__ = ["Scored", "ViewFigures", "luma", "pictured", "save_jpeg", "score"]
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
-_PICTURES = 16
+_PICTURES = 32
 _QUALITY = 88
 
 
@@ -92,10 +92,10 @@ def score(
 
 
 def pictured(count: int) -> list[int]:
-    """The views that are kept as pictures: all, or 16 evenly spaced.
+    """The views that are kept as pictures: all, or 32 evenly spaced.
 
     >>> pictured(3), len(pictured(100))
-    ([0, 1, 2], 16)
+    ([0, 1, 2], 32)
     """
     chosen = np.unique(np.linspace(0, count - 1, min(count, _PICTURES)).round().astype(int))
     return [int(view) for view in chosen]

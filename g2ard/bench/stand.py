@@ -237,12 +237,12 @@ class Stand:
 
         return self._run({"kind": "rival", **options}, source.key, "out.ply", {}, command)
 
-    def select(self, source: Stage, policy: str, k: float, seed: int) -> Path:
+    def select(self, source: Stage, policy: str, k: float, seed: int) -> Stage:
         """Part of the training views, chosen by what the prior shows."""
         count = max(1, round(k * len(io.read_views(self.train))))
         job = {"kind": "select", "policy": policy, "k": count, "seed": seed}
         files = {"scene": source.output, "views": self.train}
-        return self._run(job, source.key, "views.json", files).output
+        return self._run(job, source.key, "views.json", files)
 
     def recover(self, source: Stage, views: Path, options: dict[str, Any]) -> Stage:
         """Recovery against the training targets."""

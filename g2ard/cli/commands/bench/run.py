@@ -85,12 +85,24 @@ def run_(
     if scene:
         studies = [_ad_hoc(scene, views, photos, names, options)]
     else:
-        studies = [_narrowed(path, only, names, options) for path in definitions or []]
+        studies = [_narrowed(run, path, only, names, options) for path in definitions or []]
     rows = bench_run(studies, output, keep=keep, again=run.overwrite, progress=run.progress)
     write_report(output, studies, rows)
     run.console.table(
         "PSNR and SSIM on unseen views; CPU seconds of reduction and recovery",
-        ["study", "scene", "ratio", "method", "matched", "split", "Gaussians", "PSNR", "SSIM", "CPU s"],
+        [
+            "study",
+            "scene",
+            "ratio",
+            "method",
+            "matched",
+            "split",
+            "against",
+            "Gaussians",
+            "PSNR",
+            "SSIM",
+            "CPU s",
+        ],
         [_bench_row(row) for row in rows],
     )
     run.say(f"rows: {output / 'rows.csv'}\nreport: {output / 'report.html'}")
@@ -116,7 +128,9 @@ def _ad_hoc(
     return made.narrowed(**{**options, "adapt_steps": None}, methods=_chosen(made, names or list(_PRUNERS)))
 
 
-def _narrowed(path: Path, only: str | None, names: list[str], options: dict[str, Any]) -> Definition:
+def _narrowed(
+    run: Run, path: Path, only: str | None, names: list[str], options: dict[str, Any]
+) -> Definition:
     """A definition with the options that apply to it: it keeps to the kinds of budget it has."""
     from g2ard.bench.definition import read_definition
     from g2ard.errors import InputError
@@ -127,6 +141,9 @@ def _narrowed(path: Path, only: str | None, names: list[str], options: dict[str,
     if not scenes:
         raise InputError(f"{path}: no scene {only!r} (it has {', '.join(s.name for s in study.scenes)})")
     own = {key: options[key] for key in ("steps", "seconds", "adapt_steps") if getattr(study, key)}
+    for key in ("steps", "seconds", "adapt_steps"):
+        if options[key] and key not in own:
+            run.say(f"{path}: has no {key}, and --{key.replace('_', '-')} is left out there")
     shared = {key: options[key] for key in ("ratios", "seeds", "released", "size", "lpips")}
     methods = _chosen(study, names) if names else None
     return study.narrowed(**own, **shared, scenes=scenes, methods=methods)
@@ -164,7 +181,7 @@ def _whole(text: str) -> int:
 
 def _bench_row(row: Row) -> list[str]:
     matched = row.matched if row.matched == "released" else f"{row.amount:g} {row.matched}"
-    head = [row.study, row.scene, f"{row.ratio:g}", row.method, matched, row.split]
+    head = [row.study, row.scene, f"{row.ratio:g}", row.method, matched, row.split, row.against]
     if row.error:
         return [*head, row.error, "", "", ""]
     return [*head, f"{row.count:,}", f"{row.psnr:.2f}", f"{row.ssim:.4f}", f"{row.cpu_s:.1f}"]
