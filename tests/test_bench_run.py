@@ -5,8 +5,12 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import signal
 import subprocess
+import sys
+import time
 from collections.abc import Callable
+from dataclasses import asdict
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -216,6 +220,10 @@ def test_a_city_is_made_lifted_trained_and_adapted(tmp_path: Path) -> None:
         (("protection = 0.0", 'rounds = "many"'), "rounds: expected one of"),
         (('name = "ball"', 'nam = "ball"'), "lacks 'name'"),
         (("ratios = [4]", "ratios = [4"), "balls.toml"),
+        (("ratios = [4]", "ratios = []"), "no ratios"),
+        (("steps = [9]\nseconds = [3]\n", ""), "no steps"),
+        (("[[scene]]", '[[scene]]\nname = "ball"\n[[scene]]'), "there are two of that name"),
+        (('title = "Balls"', "title = 3"), "title: expected text"),
     ],
 )
 def test_definitions_say_what_is_wrong(tmp_path: Path, change: tuple[str, str], message: str) -> None:
@@ -231,6 +239,13 @@ def test_the_papers_studies_can_be_read() -> None:
         assert found[name].scenes
     assert [m.name for m in found["ablations"].methods][:3] == ["full", "one-shot", "-shape"]
     assert set(found["compression"].ratios) == {5, 10, 20, 30}
+
+
+def test_paths_may_name_environment_variables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("MATRIXCITY", "MIP360", "CAMBRIDGE", "G2ARD_DATA"):
+        monkeypatch.setenv(name, str(tmp_path))
+    for path in (ROOT / "benches" / "definitions").rglob("*.toml"):
+        assert "$" not in repr([asdict(scene) for scene in read_definition(path).scenes]), path
 
 
 def test_pareto_is_what_no_other_beats() -> None:
@@ -338,16 +353,61 @@ def test_a_run_touches_nothing_of_others_and_knows_its_files(tmp_path: Path) -> 
     other = tmp_path / "other.toml"
     other.write_text(SMALL)
     bench_run([read_definition(other)], out)
-    assert {row.study for row in read_rows(out / "rows.csv")} == {"balls", "other"}
+    rows = read_rows(out / "rows.csv")
+    assert [(row.study, row.input_count) for row in rows] == [("other", 800), ("balls", 800)]
+
+
+def test_rows_of_other_ratios_stay(tmp_path: Path) -> None:
+    path, out = read_definition(study(tmp_path, SMALL)), tmp_path / "out"
+    bench_run([path.narrowed(ratios=(4.0, 8.0))], out)
+    assert len(bench_run([path.narrowed(ratios=(2.0,))], out)) == 1
+    assert {row.ratio for row in read_rows(out / "rows.csv")} == {2.0, 4.0, 8.0}
+
+
+def test_one_reduction_a_round(tmp_path: Path) -> None:
+    """The paper's method takes its 75 % where the study has rounds, and one shot where it has not."""
+    text = STUDY.replace('methods = ["g2ard", "pup", "rounds", "nanogs"]', 'methods = ["rounds", "shot"]')
+    text = text.replace("seconds = [3]\n", "").replace("ratios = [4]", "ratios = [10]")
+    shot = '[method.shot]\nbase = "g2ard-paper"\nprotection = 0.0\nrounds = "one"\n'
+    out = tmp_path / "out"
+    rows = bench_run(
+        [read_definition(study(tmp_path, text.replace("[[scene]]", shot + "[[scene]]")))], out, keep=True
+    )
+    assert [row.count for row in rows] == [120, 120]
+    jobs = [json.loads(p.read_text()) for p in out.glob("work/*/stages/*/job.json")]
+    assert sorted(job["count"] for job in jobs if job["kind"] == "reduce")[:2] == [120, 120]
+    made = {
+        tuple(io.read_splats(p.parent / "out.ply").means.ravel())
+        for p in out.glob("work/*/stages/*/job.json")
+        if json.loads(p.read_text()).get("count") == 120
+    }
+    assert len(made) == 2
+
+
+def test_nothing_is_left_running(tmp_path: Path) -> None:
+    mark = tmp_path / "alive"
+    late = f"import time; time.sleep(1.5); open({str(mark)!r}, 'w')"
+    code = (
+        "from pathlib import Path; import sys; from g2ard.bench.process import measured;"
+        f"measured([sys.executable, '-c', {late!r}], Path({str(tmp_path / 'log')!r}))"
+    )
+    with subprocess.Popen([sys.executable, "-c", code]) as parent:
+        time.sleep(0.8)
+        parent.kill() if sys.platform == "linux" else parent.send_signal(signal.SIGINT)
+    time.sleep(1.5)
+    assert not mark.exists()
 
 
 def test_w_measures_again(tmp_path: Path) -> None:
     path, out = study(tmp_path, SMALL), tmp_path / "out"
     bench_run([read_definition(path)], out, keep=True)
+    made = {p: p.stat().st_mtime_ns for p in out.glob("work/*/stages/*/usage.json")}
     cell = next((out / "cells").iterdir())
     cell.write_text(cell.read_text().replace('"psnr": ', '"psnr": 1'))
     wrong = bench_run([read_definition(path)], out, keep=True)[0].psnr
     assert bench_run([read_definition(path)], out, keep=True, again=True)[0].psnr < wrong - 50
+    assert made
+    assert all(p.stat().st_mtime_ns > then for p, then in made.items())
 
 
 @pytest.mark.parametrize(

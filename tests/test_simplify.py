@@ -114,6 +114,24 @@ def test_odd_scenes(method, name):
         assert out.report["infinite_logits"] == infinite
 
 
+@pytest.mark.parametrize("method", ["default", "fast"])
+def test_a_floater_swallows_nothing_that_shows(method):
+    prior = scene(1000)
+    far = prior.means.copy()
+    far[7] = [160_000, 0, 0]
+    out = simplify(replace(prior, means=far), 100, method=method)
+    assert out.report["faded"] == 0
+    assert (out.parents == out.parents[7]).sum() == 1
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_scales_too_large_to_square(method):
+    prior = scene(300)
+    assert_sound(
+        simplify(replace(prior, scales=np.full((300, 3), 1e30, np.float32)), 30, method=method), 300, 30
+    )
+
+
 def test_floaters_that_fade_are_counted():
     prior = replace(scene(500), logit_opacities=np.full(500, 3, np.float32))
     assert simplify(prior, 50).report["faded"] == 0

@@ -13,10 +13,14 @@ from g2ard.errors import InputError
 __all__ = ["Usage", "measured"]
 
 _LAUNCHER = """
-import os, sys, time
+import os, signal, sys, time
+if sys.platform == "linux":  # a signal when whoever started us is gone
+    import ctypes
+    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
 began = time.perf_counter()
 to_log = [(os.POSIX_SPAWN_DUP2, 2, 1)]
 pid = os.posix_spawnp(sys.argv[1], sys.argv[1:], os.environ, file_actions=to_log)
+signal.signal(signal.SIGTERM, lambda *_: os.kill(pid, signal.SIGTERM))
 _, status, usage = os.wait4(pid, 0)
 cpu, wall = usage.ru_utime + usage.ru_stime, time.perf_counter() - began
 print(os.waitstatus_to_exitcode(status), cpu, wall, usage.ru_maxrss)
@@ -40,7 +44,7 @@ class Usage:
 
 
 def measured(command: Sequence[str], log: Path) -> Usage:
-    """Run a command to its end.
+    """Run a command to its end; it ends with us.
 
     Args:
         command: program and arguments.
@@ -51,9 +55,14 @@ def measured(command: Sequence[str], log: Path) -> Usage:
     """
     with log.open("wb") as out:
         launched = [sys.executable, "-I", "-S", "-c", _LAUNCHER, *command]
-        told = subprocess.run(
-            launched, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=out, check=False
-        ).stdout.split()
+        with subprocess.Popen(
+            launched, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=out
+        ) as launcher:
+            try:
+                told = launcher.communicate()[0].split()
+            except BaseException:  # Ctrl-C to us alone: nothing is left running
+                launcher.terminate()
+                raise
     said = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     last = said[-1] if said else "it said nothing"
     if len(told) != 4:

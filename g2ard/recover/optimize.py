@@ -27,8 +27,9 @@ from g2ard.targets import Targets, fingerprint_of, mask_of
 __all__ = ["Recovered", "Watch", "recover"]
 
 _TRIAL_STEPS = 20
-_TRIAL_SHARE = 0.1
-"""Under a time limit: steps of a trial, and the share of the limit that all trials may take."""
+_TRIAL_SHARE, _CALM_SHARE = 0.1, 0.3
+"""Under a time limit: steps of a trial, and the share of the limit that all trials may take; the second where
+rates that are too large would spend it on nothing."""
 
 _LOG_POINTS = 10
 """How often Drift95 and Needle are logged over a recovery."""
@@ -209,25 +210,32 @@ class _Loop:
         self.multiplier = guess
         if not steps:
             return
-        began = time.monotonic()
+        began, share = time.monotonic(), _TRIAL_SHARE
+        seen: dict[float, float] = {}
 
         def score(multiplier: float) -> float:
             engine = self._new_engine()
             for step in range(steps):
-                if limit is not None and time.monotonic() - began > _TRIAL_SHARE * limit:
+                if limit is not None and time.monotonic() - began > share * limit:
                     raise TimeoutError
                 self._learn(engine, step, step / steps, multiplier)
-            return self.probe.all_of(engine.splats())
+            seen[multiplier] = self.probe.all_of(engine.splats())
+            return seen[multiplier]
 
+        nearly_there = guess <= min(MULTIPLIERS)
         try:
-            self.multiplier, seen = climb(score, guess, start)
+            self.multiplier, _ = climb(score, guess, start)
             if seen[self.multiplier] < start:  # a few steps on photos that are nearly met say nothing
-                self.multiplier = guess
-                if guess <= min(MULTIPLIERS):
-                    self.multiplier, seen = calm(score, min(MULTIPLIERS), seen, start)
-            self.trials = [{"multiplier": m, "psnr": value} for m, value in seen.items()]
-        except TimeoutError:
-            pass  # the guess stands
+                self.multiplier, share = guess, _CALM_SHARE
+                if nearly_there:
+                    self.multiplier, _ = calm(score, min(MULTIPLIERS), seen, start)
+        except TimeoutError:  # the best of what was seen, or calmer than all of it
+            best = max(seen, key=lambda m: seen[m], default=guess)
+            if seen.get(best, start) >= start:
+                self.multiplier = best
+            elif nearly_there:
+                self.multiplier = best / 3
+        self.trials = [{"multiplier": m, "psnr": value} for m, value in sorted(seen.items())]
         self.seconds = time.monotonic() - began
 
     def _learn(

@@ -40,10 +40,10 @@ def trial_steps(horizon: int) -> int:
 
 
 def climb(score: Callable[[float], float], guess: float, start: float) -> tuple[float, dict[float, float]]:
-    """The best of `MULTIPLIERS`, walking uphill from the one nearest to `guess`, and all scores seen.
+    """The best of `MULTIPLIERS`, walking both ways from the one nearest to `guess`, and all scores seen.
 
-    Between two that gain nearly the same the larger is better: a long run calms down in the end, a trial has
-    no time for what the larger would yet reach.
+    Of those that gain nine tenths of the best gain the largest is taken: a long run calms down in the end, a
+    trial has no time for what the larger would yet reach.
 
     Args:
         score: PSNR that a trial with a multiplier ends at.
@@ -55,17 +55,22 @@ def climb(score: Callable[[float], float], guess: float, start: float) -> tuple[
     >>> round(climb(lambda m: {1 / 3: 32.0, 3**-0.5: 31.9}.get(m, 30.0), 1 / 3, start=30)[0], 3)
     0.577
     """
+    seen: dict[int, float] = {}
+
+    def good(i: int) -> bool:
+        best = max(seen.values())
+        return seen[i] >= best - _TIE * max(best - start, 0.0)
+
     at = min(range(len(MULTIPLIERS)), key=lambda i: abs(math.log(MULTIPLIERS[i] / guess)))
-    seen = {at: score(MULTIPLIERS[at])}
-    for way in (-1, 1):
-        while 0 <= at + way < len(MULTIPLIERS):
-            if at + way not in seen:
-                seen[at + way] = score(MULTIPLIERS[at + way])
-            smaller, larger = seen[min(at, at + way)], seen[max(at, at + way)]
-            if (larger > smaller - _TIE * max(smaller - start, 0.0)) != (way > 0):
+    for way in (range(at, -1, -1), range(at + 1, len(MULTIPLIERS))):
+        for i in way:
+            value = score(MULTIPLIERS[i])
+            seen[i] = value if math.isfinite(value) else -math.inf
+            if not good(i):
                 break
-            at += way
-    return MULTIPLIERS[at], {MULTIPLIERS[i]: value for i, value in sorted(seen.items())}
+    best = max(seen, key=lambda i: (seen[i], -i))
+    chosen = max(filter(good, seen)) if seen[best] > start else best
+    return MULTIPLIERS[chosen], {MULTIPLIERS[i]: value for i, value in sorted(seen.items())}
 
 
 def calm(

@@ -35,6 +35,9 @@ class RowAdam(torch.optim.Optimizer):
     ([[-0.1, 0.1], [0.0, 0.0], [0.0, 0.0]], 1)
     """
 
+    skipped = 0
+    """Steps of single rows left out because a gradient was not finite; not part of `state_dict`."""
+
     def __init__(
         self,
         parameters: Mapping[str, Tensor],
@@ -44,11 +47,10 @@ class RowAdam(torch.optim.Optimizer):
     ) -> None:
         groups = [{"params": [p], "name": name} for name, p in parameters.items()]
         super().__init__(groups, {"lr": 0.0, "betas": betas, "eps": eps})
-        first = next(iter(parameters.values()))
-        self.count = torch.zeros(len(first), dtype=torch.int64, device=first.device)
-        self.skipped = 0
+        rows = len(next(iter(parameters.values())))
         for p in parameters.values():
-            self.state[p] = {"m": torch.zeros_like(p), "v": torch.zeros_like(p)}
+            count = torch.zeros(rows, dtype=torch.int64, device=p.device)
+            self.state[p] = {"m": torch.zeros_like(p), "v": torch.zeros_like(p), "count": count}
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> None:  # type: ignore[override]
@@ -56,25 +58,25 @@ class RowAdam(torch.optim.Optimizer):
         if closure is not None:
             raise ValueError("RowAdam takes no closure")
         groups = [group for group in self.param_groups if group["params"][0].grad is not None]
-        touched, sound = (
-            torch.zeros_like(self.count, dtype=torch.bool),
-            torch.ones_like(self.count, dtype=torch.bool),
-        )
-        for group in groups:
-            grad = group["params"][0].grad.reshape(len(touched), -1)
-            touched |= (grad != 0).any(1)
-            sound &= (grad.abs() <= _LARGEST).all(1)
+        grads = [
+            group["params"][0].grad.flatten(1)
+            if group["params"][0].ndim > 1
+            else group["params"][0].grad[:, None]
+            for group in groups
+        ]
+        touched = torch.stack([(grad != 0).any(1) for grad in grads]).any(0)
+        sound = torch.stack([(grad.abs() <= _LARGEST).all(1) for grad in grads]).all(0)
         self.skipped += int((touched & ~sound).sum())
         rows = (touched & sound).nonzero()[:, 0]
-        self.count[rows] += 1
-        count = self.count[rows].double()
         for group in groups:
-            (p,), (beta1, beta2) = group["params"], group["betas"]
-            grad = p.grad[rows]
-            m, v = (self.state[p][key] for key in ("m", "v"))
-            shape = (-1, *[1] * (grad.ndim - 1))
-            bias1, bias2 = ((1 - beta**count).reshape(shape) for beta in (beta1, beta2))
-            m[rows] = m[rows].lerp_(grad, 1 - beta1)
-            v[rows] = v[rows].mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
-            size = v[rows] * (1 / bias2).float()
-            p[rows] -= group["lr"] * (m[rows] * (1 / bias1).float()) / (size.sqrt_() + group["eps"])
+            self._step_rows(group, rows)
+
+    def _step_rows(self, group: dict[str, Any], rows: Tensor) -> None:
+        (p,), (beta1, beta2) = group["params"], group["betas"]
+        grad, (m, v, count) = p.grad[rows], (self.state[p][key] for key in ("m", "v", "count"))
+        count[rows] += 1
+        steps = count[rows].double().reshape(-1, *[1] * (grad.ndim - 1))
+        bias1, bias2 = ((1 / (1 - beta**steps)).to(p.dtype) for beta in (beta1, beta2))
+        m[rows] = m[rows].lerp_(grad, 1 - beta1)
+        v[rows] = v[rows].mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
+        p[rows] -= group["lr"] * (m[rows] * bias1) / ((v[rows] * bias2).sqrt_() + group["eps"])

@@ -138,7 +138,7 @@ class TorchEngine:
         """Everything a bitwise resume needs."""
         arrays = {f"p.{name}": value.detach().cpu().numpy() for name, value in self._parameters.items()}
         arrays["base"], arrays["unit"] = self._base.cpu().numpy(), self._unit.cpu().numpy()
-        arrays["count"], arrays["skipped"] = self._adam.count.cpu().numpy(), np.array(self._adam.skipped)
+        arrays["skipped"] = np.array(self._adam.skipped)
         for name, key, moment in self._moments():
             arrays[f"{key}.{name}"] = moment.cpu().numpy()
         return arrays
@@ -150,7 +150,6 @@ class TorchEngine:
                 parameter.copy_(torch.from_numpy(state[f"p.{name}"]))
         self._base = torch.from_numpy(state["base"]).to(self.device)
         self._unit = torch.from_numpy(state["unit"]).to(self.device)
-        self._adam.count.copy_(torch.from_numpy(state["count"]))
         self._adam.skipped = int(state["skipped"])
         for name, key, moment in self._moments():
             moment.copy_(torch.from_numpy(state[f"{key}.{name}"]))

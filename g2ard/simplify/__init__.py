@@ -24,6 +24,10 @@ _FAINTEST = np.float32(-16)
 """A logit; files' readers clamp to it too."""
 
 
+_LARGEST = np.float32(np.exp(43))
+"""A scale whose square is a float32; files' readers clamp to it too."""
+
+
 @dataclass(frozen=True, eq=False)
 class Simplified:
     """What simplification made.
@@ -115,8 +119,8 @@ def simplify(
     The result does not depend on the order of the rows, the unit, or the number of threads.
 
     Args:
-        splats: the scene. Infinite logits mean α = 0 or 1; rows with other non-finite values are dropped
-            and counted.
+        splats: the scene. Infinite logits mean α = 0 or 1, scales over e⁴³ count as that; rows with other
+            non-finite values are dropped and counted.
         budget: Gaussians to keep, at most as many as there are.
         method: the policy.
         visibility: for `default` and `fast`: what views see of each Gaussian (`g2ard.render.visibility`), or
@@ -227,7 +231,7 @@ def _clean(splats: Splats) -> tuple[Splats, NDArray[np.bool_] | slice]:
         scene,
         means=np.ascontiguousarray(scene.means, kind),
         quats=np.ascontiguousarray(scene.quats, np.float32),
-        scales=np.ascontiguousarray(scene.scales, np.float32),
+        scales=np.minimum(scene.scales, _LARGEST, dtype=np.float32),
         logit_opacities=np.ascontiguousarray(scene.logit_opacities, np.float32),
         sh0=np.ascontiguousarray(scene.sh0, np.float32),
         shN=np.ascontiguousarray(scene.shN, np.float32),
@@ -301,7 +305,7 @@ def _faded(splats: Splats, small: Splats, parents: NDArray[np.int64]) -> int:
 
 def _spared(rounds: list[dict[str, Any]]) -> dict[str, int]:
     """What the paper's rounds need not have done."""
-    if not all("cells" in r for r in rounds):
+    if not rounds or "cells" not in rounds[0]:
         return {}
     return {
         "coverages": sum(r["refused"]["energy"] for r in rounds),

@@ -47,6 +47,9 @@ pub struct Node {
 /// α never exceeds it: renderers clip there.
 pub const MAX_ALPHA: f32 = 0.99;
 
+/// Renderers draw nothing fainter.
+const MIN_ALPHA: f32 = 1.0 / 255.0;
+
 #[inline(always)]
 fn adjugate(s: &Sym) -> Sym {
     let [xx, xy, xz, yy, yz, zz] = *s;
@@ -211,6 +214,9 @@ impl Node {
             0.5
         };
         let (p, q, r) = (self.alpha, other.alpha, m.alpha);
+        if r < MIN_ALPHA && p.max(q) >= MIN_ALPHA {
+            return f32::MAX; // what is spread so thin that nobody draws it would be lost
+        }
         let (u, v) = (share * p, (1.0 - share) * q);
         let (mut geo, mut col) = (0.0, 0.0);
         for l in 0..USED as usize {

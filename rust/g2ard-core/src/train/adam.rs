@@ -67,6 +67,7 @@ impl Kernel for Update<'_> {
                     continue;
                 }
             }
+            active &= !zero(&g).bits();
             let good = finite(&g).bits() & active;
             skipped += (active & !good).count_ones() as usize;
             updated += good.count_ones() as usize;
@@ -90,6 +91,23 @@ fn zero_unseen<F: Lanes>(g: &mut RowGradients<F>, seen: F::Mask) {
         g.quat[k] = g.quat[k].only(seen);
     }
     g.logit_opacity = g.logit_opacity.only(seen);
+}
+
+/// Lanes without any gradient, such as those that a mask hides: they are left alone too.
+#[inline(always)]
+fn zero<F: Lanes>(g: &RowGradients<F>) -> F::Mask {
+    let none = F::splat(0.0);
+    let mut all = none.ge(g.logit_opacity.abs());
+    for k in 0..3 {
+        all = all
+            .and(none.ge(g.mean[k].abs()))
+            .and(none.ge(g.log_scale[k].abs()))
+            .and(none.ge(g.rgb[k].abs()));
+    }
+    for k in 0..4 {
+        all = all.and(none.ge(g.quat[k].abs()));
+    }
+    all
 }
 
 /// Lanes whose every gradient can be squared.
