@@ -182,6 +182,25 @@ def test_trials_choose_rates_that_suit_the_scene(student: Splats, targets: Teach
     assert (report["multiplier"], report["trials"]) == (0.7, [])
 
 
+def test_a_start_that_is_nearly_there_takes_small_steps_without_trials(targets: TeacherRenders) -> None:
+    near = replace(TEACHER, sh0=TEACHER.sh0 + np.float32(0.004))
+    report = recover(near, targets, RecoverConfig(time_limit=0.05)).report
+    assert report["trials"] == []
+    assert report["multiplier"] < 1 / 3
+
+
+def test_masked_gaussians_are_left_alone(student: Splats) -> None:
+    class Masked(TeacherRenders):
+        def mask(self, view: int) -> Any:
+            return np.arange(self[view].shape[1])[None, :] + np.zeros((self[view].shape[0], 1)) < 20
+
+    masked = Masked(TEACHER, VIEWS)
+    fused, torch = (
+        recover(student, masked, RecoverConfig(steps=12, engine=e)).splats for e in ("fused", "torch")
+    )
+    assert np.abs(fused.means - torch.means).max() < 1e-4
+
+
 def test_trials_stop_where_the_clock_is_short(student: Splats, targets: TeacherRenders) -> None:
     report = recover(student, targets, RecoverConfig(time_limit=0.05)).report
     assert report["trials"] == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -204,7 +205,8 @@ class _Loop:
         if self.config.schedule.multiplier is not None:
             self.multiplier = self.config.schedule.multiplier
             return
-        guess = multiplier_for(10 ** (-start / 20))
+        rmse = 10 ** (-start / 20)
+        guess = multiplier_for(rmse)
         limit = self.config.time_limit
         steps = trial_steps(self.config.horizon) if limit is None else _TRIAL_STEPS
         self.multiplier = guess
@@ -231,10 +233,10 @@ class _Loop:
                     self.multiplier, _ = calm(score, min(MULTIPLIERS), seen, start)
         except TimeoutError:  # the best of what was seen, or calmer than all of it
             best = max(seen, key=lambda m: seen[m], default=guess)
-            if seen.get(best, start) >= start:
+            if seen.get(best, -math.inf) >= start:
                 self.multiplier = best
             elif nearly_there:
-                self.multiplier = best / 3
+                self.multiplier = min(best / 3, multiplier_for(rmse, 0.01))
         self.trials = [{"multiplier": m, "psnr": value} for m, value in sorted(seen.items())]
         self.seconds = time.monotonic() - began
 

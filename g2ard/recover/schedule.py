@@ -124,12 +124,13 @@ def schedule_named(name: str, steps: int | None = None) -> Schedule:
     return SCHEDULES[name] if steps is None else SCHEDULES[name].scaled(steps)
 
 
-def multiplier_for(start_rmse: float) -> float:
+def multiplier_for(start_rmse: float, least: float = 1 / 3) -> float:
     """A guess at the rate multiplier from the RMSE before recovery: 1 from 0.039 up, a third from 0.013 down.
 
-    The better a start already is, the smaller the steps that improve it.
+    The better a start already is, the smaller the steps that improve it. A third is the `least` that trials
+    begin at; where there is no time for trials, starts that are nearly there want less.
 
     >>> multiplier_for(0.05), round(multiplier_for(0.026), 3), round(multiplier_for(0.001), 3)
     (1.0, 0.667, 0.333)
     """
-    return min(1.0, max(1 / 3, start_rmse / 0.039))
+    return min(1.0, max(least, start_rmse / 0.039))
