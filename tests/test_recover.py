@@ -172,7 +172,7 @@ def test_paper_schedule_runs_with_its_own_rates(student: Splats, targets: Teache
 def test_trials_choose_rates_that_suit_the_scene(student: Splats, targets: TeacherRenders) -> None:
     report = recover(student, targets, RecoverConfig(steps=100)).report
     most = max(trial["psnr"] for trial in report["trials"]) - report["psnr"]["before"]
-    good = [t for t in report["trials"] if t["psnr"] - report["psnr"]["before"] >= 0.9 * most]
+    good = [t for t in report["trials"] if t["psnr"] - report["psnr"]["before"] >= 0.96 * most]
     assert report["multiplier"] == max(trial["multiplier"] for trial in good)
     assert len(report["trials"]) >= 2
     nearly = recover(TEACHER, targets, RecoverConfig(steps=100)).report  # nothing to gain: small steps

@@ -17,7 +17,7 @@ __all__ = ["MULTIPLIERS", "Probe", "calm", "climb", "trial_steps"]
 MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
 """Of all rates; trained scenes want 1 or less, lifts more."""
 
-_TIE = 0.1
+_TIE = 0.04
 """Gains that differ by less than this share of the smaller multiplier's are nearly the same."""
 _CALMEST = 0.01
 """Smaller ones change nothing that 8 bits show."""
@@ -42,7 +42,7 @@ def trial_steps(horizon: int) -> int:
 def climb(score: Callable[[float], float], guess: float, start: float) -> tuple[float, dict[float, float]]:
     """The best of `MULTIPLIERS`, walking both ways from the one nearest to `guess`, and all scores seen.
 
-    Of those that gain nine tenths of the best gain the largest is taken: a long run calms down in the end, a
+    Of those whose gain is within 4 % of the best the largest is taken: a long run calms down in the end, a
     trial has no time for what the larger would yet reach.
 
     Args:
@@ -52,7 +52,7 @@ def climb(score: Callable[[float], float], guess: float, start: float) -> tuple[
 
     >>> climb(lambda m: -abs(m - 1), 0.2, start=0)[0]
     1.0
-    >>> round(climb(lambda m: {1 / 3: 32.0, 3**-0.5: 31.9}.get(m, 30.0), 1 / 3, start=30)[0], 3)
+    >>> round(climb(lambda m: {1 / 3: 32.0, 3**-0.5: 31.95}.get(m, 30.0), 1 / 3, start=30)[0], 3)
     0.577
     """
     seen: dict[int, float] = {}
