@@ -1,4 +1,4 @@
-"""Recovery steps on an NVIDIA GPU: gsplat's rasteriser, torch's loss and Adam."""
+"""Recovery steps on an NVIDIA GPU: gsplat's rasteriser, torch's loss, Adam by rows."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
 """Of all rates; trained scenes want 1 or less, lifts more."""
 
 _TIE = 0.04
-"""Gains that differ by less than this share of the smaller multiplier's are nearly the same."""
+"""Gains that differ from the best by less than this share of it are nearly the same."""
 _CALMEST = 0.01
 """Smaller ones change nothing that 8 bits show."""
 _VIEWS = 8
