@@ -38,7 +38,7 @@ lint: setup
 
 # Needs a scene: SCENE=path, or real data. Every study runs once, small: one scene, two ratios, few steps.
 # What bench/ and bench.csv hold is not measured again; `make clean` removes them.
-QUICK := --only city,guitar --ratios 10,30 --seeds 0 --size 240 --steps 150 --seconds 12 --adapt-steps 500
+QUICK := --only city,guitar --ratios 10,30 --seeds 0 --size 240 --steps 150 --seconds 8 --adapt-steps 500
 SCENE ?= $(G2ARD_DATA)/playbot/0_0
 bench: setup
 	$(BIN)/g2ard bench raster $(SCENE)
