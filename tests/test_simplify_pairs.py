@@ -18,8 +18,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from reference import simplify as naive
 
 
-@pytest.mark.parametrize("method", ["default", "fast"])
-def test_what_is_seen_is_kept_finer(method):
+@pytest.mark.parametrize(("method", "least"), [("default", 0.6), ("fast", 0.55)])  # fast cuts coarser
+def test_what_is_seen_is_kept_finer(method, least):
     prior = scene(4000)
     left = prior.means[:, 0] < 0
     seen = Views(np.where(left, 100.0, 0.0), np.where(left, 0.01, np.inf))
@@ -27,7 +27,7 @@ def test_what_is_seen_is_kept_finer(method):
     assert_sound(out, 4000, 400)
     blind = simplify(prior, 400, method=method).splats
     share, unguided = (np.mean(s.means[:, 0] < 0) for s in (out.splats, blind))
-    assert share > 0.55
+    assert share > least
     assert share > 5 * unguided  # detail draws the blind one to the other half
     with pytest.raises(InputError, match=r"visibility.weight: expected shape \(4000,\)"):
         simplify(prior, 400, method=method, visibility=Views(np.ones(3), np.ones(4000)))
