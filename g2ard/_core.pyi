@@ -74,19 +74,6 @@ class Look:
     ) -> int: ...
     def by_row(self) -> tuple[_F32, _F32]: ...
 
-def simplify_pool(
-    scene: Splats,
-    parents: NDArray[np.int64],
-    count: int,
-    *,
-    protected: NDArray[np.bool_] | None,
-    weight: NDArray[np.float32],
-    pixel_size: NDArray[np.float32],
-    dilation: float,
-    pixel_scale: float,
-    growth: float,
-) -> dict[str, Any]: ...
-
 _F32 = NDArray[np.float32]
 _Arrays = tuple[_F32, ...]
 _View = tuple[list[list[float]], list[float], tuple[int, int], float]

@@ -40,12 +40,15 @@ class Grid:
         cell: side.
         opaque: (X, Y, Z) int8 king's moves to the nearest cell that stops light, at most `_REACH`.
         murky: likewise to the nearest cell that is not quite empty.
+        scale: (X, Y, Z) float32, geometric mean of the two longer standard deviations of what fills a cell;
+            0 where nothing does.
     """
 
     low: Floats
     cell: float
     opaque: NDArray[np.int8]
     murky: NDArray[np.int8]
+    scale: NDArray[np.float32]
 
     @classmethod
     def of(cls, low: Floats, high: Floats, matter: Matter, axes: Floats, *, cells: int = 0) -> Grid:
@@ -56,7 +59,9 @@ class Grid:
         sides = np.maximum(high - low, np.max(high - low) / 256)
         cell = float(np.cbrt(np.prod(sides) / cells))
         shape = np.maximum(1, np.ceil(sides / cell)).astype(int)
-        points, filled = turned(matter.points, axes), np.zeros(int(np.prod(shape)))
+        points = turned(matter.points, axes)
+        filled, logs = np.zeros(int(np.prod(shape))), np.zeros(int(np.prod(shape)))
+        sizes = 0.5 * np.log(np.maximum(matter.scales[:, 1] * matter.scales[:, 2], np.finfo(float).tiny))
         faces = 2 * np.pi * matter.scales[:, 1] * matter.scales[:, 2] / cell**2
         optical = matter.stand_for * matter.opacities * faces
         parts = np.clip(np.ceil(1.6 * matter.scales[:, 2] / cell), 1, 9).astype(np.int8)
@@ -68,8 +73,10 @@ class Grid:
                 at = points[rows] if spans is None else points[rows] + a * spans[:, 0] + b * spans[:, 1]
                 index, inside = _index(at, low, cell, shape)
                 filled += np.bincount(index[inside], share[inside], filled.size)
+                logs += np.bincount(index[inside], (share * sizes[rows])[inside], filled.size)
+        scale = np.where(filled > 0, np.exp(logs / np.where(filled > 0, filled, 1)), 0).astype(np.float32)
         opaque, murky = (_steps((filled > limit).reshape(shape)) for limit in (_OPAQUE, _MURKY))
-        return cls(low, cell, opaque, murky)
+        return cls(low, cell, opaque, murky, scale.reshape(shape))
 
     def distance(self, points: Floats) -> Floats:
         """(M,) from points to the nearest cell with something in it, or from outside to the box if farther.
@@ -81,6 +88,11 @@ class Grid:
         high = self.low + self.cell * np.array(self.murky.shape)
         outside = norms(np.maximum(0, np.maximum(self.low - points, points - high)))
         return np.where(inside, found, np.maximum(outside, found))
+
+    def scale_at(self, points: Floats) -> Floats:
+        """(M,) `scale` of the cells that points lie in, 0 outside the box."""
+        index, inside = _index(points, self.low, self.cell, np.array(self.murky.shape))
+        return np.where(inside, self.scale.ravel()[index], 0.0)
 
     def cast(self, eyes: Floats, directions: Floats, *, murky: bool = False) -> Floats:
         """(M,) distances at which unit rays first meet an opaque cell, or a murky one; inf if they do not."""

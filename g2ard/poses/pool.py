@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.poses.aerial import plan_aerial
+from g2ard.poses.auto import plan_auto
 from g2ard.poses.lattice import strata
+from g2ard.poses.near import reach_of
 from g2ard.poses.orbit import plan_orbit
 from g2ard.poses.shape import shape_of
 from g2ard.poses.sight import Lens, Poses
@@ -26,10 +28,6 @@ __all__ = ["KINDS", "Pool", "plan_pool"]
 
 KINDS = ("auto", "orbit", "walk", "aerial")
 
-_STREET = 0.25
-"""Share of a landscape's poses that stand in it, where there is room."""
-
-
 @dataclass(frozen=True, eq=False)
 class Pool:
     """A pool and how it came about.
@@ -39,12 +37,16 @@ class Pool:
         kind: "orbit", "walk", "aerial", or several joined by " + ".
         why: what in the scene decided it.
         up: (3,) unit vector in the world.
+        unseen: share of a sample of the matter that no pose sees.
+        coarse: share that is seen, but nowhere with a standard deviation of a pixel.
     """
 
     cameras: Cameras
     kind: str
     why: str
     up: NDArray[np.float64]
+    unseen: float = 0.0
+    coarse: float = 0.0
 
 
 def plan_pool(
@@ -74,9 +76,12 @@ def plan_pool(
     progress("scene", 0, 1)
     site = Site.of(splats, up, rows)
     progress("scene", 1, 1)
-    kinds, why = _kinds(site, kind)
     tell = counter(progress, "poses")
-    poses, used = _planned(site, kinds, count, lens, seed, tell)
+    if kind == "auto":
+        poses, used, why = plan_auto(site, splats, count, lens, seed, tell)
+    else:
+        poses, used, why = _planned(site, kind, count, lens, seed, tell), [kind], "as asked"
+    reach = reach_of(site, poses, lens)
     if len(poses) < count:
         raise InputError(
             f"{len(poses)} of {count} poses found a free place with a view ({kind}: {why}): "
@@ -84,40 +89,23 @@ def plan_pool(
         )
     order = strata(_features(poses), HOLD_OUT, seed)
     cameras = poses.take(order).cameras(site, lens)
-    return Pool(cameras, " + ".join(used), f"{why}; {site.up.why}", site.up.axis)
-
-
-def _kinds(site: Site, kind: str) -> tuple[dict[str, float], str]:
-    """Kinds of poses and their shares, and why."""
-    if kind != "auto":
-        return {kind: 1.0}, "as asked"
-    shape, why = shape_of(site)
-    shares = {  # an orbit takes what the others could not place
-        "object": {"orbit": 1.0},
-        "room": {"walk": 1.0, "orbit": 1.0},
-        "landscape": {"walk": _STREET, "aerial": 1.0, "orbit": 1.0},
-    }
-    return shares[shape], f"{shape}: {why}"
+    return Pool(
+        cameras,
+        " + ".join(used),
+        f"{why}; {site.up.why}",
+        site.up.axis,
+        unseen=reach.unseen(),
+        coarse=float(reach.coarse(lens).mean()),
+    )
 
 
 def _planned(
-    site: Site, kinds: dict[str, float], count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]
-) -> tuple[Poses, list[str]]:
-    """Each kind's share of what is left to plan; a kind that falls short leaves more to the next."""
-    parts: list[Poses] = []
-    used: list[str] = []
-    for kind, share in kinds.items():
-        wanted = round(share * (count - sum(len(part) for part in parts)))
-        if not wanted:
-            continue
-        if kind == "walk":
-            part = plan_walk(site, wanted, lens, seed, tell, indoors=shape_of(site)[0] == "room")
-        else:
-            part = {"orbit": plan_orbit, "aerial": plan_aerial}[kind](site, wanted, lens, seed, tell)
-        if len(part):
-            parts.append(part)
-            used.append(kind)
-    return (Poses.joined(parts) if parts else Poses(np.zeros((0, 3)), np.zeros((0, 3)))), used
+    site: Site, kind: str, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]
+) -> Poses:
+    """Poses of a kind that was asked for."""
+    if kind == "walk":
+        return plan_walk(site, count, lens, seed, tell, indoors=shape_of(site)[0] == "room")
+    return {"orbit": plan_orbit, "aerial": plan_aerial}[kind](site, count, lens, seed, tell)
 
 
 def _lens(size: tuple[int, int], fov: float) -> Lens:

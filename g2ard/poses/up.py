@@ -21,6 +21,10 @@ _FACING = np.cos(np.radians(20))
 _SLAB = 0.04
 """Half the thickness of a layer that counts as a plane, in sizes of the scene."""
 
+_LAYERED = 1.8
+"""The strongest layer of a floor or path with matter on both sides holds this many times what any layer across
+it does. Measured: a room 2.2, a path 4.4; objects 1.2 and 2.2, the latter along no usual axis."""
+
 _SEARCHED = 20_000
 """Rows that the search over directions looks at; the winner is refined on all."""
 
@@ -62,6 +66,9 @@ def estimate_up(matter: Sample) -> Up:
     axis, strength = _best_plane(matter)
     if strength > 0.12:
         return _signed(matter, axis, True, "a ground plane")
+    axis, contrast = _layered(matter)
+    if contrast > _LAYERED and _habit(axis) > 1:
+        return _signed(matter, axis, True, "its layers face that way")
     if long is not None:
         return _signed(matter, _snapped(long), False, "no ground; the long axis")
     return _signed(matter, np.array([0.0, -1.0, 0.0]), False, "no ground; a guess")
@@ -101,6 +108,19 @@ def _best_plane(matter: Sample) -> tuple[Floats, float]:
         inside = np.abs(along(matter.points, axis) - height) < 2 * _SLAB
         axis = _mean_normal(matter, axis, inside & (np.abs(along(matter.normals, axis)) > _FACING))
     return axis, _edge(matter, axis)
+
+
+def _layered(matter: Sample) -> tuple[Floats, float]:
+    """The direction whose strongest layer holds most, refined, and how many times what the strongest layer
+    that faces away from it (by 60° or more) holds: a floor under noise, a path among reeds."""
+    few = matter.take(slice(_SEARCHED))
+    directions = np.concatenate([np.eye(3), fibonacci(600)[:300]])
+    shares = np.array([_layer(few, axis)[0] for axis in directions])
+    axis = directions[int(np.argmax(shares))]
+    across = np.abs(directions @ axis) < 0.5
+    contrast = shares.max() / max(shares[across].max(), np.finfo(float).tiny)
+    facing = np.abs(along(matter.normals, axis)) > _FACING
+    return _mean_normal(matter, axis, facing), float(contrast)
 
 
 def _edge(matter: Sample, axis: Floats) -> float:

@@ -41,7 +41,8 @@ class Simplified:
             `rounds` (a dict each: `before` − `dropped` − `merged` − `trimmed` = `after`, where `merged` is by
             how many rows merging shrank the scene), `protected`, `nonfinite_rows`,
             `infinite_logits` (taken as α = 0 or 1), `clamped_opacities` (merged α that reached
-            0.99: what `max_growth` could not take was lost), `resized` (rows fitted to what views see),
+            0.99: what `max_growth` could not take was lost), `fitted` (rows whose opacity was fitted to what views see), `unseen`
+            (rows of the input that are kept though no view sees them; None without views),
             `faded` (merged α < 1/255 where a member's was not), `skipped` (`alone`: rows passed on as they
             were; `sh_bands`: of zeros, left out of all sums; of the paper's, `coverages`: groups that the
             cheaper guard had refused; rounds without `binnings`, or `trims`: few rows were left already).
@@ -106,7 +107,7 @@ def simplify(
     become one. Mean, covariance and SH are averaged by mass, and mass m = α·A *as rendered* is conserved,
     with A = √tr adj(Σ + e²I) and e the blur of a renderer. A merge costs the squared error of its projections
     times how much of it the views see. Without `visibility` it needs no cameras at all; with a function
-    of it the rows' two longer axes are fitted last, within a fifth, to what the views see of them.
+    of it the rows' opacities are fitted last to what the views see of them.
 
     `fast` merges along Morton order all the way, on two lattices in turn: no graph of neighbours.
 
@@ -124,7 +125,7 @@ def simplify(
         budget: Gaussians to keep, at most as many as there are.
         method: the policy.
         visibility: for `default` and `fast`: what views see of each Gaussian (`g2ard.render.visibility`), or
-            a function that finds it for a scene, asked again as the scene shrinks (+0.4 dB on small objects).
+            a function that finds it for a scene, asked again for the result, whose opacities are fitted to it.
         protected: (N,) bool flags to inherit. With None, `paper` computes them (see `flag`), the others,
             which have no use for them, go without.
         flag_budget: the count that sets the flags' cell size, where this call is one round on the way to a
@@ -281,7 +282,8 @@ def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str
         "nonfinite_rows": 0 if isinstance(finite, slice) else len(splats) - int(np.count_nonzero(finite)),
         "infinite_logits": out["infinite_logits"],
         "clamped_opacities": out["clamped_opacities"],
-        "resized": out.get("resized", 0),
+        "fitted": out.get("fitted", 0),
+        "unseen": out.get("unseen"),
         "faded": _faded(splats, small, parents),
         "skipped": {
             "alone": alone,

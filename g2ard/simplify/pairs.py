@@ -1,11 +1,9 @@
-"""The policies `default` and `fast`: stages of merging, with what views see looked at again in between."""
+"""The policies `default` and `fast`: merging weighed by what views see, then sizes fitted to it."""
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,19 +13,21 @@ from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.progress import Progress, counter
 from g2ard.simplify.config import SimplifyConfig, schedule
-from g2ard.splats import Splats
+from g2ard.splats import DRAWN_LOGIT, Splats
 
 __all__ = ["Seen", "Visibility", "merge", "merge_looking", "rows_of", "splats_of"]
 
 _LADDER = {"default": (3.0, 1), "fast": (1.0, 2)}
-"""Down to how many times the budget rows merge along Morton order, and in how many steps. A stage before the
-last does so all the way."""
+"""Down to how many times the budget rows merge along Morton order, and in how many steps."""
 
 _BLIND = 1 / 3
 """How much of its weight the error of coverage has where nothing is known of what views see."""
 
-_REFRESH = 0.3
-"""Visibility is looked at again when the count has fallen to this share of what it was."""
+MAX_OPACITY = 0.99
+"""α never exceeds it: renderers clip there."""
+
+DRAWN_OPACITY = float(1 / (1 + np.exp(-DRAWN_LOGIT)))
+"""Renderers draw nothing fainter."""
 
 
 class Seen(Protocol):
@@ -68,11 +68,8 @@ def merge(
     flags: NDArray[np.bool_] | None,
     config: SimplifyConfig,
     tell: Callable[[int, int], None],
-    *,
-    stage: int = 0,
-    last: bool = True,
 ) -> dict[str, Any]:
-    """One stage of `default` or `fast`; `seen` has a row for each of the scene's."""
+    """`default` or `fast`; `seen` has a row for each of the scene's."""
     ladder, steps = _LADDER[method]
     return _core.simplify_pairwise(
         scene,
@@ -80,8 +77,8 @@ def merge(
         protected=flags,
         weight=None if seen is None else seen.weight,
         pixel_size=None if seen is None else seen.pixel_size,
-        min_opacity=0.0 if stage else config.min_opacity_of(method),  # merged clusters are no chaff
-        ladder=ladder if last else 1.0,
+        min_opacity=config.min_opacity_of(method),
+        ladder=ladder,
         ladder_steps=steps,
         neighbors=config.neighbors,
         geometric=config.geometric_weight * (_BLIND if seen is None else 1.0),
@@ -101,49 +98,27 @@ def merge_looking(
     config: SimplifyConfig,
     progress: Progress,
 ) -> dict[str, Any]:
-    """As many stages as the refreshes are worth; what they join is then made of its raw members."""
-    whole, part = scene, flags
-    tell = counter(progress, "simplify")
-    first = seen = rows_of(look(scene), len(scene), slice(None))
-    parents = np.arange(len(scene))
-    rounds: list[dict[str, int]] = []
-    for stage in itertools.count():
-        last = 2 * budget >= _REFRESH * len(scene)  # else not worth it
-        target = budget if last else math.ceil(_REFRESH * len(scene))
-        shifted = _shifted(tell, len(whole) - len(scene), len(whole) - budget)
-        out = merge(scene, target, method, seen, part, config, shifted, stage=stage, last=last)
-        rounds += out["rounds"]
-        parents = np.where(parents < 0, -1, out["parents"][parents])
-        if last:
-            break
-        scene, part = splats_of(scene, out), None if part is None else out["protected"]
-        seen = rows_of(look(scene), len(scene), slice(None))
-    if stage:
-        out = _core.simplify_pool(
-            whole,
-            parents,
-            budget,
-            protected=flags,
-            weight=first.weight,
-            pixel_size=first.pixel_size,
-            dilation=config.dilation,
-            pixel_scale=config.pixel_scale,
-            growth=config.max_growth,
-        )
-    merged = splats_of(whole, out)
-    order = _core.simplify_order(whole)  # sums round alike whatever the order of the rows
-    scales = _resized(merged, parents[order], first.weight[order], look(merged).weight)
-    resized = int(np.count_nonzero((scales != merged.scales).any(axis=1)))
-    return {**out, "scales": scales, "parents": parents, "rounds": rounds, "resized": resized}
+    """Merge by what views see of the scene, then fit each row's opacity to what they see of the result."""
+    seen = rows_of(look(scene), len(scene), slice(None))
+    out = merge(scene, budget, method, seen, flags, config, counter(progress, "simplify"))
+    merged, parents = splats_of(scene, out), out["parents"]
+    order = _core.simplify_order(scene)  # sums round alike whatever the order of the rows
+    fitted = _fitted(merged, parents[order], seen.weight[order], look(merged).weight)
+    return {
+        **out,
+        "scales": fitted.scales,
+        "logit_opacities": fitted.logit_opacities,
+        "fitted": int(np.count_nonzero(fitted.logit_opacities != merged.logit_opacities)),
+        "unseen": int(np.count_nonzero((seen.weight == 0) & (parents >= 0))),
+    }
 
 
-def _resized(
-    scene: Splats, parents: NDArray[np.int64], wanted: NDArray[Any], now: NDArray[Any]
-) -> NDArray[np.float32]:
-    """Scales with which the views see of each row about what they saw of its members: Σ αT is conserved.
+def _fitted(scene: Splats, parents: NDArray[np.int64], wanted: NDArray[Any], now: NDArray[Any]) -> Splats:
+    """The scene with opacities by which the views see of each row about what they saw of its members.
 
-    The area of the two longer axes takes the square root of the ratio, for neighbours share what is missing;
-    a floor of 5 % of the mean keeps what is hardly seen as it is.
+    Σ αT is conserved as far as a row alone can: α is multiplied by the square root of the ratio, for
+    neighbours share what is missing, within 0.7–1.4; what α ≤ 0.99 cannot hold goes to the area of the two
+    longer axes. A floor of 5 % of the mean keeps what is hardly seen as it is.
 
     Args:
         scene: M merged Gaussians.
@@ -155,14 +130,22 @@ def _resized(
     members = np.bincount(parents[kept], minlength=len(scene))
     target = np.bincount(parents[kept], wanted[kept], len(scene))
     floor = 0.05 * target.mean()
-    area = np.sqrt(np.clip((target + floor) / np.maximum(now + floor, np.finfo(float).tiny), 0.7, 1.4))
-    area[(members < 2) | ~np.isfinite(area)] = 1.0
+    factor = np.sqrt(np.clip((target + floor) / np.maximum(now + floor, np.finfo(float).tiny), 0.5, 2.0))
+    alone = (members < 2) | ~np.isfinite(factor)
+    alpha = scene.opacities.astype(np.float64)
+    held = np.minimum(alpha * factor, np.maximum(alpha, MAX_OPACITY))
+    faint = (held < DRAWN_OPACITY) & (alpha >= DRAWN_OPACITY)  # what was drawn still is
+    held = np.where(faint | (alpha <= 0) | alone, alpha, held)
+    area = np.where(alone | faint | (held <= 0), 1.0, alpha * factor / np.maximum(held, 1e-30))
+    changed = held != alpha
+    logits = np.log(np.maximum(held, 1e-30)) - np.log1p(-np.minimum(held, 1 - 1e-9))
     shortest = np.arange(3) == np.argmin(scene.scales, axis=1)[:, None]
-    return np.where(shortest, scene.scales, scene.scales * np.sqrt(area)[:, None]).astype(np.float32)
-
-
-def _shifted(tell: Callable[[int, int], None], done: int, total: int) -> Callable[[int, int], None]:
-    return lambda here, _: tell(done + here, total)
+    grown = (area > 1)[:, None] & ~shortest
+    return replace(
+        scene,
+        logit_opacities=np.where(changed, logits, scene.logit_opacities).astype(np.float32),
+        scales=np.where(grown, scene.scales * np.sqrt(area)[:, None], scene.scales).astype(np.float32),
+    )
 
 
 def splats_of(like: Splats, out: dict[str, Any]) -> Splats:

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from g2ard.simplify import Simplified
     from g2ard.splats import Splats
 
-_VIEWS = 48
+_VIEWS = 128
 """Poses of a pool of its own; as many of them are used as the scene needs."""
 
-_ROWS = 30_000
+_ROWS = 100_000
 """Gaussians that those are planned on."""
 
 

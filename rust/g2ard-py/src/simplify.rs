@@ -247,45 +247,6 @@ impl PyLook {
     }
 }
 
-/// One Gaussian for each cluster of `parents`, from its raw members.
-#[pyfunction]
-#[pyo3(signature = (
-    scene, parents, count, *, protected, weight, pixel_size, dilation, pixel_scale, growth
-))]
-fn simplify_pool<'py>(
-    py: Python<'py>,
-    scene: PyScene<'py>,
-    parents: PyReadonlyArray1<'py, i64>,
-    count: usize,
-    protected: Option<PyReadonlyArray1<'py, bool>>,
-    weight: PyReadonlyArray1<'py, f32>,
-    pixel_size: PyReadonlyArray1<'py, f32>,
-    dilation: f64,
-    pixel_scale: f64,
-    growth: f64,
-) -> PyResult<Bound<'py, PyDict>> {
-    let scene = scene.borrow()?;
-    let parents = arrays::flat("parents", &parents)?;
-    let protected = protected
-        .as_ref()
-        .map(|p| arrays::flat("protected", p))
-        .transpose()?;
-    let seen = Seen {
-        weight: arrays::flat("weight", &weight)?,
-        pixel: arrays::flat("pixel_size", &pixel_size)?,
-    };
-    let policy = Pairwise {
-        dilation,
-        pixel_scale,
-        growth,
-        ..Pairwise::default()
-    };
-    let outcome = long(py, None, |control| {
-        policy.pool(&scene, Some(seen), protected, parents, count, control)
-    })?;
-    outcome_dict(py, outcome, Vec::new())
-}
-
 fn pairwise_dict<'py>(py: Python<'py>, r: &PairwiseRound) -> PyResult<Bound<'py, PyDict>> {
     let round = PyDict::new(py);
     for (key, value) in [
@@ -349,6 +310,5 @@ pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(simplify_flags, m)?)?;
     m.add_function(wrap_pyfunction!(simplify_paper, m)?)?;
     m.add_function(wrap_pyfunction!(simplify_order, m)?)?;
-    m.add_function(wrap_pyfunction!(simplify_pool, m)?)?;
     m.add_function(wrap_pyfunction!(simplify_pairwise, m)?)
 }

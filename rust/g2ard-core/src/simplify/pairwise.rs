@@ -125,53 +125,6 @@ impl Pairwise {
         Ok(outcome)
     }
 
-    /// One Gaussian for each of the `count` clusters that `parents` names (−1 for none), from its raw members:
-    /// what several calls of `run` joined, without what each of them clamped or rounded.
-    pub fn pool(
-        &self,
-        scene: &SceneRef,
-        seen: Option<Seen>,
-        flags: Option<&[bool]>,
-        parents: &[i64],
-        count: usize,
-        control: &Control,
-    ) -> Result<Outcome<PairwiseRound>> {
-        let ordered = Ordered::new(scene)?;
-        self.check(scene, seen, flags)?;
-        if parents.len() != scene.len() {
-            return Err(Error::invalid(
-                "parents",
-                format!("{} rows", scene.len()),
-                parents.len(),
-            ));
-        }
-        let mut filled = vec![false; count];
-        for &p in parents.iter().filter(|p| **p >= 0) {
-            let known = filled.get_mut(p as usize);
-            *known.ok_or_else(|| Error::invalid("parents", format!("below {count}"), p))? = true;
-        }
-        if filled.contains(&false) {
-            return Err(Error::invalid(
-                "parents",
-                "a member in every cluster",
-                "none",
-            ));
-        }
-        let flags = flags.map_or_else(|| vec![false; scene.len()], |f| ordered.sorted(f));
-        let blur = self.blurs(scene, &ordered, seen);
-        let of = |p: i64| u32::try_from(p).unwrap_or(GONE);
-        let partition = Partition {
-            of: ordered.sorted(parents).into_iter().map(of).collect(),
-            count,
-        };
-        let blur = |i: usize| f64::from(blur[i]);
-        let (step, clamped) =
-            partition.assemble(scene, &ordered, &flags, self.growth, blur, control)?;
-        let mut outcome = step.finish(scene, &ordered, Vec::new());
-        outcome.clamped_opacities = clamped;
-        Ok(outcome)
-    }
-
     /// Merges runs of Morton order down to `ladder` times the budget. Each time the lattice lies
     /// elsewhere, so that what one cut apart the next may join.
     fn climb(

@@ -1,0 +1,88 @@
+"""Poses close to what the others see from too far: where a Gaussian is smaller than a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.poses.lattice import halton
+from g2ard.poses.numbers import norms
+from g2ard.poses.sight import Lens, Poses
+from g2ard.poses.site import Site
+
+__all__ = ["Reach", "plan_near", "reach_of"]
+
+Floats = NDArray[np.float64]
+
+_POINTS = 512
+"""Points of the scene's matter that stand for all of it."""
+
+_PIXELS = 1.5
+"""A near pose shows what it aims at with this standard deviation."""
+
+_STEP = (0.25, 0.6)
+"""Share of the way that is left, at least and at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """How poses see a sample of a scene's points.
+
+    Args:
+        points: (K, 3) in the site's coordinates.
+        scales: (K,) typical standard deviation of the Gaussians there.
+        best: (K,) the pose that sees a point from nearest; −1 where none does.
+        distance: (K,) from that pose; inf where there is none.
+    """
+
+    points: Floats
+    scales: Floats
+    best: NDArray[np.int64]
+    distance: Floats
+
+    def unseen(self) -> float:
+        """Share of the points that no pose sees."""
+        return float((self.best < 0).mean())
+
+    def coarse(self, lens: Lens) -> NDArray[np.bool_]:
+        """(K,) points that are seen, but with a standard deviation below a pixel."""
+        return (self.best >= 0) & (self.scales * float(lens.matrix[0, 0]) < self.distance)
+
+
+def reach_of(site: Site, poses: Poses, lens: Lens) -> Reach:
+    """Cast a ray from every pose to every point of a sample that lies within its frame."""
+    points = site.points[:_POINTS]
+    best, nearest = np.full(len(points), -1), np.full(len(points), np.inf)
+    wide, tall = lens.tangents
+    for i, frame in enumerate(poses.frames()):
+        away = points - poses.eyes[i]
+        x, y, z = (away @ frame.T).T
+        length = norms(away)
+        rows = np.flatnonzero((z > 0) & (np.abs(x) < wide * z) & (np.abs(y) < tall * z) & (length < nearest))
+        if not len(rows):
+            continue
+        directions = away[rows] / length[rows, None]
+        met = site.grid.cast(np.repeat(poses.eyes[i : i + 1], len(rows), axis=0), directions)
+        rows = rows[met > length[rows] - 2 * site.grid.cell]
+        best[rows], nearest[rows] = i, length[rows]
+    return Reach(points, site.grid.scale_at(points), best, nearest)
+
+
+def plan_near(site: Site, poses: Poses, reach: Reach, count: int, lens: Lens, seed: int) -> Poses:
+    """At most `count` poses on the way from the given ones to points that they show smaller than a pixel."""
+    rows = np.flatnonzero(reach.coarse(lens))
+    if not len(rows) or not count:
+        return poses.take(slice(0))
+    pick, turn, rise = halton(0, 3 * count, 3, seed + 3).T
+    rows = rows[(pick * len(rows)).astype(int)]
+    eyes, points = poses.eyes[reach.best[rows]], reach.points[rows]
+    wanted = reach.scales[rows] * float(lens.matrix[0, 0]) / _PIXELS
+    share = np.clip(wanted / reach.distance[rows], *_STEP)
+    eyes = points + share[:, None] * (eyes - points)
+    gazes = (points - eyes) / np.maximum(norms(points - eyes), np.finfo(float).tiny)[:, None]
+    gazes += 0.2 * np.stack([turn - 0.5, rise - 0.5, turn - rise], axis=1)
+    gazes /= norms(gazes)[:, None]
+    free = (site.grid.distance(eyes) > 2 * site.grid.cell) & (site.above_ground(eyes) > 0.01)
+    return Poses(eyes[free], gazes[free]).take(slice(count))
