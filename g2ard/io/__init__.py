@@ -279,7 +279,7 @@ def write_views(
         path: the .json to write; photos are named relative to it.
         cameras: C views.
         splits: per view "train", "test" or None; () for none.
-        weights: (C,) how often each view should be drawn; None for none.
+        weights: (C,) how often each view should be drawn, NaN where a view states none; None for none.
         overwrite: whether an existing file may be replaced.
 
     Raises:

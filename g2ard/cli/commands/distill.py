@@ -30,7 +30,14 @@ from g2ard.cli.options import (
     views_count,
 )
 from g2ard.cli.resume import check_stopped, left_at
-from g2ard.cli.scenes import load_scene, load_view_sets, make_targets, recovery_engine
+from g2ard.cli.scenes import (
+    load_for_training,
+    load_held_out,
+    load_scene,
+    load_view_sets,
+    make_targets,
+    recovery_engine,
+)
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
@@ -66,7 +73,10 @@ def distill(
     ] = None,
     held_out: Annotated[
         Path | None,
-        typer.Option(metavar="VIEWS", help="Score on these; --views is then all for recovery."),
+        typer.Option(
+            metavar="VIEWS",
+            help="Score on these; --views is then for recovery, but for what it holds out itself.",
+        ),
     ] = None,
     k: Annotated[
         Count | None,
@@ -178,7 +188,7 @@ def distill(
         )
         _write(run, output, result, unseen, colour, report)
     if pool is not None:
-        write_views(output / "views.json", pool, overwrite=True)
+        write_views(output / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
     shutil.rmtree(output / _WORK)
     _table(run, report)
     _say_views(run, report["views"], k is not None)
@@ -221,25 +231,27 @@ def _lift(run: Run, path: Path) -> Splats:
 
 def _views(
     run: Run, prior: Splats, views: Path | None, held_out: Path | None, size: int | None
-) -> tuple[ViewSet, Cameras, Cameras | None]:
-    """Views for recovery, views for scoring, and the pool both came from where one had to be made."""
+) -> tuple[ViewSet, Cameras, ViewSet | None]:
+    """Views for recovery, views for scoring, and the pool they came from where one had to be made."""
     from g2ard.io import ViewSet
     from g2ard.poses import plan_pool
-    from g2ard.splits import split_mask
+    from g2ard.splits import split_mask, splits_of
 
     if views is not None:
-        if held_out is not None:
-            train, test = (load_view_sets(run, path, ["all"], size)[0] for path in (views, held_out))
-        else:
+        if held_out is None:
             train, test = load_view_sets(run, views, ["train", "test"], size)
+        else:
+            train, test = load_for_training(run, views, size), load_held_out(run, held_out, size)
         return train, test.cameras, None
     planned = plan_pool(prior, _POOL, seed=run.seed, progress=run.progress)
-    pool = planned.cameras
+    names = planned.cameras.names
     run.say(f"poses: {planned.kind} ({planned.why})")
     if held_out is not None:
-        return ViewSet(pool.resized(size)), load_view_sets(run, held_out, ["all"], size)[0].cameras, pool
-    unseen = split_mask("views.json", pool.names, "test")
-    return ViewSet(pool.take(~unseen).resized(size)), pool.take(unseen).resized(size), pool
+        pool = ViewSet(planned.cameras, splits=("train",) * len(names))
+        return pool.resized(size), load_held_out(run, held_out, size).cameras, pool
+    pool = ViewSet(planned.cameras, splits=splits_of(None, names))
+    unseen = split_mask(None, names, "test")
+    return pool.take(~unseen).resized(size), pool.take(unseen).resized(size).cameras, pool
 
 
 def _score(run: Run, prior: Splats, result: Distilled, unseen: Targets, colour: Colour) -> dict[str, Any]:
