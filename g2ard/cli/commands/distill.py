@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.cli.found import found_views
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
@@ -22,9 +23,10 @@ from g2ard.cli.options import (
     ScheduleName,
     SizeOption,
     TimeLimitOption,
-    ViewsOption,
+    ViewsOrMadeOption,
     budget_of,
     can_judge,
+    is_made,
     one_budget,
     one_horizon,
     views_count,
@@ -52,6 +54,9 @@ _WORK = ".unfinished"
 """In the folder of the run: finished rounds and checkpoints. Nobody else has a folder of this name."""
 _POOL = 128
 """Poses of a pool made for a scene without views; every 8th is held out for scoring."""
+_SIDE = 800
+"""Pixels of the longer side of renders from cameras found beside a scene, as a pool has: INRIA's files state
+the size of the full photos, which its trainer had shrunk."""
 
 
 @command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True)
@@ -63,7 +68,7 @@ def distill(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN", help="Folder of the run.")],
     count: CountOption = None,
     ratio: RatioOption = None,
-    views: ViewsOption = None,
+    views: ViewsOrMadeOption = None,
     photos: Annotated[
         bool | None,
         typer.Option(
@@ -112,11 +117,15 @@ def distill(
     size: SizeOption = None,
     background: BackgroundOption = None,
 ) -> None:
-    """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget."""
+    """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget.
+
+    Views are those of --views, else the cameras that lie beside the scene, else a pool of poses of its own.
+    """
     one_budget(count, ratio)
     one_horizon(steps, time_limit)
     can_judge(k, policy)
-    run.spare_inputs(output / "scene.ply", *([output / "views.json"] if views is None else []))
+    given = views is not None and not is_made(views)
+    run.spare_inputs(output / "scene.ply", *([output / "views.json"] if not given else []))
     import shutil
     import time
 
@@ -131,14 +140,14 @@ def distill(
     began = time.monotonic()
     engine = recovery_engine(run)
     lifted = kind(scene) != "splats"
-    if lifted and views is None:
+    if lifted and not given:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
     if not left_at(output / _WORK):
         check_output(output, run.overwrite, folder=True)
     check_stopped(run, output / _WORK, resume)
     prior = _lift(run, scene) if lifted else load_scene(run, scene)
     budget = budget_of(scene, count, ratio, len(prior))
-    candidates, test, pool = _views(run, prior, views, held_out, size)
+    candidates, test, pool = _views(run, scene, prior, views, held_out, size)
     train = candidates.cameras
     pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
     use_photos = lifted or (pictured if photos is None else photos)
@@ -230,18 +239,24 @@ def _lift(run: Run, path: Path) -> Splats:
 
 
 def _views(
-    run: Run, prior: Splats, views: Path | None, held_out: Path | None, size: int | None
+    run: Run, scene: Path, prior: Splats, views: Path | None, held_out: Path | None, size: int | None
 ) -> tuple[ViewSet, Cameras, ViewSet | None]:
     """Views for recovery, views for scoring, and the pool they came from where one had to be made."""
     from g2ard.io import ViewSet
     from g2ard.poses import plan_pool
     from g2ard.splits import split_mask, splits_of
 
-    if views is not None:
+    found = None
+    if views is None:
+        found = views = found_views(run, scene, prior, ["train"] if held_out else ["train", "test"])
+    if views is not None and not is_made(views):
         if held_out is None:
             train, test = load_view_sets(run, views, ["train", "test"], size)
         else:
             train, test = load_for_training(run, views, size), load_held_out(run, held_out, size)
+        if found and not size and not any(train.cameras.image_paths):
+            train, test = train.resized(_SIDE), test.resized(_SIDE)
+            run.say(f"renders of them are at most {_SIDE} pixels wide or high (--size says otherwise)")
         return train, test.cameras, None
     planned = plan_pool(prior, _POOL, seed=run.seed, progress=run.progress)
     names = planned.cameras.names
