@@ -10,10 +10,14 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from g2ard.cameras import Cameras
     from g2ard.cli.frame import Run
     from g2ard.splats import Splats
 
-__all__ = ["found_views"]
+__all__ = ["as_pool", "found_views"]
+
+_SIDE = 800
+"""Pixels of the longer side, as a pool has."""
 
 _SAMPLE = 4096
 _SEEING = 0.5
@@ -54,6 +58,12 @@ def found_views(run: Run, scene: Path, splats: Splats, splits: Sequence[str]) ->
     cameras = f"{count} camera" + "s" * (count != 1)
     run.say(f"views: {cameras} of {path} (found beside the scene; --views made for a pool of its own)")
     return path
+
+
+def as_pool(cameras: Cameras) -> Cameras:
+    """Found cameras at a pool's size where they have no photos to be compared with: INRIA's file states the
+    size of the full photos, which its trainer had shrunk."""
+    return cameras if any(cameras.image_paths) else cameras.resized(_SIDE)
 
 
 def _opaque(splats: Splats) -> NDArray[np.float64]:

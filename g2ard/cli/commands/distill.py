@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from g2ard.cli.found import found_views
+from g2ard.cli.found import as_pool, found_views
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
@@ -54,9 +54,6 @@ _WORK = ".unfinished"
 """In the folder of the run: finished rounds and checkpoints. Nobody else has a folder of this name."""
 _POOL = 128
 """Poses of a pool made for a scene without views; every 8th is held out for scoring."""
-_SIDE = 800
-"""Pixels of the longer side of renders from cameras found beside a scene, as a pool has: INRIA's files state
-the size of the full photos, which its trainer had shrunk."""
 
 
 @command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True)
@@ -242,6 +239,8 @@ def _views(
     run: Run, scene: Path, prior: Splats, views: Path | None, held_out: Path | None, size: int | None
 ) -> tuple[ViewSet, Cameras, ViewSet | None]:
     """Views for recovery, views for scoring, and the pool they came from where one had to be made."""
+    from dataclasses import replace
+
     from g2ard.io import ViewSet
     from g2ard.poses import plan_pool
     from g2ard.splits import split_mask, splits_of
@@ -254,9 +253,8 @@ def _views(
             train, test = load_view_sets(run, views, ["train", "test"], size)
         else:
             train, test = load_for_training(run, views, size), load_held_out(run, held_out, size)
-        if found and not size and not any(train.cameras.image_paths):
-            train, test = train.resized(_SIDE), test.resized(_SIDE)
-            run.say(f"renders of them are at most {_SIDE} pixels wide or high (--size says otherwise)")
+        if found and not size:
+            train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
         return train, test.cameras, None
     planned = plan_pool(prior, _POOL, seed=run.seed, progress=run.progress)
     names = planned.cameras.names

@@ -105,7 +105,7 @@ def simplify(
 
 def _cameras(run: Run, scene: Path, splats: Splats, views: Path | None, method: str) -> Cameras | None:
     """The views given, else those beside the scene, else a few of its own where it leaves room for them."""
-    from g2ard.cli.found import found_views
+    from g2ard.cli.found import as_pool, found_views
     from g2ard.cli.scenes import load_views
     from g2ard.errors import InputError
 
@@ -114,8 +114,8 @@ def _cameras(run: Run, scene: Path, splats: Splats, views: Path | None, method: 
         run.say("paper uses no views")
     if method == "paper" and made:
         return None
-    if views is None and method == "default":
-        views = found_views(run, scene, splats, ["train"])
+    if views is None and method == "default" and (found := found_views(run, scene, splats, ["train"])):
+        return as_pool(load_views(run, found, "train", None))
     if views is not None and not made:
         return load_views(run, views, "train", None)
     if method != "default" and not made:
