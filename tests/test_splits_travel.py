@@ -207,6 +207,17 @@ def test_a_split_that_is_not_stated_is_one_line(command_line: CommandLine, folde
     assert "train.json: all of its 16 views are for training" in error
 
 
+def test_training_on_test_views_is_said(command_line: CommandLine, folder: Path) -> None:
+    look = ("--views", "photos", "--steps", 4, "-o")
+    for command in ("recover", "adapt"):
+        for split, words in (("all", "4 of the 16"), ("test", "4 of the 4"), ("train", None)):
+            output = f"{command}-{split}.ply"
+            status, _, error = command_line(command, "small.ply", *look, output, "--split", split, cwd=folder)
+            assert status == 0, error
+            said = f"--split {split}: {words} views trained on are test views"
+            assert (said in error) if words else ("test views" not in error)
+
+
 def test_splits_of_views() -> None:
     names = ["c", "a", "b"]
     assert splits_of(None, names) == ("train", "test", "train")

@@ -21,6 +21,7 @@ __all__ = [
     "load_scene",
     "load_split_views",
     "load_splits",
+    "load_trained",
     "load_view_sets",
     "load_views",
     "make_targets",
@@ -112,6 +113,20 @@ def load_held_out(run: Run, path: Path, size: int | None) -> ViewSet:
 
     found = _read(run, path)
     return found.take(for_scores(path, found.cameras.names, found.splits)).resized(size)
+
+
+def load_trained(run: Run, path: Path, split: str, size: int | None) -> ViewSet:
+    """The views of a split to train on, shrunk; says so if that makes training views of held-out ones.
+
+    Raises:
+        InputError: as `load_views`.
+    """
+    pool, mask = load_split_views(run, path, split)
+    chosen = pool.take(mask)
+    held_out = chosen.splits.count("test")
+    if held_out:
+        run.say(f"--split {split}: {held_out} of the {len(chosen.cameras)} views trained on are test views")
+    return chosen.resized(size)
 
 
 def load_split_views(run: Run, path: Path, split: str) -> tuple[ViewSet, NDArray[np.bool_]]:
