@@ -226,6 +226,29 @@ def test_a_run_s_data_state_their_split(tmp_path: Path) -> None:
         read_view_set(path)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"applied_scale": 0}, r"transforms\.json: 'applied_scale' is 0, not a number > 0"),
+        ({"applied_scale": "x"}, "'applied_scale' is 'x'"),
+        ({"applied_transform": [[1], [2, 3]]}, r"transforms\.json: 'applied_transform' is not a finite 3×4"),
+        ({"train_filenames": 5}, "'train_filenames' is not a list"),
+    ],
+)
+def test_bad_data_of_a_run(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    data_of(tmp_path, **change)
+    with pytest.raises(InputError, match=message):
+        read_view_set(run_of(tmp_path))
+
+
+def test_a_run_with_an_odd_split(tmp_path: Path) -> None:
+    data_of(tmp_path)
+    run = run_of(tmp_path, mode="interval")
+    (run / "config.yml").write_text((run / "config.yml").read_text().replace("interval: 4", "interval: 0"))
+    with pytest.raises(InputError, match="the run's split of it is malformed"):
+        read_view_set(run)
+
+
 def test_a_run_on_colmap(tmp_path: Path) -> None:
     colmap(tmp_path / "data" / "poster" / "colmap", POSES, text=False)
     for i in range(10):

@@ -45,9 +45,18 @@ def find_views(scene: str | Path) -> Path | None:
         _holds(own / name, nerfstudio_export.is_export) for name in nerfstudio_export.LISTS
     ):
         found = own
-    if found is None and own.name == "ply" and gsplat_run.is_run(own.parent / gsplat_run.NAME):
+    if found is None and own.name == "ply" and _is_run(own.parent / gsplat_run.NAME):
         found = own.parent / gsplat_run.NAME
     return found if found is None or scene.is_absolute() else Path(os.path.relpath(found))
+
+
+def _is_run(file: Path) -> bool:
+    from g2ard.io.gsplat_run import is_run
+
+    try:
+        return is_run(file)
+    except InputError:
+        return False
 
 
 def _holds(file: Path, test: Callable[[Any], bool]) -> bool:

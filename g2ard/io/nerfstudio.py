@@ -58,9 +58,9 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
         raise InputError(f"{file}: malformed ({error})") from error
     settings = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else None
     frames, A, applied_scale = _data(folder, settings, images)
-    scale /= applied_scale
     if not (math.isfinite(scale) and scale > 0):
         raise InputError(f"{file}: 'scale' is {content['scale']!r}, not a number > 0")
+    scale /= applied_scale
     trained_from_saved = rigid(f"{file}: 'transform'", D @ np.linalg.inv(A))
     found = view_set(file, [_moved(frame, trained_from_saved, scale) for frame in frames])
     mode = _optimized(settings)
@@ -125,8 +125,17 @@ def _saved(
         )
     A = _EYE if given is None else _affine(file, "applied_transform", given)
     if options is not None and not any(frame.split for frame in frames):
-        frames = _split(frames, options)
-    return frames, A, float(content.get("applied_scale", 1.0))
+        try:
+            frames = _split(frames, options)
+        except (ValueError, OverflowError) as error:
+            raise InputError(f"{data}: the run's split of it is malformed ({error})") from error
+    try:
+        applied_scale = float(content.get("applied_scale", 1.0))
+    except (TypeError, ValueError):
+        applied_scale = math.nan
+    if not (math.isfinite(applied_scale) and applied_scale > 0):
+        raise InputError(f"{file}: 'applied_scale' is {content['applied_scale']!r}, not a number > 0")
+    return frames, A, applied_scale
 
 
 def _split(frames: Sequence[Frame], options: Settings) -> list[Frame]:
@@ -138,7 +147,10 @@ def _split(frames: Sequence[Frame], options: Settings) -> list[Frame]:
         many = math.ceil(count * float(options.word("train_split_fraction") or 0.9))
         train = np.isin(rank, np.linspace(0, count - 1, many, dtype=int))
     elif mode == "interval":
-        train = rank % int(options.word("eval_interval") or 8) != 0
+        interval = int(options.word("eval_interval") or 8)
+        if interval < 1:
+            raise ValueError(f"eval_interval {interval}")
+        train = rank % interval != 0
     elif mode == "filename":
         train = np.array(["train" in Path(frame.name).name for frame in frames])
     else:
@@ -165,7 +177,10 @@ def _moved(frame: Frame, transform: NDArray[np.float64], scale: float) -> Frame:
 
 def _affine(path: Path, key: str, rows: Any) -> NDArray[np.float64]:
     """(4, 4) of a 3×4 or 4×4 list."""
-    matrix = np.array(rows, np.float64)
+    try:
+        matrix = np.array(rows, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
         raise InputError(f"{path}: {key!r} is not a finite 3×4 matrix")
     out = np.eye(4)

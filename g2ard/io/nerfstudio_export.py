@@ -77,7 +77,8 @@ def _frame(
             raise
         raise InputError(f"{where}: malformed ({error})") from error
     there = below(path, file_path)
-    lens = _lens(where, file_path, there or below(path, file_path.parent), lenses)
+    ups = (below(path, up) for up in file_path.parents[:3] if up.parts)
+    lens = _lens(where, file_path, there or next(filter(None, ups), None), lenses)
     photo = images / file_path.name if images else there
     if photo is not None and photo.is_file() and (size := photo_size(photo)) != lens.size:
         zoom = np.diag([size[0] / lens.size[0], size[1] / lens.size[1], 1.0])

@@ -75,7 +75,10 @@ def _stated(path: Path, content: dict[str, Any]) -> dict[str, str]:
     """file_path → split, where the file lists them as nerfstudio's data may (train_filenames and its kin)."""
     stated: dict[str, str] = {}
     for split in ("train", "val", "test"):
-        for listed in content.get(f"{split}_filenames", ()):
+        names = content.get(f"{split}_filenames", ())
+        if not isinstance(names, list | tuple):
+            raise InputError(f"{path}: '{split}_filenames' is not a list")
+        for listed in names:
             name = Path(str(listed)).as_posix()
             if stated.setdefault(name, split) != split and stated[name] == "train":
                 raise InputError(f"{path}: {name!r} is in both train_filenames and {split}_filenames")
