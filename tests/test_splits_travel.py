@@ -252,6 +252,21 @@ adapt = "photos"
 """
 
 
+def test_simplifiers_are_given_training_views_alone(folder: Path) -> None:
+    from g2ard.bench.simplify import _Stand
+
+    names = [f"{i:03d}.png" for i in range(16)]
+    (folder / "photos" / "split.json").write_text(
+        json.dumps({"train": names[:6], "val": names[6:9], "test": names[9:13]})
+    )
+    made = _Stand(folder, BALL, folder / "photos", None, 0)
+    assert set(made.test.names) == set(names[9:13])
+    written = read_view_set(made.views)
+    assert written.splits == ("train",) * 6 + ("val",) * 3 + ("test",) * 4 + (None,) * 3
+    pool = read_view_set(_Stand(folder / "photos", BALL, None, None, 0).views)
+    assert pool.splits == splits_of(None, pool.cameras.names)
+
+
 def test_studies_read_the_stated_splits(folder: Path) -> None:
     for score in ("", 'score = { unseen = "photos" }\n'):
         (folder / "study.toml").write_text(STUDY + score)
