@@ -279,22 +279,21 @@ def test_studies_read_the_stated_splits(folder: Path) -> None:
             assert set(targets.cameras.names) == TEST
 
 
-def test_caliterra_s_photos_stay_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_caliterra_s_photos_stay_apart(folder: Path, g2ard: Program, watch: Watch) -> None:
     data = real("caliterra")
-    split = json.loads((data / "split.json").read_text())
+    split = {word: set(names) for word, names in json.loads((data / "split.json").read_text()).items()}
     points = read_points(data)
-    write_splats(tmp_path / "prior.ply", lift(points.positions[::8], points.colors[::8]))
-    from g2ard.cli.commands import register
-    from g2ard.cli.frame import app
-
-    register(None)
-    monkeypatch.chdir(tmp_path)
-    ask = ["select", "prior.ply", "--views", str(data), "-k", "10", "-o", "chosen.json", "-q"]
-    app(ask, prog_name="g2ard", standalone_mode=False)
-    train = read_view_set("chosen.json", split="train").cameras
+    write_splats(folder / "prior.ply", lift(points.positions[::8], points.colors[::8]))
+    g2ard("select", "prior.ply", "--views", data, "-k", 10, "-o", "chosen.json")
+    train = set(read_view_set(folder / "chosen.json", split="train").cameras.names)
     assert len(train) == 10
-    assert set(train.names) <= set(split["train"])
-    assert set(read_view_set("chosen.json", split="test").cameras.names) == set(split["test"])
+    assert train <= split["train"]
+    small = ("--size", 64, "--steps", 4)
+    g2ard("recover", "prior.ply", "--views", "chosen.json", *small, "-o", "recovered.ply")
+    g2ard("distill", "prior.ply", "-n", 500, "--views", "chosen.json", *small, "-o", "run")
+    assert watch.trained == [train] * 2
+    assert watch.looked == [train]
+    assert watch.scored == [split["test"]] * 2
 
 
 def test_the_study_of_policies_never_offers_test_photos() -> None:
