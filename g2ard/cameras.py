@@ -116,6 +116,30 @@ class Cameras:
         Ks[:, 1] *= (heights / self.heights)[:, None]
         return replace(self, Ks=Ks, widths=widths, heights=heights)
 
+    def facing(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Which views have any of some points in front of them and within their image.
+
+        Args:
+            points: (N, 3) world.
+
+        Returns:
+            (C,) bool.
+
+        >>> K = [[50, 0, 32], [0, 50, 32], [0, 0, 1]]
+        >>> eyes = [look_at([3, 0, 0], [0, 0, 0]), look_at([3, 0, 0], [6, 0, 0])]
+        >>> Cameras.from_lists(eyes, [K] * 2, [(64, 64)] * 2, "ab").facing([[0, 0, 0]]).tolist()
+        [True, False]
+        """
+        world = np.asarray(points, np.float64)
+        seen = np.zeros(len(self), bool)
+        for i, (view, K) in enumerate(zip(self.viewmats, self.Ks, strict=True)):
+            x, y, z = view[:3, :3] @ (world - self.positions[i]).T
+            front = z > 0
+            u = K[0, 0] * x[front] / z[front] + K[0, 2]
+            v = K[1, 1] * y[front] / z[front] + K[1, 2]
+            seen[i] = ((u >= 0) & (u <= self.widths[i]) & (v >= 0) & (v <= self.heights[i])).any()
+        return seen
+
     def recentred(self, offset: ArrayLike) -> Cameras:
         """The same views in coordinates whose origin is the world point `offset` (see `Splats.offset`)."""
         shift = np.asarray(offset, np.float64)

@@ -12,14 +12,22 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import read_json
 
-__all__ = ["HOLD_OUT", "split_mask", "split_names"]
+__all__ = [
+    "HOLD_OUT",
+    "for_scores",
+    "for_training",
+    "split_mask",
+    "split_names",
+    "splits_of",
+    "states_splits",
+]
 
 HOLD_OUT = 8
 """Without a split file every 8th name is test, as in Mip-NeRF 360's and INRIA's evaluations."""
 
 
 def split_mask(
-    views: str | Path, names: Sequence[str], which: str, *, stated: Sequence[str | None] = ()
+    views: str | Path | None, names: Sequence[str], which: str, *, stated: Sequence[str | None] = ()
 ) -> NDArray[np.bool_]:
     """Which of the views belong to a split.
 
@@ -27,7 +35,7 @@ def split_mask(
     further keys), then the rule: sorted by name, every 8th from the first on is test, the others train.
 
     Args:
-        views: the file or folder the views come from.
+        views: the file or folder the views come from; None where there is none, and the rule holds.
         names: C view names. A split file may leave out their suffix or folder.
         which: "train", "test", "all", or another key of the split file.
         stated: per view the split it states itself, None where it states none; () if none does.
@@ -43,24 +51,93 @@ def split_mask(
     """
     if which == "all":
         return np.ones(len(names), bool)
-    listed = None if any(stated) else _split_file(Path(views))
-    if any(stated):
-        known, mask = sorted({s for s in stated if s}), np.array([s == which for s in stated], bool)
-    elif listed is not None:
-        known, mask = sorted(listed), _listed(names, listed.get(which, []))
-    else:
-        order = sorted(range(len(names)), key=lambda i: names[i])
-        known, test = ["test", "train"], np.zeros(len(names), bool)
-        test[order[::HOLD_OUT]] = True
-        mask = test if which == "test" else ~test
-    if which not in known:
-        raise InputError(f"{views}: no split {which!r} (there are {', '.join(known)})")
-    if not mask.any():
+    masks = _masks(views, names, stated)
+    if which not in masks:
+        raise InputError(f"{views}: no split {which!r} (there are {', '.join(sorted(masks))})")
+    if not masks[which].any():
         raise InputError(f"{views}: none of the {len(names)} views is in split {which!r}")
+    return masks[which]
+
+
+def states_splits(views: str | Path | None, stated: Sequence[str | None] = ()) -> bool:
+    """Whether views say their splits, themselves or by a split.json beside them; see `split_mask`.
+
+    Raises:
+        InputError: a split file that is broken.
+    """
+    return any(stated) or (views is not None and _split_file(Path(views)) is not None)
+
+
+def splits_of(
+    views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()
+) -> tuple[str | None, ...]:
+    """The split each view belongs to, by the rules of `split_mask`: what to write so that it travels along.
+
+    Args:
+        views: as for `split_mask`.
+        names: C view names.
+        stated: as for `split_mask`.
+
+    Returns:
+        C words, None for a view that is in no split. Of a view in several, "test" counts before "train", and
+        both before others by name.
+
+    Raises:
+        InputError: as `split_mask`, for a split file that is broken.
+
+    >>> splits_of("nowhere", ["b", "a", "c"])
+    ('train', 'test', 'train')
+    """
+    masks = _masks(views, names, stated)
+    order = sorted(masks, key=lambda word: (word != "test", word != "train", word))
+    return tuple(next((word for word in order if masks[word][i]), None) for i in range(len(names)))
+
+
+def for_training(
+    views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()
+) -> NDArray[np.bool_]:
+    """Which views may be trained on where scores are taken on other views: the train split of views that
+    state splits (themselves, or by a split.json), else all.
+
+    Args:
+        views: as for `split_mask`.
+        names: C view names.
+        stated: as for `split_mask`.
+
+    Returns:
+        (C,) bool.
+
+    Raises:
+        InputError: splits are stated, and none is "train".
+    """
+    return split_mask(views, names, "train" if states_splits(views, stated) else "all", stated=stated)
+
+
+def for_scores(
+    views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()
+) -> NDArray[np.bool_]:
+    """Which views a file given for scoring alone scores on: all but those that it states as "train".
+
+    Args:
+        views: as for `split_mask`.
+        names: C view names.
+        stated: as for `split_mask`.
+
+    Returns:
+        (C,) bool.
+
+    Raises:
+        InputError: it states all of them as "train".
+    """
+    if not states_splits(views, stated):
+        return np.ones(len(names), bool)
+    mask = np.array([split != "train" for split in splits_of(views, names, stated)], bool)
+    if not mask.any():
+        raise InputError(f"{views}: all of its {len(names)} views are for training; none is left to score on")
     return mask
 
 
-def split_names(views: str | Path, names: Sequence[str], which: str) -> list[str]:
+def split_names(views: str | Path | None, names: Sequence[str], which: str) -> list[str]:
     """The names of a split, in the order of `names`; see `split_mask`.
 
     >>> split_names("nowhere", ["b", "a", "c"], "train")
@@ -68,6 +145,24 @@ def split_names(views: str | Path, names: Sequence[str], which: str) -> list[str
     """
     mask = split_mask(views, names, which)
     return [name for name, chosen in zip(names, mask, strict=True) if chosen]
+
+
+def _masks(
+    views: str | Path | None, names: Sequence[str], stated: Sequence[str | None]
+) -> dict[str, NDArray[np.bool_]]:
+    """Split → (C,) bool: as stated, else as a split.json lists them, else by the rule."""
+    if any(stated):
+        return {word: np.array([s == word for s in stated], bool) for word in {s for s in stated if s}}
+    listed = None if views is None else _split_file(Path(views))
+    if listed is None:
+        test = np.zeros(len(names), bool)
+        test[sorted(range(len(names)), key=lambda i: names[i])[::HOLD_OUT]] = True
+        return {"train": ~test, "test": test}
+    masks = {word: _listed(names, wanted) for word, wanted in listed.items()}
+    both = masks["train"] & masks["test"] if {"train", "test"} <= set(masks) else np.zeros(len(names), bool)
+    if both.any():
+        raise InputError(f"{views}: split.json lists {names[int(np.argmax(both))]!r} as both train and test")
+    return masks
 
 
 def _split_file(views: Path) -> dict[str, list[str]] | None:

@@ -11,6 +11,7 @@ import pytest
 from test_io_clouds import columns, las, ply
 from test_io_packed import compressed, save_spz, truth
 from test_io_sog import parts
+from test_views_trainers import data_of, export, inria, result_of, run_of
 from view_files import colmap, orbit, transforms, views
 
 from g2ard.errors import InputError
@@ -42,6 +43,22 @@ def table(folder: Path, name: str, text: bool = False) -> Path:
     return colmap(folder / "project", orbit(3), text) / "sparse" / "0" / name
 
 
+def run_file(folder: Path, name: str) -> Path:
+    """A file of a nerfstudio run, or its data."""
+    data, run = data_of(folder), run_of(folder)
+    return data if name == "transforms.json" else run / name
+
+
+def exports(folder: Path) -> Path:
+    data_of(folder)
+    return export(folder / "exports", Path("data/poster/images"), "transforms_train.json", range(3))
+
+
+def result(folder: Path) -> Path:
+    colmap(folder / "data" / "garden", orbit(3), text=False)
+    return result_of(folder)
+
+
 MAKERS: dict[str, Callable[[Path], Path]] = {
     "scene": lambda f: saved(f / "a.ply", write_splats, truth(9, 1)),
     "compressed": lambda f: compressed(f / "a.ply", truth(9, 1)),
@@ -57,8 +74,17 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "points3D.bin": lambda f: table(f, "points3D.bin"),
     "images.txt": lambda f: table(f, "images.txt", text=True),
     "transforms": lambda f: transforms(f / "a.json", orbit(2)),
+    "cameras.json": lambda f: inria(f / "cameras.json", orbit(3)),
+    "dataparser_transforms.json": lambda f: run_file(f, "dataparser_transforms.json"),
+    "config.yml": lambda f: run_file(f, "config.yml"),
+    "transforms of a run": lambda f: run_file(f, "transforms.json"),
+    "ns-export": exports,
+    "cfg.yml": result,
     "views": lambda f: saved(f / "a.json", write_views, views(2)),
 }
+
+READ = {"transforms of a run": "outputs/poster/splatfacto/today"}
+"""What to read instead of the damaged file, in the test's folder."""
 
 
 def damaged(content: bytes, rng: np.random.Generator) -> bytes:
@@ -92,12 +118,13 @@ def attempt(path: Path) -> str | None:
 def test_damage_is_an_input_error_at_worst(tmp_path: Path, what: str) -> None:
     path = MAKERS[what](tmp_path)
     content = path.read_bytes()
-    assert attempt(path) is None
+    asked = tmp_path / READ[what] if what in READ else path
+    assert attempt(asked) is None
     rng = np.random.default_rng(sum(map(ord, what)))
     refused = 0
     for _ in range(150):
         path.write_bytes(damaged(content, rng))
-        line = attempt(path)
+        line = attempt(asked)
         refused += line is not None
         assert line is None or ("\n" not in line and str(tmp_path) in line)
     assert refused > 20

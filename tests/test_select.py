@@ -374,7 +374,7 @@ def test_command_line(tmp_path, command_line):
         )  # fmt: skip
         assert (status, err) == (0, "")
         said = json.loads(out)
-        back = read_view_set(tmp_path / f"{policy}.json")
+        back = read_view_set(tmp_path / f"{policy}.json", split="train")
         assert back.cameras.names == tuple(view["name"] for view in said["views"])
         assert len(back.cameras) == 4
         np.testing.assert_allclose(back.weights, [view["weight"] for view in said["views"]])

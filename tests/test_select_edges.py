@@ -170,7 +170,7 @@ def test_the_command_on_pools_of_all_shapes(command_line: CommandLine, folder: P
     }
     for name, (poses, k, count, refused) in shapes.items():
         write_views(folder / "pool.json", cameras(poses), overwrite=True)
-        status, out, error = ask(command_line, folder, k, "-w")
+        status, out, error = ask(command_line, folder, k, "-w", "--split", "all")
         assert status == 0, (name, error)
         said = json.loads(out)
         assert len(said["views"]) == count == len(read_view_set(folder / "out.json").cameras)
@@ -178,7 +178,7 @@ def test_the_command_on_pools_of_all_shapes(command_line: CommandLine, folder: P
         assert (f"{refused} views refused" in error) == bool(refused)
         assert len(said["curve"]) == len(poses) - refused
     write_views(folder / "pool.json", cameras([away]), overwrite=True)
-    status, _, error = ask(command_line, folder, 1, "-w")
+    status, _, error = ask(command_line, folder, 1, "-w", "--split", "all")
     assert status == 1
     assert "none of the 1 candidate views sees the scene" in error
 

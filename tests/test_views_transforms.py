@@ -93,7 +93,7 @@ def test_bad_transforms(tmp_path: Path, change: Callable[[dict[str, Any]], Any],
     ("content", "message"),
     [
         ("", "not JSON"),
-        ("[1]", "expected a JSON object"),
+        ("[1]", "a JSON list, but neither"),
         ("{}", "neither"),
         ('{"views": []}', "not g2ard's"),
     ],

@@ -113,9 +113,11 @@ class SceneSpec:
     Args:
         name: as the rows call it.
         prior: a trained scene or a coloured cloud; relative to the definition, or to the city made.
-        train: views to recover on; None takes the training part of a pool made for the scene.
-        score: name → views to score on; empty takes the test part of `train`, or of the pool.
-        adapt: views of new appearance, for studies that adapt.
+        train: views to recover on: their train split, or all if there is a `score` and they state no split;
+            None takes the training part of a pool made for the scene.
+        score: name → views to score on, but for those stated as train; empty takes the test part of `train`,
+            or of the pool.
+        adapt: views of new appearance, for studies that adapt; every third is scored if they state no split.
         targets: "teacher", the prior's renders, or "photos".
         background: behind the scene.
         indoor: whether Mini-Splatting uses its importance for rooms.

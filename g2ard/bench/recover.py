@@ -29,7 +29,7 @@ from g2ard.recover.schedule import PAPER
 from g2ard.render import looker
 from g2ard.simplify import simplify
 from g2ard.splats import Splats
-from g2ard.splits import HOLD_OUT, split_mask
+from g2ard.splits import HOLD_OUT, for_scores, for_training, split_mask
 from g2ard.targets import Photos, Targets, TeacherRenders
 
 __all__ = ["STUDIES", "Look", "RecoverBench", "bench_recover"]
@@ -148,9 +148,10 @@ class RecoverBench:
             return pool.take(~unseen), pool.take(unseen)
         found = io.read_view_set(self.views)
         if self.held_out is not None:
-            return found.cameras.resized(self.size), io.read_view_set(self.held_out).cameras.resized(
-                self.size
-            )
+            keep = for_training(self.views, found.cameras.names, found.splits)
+            other = io.read_view_set(self.held_out)
+            score = for_scores(self.held_out, other.cameras.names, other.splits)
+            return found.take(keep).resized(self.size).cameras, other.take(score).resized(self.size).cameras
         masks = (
             split_mask(self.views, found.cameras.names, split, stated=found.splits)
             for split in ("train", "test")

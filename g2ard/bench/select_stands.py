@@ -21,6 +21,7 @@ from g2ard.recover.anchors import PRESETS, Regularizers
 from g2ard.render import render
 from g2ard.simplify import simplify
 from g2ard.splats import Splats
+from g2ard.splits import splits_of, states_splits
 from g2ard.synth import CityConfig, city
 from g2ard.targets import Targets
 
@@ -208,8 +209,12 @@ def _city(size: Size, cache: Path | None) -> Stand:
 
 
 def _photos(folder: Path, size: Size) -> Stand:
-    """Outside is the eighth of the photos at one end of the site; every 8th of the others is a test."""
-    cameras = io.read_views(folder).resized(size.pixels)
+    """Outside is the eighth of the photos at one end of the site; of the others those are tests that the
+    folder states as such, else every 8th."""
+    found = io.read_view_set(folder)
+    stated, words = states_splits(folder, found.splits), splits_of(folder, found.cameras.names, found.splits)
+    known = np.array([word in ("train", "test") for word in words])
+    cameras, held_out = found.cameras.take(known).resized(size.pixels), np.array(words)[known] == "test"
     points = io.read_points(folder)
     prior = lift(points.positions, points.colors)
     centred = cameras.positions - cameras.positions.mean(0)
@@ -219,7 +224,7 @@ def _photos(folder: Path, size: Size) -> Stand:
         prior=prior,
         student=_reduced(prior, size),
         targets=_Made(cameras.take(rest), load_image),
-        tests=np.arange(0, len(rest), 8),
+        tests=np.flatnonzero(held_out[rest]) if stated else np.arange(0, len(rest), 8),
         outside=_Made(cameras.take(far), load_image),
         regularizers=PRESETS["lift"],
         sh_degree=3,

@@ -18,13 +18,12 @@ from g2ard import __version__, baselines, io
 from g2ard.bench import rows as table
 from g2ard.bench.process import measured
 from g2ard.bench.raster import cpu_name
-from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.evaluate import evaluate
 from g2ard.poses import make_pool
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
-from g2ard.splits import HOLD_OUT, split_mask
+from g2ard.splits import split_mask, splits_of
 from g2ard.targets import TeacherRenders
 
 __all__ = [
@@ -170,10 +169,9 @@ class _Stand:
         self.folder, self.splats, self.splat_transform = folder, splats, splat_transform
         self.source, self.views = folder / "scene.ply", folder / "views.json"
         io.write_splats(self.source, splats)
-        cameras, held_out = _split(splats, views, seed)
-        splits = ["test" if test else "train" for test in held_out]
-        io.write_views(self.views, cameras, splits=splits)
-        self.test = cameras.take(held_out)
+        found = _views(splats, views, seed)
+        io.write_views(self.views, found.cameras, splits=found.splits)
+        self.test = found.cameras.take(split_mask(views, found.cameras.names, "test", stated=found.splits))
 
     @cached_property
     def targets(self) -> TeacherRenders:
@@ -220,13 +218,10 @@ def _readable(scene: Path) -> Splats:
     return replace(splats, logit_opacities=np.clip(splats.logit_opacities, -_MAX_LOGIT, _MAX_LOGIT))
 
 
-def _split(splats: Splats, views: Path | None, seed: int) -> tuple[Cameras, np.ndarray]:
-    """Cameras, and which are held out."""
-    if views is None:
-        pool = make_pool(splats, _POOL, seed=seed)
-        return pool, np.arange(len(pool)) % HOLD_OUT == 0
-    found = io.read_view_set(views)
-    return found.cameras, split_mask(views, found.cameras.names, "test", stated=found.splits)
+def _views(splats: Splats, views: Path | None, seed: int) -> io.ViewSet:
+    """The views given, or a pool; each with its split."""
+    found = io.ViewSet(make_pool(splats, _POOL, seed=seed)) if views is None else io.read_view_set(views)
+    return replace(found, splits=splits_of(views, found.cameras.names, found.splits))
 
 
 def _version(method: str, splat_transform: Path | None) -> str:

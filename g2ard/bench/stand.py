@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from g2ard import __version__, io
 from g2ard.bench.definition import Definition, SceneSpec
@@ -22,7 +23,7 @@ from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
-from g2ard.splits import split_mask
+from g2ard.splits import for_scores, for_training, split_mask, splits_of, states_splits
 from g2ard.targets import Photos, Targets, TeacherRenders
 
 __all__ = ["Stage", "Stand", "fingerprint", "folder_of", "scene_key"]
@@ -149,30 +150,43 @@ class Stand:
                 cameras = self._pool("train")
             else:
                 whole = self.place / self.scene.train
-                cameras = self._views(whole, "all" if self.scene.score else "train")
-            io.write_views(path, cameras)
+                apart = bool(self.scene.score)
+                cameras = self._apart(whole, for_training) if apart else self._views(whole, "train")
+            io.write_views(path, cameras, splits=["train"] * len(cameras))
         return path
 
     def adaptation(self, split: str) -> Cameras:
-        """Views of new appearance: "train" to adapt on; every third, by name, is "test". They are few."""
+        """Views of new appearance: "train" to adapt on and "test", as they state; where they state no split
+        every third, by name, is "test", for they are few."""
         if self.scene.adapt is None:
             raise InputError(f"scene {self.scene.name}: the study adapts, and it has no `adapt` views")
-        cameras = self._views(self.place / self.scene.adapt, "all")
-        held_out = np.argsort(np.argsort(cameras.names)) % 3 == 1
-        return cameras.take(held_out if split == "test" else ~held_out)
+        path = self.place / self.scene.adapt
+        found = io.read_view_set(path)
+        if states_splits(path, found.splits):
+            return self._views(path, split)
+        held_out = np.argsort(np.argsort(found.cameras.names)) % 3 == 1
+        return self._small(found, held_out if split == "test" else ~held_out)
 
     @cached_property
     def adapt(self) -> Path:
         """The views to adapt on, written out."""
         path = self.folder / "adapt.json"
         if not path.exists():
-            io.write_views(path, self.adaptation("train"))
+            cameras = self.adaptation("train")
+            io.write_views(path, cameras, splits=["train"] * len(cameras))
         return path
 
     def _views(self, path: Path, split: str) -> Cameras:
         found = io.read_view_set(path)
-        mask = split_mask(path, found.cameras.names, split, stated=found.splits)
-        return found.cameras.take(mask).resized(self.definition.size)
+        return self._small(found, split_mask(path, found.cameras.names, split, stated=found.splits))
+
+    def _small(self, found: io.ViewSet, mask: NDArray[np.bool_]) -> Cameras:
+        return found.take(mask).resized(self.definition.size).cameras
+
+    def _apart(self, path: Path, chosen: Callable[..., NDArray[np.bool_]]) -> Cameras:
+        """The views that `for_training` or `for_scores` chooses, where a scene is scored on its own files."""
+        found = io.read_view_set(path)
+        return self._small(found, chosen(path, found.cameras.names, found.splits))
 
     def _pool(self, split: str) -> Cameras:
         """A pool made for the scene; every 8th pose is scored."""
@@ -180,7 +194,8 @@ class Stand:
         if not path.exists():
             from g2ard.poses import make_pool
 
-            io.write_views(path, make_pool(io.read_splats(self.prior(None).output), _POOL, seed=0))
+            pool = make_pool(io.read_splats(self.prior(None).output), _POOL, seed=0)
+            io.write_views(path, pool, splits=splits_of(None, pool.names))
         return self._views(path, split)
 
     @cached_property
@@ -188,7 +203,7 @@ class Stand:
         """Split → targets to score against."""
         spec = self.scene
         if spec.score:
-            views = {name: self._views(self.place / path, "all") for name, path in spec.score.items()}
+            views = {name: self._apart(self.place / path, for_scores) for name, path in spec.score.items()}
         elif spec.train is not None:
             views = {"test": self._views(self.place / spec.train, "test")}
         else:

@@ -110,7 +110,8 @@ def _select(job: Job) -> dict[str, Any]:
 
     cameras = io.read_views(job["views"])
     chosen = select(io.read_splats(job["scene"]), cameras, job["k"], policy=job["policy"], seed=job["seed"])
-    io.write_views(job["output"], cameras.take(np.sort(chosen.order)), overwrite=True)
+    kept = cameras.take(np.sort(chosen.order))  # of training views alone: the stand has taken the others out
+    io.write_views(job["output"], kept, splits=["train"] * len(kept), overwrite=True)
     return {"views": len(chosen.order)}
 
 

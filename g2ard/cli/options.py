@@ -20,8 +20,10 @@ __all__ = [
     "SceneArgument",
     "Triple",
     "ViewsOption",
+    "ViewsOrMadeOption",
     "budget_of",
     "can_judge",
+    "is_made",
     "one_budget",
     "parse_ratio",
     "views_count",
@@ -94,7 +96,33 @@ SceneArgument = Annotated[
 ]
 ViewsOption = Annotated[
     Path | None,
-    typer.Option("--views", metavar="VIEWS", help="A COLMAP folder, a transforms.json or g2ard's own .json."),
+    typer.Option(
+        "--views",
+        metavar="VIEWS",
+        help="A COLMAP folder, transforms.json, cameras.json, a trainer's run or g2ard's own .json.",
+    ),
+]
+
+
+def _views_or_made(text: str) -> Path | str:
+    """A word beside all paths: a folder of that name is ./made."""
+    return "made" if text == "made" else Path(text)
+
+
+def is_made(views: object) -> bool:
+    """Whether `--views made` was given."""
+    return views == "made"
+
+
+ViewsOrMadeOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--views",
+        parser=_views_or_made,
+        metavar="VIEWS|made",
+        help="A COLMAP folder, transforms.json, cameras.json, a trainer's run or g2ard's own .json; "
+        "what lies beside the scene if not given; made: a pool of its own instead.",
+    ),
 ]
 LookOption = Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")]
 OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Where the result goes.")]

@@ -6,6 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from g2ard.cameras import Cameras
     from g2ard.cli.frame import Run
     from g2ard.io import ViewSet
@@ -13,8 +16,12 @@ if TYPE_CHECKING:
     from g2ard.targets import Targets
 
 __all__ = [
+    "load_for_training",
+    "load_held_out",
     "load_scene",
+    "load_split_views",
     "load_splits",
+    "load_trained",
     "load_view_sets",
     "load_views",
     "make_targets",
@@ -76,17 +83,75 @@ def load_view_sets(run: Run, path: Path, splits: list[str], size: int | None) ->
     Raises:
         InputError: as `load_views`.
     """
+    from g2ard.splits import split_mask
+
+    found = _read(run, path)
+    masks = [split_mask(path, found.cameras.names, split, stated=found.splits) for split in splits]
+    return [found.take(mask).resized(size) for mask in masks]
+
+
+def load_for_training(run: Run, path: Path, size: int | None) -> ViewSet:
+    """The views to train on of a file beside which another is given to score on: its train split where it
+    states splits, else all.
+
+    Raises:
+        InputError: as `load_views`, and as `g2ard.splits.for_training`.
+    """
+    from g2ard.splits import for_training
+
+    found = _read(run, path)
+    return found.take(for_training(path, found.cameras.names, found.splits)).resized(size)
+
+
+def load_held_out(run: Run, path: Path, size: int | None) -> ViewSet:
+    """The views of a file given to score on.
+
+    Raises:
+        InputError: as `load_views`, and as `g2ard.splits.for_scores`.
+    """
+    from g2ard.splits import for_scores
+
+    found = _read(run, path)
+    return found.take(for_scores(path, found.cameras.names, found.splits)).resized(size)
+
+
+def load_trained(run: Run, path: Path, split: str, size: int | None) -> ViewSet:
+    """The views of a split to train on, shrunk; says so if that makes training views of held-out ones.
+
+    Raises:
+        InputError: as `load_views`.
+    """
+    pool, mask = load_split_views(run, path, split)
+    chosen = pool.take(mask)
+    held_out = chosen.splits.count("test")
+    if held_out:
+        run.say(f"--split {split}: {held_out} of the {len(chosen.cameras)} views trained on are test views")
+    return chosen.resized(size)
+
+
+def load_split_views(run: Run, path: Path, split: str) -> tuple[ViewSet, NDArray[np.bool_]]:
+    """All views, each with the split it belongs to, stated or by the rule; and which of them `split` means.
+
+    Raises:
+        InputError: as `load_views`.
+    """
     from dataclasses import replace
 
+    from g2ard.splits import split_mask, splits_of
+
+    found = _read(run, path)
+    names = found.cameras.names
+    mask = split_mask(path, names, split, stated=found.splits)
+    return replace(found, splits=splits_of(path, names, found.splits)), mask
+
+
+def _read(run: Run, path: Path) -> ViewSet:
     from g2ard.io import read_view_set
-    from g2ard.splits import split_mask
 
     found = read_view_set(path)
     for note in found.notes:
         run.say(f"{path}: {note}")
-    masks = [split_mask(path, found.cameras.names, split, stated=found.splits) for split in splits]
-    parts = [found.take(mask) for mask in masks]
-    return [replace(part, cameras=part.cameras.resized(size)) for part in parts]
+    return found
 
 
 def make_targets(

@@ -4,7 +4,9 @@
 |---|---|
 | `read_splats`, `read_scene` | 3DGS .ply, .compressed.ply, SOG folder or .sog, .spz, .splat |
 | `read_points`, `read_cloud` | .ply, .las, .laz, COLMAP points3D |
-| `read_views`, `read_view_set` | COLMAP folder, transforms.json, Cambridge Landmarks, g2ard's own .json |
+| `read_views`, `read_view_set` | COLMAP, transforms.json, INRIA's, nerfstudio, gsplat, Cambridge, g2ard's |
+
+`find_views` looks for the cameras that trainers leave beside a scene.
 
 The short forms return the data; the long ones also say what was noticed (`Note`). Nothing heavy is imported
 until a function is called.
@@ -17,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from g2ard.io.atomic import atomic_folder, atomic_output, check_output
 from g2ard.io.detect import kind
+from g2ard.io.find import find_views
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,6 +41,7 @@ __all__ = [
     "check_output",
     "check_scene_output",
     "check_views_output",
+    "find_views",
     "kind",
     "read_cloud",
     "read_points",
@@ -253,11 +257,11 @@ def read_view_set(path: str | Path, *, images: str | Path | None = None, split: 
     from importlib import import_module
 
     from g2ard.errors import InputError
-    from g2ard.io.detect import file_format
+    from g2ard.io.detect import KINDS, file_format
     from g2ard.splits import split_mask
 
     path, found = Path(path), file_format(path)
-    if found not in ("colmap", "transforms", "cambridge", "views"):
+    if KINDS[found] != "views":
         raise InputError(f"{path}: views are needed (a COLMAP folder, transforms.json, g2ard's .json)")
     if images is not None and not Path(images).is_dir():
         raise InputError(f"{images}: no such folder of photos")
@@ -279,7 +283,7 @@ def write_views(
         path: the .json to write; photos are named relative to it.
         cameras: C views.
         splits: per view "train", "test" or None; () for none.
-        weights: (C,) how often each view should be drawn; None for none.
+        weights: (C,) how often each view should be drawn, NaN where a view states none; None for none.
         overwrite: whether an existing file may be replaced.
 
     Raises:

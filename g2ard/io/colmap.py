@@ -14,9 +14,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from g2ard.io.photos import Frame
     from g2ard.io.types import ViewSet
 
-__all__ = ["model_folder", "parsing", "photos_beside", "read", "text_lines"]
+__all__ = ["frames", "model_folder", "parsing", "photos_beside", "read", "text_lines"]
 
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
@@ -103,7 +104,18 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
         InputError: no model there, a truncated file, a camera model that is not pinhole with OpenCV
             distortion, or no registered image.
     """
-    from g2ard.io.photos import Frame, photo_size, view_set
+    from g2ard.io.photos import view_set
+
+    return view_set(*frames(path, images))
+
+
+def frames(path: Path, images: Path | None = None) -> tuple[Path, list[Frame]]:
+    """As `read`, before photos that are missing are left out; and the folder of the model.
+
+    Raises:
+        InputError: as `read`.
+    """
+    from g2ard.io.photos import Frame, photo_size
 
     if images is None and (beside := photos_beside(path)):
         path, images = beside
@@ -117,7 +129,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     with parsing(tables[1]):
         found = (_images_bin if binary else _images_txt)(tables[1])
     photos = images or _photo_folder(path, folder)
-    frames = []
+    listed = []
     sizes: dict[int, tuple[int, int]] = {}
     for image in sorted(found, key=lambda i: i.name):
         if image.camera not in cameras:
@@ -128,10 +140,10 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
             if image.camera not in sizes:  # one lens, one size
                 sizes[image.camera] = photo_size(photo)
             camera = camera.at(sizes[image.camera])
-        frames.append(
+        listed.append(
             Frame(image.name, _viewmat(tables[1], image), camera.K, camera.size, photo, camera.distortion)
         )
-    return view_set(folder, frames)
+    return folder, listed
 
 
 def _photo_folder(path: Path, model: Path) -> Path | None:

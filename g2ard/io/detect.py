@@ -7,7 +7,7 @@ from typing import Literal
 
 from g2ard.errors import InputError
 
-__all__ = ["Format", "Kind", "file_format", "kind"]
+__all__ = ["KINDS", "Format", "Kind", "file_format", "kind"]
 
 Format = Literal[
     "ply",
@@ -21,14 +21,19 @@ Format = Literal[
     "colmap",
     "transforms",
     "cambridge",
+    "inria",
+    "nerfstudio",
+    "nerfstudio_export",
+    "gsplat_run",
     "views",
 ]
 Kind = Literal["splats", "points", "views"]
 
-_KINDS: dict[str, Kind] = {
+KINDS: dict[str, Kind] = {
     **dict.fromkeys(("ply", "compressed_ply", "sog", "spz", "splat"), "splats"),
     **dict.fromkeys(("cloud_ply", "las", "points3d"), "points"),
     **dict.fromkeys(("colmap", "transforms", "cambridge", "views"), "views"),
+    **dict.fromkeys(("inria", "nerfstudio", "nerfstudio_export", "gsplat_run"), "views"),
 }
 
 
@@ -40,7 +45,7 @@ def kind(path: str | Path) -> Kind:
     Raises:
         InputError: nothing is there, or it is nothing g2ard reads.
     """
-    return _KINDS[file_format(path)]
+    return KINDS[file_format(path)]
 
 
 def file_format(path: str | Path) -> Format:
@@ -61,6 +66,8 @@ def file_format(path: str | Path) -> Format:
         return "points3d"
     if name in ("cameras.bin", "cameras.txt", "images.bin", "images.txt"):
         return "colmap"
+    if name in ("config.yml", "cfg.yml"):
+        return "nerfstudio" if name == "config.yml" else "gsplat_run"
     by_suffix: dict[str, Format] = {
         ".sog": "sog",
         ".spz": "spz",
@@ -76,7 +83,7 @@ def file_format(path: str | Path) -> Format:
         return _json_format(path)
     raise InputError(
         f"{path}: unknown format {path.suffix!r} (scenes: .ply .sog .spz .splat; clouds: .ply .las .laz; "
-        "views: a COLMAP folder or a .json)"
+        "views: a COLMAP folder, a .json, or a trainer's run)"
     )
 
 
@@ -86,21 +93,31 @@ def _folder_format(path: Path) -> Format:
     if chunks_of(path):
         return "sog"
 
+    from g2ard.io import gsplat_run, inria, nerfstudio
     from g2ard.io.cambridge import is_cambridge
     from g2ard.io.colmap import model_folder, photos_beside
+    from g2ard.io.nerfstudio_export import exported
     from g2ard.io.transforms import files_of
 
+    if (path / nerfstudio.NAME).is_file():  # before its data, whose world is another
+        return "nerfstudio"
     if model_folder(path) is not None:
         return "colmap"
+    if exported(path):
+        return "nerfstudio_export"
     if files_of(path):
         return "transforms"
     if is_cambridge(path):
         return "cambridge"
     if photos_beside(path):
         return "colmap"
+    if (path / inria.NAME).is_file():
+        return "inria"
+    if gsplat_run.is_run(path / gsplat_run.NAME):
+        return "gsplat_run"
     raise InputError(
-        f"{path}: nothing known in this folder "
-        "(looked for SOG's meta.json, a COLMAP sparse/0, transforms.json, Cambridge's dataset_train.txt)"
+        f"{path}: nothing known in this folder (looked for SOG's meta.json, a COLMAP sparse/0, "
+        "transforms.json, cameras.json, nerfstudio's and gsplat's runs, Cambridge's dataset_train.txt)"
     )
 
 
@@ -118,11 +135,23 @@ def _ply_format(path: Path) -> Format:
 
 
 def _json_format(path: Path) -> Format:
-    from g2ard.io.jsonfile import read_json
+    from g2ard.io.inria import is_inria
+    from g2ard.io.jsonfile import read_any_json
+    from g2ard.io.nerfstudio_export import is_export
 
-    content = read_json(path)
+    content = read_any_json(path)
+    if is_inria(content):
+        return "inria"
+    if is_export(content):
+        return "nerfstudio_export"
+    if not isinstance(content, dict):
+        raise InputError(
+            f"{path}: a JSON list, but neither INRIA's cameras nor those of nerfstudio's ns-export"
+        )
     if "views" in content:
         return "views"
     if "frames" in content:
         return "transforms"
+    if {"transform", "scale"} <= set(content):
+        return "nerfstudio"
     raise InputError(f"{path}: neither a transforms.json ('frames') nor g2ard's views ('views')")

@@ -15,7 +15,7 @@ from g2ard.errors import InputError
 from g2ard.io.clean import plural
 from g2ard.io.types import Note, ViewSet
 
-__all__ = ["Frame", "find_photo", "photo_size", "pixels", "rigid", "rotation", "view_set"]
+__all__ = ["Frame", "find_photo", "inverse", "photo_size", "pixels", "rigid", "rotation", "view_set"]
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 
@@ -95,6 +95,14 @@ def rigid(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
         raise InputError(f"{where}: its pose is not a rotation and a translation")
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = R, matrix[:3, 3]
+    return out
+
+
+def inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The inverse of a (4, 4) rigid transform."""
+    R, t = matrix[:3, :3], matrix[:3, 3]
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = R.T, -R.T @ t
     return out
 
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import read_json
-from g2ard.io.photos import Frame, find_photo, photo_size, pixels, rigid, view_set
+from g2ard.io.photos import Frame, find_photo, inverse, photo_size, pixels, rigid, view_set
 from g2ard.io.types import ViewSet
 
-__all__ = ["files_of", "read"]
+__all__ = ["files_of", "frames", "opencv_view", "read"]
 
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
@@ -34,10 +34,18 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     Raises:
         InputError: no frames, a pose or intrinsics that make no sense, or a fisheye lens.
     """
+    return view_set(path, frames(path, images))
+
+
+def frames(path: Path, images: Path | None = None) -> list[Frame]:
+    """As `read`, before photos that are missing are left out.
+
+    Raises:
+        InputError: as `read`.
+    """
     if path.is_file():
-        return view_set(path, _frames(path, images))
-    found = files_of(path)
-    return view_set(path, [frame for file, split in found.items() for frame in _frames(file, images, split)])
+        return _frames(path, images)
+    return [frame for file, split in files_of(path).items() for frame in _frames(file, images, split)]
 
 
 def files_of(folder: Path) -> dict[Path, str | None]:
@@ -52,10 +60,29 @@ def files_of(folder: Path) -> dict[Path, str | None]:
 
 def _frames(path: Path, images: Path | None, split: str | None = None) -> list[Frame]:
     content = read_json(path)
-    frames = content.get("frames")
-    if not isinstance(frames, list) or not frames:
+    listed = content.get("frames")
+    if not isinstance(listed, list) or not listed:
         raise InputError(f"{path}: no views found ('frames' is empty)")
-    return [_frame(path, i, content, frame, images)._replace(split=split) for i, frame in enumerate(frames)]
+    found = [_frame(path, i, content, frame, images) for i, frame in enumerate(listed)]
+    stated = _stated(path, content)
+    if not stated:
+        return [frame._replace(split=split) for frame in found]
+    names = [Path(str(frame.get("file_path"))).as_posix() for frame in listed]
+    return [frame._replace(split=stated.get(name)) for frame, name in zip(found, names, strict=True)]
+
+
+def _stated(path: Path, content: dict[str, Any]) -> dict[str, str]:
+    """file_path → split, where the file lists them as nerfstudio's data may (train_filenames and its kin)."""
+    stated: dict[str, str] = {}
+    for split in ("train", "val", "test"):
+        names = content.get(f"{split}_filenames", ())
+        if not isinstance(names, list | tuple):
+            raise InputError(f"{path}: '{split}_filenames' is not a list")
+        for listed in names:
+            name = Path(str(listed)).as_posix()
+            if stated.setdefault(name, split) != split and stated[name] == "train":
+                raise InputError(f"{path}: {name!r} is in both train_filenames and {split}_filenames")
+    return stated
 
 
 def _frame(path: Path, index: int, content: dict[str, Any], frame: Any, images: Path | None) -> Frame:
@@ -69,7 +96,7 @@ def _frame(path: Path, index: int, content: dict[str, Any], frame: Any, images: 
         photo = find_photo(images / Path(file_path).name if images else path.parent / file_path)
         return Frame(
             name=file_path.removeprefix("./").removeprefix("images/"),
-            viewmat=_camera_from_world(rigid(where, world_from_camera)),
+            viewmat=opencv_view(rigid(where, world_from_camera)),
             photo=photo,
             mask=None if mask is None else _there(where, path.parent / str(mask)),
             **_intrinsics(where, {**content, **frame}, photo),
@@ -98,12 +125,9 @@ def _there(where: str, mask: Path) -> Path:
     return mask
 
 
-def _camera_from_world(world_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    world_from_opencv = world_from_camera @ _FLIP
-    R, centre = world_from_opencv[:3, :3], world_from_opencv[:3, 3]
-    view = np.eye(4)
-    view[:3, :3], view[:3, 3] = R.T, -R.T @ centre
-    return view
+def opencv_view(world_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) camera_from_world with OpenCV's axes, of a rigid world_from_camera with OpenGL's."""
+    return inverse(world_from_camera @ _FLIP)
 
 
 def _intrinsics(where: str, values: dict[str, Any], photo: Path) -> dict[str, Any]:

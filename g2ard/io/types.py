@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -98,3 +98,7 @@ class ViewSet:
         splits = tuple(self.splits[i] for i in rows) if self.splits else ()
         weights = None if self.weights is None else self.weights[rows]
         return ViewSet(self.cameras.take(rows), self.notes, splits, weights)
+
+    def resized(self, longest: int | None) -> ViewSet:
+        """The same views with their longer side shrunk to at most `longest` pixels (None keeps them)."""
+        return replace(self, cameras=self.cameras.resized(longest))

@@ -94,7 +94,7 @@ def write(
         path: the .json to write.
         cameras: C views.
         splits: per view "train", "test" or None; () for none.
-        weights: (C,) how often each view should be drawn; None for none.
+        weights: (C,) how often each view should be drawn, NaN where a view states none; None for none.
         overwrite: whether an existing file may be replaced.
 
     Raises:
@@ -102,7 +102,8 @@ def write(
         InputError: no views, or splits or weights of another length.
     """
     count = len(cameras)
-    drawn = [None] * count if weights is None else np.asarray(weights, np.float64).tolist()
+    given = np.full(count, np.nan) if weights is None else np.asarray(weights, np.float64)
+    drawn = [None if np.isnan(weight) else weight for weight in given.tolist()]
     parts = list(splits) or [None] * count
     if not count or len(parts) != count or len(drawn) != count:
         raise InputError(f"{path}: {count} views, {len(parts)} splits and {len(drawn)} weights do not fit")

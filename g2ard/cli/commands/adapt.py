@@ -45,7 +45,7 @@ def adapt(
     from g2ard.adapt import AdaptConfig
     from g2ard.adapt import adapt as refit
     from g2ard.cli.resume import check_stopped, stoppable
-    from g2ard.cli.scenes import load_scene, load_views, make_targets, trained_on
+    from g2ard.cli.scenes import load_scene, load_trained, make_targets, trained_on
     from g2ard.io import check_scene_output, write_splats
 
     work = output.parent / f".{output.name}.work"
@@ -54,7 +54,7 @@ def adapt(
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(run, compact)
     dense = load_scene(run, teacher) if teacher else None
-    cameras = load_views(run, views, split, size)
+    cameras = load_trained(run, views, split, size).cameras
     config = AdaptConfig(
         steps=steps,
         tolerance=tolerance,

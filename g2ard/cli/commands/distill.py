@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.cli.found import as_pool, found_views
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
@@ -22,15 +23,23 @@ from g2ard.cli.options import (
     ScheduleName,
     SizeOption,
     TimeLimitOption,
-    ViewsOption,
+    ViewsOrMadeOption,
     budget_of,
     can_judge,
+    is_made,
     one_budget,
     one_horizon,
     views_count,
 )
 from g2ard.cli.resume import check_stopped, left_at
-from g2ard.cli.scenes import load_scene, load_view_sets, make_targets, recovery_engine
+from g2ard.cli.scenes import (
+    load_for_training,
+    load_held_out,
+    load_scene,
+    load_view_sets,
+    make_targets,
+    recovery_engine,
+)
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
@@ -56,7 +65,7 @@ def distill(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN", help="Folder of the run.")],
     count: CountOption = None,
     ratio: RatioOption = None,
-    views: ViewsOption = None,
+    views: ViewsOrMadeOption = None,
     photos: Annotated[
         bool | None,
         typer.Option(
@@ -66,7 +75,10 @@ def distill(
     ] = None,
     held_out: Annotated[
         Path | None,
-        typer.Option(metavar="VIEWS", help="Score on these; --views is then all for recovery."),
+        typer.Option(
+            metavar="VIEWS",
+            help="Score on these; --views is then for recovery, but for what it holds out itself.",
+        ),
     ] = None,
     k: Annotated[
         Count | None,
@@ -102,11 +114,15 @@ def distill(
     size: SizeOption = None,
     background: BackgroundOption = None,
 ) -> None:
-    """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget."""
+    """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget.
+
+    Views are those of --views, else the cameras that lie beside the scene, else a pool of poses of its own.
+    """
     one_budget(count, ratio)
     one_horizon(steps, time_limit)
     can_judge(k, policy)
-    run.spare_inputs(output / "scene.ply", *([output / "views.json"] if views is None else []))
+    given = views is not None and not is_made(views)
+    run.spare_inputs(output / "scene.ply", *([output / "views.json"] if not given else []))
     import shutil
     import time
 
@@ -121,14 +137,14 @@ def distill(
     began = time.monotonic()
     engine = recovery_engine(run)
     lifted = kind(scene) != "splats"
-    if lifted and views is None:
+    if lifted and not given:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
     if not left_at(output / _WORK):
         check_output(output, run.overwrite, folder=True)
     check_stopped(run, output / _WORK, resume)
     prior = _lift(run, scene) if lifted else load_scene(run, scene)
     budget = budget_of(scene, count, ratio, len(prior))
-    candidates, test, pool = _views(run, prior, views, held_out, size)
+    candidates, test, pool = _views(run, scene, prior, views, held_out, size)
     train = candidates.cameras
     pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
     use_photos = lifted or (pictured if photos is None else photos)
@@ -178,7 +194,7 @@ def distill(
         )
         _write(run, output, result, unseen, colour, report)
     if pool is not None:
-        write_views(output / "views.json", pool, overwrite=True)
+        write_views(output / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
     shutil.rmtree(output / _WORK)
     _table(run, report)
     _say_views(run, report["views"], k is not None)
@@ -220,26 +236,35 @@ def _lift(run: Run, path: Path) -> Splats:
 
 
 def _views(
-    run: Run, prior: Splats, views: Path | None, held_out: Path | None, size: int | None
-) -> tuple[ViewSet, Cameras, Cameras | None]:
-    """Views for recovery, views for scoring, and the pool both came from where one had to be made."""
+    run: Run, scene: Path, prior: Splats, views: Path | None, held_out: Path | None, size: int | None
+) -> tuple[ViewSet, Cameras, ViewSet | None]:
+    """Views for recovery, views for scoring, and the pool they came from where one had to be made."""
+    from dataclasses import replace
+
     from g2ard.io import ViewSet
     from g2ard.poses import plan_pool
-    from g2ard.splits import split_mask
+    from g2ard.splits import split_mask, splits_of
 
-    if views is not None:
-        if held_out is not None:
-            train, test = (load_view_sets(run, path, ["all"], size)[0] for path in (views, held_out))
-        else:
+    found = None
+    if views is None:
+        found = views = found_views(run, scene, prior, ["train"] if held_out else ["train", "test"])
+    if views is not None and not is_made(views):
+        if held_out is None:
             train, test = load_view_sets(run, views, ["train", "test"], size)
+        else:
+            train, test = load_for_training(run, views, size), load_held_out(run, held_out, size)
+        if found and not size:
+            train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
         return train, test.cameras, None
     planned = plan_pool(prior, _POOL, seed=run.seed, progress=run.progress)
-    pool = planned.cameras
+    names = planned.cameras.names
     run.say(f"poses: {planned.kind} ({planned.why})")
     if held_out is not None:
-        return ViewSet(pool.resized(size)), load_view_sets(run, held_out, ["all"], size)[0].cameras, pool
-    unseen = split_mask("views.json", pool.names, "test")
-    return ViewSet(pool.take(~unseen).resized(size)), pool.take(unseen).resized(size), pool
+        pool = ViewSet(planned.cameras, splits=("train",) * len(names))
+        return pool.resized(size), load_held_out(run, held_out, size).cameras, pool
+    pool = ViewSet(planned.cameras, splits=splits_of(None, names))
+    unseen = split_mask(None, names, "test")
+    return pool.take(~unseen).resized(size), pool.take(unseen).resized(size).cameras, pool
 
 
 def _score(run: Run, prior: Splats, result: Distilled, unseen: Targets, colour: Colour) -> dict[str, Any]:

@@ -71,6 +71,7 @@ def poses(
     from g2ard.cli.scenes import load_scene
     from g2ard.io import check_views_output, write_views
     from g2ard.poses import plan_pool
+    from g2ard.splits import splits_of
 
     check_views_output(output, run.overwrite)
     splats = load_scene(run, scene)
@@ -84,7 +85,8 @@ def poses(
         seed=run.seed,
         progress=run.progress,
     )
-    write_views(output, pool.cameras, overwrite=run.overwrite)
+    splits = splits_of(None, pool.cameras.names)
+    write_views(output, pool.cameras, splits=splits, overwrite=run.overwrite)
     direction = ", ".join(f"{v:.2f}" for v in pool.up)
     run.say(f"{output}: {count} poses, {pool.kind} ({pool.why}; up is {direction})")
     run.result({"count": count, "kind": pool.kind, "why": pool.why, "up": pool.up.tolist()})

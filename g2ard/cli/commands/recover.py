@@ -50,7 +50,7 @@ def recover(
 ) -> None:
     """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
     from g2ard.cli.resume import check_stopped, stoppable
-    from g2ard.cli.scenes import load_scene, load_view_sets, make_targets, recovery_engine, trained_on
+    from g2ard.cli.scenes import load_scene, load_trained, make_targets, recovery_engine, trained_on
     from g2ard.io import check_scene_output, write_splats
     from g2ard.recover import RecoverConfig
     from g2ard.recover import recover as optimize
@@ -65,7 +65,7 @@ def recover(
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(run, student)
     dense = load_scene(run, teacher) if teacher else None
-    chosen = load_view_sets(run, views, [split], size)[0]
+    chosen = load_trained(run, views, split, size)
     weights = chosen.weights if weighted else None
     if weights is not None:
         run.say(f"{len(weights)} views, drawn by their weights")

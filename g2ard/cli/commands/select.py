@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,10 +13,14 @@ from g2ard.cli.options import (
     OutputOption,
     PolicyOption,
     SceneArgument,
+    SplitOption,
     ViewsOption,
     can_judge,
     views_count,
 )
+
+if TYPE_CHECKING:
+    from g2ard.io import ViewSet
 
 
 @command("select", example="g2ard select scene.ply --views poses.json -k 100 -o chosen.json")
@@ -31,11 +36,15 @@ def select(
     ],
     views: ViewsOption = None,
     policy: PolicyOption = "auto",
+    split: SplitOption = "train",
     cells: Annotated[int, typer.Option(min=1, help="Surface cells, of directional and coverage.")] = 300_000,
 ) -> None:
-    """Choose the views worth having, best first, with a weight for how often to draw each."""
-    from g2ard.cli.scenes import load_scene, load_views
-    from g2ard.io import check_views_output, write_views
+    """Choose the views worth having, best first, with a weight for how often to draw each.
+
+    Views that are not for training follow after them, with their split and no weight, to score on.
+    """
+    from g2ard.cli.scenes import load_scene, load_split_views
+    from g2ard.io import check_views_output
     from g2ard.select import CoverageOptions
     from g2ard.select import select as choose
 
@@ -44,7 +53,8 @@ def select(
     can_judge(k, policy)
     check_views_output(output, run.overwrite)
     splats = load_scene(run, scene)
-    cameras = load_views(run, views, "all", None)
+    pool, candidates = load_split_views(run, views, split)
+    cameras = pool.cameras.take(candidates)
     chosen = choose(
         splats,
         cameras,
@@ -55,7 +65,7 @@ def select(
         progress=run.progress,
     )
     kept = cameras.take(chosen.order)
-    write_views(output, kept, weights=chosen.weights, overwrite=run.overwrite)
+    _write(run, output, pool, candidates.nonzero()[0][chosen.order], chosen.weights)
     if len(chosen.refused):
         run.say(f"{len(chosen.refused)} views refused: they see nothing of the scene, or stand within it")
     run.say(
@@ -78,3 +88,24 @@ def select(
             "seconds": chosen.seconds,
         }
     )
+
+
+def _write(run: Run, output: Path, pool: ViewSet, chosen: Any, weights: Any) -> None:
+    """The chosen rows of the pool, best first, then all others that are not for training."""
+    import numpy as np
+
+    from g2ard.io import write_views
+
+    kept = np.isin(np.arange(len(pool.splits)), chosen)
+    held_out = [i for i, word in enumerate(pool.splits) if word not in ("train", None) and not kept[i]]
+    rows = np.array([*chosen, *held_out], int)
+    write_views(
+        output,
+        pool.cameras.take(rows),
+        splits=[pool.splits[i] for i in rows],
+        weights=[*weights, *[np.nan] * len(held_out)],
+        overwrite=run.overwrite,
+    )
+    if held_out:
+        words = ", ".join(sorted({str(pool.splits[i]) for i in held_out}))
+        run.say(f"{len(held_out)} views held out ({words}) follow the chosen ones")

@@ -14,8 +14,9 @@ from g2ard.cli.options import (
     OutputOption,
     RatioOption,
     SceneArgument,
-    ViewsOption,
+    ViewsOrMadeOption,
     budget_of,
+    is_made,
     one_budget,
 )
 
@@ -38,9 +39,10 @@ def simplify(
     output: OutputOption,
     count: CountOption = None,
     ratio: RatioOption = None,
-    views: ViewsOption = None,
+    views: ViewsOrMadeOption = None,
     no_views: Annotated[
-        bool, typer.Option("--no-views", help="Use no cameras at all, not even a pool of its own.")
+        bool,
+        typer.Option("--no-views", help="Use no cameras at all, neither found ones nor a pool of its own."),
     ] = False,
     method: Annotated[Method, typer.Option(help="The policy.")] = "default",
     retention: Annotated[
@@ -50,8 +52,8 @@ def simplify(
 ) -> None:
     """Reduce a scene to an exact number of Gaussians; no images needed.
 
-    The default method weighs errors by what is seen: from --views, else from a pool of poses of its own. The
-    fast one looks only at given views, the paper's at none.
+    The default method weighs errors by what is seen: from --views, else from the cameras that lie beside the
+    scene, else from a pool of poses of its own. The fast one looks only at given views, the paper's at none.
     """
     import time
 
@@ -70,7 +72,8 @@ def simplify(
         run.say(f"{scene}: {note}")
     read = time.perf_counter()
     budget = budget_of(scene, count, ratio, len(found.splats))
-    cameras = None if no_views or budget >= len(found.splats) else _cameras(run, found.splats, views, method)
+    looks = not no_views and budget < len(found.splats)
+    cameras = _cameras(run, scene, found.splats, views, method) if looks else None
     small = reduce(
         found.splats,
         budget,
@@ -100,17 +103,23 @@ def simplify(
     )
 
 
-def _cameras(run: Run, splats: Splats, views: Path | None, method: str) -> Cameras | None:
-    """The views given, or a few of its own where the scene leaves room for them."""
-    if views is not None:
-        from g2ard.cli.scenes import load_views
-
-        if method == "paper":
-            run.say("paper uses no views")
-        return load_views(run, views, "train", None)
-    if method != "default":
-        return None
+def _cameras(run: Run, scene: Path, splats: Splats, views: Path | None, method: str) -> Cameras | None:
+    """The views given, else those beside the scene, else a few of its own where it leaves room for them."""
+    from g2ard.cli.found import as_pool, found_views
+    from g2ard.cli.scenes import load_views
     from g2ard.errors import InputError
+
+    made = is_made(views)
+    if method == "paper" and views is not None:
+        run.say("paper uses no views")
+    if method == "paper" and made:
+        return None
+    if views is None and method == "default" and (found := found_views(run, scene, splats, ["train"])):
+        return as_pool(load_views(run, found, "train", None))
+    if views is not None and not made:
+        return load_views(run, views, "train", None)
+    if method != "default" and not made:
+        return None
     from g2ard.poses import make_pool
 
     try:

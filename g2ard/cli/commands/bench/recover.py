@@ -36,7 +36,10 @@ def recover(
     views: ViewsOption = None,
     held_out: Annotated[
         Path | None,
-        typer.Option(metavar="VIEWS", help="Score on these; --views is then all for recovery."),
+        typer.Option(
+            metavar="VIEWS",
+            help="Score on these; --views is then for recovery, but for what it holds out itself.",
+        ),
     ] = None,
     photos: Annotated[
         bool | None,

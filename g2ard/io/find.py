@@ -1,0 +1,69 @@
+"""Cameras that trainers leave beside a scene."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from g2ard.errors import InputError
+
+__all__ = ["find_views"]
+
+
+def find_views(scene: str | Path) -> Path | None:
+    """The cameras a scene was trained with, where its own folder or its trainer's layout tells them.
+
+    Looked at, in this order, and only where no guess is needed whose world the cameras are in:
+
+    - cameras.json (INRIA) in the scene's own folder, or in the model's folder above
+      point_cloud/iteration_N/;
+    - nerfstudio's dataparser_transforms.json, else the lists of `ns-export cameras`, in the scene's own
+      folder;
+    - cfg.yml (gsplat's simple_trainer) above ply/.
+
+    A transforms.json or a COLMAP model beside a scene is not taken: trainers move the world they read.
+
+    Args:
+        scene: a scene's file or folder; it need not exist.
+
+    Returns:
+        A path for `read_view_set`, which may still find it broken; None if nothing is there.
+    """
+    from g2ard.io import gsplat_run, inria, nerfstudio, nerfstudio_export
+
+    scene = Path(scene)
+    own = (scene if scene.is_dir() else scene.parent).absolute()
+    iteration = re.fullmatch(r"iteration_\d+", own.name) and own.parent.name == "point_cloud"
+    places = [own / inria.NAME, *([own.parent.parent / inria.NAME] if iteration else ())]
+    found = next((file for file in places if _holds(file, inria.is_inria)), None)
+    if found is None and (own / nerfstudio.NAME).is_file():
+        found = own / nerfstudio.NAME
+    if found is None and any(
+        _holds(own / name, nerfstudio_export.is_export) for name in nerfstudio_export.LISTS
+    ):
+        found = own
+    if found is None and own.name == "ply" and _is_run(own.parent / gsplat_run.NAME):
+        found = own.parent / gsplat_run.NAME
+    return found if found is None or scene.is_absolute() else Path(os.path.relpath(found))
+
+
+def _is_run(file: Path) -> bool:
+    from g2ard.io.gsplat_run import is_run
+
+    try:
+        return is_run(file)
+    except InputError:
+        return False
+
+
+def _holds(file: Path, test: Callable[[Any], bool]) -> bool:
+    """Whether a JSON file is there and holds what `test` knows."""
+    from g2ard.io.jsonfile import read_any_json
+
+    try:
+        return file.is_file() and test(read_any_json(file))
+    except InputError:
+        return False

@@ -1,0 +1,82 @@
+"""cameras.json, as INRIA's 3D Gaussian Splatting writes it beside point_cloud/ in a model's folder."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from g2ard.errors import InputError
+from g2ard.io.clean import plural
+from g2ard.io.jsonfile import read_json_list
+from g2ard.io.photos import Frame, find_photo, inverse, pixels, rigid, view_set
+from g2ard.io.types import Note, ViewSet
+
+__all__ = ["NAME", "is_inria", "read"]
+
+NAME = "cameras.json"
+"""How the file is called."""
+
+
+def is_inria(content: Any) -> bool:
+    """Whether what a JSON file holds is a list of such cameras."""
+    first = content[0] if isinstance(content, list) and content else None
+    return isinstance(first, dict) and {"position", "rotation"} <= set(first)
+
+
+def read(path: Path, images: Path | None = None) -> ViewSet:
+    """Read the cameras a model was trained and tested on.
+
+    Each is {id, img_name, width, height, position, rotation, fx, fy}: the camera's centre in the world, and
+    world_from_camera as rows, with OpenCV's axes. The principal point is not stored: INRIA's trainer takes
+    the image's middle. Names that repeat (NeRF's synthetic scenes have an r_0 in each split) get their id.
+
+    Args:
+        path: the JSON, or the model's folder.
+        images: a folder to look for photos in, by their names; None means there are none.
+
+    Raises:
+        InputError: no cameras, or one that makes no sense.
+    """
+    file = path / NAME if path.is_dir() else path
+    listed = read_json_list(file)
+    frames = [_frame(file, i, camera, images) for i, camera in enumerate(listed)]
+    times = Counter(frame.name for frame in frames)
+    twice = {name for name, count in times.items() if count > 1}
+    if not twice:
+        return view_set(file, frames)
+    named = [
+        frame._replace(name=f"{frame.name}_{camera.get('id', i)}") if frame.name in twice else frame
+        for i, (frame, camera) in enumerate(zip(frames, listed, strict=True))
+    ]
+    found = view_set(file, named)
+    count = sum(times[name] for name in twice)
+    text = f"{plural(count, 'camera')} of {len(frames)} share a name with another, and get their id"
+    return replace(found, notes=(*found.notes, Note("repeated_names", count, text)))
+
+
+def _frame(path: Path, index: int, camera: Any, images: Path | None) -> Frame:
+    where = f"{path}: camera {index}"
+    try:
+        name = str(camera["img_name"])
+        world_from_camera = np.eye(4)
+        world_from_camera[:3, :3] = np.array(camera["rotation"], np.float64)
+        world_from_camera[:3, 3] = np.array(camera["position"], np.float64)
+        width, height = pixels(where, camera, "width"), pixels(where, camera, "height")
+        K = [[float(camera["fx"]), 0, width / 2], [0, float(camera["fy"]), height / 2], [0, 0, 1]]
+        return Frame(
+            name=name,
+            viewmat=inverse(rigid(where, world_from_camera)),
+            K=np.array(K),
+            size=(width, height),
+            photo=find_photo(images / Path(name).name) if images else None,
+        )
+    except KeyError as error:
+        raise InputError(f"{where}: lacks {error}") from error
+    except (TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{where}: malformed ({error})") from error

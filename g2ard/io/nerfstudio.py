@@ -1,0 +1,190 @@
+"""The folder of a nerfstudio run: the cameras of its data, moved into the world it trained in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.io import colmap, transforms
+from g2ard.io.jsonfile import read_json
+from g2ard.io.photos import Frame, inverse, rigid, view_set
+from g2ard.io.settings import Settings, below, read_settings
+from g2ard.io.types import Note, ViewSet
+
+__all__ = ["CONFIG", "NAME", "read"]
+
+NAME = "dataparser_transforms.json"
+"""What a run leaves beside its config.yml: `transform`, 3×4, and `scale`."""
+CONFIG = "config.yml"
+
+_PARSERS = ("NerfstudioDataParser", "ColmapDataParser", "BlenderDataParser")
+_EYE = np.eye(4)
+
+
+def read(path: Path, images: Path | None = None) -> ViewSet:
+    """Read the cameras a run was trained and tested on, in the world of the scene it exports.
+
+    x_trained = s·(D·A⁻¹·x): D and the run's scale come from dataparser_transforms.json and start from the
+    original data; A (`applied_transform`) and `applied_scale` of the data's transforms.json led from there
+    to the poses that file holds, s = scale / applied_scale. COLMAP's poses are the original data: A = 1.
+
+    Args:
+        path: the run's folder, its dataparser_transforms.json or its config.yml. config.yml tells where the
+            data is; without it, a transforms.json in the folder is the data.
+        images: a folder to look for photos in, by their file names; None takes the data's.
+
+    Raises:
+        InputError: the run's files or its data are absent or broken, its data were read in a way that is not
+            known, or nothing tells A.
+    """
+    folder = path if path.is_dir() else path.parent
+    file = folder / NAME
+    content = read_json(file)
+    try:
+        D = _affine(file, "transform", content["transform"])
+        scale = float(content["scale"])
+    except KeyError as error:
+        raise InputError(f"{file}: lacks {error}") from error
+    except (TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{file}: malformed ({error})") from error
+    settings = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else None
+    frames, A, applied_scale = _data(folder, settings, images)
+    if not (math.isfinite(scale) and scale > 0):
+        raise InputError(f"{file}: 'scale' is {content['scale']!r}, not a number > 0")
+    scale /= applied_scale
+    trained_from_saved = rigid(f"{file}: 'transform'", D @ np.linalg.inv(A))
+    found = view_set(file, [_moved(frame, trained_from_saved, scale) for frame in frames])
+    mode = _optimized(settings)
+    if mode is None:
+        return found
+    text = f"the run optimised its poses ({mode}), and these are as they were before"
+    return replace(found, notes=(*found.notes, Note("optimised_poses", len(found.cameras), text)))
+
+
+def _data(
+    folder: Path, settings: Settings | None, images: Path | None
+) -> tuple[list[Frame], NDArray[np.float64], float]:
+    """The frames of the data, and A and the scale that had been applied to them."""
+    if settings is None:
+        if not (folder / "transforms.json").is_file():
+            raise InputError(
+                f"{folder / NAME}: neither a {CONFIG} nor a transforms.json beside it tells its data"
+            )
+        return _saved(folder / "transforms.json", images, None)
+    parser, options, data = _parser(folder / CONFIG, settings)
+    place = below(folder / CONFIG, data)
+    if place is None:
+        raise InputError(f"{folder / CONFIG}: its data {data.as_posix()} is not there")
+    if parser == "ColmapDataParser":
+        model = place / (options.path("colmap_path") or "colmap/sparse/0")
+        photos = images or place / (options.path("images_path") or "images")
+        return colmap.frames(model, photos if photos.is_dir() else None)[1], _EYE, 1.0
+    return _saved(place, images, options if parser == "NerfstudioDataParser" else None)
+
+
+def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
+    """Which parser read the data, its options, and where the data was."""
+    pipeline = settings.block("pipeline")
+    manager = pipeline and pipeline[1].block("datamanager")
+    parser = manager and manager[1].block("dataparser")
+    if not parser or not manager:
+        raise InputError(f"{path}: lacks 'pipeline.datamanager.dataparser'")
+    name = parser[0].rsplit(".", 1)[-1].removesuffix("Config")
+    if name not in _PARSERS:
+        raise InputError(
+            f"{path}: data read by {name or 'no known parser'} are not supported ({', '.join(_PARSERS)} are)"
+        )
+    data = settings.path("data") or manager[1].path("data") or parser[1].path("data")
+    if data is None:
+        raise InputError(f"{path}: 'data' names no folder")
+    return name, parser[1], data
+
+
+def _saved(
+    data: Path, images: Path | None, options: Settings | None
+) -> tuple[list[Frame], NDArray[np.float64], float]:
+    """The frames of a transforms.json, or of a folder with one or with transforms_train.json and its kin."""
+    file = data / "transforms.json" if (data / "transforms.json").is_file() else data
+    frames = transforms.frames(file, images)
+    if not frames:
+        raise InputError(f"{data}: no transforms.json in the run's data")
+    content = read_json(file) if file.is_file() else {}
+    given = content.get("applied_transform")
+    if given is None and options is not None and (file.parent / "colmap" / "sparse" / "0").is_dir():
+        raise InputError(
+            f"{file}: lacks 'applied_transform', and versions of nerfstudio differ in what they take for it"
+        )
+    A = _EYE if given is None else _affine(file, "applied_transform", given)
+    if options is not None and not any(frame.split for frame in frames):
+        try:
+            frames = _split(frames, options)
+        except (ValueError, OverflowError) as error:
+            raise InputError(f"{data}: the run's split of it is malformed ({error})") from error
+    try:
+        applied_scale = float(content.get("applied_scale", 1.0))
+    except (TypeError, ValueError):
+        applied_scale = math.nan
+    if not (math.isfinite(applied_scale) and applied_scale > 0):
+        raise InputError(f"{file}: 'applied_scale' is {content['applied_scale']!r}, not a number > 0")
+    return frames, A, applied_scale
+
+
+def _split(frames: Sequence[Frame], options: Settings) -> list[Frame]:
+    """The run's own split by `eval_mode`, over the sorted paths of photos; none where all are for both."""
+    count, mode = len(frames), options.word("eval_mode")
+    order = sorted(range(count), key=lambda i: frames[i].photo or Path(frames[i].name))
+    rank = np.argsort(order)
+    if mode == "fraction":
+        many = math.ceil(count * float(options.word("train_split_fraction") or 0.9))
+        train = np.isin(rank, np.linspace(0, count - 1, many, dtype=int))
+    elif mode == "interval":
+        interval = int(options.word("eval_interval") or 8)
+        if interval < 1:
+            raise ValueError(f"eval_interval {interval}")
+        train = rank % interval != 0
+    elif mode == "filename":
+        train = np.array(["train" in Path(frame.name).name for frame in frames])
+    else:
+        return list(frames)
+    words = np.where(train, "train", "test").tolist()
+    return [frame._replace(split=word) for frame, word in zip(frames, words, strict=True)]
+
+
+def _optimized(settings: Settings | None) -> str | None:
+    """How the run optimised its poses; None where it did not, or nothing says so."""
+    pipeline = settings and settings.block("pipeline")
+    model = pipeline and pipeline[1].block("model")
+    optimizer = model and model[1].block("camera_optimizer")
+    mode = optimizer[1].word("mode") if optimizer else None
+    return None if mode in (None, "off", "false") else mode
+
+
+def _moved(frame: Frame, transform: NDArray[np.float64], scale: float) -> Frame:
+    """The frame after x → scale·(transform·x): its axes turn, only its centre scales."""
+    world_from_camera = transform @ inverse(frame.viewmat)
+    world_from_camera[:3, 3] *= scale
+    return frame._replace(viewmat=inverse(world_from_camera))
+
+
+def _affine(path: Path, key: str, rows: Any) -> NDArray[np.float64]:
+    """(4, 4) of a 3×4 or 4×4 list."""
+    try:
+        matrix = np.array(rows, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
+        raise InputError(f"{path}: {key!r} is not a finite 3×4 matrix")
+    out = np.eye(4)
+    out[:3] = matrix[:3]
+    if not 0.99 < abs(np.linalg.det(out[:3, :3])) < 1.01:
+        raise InputError(f"{path}: {key!r} is no rotation")
+    return out

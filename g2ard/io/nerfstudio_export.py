@@ -1,0 +1,120 @@
+"""Poses as nerfstudio's `ns-export cameras` lists them: transforms_train.json and transforms_eval.json."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from g2ard.errors import InputError
+from g2ard.io import colmap, transforms
+from g2ard.io.jsonfile import read_any_json, read_json_list
+from g2ard.io.photos import Frame, photo_size, rigid, view_set
+from g2ard.io.settings import below
+from g2ard.io.types import ViewSet
+
+__all__ = ["LISTS", "exported", "is_export", "read"]
+
+LISTS = {"transforms_train.json": "train", "transforms_eval.json": "test"}
+"""The files, and the split each stands for."""
+
+
+class _Lens(NamedTuple):
+    """What the data says of a photo that the export leaves out."""
+
+    K: Any
+    size: tuple[int, int]
+    distortion: tuple[float, ...]
+
+
+def is_export(content: Any) -> bool:
+    """Whether what a JSON file holds is such a list."""
+    first = content[0] if isinstance(content, list) and content else None
+    return isinstance(first, dict) and {"file_path", "transform"} <= set(first)
+
+
+def exported(folder: Path) -> list[Path]:
+    """The lists in a folder."""
+    found = [folder / name for name in LISTS if (folder / name).is_file()]
+    return [file for file in found if is_export(read_any_json(file))]
+
+
+def read(path: Path, images: Path | None = None) -> ViewSet:
+    """Read exported poses, {file_path, transform}: world_from_camera, 3×4, OpenGL's axes, in the world of the
+    exported scene. Views of the train list are "train", those of the eval list "test".
+
+    They hold no intrinsics: those come from the data the photos lie in (a transforms.json or a COLMAP
+    model above them), scaled to the photo's size where that is another.
+
+    Args:
+        path: one of the lists, or the folder of both.
+        images: a folder to look for photos in, by their file names; None takes `file_path`.
+
+    Raises:
+        InputError: no poses, one that makes no sense, or nothing tells their intrinsics.
+    """
+    files = exported(path) if path.is_dir() else [path]
+    lenses: dict[Path, dict[str, _Lens]] = {}
+    frames = []
+    for file in files:
+        for i, entry in enumerate(read_json_list(file)):
+            frames.append(_frame(file, i, entry, images, lenses))
+    return view_set(path, frames)
+
+
+def _frame(
+    path: Path, index: int, entry: Any, images: Path | None, lenses: dict[Path, dict[str, _Lens]]
+) -> Frame:
+    where = f"{path}: camera {index}"
+    try:
+        file_path = Path(str(entry["file_path"]))
+        viewmat = transforms.opencv_view(rigid(where, np.array(entry["transform"], np.float64)))
+    except KeyError as error:
+        raise InputError(f"{where}: lacks {error}") from error
+    except (TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{where}: malformed ({error})") from error
+    there = below(path, file_path)
+    ups = (below(path, up) for up in file_path.parents[:3] if up.parts)
+    lens = _lens(where, file_path, there or next(filter(None, ups), None), lenses)
+    photo = images / file_path.name if images else there
+    if photo is not None and photo.is_file() and (size := photo_size(photo)) != lens.size:
+        zoom = np.diag([size[0] / lens.size[0], size[1] / lens.size[1], 1.0])
+        lens = lens._replace(K=zoom @ lens.K, size=size)
+    return Frame(
+        name=file_path.name,
+        viewmat=viewmat,
+        K=lens.K,
+        size=lens.size,
+        photo=photo or file_path,
+        distortion=lens.distortion,
+        split=LISTS.get(path.name),
+    )
+
+
+def _lens(where: str, named: Path, place: Path | None, known: dict[Path, dict[str, _Lens]]) -> _Lens:
+    """By the photo's file name, out of the data in the nearest folder above it that holds any."""
+    for folder in () if place is None else (place, *place.parents[:3]):
+        if folder not in known:
+            known[folder] = _lenses(folder)
+        if named.name in known[folder]:
+            return known[folder][named.name]
+    raise InputError(
+        f"{where}: ns-export writes no intrinsics, and no transforms.json or COLMAP model above "
+        f"{named.as_posix()} tells them; give the run's folder (with its dataparser_transforms.json) instead"
+    )
+
+
+def _lenses(folder: Path) -> dict[str, _Lens]:
+    if (folder / "transforms.json").is_file():
+        frames = transforms.frames(folder / "transforms.json")
+    elif folder.is_dir() and colmap.model_folder(folder) is not None:
+        frames = colmap.frames(folder)[1]
+    else:
+        return {}
+    names = [Path(frame.photo.name if frame.photo else frame.name).name for frame in frames]
+    if len(set(names)) < len(names):
+        raise InputError(f"{folder}: photos of one name in several folders: which is whose is not to be told")
+    return {name: _Lens(f.K, f.size, f.distortion) for name, f in zip(names, frames, strict=True)}
