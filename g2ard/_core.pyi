@@ -112,6 +112,7 @@ class Trainer:
         rates: list[float],
         regularizers: tuple[float, float, bool] | None = None,
         mask: NDArray[np.bool_] | None = None,
+        reach: float | None = None,
     ) -> tuple[float, int]: ...
     def rehearse(
         self, view: _View, choices: _Choices, background: list[float], target: _F32, ssim_weight: float

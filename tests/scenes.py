@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from g2ard.cameras import Cameras, look_at
@@ -24,6 +26,24 @@ def checkered_ball(n: int = 3000, seed: int = 0) -> Splats:
         logit_opacities=rng.normal(2.5, 0.5, n),
         sh0=((color - 0.5) / 0.28209479)[:, None],
         shN=rng.normal(0, 0.03, (n, 3, 3)),
+    )
+
+
+def under_a_sky(scene: Splats, count: int = 300, seed: int = 0) -> Splats:
+    """The scene within `count` faint layers, each wider than the scene is and next to nothing thick."""
+    rng = np.random.default_rng(seed)
+    towards = rng.normal(size=(count, 3))
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    layers = Splats.create(
+        towards * rng.uniform(20, 60, (count, 1)),
+        quats=rng.normal(size=(count, 4)),
+        scales=np.exp(rng.normal(np.log([12, 6, 1e-9]), 0.3, (count, 3))),
+        logit_opacities=rng.normal(-2, 1, count),
+        sh0=rng.normal(0, 0.6, (count, 1, 3)),
+    ).with_sh_degree(scene.sh_degree)
+    names = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+    return replace(
+        scene, **{name: np.concatenate([getattr(scene, name), getattr(layers, name)]) for name in names}
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from g2ard import _core
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.recover.anchors import Anchors, Regularizers
+from g2ard.recover.extent import extents, share_of_rate
 from g2ard.recover.losses import l1_ssim
 from g2ard.recover.rasterize import rasterize
 from g2ard.recover.regularize import TorchAnchors, regularization
@@ -34,10 +36,12 @@ def trainer_of(p: Params, units: NDArray[np.float32] | None = None, isa: str | N
     return _core.Trainer(arrays(p), units, isa)
 
 
-def step(trainer: _core.Trainer, v: Cameras, target: Any, regularizers: Any = None) -> tuple[float, int]:
+def step(
+    trainer: _core.Trainer, v: Cameras, target: Any, regularizers: Any = None, reach: float | None = None
+) -> tuple[float, int]:
     view = view_of(v, 0, SETTINGS)
     rates = list(RATES.values())
-    return trainer.step(view, SETTINGS.choices, BACKGROUND, target, 0.2, rates, regularizers)
+    return trainer.step(view, SETTINGS.choices, BACKGROUND, target, 0.2, rates, regularizers, None, reach)
 
 
 def problem(n: int = 200, degree: int = 3, views: int = 3) -> tuple[Params, list[Cameras], list[Any]]:
@@ -46,6 +50,28 @@ def problem(n: int = 200, degree: int = 3, views: int = 3) -> tuple[Params, list
     cameras = [camera(56, 40, seed=s) for s in range(views)]
     targets = [rng.random((40, 56, 3)).astype(np.float32) for _ in cameras]
     return p, cameras, targets
+
+
+def naive_shares(p: dict[str, NDArray[Any]], cameras: Cameras, reach: float) -> dict[str, NDArray[Any]]:
+    """1/(1 + (σ/reach)¹⁶) in float64, one Gaussian at a time: σ by the eigenvalues of J W R S Sᵀ Rᵀ Wᵀ Jᵀ."""
+    W, K = cameras.viewmats[0], cameras.Ks[0]
+    size = np.array([cameras.widths[0], cameras.heights[0]])
+    focal = np.array([K[0, 0], K[1, 1]])
+    low, high = (-K[:2, 2] - 0.15 * size) / focal, (size - K[:2, 2] + 0.15 * size) / focal
+    whole, own = np.ones((len(p["means"]), 1)), np.ones((len(p["means"]), 3))
+    for i in range(len(whole)):
+        x, y, z = W[:3, :3] @ p["means"][i] + W[:3, 3]
+        if z < SETTINGS.near_of(0):
+            continue
+        u, v = np.clip([x / z, y / z], low, high)
+        J = np.array([[focal[0] / z, 0, -focal[0] * u / z], [0, focal[1] / z, -focal[1] * v / z]])
+        a, b, c, d = p["quats"][i] / np.linalg.norm(p["quats"][i])
+        q = np.array([[0, -d, c], [d, 0, -b], [-c, b, 0]])
+        R = np.eye(3) + 2 * a * q + 2 * q @ q
+        M = J @ W[:3, :3] @ R @ np.diag(np.exp(p["log_scales"][i]))
+        whole[i] = 1 / (1 + (math.sqrt(np.linalg.eigvalsh(M @ M.T)[1]) / reach) ** 16)
+        own[i] = 1 / (1 + (np.linalg.norm(M, axis=0) / reach) ** 16)
+    return {"means": whole, "quats": whole, "log_scales": own}
 
 
 class Twin:
@@ -58,7 +84,8 @@ class Twin:
         self.t = np.zeros(len(p["means"]))
         self.units = np.ones(len(self.t)) if units is None else units.astype(np.float64)
 
-    def step(self, cameras: Cameras, target: Any, extra: Any = None) -> float:
+    def step(self, cameras: Cameras, target: Any, extra: Any = None, reach: float = math.inf) -> float:
+        shares = naive_shares(self.p, cameras, reach)
         mine = tensors_of({k: v.astype(np.float32) for k, v in self.p.items()})
         image, _, _ = rasterize(*mine, cameras, 0, background=BACKGROUND, settings=SETTINGS)
         loss = l1_ssim(image, torch.from_numpy(target), 0.2)
@@ -76,6 +103,7 @@ class Twin:
             self.v[k] = np.where(r, 0.999 * self.v[k] + 0.001 * g * g, self.v[k])
             m, v = self.m[k] / (1 - 0.9**t), self.v[k] / (1 - 0.999**t)
             unit = self.units.reshape(r.shape) if k == "means" else 1.0
+            unit = unit * shares.get(k, 1.0)
             self.p[k] = np.where(r, self.p[k] - RATES[k] * unit * m / (np.sqrt(v) + 1e-15), self.p[k])
         return loss.item()
 
@@ -106,6 +134,43 @@ def test_steps_are_torch_s(degree: int, isa: str) -> None:
         assert 0 < updated <= len(p["means"])
     assert_close(trainer.arrays(), twin.p, p, to=2e-2)
     assert trainer.skipped == 0
+
+
+@pytest.mark.parametrize("isa", _core.instruction_sets())
+def test_what_is_large_in_a_view_moves_less(isa: str) -> None:
+    p, cameras, targets = problem()
+    p["log_scales"][::7] += 2
+    p["log_scales"][::7, 1] -= 9
+    reach = 3.0
+    shares = naive_shares(p, cameras[0], reach)
+    assert all((share < 0.2).mean() > 0.1 and (share > 0.8).mean() > 0.1 for share in shares.values())
+    assert ((shares["log_scales"] > 0.9) & (shares["means"] < 0.1)).any()
+    trainer, twin = trainer_of(p, isa=isa), Twin(p)
+    for i in range(6):
+        step(trainer, cameras[i % 3], targets[i % 3], reach=reach)
+        twin.step(cameras[i % 3], targets[i % 3], reach=reach)
+    assert_close(trainer.arrays(), twin.p, p, to=2e-2)
+    free = trainer_of(p, isa=isa)
+    step(free, cameras[0], targets[0])
+    limited = trainer_of(p, isa=isa)
+    step(limited, cameras[0], targets[0], reach=reach)
+    for name, a, b in zip(NAMES, limited.arrays(), free.arrays(), strict=True):
+        if name in shares:  # the first step of Adam is the rate itself
+            want = shares[name] * (b - p[name])
+            assert np.abs(a - p[name] - want).max() < 1e-4 * RATES[name] + 1e-6, name
+        else:
+            assert np.array_equal(a, b), name
+
+
+def test_sizes_on_the_screen_are_the_naive_ones() -> None:
+    p, cameras, _ = problem()
+    p["means"][::9] *= 20  # some far off the image, some behind the camera
+    p["log_scales"][::5, 2] = -25
+    tensors = [torch.from_numpy(p[k].astype(np.float64)) for k in ("means", "quats", "log_scales")]
+    largest, axes = extents(*tensors, cameras[0], 0, SETTINGS.near_of(0))
+    want = naive_shares(p, cameras[0], 3.0)
+    np.testing.assert_allclose(share_of_rate(largest, 3.0)[:, None], want["means"], rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(share_of_rate(axes, 3.0), want["log_scales"], rtol=1e-4, atol=1e-12)
 
 
 def test_dense_steps_are_torch_optim_s() -> None:
@@ -245,6 +310,8 @@ def test_bad_input_is_named() -> None:
         step(trainer_of(p), cameras[0], targets[0][:5])
     with pytest.raises(InputError, match="anchors set before"):
         step(trainer_of(p), cameras[0], targets[0], (1.0, 1.0, True))
+    with pytest.raises(InputError, match="reach: expected pixels, more than 0"):
+        step(trainer_of(p), cameras[0], targets[0], reach=0.0)
     with pytest.raises(InputError, match="units: expected 10 values"):
         trainer_of(p, np.ones(9, np.float32))
     state = trainer_of(p).state()

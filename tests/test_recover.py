@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import time
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import around, checkered_ball
+from scenes import around, checkered_ball, under_a_sky
 
 from g2ard import _core
 from g2ard.errors import InputError
@@ -180,6 +181,35 @@ def test_trials_choose_rates_that_suit_the_scene(student: Splats, targets: Teach
     fixed = RecoverConfig(schedule=replace(TUNED, multiplier=0.7), steps=100)
     report = recover(student, targets, fixed).report
     assert (report["multiplier"], report["trials"]) == (0.7, [])
+
+
+def test_layers_as_wide_as_the_sky_do_not_shake_the_image() -> None:
+    targets = TeacherRenders(under_a_sky(TEACHER), around(12, (160, 120)))
+    start = under_a_sky(simplify(TEACHER, 1500).splats)
+    held, free = (
+        recover(
+            start, targets, RecoverConfig(schedule=replace(TUNED, multiplier=1.0, reach=reach), steps=150)
+        )
+        for reach in (None, math.inf)
+    )
+    assert (held.report["reach"], free.report["reach"]) == (pytest.approx(0.0252, rel=1e-2), None)
+    assert held.report["psnr"]["after"] > free.report["psnr"]["after"] + 0.8
+    moved = [np.abs(done.splats.means - start.means)[-300:].max() for done in (held, free)]
+    assert moved[0] < 0.01 * moved[1]
+
+
+def test_both_engines_limit_the_same_gaussians(student: Splats, targets: TeacherRenders) -> None:
+    tight = replace(TUNED, multiplier=1.0, reach=0.02)
+    fused, torch = (
+        recover(student, targets, RecoverConfig(schedule=tight, steps=30, engine=e)).splats
+        for e in ("fused", "torch")
+    )
+    free = recover(student, targets, RecoverConfig(schedule=replace(tight, reach=math.inf), steps=30)).splats
+    for name in ("means", "scales", "sh0"):
+        ours, theirs = getattr(fused, name), getattr(torch, name)
+        moved = np.linalg.norm(ours - getattr(student.with_sh_degree(fused.sh_degree), name))
+        assert np.linalg.norm(ours - theirs) < 1e-2 * moved, name
+    assert np.linalg.norm(fused.means - student.means) < 0.8 * np.linalg.norm(free.means - student.means)
 
 
 def test_a_start_that_is_nearly_there_takes_small_steps_without_trials(targets: TeacherRenders) -> None:

@@ -7,6 +7,7 @@ the stage reports is written beside the output, as report.json.
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from dataclasses import replace
@@ -170,6 +171,7 @@ def _schedule(name: str, cameras: Cameras) -> Schedule:
         means_in_scales=False,
         cosine_floor=None,
         multiplier=1.0,
+        reach=math.inf,
     )
 
 

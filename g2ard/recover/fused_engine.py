@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from g2ard import _core
 from g2ard.cameras import Cameras
 from g2ard.recover.anchors import Anchors, Regularizers
 from g2ard.recover.schedule import Rates
+from g2ard.recover.sizes import radii
 from g2ard.render import arrays_of, settings_for, view_of
 from g2ard.splats import Splats
 
@@ -37,7 +39,7 @@ class FusedEngine:
         self._weights = (regularizers.anchor, regularizers.shape, regularizers.effective_rank)
         self._ssim_weight = ssim_weight
         self._background = list(background)
-        units = np.ascontiguousarray(splats.scales.max(1)) if means_in_scales else None
+        units = radii(splats) if means_in_scales else None
         self._trainer = _core.Trainer(arrays_of(splats), units)
         self._anchors = (
             anchors.means,
@@ -73,8 +75,15 @@ class FusedEngine:
             ],
             self._weights if regularize else None,
             mask,
+            self._reach(view, rates.reach),
         )
         return loss
+
+    def _reach(self, view: int, share: float) -> float | None:
+        """In pixels."""
+        if math.isinf(share):
+            return None
+        return share * float(max(self._cameras.widths[view], self._cameras.heights[view]))
 
     def splats(self) -> Splats:
         """The scene as it stands, quaternions normalised."""

@@ -21,7 +21,8 @@ from g2ard.recover.anchors import Anchors, drift95, needle
 from g2ard.recover.config import RecoverConfig
 from g2ard.recover.draw import checked_weights, drawn
 from g2ard.recover.probe import MULTIPLIERS, Probe, calm, climb, trial_steps
-from g2ard.recover.schedule import Rates, multiplier_for
+from g2ard.recover.schedule import Rates, multiplier_for, reach_for
+from g2ard.recover.sizes import typical_share
 from g2ard.splats import Splats
 from g2ard.targets import Targets, fingerprint_of, mask_of
 
@@ -46,9 +47,10 @@ class Recovered:
     Args:
         splats: same count and order as the student.
         report: steps, seconds, loss (one mean per 1 % of the horizon), psnr {before, after} over a sample of
-            the training views, multiplier, trials (those that chose it), drift95, needle, geometry (ten of
-            {step, drift95, needle} on the way), regularizers {steps, share of the time}, skipped, and
-            kept_start: whether the student was better than what came of it, and is the result.
+            the training views, multiplier, reach (None is no limit), trials (those that chose the
+            multiplier), drift95, needle, geometry (ten of {step, drift95, needle} on the way), regularizers
+            {steps, share of the time}, skipped, and kept_start: whether the student was better than what came
+            of it, and is the result.
     """
 
     splats: Splats
@@ -125,7 +127,7 @@ def recover(
     often = checked_weights(weights, len(targets.cameras))
     loop = _Loop(student, targets, config, often, anchors, probe)
     if checkpoint is None or not checkpoint.exists():
-        loop.choose_multiplier(before)
+        loop.choose_rates(before)
     loop.run(checkpoint, progress, stage, watch)
     result = loop.engine.splats()
     after = probe.all_of(result)
@@ -140,6 +142,7 @@ def recover(
             "loss": loop.curve(),
             "psnr": {"before": before, "after": after},
             "multiplier": loop.multiplier,
+            "reach": _finite(loop.reach),
             "trials": loop.trials,
             "drift95": drift95(anchors, result.means),
             "needle": needle(result.scales),
@@ -168,6 +171,7 @@ class _Loop:
         self.weights = weights
         self.anchors = anchors
         self.multiplier = 1.0
+        self.reach = math.inf
         self.trials: list[dict[str, float]] = []
         self.student = student
         self.probe = probe
@@ -196,16 +200,22 @@ class _Loop:
         )
         return engine
 
-    def choose_multiplier(self, start: float) -> None:
-        """The schedule's, or the one that short trials from the start like best; their time counts.
+    def choose_rates(self, start: float) -> None:
+        """The schedule's reach and multiplier, or what the start suggests, and short trials like best.
+
+        The time of the trials counts.
 
         Args:
             start: PSNR before recovery: where the search begins, and all there is for short horizons.
         """
+        rmse = 10 ** (-start / 20)
+        reach = self.config.schedule.reach
+        if reach is None:
+            reach = reach_for(rmse, typical_share(self.student, self.targets.cameras))
+        self.reach = reach
         if self.config.schedule.multiplier is not None:
             self.multiplier = self.config.schedule.multiplier
             return
-        rmse = 10 ** (-start / 20)
         guess = multiplier_for(rmse)
         limit = self.config.time_limit
         steps = trial_steps(self.config.horizon) if limit is None else _TRIAL_STEPS
@@ -243,7 +253,9 @@ class _Loop:
     def _learn(
         self, engine: Engine, step: int, share: float, multiplier: float, *, regularize: bool = False
     ) -> float:
-        rates = self.config.schedule.at(share, final=self.config.final, multiplier=multiplier)
+        rates = self.config.schedule.at(
+            share, final=self.config.final, multiplier=multiplier, reach=self.reach
+        )
         view = self._view(step)
         target, mask = self.targets[view], mask_of(self.targets, view)
         return engine.step(view, target, rates, regularize=regularize, mask=mask)
@@ -326,6 +338,7 @@ class _Loop:
             "done": self.done,
             "seconds": self.seconds,
             "multiplier": self.multiplier,
+            "reach": _finite(self.reach),
             "trials": self.trials,
             "geometry": self.geometry,
             "seconds_of": [self._seconds_of[False], self._seconds_of[True]],
@@ -338,8 +351,14 @@ class _Loop:
         self.engine.load(arrays)
         self.done, self.seconds = int(meta["done"]), float(meta["seconds"])
         self.multiplier = float(meta["multiplier"])
+        self.reach = math.inf if meta["reach"] is None else float(meta["reach"])
         self.trials, self.geometry = list(meta["trials"]), list(meta["geometry"])
         self._seconds_of = dict(zip((False, True), meta["seconds_of"], strict=True))
+
+
+def _finite(reach: float) -> float | None:
+    """JSON knows no infinity."""
+    return None if math.isinf(reach) else reach
 
 
 def _engine_class(name: str) -> Any:

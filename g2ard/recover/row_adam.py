@@ -19,7 +19,8 @@ class RowAdam(torch.optim.Optimizer):
 
     A row whose gradients are all zero keeps its values and its moments, and each row has a count of steps t
     of its own: p ← p − lr · m/(1 − β₁ᵗ) / (√(v/(1 − β₂ᵗ)) + ε), with the bias terms in float64. A row with a
-    gradient that is not finite, or over 1e18, is left alone too, and counted.
+    gradient that is not finite, or over 1e18, is left alone too, and counted. A group's "share", if there is
+    one, multiplies its lr row by row or value by value.
 
     Args:
         parameters: by name, (N, …) each; parameter groups are in this order, with the name and lr 0.
@@ -79,4 +80,7 @@ class RowAdam(torch.optim.Optimizer):
         bias1, bias2 = ((1 / (1 - beta**steps)).to(p.dtype) for beta in (beta1, beta2))
         m[rows] = m[rows].lerp_(grad, 1 - beta1)
         v[rows] = v[rows].mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
-        p[rows] -= group["lr"] * (m[rows] * bias1) / ((v[rows] * bias2).sqrt_() + group["eps"])
+        step = (m[rows] * bias1) / ((v[rows] * bias2).sqrt_() + group["eps"])
+        if group.get("share") is not None:
+            step *= group["share"][rows]
+        p[rows] -= group["lr"] * step

@@ -9,18 +9,30 @@ from g2ard.errors import InputError
 
 __all__ = ["PAPER", "SCHEDULES", "TUNED", "Rates", "Schedule", "schedule_named"]
 
+_REACH = 0.01
+"""What is larger than a hundredth of the image stands still, unless that is what the scene is made of."""
+
+_UNTRAINED_RMSE = 0.1
+"""A start further from its targets must yet become surfaces: large Gaussians have to move."""
+
 
 @dataclass(frozen=True)
 class Rates:
     """Adam's learning rate of each attribute, in the space it is optimised in.
 
+    What is large in the view a step looks at stands still: a Gaussian whose largest standard deviation there
+    is σ, as a share of the image's longer side, takes steps of 1/(1 + (σ/reach)¹⁶) times the rate in means
+    and rotations, and each of its scales by the σ of that axis alone (`g2ard.recover.extent`). Many layers
+    that move together, as those of a sky do, move the image by the sum of their steps.
+
     Args:
-        means: of the Gaussian's own largest scale when the schedule says `means_in_scales`, else scene units.
+        means: of the Gaussian's own radius when the schedule says `means_in_scales`, else scene units.
         log_scales: natural-log units.
         quats: components of the unnormalised quaternion.
         logit_opacities: logits.
         sh0: band-0 coefficients.
         shN: higher-band coefficients.
+        reach: share of the image's longer side; infinite lets all sizes learn alike.
     """
 
     means: float
@@ -29,6 +41,7 @@ class Rates:
     logit_opacities: float
     sh0: float
     shN: float
+    reach: float = math.inf
 
     def scaled(self, geometry: float, appearance: float) -> Rates:
         """Means, scales and rotations times `geometry`; opacity and SH times `appearance`."""
@@ -39,6 +52,7 @@ class Rates:
             self.logit_opacities * appearance,
             self.sh0 * appearance,
             self.shN * appearance,
+            self.reach,
         )
 
 
@@ -50,11 +64,12 @@ class Schedule:
         rates: at the first step.
         steps: the horizon of the final (or only) recovery.
         round_steps: recovery steps of each intermediate round; 0 recovers at the final count only.
-        means_in_scales: `rates.means` is a share of each Gaussian's largest scale, so that the step does not
-            depend on the scene's unit.
+        means_in_scales: `rates.means` is a share of each Gaussian's radius, the geometric mean of its longer
+            scales, so that the step does not depend on the scene's unit.
         cosine_floor: every rate follows a cosine down to this share of itself; None keeps geometry constant.
         appearance_decay: (rounds, final) share that appearance rates decay to exponentially; 1 keeps them.
         multiplier: of all rates; None chooses it by short trials, which begin at `multiplier_for`.
+        reach: see `Rates`; None chooses by the start (`reach_for`).
     """
 
     rates: Rates
@@ -64,6 +79,7 @@ class Schedule:
     cosine_floor: float | None = 0.01
     appearance_decay: tuple[float, float] = (1.0, 1.0)
     multiplier: float | None = None
+    reach: float | None = None
 
     def scaled(self, steps: int) -> Schedule:
         """The same schedule over a final horizon of `steps`, the rounds' in proportion.
@@ -75,13 +91,13 @@ class Schedule:
         rounds = max(1, round(self.round_steps * share)) if self.round_steps else 0
         return replace(self, steps=steps, round_steps=rounds)
 
-    def at(self, t: float, *, final: bool, multiplier: float = 1.0) -> Rates:
+    def at(self, t: float, *, final: bool, multiplier: float = 1.0, reach: float = math.inf) -> Rates:
         """The rates at the share `t` of the horizon, from 0 at the first step to 1 after the last."""
         cosine = 1.0
         if self.cosine_floor is not None:
             cosine = self.cosine_floor + (1 - self.cosine_floor) * 0.5 * (1 + math.cos(math.pi * t))
         decay = self.appearance_decay[1 if final else 0] ** t
-        return self.rates.scaled(cosine * multiplier, cosine * decay * multiplier)
+        return replace(self.rates.scaled(cosine * multiplier, cosine * decay * multiplier), reach=reach)
 
 
 TUNED = Schedule(
@@ -98,6 +114,7 @@ PAPER = Schedule(
     cosine_floor=None,
     appearance_decay=(0.36, 0.1),
     multiplier=1.0,
+    reach=math.inf,
 )
 """The supplement's `tab:s_config`: 8,000 steps a round, 30,000 at the end; the rates it leaves out are 3DGS's
 own. `PAPER.scaled(3000)` is the same at a tenth of the length."""
@@ -134,3 +151,16 @@ def multiplier_for(start_rmse: float, least: float = 1 / 3) -> float:
     (1.0, 0.667, 0.333)
     """
     return min(1.0, max(least, start_rmse / 0.039))
+
+
+def reach_for(start_rmse: float, typical: float) -> float:
+    """`Schedule.reach` of a start: .01, or the typical size if that is more; no limit for an untrained start.
+
+    Args:
+        start_rmse: before recovery.
+        typical: see `g2ard.recover.sizes.typical_share`.
+
+    >>> reach_for(0.02, 0.005), reach_for(0.05, 0.04), reach_for(0.15, 0.005)
+    (0.01, 0.04, inf)
+    """
+    return max(_REACH, typical) if start_rmse < _UNTRAINED_RMSE else math.inf

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,11 +13,13 @@ from torch import Tensor
 
 from g2ard.cameras import Cameras
 from g2ard.recover.anchors import Anchors, Regularizers
+from g2ard.recover.extent import extents, share_of_rate
 from g2ard.recover.losses import l1_ssim
 from g2ard.recover.rasterize import rasterize
 from g2ard.recover.regularize import TorchAnchors, regularization
 from g2ard.recover.row_adam import RowAdam
 from g2ard.recover.schedule import Rates
+from g2ard.recover.sizes import radii
 from g2ard.render import settings_for
 from g2ard.splats import Splats
 
@@ -28,8 +31,8 @@ _NAMES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 class TorchEngine:
     """Holds the parameters and `RowAdam`'s moments; one `step` a view.
 
-    With `means_in_scales` the means are optimised as multiples of each Gaussian's largest initial scale: Adam
-    is indifferent to the scale of a gradient, so a rate of 0.05 moves a Gaussian by 5 % of its own size.
+    With `means_in_scales` the means are optimised as multiples of each Gaussian's initial radius (`radii`):
+    Adam is indifferent to the scale of a gradient, so a rate of 0.05 moves a Gaussian by 5 % of its own size.
     Rendering, loss and device are what subclasses change.
     """
 
@@ -54,10 +57,8 @@ class TorchEngine:
         self._ssim_weight = ssim_weight
         self._background = background
         self._base = torch.from_numpy(splats.means.astype(np.float32)).to(self.device)
-        unit = (
-            splats.scales.max(1, keepdims=True) if means_in_scales else np.ones((len(splats), 1), np.float32)
-        )
-        self._unit = torch.from_numpy(np.ascontiguousarray(unit)).to(self.device)
+        unit = radii(splats) if means_in_scales else np.ones(len(splats), np.float32)
+        self._unit = torch.from_numpy(unit[:, None]).to(self.device)
         start = {
             "means": np.zeros((len(splats), 3), np.float32),
             "log_scales": splats.log_scales,
@@ -96,10 +97,21 @@ class TorchEngine:
             )
         self._adam.zero_grad(set_to_none=True)
         torch.autograd.backward(total)
+        shares = self._shares(means.detach(), view, rates.reach)
         for group in self._adam.param_groups:
-            group["lr"] = getattr(rates, group["name"])
+            group["lr"], group["share"] = getattr(rates, group["name"]), shares.get(group["name"])
         self._adam.step()
         return float(loss.detach())
+
+    def _shares(self, means: Tensor, view: int, reach: float) -> dict[str, Tensor]:
+        """What is left of each rate, by row or by value, for the size of things in this view."""
+        if math.isinf(reach):
+            return {}
+        p, near = self._parameters, self._settings.near_of(view)
+        largest, axes = extents(means, p["quats"], p["log_scales"], self._cameras, view, near)
+        pixels = reach * float(max(self._cameras.widths[view], self._cameras.heights[view]))
+        whole = share_of_rate(largest, pixels)[:, None]
+        return {"means": whole, "quats": whole, "log_scales": share_of_rate(axes, pixels)}
 
     def _render(self, means: Tensor, view: int) -> Tensor:
         """(H, W, 3) of one view, differentiable."""

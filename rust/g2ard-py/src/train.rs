@@ -56,7 +56,8 @@ impl PyTrainer {
 
     /// One step: (photometric loss before it, Gaussians moved). `rates`: means, quats, log_scales, logit_opacities,
     /// sh0, shN. `regularizers`: (λ_anchor, λ_shape, effective rank too) or None. `mask`: where the loss counts.
-    #[pyo3(signature = (view, choices, background, target, ssim_weight, rates, regularizers = None, mask = None))]
+    /// `reach`: pixels beyond which geometry stands still.
+    #[pyo3(signature = (view, choices, background, target, ssim_weight, rates, regularizers = None, mask = None, reach = None))]
     #[allow(clippy::too_many_arguments)] // all of them by name from one place in Python
     fn step(
         &mut self,
@@ -69,6 +70,7 @@ impl PyTrainer {
         rates: [f32; 6],
         regularizers: Option<(f32, f32, bool)>,
         mask: Option<PyReadonlyArray2<'_, bool>>,
+        reach: Option<f32>,
     ) -> PyResult<(f64, usize)> {
         let [means, quats, log_scales, logit_opacities, sh0, sh_n] = rates;
         let lesson = Lesson {
@@ -86,6 +88,7 @@ impl PyTrainer {
                 sh0,
                 sh_n,
             },
+            reach,
             regularizers: regularizers.map(|(anchor, shape, effective_rank)| Regularizers {
                 anchor,
                 shape,
@@ -117,6 +120,7 @@ impl PyTrainer {
             mask: None,
             ssim_weight,
             rates: Rates::default(),
+            reach: None,
             regularizers: None,
         };
         let inner = &mut self.inner;

@@ -38,6 +38,7 @@ pub struct Update<'a> {
     pub store: Writer,
     pub biases: &'a Biases,
     pub rates: &'a Rates,
+    pub reach: Option<f32>,
     pub regularize: Option<(&'a Regularizers, &'a Anchors)>,
 }
 
@@ -159,13 +160,20 @@ impl Update<'_> {
         // SAFETY: as above.
         let unit = unsafe { F::load(&*self.store.units.at(group)) };
         let rates = self.rates;
+        let share = self.share(g.extent.largest);
         for k in 0..3 {
-            self.attribute(&step, k, g.mean[k], unit * F::splat(rates.means));
-            self.attribute(&step, 7 + k, g.log_scale[k], F::splat(rates.log_scales));
+            self.attribute(&step, k, g.mean[k], share * unit * F::splat(rates.means));
+            let own = self.share(g.extent.axes[k]);
+            self.attribute(
+                &step,
+                7 + k,
+                g.log_scale[k],
+                own * F::splat(rates.log_scales),
+            );
             self.attribute(&step, SH + k, g.basis[0] * g.rgb[k], F::splat(rates.sh0));
         }
         for k in 0..4 {
-            self.attribute(&step, 3 + k, g.quat[k], F::splat(rates.quats));
+            self.attribute(&step, 3 + k, g.quat[k], share * F::splat(rates.quats));
         }
         self.attribute(&step, 10, g.logit_opacity, F::splat(rates.logit_opacities));
         let rate = F::splat(rates.sh_n);
@@ -175,6 +183,21 @@ impl Update<'_> {
                 self.attribute(&step, SH + 3 * k + c, g.basis[k] * g.rgb[c], rate);
             }
         }
+    }
+
+    /// 1/(1 + (σ/c)¹⁶) of what is σ pixels large, from σ².
+    #[inline(always)]
+    fn share<F: Lanes>(&self, variance: F) -> F {
+        let one = F::splat(1.0);
+        let Some(reach) = self.reach else {
+            return one;
+        };
+        // Beyond ten times the reach nothing moves anyway, and the eighth power stays within f32.
+        let shrink = F::splat(1.0 / reach);
+        let ratio = (variance * shrink * shrink).min(F::splat(100.0));
+        let square = ratio * ratio;
+        let fourth = square * square;
+        one / fourth.fma(fourth, one)
     }
 
     #[inline(always)]

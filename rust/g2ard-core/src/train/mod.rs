@@ -51,6 +51,9 @@ pub struct Lesson<'a> {
     /// λ of (1 − λ)·L1 + λ·(1 − SSIM).
     pub ssim_weight: f32,
     pub rates: Rates,
+    /// σ in pixels, c: the rates of what is larger in this view are multiplied by 1/(1 + (σ/c)¹⁶), means and rotations
+    /// by σ of the Gaussian's longer side, each scale by that of its own axis. `None` lets all learn alike.
+    pub reach: Option<f32>,
     /// Added to the loss of this step; needs anchors.
     pub regularizers: Option<Regularizers>,
 }
@@ -184,6 +187,11 @@ impl Trainer {
                 lesson.target.len(),
             ));
         }
+        if let Some(reach) = lesson.reach
+            && !(reach > 0.0 && reach.is_finite())
+        {
+            return Err(Error::invalid("reach", "pixels, more than 0", reach));
+        }
         if lesson.regularizers.is_some() && self.anchors.is_none() {
             return Err(Error::invalid("regularizers", "anchors set before", "none"));
         }
@@ -235,6 +243,7 @@ impl Trainer {
                     store: writer,
                     biases,
                     rates: &lesson.rates,
+                    reach: lesson.reach,
                     regularize,
                 },
             )

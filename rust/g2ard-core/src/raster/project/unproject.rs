@@ -1,6 +1,6 @@
 //! Back through the projection: from a splat's gradient to the stored parameters'.
 
-use super::{HALF_LOG2_E, INRIA_FLOOR, View, colour, direction, project};
+use super::{HALF_LOG2_E, INRIA_FLOOR, View, colour, direction, dot, project};
 use crate::raster::params::Source;
 use crate::raster::simd::Lanes;
 use crate::raster::{Convention, DILATION, sh};
@@ -21,6 +21,30 @@ pub struct RowGradients<F: Lanes> {
     pub logit_opacity: F,
     pub basis: [F; 16],
     pub rgb: [F; 3],
+    pub extent: Extent<F>,
+}
+
+/// How large a Gaussian is on the screen before dilation, px²; 0 behind the near plane.
+pub struct Extent<F: Lanes> {
+    /// The larger variance of its ellipse.
+    pub largest: F,
+    /// The squared length of each of its axes.
+    pub axes: [F; 3],
+}
+
+impl<F: Lanes> Extent<F> {
+    /// `m` is J·W·R·S: its columns are the axes. The larger eigenvalue of MMᵀ is a root of squares: nothing cancels.
+    #[inline(always)]
+    fn of(m: &[[F; 3]; 2], seen: F::Mask) -> Self {
+        let half = F::splat(0.5);
+        let (xx, xy, yy) = (dot(&m[0], &m[0]), dot(&m[0], &m[1]), dot(&m[1], &m[1]));
+        let apart = half * (xx - yy);
+        let largest = half.fma(xx + yy, apart.fma(apart, xy * xy).sqrt());
+        Self {
+            largest: largest.only(seen),
+            axes: [0, 1, 2].map(|k| m[0][k].fma(m[0][k], m[1][k] * m[1][k]).only(seen)),
+        }
+    }
 }
 
 /// Back through the projection of one group. Lanes with zero `moments`, `rgb` and `depth` get zeros.
@@ -141,6 +165,7 @@ pub fn unproject<F: Lanes, S: Source>(
         logit_opacity: h * p.rest_opacity,
         basis,
         rgb,
+        extent: Extent::of(&p.m, p.depth.ge(F::splat(view.near))),
     }
 }
 

@@ -1,0 +1,58 @@
+"""A Gaussian's own unit of length, and how large a scene's Gaussians are in its views."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.cameras import Cameras
+from g2ard.splats import Splats
+
+__all__ = ["radii", "typical_share"]
+
+_NEEDLE = 1e-2
+"""A needle's unit is not less than a tenth of its length."""
+
+_VIEWS = 8
+
+
+def radii(splats: Splats) -> NDArray[np.float32]:
+    """(N,) √(s₁·s₂) of the two longer scales s₁ ≥ s₂, s₂ at least s₁/100: what a mean's rate is a share of.
+
+    The largest scale would move a needle by several of its widths.
+
+    >>> radii(Splats.create([[0, 0, 0]], scales=[[9.0, 1e-9, 4.0]])).tolist()
+    [6.0]
+    """
+    scales = np.sort(splats.scales.astype(np.float64), axis=1)
+    middle = np.maximum(scales[:, 1], _NEEDLE * scales[:, 2])
+    return np.ascontiguousarray(np.sqrt(middle * scales[:, 2]).astype(np.float32))
+
+
+def typical_share(splats: Splats, cameras: Cameras) -> float:
+    """The median of f·s₁/z over Gaussians and a few views, as a share of the longer side; 0 if none is seen.
+
+    Args:
+        splats: the scene; its offset counts, cameras are in world coordinates.
+        cameras: evenly spaced ones of them are looked from; who stands in front of whom does not matter.
+
+    >>> from g2ard.cameras import look_at
+    >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1, 0.2, 0.01]])
+    >>> views = Cameras.from_lists(
+    ...     [look_at([0, -2, 0], [0, 0, 0])], [[[50, 0, 16], [0, 50, 12], [0, 0, 1]]], [(40, 24)], ["v"])
+    >>> round(typical_share(dot, views), 6)  # 50 · 0.2 / 2 = 5 pixels of 40
+    0.125
+    """
+    cameras = cameras.recentred(splats.offset)
+    largest, found = splats.scales.max(1, initial=0.0).astype(np.float64), []
+    for view in np.unique(np.linspace(0, len(cameras) - 1, min(_VIEWS, len(cameras))).round().astype(int)):
+        pose, K = cameras.viewmats[view], cameras.Ks[view]
+        size = np.array([cameras.widths[view], cameras.heights[view]], np.float64)
+        at = (splats.means @ pose[:3, :3].T + pose[:3, 3]) @ K.T
+        front = at[:, 2] > 0
+        depth = np.where(front, at[:, 2], 1.0)
+        pixel = at[:, :2] / depth[:, None]
+        inside = front & ((pixel >= 0) & (pixel < size)).all(1)
+        found.append(largest[inside] / depth[inside] * (K[0, 0] / size.max()))
+    shares = np.concatenate(found)
+    return float(np.median(shares)) if len(shares) else 0.0
