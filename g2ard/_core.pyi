@@ -25,6 +25,14 @@ def lift_points(
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
 def knn(points: NDArray[np.float64], k: int) -> NDArray[np.uint32]: ...
+def cast_rays(
+    steps: NDArray[np.int8],
+    shape: list[int],
+    low: list[float],
+    cell: float,
+    eyes: NDArray[np.float64],
+    directions: NDArray[np.float64],
+) -> NDArray[np.float64]: ...
 def simplify_flags(
     scene: Splats,
     cells: int,

@@ -1,4 +1,4 @@
-"""Poses for a scene of any kind: from within, from around and above, from near, from where it is in focus."""
+"""Poses for a scene of any kind: from within, from around and above, from where it is in focus."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 from g2ard.poses.aerial import plan_aerial
 from g2ard.poses.focus import Glance, plan_focus
 from g2ard.poses.inside import find_inside, plan_inside
-from g2ard.poses.near import plan_near, reach_of
 from g2ard.poses.orbit import plan_orbit
 from g2ard.poses.shape import shape_of
 from g2ard.poses.sight import Lens, Poses
@@ -26,15 +25,13 @@ does. Measured: showroom .026–.079, objects and open scenes 0.000."""
 _STREET = 0.25
 """Share of a landscape's poses that stand in it, where there is room."""
 
-_NEAR = 0.25
-"""Share of the poses around and above a scene that go near, where there is something to see from near."""
-
 _SHARP = 0.04
-"""Radians: the 90th percentile of what a pose from around or above shows, at most. Measured: objects .007–.01,
-a park .012, an open scene seen through its own sky .1 and more."""
+"""Radians: the 90th percentile of what a pose from around or above shows, at most. Measured: objects
+.007–.01, a park .012, an open scene seen through its own sky .1 and more."""
 
 _SAMPLED = 16
-"""Poses from around or above that are looked through; if three quarters are sharp, all are taken."""
+"""Poses from around or above that are looked through: if three quarters are sharp, all are taken, if under a
+quarter, none, else each is looked through."""
 
 
 def plan_auto(
@@ -43,8 +40,8 @@ def plan_auto(
     """At most `count` poses, the kinds they are of, and why.
 
     Nothing is decided for the scene as a whole: what lies within rooms is seen from within, in proportion;
-    the others stand around or above the scene as its shape allows, as far as it is in focus from there, some
-    of them near; what is then missing stands on the ground and wherever the scene is in focus.
+    the others stand around or above the scene as its shape allows, as far as it is in focus from there; what
+    is then missing stands on the ground and wherever the scene is in focus.
     """
     parts: dict[str, Poses] = {}
     inside = find_inside(site, seed)
@@ -91,18 +88,17 @@ def _add_far(
     add: Callable[[str, Poses], None],
     why: list[str],
 ) -> None:
-    """Poses around or above, those that are sharp, and near ones on the way to what they show too small."""
+    """Poses around or above, those that are sharp."""
     plan = plan_aerial if kind == "aerial" else plan_orbit
     poses = plan(site, count, lens, seed, tell)
     if not len(poses):
         return
     some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _SAMPLED)).round().astype(int))
     sharp = glance.of(poses.take(some).cameras(site, lens), tell).coarse < _SHARP
-    if sharp.mean() < 0.75:
+    if sharp.mean() < 0.25:
+        poses = poses.take(slice(0))
+    elif sharp.mean() < 0.75:
         poses = poses.take(glance.of(poses.cameras(site, lens), tell).coarse < _SHARP)
+    if sharp.mean() < 0.75:
         why.append(f"{sharp.mean():.0%} of the {kind} poses see it in focus")
-    if not len(poses):
-        return
-    near = plan_near(site, poses, reach_of(site, poses, lens), round(_NEAR * len(poses)), lens, seed)
-    add(kind, poses.take(slice(len(poses) - len(near))))
-    add("near", near)
+    add(kind, poses)

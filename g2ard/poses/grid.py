@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard import _core
 from g2ard.poses.matter import Matter
 from g2ard.poses.numbers import norms, turned
 
@@ -96,21 +97,15 @@ class Grid:
 
     def cast(self, eyes: Floats, directions: Floats, *, murky: bool = False) -> Floats:
         """(M,) distances at which unit rays first meet an opaque cell, or a murky one; inf if they do not."""
-        shape = np.array(self.opaque.shape)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ends = (np.stack([self.low, self.low + self.cell * shape])[:, None] - eyes) / directions
-        near = np.nan_to_num(ends.min(axis=0), nan=-np.inf).max(axis=1)
-        far = np.nan_to_num(ends.max(axis=0), nan=np.inf).min(axis=1)
-        reached, hits = np.maximum(near, 0) + 0.01 * self.cell, np.full(len(eyes), np.inf)
-        steps, rows = (self.murky if murky else self.opaque).ravel(), np.flatnonzero(reached < far)
-        while len(rows):
-            index, _ = _index(eyes[rows] + reached[rows, None] * directions[rows], self.low, self.cell, shape)
-            ahead = steps[index]
-            met = ahead == 0
-            hits[rows[met]] = reached[rows[met]]
-            reached[rows] += self.cell * np.maximum(ahead - 1.0, 0.6)
-            rows = rows[~met & (reached[rows] < far[rows])]
-        return hits
+        steps = self.murky if murky else self.opaque
+        return _core.cast_rays(
+            steps.ravel(),
+            list(steps.shape),
+            self.low.tolist(),
+            self.cell,
+            np.ascontiguousarray(eyes, np.float64),
+            np.ascontiguousarray(directions, np.float64),
+        )
 
 
 def _lattice(count: int) -> list[tuple[float, float]]:

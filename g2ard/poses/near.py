@@ -1,4 +1,4 @@
-"""Poses close to what the others see from too far: where a Gaussian is smaller than a pixel."""
+"""Poses nearer than the others, to what they see, and what a pool shows of a scene's matter."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from g2ard.poses.lattice import halton
 from g2ard.poses.numbers import norms
-from g2ard.poses.sight import Lens, Poses
+from g2ard.poses.sight import Lens, Poses, look
 from g2ard.poses.site import Site
 
 __all__ = ["Reach", "plan_near", "reach_of"]
@@ -71,12 +71,20 @@ def reach_of(site: Site, poses: Poses, lens: Lens) -> Reach:
 
 
 def plan_near(site: Site, poses: Poses, reach: Reach, count: int, lens: Lens, seed: int) -> Poses:
-    """At most `count` poses on the way from the given ones to points that they show smaller than a pixel."""
-    rows = np.flatnonzero(reach.coarse(lens))
-    if not len(rows) or not count:
+    """At most `count` poses on the way from the given ones to points that they see.
+
+    They stand where the points have a standard deviation of 1.5 pixels, within 0.25–0.6 of the way; half of
+    them look at points that the given poses show smaller than a pixel, as far as there are any.
+    """
+    if not count:
         return poses.take(slice(0))
-    pick, turn, rise = halton(0, 3 * count, 3, seed + 3).T
-    rows = rows[(pick * len(rows)).astype(int)]
+    chance = np.random.default_rng(seed)
+    small = chance.permutation(np.flatnonzero(reach.coarse(lens)))[: count // 2]
+    rows = np.concatenate([small, np.setdiff1d(np.flatnonzero(reach.best >= 0), small)])
+    rows[len(small) :] = chance.permutation(rows[len(small) :])
+    if not len(rows):
+        return poses.take(slice(0))
+    turn, rise = halton(0, len(rows), 2, seed + 3).T
     eyes, points = poses.eyes[reach.best[rows]], reach.points[rows]
     wanted = reach.scales[rows] * float(lens.matrix[0, 0]) / _PIXELS
     share = np.clip(wanted / reach.distance[rows], *_STEP)
@@ -85,4 +93,6 @@ def plan_near(site: Site, poses: Poses, reach: Reach, count: int, lens: Lens, se
     gazes += 0.2 * np.stack([turn - 0.5, rise - 0.5, turn - rise], axis=1)
     gazes /= norms(gazes)[:, None]
     free = (site.grid.distance(eyes) > 2 * site.grid.cell) & (site.above_ground(eyes) > 0.01)
-    return Poses(eyes[free], gazes[free]).take(slice(count))
+    near = Poses(eyes[free], gazes[free])
+    clear = look(site, near, lens).close > 2 * site.grid.cell
+    return near.take(clear).take(slice(count))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from g2ard.errors import InputError
 from g2ard.poses.aerial import plan_aerial
 from g2ard.poses.auto import plan_auto
 from g2ard.poses.lattice import strata
-from g2ard.poses.near import reach_of
+from g2ard.poses.near import Reach, plan_near, reach_of
 from g2ard.poses.orbit import plan_orbit
 from g2ard.poses.shape import shape_of
 from g2ard.poses.sight import Lens, Poses
@@ -28,6 +28,7 @@ __all__ = ["KINDS", "Pool", "plan_pool"]
 
 KINDS = ("auto", "orbit", "walk", "aerial")
 
+
 @dataclass(frozen=True, eq=False)
 class Pool:
     """A pool and how it came about.
@@ -39,6 +40,7 @@ class Pool:
         up: (3,) unit vector in the world.
         unseen: share of a sample of the matter that no pose sees.
         coarse: share that is seen, but nowhere with a standard deviation of a pixel.
+        apart: views of another kind than `cameras`, nearer to what those see; None unless asked for.
     """
 
     cameras: Cameras
@@ -47,6 +49,7 @@ class Pool:
     up: NDArray[np.float64]
     unseen: float = 0.0
     coarse: float = 0.0
+    apart: Cameras | None = None
 
 
 def plan_pool(
@@ -59,9 +62,12 @@ def plan_pool(
     up: ArrayLike | None = None,
     seed: int = 0,
     rows: int | None = None,
+    apart: int = 0,
     progress: Progress = silent,
 ) -> Pool:
     """As `make_pool` (see there for all but the result), and what was found out about the scene.
+
+    `apart` asks for so many views of another kind, at most.
 
     Raises:
         InputError: as `make_pool`.
@@ -96,7 +102,17 @@ def plan_pool(
         site.up.axis,
         unseen=reach.unseen(),
         coarse=float(reach.coarse(lens).mean()),
+        apart=_apart(site, poses, reach, apart, lens, seed),
     )
+
+
+def _apart(site: Site, poses: Poses, reach: Reach, count: int, lens: Lens, seed: int) -> Cameras | None:
+    """Near views; None where none is asked for or has room."""
+    near = plan_near(site, poses, reach, count, lens, seed)
+    if not len(near):
+        return None
+    cameras = near.cameras(site, lens)
+    return replace(cameras, names=tuple(name.replace("pose", "near") for name in cameras.names))
 
 
 def _planned(

@@ -22,8 +22,8 @@ _SLAB = 0.04
 """Half the thickness of a layer that counts as a plane, in sizes of the scene."""
 
 _LAYERED = 1.8
-"""The strongest layer of a floor or path with matter on both sides holds this many times what any layer across
-it does. Measured: a room 2.2, a path 4.4; objects 1.2 and 2.2, the latter along no usual axis."""
+"""The strongest layer of a floor or path with matter on both sides holds this many times what any layer
+across it does. Measured: a room 2.2, a path 4.4; objects 1.2 and 2.2, the latter along no usual axis."""
 
 _SEARCHED = 20_000
 """Rows that the search over directions looks at; the winner is refined on all."""

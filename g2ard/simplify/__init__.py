@@ -41,11 +41,11 @@ class Simplified:
             `rounds` (a dict each: `before` − `dropped` − `merged` − `trimmed` = `after`, where `merged` is by
             how many rows merging shrank the scene), `protected`, `nonfinite_rows`,
             `infinite_logits` (taken as α = 0 or 1), `clamped_opacities` (merged α that reached
-            0.99: what `max_growth` could not take was lost), `fitted` (rows whose opacity was fitted to what views see), `unseen`
-            (rows of the input that are kept though no view sees them; None without views),
-            `faded` (merged α < 1/255 where a member's was not), `skipped` (`alone`: rows passed on as they
-            were; `sh_bands`: of zeros, left out of all sums; of the paper's, `coverages`: groups that the
-            cheaper guard had refused; rounds without `binnings`, or `trims`: few rows were left already).
+            0.99: what `max_growth` could not take was lost), `fitted` (rows whose opacity was fitted to what
+            views see), `unseen` (rows of the input that are kept though no view sees them; None without
+            views), `faded` (merged α < 1/255 where a member's was not), `skipped` (`alone`: rows passed on as
+            they were; `sh_bands`: of zeros, left out of all sums; of the paper's, `coverages`: groups that
+            the cheaper guard had refused; rounds without `binnings`, or `trims`: few rows were left already).
     """
 
     splats: Splats
@@ -125,7 +125,7 @@ def simplify(
         budget: Gaussians to keep, at most as many as there are.
         method: the policy.
         visibility: for `default` and `fast`: what views see of each Gaussian (`g2ard.render.visibility`), or
-            a function that finds it for a scene, asked again for the result, whose opacities are fitted to it.
+            a function that finds it for a scene, asked again for the result, whose opacities it fits.
         protected: (N,) bool flags to inherit. With None, `paper` computes them (see `flag`), the others,
             which have no use for them, go without.
         flag_budget: the count that sets the flags' cell size, where this call is one round on the way to a

@@ -1,9 +1,9 @@
-//! Exact nearest neighbours.
+//! Exact nearest neighbours; rays through cells.
 
 use g2ard_core::Error;
-use g2ard_core::spatial::Tree;
+use g2ard_core::spatial::{Steps, Tree};
 use numpy::ndarray::Array2;
-use numpy::{IntoPyArray, PyArray2, PyReadonlyArray2};
+use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use rayon::prelude::*;
 
@@ -50,6 +50,30 @@ fn neighbors(points: &[[f64; 3]], k: usize) -> Array2<u32> {
     rows
 }
 
+/// (M,) distances at which unit rays first meet a cell of 0 steps; infinite where they do not.
+#[pyfunction]
+fn cast_rays<'py>(
+    py: Python<'py>,
+    steps: PyReadonlyArray1<'py, i8>,
+    shape: [usize; 3],
+    low: [f64; 3],
+    cell: f64,
+    eyes: PyReadonlyArray2<'py, f64>,
+    directions: PyReadonlyArray2<'py, f64>,
+) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    let steps = Steps {
+        low,
+        cell,
+        shape,
+        steps: arrays::flat("steps", &steps)?,
+    };
+    let eyes = arrays::rows::<f64, 3>("eyes", &eyes)?;
+    let directions = arrays::rows::<f64, 3>("directions", &directions)?;
+    let found = quick(py, || steps.cast(eyes, directions))?;
+    Ok(PyArray1::from_vec(py, found))
+}
+
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_function(wrap_pyfunction!(cast_rays, m)?)?;
     m.add_function(wrap_pyfunction!(knn, m)?)
 }

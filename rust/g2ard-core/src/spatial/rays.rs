@@ -1,0 +1,144 @@
+//! What rays meet first in a box of cells whose distance to the nearest full cell is known.
+
+use rayon::prelude::*;
+
+use crate::{Error, Result};
+
+/// Shortest stride, in cells: across the corner of a cell beside a full one.
+const LEAST: f64 = 0.6;
+/// How far within the box a ray from outside begins, in cells.
+const INSET: f64 = 0.01;
+
+/// Cells of side `cell` from `low`; `steps` are king's moves to the nearest full one, 0 in it, the last axis running.
+#[derive(Debug, Clone, Copy)]
+pub struct Steps<'a> {
+    pub low: [f64; 3],
+    pub cell: f64,
+    pub shape: [usize; 3],
+    pub steps: &'a [i8],
+}
+
+impl Steps<'_> {
+    /// Distances along unit rays at which they first meet a full cell; infinite where they do not.
+    pub fn cast(&self, eyes: &[[f64; 3]], directions: &[[f64; 3]]) -> Result<Vec<f64>> {
+        let count: usize = self.shape.iter().product();
+        if self.steps.len() != count || count == 0 {
+            return Err(Error::invalid(
+                "steps",
+                format!("{count} cells, at least 1"),
+                self.steps.len(),
+            ));
+        }
+        if eyes.len() != directions.len() {
+            return Err(Error::invalid(
+                "directions",
+                format!("{} rows", eyes.len()),
+                directions.len(),
+            ));
+        }
+        let rays = eyes.par_iter().zip(directions);
+        Ok(rays
+            .map(|(eye, direction)| self.first(eye, direction))
+            .collect())
+    }
+
+    fn first(&self, eye: &[f64; 3], direction: &[f64; 3]) -> f64 {
+        let (mut near, mut far) = (f64::NEG_INFINITY, f64::INFINITY);
+        for k in 0..3 {
+            let high = self.low[k] + self.cell * self.shape[k] as f64;
+            let ends = [self.low[k], high].map(|end| (end - eye[k]) / direction[k]);
+            if ends.iter().any(|end| end.is_nan()) {
+                continue; // 0/0: the ray runs in a face of the box
+            }
+            near = near.max(ends[0].min(ends[1]));
+            far = far.min(ends[0].max(ends[1]));
+        }
+        let mut reached = near.max(0.0) + INSET * self.cell;
+        while reached < far {
+            let ahead = self.ahead([0, 1, 2].map(|k| eye[k] + reached * direction[k]));
+            if ahead == 0 {
+                return reached;
+            }
+            reached += self.cell * (f64::from(ahead) - 1.0).max(LEAST);
+        }
+        f64::INFINITY
+    }
+
+    /// Steps at a point, which is taken into the box if rounding put it beside.
+    fn ahead(&self, point: [f64; 3]) -> i8 {
+        let index = (0..3).fold(0, |flat, k| {
+            let place = ((point[k] - self.low[k]) / self.cell).floor();
+            flat * self.shape[k] + (place.max(0.0) as usize).min(self.shape[k] - 1)
+        });
+        self.steps[index]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// One full cell in the middle of 5 × 5 × 5, at [2, 3)³.
+    fn middle() -> Vec<i8> {
+        let away = |i: usize| (i as i8 - 2).abs();
+        (0..125)
+            .map(|i| away(i / 25).max(away(i / 5 % 5)).max(away(i % 5)))
+            .collect()
+    }
+
+    #[test]
+    fn rays_stop_at_the_full_cell_or_leave() {
+        let steps = middle();
+        let box_ = Steps {
+            low: [0.0; 3],
+            cell: 1.0,
+            shape: [5; 3],
+            steps: &steps,
+        };
+        let eyes = [
+            [-3.0, 2.5, 2.5],
+            [2.5, 2.5, 9.0],
+            [-1.0, 0.5, 0.5],
+            [2.5, 2.5, 2.5],
+            [0.5, 0.5, 0.5],
+            [0.0, 7.0, 0.0],
+        ];
+        let oblique = 1.0 / 3f64.sqrt();
+        let rays = [
+            [1.0, 0.0, 0.0],
+            [0.0, 0.0, -1.0],
+            [1.0, 0.0, 0.0],
+            [0.0, 1.0, 0.0],
+            [oblique; 3],
+            [1.0, 0.0, 0.0],
+        ];
+        let found = box_.cast(&eyes, &rays).unwrap();
+        let near = |got: f64, want: f64| assert!((got - want).abs() <= 0.61, "{got} {want}");
+        near(found[0], 5.0);
+        near(found[1], 6.0);
+        assert_eq!(found[2], f64::INFINITY);
+        near(found[3], 0.0);
+        near(found[4], 1.5 * 3f64.sqrt());
+        assert_eq!(found[5], f64::INFINITY);
+    }
+
+    #[test]
+    fn wrong_lengths_are_refused() {
+        let box_ = Steps {
+            low: [0.0; 3],
+            cell: 1.0,
+            shape: [5; 3],
+            steps: &[0; 3],
+        };
+        assert!(box_.cast(&[], &[]).is_err());
+        let steps = middle();
+        assert!(
+            Steps {
+                steps: &steps,
+                ..box_
+            }
+            .cast(&[[0.0; 3]], &[])
+            .is_err()
+        );
+    }
+}
