@@ -20,13 +20,14 @@ from g2ard.recover import checkpoint as checkpoints
 from g2ard.recover.anchors import Anchors, drift95, needle
 from g2ard.recover.config import RecoverConfig
 from g2ard.recover.draw import checked_weights, drawn
+from g2ard.recover.guard import Guard
 from g2ard.recover.probe import MULTIPLIERS, Probe, calm, climb, trial_steps
 from g2ard.recover.schedule import Rates, multiplier_for, reach_for
 from g2ard.recover.sizes import typical_share
 from g2ard.splats import Splats
 from g2ard.targets import Targets, fingerprint_of, mask_of
 
-__all__ = ["Recovered", "Watch", "recover"]
+__all__ = ["Recovered", "Watch", "outcome", "recover"]
 
 _TRIAL_STEPS = 20
 _TRIAL_SHARE, _CALM_SHARE = 0.1, 0.3
@@ -49,7 +50,10 @@ class Recovered:
         report: steps, seconds, loss (one mean per 1 % of the horizon), psnr {before, after} over a sample of
             the training views, multiplier, reach (None is no limit), trials (those that chose the
             multiplier), drift95, needle, geometry (ten of {step, drift95, needle} on the way), regularizers
-            {steps, share of the time}, skipped, and kept_start: whether the student was better than what came
+            {steps, share of the time}, skipped, backed_off (a list of {step, psnr}: where so much was lost
+            that recovery went on from the best scene with a third of the rates), stopped (the step at which
+            it was given up, else None), way (how far the result goes from the student to where the steps
+            ended: 1 but where that lost), and kept_start: whether the student was better than all that came
             of it, and is the result.
     """
 
@@ -95,7 +99,8 @@ def recover(
     """Optimise every attribute of a fixed set of Gaussians against targets (`eq:objective`).
 
     L = (1−λ)·L1 + λ·(1−SSIM), and every `period` steps + λ_a·L_anchor + λ_s·L_shape. No Gaussian is added
-    or removed. A student that the steps only made worse, by PSNR of the training views, is returned as it is.
+    or removed. Where the steps lose against the student, by PSNR of some training views, recovery goes back,
+    and on with a third of the rates; a student that is only made worse is returned as it is.
 
     Args:
         student: the scene to recover; its offset counts, cameras are in world coordinates.
@@ -125,15 +130,11 @@ def recover(
     probe = Probe(targets, config.background)
     before = probe.all_of(student)
     often = checked_weights(weights, len(targets.cameras))
-    loop = _Loop(student, targets, config, often, anchors, probe)
+    loop = _Loop(student, targets, config, often, anchors, probe, Guard(probe.all_of, student, before))
     if checkpoint is None or not checkpoint.exists():
         loop.choose_rates(before)
     loop.run(checkpoint, progress, stage, watch)
-    result = loop.engine.splats()
-    after = probe.all_of(result)
-    kept_start = after < before
-    if kept_start:
-        result, after = student, before
+    result, after, way = loop.guard.judge(loop.engine.splats())
     return Recovered(
         result,
         {
@@ -148,10 +149,40 @@ def recover(
             "needle": needle(result.scales),
             "geometry": loop.geometry,
             "regularizers": loop.regularizers,
-            "kept_start": kept_start,
-            "skipped": {"non_finite": loop.engine.skipped},
+            "backed_off": loop.guard.backed_off,
+            "stopped": loop.guard.stopped,
+            "way": way,
+            "kept_start": way == 0,
+            "skipped": {"non_finite": loop.skipped},
         },
     )
+
+
+def outcome(report: dict[str, Any]) -> str | None:
+    """One line about a recovery that did not simply go well; None for one that did.
+
+    >>> outcome({"kept_start": False, "backed_off": [], "stopped": None, "way": 1.0}) is None
+    True
+    >>> lost = [{"step": 30, "psnr": 23.35}]
+    >>> outcome({"kept_start": False, "backed_off": lost, "stopped": None, "psnr": {"before": 32.9}})
+    'recovery fell to 23.35 dB (start 32.90) at step 30: it went on from the best with a third of the rates'
+    """
+    start = f"(start {report['psnr']['before']:.2f})" if report["backed_off"] else ""
+    lines = [f"{found['psnr']:.2f} dB {start} at step {found['step']}" for found in report["backed_off"]]
+    if report["kept_start"]:
+        why = "every step only made the training views worse"
+        if lines:
+            why = f"recovery fell to {', '.join(lines)}, and slower rates gained nothing"
+        given_up = "" if report["stopped"] is None else f"; given up at step {report['stopped']}"
+        return f"kept the simplified scene: {why}{given_up}"
+    if lines:
+        thirds = "a third" if len(lines) == 1 else f"1/{3 ** len(lines)}"
+        return f"recovery fell to {', '.join(lines)}: it went on from the best with {thirds} of the rates"
+    if report["way"] < 1:
+        return (
+            f"recovery ended below its start: the scene goes {report['way']:.0%} of the way to where it ended"
+        )
+    return None
 
 
 class _Loop:
@@ -165,6 +196,7 @@ class _Loop:
         weights: NDArray[np.float64] | None,
         anchors: Anchors,
         probe: Probe,
+        guard: Guard,
     ) -> None:
         self.targets = targets
         self.config = config
@@ -175,6 +207,8 @@ class _Loop:
         self.trials: list[dict[str, float]] = []
         self.student = student
         self.probe = probe
+        self.guard = guard
+        self._skipped = 0  # by engines before this one
         self.done = 0
         self.seconds = 0.0
         self.losses: list[float] = []
@@ -187,8 +221,13 @@ class _Loop:
         """Made when first needed: trials need theirs before, and two at once would double the memory."""
         return self._new_engine()
 
-    def _new_engine(self) -> Engine:
-        config, student = self.config, self.student
+    @property
+    def skipped(self) -> int:
+        """Steps of single Gaussians left out because a gradient was not finite."""
+        return self._skipped + self.engine.skipped
+
+    def _new_engine(self, start: Splats | None = None) -> Engine:
+        config, student = self.config, self.student if start is None else start
         engine: Engine = _engine_class(config.engine)(
             student,
             self.targets.cameras.recentred(student.offset),
@@ -209,10 +248,9 @@ class _Loop:
             start: PSNR before recovery: where the search begins, and all there is for short horizons.
         """
         rmse = 10 ** (-start / 20)
+        typical = typical_share(self.student, self.targets.cameras)
         reach = self.config.schedule.reach
-        if reach is None:
-            reach = reach_for(rmse, typical_share(self.student, self.targets.cameras))
-        self.reach = reach
+        self.reach = reach_for(rmse, typical) if reach is None else reach
         if self.config.schedule.multiplier is not None:
             self.multiplier = self.config.schedule.multiplier
             return
@@ -237,6 +275,11 @@ class _Loop:
         nearly_there = guess <= min(MULTIPLIERS)
         try:
             self.multiplier, _ = climb(score, guess, start)
+            tight = reach_for(0.0, typical)
+            if seen[self.multiplier] < start and self.config.schedule.reach is None and tight < self.reach:
+                self.reach = tight  # not as untrained as it looked
+                seen.clear()
+                self.multiplier, _ = climb(score, guess, start)
             if seen[self.multiplier] < start:  # a few steps on photos that are nearly met say nothing
                 self.multiplier, share = guess, _CALM_SHARE
                 if nearly_there:
@@ -265,8 +308,9 @@ class _Loop:
             self._resume(checkpoint)
         earlier, began, saved = self.seconds, time.monotonic(), time.monotonic()
         with checkpoints.deferred_interrupt() as interrupted:
-            while self._share() < 1:
+            while self._share() < 1 and self.guard.stopped is None:
                 self._step()
+                self._look()
                 now = time.monotonic()
                 self.seconds = earlier + now - began
                 self._log()
@@ -298,6 +342,17 @@ class _Loop:
         tally[0] += 1
         tally[1] += time.monotonic() - began
         self.done += 1
+
+    def _look(self) -> None:
+        """Where too much is lost to come back, go on from the best scene with a third of the rates."""
+        share = self._share()
+        if not self.guard.due(share):
+            return
+        if self.guard.look(self.engine.splats(), share, self.done) == "back":
+            self.multiplier /= 3
+            self._skipped += self.engine.skipped
+            del self.engine  # two at once would double the memory
+            self.engine = self._new_engine(self.guard.best)
 
     def _log(self) -> None:
         """Drift95 and Needle at every tenth of the horizon."""
@@ -342,12 +397,17 @@ class _Loop:
             "trials": self.trials,
             "geometry": self.geometry,
             "seconds_of": [self._seconds_of[False], self._seconds_of[True]],
+            "skipped": self._skipped,
+            "guard": self.guard.meta(),
         }
-        checkpoints.save(path, self.key, meta, {**self.engine.state(), "losses": np.array(self.losses)})
+        arrays = {**self.engine.state(), "losses": np.array(self.losses), **self.guard.arrays()}
+        checkpoints.save(path, self.key, meta, arrays)
 
     def _resume(self, path: Path) -> None:
         meta, arrays = checkpoints.load(path, self.key)
         self.losses = arrays.pop("losses").tolist()
+        self.guard.load(meta["guard"], arrays)
+        self._skipped = int(meta["skipped"])
         self.engine.load(arrays)
         self.done, self.seconds = int(meta["done"]), float(meta["seconds"])
         self.multiplier = float(meta["multiplier"])
