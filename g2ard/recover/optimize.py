@@ -53,8 +53,10 @@ class Recovered:
             {steps, share of the time}, skipped, backed_off (a list of {step, psnr}: where so much was lost
             that recovery went on from the best scene with a third of the rates), stopped (the step at which
             it was given up, else None), way (how far the result goes from the student to where the steps
-            ended: 1 but where that lost), and kept_start: whether the student was better than all that came
-            of it, and is the result.
+            ended: 1 but where that lost), kept_start: whether the student was better than all that came of
+            it, and is the result, and validation: None without such views, else looks (a list of {step,
+            psnr}, last of the result) and doubt (a Gaussian that v views touched keeps v/(v + doubt) of its
+            change; None where all keep the same part, or none).
     """
 
     splats: Splats
@@ -81,6 +83,9 @@ class Engine(Protocol):
     def load(self, state: dict[str, NDArray[Any]]) -> None: ...
 
     @property
+    def counts(self) -> NDArray[Any]: ...
+
+    @property
     def skipped(self) -> int: ...
 
 
@@ -91,6 +96,7 @@ def recover(
     *,
     weights: ArrayLike | None = None,
     anchors: Anchors | None = None,
+    validation: Targets | None = None,
     checkpoint: Path | None = None,
     progress: Progress = silent,
     stage: str = "recover",
@@ -108,6 +114,10 @@ def recover(
         config: see `RecoverConfig`.
         weights: (C,) how often each view is drawn, in proportion; None draws all equally often.
         anchors: frozen geometry; None freezes the student as given.
+        validation: a few views of another kind than `targets` (nearer, or from where people stand), never
+            learned from: they decide how much of what the steps changed stays, Gaussian by Gaussian as it
+            was seen (`g2ard.recover.guard`), and end a recovery that they only lose by. At most eight are
+            looked at.
         checkpoint: a file written every minute and at Ctrl-C; if it is there, recovery goes on from it, and
             the result is bitwise that of never having stopped.
         progress: told of every step, with loss, PSNR of a few training views and steps/s.
@@ -130,11 +140,19 @@ def recover(
     probe = Probe(targets, config.background)
     before = probe.all_of(student)
     often = checked_weights(weights, len(targets.cameras))
-    loop = _Loop(student, targets, config, often, anchors, probe, Guard(probe.all_of, student, before))
+    others = None if validation is None else Probe(validation, config.background).all_of
+    guard = Guard(probe.all_of, student, before, others)
+    held = None if validation is None else fingerprint_of(validation)
+    loop = _Loop(student, targets, config, often, anchors, probe, guard, held)
     if checkpoint is None or not checkpoint.exists():
         loop.choose_rates(before)
     loop.run(checkpoint, progress, stage, watch)
-    result, after, way = loop.guard.judge(loop.engine.splats())
+    end = loop.engine.splats()
+    result, after, way = guard.judge(end)
+    doubt: float | None = 0.0
+    if result is end and validation is not None:
+        result, doubt = guard.settle(end, loop.views_seen, loop.done)
+        after, way = (after, way) if result is end else (probe.all_of(result), float(result is not student))
     return Recovered(
         result,
         {
@@ -153,6 +171,9 @@ def recover(
             "stopped": loop.guard.stopped,
             "way": way,
             "kept_start": way == 0,
+            "validation": None
+            if validation is None
+            else {"looks": guard.validation, "doubt": None if doubt is None else _finite(doubt)},
             "skipped": {"non_finite": loop.skipped},
         },
     )
@@ -171,6 +192,10 @@ def outcome(report: dict[str, Any]) -> str | None:
     lines = [f"{found['psnr']:.2f} dB {start} at step {found['step']}" for found in report["backed_off"]]
     if report["kept_start"]:
         why = "every step only made the training views worse"
+        looks = (report["validation"] or {"looks": []})["looks"]
+        if len(looks) > 2 and looks[-1]["psnr"] == looks[0]["psnr"]:
+            first, worst = looks[0]["psnr"], looks[-2]["psnr"]
+            why = f"views of another kind only lost by the steps ({first:.2f} → {worst:.2f} dB)"
         if lines:
             why = f"recovery fell to {', '.join(lines)}, and slower rates gained nothing"
         given_up = "" if report["stopped"] is None else f"; given up at step {report['stopped']}"
@@ -197,6 +222,7 @@ class _Loop:
         anchors: Anchors,
         probe: Probe,
         guard: Guard,
+        held: str | None,
     ) -> None:
         self.targets = targets
         self.config = config
@@ -214,7 +240,7 @@ class _Loop:
         self.losses: list[float] = []
         self.geometry: list[dict[str, float]] = []
         self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised? → steps, seconds
-        self.key = _fingerprint(student, targets, config, weights, anchors)
+        self.key = _fingerprint(student, targets, config, weights, anchors, held)
 
     @cached_property
     def engine(self) -> Engine:
@@ -225,6 +251,12 @@ class _Loop:
     def skipped(self) -> int:
         """Steps of single Gaussians left out because a gradient was not finite."""
         return self._skipped + self.engine.skipped
+
+    @property
+    def views_seen(self) -> NDArray[np.float64]:
+        """(N,) how many of the views have touched each Gaussian, from the steps it has taken."""
+        steps = self.done - (int(self.guard.backed_off[-1]["step"]) if self.guard.backed_off else 0)
+        return self.engine.counts * (len(self.targets.cameras) / max(1, steps))
 
     def _new_engine(self, start: Splats | None = None) -> Engine:
         config, student = self.config, self.student if start is None else start
@@ -443,9 +475,11 @@ def _fingerprint(
     config: RecoverConfig,
     weights: NDArray[np.float64] | None,
     anchors: Anchors,
+    validation: str | None,
 ) -> str:
     often = [] if weights is None else [repr(weights.tolist())]
     parts = (repr(config), student.fingerprint(), fingerprint_of(targets), *often)
+    parts = parts if validation is None else (*parts, validation)
     digest = hashlib.sha256("\n".join(parts).encode())
     for held in (anchors.means, anchors.frames, anchors.r_parallel, anchors.r_perp):
         digest.update(np.ascontiguousarray(held).tobytes())
