@@ -5,8 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from scenes import around, checkered_ball
 
@@ -140,3 +142,27 @@ def test_ctrl_c_before_a_command_is_one_line(moment: str) -> None:
     code = f"import os, signal, sys\n{unignored}\n{moment}from g2ard.__main__ import main\nmain()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, "g2ard: interrupted\n")
+
+
+def test_recover_says_that_it_went_back(tmp_path: Path, command_line: CommandLine) -> None:
+    ball = checkered_ball(800)
+    grain = np.random.default_rng(0).normal(0, 1e-3, ball.sh0.shape).astype(np.float32)
+    write_splats(tmp_path / "ball.ply", ball)
+    write_splats(tmp_path / "start.ply", replace(ball, sh0=ball.sh0 + grain))
+    write_views(tmp_path / "v.json", around(6))
+    asked = (
+        "recover",
+        "start.ply",
+        "--views",
+        "v.json",
+        "--teacher",
+        "ball.ply",
+        "-o",
+        "o.ply",
+        "--steps",
+        4,
+    )
+    status, _, told = command_line(*asked, cwd=tmp_path)
+    assert status == 0
+    assert "recovery fell to " in told
+    assert "of the rates" in told

@@ -130,6 +130,7 @@ def distill(
     from g2ard.distill import distill as pipeline
     from g2ard.io import kind, write_views
     from g2ard.io.atomic import check_output
+    from g2ard.recover.optimize import outcome
     from g2ard.recover.presets import preset_for
     from g2ard.recover.schedule import schedule_named
     from g2ard.report.distilled import distill_report
@@ -197,6 +198,9 @@ def distill(
         write_views(output / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
     shutil.rmtree(output / _WORK)
     _table(run, report)
+    for done in (done for entry in report["rounds"] for done in entry.get("recover", [])):
+        if (told := outcome(done)) is not None:
+            run.say(told)
     _say_views(run, report["views"], k is not None)
     run.say(
         f"scene: {output / 'scene.ply'}\npicture: {output / 'preview.png'}\n"
