@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,8 +31,11 @@ _SHARP = 0.04
 .007–.01, a park .012, an open scene seen through its own sky .1 and more."""
 
 _SAMPLED = 16
-"""Poses from around or above that are looked through: if three quarters are sharp, all are taken, if under a
-quarter, none, else each is looked through."""
+"""Poses from around or above that are looked through first."""
+
+_FEW, _MOST = 0.5, 0.9
+"""If fewer of those than the first share are sharp, none is taken, if more than the second, all; else each is
+looked through."""
 
 
 def plan_auto(
@@ -59,16 +63,17 @@ def plan_auto(
     if missing():
         shape, shape_why = shape_of(site)
         why.append(f"{shape}: {shape_why}")
-        if shape != "object":
-            part = _STREET if shape == "landscape" else 1.0
-            indoors = shape == "room"
-            add("walk", plan_walk(site, round(part * missing()), lens, seed, tell, indoors=indoors))
         glance = Glance(splats)
-        kind = "aerial" if shape == "landscape" else "orbit"
-        _add_far(site, glance, kind, missing(), lens, seed, tell, add, why)
-    if missing():
-        add("walk", plan_walk(site, missing() // 2, lens, seed + 1, tell, indoors=False))
-        add("focus", plan_focus(site, glance, missing(), lens, seed, tell)[0])
+        far = _far(site, glance, "aerial" if shape == "landscape" else "orbit", missing(), lens, seed, tell)
+        if shape != "object" and far.sharp:
+            part = round((_STREET if shape == "landscape" else 1.0) * missing())
+            add("walk", plan_walk(site, part, lens, seed, tell, indoors=shape == "room"))
+        add(far.kind, far.poses.take(slice(missing())))
+        if not far.sharp:
+            why.append(f"from around or above it is out of focus ({far.share:.0%} of the poses)")
+        if missing():
+            ground = plan_walk(site, missing() // 2, lens, seed + 1, tell, indoors=False)
+            add("focus", plan_focus(site, glance, missing(), lens, seed, tell, also=ground)[0])
     for kind in ("aerial", "orbit"):  # better a view through fog than none
         if missing():
             plan = plan_aerial if kind == "aerial" else plan_orbit
@@ -77,28 +82,31 @@ def plan_auto(
     return Poses.joined([none, *parts.values()]).take(slice(count)), list(parts), "; ".join(why)
 
 
-def _add_far(
-    site: Site,
-    glance: Glance,
-    kind: str,
-    count: int,
-    lens: Lens,
-    seed: int,
-    tell: Callable[[int, int], None],
-    add: Callable[[str, Poses], None],
-    why: list[str],
-) -> None:
-    """Poses around or above, those that are sharp."""
+@dataclass(frozen=True, eq=False)
+class _Far:
+    """Poses around or above that are in focus; `share` is of those looked through."""
+
+    kind: str
+    poses: Poses
+    share: float
+
+    @property
+    def sharp(self) -> bool:
+        """Whether there are enough of them to rely on."""
+        return self.share >= _FEW
+
+
+def _far(
+    site: Site, glance: Glance, kind: str, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]
+) -> _Far:
     plan = plan_aerial if kind == "aerial" else plan_orbit
+    some = plan(site, min(count, _SAMPLED), lens, seed, tell)
+    if not len(some):
+        return _Far(kind, some, 1.0)
+    share = float((glance.of(some.cameras(site, lens), tell).coarse < _SHARP).mean())
+    if share < _FEW:
+        return _Far(kind, some.take(slice(0)), share)
     poses = plan(site, count, lens, seed, tell)
-    if not len(poses):
-        return
-    some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _SAMPLED)).round().astype(int))
-    sharp = glance.of(poses.take(some).cameras(site, lens), tell).coarse < _SHARP
-    if sharp.mean() < 0.25:
-        poses = poses.take(slice(0))
-    elif sharp.mean() < 0.75:
+    if share < _MOST:
         poses = poses.take(glance.of(poses.cameras(site, lens), tell).coarse < _SHARP)
-    if sharp.mean() < 0.75:
-        why.append(f"{sharp.mean():.0%} of the {kind} poses see it in focus")
-    add(kind, poses)
+    return _Far(kind, poses, share)

@@ -30,7 +30,7 @@ _LONGEST = 96
 _MOST_WIDENED = 4.0
 """A sample's Gaussians grow to cover what the others did, along the two longer axes, at most so much."""
 
-_TRIED = 6
+_TRIED = 4
 """Candidates looked at for each pose wanted."""
 
 _COVERED = 0.8
@@ -104,26 +104,46 @@ class Glance:
 
 
 def plan_focus(
-    site: Site, glance: Glance, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]
+    site: Site,
+    glance: Glance,
+    count: int,
+    lens: Lens,
+    seed: int,
+    tell: Callable[[int, int], None],
+    *,
+    also: Poses,
 ) -> tuple[Poses, Focus]:
     """At most `count` poses in free space whose image the scene fills, the sharpest of those tried.
+
+    Sharp is what has a small median and a small 90th percentile of the standard deviations it shows.
+
+    Args:
+        site: the scene, upright.
+        glance: of it.
+        count: how many.
+        lens: of the poses.
+        seed: of the placement.
+        tell: told of the poses looked through.
+        also: poses to try besides those in free space anywhere.
 
     Returns:
         The poses and what glances show of them.
     """
-    tries = _TRIED * count
-    *at, turn, pitch = halton(0, 2 * tries, 5, seed + 2).T
+    poses = Poses.joined([also, _anywhere(site, _TRIED * count, lens, seed)])
+    found = glance.of(poses.cameras(site, lens), tell) if len(poses) else Focus(*np.zeros((3, 0)))
+    rows = np.flatnonzero(found.covered > _COVERED)
+    sharpest = np.argsort((found.typical * found.coarse)[rows], kind="stable")[:count]
+    rows = np.sort(rows[sharpest])
+    return poses.take(rows), Focus(found.covered[rows], found.typical[rows], found.coarse[rows])
+
+
+def _anywhere(site: Site, count: int, lens: Lens, seed: int) -> Poses:
+    """At most `count` poses in free space, gazing about the horizon, none at something close."""
+    *at, turn, pitch = halton(0, 2 * count, 5, seed + 2).T
     points = site.box[0] + (site.box[1] - site.box[0]) * np.stack(at, axis=1)
     around = 2 * np.pi * turn
     rise = np.radians(_PITCHES[0] + (_PITCHES[1] - _PITCHES[0]) * pitch)
     gazes = np.stack([np.cos(rise) * np.cos(around), np.cos(rise) * np.sin(around), np.sin(rise)], axis=1)
     free = site.grid.distance(points) > 3 * site.grid.cell
-    poses = Poses(points[free], gazes[free]).take(slice(tries))
-    if not len(poses):
-        return poses, Focus(*np.zeros((3, 0)))
-    near = look(site, poses, lens).close
-    poses = poses.take(near > 4 * site.grid.cell)
-    found = glance.of(poses.cameras(site, lens), tell) if len(poses) else Focus(*np.zeros((3, 0)))
-    rows = np.flatnonzero(found.covered > _COVERED)
-    rows = np.sort(rows[np.argsort(found.coarse[rows], kind="stable")[:count]])
-    return poses.take(rows), Focus(found.covered[rows], found.typical[rows], found.coarse[rows])
+    poses = Poses(points[free], gazes[free]).take(slice(count))
+    return poses.take(look(site, poses, lens).close > 4 * site.grid.cell)
