@@ -34,6 +34,9 @@ _TRIAL_SHARE, _CALM_SHARE = 0.1, 0.3
 """Under a time limit: steps of a trial, and the share of the limit that all trials may take; the second where
 rates that are too large would spend it on nothing."""
 
+_SHORT = 20
+"""Steps under which there is no way back: none would be left to go on with."""
+
 _LOG_POINTS = 10
 """How often Drift95 and Needle are logged over a recovery."""
 
@@ -378,7 +381,8 @@ class _Loop:
     def _look(self) -> None:
         """Where too much is lost to come back, go on from the best scene with a third of the rates."""
         share = self._share()
-        if not self.guard.due(share):
+        short = self.config.time_limit is None and self.config.horizon < _SHORT
+        if short or not self.guard.due(share):
             return
         if self.guard.look(self.engine.splats(), share, self.done) == "back":
             self.multiplier /= 3
