@@ -73,11 +73,10 @@ def plan_auto(
             why.append(f"from around or above it is out of focus ({far.share:.0%} of the poses)")
         if missing():
             ground = plan_walk(site, missing() // 2, lens, seed + 1, tell, indoors=False)
-            add("focus", plan_focus(site, glance, missing(), lens, seed, tell, also=ground)[0])
-    for kind in ("aerial", "orbit"):  # better a view through fog than none
-        if missing():
-            plan = plan_aerial if kind == "aerial" else plan_orbit
-            add(kind, plan(site, missing(), lens, seed + 1, tell))
+            add("focus", plan_focus(site, glance, missing(), lens, seed, tell, also=ground))
+    for kind, plan in (("aerial", plan_aerial), ("orbit", plan_orbit)):  # better a view through fog than none
+        if not parts:
+            add(kind, plan(site, count, lens, seed + 1, tell))
     none = Poses(np.zeros((0, 3)), np.zeros((0, 3)))
     return Poses.joined([none, *parts.values()]).take(slice(count)), list(parts), "; ".join(why)
 
@@ -100,13 +99,13 @@ def _far(
     site: Site, glance: Glance, kind: str, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]
 ) -> _Far:
     plan = plan_aerial if kind == "aerial" else plan_orbit
-    some = plan(site, min(count, _SAMPLED), lens, seed, tell)
-    if not len(some):
-        return _Far(kind, some, 1.0)
-    share = float((glance.of(some.cameras(site, lens), tell).coarse < _SHARP).mean())
-    if share < _FEW:
-        return _Far(kind, some.take(slice(0)), share)
     poses = plan(site, count, lens, seed, tell)
-    if share < _MOST:
+    if not len(poses):
+        return _Far(kind, poses, 1.0)
+    some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _SAMPLED)).round().astype(int))
+    share = float((glance.of(poses.take(some).cameras(site, lens), tell).coarse < _SHARP).mean())
+    if share < _FEW:
+        poses = poses.take(slice(0))
+    elif share < _MOST:
         poses = poses.take(glance.of(poses.cameras(site, lens), tell).coarse < _SHARP)
     return _Far(kind, poses, share)
