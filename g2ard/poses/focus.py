@@ -79,8 +79,8 @@ class Glance:
             np.zeros((len(means), 0, 3), np.float32),
         )
 
-    def of(self, cameras: Cameras, tell: Callable[[int, int], None]) -> Focus:
-        """Look through each camera."""
+    def of(self, cameras: Cameras, tell: Callable[[int, int], None], reach: Floats | None = None) -> Focus:
+        """Look through each camera; what is farther than `reach`, (C,), is a backdrop and does not count."""
         from g2ard.render import RasterSettings, view_of
 
         here = cameras.resized(_LONGEST).recentred(self._middle)
@@ -92,12 +92,12 @@ class Glance:
                 self._arrays, [view_of(here, i, settings)], settings.choices, None
             )
             weight = sums["weight"]
-            seen = weight > 0
+            depth = norms(self._means - here.positions[i])
+            seen = (weight > 0) & (depth <= (np.inf if reach is None else reach[i]))
             figures[0, i] = weight.sum() / (here.widths[i] * here.heights[i])
             figures[1:, i] = np.inf
             if seen.any():
-                depth = norms(self._means[seen] - here.positions[i])
-                angle = self._sigma[seen] / np.maximum(depth, np.finfo(float).tiny)
+                angle = self._sigma[seen] / np.maximum(depth[seen], np.finfo(float).tiny)
                 figures[1:, i] = quantile(angle, weight[seen], [0.5, 0.9])
             tell(i + 1, len(here))
         return Focus(*figures)
