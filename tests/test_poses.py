@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from reference import poses as naive
 
 SCENES = {"statue": naive.statue, "room": naive.room, "town": naive.town}
-KINDS = {"statue": {"orbit"}, "room": {"walk"}, "town": {"walk", "aerial"}}
+KINDS = {"statue": {"orbit"}, "room": {"inside"}, "town": {"walk", "aerial"}}
 
 
 @pytest.fixture(scope="module")
@@ -48,11 +48,11 @@ def inside_matter(name: str, eyes: np.ndarray) -> np.ndarray:
     return (eyes[:, 2] < 0.1) | np.any([within(*h, 0.1) for h in naive.HOUSES], axis=0)
 
 
-def share_in_frame(splats: Splats, cameras) -> np.ndarray:
-    """Per view, the share of 12×9 blocks of the frame that the means fall into."""
+def share_in_frame(splats: Splats, cameras, every: int = 5) -> np.ndarray:
+    """Per view, the share of 12×9 blocks of the frame that the means, or some of them, fall into."""
     shares = []
     for view, K in zip(cameras.viewmats, cameras.Ks, strict=True):
-        p = (splats.means[::5] + splats.offset) @ view[:3, :3].T + view[:3, 3]
+        p = (splats.means[::every] + splats.offset) @ view[:3, :3].T + view[:3, 3]
         p = p[p[:, 2] > 0]
         uv = (p @ K.T)[:, :2] / p[:, 2:] / (800 / 12, 600 / 9)
         uv = uv[(uv >= 0).all(1) & (uv < (12, 9)).all(1)].astype(int)
@@ -74,9 +74,10 @@ def test_auto_pools_are_whole_upright_free_and_see_the_scene(name, turned, scene
     tops = -pool.cameras.viewmats[:, 1, :3] @ turn[:, 2]
     assert (tops > -1e-6).all()
     assert (tops > 0.3).mean() > 0.5
-    seen = share_in_frame(naive.moved(scenes[name], turn, 1.0, shift), pool.cameras)
-    assert seen.min() > 0.25
-    assert np.median(seen) > 0.4
+    within = pool.kind == "inside"  # a wall at arm's length shows few means, but fills the frame
+    seen = share_in_frame(naive.moved(scenes[name], turn, 1.0, shift), pool.cameras, 1 if within else 5)
+    assert seen.min() > (0.5 if within else 0.25)
+    assert np.median(seen) > (0.9 if within else 0.4)
 
 
 @pytest.mark.parametrize(("name", "kind"), [("statue", "orbit"), ("town", "aerial"), ("town", "walk")])

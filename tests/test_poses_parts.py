@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from g2ard.poses.grid import Grid
 from g2ard.poses.lattice import halton, strata
@@ -49,6 +52,37 @@ def test_grid_equals_its_naive_twin() -> None:
     assert (np.isfinite(want) != np.isfinite(got)).sum() <= 2  # corners cut between two steps
     assert (np.abs(got[hit] - want[hit]) < 0.7 * grid.cell).mean() > 0.9
     assert (got[hit] > want[hit] - 0.02 * grid.cell).all()
+
+
+_CAST = """
+import sys
+import numpy as np
+from g2ard import _core
+case = np.load(sys.argv[1])
+steps = case["steps"]
+found = _core.cast_rays(
+    steps.ravel(), list(steps.shape), case["low"].tolist(), float(case["cell"]), case["eyes"], case["ways"]
+)
+np.save(sys.argv[2], found)
+"""
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_cast_equals_its_naive_twin_bit_for_bit(threads, tmp_path: Path) -> None:
+    rng = np.random.default_rng(threads)
+    shape, low, cell = (13, 7, 9), np.array([-0.3, 0.7, 1e3]), 0.07
+    steps = naive.king_steps(rng.random(shape) < 0.02, 12).astype(np.int8)
+    at, towards = rng.uniform(-1, 2, (4000, 3)), rng.uniform(0, 1, (4000, 3))
+    eyes, ways = low + cell * np.array(shape) * at, cell * np.array(shape) * (towards - at)
+    ways[:500] = np.eye(3)[rng.integers(3, size=500)] * rng.choice([-1.0, 1.0], (500, 1))
+    eyes[:100] = low + cell * np.array(shape) * rng.integers(0, 2, (100, 3))  # along edges, from corners
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    np.savez(tmp_path / "case.npz", steps=steps, low=low, cell=cell, eyes=eyes, ways=ways)
+    program = [sys.executable, "-c", _CAST, str(tmp_path / "case.npz"), str(tmp_path / "found.npy")]
+    subprocess.run(program, env={**os.environ, "RAYON_NUM_THREADS": str(threads)}, check=True)
+    want = naive.cast_rays(steps, low, cell, eyes, ways)
+    assert 300 < np.isfinite(want).sum() < 3500
+    np.testing.assert_array_equal(np.load(tmp_path / "found.npy"), want)
 
 
 def test_distance_is_never_too_long() -> None:

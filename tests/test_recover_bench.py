@@ -74,6 +74,35 @@ def test_rounds_take_the_time_they_are_given(bench: RecoverBench, tmp_path: Path
     assert any(look.count > 500 for look in found)  # looks within rounds
 
 
+def test_standing_views_are_looked_at_beside_the_pools(bench: RecoverBench, tmp_path: Path) -> None:
+    csv = tmp_path / "f.csv"
+    both = RecoverBench(bench.scene, bench.views, size=48, protocol="both")
+    ask = partial(
+        bench_recover, study="curves", csv_path=csv, ratios=[5], steps=[50], variants=["default@50"]
+    )
+    ask(replace(both, protocol="pool"))
+    found = ask(both)
+    kinds = ["pool", "near", "standing"]
+    assert [look.views_kind for look in found if look.final] == kinds
+    on_the_way = [(look.views_kind, look.step) for look in found if not look.final]
+    assert sorted(on_the_way) == [(kind, step) for kind in sorted(kinds) for step in (25, 50)]
+    assert len({look.psnr for look in found if look.final}) == 3
+    before = csv.read_text()
+    standing = ask(replace(both, protocol="standing"))
+    assert csv.read_text() == before  # nothing was run again
+    assert {look.views_kind for look in standing} == {"near", "standing"}
+    slow = [
+        replace(look, variant="paper/10", seconds=100.0, psnr=look.psnr - 0.01)
+        for look in found
+        if look.final
+    ]
+    assert [s.views_kind for s in speedups([*found, *slow])] == kinds
+    with pytest.raises(InputError, match="protocol"):
+        ask(replace(both, protocol="sitting"))
+    with pytest.raises(InputError, match="trained scene is needed"):
+        ask(replace(both, photos=True))
+
+
 def test_bad_wishes_are_named(bench: RecoverBench, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="study"):
         bench_recover(bench, "speed", tmp_path / "f.csv")

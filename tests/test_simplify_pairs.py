@@ -33,7 +33,7 @@ def test_what_is_seen_is_kept_finer(method, least):
         simplify(prior, 400, method=method, visibility=Views(np.ones(3), np.ones(4000)))
 
 
-def test_a_function_of_visibility_is_asked_again_as_the_scene_shrinks():
+def test_a_function_of_visibility_is_asked_again_for_the_result():
     prior, asked = scene(4000), []
 
     def look(splats):
@@ -42,8 +42,21 @@ def test_a_function_of_visibility_is_asked_again_as_the_scene_shrinks():
 
     out = simplify(prior, 100, visibility=look, protected=np.ones(4000, bool))
     assert_sound(out, 4000, 100)
-    assert asked == [4000, 1200, 360, 100]  # the last to resize what was merged
+    assert asked == [4000, 100]  # the last to fit what was merged
     assert out.protected.all()
+    assert out.report["unseen"] == 0
+
+
+def test_what_no_view_sees_is_counted():
+    prior = scene(4000)
+    unseen = prior.means[:, 0] < 0
+
+    def look(splats):
+        return Views(np.where(splats.means[:, 0] < 0, 0.0, 1.0), np.full(len(splats), 0.01))
+
+    out = simplify(prior, 100, visibility=look)
+    assert out.report["unseen"] == (unseen & (out.parents >= 0)).sum() > 0
+    assert simplify(prior, 100).report["unseen"] is None
 
 
 @pytest.mark.parametrize("growth", [1.0, 1.5])
@@ -83,21 +96,31 @@ def test_an_opaque_wall_stays_opaque_and_thin(method):
     assert render(seen, cameras, 0).alpha[15:45, 20:60].mean() > alpha[1.5]
 
 
-def test_stages_join_raw_members():
+def test_opacities_are_fitted_and_all_else_is_the_members():
     prior = scene(4000, dtype=np.float64)
     config = SimplifyConfig(max_growth=1)
     out = simplify(prior, 100, visibility=all_alike, config=config)
-    assert out.report["resized"] > 50
+    assert out.report["fitted"] > 50
+    members = np.bincount(out.parents[out.parents >= 0], minlength=100)
+    floor = 0.05 * members.mean()  # every row sends 1 to the views, before and after
+    factor = np.sqrt(np.clip((members + floor) / (1 + floor), 0.5, 2))
     for p in range(0, 100, 7):
         rows = np.flatnonzero(out.parents == p)
         if len(rows) > 1:
-            mean, _, alpha, sh = naive.merge_as_rendered(prior, rows, (0.4 * 0.01) ** 2, 1.0)
+            mean, cov, alpha, sh = naive.merge_as_rendered(prior, rows, (0.4 * 0.01) ** 2, 1.0)
+            wanted = alpha * factor[p]
+            held = min(wanted, max(alpha, 0.99))
             np.testing.assert_allclose(out.splats.means[p], mean, rtol=0, atol=1e-7)
-            np.testing.assert_allclose(out.splats.opacities[p], alpha, rtol=1e-4)
+            np.testing.assert_allclose(out.splats.opacities[p], held, rtol=1e-4)
             np.testing.assert_allclose(np.r_[out.splats.sh0[p], out.splats.shN[p]], sh, rtol=0, atol=1e-5)
+            areas = [
+                np.sort(np.linalg.eigvalsh(c))[1:].prod() ** 0.5
+                for c in (naive.covariance(out.splats, p), cov)
+            ]
+            np.testing.assert_allclose(areas[0] / areas[1], wanted / held, rtol=1e-3)
 
 
-def test_stages_drop_no_merged_cluster():
+def test_no_merged_cluster_is_dropped():
     rng = np.random.default_rng(4)
     prior = Splats.create(
         rng.uniform(0, 100, (2000, 3)), scales=np.full((2000, 3), 0.01), logit_opacities=np.full(2000, 2)
@@ -123,7 +146,7 @@ def test_what_is_seen_does_not_depend_on_the_order_of_rows(method, scale):
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(a.splats, name), getattr(b.splats, name), err_msg=name)
     np.testing.assert_array_equal(a.parents[shuffled], b.parents)
-    assert a.report["resized"] > 40
+    assert a.report["fitted"] > 40
 
 
 def test_bands_of_zeros_are_skipped_and_come_back():

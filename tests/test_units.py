@@ -53,7 +53,7 @@ def test_what_views_see_scales_by_powers_of_two_exactly(method, unit, dtype):
     small, near = in_units(scene, cameras, unit)
     here = simplify(scene, 150, method=method, visibility=looker(cameras))
     there = simplify(small, 150, method=method, visibility=looker(near))
-    assert here.report["resized"] > 50
+    assert here.report["fitted"] > 50
     back = in_units(there.splats, near, 1 / unit)[0]
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(back, name), getattr(here.splats, name), err_msg=name)

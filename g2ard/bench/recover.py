@@ -15,6 +15,7 @@ from g2ard import __version__, io
 from g2ard.bench import rows
 from g2ard.bench.recover_studies import STUDIES, Plan
 from g2ard.bench.simplify import machine, scene_label
+from g2ard.bench.standing import check_protocol, standing_targets
 from g2ard.cameras import Cameras
 from g2ard.distill import DistillConfig, distill
 from g2ard.errors import InputError
@@ -65,6 +66,7 @@ class Look:
         final: 1 for the result, 0 on the way.
         version: of g2ard.
         machine: processor and cores.
+        views_kind: what was looked at: "pool", "near" or "standing".
     """
 
     study: str
@@ -88,6 +90,7 @@ class Look:
     final: int
     version: str
     machine: str
+    views_kind: str = "pool"
 
     @property
     def key(self) -> tuple[str, str, float, int, str]:
@@ -107,6 +110,8 @@ class RecoverBench:
         size: shrink views to this longer side.
         background: RGB behind the scene.
         pool_seed: of the pool.
+        protocol: "pool" scores on unseen views of the pool, or those given; "standing" on views of other
+            kinds, from near and from where people stand (`g2ard.bench.standing.standing_views`); "both".
     """
 
     scene: Path
@@ -116,6 +121,7 @@ class RecoverBench:
     size: int | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pool_seed: int = 0
+    protocol: str = "pool"
     _starts: dict[int, tuple[Splats, float]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -159,14 +165,40 @@ class RecoverBench:
         train, test = (found.cameras.take(mask).resized(self.size) for mask in masks)
         return train, test
 
+    @property
+    def from_photos(self) -> bool:
+        """Whether photos are the targets."""
+        return self.lifted if self.photos is None else self.photos
+
     @cached_property
     def targets(self) -> tuple[Targets, Targets]:
         """What both kinds of views show."""
         train, test = self.cameras
-        if self.lifted if self.photos is None else self.photos:
+        if self.from_photos:
             return Photos(train), Photos(test)
         teach = partial(TeacherRenders, self.prior, background=self.background)
         return teach(train), teach(test)
+
+    @cached_property
+    def scored(self) -> dict[str, Targets]:
+        """What is scored on, by kind of views.
+
+        Raises:
+            InputError: an unknown protocol, or standing views where photos are the targets.
+        """
+        kinds = check_protocol(self.protocol)
+        elsewhere = set(kinds) != {"pool"}
+        if elsewhere and self.from_photos:
+            raise InputError("protocol: no photos show it from elsewhere; a trained scene is needed")
+        found: dict[str, Targets] = {"pool": self.targets[1]} if "pool" in kinds else {}
+        if not elsewhere:
+            return found
+        found |= standing_targets(
+            self.prior, self.scene, self.pool_seed, size=self.size, background=self.background
+        )
+        if not found:
+            raise InputError(f"{self.scene}: no place for near or standing views")
+        return found
 
     @property
     def sh_degree(self) -> int | None:
@@ -200,7 +232,7 @@ def bench_recover(
     """Run every ratio × variant × seed of a study that `csv_path` does not hold whole; rows are appended.
 
     Every run starts from the same `g2ard simplify` of the prior, looking through the training views, and is
-    scored on unseen views along the way; the looks do not count as time.
+    scored on unseen views of each kind of its protocol along the way; the looks do not count as time.
 
     Args:
         bench: the scene.
@@ -217,11 +249,12 @@ def bench_recover(
         The rows of these ratios, seeds and variants.
 
     Raises:
-        InputError: an unknown study or variant, a scene or views that cannot be read, or a result with a
-            value that is not finite.
+        InputError: an unknown study, variant or protocol, a scene or views that cannot be read, or a result
+            with a value that is not finite.
     """
     if study not in STUDIES:
         raise InputError(f"study: expected one of {', '.join(STUDIES)}, got {study!r}")
+    check_protocol(bench.protocol)
     kept = _whole(rows.read(csv_path, Look))
     rows.rewrite(csv_path, kept, Look)
     preset, why, _ = preset_for("auto", bench.prior, bench.cameras[0])
@@ -236,29 +269,32 @@ def bench_recover(
         for variant in variants or plans
         for seed in seeds
     ]
-    done = {look.key for look in kept}
+    done = {(look.key, look.views_kind) for look in kept}
     for number, key in enumerate(wanted, 1):
-        if key not in done:
+        kinds = [kind for kind in bench.scored if (key, kind) not in done]
+        if kinds:
             plan = plans[key[4]]
             weights = plan.regularizers or (papers if plan.schedule.rates == PAPER.rates else preset)
-            run = _Run(bench, key, replace(plan, regularizers=weights))
+            run = _Run(bench, key, replace(plan, regularizers=weights), kinds)
             found = run.looks(progress)
             rows.append(csv_path, found)
             kept += found
         progress("bench recover", number, len(wanted), {key[1]: f"{key[2]:g}× {key[4]}"})
-    return [look for look in kept if look.key in set(wanted)]
+    return [look for look in kept if look.key in set(wanted) and look.views_kind in bench.scored]
 
 
 def _whole(looks: Sequence[Look]) -> list[Look]:
-    ended = {look.key for look in looks if look.final}
-    return [look for look in looks if look.key in ended]
+    ended = {(look.key, look.views_kind) for look in looks if look.final}
+    return [look for look in looks if (look.key, look.views_kind) in ended]
 
 
 class _Run:
     """One recovery, or a chain of them, with its looks."""
 
-    def __init__(self, bench: RecoverBench, key: tuple[str, str, float, int, str], plan: Plan) -> None:
-        self.bench, self.key, self.plan = bench, key, plan
+    def __init__(
+        self, bench: RecoverBench, key: tuple[str, str, float, int, str], plan: Plan, kinds: Sequence[str]
+    ) -> None:
+        self.bench, self.key, self.plan, self.kinds = bench, key, plan, kinds
         self.budget = max(1, int(np.floor(len(bench.prior) / key[2] + 0.5)))
         self.found: list[Look] = []
         self.simplify_s = 0.0
@@ -277,14 +313,17 @@ class _Run:
         _check_finite(done, [loss for report in reports for loss in report["loss"]])
         spent = sum(report["seconds"] for report in reports)
         extra = sum(report["seconds"] * report["regularizers"]["share"] for report in reports)
-        last = replace(
-            self._look(done, reports[-1]["steps"], spent, final=1),
-            simplify_s=self.simplify_s,
-            drift95=drift95(Anchors.of(started), done.means),
-            reg_share=extra / max(spent, 1e-9),
-            skipped=sum(report["skipped"]["non_finite"] for report in reports),
-        )
-        return [*self.found, last]
+        ends = [
+            replace(
+                look,
+                simplify_s=self.simplify_s,
+                drift95=drift95(Anchors.of(started), done.means),
+                reg_share=extra / max(spent, 1e-9),
+                skipped=sum(report["skipped"]["non_finite"] for report in reports),
+            )
+            for look in self._look(done, reports[-1]["steps"], spent, final=1)
+        ]
+        return [*self.found, *ends]
 
     def _once(self, progress: Progress) -> tuple[Splats, Splats, list[dict[str, Any]]]:
         plan, bench = self.plan, self.bench
@@ -331,7 +370,7 @@ class _Run:
         self.now = seconds
         self._count_cpu()
         if step >= _FIRST_LOOK and (step // _FIRST_LOOK).bit_count() == 1 and step % _FIRST_LOOK == 0:
-            self.found.append(self._look(splats(), step, self.before + seconds))
+            self.found += self._look(splats(), step, self.before + seconds)
         self.cpu_began = time.process_time()
 
     def _count_cpu(self) -> None:
@@ -339,9 +378,13 @@ class _Run:
         self.cpu += now - self.cpu_began
         self.cpu_began = now
 
-    def _look(self, splats: Splats, step: int, seconds: float, *, final: int = 0) -> Look:
+    def _look(self, splats: Splats, step: int, seconds: float, *, final: int = 0) -> list[Look]:
+        """One for each kind of views."""
+        return [self._looked(kind, splats, step, seconds, final) for kind in self.kinds]
+
+    def _looked(self, kind: str, splats: Splats, step: int, seconds: float, final: int) -> Look:
         study, scene, ratio, seed, variant = self.key
-        score = evaluate(splats, self.bench.targets[1], background=self.bench.background)
+        score = evaluate(splats, self.bench.scored[kind], background=self.bench.background)
         return Look(
             study=study,
             scene=scene,
@@ -364,6 +407,7 @@ class _Run:
             final=final,
             version=f"g2ard {__version__}",
             machine=machine(),
+            views_kind=kind,
         )
 
 

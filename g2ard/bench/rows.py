@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, fields
+from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -24,6 +24,8 @@ _DIGITS = 6
 def read(path: Path, kind: type[Row]) -> list[Row]:
     """The rows of a CSV, none if there is no such file; fields must be int, float, str or optional ones.
 
+    A file from before the last columns came takes their defaults.
+
     Raises:
         InputError: it was not written from `kind`.
     """
@@ -31,14 +33,17 @@ def read(path: Path, kind: type[Row]) -> list[Row]:
         return []
     with path.open(newline="", encoding="utf-8") as file:
         lines = csv.DictReader(file)
-        if lines.fieldnames != [f.name for f in fields(kind)]:
+        known, held = fields(kind), lines.fieldnames or []
+        if held != [f.name for f in known[: len(held)]] or any(
+            f.default is MISSING for f in known[len(held) :]
+        ):
             raise InputError(f"{path}: has other columns than this benchmark's")
         return [_row(path, number, line, kind) for number, line in enumerate(lines, 2)]
 
 
 def _row(path: Path, number: int, line: dict[str, str], kind: type[Row]) -> Row:
     try:
-        return kind(**{f.name: _value(line[f.name], str(f.type)) for f in fields(kind)})
+        return kind(**{f.name: _value(line[f.name], str(f.type)) for f in fields(kind) if f.name in line})
     except (TypeError, ValueError):
         raise InputError(f"{path}: line {number}: not a row of this benchmark") from None
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from g2ard import __version__, baselines, io
 from g2ard.bench import rows as table
 from g2ard.bench.process import measured
 from g2ard.bench.raster import cpu_name
+from g2ard.bench.standing import check_protocol, standing_targets
 from g2ard.errors import InputError
 from g2ard.evaluate import evaluate
 from g2ard.poses import make_pool
@@ -61,12 +63,13 @@ class Cell:
         cpu_s: user + system seconds of the whole command, its start and files included.
         wall_s: the same by the clock.
         peak_mb: largest resident size, 10⁶ bytes.
-        psnr: mean over the held-out views, dB, against the scene itself.
+        psnr: mean over the unseen views, dB, against the scene itself.
         ssim: the same.
         views: how many were scored.
         version: of the method's program.
         machine: processor and cores.
         error: why there are no figures; "" if there are.
+        views_kind: what it was scored on: "pool", "near" or "standing".
     """
 
     scene: str
@@ -84,11 +87,12 @@ class Cell:
     version: str = ""
     machine: str = ""
     error: str = ""
+    views_kind: str = "pool"
 
     @property
-    def key(self) -> tuple[str, float, str]:
+    def key(self) -> tuple[str, float, str, str]:
         """What tells it from other rows."""
-        return self.scene, self.ratio, self.method
+        return self.scene, self.ratio, self.method, self.views_kind
 
 
 def scene_label(path: Path) -> str:
@@ -114,12 +118,16 @@ def bench_simplify(
     views: Path | None = None,
     splat_transform: Path | None = None,
     seed: int = 0,
+    protocol: str = "pool",
     progress: Progress = silent,
 ) -> list[Cell]:
     """Measure every scene × ratio × method that `csv_path` does not hold yet; append rows as they are done.
 
-    The scene is written as .ply once; each method reads that and writes its own. Scored are every 8th of a
-    pool of 128 poses, or the views' own test split; `default` gets the others, so nothing it used is scored.
+    The scene is written as .ply once; each method reads that and writes its own. Under the protocol "pool"
+    every 8th of a pool of 128 poses is scored, or the views' own test split; `default` gets the others, so
+    nothing it used is scored. Under "standing" each method runs as its user runs it (`default` with a pool
+    of its own, unless `views` are given) and is scored on views of other kinds, which it never sees, one row
+    each (`g2ard.bench.standing.standing_views`). "both" is both.
 
     Args:
         scenes: anything `g2ard.io.read_scene` reads.
@@ -129,34 +137,42 @@ def bench_simplify(
         views: to train and score on; None makes a pool for each scene.
         splat_transform: its program; needed for its two methods.
         seed: of the pool.
+        protocol: "pool", "standing" or "both".
         progress: told after each cell.
 
     Returns:
         The rows of these scenes, ratios and methods; a method that fails is a row with its error.
 
     Raises:
-        InputError: a scene, the views or the CSV cannot be read, or an unknown method.
+        InputError: a scene, the views or the CSV cannot be read, an unknown method or protocol.
     """
+    kinds = check_protocol(protocol)
     unknown = [m for m in methods if m not in METHODS]
     if unknown:
         raise InputError(f"methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown)}")
     done = {cell.key: cell for cell in table.read(csv_path, Cell) if not cell.error}
     table.rewrite(csv_path, done.values(), Cell)
-    wanted = [(p, (scene_label(p), float(r), m)) for p in scenes for r in ratios for m in methods]
+    wanted = [
+        (p, (scene_label(p), float(r), m, k)) for p in scenes for r in ratios for m in methods for k in kinds
+    ]
     total, finished = len(wanted), sum(key in done for _, key in wanted)
     versions = {m: _version(m, splat_transform) for m in methods}
     for scene in scenes:
-        missing = [key for path, key in wanted if path == scene and key not in done]
+        missing: dict[tuple[str, float, str], list[str]] = {}
+        for path, key in wanted:
+            if path == scene and key not in done:
+                missing.setdefault(key[:3], []).append(key[3])
         if not missing:
             continue
         with tempfile.TemporaryDirectory(prefix="g2ard-bench-") as folder:
-            stand = _Stand(Path(folder), _readable(scene), views, splat_transform, seed)
-            for key in missing:
-                cell = replace(stand.measure(*key), version=versions[key[2]], machine=machine())
-                table.append(csv_path, [cell])
-                done[key] = cell
-                finished += 1
-                progress("bench simplify", finished, total, {key[0]: f"{key[1]:g}× {key[2]}"})
+            stand = _Stand(Path(folder), scene, views, splat_transform, seed, kinds)
+            for name, some in missing.items():
+                about: dict[str, Any] = {"version": versions[name[2]], "machine": machine()}
+                cells = [replace(cell, **about) for cell in stand.measure(*name, some)]
+                table.append(csv_path, cells)
+                done |= {cell.key: cell for cell in cells}
+                finished += len(cells)
+                progress("bench simplify", finished, total, {name[0]: f"{name[1]:g}× {name[2]}"})
     return [done[key] for _, key in wanted]
 
 
@@ -164,36 +180,69 @@ class _Stand:
     """One scene, written out, with its views; measures methods on it."""
 
     def __init__(
-        self, folder: Path, splats: Splats, views: Path | None, splat_transform: Path | None, seed: int
+        self,
+        folder: Path,
+        scene: Path,
+        views: Path | None,
+        splat_transform: Path | None,
+        seed: int,
+        kinds: Sequence[str],
     ) -> None:
-        self.folder, self.splats, self.splat_transform = folder, splats, splat_transform
-        self.source, self.views = folder / "scene.ply", folder / "views.json"
-        io.write_splats(self.source, splats)
-        found = _views(splats, views, seed)
-        io.write_views(self.views, found.cameras, splits=found.splits)
-        self.test = found.cameras.take(split_mask(views, found.cameras.names, "test", stated=found.splits))
+        self.folder, self.given, self.seed = folder, views, seed
+        self.splats, self.splat_transform = _readable(scene), splat_transform
+        self.source, self.targets = folder / "scene.ply", dict[str, TeacherRenders]()
+        io.write_splats(self.source, self.splats)
+        if "pool" in kinds:
+            found = self.pool
+            test = split_mask(views, found.cameras.names, "test", stated=found.splits)
+            self.targets["pool"] = TeacherRenders(self.splats, found.cameras.take(test), lazy=True)
+        if set(kinds) - {"pool"}:
+            self.targets |= standing_targets(self.splats, scene, seed)
 
     @cached_property
-    def targets(self) -> TeacherRenders:
-        return TeacherRenders(self.splats, self.test)
+    def pool(self) -> io.ViewSet:
+        return _views(self.splats, self.given, self.seed)
 
-    def measure(self, scene: str, ratio: float, method: str) -> Cell:
+    @cached_property
+    def views(self) -> Path:
+        path = self.folder / "views.json"
+        io.write_views(path, self.pool.cameras, splits=self.pool.splits)
+        return path
+
+    def measure(self, scene: str, ratio: float, method: str, kinds: Sequence[str]) -> list[Cell]:
+        """A row for each kind of views; what is run alike for several runs once."""
         n = len(self.splats)
         budget = max(1, int(np.floor(n / ratio + 0.5)))
-        cell = Cell(scene, ratio, method, n, budget)
+        ran: dict[bool, tuple[dict[str, Any], Splats | None]] = {}
+        cells = []
+        for kind in kinds:
+            cell = Cell(scene, ratio, method, n, budget, views_kind=kind)
+            if kind not in self.targets:
+                cells.append(replace(cell, error=f"no place for {kind} views"))
+                continue
+            own = kind != "pool" and method == "default" and self.given is None
+            if own not in ran:
+                ran[own] = self.run(method, budget, own)
+            figures, small = ran[own]
+            if small is not None:
+                score = evaluate(small, self.targets[kind])
+                figures = {**figures, "psnr": score.psnr, "ssim": score.ssim, "views": len(score.views)}
+            cells.append(replace(cell, **figures))
+        return cells
+
+    def run(self, method: str, budget: int, own: bool) -> tuple[dict[str, Any], Splats | None]:
+        """What it took and made, or the error."""
         output = self.folder / "out.ply"
         output.unlink(missing_ok=True)
         try:
-            usage = measured(self.command(method, budget, output), self.folder / "log")
+            usage = measured(self.command(method, budget, output, own), self.folder / "log")
             small = io.read_splats(output)
-            score = evaluate(small, self.targets)
         except (InputError, OSError) as e:
-            return replace(cell, error=" ".join(str(e).split()))
-        return replace(
-            cell, **asdict(usage), count=len(small), psnr=score.psnr, ssim=score.ssim, views=len(score.views)
-        )
+            return {"error": " ".join(str(e).split())}, None
+        return {**asdict(usage), "count": len(small)}, small
 
-    def command(self, method: str, budget: int, output: Path) -> list[str]:
+    def command(self, method: str, budget: int, output: Path, own: bool) -> list[str]:
+        """As its user would type it; `own`: with the views that it makes itself."""
         source, python = str(self.source), [sys.executable, "-m"]
         if method.startswith("splat-transform"):
             if self.splat_transform is None:
@@ -205,7 +254,7 @@ class _Stand:
             views = ["--views", str(self.views)] if method in baselines.NEED_VIEWS else []
             return [*python, "g2ard.baselines", method, source, str(budget), str(output), *views]
         flags = {
-            "default": ["--views", str(self.views)],
+            "default": [] if own else ["--views", str(self.views)],
             "no-views": ["--no-views"],
             "fast": ["--method", "fast"],
             "paper": ["--method", "paper"],

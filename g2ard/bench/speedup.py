@@ -23,6 +23,7 @@ class Speedup:
         seconds: it took.
         reached_s: seconds of the fastest default run at its first look that is as good; None if none is.
         best_psnr: of the default runs.
+        views_kind: what both were scored on.
     """
 
     scene: str
@@ -33,6 +34,7 @@ class Speedup:
     seconds: float
     reached_s: float | None
     best_psnr: float
+    views_kind: str = "pool"
 
     @property
     def share(self) -> float | None:
@@ -52,6 +54,7 @@ def speedups(looks: Sequence[Look]) -> list[Speedup]:
             if look.variant.startswith("default@")
             and look.count == look.budget
             and look.key[:4] == other.key[:4]
+            and look.views_kind == other.views_kind
         ]
         if rivals:
             reached = [look.seconds for look in rivals if look.psnr >= other.psnr]
@@ -65,6 +68,7 @@ def speedups(looks: Sequence[Look]) -> list[Speedup]:
                     other.seconds,
                     min(reached, default=None),
                     max(look.psnr for look in rivals),
+                    other.views_kind,
                 )
             )
     return found

@@ -16,6 +16,7 @@ __all__ = [
     "LookOption",
     "OutputOption",
     "PolicyOption",
+    "ProtocolOption",
     "RatioOption",
     "SceneArgument",
     "Triple",
@@ -93,6 +94,13 @@ RatioOption = Annotated[
 ]
 SceneArgument = Annotated[
     Path, typer.Argument(metavar="SCENE", help="A .ply (3DGS), SOG, .spz, .splat or .compressed.ply.")
+]
+ProtocolOption = Annotated[
+    str,
+    typer.Option(
+        metavar="pool|standing|both",
+        help="Views that are scored: held out of the pool, or near ones and those where people stand.",
+    ),
 ]
 ViewsOption = Annotated[
     Path | None,

@@ -6,10 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from g2ard.poses.aerial import plan_aerial
 from g2ard.poses.focus import Glance, plan_focus
 from g2ard.poses.inside import find_inside, plan_inside
+from g2ard.poses.numbers import middle, norms
 from g2ard.poses.orbit import plan_orbit
 from g2ard.poses.shape import shape_of
 from g2ard.poses.sight import Lens, Poses
@@ -29,6 +31,9 @@ _STREET = 0.25
 _SHARP = 0.04
 """Radians: the 90th percentile of what a pose from around or above shows, at most. Measured: objects
 .007–.01, a park .012, an open scene seen through its own sky .1 and more."""
+
+_OWN = 2.0
+"""A scene of few Gaussians is as sharp as they are large: this many times their median is sharp as well."""
 
 _SAMPLED = 16
 """Poses from around or above that are looked through first."""
@@ -103,9 +108,20 @@ def _far(
     if not len(poses):
         return _Far(kind, poses, 1.0)
     some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _SAMPLED)).round().astype(int))
-    share = float((glance.of(poses.take(some).cameras(site, lens), tell).coarse < _SHARP).mean())
+    share = float(_sharp(site, glance, poses.take(some), lens, tell).mean())
     if share < _FEW:
         poses = poses.take(slice(0))
     elif share < _MOST:
-        poses = poses.take(glance.of(poses.cameras(site, lens), tell).coarse < _SHARP)
+        poses = poses.take(_sharp(site, glance, poses, lens, tell))
     return _Far(kind, poses, share)
+
+
+def _sharp(
+    site: Site, glance: Glance, poses: Poses, lens: Lens, tell: Callable[[int, int], None]
+) -> NDArray[np.bool_]:
+    """Whether poses see the scene in focus; what stands behind all of it does not count."""
+    away = norms(poses.eyes - site.box.mean(axis=0))
+    reach = away + norms(site.box[1:] - site.box[:1]) / 2
+    own = middle(site.grid.scale_at(site.points))  # by count: a sky is few rows and much area
+    coarse = glance.of(poses.cameras(site, lens), tell, site.size * reach).coarse
+    return coarse < np.maximum(_SHARP, _OWN * own / np.maximum(away, np.finfo(float).tiny))

@@ -89,8 +89,8 @@ class Glance:
             np.zeros((len(means), 0, 3), np.float32),
         )
 
-    def of(self, cameras: Cameras, tell: Callable[[int, int], None]) -> Focus:
-        """Look through each camera."""
+    def of(self, cameras: Cameras, tell: Callable[[int, int], None], reach: Floats | None = None) -> Focus:
+        """Look through each camera; what is farther than `reach`, (C,), is a backdrop and does not count."""
         from g2ard.render import RasterSettings, view_of
 
         here = cameras.resized(_LONGEST).recentred(self._middle)
@@ -102,12 +102,12 @@ class Glance:
                 self._arrays, [view_of(here, i, settings)], settings.choices, None
             )
             weight = sums["weight"]
-            seen = weight > 0
+            depth = norms(self._means - here.positions[i])
+            seen = (weight > 0) & (depth <= (np.inf if reach is None else reach[i]))
             pixels = here.widths[i] * here.heights[i]
             figures[:, i] = weight.sum() / pixels, 0.0, np.inf
             if seen.any():
-                depth = norms(self._means[seen] - here.positions[i])
-                angle = self._sigma[seen] / np.maximum(depth, np.finfo(float).tiny)
+                angle = self._sigma[seen] / np.maximum(depth[seen], np.finfo(float).tiny)
                 fine = weight[seen][angle < _FINE].sum() / pixels
                 figures[1:, i] = fine, quantile(angle, weight[seen], 0.9)
             tell(i + 1, len(here))

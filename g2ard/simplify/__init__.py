@@ -41,11 +41,12 @@ class Simplified:
             `rounds` (a dict each: `before` − `dropped` − `merged` − `trimmed` = `after`, where `merged` is by
             how many rows merging shrank the scene), `protected`, `nonfinite_rows`,
             `infinite_logits` (taken as α = 0 or 1), `clamped_opacities` (merged α that reached
-            0.99: what `max_growth` could not take was lost), `fitted` (rows whose opacity was fitted to what
-            views see), `unseen` (rows of the input that are kept though no view sees them; None without
-            views), `faded` (merged α < 1/255 where a member's was not), `skipped` (`alone`: rows passed on as
-            they were; `sh_bands`: of zeros, left out of all sums; of the paper's, `coverages`: groups that
-            the cheaper guard had refused; rounds without `binnings`, or `trims`: few rows were left already).
+            0.99: what `max_growth` could not take was lost), `fitted` (rows whose opacity or, where that is
+            full, area was fitted to what views see), `unseen` (rows of the input that are kept though no
+            view sees them; None without views), `faded` (merged α < 1/255 where a member's was not),
+            `skipped` (`alone`: rows passed on as they were; `sh_bands`: of zeros, left out of all sums; of
+            the paper's, `coverages`: groups that the cheaper guard had refused; rounds without `binnings`, or
+            `trims`: few rows were left already).
     """
 
     splats: Splats

@@ -104,11 +104,13 @@ def merge_looking(
     merged, parents = splats_of(scene, out), out["parents"]
     order = _core.simplify_order(scene)  # sums round alike whatever the order of the rows
     fitted = _fitted(merged, parents[order], seen.weight[order], look(merged).weight)
+    changed = fitted.logit_opacities != merged.logit_opacities
+    changed |= (fitted.scales != merged.scales).any(axis=1)
     return {
         **out,
         "scales": fitted.scales,
         "logit_opacities": fitted.logit_opacities,
-        "fitted": int(np.count_nonzero(fitted.logit_opacities != merged.logit_opacities)),
+        "fitted": int(np.count_nonzero(changed)),
         "unseen": int(np.count_nonzero((seen.weight == 0) & (parents >= 0))),
     }
 

@@ -27,6 +27,24 @@ def first_hit(cells, low, cell, eye, direction, step=0.01):
     return np.inf
 
 
+def cast_rays(steps, low, cell, eyes, directions):
+    """`_core.cast_rays`, all rays a stride at a time: the same sums, in the same order, in float64."""
+    shape = np.array(steps.shape)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = (np.stack([low, low + cell * shape])[:, None] - eyes) / directions
+    near = np.where(np.isnan(ends).any(axis=0), -np.inf, ends.min(axis=0)).max(axis=1)
+    far = np.where(np.isnan(ends).any(axis=0), np.inf, ends.max(axis=0)).min(axis=1)
+    reached, hits = np.maximum(near, 0) + 0.01 * cell, np.full(len(eyes), np.inf)
+    rows = np.flatnonzero(reached < far)
+    while len(rows):
+        place = np.floor((eyes[rows] + reached[rows, None] * directions[rows] - low) / cell)
+        ahead = steps[tuple(np.clip(place, 0, shape - 1).astype(int).T)]
+        hits[rows[ahead == 0]] = reached[rows[ahead == 0]]
+        reached[rows] += cell * np.maximum(ahead - 1.0, 0.6)
+        rows = rows[(ahead > 0) & (reached[rows] < far[rows])]
+    return hits
+
+
 def rotation(seed):
     q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))

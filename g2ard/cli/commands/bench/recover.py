@@ -12,6 +12,7 @@ from g2ard.cli.commands.bench.group import bench
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
+    ProtocolOption,
     SizeOption,
     TimeLimitOption,
     ViewsOption,
@@ -46,6 +47,7 @@ def recover(
         typer.Option("--photos/--renders", help="Targets; photos for a cloud, else the scene's renders."),
     ] = None,
     steps: Annotated[str, typer.Option(help="Horizons of the default schedule.")] = "100,300,1000",
+    protocol: ProtocolOption = "pool",
     time_limit: TimeLimitOption = None,
     seeds: Annotated[str, typer.Option(help="Comma-separated.")] = "0",
     variants: Annotated[str | None, typer.Option(help="Some of the study's; all if not given.")] = None,
@@ -60,6 +62,9 @@ def recover(
     curves: the default's horizons beside the paper's schedule at a tenth, with and without a decay.
     paper: beside all of it. regularizers: with and without each. rounds: against one shot in equal time
     (--time-limit). multiplier: of the rates. endurance: 5,000 steps.
+
+    With --protocol standing runs are scored from near and from where people stand: on the views of a
+    standing.json beside the scene, else on made ones that no run sees.
     """
     from g2ard.bench.recover import RecoverBench, bench_recover
     from g2ard.bench.simplify import machine
@@ -67,7 +72,7 @@ def recover(
 
     colour = background or (0.0, 0.0, 0.0)
     looks = bench_recover(
-        RecoverBench(scene, views, held_out, photos, size, colour),
+        RecoverBench(scene, views, held_out, photos, size, colour, protocol=protocol),
         study,
         csv,
         ratios=[parse_ratio(part) for part in ratios.split(",")],
@@ -77,7 +82,7 @@ def recover(
         variants=[part.strip() for part in variants.split(",")] if variants else None,
         progress=run.progress,
     )
-    columns = ["scene", "ratio", "variant", "seed", "steps", "seconds", "CPU s", "PSNR", "SSIM"]
+    columns = ["scene", "ratio", "variant", "views", "seed", "steps", "seconds", "CPU s", "PSNR", "SSIM"]
     run.console.table(
         f"{machine()}; unseen views at the end of each run",
         [*columns, "Drift95", "needles", "rank p1", "regularisers"],
@@ -87,12 +92,13 @@ def recover(
     if faster:
         run.console.table(
             "The default's seconds to the other's PSNR",
-            ["scene", "ratio", "against", "PSNR", "seconds", "default's", "share"],
+            ["scene", "ratio", "against", "views", "PSNR", "seconds", "default's", "share"],
             [
                 [
                     s.scene,
                     f"{s.ratio:g}",
                     s.against,
+                    s.views_kind,
                     f"{s.psnr:.2f}",
                     f"{s.seconds:.1f}",
                     "never" if s.reached_s is None else f"{s.reached_s:.1f}",
@@ -127,6 +133,7 @@ def _result(look: Look) -> list[str]:
         look.scene,
         f"{look.ratio:g}",
         look.variant,
+        look.views_kind,
         str(look.seed),
         str(look.step),
         f"{look.seconds:.1f}",

@@ -11,6 +11,7 @@ import typer
 from g2ard.cli.commands.bench.group import bench
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
+    ProtocolOption,
     ViewsOption,
     parse_ratio,
 )
@@ -32,6 +33,7 @@ def simplify(
         ),
     ] = None,
     views: ViewsOption = None,
+    protocol: ProtocolOption = "pool",
     csv: Annotated[
         Path, typer.Option("-o", "--csv", metavar="FILE", help="Rows go here; those there are not redone.")
     ] = Path("bench_simplify.csv"),
@@ -42,6 +44,8 @@ def simplify(
     """Error on unseen views, CPU seconds and memory of every simplifier, each as a whole command.
 
     Scored are every 8th of 128 poses made for the scene, or the test split of --views; nothing a method used.
+    With --protocol standing every method runs as its user runs it, and is scored from near and from where
+    people stand: on the views of a standing.json beside the scene, else on made ones that no method sees.
     """
     from g2ard.bench.simplify import METHODS, bench_simplify, find_splat_transform, machine
 
@@ -58,18 +62,19 @@ def simplify(
         views=views,
         splat_transform=program,
         seed=run.seed,
+        protocol=protocol,
         progress=run.progress,
     )
     run.console.table(
         f"{machine()}; PSNR and SSIM on unseen views, CPU seconds and peak MB of the whole command",
-        ["scene", "ratio", "method", "Gaussians", "PSNR", "SSIM", "CPU s", "wall s", "MB"],
+        ["scene", "ratio", "method", "views", "Gaussians", "PSNR", "SSIM", "CPU s", "wall s", "MB"],
         [_row(cell) for cell in cells],
     )
     run.result({"machine": machine(), "rows": [asdict(cell) for cell in cells]})
 
 
 def _row(cell: Cell) -> list[str]:
-    head = [cell.scene, f"{cell.ratio:g}", cell.method]
+    head = [cell.scene, f"{cell.ratio:g}", cell.method, cell.views_kind]
     if cell.error:
         return [*head, cell.error, *[""] * 5]
     return [
