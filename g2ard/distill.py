@@ -35,7 +35,8 @@ class DistillConfig:
         method: simplification's: default, fast or paper.
         schedule: recovery's; one with `round_steps` recovers after every round of 75 % (the paper), without
             them the reduction is one shot and all recovery happens at the target count.
-        steps: overrides the schedule's final horizon.
+        steps: the final horizon; None means the schedule's, more where a view holds little of the scene
+            (`g2ard.recover.need`).
         time_limit: seconds for all recovery, shared out over rounds in proportion to their steps; horizons
             become what fits into them.
         regularizers: weights of L_anchor and L_shape.
@@ -255,7 +256,7 @@ class _Rounds:
         if not self._restore(name, entry):
             config = RecoverConfig(
                 schedule=self.config.schedule,
-                steps=self.config.steps if final else None,
+                steps=self._steps() if final else None,
                 time_limit=self._seconds(final),
                 regularizers=self.config.regularizers,
                 background=self.config.background,
@@ -281,6 +282,15 @@ class _Rounds:
             if checkpoint is not None:
                 checkpoint.unlink(missing_ok=True)
         self.seconds["recover"] += entry["recover"][-1]["seconds"]
+
+    def _steps(self) -> int | None:
+        """The final horizon: as asked for, the paper's, or by need."""
+        from g2ard.recover.need import steps_for
+
+        schedule = self.config.schedule
+        if self.config.steps is not None or not schedule.means_in_scales:
+            return self.config.steps
+        return steps_for(self.state, self.supervision.targets.cameras, schedule.steps)
 
     def _seconds(self, final: bool) -> float | None:
         """This recovery's part of the time limit."""

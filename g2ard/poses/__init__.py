@@ -23,7 +23,7 @@ def make_pool(
     *,
     kind: str = "auto",
     size: tuple[int, int] = (800, 600),
-    fov: float = 50.0,
+    fov: float | None = None,
     up: ArrayLike | None = None,
     seed: int = 0,
     rows: int | None = None,
@@ -38,7 +38,7 @@ def make_pool(
             rooms and streets), "aerial" (straight down and oblique), or "auto": orbit for an object, walk
             inside a room, three quarters aerial and a quarter walk for a landscape or a city.
         size: width and height in pixels.
-        fov: horizontal field of view, degrees.
+        fov: horizontal field of view, degrees; None means 50, and 70 for a pool within rooms.
         up: (3,) direction away from the ground; None to estimate it.
         seed: of the placement; the same seed gives the same poses.
         rows: of more Gaussians than this only a fair sample is looked at, on a coarser grid: less sure of

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from g2ard.poses.aerial import plan_aerial
 from g2ard.poses.focus import Glance, plan_focus
-from g2ard.poses.inside import find_inside, plan_inside
+from g2ard.poses.inside import Inside, plan_inside
 from g2ard.poses.numbers import middle, norms
 from g2ard.poses.orbit import plan_orbit
 from g2ard.poses.shape import shape_of
@@ -20,10 +20,6 @@ from g2ard.poses.walk import plan_walk
 from g2ard.splats import Splats
 
 __all__ = ["plan_auto"]
-
-_SOME_INSIDE, _ALL_INSIDE = 0.005, 0.025
-"""Share of the box that lies within rooms: below the first nobody stands inside, from the second on everybody
-does. Measured: showroom .026–.079, objects and open scenes 0.000."""
 
 _STREET = 0.25
 """Share of a landscape's poses that stand in it, where there is room."""
@@ -44,7 +40,13 @@ looked through."""
 
 
 def plan_auto(
-    site: Site, splats: Splats, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]
+    site: Site,
+    splats: Splats,
+    inside: Inside,
+    count: int,
+    lens: Lens,
+    seed: int,
+    tell: Callable[[int, int], None],
 ) -> tuple[Poses, list[str], str]:
     """At most `count` poses, the kinds they are of, and why.
 
@@ -53,8 +55,6 @@ def plan_auto(
     is then missing stands on the ground and wherever the scene is in focus.
     """
     parts: dict[str, Poses] = {}
-    inside = find_inside(site, seed)
-    share = float(np.clip((inside.share - _SOME_INSIDE) / (_ALL_INSIDE - _SOME_INSIDE), 0, 1))
     why = [f"{inside.share:.1%} of its box lies within rooms"]
 
     def missing() -> int:
@@ -64,7 +64,7 @@ def plan_auto(
         if len(poses):
             parts[kind] = poses if kind not in parts else Poses.joined([parts[kind], poses])
 
-    add("inside", plan_inside(site, inside, round(share * count), lens, seed, tell))
+    add("inside", plan_inside(site, inside, round(inside.weight * count), lens, seed, tell))
     if missing():
         shape, shape_why = shape_of(site)
         why.append(f"{shape}: {shape_why}")

@@ -27,8 +27,6 @@ _SHARES = (0.5, 0.25)
 
 _DOUBTS = (2.0, 5.0, 10.0, 20.0)
 """How many views must have touched a Gaussian for half of its change to stay."""
-_PRICE = 0.2
-"""dB of the training views that other views' gain may cost; unseen ones of their kind lose half as much."""
 _TIE = 0.1
 """dB of the other views that are no loss yet."""
 _HALF, _HOPELESS = 0.5, 0.5
@@ -97,9 +95,8 @@ class Guard:
     def settle(self, result: Splats, views: NDArray[np.float64], step: int) -> tuple[Splats, float | None]:
         """What of a result's changes stays, by the views of another kind; all of them where there are none.
 
-        A Gaussian that v views touched goes v/(v + k) of its way. While the other views gain against the
-        start, k is the one they like best of those that cost the training views at most 0.2 dB. Where they
-        lose, they alone decide, and may choose a part of the way for all Gaussians alike, or the start.
+        While they gain against the start, or lose under 0.1 dB, everything stays. Else they choose: a
+        Gaussian that v views touched goes v/(v + k) of its way, or all go the same part of it, or none.
 
         Args:
             result: where the steps ended.
@@ -112,19 +109,17 @@ class Guard:
         if self.others is None:
             return result, 0.0
         self.validation.append({"step": step, "psnr": self.others(result)})
-        least = -math.inf if self.lost > _TIE else self.score(result) - _PRICE
-        best, most = result, self.validation[-1]["psnr"]
-        chosen: float | None = 0.0
+        if self.lost <= _TIE:
+            return result, 0.0
+        best, most = self.start, self.validation[0]["psnr"]
+        chosen: float | None = math.inf
         ways: list[tuple[float | None, NDArray[np.float64] | float]] = [
-            (k, views / (views + k)) for k in _DOUBTS
+            (0.0, 1.0),
+            *((k, views / (views + k)) for k in _DOUBTS),
+            *((None, share) for share in _SHARES),
         ]
-        if self.lost > _TIE:
-            best, chosen, most = self.start, math.inf, self.validation[0]["psnr"]
-            ways += [(None, share) for share in _SHARES]
         for k, share in ways:
             part = blended(self.start, result, share)
-            if self.score(part) < least:
-                break
             value = self.others(part)
             if value > most:
                 best, chosen, most = part, k, value

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 _WORK = ".unfinished"
 """In the folder of the run: finished rounds and checkpoints. Nobody else has a folder of this name."""
-_POOL = 128
+_POOL = 160
 """Poses of a pool made for a scene without views; every 8th is held out for scoring."""
 _APART = 24
 """Views of another kind: half of them decide how much of recovery's changes stays, half are scored."""
