@@ -265,12 +265,12 @@ class Seen:
 
 
 def looker(
-    cameras: Cameras, *, views: int = 128, longest: int = 300, progress: Progress = silent
+    cameras: Cameras, *, views: int = 96, longest: int = 300, progress: Progress = silent
 ) -> Callable[[Splats], Seen]:
     """A function that tells what a few small renders see of a scene, as `g2ard.simplify.simplify` takes it.
 
-    It looks from sixteen views at a time until the next sixteen find under 0.5 % more of the Gaussians: an
-    object takes 48 views, a room all (`docs/benchmarks.md`). The first scene decides how many; for the later
+    It looks from sixteen views at a time until the next sixteen find under 1 % more of the Gaussians: an
+    object takes 32 views, a room all (`docs/benchmarks.md`). The first scene decides how many; for the later
     ones the views stay the same, so that the sums compare. What it tells depends on the scene's content
     alone, not on the order of its rows.
 
@@ -321,7 +321,7 @@ _NEAR_SAMPLE = 65_536
 _NEAR = 1e-3
 """Nearest depth that counts, over the median distance of the cameras from the scene's middle."""
 
-_CONVERGED = 0.005
+_CONVERGED = 0.01
 """Glances that find a smaller share of the Gaussians for the first time are the last."""
 
 

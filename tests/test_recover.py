@@ -393,13 +393,13 @@ def test_views_of_another_kind_decide_what_stays() -> None:
         return Guard(lambda scene: training * float(way(scene).mean()), start, 0.0, others)
 
     def doubtful(scene: Splats) -> float:  # what one view has seen costs, what many have pays
-        return float(way(scene) @ [-1, 0.5, 1, 1])
+        return float(way(scene) @ [-3, 0.5, 1, 1])
 
-    part, k = guard(0.5, doubtful).settle(end, views, 9)
-    assert k == 2
-    np.testing.assert_allclose(way(part), views / (views + 2), atol=1e-5)
-    whole, k = guard(10.0, doubtful).settle(end, views, 9)  # too dear in the training views
-    assert (whole, k) == (end, 0.0)
+    part, k = guard(10.0, doubtful).settle(end, views, 9)
+    assert k == 5
+    np.testing.assert_allclose(way(part), views / (views + 5), atol=1e-5)
+    gaining = guard(10.0, lambda scene: float(way(scene).mean()))
+    assert gaining.settle(end, views, 9) == (end, 0.0)
     harm = guard(10.0, lambda scene: -float(way(scene).mean()))
     assert harm.settle(end, views, 9) == (start, math.inf)
     half = guard(10.0, lambda scene: -abs(float(way(scene)[0]) - 0.25) - abs(float(way(scene)[3]) - 0.25))

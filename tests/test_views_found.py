@@ -72,7 +72,7 @@ def test_distill_trains_and_scores_on_them(command_line: CommandLine, folder: Pa
     status, out, error = command_line(*DISTILL, "-o", "pool", "--size", 64, "--views", "made", cwd=folder)
     assert status == 0, error
     assert "views:" not in error
-    assert len(read_view_set(folder / "pool" / "views.json").cameras) == 128
+    assert len(read_view_set(folder / "pool" / "views.json").cameras) == 160
 
 
 def test_large_cameras_without_photos_are_shrunk(command_line: CommandLine, folder: Path) -> None:

@@ -79,9 +79,10 @@ def plan_auto(
         if missing():
             ground = plan_walk(site, missing() // 2, lens, seed + 1, tell, indoors=False)
             add("focus", plan_focus(site, glance, missing(), lens, seed, tell, also=ground))
-    for kind, plan in (("aerial", plan_aerial), ("orbit", plan_orbit)):  # better a view through fog than none
-        if not parts:
-            add(kind, plan(site, count, lens, seed + 1, tell))
+            add("walk", ground.take(slice(missing())))  # better a view that is not quite sharp than none
+    for kind, plan in (("orbit", plan_orbit), ("aerial", plan_aerial)):
+        if missing():
+            add(kind, plan(site, missing(), lens, seed + 1, tell))
     none = Poses(np.zeros((0, 3)), np.zeros((0, 3)))
     return Poses.joined([none, *parts.values()]).take(slice(count)), list(parts), "; ".join(why)
 

@@ -122,7 +122,7 @@ def plan_focus(
     seed: int,
     tell: Callable[[int, int], None],
     *,
-    also: Poses,
+    also: Poses | None = None,
 ) -> Poses:
     """At most `count` poses in free space whose image the scene fills, much of it with something fine.
 
@@ -135,11 +135,14 @@ def plan_focus(
         tell: told of the poses looked through.
         also: poses to try before those in free space anywhere.
     """
-    poses, found = also, glance.of(also.cameras(site, lens), tell)
+    poses = Poses(np.zeros((0, 3)), np.zeros((0, 3))) if also is None else also
+    found = glance.of(poses.cameras(site, lens), tell) if len(poses) else Focus(*np.zeros((3, 0)))
     for batch in range(_TRIED):
         if len(found.good(*_GOOD[0])) >= count:
             break
         more = _anywhere(site, batch * count, (batch + 1) * count, lens, seed)
+        if not len(more):
+            continue
         poses = Poses.joined([poses, more])
         seen = glance.of(more.cameras(site, lens), tell)
         found = Focus(

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from g2ard.simplify import Simplified
     from g2ard.splats import Splats
 
-_VIEWS = 128
+_VIEWS = 96
 """Poses of a pool of its own; as many of them are used as the scene needs."""
 
 _ROWS = 100_000
