@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,14 @@ def test_a_backdrop_does_not_count() -> None:
 def test_a_coarse_object_is_still_seen_from_around() -> None:
     pool = plan_pool(naive.sphere((0, 0, 0), 1.0, 0.16), 16)
     assert pool.kind == "orbit"
+
+
+@pytest.mark.parametrize("every", [40, 160])
+def test_a_thinned_object_is_still_seen_from_around(every) -> None:
+    scene = read_splats(real("playbot/0_0"))
+    thin = scene.take(np.arange(0, len(scene), every))
+    thin = replace(thin, scales=thin.scales * np.float32(np.sqrt(every)))  # each is larger in its stead
+    assert plan_pool(thin, 24).kind == "orbit"
 
 
 @pytest.mark.parametrize("make", [naive.statue, naive.room])

@@ -31,8 +31,9 @@ _SHARP = 0.04
 """Radians: the 90th percentile of what a pose from around or above shows, at most. Measured: objects
 .007–.01, a park .012, an open scene seen through its own sky .1 and more."""
 
-_OWN = 2.0
-"""A scene of few Gaussians is as sharp as they are large: this many times their median is sharp as well."""
+_OWN = 12.0
+"""A scene of few Gaussians is as sharp as they are large: this many times their median is sharp as well.
+Measured without fog: 4 in an object, 9 and 12 in its thinnings to 12,500 and 3,000 Gaussians."""
 
 _SAMPLED = 16
 """Poses from around or above that are looked through: if three quarters are sharp, all are taken, if under a
