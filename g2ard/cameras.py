@@ -131,14 +131,18 @@ class Cameras:
         [True, False]
         """
         world = np.asarray(points, np.float64)
-        seen = np.zeros(len(self), bool)
-        for i, (view, K) in enumerate(zip(self.viewmats, self.Ks, strict=True)):
-            x, y, z = view[:3, :3] @ (world - self.positions[i]).T
-            front = z > 0
-            u = K[0, 0] * x[front] / z[front] + K[0, 2]
-            v = K[1, 1] * y[front] / z[front] + K[1, 2]
-            seen[i] = ((u >= 0) & (u <= self.widths[i]) & (v >= 0) & (v <= self.heights[i])).any()
-        return seen
+        return np.array([self.take([i]).holds(world).any() for i in range(len(self))], bool)
+
+    def holds(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Which of some points, (N, 3) in the world, lie within the image of the first view, as (N,) bool.
+
+        What hides them does not count.
+        """
+        x, y, z = self.viewmats[0, :3, :3] @ (np.asarray(points, np.float64) - self.positions[0]).T
+        K, front = self.Ks[0], z > 0
+        ahead = np.where(front, z, 1.0)
+        u, v = K[0, 0] * x / ahead + K[0, 2], K[1, 1] * y / ahead + K[1, 2]
+        return front & (u >= 0) & (u <= self.widths[0]) & (v >= 0) & (v <= self.heights[0])
 
     def recentred(self, offset: ArrayLike) -> Cameras:
         """The same views in coordinates whose origin is the world point `offset` (see `Splats.offset`)."""

@@ -35,7 +35,8 @@ class DistillConfig:
         method: simplification's: default, fast or paper.
         schedule: recovery's; one with `round_steps` recovers after every round of 75 % (the paper), without
             them the reduction is one shot and all recovery happens at the target count.
-        steps: overrides the schedule's final horizon.
+        steps: the final horizon; None means the schedule's, more where a view holds little of the scene
+            (`g2ard.recover.need`).
         time_limit: seconds for all recovery, shared out over rounds in proportion to their steps; horizons
             become what fits into them.
         regularizers: weights of L_anchor and L_shape.
@@ -91,6 +92,7 @@ def distill(
     config: DistillConfig | None = None,
     *,
     weights: ArrayLike | None = None,
+    validation: Targets | None = None,
     work: Path | None = None,
     progress: Progress = silent,
     watch: Watch | None = None,
@@ -106,6 +108,8 @@ def distill(
         targets: photos, or the prior's own renders.
         config: see `DistillConfig`.
         weights: (C,) how often to draw each view, where that is known already; None weighs them here.
+        validation: a few views of another kind, never learned from, which decide how much of recovery's
+            changes stays, see `g2ard.recover.recover`.
         work: a folder for finished rounds and checkpoints; a second call with the same inputs goes on there.
         progress: told of all stages.
         watch: called after every step of every recovery, see `g2ard.recover.recover`.
@@ -122,7 +126,7 @@ def distill(
     config = config or DistillConfig()
     many = config.schedule.round_steps > 0
     counts = counts_of(len(prior), budget) if many else [budget]
-    rounds = _Rounds(prior, budget, targets, config, len(counts), weights, work, progress, watch)
+    rounds = _Rounds(prior, budget, targets, config, len(counts), weights, validation, work, progress, watch)
     for number, count in enumerate(counts, start=1):
         rounds.advance(number, count, final=number == len(counts))
     report = {"rounds": rounds.log, "seconds": rounds.seconds, "views": rounds.supervision.report}
@@ -185,18 +189,20 @@ class _Rounds:
         config: DistillConfig,
         count: int,
         weights: ArrayLike | None,
+        validation: Targets | None,
         work: Path | None,
         progress: Progress,
         watch: Watch | None,
     ) -> None:
         self.prior, self.budget, self.targets, self.config = prior, budget, targets, config
+        self.validation = validation
         self.count, self.work, self.progress, self.watch = count, work, progress, watch
         self.state = self.simplified = prior
         self.protected: Any = None
         self.log: list[dict[str, Any]] = []
         self.seconds = {"select": 0.0, "simplify": 0.0, "recover": 0.0}
         self.weights = checked_weights(weights, len(targets.cameras))
-        self.key = _fingerprint(prior, budget, targets, config, self.weights)
+        self.key = _fingerprint(prior, budget, targets, config, self.weights, validation)
         self._select(prior)
 
     def advance(self, number: int, count: int, *, final: bool) -> None:
@@ -250,7 +256,7 @@ class _Rounds:
         if not self._restore(name, entry):
             config = RecoverConfig(
                 schedule=self.config.schedule,
-                steps=self.config.steps if final else None,
+                steps=self._steps() if final else None,
                 time_limit=self._seconds(final),
                 regularizers=self.config.regularizers,
                 background=self.config.background,
@@ -264,6 +270,7 @@ class _Rounds:
                 self.supervision.targets,
                 config,
                 weights=self.supervision.weights,
+                validation=self.validation,
                 checkpoint=checkpoint,
                 progress=self.progress,
                 stage="recover" if final else f"recover {name}",
@@ -275,6 +282,15 @@ class _Rounds:
             if checkpoint is not None:
                 checkpoint.unlink(missing_ok=True)
         self.seconds["recover"] += entry["recover"][-1]["seconds"]
+
+    def _steps(self) -> int | None:
+        """The final horizon: as asked for, the paper's, or by need."""
+        from g2ard.recover.need import steps_for
+
+        schedule = self.config.schedule
+        if self.config.steps is not None or not schedule.means_in_scales:
+            return self.config.steps
+        return steps_for(self.state, self.supervision.targets.cameras, schedule.steps)
 
     def _seconds(self, final: bool) -> float | None:
         """This recovery's part of the time limit."""
@@ -304,7 +320,15 @@ class _Rounds:
         return True
 
 
-def _fingerprint(prior: Splats, budget: int, targets: Targets, config: DistillConfig, weights: Any) -> str:
+def _fingerprint(
+    prior: Splats,
+    budget: int,
+    targets: Targets,
+    config: DistillConfig,
+    weights: Any,
+    validation: Targets | None,
+) -> str:
     given = None if weights is None else weights.tolist()
-    parts = (repr((budget, config, given)), prior.fingerprint(), fingerprint_of(targets))
+    held = [] if validation is None else [fingerprint_of(validation)]
+    parts = (repr((budget, config, given)), prior.fingerprint(), fingerprint_of(targets), *held)
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()

@@ -5,8 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from scenes import around, checkered_ball
 
@@ -140,3 +142,16 @@ def test_ctrl_c_before_a_command_is_one_line(moment: str) -> None:
     code = f"import os, signal, sys\n{unignored}\n{moment}from g2ard.__main__ import main\nmain()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, "g2ard: interrupted\n")
+
+
+def test_recover_says_what_became_of_steps_that_lost(tmp_path: Path, command_line: CommandLine) -> None:
+    ball = checkered_ball(800)
+    grain = np.random.default_rng(0).normal(0, 1e-3, ball.sh0.shape).astype(np.float32)
+    write_splats(tmp_path / "ball.ply", ball)
+    write_splats(tmp_path / "start.ply", replace(ball, sh0=ball.sh0 + grain))
+    write_views(tmp_path / "v.json", around(6))
+    asked = ("recover", "start.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "o.ply", "-w")
+    for steps, words in ((4, "kept the simplified scene: every step only"), (24, "recovery fell to ")):
+        status, _, told = command_line(*asked, "--steps", steps, cwd=tmp_path)
+        assert status == 0, told
+        assert sum(words in line for line in told.splitlines()) == 1

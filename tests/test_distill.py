@@ -33,6 +33,15 @@ def targets() -> TeacherRenders:
     return TeacherRenders(PRIOR, around())
 
 
+def test_views_of_another_kind_are_handed_on(targets: TeacherRenders, tmp_path: Path) -> None:
+    near = TeacherRenders(PRIOR, around(4, (64, 48), 2.0))
+    config = DistillConfig(steps=20)
+    done = distill(PRIOR, 300, targets, config, validation=near, work=tmp_path)
+    assert done.report["rounds"][0]["recover"][0]["validation"]["looks"]
+    with pytest.raises(InputError, match="other options"):
+        distill(PRIOR, 300, targets, config, work=tmp_path)
+
+
 def test_one_shot_reaches_the_budget_and_recovers(targets: TeacherRenders) -> None:
     result = distill(PRIOR, 300, targets, DistillConfig(steps=120))
     assert len(result.splats) == len(result.simplified) == 300

@@ -16,7 +16,7 @@ from g2ard.poses.focus import Glance, plan_focus
 from g2ard.poses.inside import find_inside, plan_inside
 from g2ard.poses.lattice import fibonacci
 from g2ard.poses.matter import Matter
-from g2ard.poses.sight import Lens
+from g2ard.poses.sight import Lens, Poses
 from g2ard.poses.site import Site
 from g2ard.poses.up import estimate_up
 from g2ard.splats import Splats
@@ -78,15 +78,14 @@ def test_an_open_scene_is_seen_from_below_its_sky(open_scene) -> None:
     assert "focus" in pool.why
 
 
-def test_the_sharpest_of_those_tried_are_kept(open_scene) -> None:
+def test_places_in_focus_are_free_and_show_the_scene(open_scene) -> None:
     site, glance = Site.of(open_scene), Glance(open_scene)
-    poses, focus = plan_focus(site, glance, 12, Lens(), 0, tell)
+    none = Poses(np.zeros((0, 3)), np.zeros((0, 3)))
+    poses = plan_focus(site, glance, 12, Lens(), 0, tell, also=none)
     assert 0 < len(poses) <= 12
-    assert (focus.covered > 0.8).all()
     assert (site.grid.distance(poses.eyes) > 3 * site.grid.cell).all()
-    assert (focus.typical <= focus.coarse).all()
-    again = glance.of(poses.cameras(site, Lens()), tell)
-    np.testing.assert_array_equal(again.coarse, focus.coarse)
+    assert (glance.of(poses.cameras(site, Lens()), tell).covered > 0.5).all()
+    assert len(glance.of(none.cameras(site, Lens()), tell).covered) == 0
 
 
 @pytest.mark.parametrize("layers", [400, 1500])
@@ -117,7 +116,9 @@ def test_a_thinned_object_is_still_seen_from_around(every) -> None:
     scene = read_splats(real("playbot/0_0"))
     thin = scene.take(np.arange(0, len(scene), every))
     thin = replace(thin, scales=thin.scales * np.float32(np.sqrt(every)))  # each is larger in its stead
-    assert plan_pool(thin, 24).kind == "orbit"
+    pool = plan_pool(thin, 24)
+    assert len(pool.cameras) == 24
+    assert pool.kind.startswith("orbit")
 
 
 @pytest.mark.parametrize("make", [naive.statue, naive.room])

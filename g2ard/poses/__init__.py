@@ -24,7 +24,7 @@ def make_pool(
     *,
     kind: str = "auto",
     size: tuple[int, int] = (800, 600),
-    fov: float = 50.0,
+    fov: float | None = None,
     up: ArrayLike | None = None,
     seed: int = 0,
     rows: int | None = None,
@@ -40,7 +40,7 @@ def make_pool(
             scene lies within such; orbit for an object, three quarters aerial and a quarter walk for a
             landscape, as far as it is in focus from there; the rest walks or stands where it is in focus.
         size: width and height in pixels.
-        fov: horizontal field of view, degrees.
+        fov: horizontal field of view, degrees; None means 50, and 70 for a pool within rooms.
         up: (3,) direction away from the ground; None to estimate it.
         seed: of the placement; the same seed gives the same poses.
         rows: of more Gaussians than this only a fair sample is looked at, on a coarser grid: less sure of

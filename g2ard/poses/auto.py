@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.poses.aerial import plan_aerial
 from g2ard.poses.focus import Glance, plan_focus
-from g2ard.poses.inside import find_inside, plan_inside
+from g2ard.poses.inside import Inside, plan_inside
 from g2ard.poses.numbers import middle, norms
 from g2ard.poses.orbit import plan_orbit
 from g2ard.poses.shape import shape_of
@@ -19,10 +20,6 @@ from g2ard.poses.walk import plan_walk
 from g2ard.splats import Splats
 
 __all__ = ["plan_auto"]
-
-_SOME_INSIDE, _ALL_INSIDE = 0.005, 0.025
-"""Share of the box that lies within rooms: below the first nobody stands inside, from the second on everybody
-does. Measured: showroom .026–.079, objects and open scenes 0.000."""
 
 _STREET = 0.25
 """Share of a landscape's poses that stand in it, where there is room."""
@@ -36,12 +33,21 @@ _OWN = 12.0
 Measured without fog: 4 in an object, 9 and 12 in its thinnings to 12,500 and 3,000 Gaussians."""
 
 _SAMPLED = 16
-"""Poses from around or above that are looked through: if three quarters are sharp, all are taken, if under a
-quarter, none, else each is looked through."""
+"""Poses from around or above that are looked through first."""
+
+_FEW, _MOST = 0.5, 0.9
+"""If fewer of those than the first share are sharp, none is taken, if more than the second, all; else each is
+looked through."""
 
 
 def plan_auto(
-    site: Site, splats: Splats, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]
+    site: Site,
+    splats: Splats,
+    inside: Inside,
+    count: int,
+    lens: Lens,
+    seed: int,
+    tell: Callable[[int, int], None],
 ) -> tuple[Poses, list[str], str]:
     """At most `count` poses, the kinds they are of, and why.
 
@@ -50,8 +56,6 @@ def plan_auto(
     is then missing stands on the ground and wherever the scene is in focus.
     """
     parts: dict[str, Poses] = {}
-    inside = find_inside(site, seed)
-    share = float(np.clip((inside.share - _SOME_INSIDE) / (_ALL_INSIDE - _SOME_INSIDE), 0, 1))
     why = [f"{inside.share:.1%} of its box lies within rooms"]
 
     def missing() -> int:
@@ -61,53 +65,61 @@ def plan_auto(
         if len(poses):
             parts[kind] = poses if kind not in parts else Poses.joined([parts[kind], poses])
 
-    add("inside", plan_inside(site, inside, round(share * count), lens, seed, tell))
+    add("inside", plan_inside(site, inside, round(inside.weight * count), lens, seed, tell))
     if missing():
         shape, shape_why = shape_of(site)
         why.append(f"{shape}: {shape_why}")
-        if shape != "object":
-            part = _STREET if shape == "landscape" else 1.0
-            indoors = shape == "room"
-            add("walk", plan_walk(site, round(part * missing()), lens, seed, tell, indoors=indoors))
         glance = Glance(splats)
-        kind = "aerial" if shape == "landscape" else "orbit"
-        _add_far(site, glance, kind, missing(), lens, seed, tell, add, why)
-    if missing():
-        add("walk", plan_walk(site, missing() // 2, lens, seed + 1, tell, indoors=False))
-        add("focus", plan_focus(site, glance, missing(), lens, seed, tell)[0])
-    for kind in ("aerial", "orbit"):  # better a view through fog than none
+        far = _far(site, glance, "aerial" if shape == "landscape" else "orbit", missing(), lens, seed, tell)
+        if shape != "object" and far.sharp:
+            part = round((_STREET if shape == "landscape" else 1.0) * missing())
+            add("walk", plan_walk(site, part, lens, seed, tell, indoors=shape == "room"))
+        add(far.kind, far.poses.take(slice(missing())))
+        if not far.sharp:
+            why.append(f"from around or above it is out of focus ({far.share:.0%} of the poses)")
         if missing():
-            plan = plan_aerial if kind == "aerial" else plan_orbit
+            ground = plan_walk(site, missing() // 2, lens, seed + 1, tell, indoors=False)
+            add("focus", plan_focus(site, glance, missing(), lens, seed, tell, also=ground))
+        if missing() and not far.sharp:
+            add("walk", plan_walk(site, missing(), lens, seed + 2, tell, indoors=False))
+    for kind, plan in (("aerial", plan_aerial), ("orbit", plan_orbit)):  # better a view through fog than none
+        if missing() and (not parts or kind in parts):
+            add(kind, plan(site, missing(), lens, seed + 1, tell))
+    for kind, plan in (("aerial", plan_aerial), ("orbit", plan_orbit)):  # or than too few
+        if missing():
             add(kind, plan(site, missing(), lens, seed + 1, tell))
     none = Poses(np.zeros((0, 3)), np.zeros((0, 3)))
     return Poses.joined([none, *parts.values()]).take(slice(count)), list(parts), "; ".join(why)
 
 
-def _add_far(
-    site: Site,
-    glance: Glance,
-    kind: str,
-    count: int,
-    lens: Lens,
-    seed: int,
-    tell: Callable[[int, int], None],
-    add: Callable[[str, Poses], None],
-    why: list[str],
-) -> None:
-    """Poses around or above, those that are sharp."""
+@dataclass(frozen=True, eq=False)
+class _Far:
+    """Poses around or above that are in focus; `share` is of those looked through."""
+
+    kind: str
+    poses: Poses
+    share: float
+
+    @property
+    def sharp(self) -> bool:
+        """Whether there are enough of them to rely on."""
+        return self.share >= _FEW
+
+
+def _far(
+    site: Site, glance: Glance, kind: str, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]
+) -> _Far:
     plan = plan_aerial if kind == "aerial" else plan_orbit
     poses = plan(site, count, lens, seed, tell)
     if not len(poses):
-        return
+        return _Far(kind, poses, 1.0)
     some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _SAMPLED)).round().astype(int))
-    sharp = _sharp(site, glance, poses.take(some), lens, tell)
-    if sharp.mean() < 0.25:
+    share = float(_sharp(site, glance, poses.take(some), lens, tell).mean())
+    if share < _FEW:
         poses = poses.take(slice(0))
-    elif sharp.mean() < 0.75:
+    elif share < _MOST:
         poses = poses.take(_sharp(site, glance, poses, lens, tell))
-    if sharp.mean() < 0.75:
-        why.append(f"{sharp.mean():.0%} of the {kind} poses see it in focus")
-    add(kind, poses)
+    return _Far(kind, poses, share)
 
 
 def _sharp(

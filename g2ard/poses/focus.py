@@ -30,11 +30,16 @@ _LONGEST = 96
 _MOST_WIDENED = 4.0
 """A sample's Gaussians grow to cover what the others did, along the two longer axes, at most so much."""
 
-_TRIED = 6
-"""Candidates looked at for each pose wanted."""
+_TRIED = 8
+"""Candidates looked at for each pose wanted, at most."""
 
-_COVERED = 0.8
-"""Share of the image that the scene covers in a pose worth keeping."""
+_FINE = 0.03
+"""Radians: light from Gaussians of a smaller standard deviation is what a picture shows; the rest is fog and
+sky."""
+
+_GOOD = ((0.8, 0.3), (0.7, 0.2), (0.5, 0.1))
+"""Least share of the image that the scene covers, and that something fine does: of good poses first, then of
+worse ones where those are too few."""
 
 _PITCHES = (-35.0, 20.0)
 """Degrees above the horizon of the gazes tried."""
@@ -46,13 +51,18 @@ class Focus:
 
     Args:
         covered: mean α of the image.
-        typical: median standard deviation of what is seen, weighed by αT, in radians.
-        coarse: the 90th percentile of the same: fog, sky and what is too near are coarse.
+        fine: the part of it from Gaussians whose standard deviation is under 0.03 rad.
+        coarse: 90th percentile, weighed by αT, of the standard deviations of what is seen, in radians: fog,
+            sky and what is too near are coarse.
     """
 
     covered: Floats
-    typical: Floats
+    fine: Floats
     coarse: Floats
+
+    def good(self, covered: float, fine: float) -> NDArray[np.int64]:
+        """Cameras with at least so much of both."""
+        return np.flatnonzero((self.covered > covered) & (self.fine > fine))
 
 
 class Glance:
@@ -83,6 +93,8 @@ class Glance:
         """Look through each camera; what is farther than `reach`, (C,), is a backdrop and does not count."""
         from g2ard.render import RasterSettings, view_of
 
+        if not len(cameras):
+            return Focus(*np.zeros((3, 0)))
         here = cameras.resized(_LONGEST).recentred(self._middle)
         distance = float(np.median(norms(here.positions)))
         settings = RasterSettings(near=1e-3 * distance or None)
@@ -94,36 +106,61 @@ class Glance:
             weight = sums["weight"]
             depth = norms(self._means - here.positions[i])
             seen = (weight > 0) & (depth <= (np.inf if reach is None else reach[i]))
-            figures[0, i] = weight.sum() / (here.widths[i] * here.heights[i])
-            figures[1:, i] = np.inf
+            pixels = here.widths[i] * here.heights[i]
+            figures[:, i] = weight.sum() / pixels, 0.0, np.inf
             if seen.any():
                 angle = self._sigma[seen] / np.maximum(depth[seen], np.finfo(float).tiny)
-                figures[1:, i] = quantile(angle, weight[seen], [0.5, 0.9])
+                fine = weight[seen][angle < _FINE].sum() / pixels
+                figures[1:, i] = fine, quantile(angle, weight[seen], 0.9)
             tell(i + 1, len(here))
         return Focus(*figures)
 
 
 def plan_focus(
-    site: Site, glance: Glance, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]
-) -> tuple[Poses, Focus]:
-    """At most `count` poses in free space whose image the scene fills, the sharpest of those tried.
+    site: Site,
+    glance: Glance,
+    count: int,
+    lens: Lens,
+    seed: int,
+    tell: Callable[[int, int], None],
+    *,
+    also: Poses,
+) -> Poses:
+    """At most `count` poses in free space whose image the scene fills, much of it with something fine.
 
-    Returns:
-        The poses and what glances show of them.
+    Args:
+        site: the scene, upright.
+        glance: of it.
+        count: how many.
+        lens: of the poses.
+        seed: of the placement.
+        tell: told of the poses looked through.
+        also: poses to try before those in free space anywhere.
     """
-    tries = _TRIED * count
-    *at, turn, pitch = halton(0, 2 * tries, 5, seed + 2).T
+    poses, found = also, glance.of(also.cameras(site, lens), tell)
+    for batch in range(_TRIED):
+        if len(found.good(*_GOOD[0])) >= count:
+            break
+        more = _anywhere(site, batch * count, (batch + 1) * count, lens, seed)
+        poses = Poses.joined([poses, more])
+        seen = glance.of(more.cameras(site, lens), tell)
+        found = Focus(
+            *(np.append(getattr(found, k), getattr(seen, k)) for k in ("covered", "fine", "coarse"))
+        )
+    rows: list[int] = []
+    for least in _GOOD:
+        rows += [row for row in found.good(*least).tolist() if row not in rows]
+    return poses.take(np.sort(np.array(rows[:count], np.int64)))
+
+
+def _anywhere(site: Site, start: int, stop: int, lens: Lens, seed: int) -> Poses:
+    """Part of an endless even sequence: what stands in free space and gazes about the horizon, at nothing
+    close."""
+    *at, turn, pitch = halton(2 * start, 2 * stop, 5, seed + 2).T
     points = site.box[0] + (site.box[1] - site.box[0]) * np.stack(at, axis=1)
     around = 2 * np.pi * turn
     rise = np.radians(_PITCHES[0] + (_PITCHES[1] - _PITCHES[0]) * pitch)
     gazes = np.stack([np.cos(rise) * np.cos(around), np.cos(rise) * np.sin(around), np.sin(rise)], axis=1)
     free = site.grid.distance(points) > 3 * site.grid.cell
-    poses = Poses(points[free], gazes[free]).take(slice(tries))
-    if not len(poses):
-        return poses, Focus(*np.zeros((3, 0)))
-    near = look(site, poses, lens).close
-    poses = poses.take(near > 4 * site.grid.cell)
-    found = glance.of(poses.cameras(site, lens), tell) if len(poses) else Focus(*np.zeros((3, 0)))
-    rows = np.flatnonzero(found.covered > _COVERED)
-    rows = np.sort(rows[np.argsort(found.coarse[rows], kind="stable")[:count]])
-    return poses.take(rows), Focus(found.covered[rows], found.typical[rows], found.coarse[rows])
+    poses = Poses(points[free], gazes[free])
+    return poses.take(look(site, poses, lens).close > 4 * site.grid.cell)

@@ -13,6 +13,7 @@ from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.poses.aerial import plan_aerial
 from g2ard.poses.auto import plan_auto
+from g2ard.poses.inside import find_inside
 from g2ard.poses.lattice import strata
 from g2ard.poses.near import Reach, plan_near, reach_of
 from g2ard.poses.orbit import plan_orbit
@@ -27,6 +28,9 @@ from g2ard.splits import HOLD_OUT
 __all__ = ["KINDS", "Pool", "plan_pool"]
 
 KINDS = ("auto", "orbit", "walk", "aerial")
+
+_FOV, _FOV_INSIDE = 50.0, 70.0
+"""Degrees: within rooms people take wider lenses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +62,7 @@ def plan_pool(
     *,
     kind: str = "auto",
     size: tuple[int, int] = (800, 600),
-    fov: float = 50.0,
+    fov: float | None = None,
     up: ArrayLike | None = None,
     seed: int = 0,
     rows: int | None = None,
@@ -72,7 +76,7 @@ def plan_pool(
     Raises:
         InputError: as `make_pool`.
     """
-    lens = _lens(size, fov)
+    lens = _lens(size, _FOV if fov is None else fov)
     if count < 1:
         raise InputError(f"count: expected at least 1 pose, got {count}")
     if rows is not None and rows < 1:
@@ -84,7 +88,10 @@ def plan_pool(
     progress("scene", 1, 1)
     tell = counter(progress, "poses")
     if kind == "auto":
-        poses, used, why = plan_auto(site, splats, count, lens, seed, tell)
+        inside = find_inside(site, seed)
+        if fov is None and inside.weight > 0.5:
+            lens = _lens(size, _FOV_INSIDE)
+        poses, used, why = plan_auto(site, splats, inside, count, lens, seed, tell)
     else:
         poses, used, why = _planned(site, kind, count, lens, seed, tell), [kind], "as asked"
     reach = reach_of(site, poses, lens)

@@ -110,6 +110,11 @@ class FusedEngine:
         self._trainer.anchor(*self._anchors)
 
     @property
+    def counts(self) -> NDArray[Any]:
+        """(N,) steps that each Gaussian has taken."""
+        return self._trainer.state()["steps"]
+
+    @property
     def skipped(self) -> int:
         """Steps of single Gaussians left out because a gradient was not finite."""
         return self._trainer.skipped

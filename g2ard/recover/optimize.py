@@ -20,18 +20,22 @@ from g2ard.recover import checkpoint as checkpoints
 from g2ard.recover.anchors import Anchors, drift95, needle
 from g2ard.recover.config import RecoverConfig
 from g2ard.recover.draw import checked_weights, drawn
+from g2ard.recover.guard import Guard
 from g2ard.recover.probe import MULTIPLIERS, Probe, calm, climb, trial_steps
 from g2ard.recover.schedule import Rates, multiplier_for, reach_for
 from g2ard.recover.sizes import typical_share
 from g2ard.splats import Splats
 from g2ard.targets import Targets, fingerprint_of, mask_of
 
-__all__ = ["Recovered", "Watch", "recover"]
+__all__ = ["Recovered", "Watch", "outcome", "recover"]
 
 _TRIAL_STEPS = 20
 _TRIAL_SHARE, _CALM_SHARE = 0.1, 0.3
 """Under a time limit: steps of a trial, and the share of the limit that all trials may take; the second where
 rates that are too large would spend it on nothing."""
+
+_SHORT = 20
+"""Steps under which there is no way back: none would be left to go on with."""
 
 _LOG_POINTS = 10
 """How often Drift95 and Needle are logged over a recovery."""
@@ -49,8 +53,13 @@ class Recovered:
         report: steps, seconds, loss (one mean per 1 % of the horizon), psnr {before, after} over a sample of
             the training views, multiplier, reach (None is no limit), trials (those that chose the
             multiplier), drift95, needle, geometry (ten of {step, drift95, needle} on the way), regularizers
-            {steps, share of the time}, skipped, and kept_start: whether the student was better than what came
-            of it, and is the result.
+            {steps, share of the time}, skipped, backed_off (a list of {step, psnr}: where so much was lost
+            that recovery went on from the best scene with a third of the rates), stopped (the step at which
+            it was given up, else None), way (how far the result goes from the student to where the steps
+            ended: 1 but where that lost), kept_start: whether the student was better than all that came of
+            it, and is the result, and validation: None without such views, else looks (a list of {step,
+            psnr}, last of the result) and doubt (a Gaussian that v views touched keeps v/(v + doubt) of its
+            change; None where all keep the same part, or none).
     """
 
     splats: Splats
@@ -77,6 +86,9 @@ class Engine(Protocol):
     def load(self, state: dict[str, NDArray[Any]]) -> None: ...
 
     @property
+    def counts(self) -> NDArray[Any]: ...
+
+    @property
     def skipped(self) -> int: ...
 
 
@@ -87,6 +99,7 @@ def recover(
     *,
     weights: ArrayLike | None = None,
     anchors: Anchors | None = None,
+    validation: Targets | None = None,
     checkpoint: Path | None = None,
     progress: Progress = silent,
     stage: str = "recover",
@@ -95,7 +108,8 @@ def recover(
     """Optimise every attribute of a fixed set of Gaussians against targets (`eq:objective`).
 
     L = (1−λ)·L1 + λ·(1−SSIM), and every `period` steps + λ_a·L_anchor + λ_s·L_shape. No Gaussian is added
-    or removed. A student that the steps only made worse, by PSNR of the training views, is returned as it is.
+    or removed. Where the steps lose against the student, by PSNR of some training views, recovery goes back,
+    and on with a third of the rates; a student that is only made worse is returned as it is.
 
     Args:
         student: the scene to recover; its offset counts, cameras are in world coordinates.
@@ -103,6 +117,10 @@ def recover(
         config: see `RecoverConfig`.
         weights: (C,) how often each view is drawn, in proportion; None draws all equally often.
         anchors: frozen geometry; None freezes the student as given.
+        validation: a few views of another kind than `targets` (nearer, or from where people stand), never
+            learned from: they decide how much of what the steps changed stays, Gaussian by Gaussian as it
+            was seen (`g2ard.recover.guard`), and end a recovery that they only lose by. At most eight are
+            looked at.
         checkpoint: a file written every minute and at Ctrl-C; if it is there, recovery goes on from it, and
             the result is bitwise that of never having stopped.
         progress: told of every step, with loss, PSNR of a few training views and steps/s.
@@ -125,15 +143,19 @@ def recover(
     probe = Probe(targets, config.background)
     before = probe.all_of(student)
     often = checked_weights(weights, len(targets.cameras))
-    loop = _Loop(student, targets, config, often, anchors, probe)
+    others = None if validation is None else Probe(validation, config.background).all_of
+    guard = Guard(probe.all_of, student, before, others)
+    held = None if validation is None else fingerprint_of(validation)
+    loop = _Loop(student, targets, config, often, anchors, probe, guard, held)
     if checkpoint is None or not checkpoint.exists():
         loop.choose_rates(before)
     loop.run(checkpoint, progress, stage, watch)
-    result = loop.engine.splats()
-    after = probe.all_of(result)
-    kept_start = after < before
-    if kept_start:
-        result, after = student, before
+    end = loop.engine.splats()
+    result, after, way = guard.judge(end)
+    doubt: float | None = 0.0
+    if result is end and validation is not None:
+        result, doubt = guard.settle(end, loop.views_seen, loop.done)
+        after, way = (after, way) if result is end else (probe.all_of(result), float(result is not student))
     return Recovered(
         result,
         {
@@ -148,10 +170,47 @@ def recover(
             "needle": needle(result.scales),
             "geometry": loop.geometry,
             "regularizers": loop.regularizers,
-            "kept_start": kept_start,
-            "skipped": {"non_finite": loop.engine.skipped},
+            "backed_off": loop.guard.backed_off,
+            "stopped": loop.guard.stopped,
+            "way": way,
+            "kept_start": way == 0,
+            "validation": None
+            if validation is None
+            else {"looks": guard.validation, "doubt": None if doubt is None else _finite(doubt)},
+            "skipped": {"non_finite": loop.skipped},
         },
     )
+
+
+def outcome(report: dict[str, Any]) -> str | None:
+    """One line about a recovery that did not simply go well; None for one that did.
+
+    >>> outcome({"kept_start": False, "backed_off": [], "stopped": None, "way": 1.0}) is None
+    True
+    >>> lost = [{"step": 30, "psnr": 23.35}]
+    >>> outcome({"kept_start": False, "backed_off": lost, "stopped": None, "psnr": {"before": 32.9}})
+    'recovery fell to 23.35 dB (start 32.90) at step 30: it went on from the best with a third of the rates'
+    """
+    start = f"(start {report['psnr']['before']:.2f})" if report["backed_off"] else ""
+    lines = [f"{found['psnr']:.2f} dB {start} at step {found['step']}" for found in report["backed_off"]]
+    if report["kept_start"]:
+        why = "every step only made the training views worse"
+        looks = (report["validation"] or {"looks": []})["looks"]
+        if len(looks) > 2 and looks[-1]["psnr"] == looks[0]["psnr"]:
+            first, worst = looks[0]["psnr"], looks[-2]["psnr"]
+            why = f"views of another kind only lost by the steps ({first:.2f} → {worst:.2f} dB)"
+        if lines:
+            why = f"recovery fell to {', '.join(lines)}, and slower rates gained nothing"
+        given_up = "" if report["stopped"] is None else f"; given up at step {report['stopped']}"
+        return f"kept the simplified scene: {why}{given_up}"
+    if lines:
+        thirds = "a third" if len(lines) == 1 else f"1/{3 ** len(lines)}"
+        return f"recovery fell to {', '.join(lines)}: it went on from the best with {thirds} of the rates"
+    if report["way"] < 1:
+        return (
+            f"recovery ended below its start: the scene goes {report['way']:.0%} of the way to where it ended"
+        )
+    return None
 
 
 class _Loop:
@@ -165,6 +224,8 @@ class _Loop:
         weights: NDArray[np.float64] | None,
         anchors: Anchors,
         probe: Probe,
+        guard: Guard,
+        held: str | None,
     ) -> None:
         self.targets = targets
         self.config = config
@@ -175,20 +236,33 @@ class _Loop:
         self.trials: list[dict[str, float]] = []
         self.student = student
         self.probe = probe
+        self.guard = guard
+        self._skipped = 0  # by engines before this one
         self.done = 0
         self.seconds = 0.0
         self.losses: list[float] = []
         self.geometry: list[dict[str, float]] = []
         self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised? → steps, seconds
-        self.key = _fingerprint(student, targets, config, weights, anchors)
+        self.key = _fingerprint(student, targets, config, weights, anchors, held)
 
     @cached_property
     def engine(self) -> Engine:
         """Made when first needed: trials need theirs before, and two at once would double the memory."""
         return self._new_engine()
 
-    def _new_engine(self) -> Engine:
-        config, student = self.config, self.student
+    @property
+    def skipped(self) -> int:
+        """Steps of single Gaussians left out because a gradient was not finite."""
+        return self._skipped + self.engine.skipped
+
+    @property
+    def views_seen(self) -> NDArray[np.float64]:
+        """(N,) how many of the views have touched each Gaussian, from the steps it has taken."""
+        steps = self.done - (int(self.guard.backed_off[-1]["step"]) if self.guard.backed_off else 0)
+        return self.engine.counts * (len(self.targets.cameras) / max(1, steps))
+
+    def _new_engine(self, start: Splats | None = None) -> Engine:
+        config, student = self.config, self.student if start is None else start
         engine: Engine = _engine_class(config.engine)(
             student,
             self.targets.cameras.recentred(student.offset),
@@ -209,10 +283,9 @@ class _Loop:
             start: PSNR before recovery: where the search begins, and all there is for short horizons.
         """
         rmse = 10 ** (-start / 20)
+        typical = typical_share(self.student, self.targets.cameras)
         reach = self.config.schedule.reach
-        if reach is None:
-            reach = reach_for(rmse, typical_share(self.student, self.targets.cameras))
-        self.reach = reach
+        self.reach = reach_for(rmse, typical) if reach is None else reach
         if self.config.schedule.multiplier is not None:
             self.multiplier = self.config.schedule.multiplier
             return
@@ -237,6 +310,11 @@ class _Loop:
         nearly_there = guess <= min(MULTIPLIERS)
         try:
             self.multiplier, _ = climb(score, guess, start)
+            tight = reach_for(0.0, typical)
+            if seen[self.multiplier] < start and self.config.schedule.reach is None and tight < self.reach:
+                self.reach = tight  # not as untrained as it looked
+                seen.clear()
+                self.multiplier, _ = climb(score, guess, start)
             if seen[self.multiplier] < start:  # a few steps on photos that are nearly met say nothing
                 self.multiplier, share = guess, _CALM_SHARE
                 if nearly_there:
@@ -265,8 +343,9 @@ class _Loop:
             self._resume(checkpoint)
         earlier, began, saved = self.seconds, time.monotonic(), time.monotonic()
         with checkpoints.deferred_interrupt() as interrupted:
-            while self._share() < 1:
+            while self._share() < 1 and self.guard.stopped is None:
                 self._step()
+                self._look()
                 now = time.monotonic()
                 self.seconds = earlier + now - began
                 self._log()
@@ -298,6 +377,18 @@ class _Loop:
         tally[0] += 1
         tally[1] += time.monotonic() - began
         self.done += 1
+
+    def _look(self) -> None:
+        """Where too much is lost to come back, go on from the best scene with a third of the rates."""
+        share = self._share()
+        short = self.config.time_limit is None and self.config.horizon < _SHORT
+        if short or not self.guard.due(share):
+            return
+        if self.guard.look(self.engine.splats(), share, self.done) == "back":
+            self.multiplier /= 3
+            self._skipped += self.engine.skipped
+            del self.engine  # two at once would double the memory
+            self.engine = self._new_engine(self.guard.best)
 
     def _log(self) -> None:
         """Drift95 and Needle at every tenth of the horizon."""
@@ -342,12 +433,17 @@ class _Loop:
             "trials": self.trials,
             "geometry": self.geometry,
             "seconds_of": [self._seconds_of[False], self._seconds_of[True]],
+            "skipped": self._skipped,
+            "guard": self.guard.meta(),
         }
-        checkpoints.save(path, self.key, meta, {**self.engine.state(), "losses": np.array(self.losses)})
+        arrays = {**self.engine.state(), "losses": np.array(self.losses), **self.guard.arrays()}
+        checkpoints.save(path, self.key, meta, arrays)
 
     def _resume(self, path: Path) -> None:
         meta, arrays = checkpoints.load(path, self.key)
         self.losses = arrays.pop("losses").tolist()
+        self.guard.load(meta["guard"], arrays)
+        self._skipped = int(meta["skipped"])
         self.engine.load(arrays)
         self.done, self.seconds = int(meta["done"]), float(meta["seconds"])
         self.multiplier = float(meta["multiplier"])
@@ -383,9 +479,11 @@ def _fingerprint(
     config: RecoverConfig,
     weights: NDArray[np.float64] | None,
     anchors: Anchors,
+    validation: str | None,
 ) -> str:
     often = [] if weights is None else [repr(weights.tolist())]
     parts = (repr(config), student.fingerprint(), fingerprint_of(targets), *often)
+    parts = parts if validation is None else (*parts, validation)
     digest = hashlib.sha256("\n".join(parts).encode())
     for held in (anchors.means, anchors.frames, anchors.r_parallel, anchors.r_perp):
         digest.update(np.ascontiguousarray(held).tobytes())

@@ -172,6 +172,11 @@ class TorchEngine:
                 yield group["name"], key, moment
 
     @property
+    def counts(self) -> NDArray[Any]:
+        """(N,) steps that each Gaussian has taken."""
+        return self._adam.state[self._parameters["means"]]["count"].cpu().numpy()
+
+    @property
     def skipped(self) -> int:
         """Steps of single Gaussians left out because a gradient was not finite."""
         return self._adam.skipped

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.distill import Distilled
     from g2ard.io import ViewSet
+    from g2ard.poses import Pool
     from g2ard.splats import Splats
     from g2ard.targets import Targets
 
@@ -52,8 +54,33 @@ if TYPE_CHECKING:
 
 _WORK = ".unfinished"
 """In the folder of the run: finished rounds and checkpoints. Nobody else has a folder of this name."""
-_POOL = 128
+_POOL = 160
 """Poses of a pool made for a scene without views; every 8th is held out for scoring."""
+_APART = 24
+"""Views of another kind: half of them decide how much of recovery's changes stays, half are scored."""
+_ROWS = 200_000
+"""Gaussians that poses are planned on."""
+_LOSS = 0.05
+"""dB under the simplified scene that the command speaks of."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """What a run looks at.
+
+    Args:
+        train: to recover from.
+        test: of their kind, for scoring.
+        apart: of another kind, nearer; None where none can be made.
+        pool: all of a pool made for the scene, to be written beside the result.
+        unseen: share of a sample of the scene's matter that no view of that pool sees.
+    """
+
+    train: ViewSet
+    test: Cameras
+    apart: Cameras | None = None
+    pool: ViewSet | None = None
+    unseen: float | None = None
 
 
 @command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True)
@@ -130,6 +157,7 @@ def distill(
     from g2ard.distill import distill as pipeline
     from g2ard.io import kind, write_views
     from g2ard.io.atomic import check_output
+    from g2ard.recover.optimize import outcome
     from g2ard.recover.presets import preset_for
     from g2ard.recover.schedule import schedule_named
     from g2ard.report.distilled import distill_report
@@ -144,8 +172,8 @@ def distill(
     check_stopped(run, output / _WORK, resume)
     prior = _lift(run, scene) if lifted else load_scene(run, scene)
     budget = budget_of(scene, count, ratio, len(prior))
-    candidates, test, pool = _views(run, scene, prior, views, held_out, size)
-    train = candidates.cameras
+    looks = _views(run, scene, prior, views, held_out, size, teach=not lifted and photos is not True)
+    train, test = looks.train.cameras, looks.test
     pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
     use_photos = lifted or (pictured if photos is None else photos)
     teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
@@ -170,17 +198,20 @@ def distill(
     )
     targets = make_targets(run, train, teacher, colour, lazy=k is not None)
     unseen = make_targets(run, test, teacher, colour)
+    validation, apart = _apart_targets(run, looks.apart, teacher, colour)
     with _work_folder(run, output, resume) as work:
         result = pipeline(
             prior,
             budget,
             targets,
             config,
-            weights=candidates.weights if weighted else None,
+            weights=looks.train.weights if weighted else None,
+            validation=validation,
             work=work,
             progress=run.progress,
         )
-        report = _score(run, prior, result, unseen, colour)
+        report = _score(run, prior, result, {"scores": unseen, "apart": apart}, colour)
+        report["unseen"] = looks.unseen
         report |= {"against": against, "preset": why, "prior": measured.as_dict()}
         report |= {key: result.report[key] for key in ("rounds", "views")}
         report["seconds"] = {**result.report["seconds"], "total": time.monotonic() - began}
@@ -193,10 +224,14 @@ def distill(
             colour,
         )
         _write(run, output, result, unseen, colour, report)
-    if pool is not None:
-        write_views(output / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
+    if looks.pool is not None:
+        write_views(output / "views.json", looks.pool.cameras, splits=looks.pool.splits, overwrite=True)
     shutil.rmtree(output / _WORK)
     _table(run, report)
+    for done in (done for entry in report["rounds"] for done in entry.get("recover", [])):
+        if (told := outcome(done)) is not None:
+            run.say(told)
+    _warn(run, report)
     _say_views(run, report["views"], k is not None)
     run.say(
         f"scene: {output / 'scene.ply'}\npicture: {output / 'preview.png'}\n"
@@ -236,13 +271,17 @@ def _lift(run: Run, path: Path) -> Splats:
 
 
 def _views(
-    run: Run, scene: Path, prior: Splats, views: Path | None, held_out: Path | None, size: int | None
-) -> tuple[ViewSet, Cameras, ViewSet | None]:
-    """Views for recovery, views for scoring, and the pool they came from where one had to be made."""
-    from dataclasses import replace
-
+    run: Run,
+    scene: Path,
+    prior: Splats,
+    views: Path | None,
+    held_out: Path | None,
+    size: int | None,
+    *,
+    teach: bool,
+) -> _Views:
+    """Views for recovery and for scoring; `teach`: the scene can be rendered into others than those given."""
     from g2ard.io import ViewSet
-    from g2ard.poses import plan_pool
     from g2ard.splits import split_mask, splits_of
 
     found = None
@@ -255,31 +294,78 @@ def _views(
             train, test = load_for_training(run, views, size), load_held_out(run, held_out, size)
         if found and not size:
             train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
-        return train, test.cameras, None
-    planned = plan_pool(prior, _POOL, seed=run.seed, progress=run.progress)
+        return _Views(train, test.cameras, _planned(run, prior, needed=False).apart if teach else None)
+    planned = _planned(run, prior, needed=True)
+    apart = planned.apart and planned.apart.resized(size)
     names = planned.cameras.names
     run.say(f"poses: {planned.kind} ({planned.why})")
     if held_out is not None:
         pool = ViewSet(planned.cameras, splits=("train",) * len(names))
-        return pool.resized(size), load_held_out(run, held_out, size).cameras, pool
+        test = load_held_out(run, held_out, size)
+        return _Views(pool.resized(size), test.cameras, apart, pool, planned.unseen)
     pool = ViewSet(planned.cameras, splits=splits_of(None, names))
-    unseen = split_mask(None, names, "test")
-    return pool.take(~unseen).resized(size), pool.take(unseen).resized(size).cameras, pool
+    mask = split_mask(None, names, "test")
+    train = pool.take(~mask).resized(size)
+    return _Views(train, pool.take(mask).resized(size).cameras, apart, pool, planned.unseen)
 
 
-def _score(run: Run, prior: Splats, result: Distilled, unseen: Targets, colour: Colour) -> dict[str, Any]:
+def _planned(run: Run, prior: Splats, *, needed: bool) -> Pool:
+    """A pool for the scene; where only views of another kind are wanted, a small one, empty if need be."""
+    import numpy as np
+
+    from g2ard.cameras import Cameras
+    from g2ard.errors import InputError
+    from g2ard.poses import Pool, plan_pool
+
+    try:
+        return plan_pool(
+            prior,
+            _POOL if needed else _APART,
+            seed=run.seed,
+            rows=_ROWS,
+            apart=_APART,
+            progress=run.progress,
+        )
+    except InputError:
+        if needed:
+            raise
+        return Pool(Cameras.from_lists([], [], [], []), "none", "no free place", np.zeros(3))
+
+
+def _apart_targets(
+    run: Run, cameras: Cameras | None, teacher: Splats | None, colour: Colour
+) -> tuple[Targets | None, Targets | None]:
+    """Every second view of another kind to validate with, the others to score; None without a teacher."""
+    if cameras is None or teacher is None or len(cameras) < 2:
+        return None, None
+    rows = range(len(cameras))
+    parts = [cameras.take([i for i in rows if i % 2 == which]) for which in (0, 1)]
+    validation, scored = (make_targets(run, part, teacher, colour) for part in parts)
+    return validation, scored
+
+
+def _score(
+    run: Run, prior: Splats, result: Distilled, views: dict[str, Targets | None], colour: Colour
+) -> dict[str, Any]:
+    """Both scenes' figures in each kind of views; None for a kind without any."""
     from g2ard.evaluate import evaluate
 
     scenes = {"simplified": result.simplified, "recovered": result.splats}
-    scores = {
-        name: evaluate(splats, unseen, background=colour, progress=run.progress, stage=f"score {name}")
-        for name, splats in scenes.items()
+    scores: dict[str, Any] = {
+        kind: targets
+        and {
+            name: evaluate(
+                splats, targets, background=colour, progress=run.progress, stage=f"score {name}"
+            ).as_dict()
+            for name, splats in scenes.items()
+        }
+        for kind, targets in views.items()
     }
     return {
         "input_count": len(prior),
         "output_count": len(result.splats),
         "bytes": {"input": prior.nbytes, "output": result.splats.nbytes},
-        "scores": {name: score.as_dict() for name, score in scores.items()},
+        **scores,
     }
 
 
@@ -300,21 +386,51 @@ def _write(
 
 
 def _table(run: Run, report: dict[str, Any]) -> None:
-    def row(name: str, count: int, size: int, score: dict[str, Any] | None) -> list[str]:
-        figures = [f"{score['psnr']:.2f}", f"{score['ssim']:.4f}"] if score else ["–", "–"]
+    kinds = [report["scores"]] + ([report["apart"]] if report["apart"] else [])
+
+    def row(name: str, count: int, size: int) -> list[str]:
+        figures = []
+        for scores in kinds:
+            score = scores.get(name)
+            figures += [f"{score['psnr']:.2f}", f"{score['ssim']:.4f}"] if score else ["–", "–"]
         return [name, f"{count:,}", f"{size / 1e6:.2f}", f"{size / count:.0f}", *figures]
 
-    scores, size = report["scores"], report["bytes"]
+    size = report["bytes"]
     times = ", ".join(f"{name} {value:.1f} s" for name, value in report["seconds"].items())
+    counts = [str(len(scores["recovered"]["views"])) for scores in kinds]
+    apart = f" and {counts[1]} of another kind (nearer)" if len(kinds) > 1 else ""
     run.console.table(
-        f"{len(scores['recovered']['views'])} unseen views against {report['against']}; {times}",
-        ["scene", "Gaussians", "MB", "bytes each", "PSNR", "SSIM"],
+        f"{counts[0]} unseen views{apart} against {report['against']}; {times}",
         [
-            row("dense", report["input_count"], size["input"], None),
-            row("simplified", report["output_count"], size["output"], scores["simplified"]),
-            row("recovered", report["output_count"], size["output"], scores["recovered"]),
+            "scene",
+            "Gaussians",
+            "MB",
+            "bytes each",
+            "PSNR",
+            "SSIM",
+            *["PSNR near", "SSIM near"][: 2 * (len(kinds) - 1)],
+        ],
+        [
+            row("dense", report["input_count"], size["input"]),
+            row("simplified", report["output_count"], size["output"]),
+            row("recovered", report["output_count"], size["output"]),
         ],
     )
+
+
+def _warn(run: Run, report: dict[str, Any]) -> None:
+    """Where recovery lost, and what no view saw."""
+    for kind, what in (("scores", "unseen views"), ("apart", "views of another kind")):
+        if not report[kind]:
+            continue
+        before, after = (report[kind][name]["psnr"] for name in ("simplified", "recovered"))
+        if after < before - _LOSS:
+            run.say(
+                f"warning: recovery lost {before - after:.2f} dB in {what}: the simplified scene is better"
+                " there (g2ard simplify makes it)"
+            )
+    if report["unseen"]:
+        run.say(f"no view sees {report['unseen']:.0%} of the scene's matter: it is simplified, not recovered")
 
 
 def _say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:

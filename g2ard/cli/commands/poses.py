@@ -59,7 +59,10 @@ def poses(
         _Size | None,
         typer.Option(parser=_size, metavar="WxH", help="Pixels; 800x600 unless given."),
     ] = None,
-    fov: Annotated[float, typer.Option(min=1, max=170, help="Horizontal field of view, degrees.")] = 50.0,
+    fov: Annotated[
+        float | None,
+        typer.Option(min=1, max=170, help="Horizontal field of view, degrees; 50 unless given, 70 in rooms."),
+    ] = None,
     up: Annotated[
         Triple | None,
         typer.Option(

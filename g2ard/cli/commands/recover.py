@@ -54,6 +54,7 @@ def recover(
     from g2ard.io import check_scene_output, write_splats
     from g2ard.recover import RecoverConfig
     from g2ard.recover import recover as optimize
+    from g2ard.recover.optimize import outcome
     from g2ard.recover.presets import preset_for
     from g2ard.recover.schedule import schedule_named
 
@@ -89,6 +90,8 @@ def recover(
             splats, targets, config, weights=weights, checkpoint=checkpoint, progress=run.progress
         )
         write_splats(output, result.splats, overwrite=run.overwrite)
+    if (told := outcome(result.report)) is not None:
+        run.say(told)
     gain = result.report["psnr"]
     run.say(
         f"{output}: {len(splats):,} Gaussians, "
