@@ -1,8 +1,9 @@
 """Cameras for a scene that comes without any: around objects, through rooms and streets, from the air.
 
 The scene is stood upright (`up`), weighed without its floaters and sky (`matter`), its free space mapped
-(`grid`, `site`), its shape named (`shape`); then planners (`orbit`, `walk`, `aerial`) propose poses from
-endless even sequences and keep those that stand free and see enough (`sight`, `gather`).
+(`grid`, `site`), its shape named (`shape`); then planners (`orbit`, `walk`, `aerial`, `inside`, `focus`)
+propose poses from endless even sequences and keep those that stand free and see enough (`sight`, `gather`).
+`auto` joins them; `near` steps nearer to what a pool sees and tells what it does not.
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ def make_pool(
         splats: the scene, any unit, origin and orientation.
         count: how many.
         kind: "orbit" (around an object, elevations −5° to 50°), "walk" (in free space at eye height, through
-            rooms and streets), "aerial" (straight down and oblique), or "auto": orbit for an object, walk
-            inside a room, three quarters aerial and a quarter walk for a landscape or a city.
+            rooms and streets), "aerial" (straight down and oblique), or "auto": within rooms as far as the
+            scene lies within such; orbit for an object, three quarters aerial and a quarter walk for a
+            landscape, as far as it is in focus from there; the rest walks or stands where it is in focus.
         size: width and height in pixels.
         fov: horizontal field of view, degrees; None means 50, and 70 for a pool within rooms.
         up: (3,) direction away from the ground; None to estimate it.

@@ -93,6 +93,8 @@ class Glance:
         """Look through each camera; what is farther than `reach`, (C,), is a backdrop and does not count."""
         from g2ard.render import RasterSettings, view_of
 
+        if not len(cameras):
+            return Focus(*np.zeros((3, 0)))
         here = cameras.resized(_LONGEST).recentred(self._middle)
         distance = float(np.median(norms(here.positions)))
         settings = RasterSettings(near=1e-3 * distance or None)
