@@ -29,8 +29,8 @@ class SimplifyConfig:
         min_opacity: below this α a Gaussian is dropped; None means the method's own, 0.01 in the paper, 0.004
             (what no renderer draws) for the others.
         neighbors: `default`: nearest clusters that one may merge with. More lets far ones in: 16 is worse.
-        geometric_weight: of `default` and `fast`: weight of the error of coverage beside that of colour; a
-            third of it without views, for most of what it would then weigh lies hidden.
+        geometric_weight: of `default` and `fast`: weight of the error of coverage beside that of colour; half
+            of it without views, for much of what it would then weigh lies hidden.
         dilation: of `default` and `fast`: standard deviation of the blur that renderers add, in pixels
             (√0.3 would be all of it; 0.4 measured best).
         pixel_scale: of `default` and `fast` without views: the size of a pixel over the median of the largest

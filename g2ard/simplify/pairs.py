@@ -20,7 +20,7 @@ __all__ = ["Seen", "Visibility", "merge", "merge_looking", "rows_of", "splats_of
 _LADDER = {"default": (3.0, 1), "fast": (1.0, 2)}
 """Down to how many times the budget rows merge along Morton order, and in how many steps."""
 
-_BLIND = 1 / 3
+_BLIND = 1 / 2
 """How much of its weight the error of coverage has where nothing is known of what views see."""
 
 MAX_OPACITY = 0.99
