@@ -26,11 +26,19 @@ _OVERLAP = 5.0
 """Nadir images that show the same spot of ground, as drone surveys fly it."""
 
 
-def plan_aerial(site: Site, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]) -> Poses:
+def plan_aerial(
+    site: Site,
+    count: int,
+    lens: Lens,
+    seed: int,
+    tell: Callable[[int, int], None],
+    *,
+    first: int | None = None,
+) -> Poses:
     """At most `count` poses above everything, their footprints spread evenly over the scene.
 
     The height follows from the count: few poses see much each, many see detail. Poses in or close to
-    matter, or with a quarter of their frame empty, are left out.
+    matter, or with a quarter of their frame empty, are left out. `first` asks for so many of them only.
     """
     height = _height(site, count, lens)
 
@@ -52,7 +60,7 @@ def plan_aerial(site: Site, count: int, lens: Lens, seed: int, tell: Callable[[i
         seen = look(site, poses, lens, free)
         return np.where(seen.close > 0.3 * height, seen.covered / 0.75, 0.0)
 
-    return gather(count, propose, judge, tell)
+    return gather(count if first is None else min(first, count), propose, judge, tell)
 
 
 def _height(site: Site, count: int, lens: Lens) -> Floats | float:

@@ -110,14 +110,14 @@ def _far(
     site: Site, glance: Glance, kind: str, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]
 ) -> _Far:
     plan = plan_aerial if kind == "aerial" else plan_orbit
-    poses = plan(site, count, lens, seed, tell)
-    if not len(poses):
-        return _Far(kind, poses, 1.0)
-    some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _SAMPLED)).round().astype(int))
-    share = float(_sharp(site, glance, poses.take(some), lens, tell).mean())
+    some = plan(site, count, lens, seed, tell, first=_SAMPLED)
+    if not len(some):
+        return _Far(kind, some, 1.0)
+    share = float(_sharp(site, glance, some, lens, tell).mean())
     if share < _FEW:
-        poses = poses.take(slice(0))
-    elif share < _MOST:
+        return _Far(kind, some.take(slice(0)), share)
+    poses = plan(site, count, lens, seed, tell)
+    if share < _MOST:
         poses = poses.take(_sharp(site, glance, poses, lens, tell))
     return _Far(kind, poses, share)
 

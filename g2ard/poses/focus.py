@@ -21,7 +21,7 @@ __all__ = ["Focus", "Glance", "plan_focus"]
 
 Floats = NDArray[np.float64]
 
-_ROWS = 20_000
+_ROWS = 12_000
 """Gaussians that a glance renders."""
 
 _LONGEST = 96

@@ -27,10 +27,19 @@ _OUTLINE = 8_000
 """Points that stand for the thing's outline."""
 
 
-def plan_orbit(site: Site, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]) -> Poses:
+def plan_orbit(
+    site: Site,
+    count: int,
+    lens: Lens,
+    seed: int,
+    tell: Callable[[int, int], None],
+    *,
+    first: int | None = None,
+) -> Poses:
     """At most `count` poses around the middle of the matter, evenly over the dome.
 
     Poses below the ground, in or close to matter are left out; the rest see it, for it fills their frame.
+    `first` asks for so many of them only.
     """
     target = site.box.mean(axis=0)
     low, high = np.sin(np.radians(_ELEVATIONS))
@@ -48,7 +57,7 @@ def plan_orbit(site: Site, count: int, lens: Lens, seed: int, tell: Callable[[in
         free = (site.grid.distance(poses.eyes) > 2 * site.grid.cell) & (site.above_ground(poses.eyes) > 0.02)
         return (look(site, poses, lens, free).close > 4 * site.grid.cell).astype(float)
 
-    return gather(count, propose, judge, tell)
+    return gather(count if first is None else min(first, count), propose, judge, tell)
 
 
 def _fitting(site: Site, target: Floats, outward: Floats, lens: Lens) -> Floats:
