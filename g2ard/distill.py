@@ -17,7 +17,7 @@ from g2ard.recover.anchors import PRESETS, Regularizers
 from g2ard.recover.draw import checked_weights
 from g2ard.recover.schedule import TUNED, Schedule
 from g2ard.splats import Splats
-from g2ard.targets import Subset, Targets, fingerprint_of
+from g2ard.targets import Photos, Subset, Targets, fingerprint_of
 
 if TYPE_CHECKING:
     from g2ard.recover.optimize import Watch
@@ -284,11 +284,15 @@ class _Rounds:
         self.seconds["recover"] += entry["recover"][-1]["seconds"]
 
     def _steps(self) -> int | None:
-        """The final horizon: as asked for, the paper's, or by need."""
+        """The final horizon: as asked for, the paper's, or by need.
+
+        A teacher can be learned from as long as it pays; photos are learned by heart: the city's 84 at
+        2,250 steps 21.54 dB in others, at 1,000 21.55.
+        """
         from g2ard.recover.need import steps_for
 
         schedule = self.config.schedule
-        if self.config.steps is not None or not schedule.means_in_scales:
+        if self.config.steps is not None or not schedule.means_in_scales or isinstance(self.targets, Photos):
             return self.config.steps
         return steps_for(self.state, self.supervision.targets.cameras, schedule.steps)
 
