@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,11 @@ from g2ard.errors import InputError
 from g2ard.evaluate import evaluate
 from g2ard.images import write_png
 from g2ard.io import Points, read_splats, write_points, write_splats, write_views
-from g2ard.recover.schedule import TUNED
+from g2ard.progress import silent
+from g2ard.recover.schedule import PAPER, TUNED
 from g2ard.render import render
 from g2ard.splats import SH_C0, Splats
-from g2ard.targets import TeacherRenders
+from g2ard.targets import Targets, TeacherRenders
 
 CommandLine = Callable[..., tuple[int, str, str]]
 PRIOR = checkered_ball()
@@ -99,12 +101,55 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
     assert report["output_count"] == len(read_splats(tmp_path / "run" / "scene.ply")) == 300
     assert report["scores"]["recovered"]["psnr"] > report["scores"]["simplified"]["psnr"]
     assert report["against"] == "teacher renders"
+    apart = report["apart"]
+    assert {view["name"][:5] for view in apart["recovered"]["views"]} == {"near_"}
+    assert not {view["name"] for view in report["scores"]["recovered"]["views"]} & {
+        view["name"] for view in apart["recovered"]["views"]
+    }
+    assert 0 <= report["unseen"] < 0.5
+    assert "of another kind" in error
     left = sorted(p.name for p in (tmp_path / "run").iterdir())
     assert left == ["preview.png", "report.html", "report.json", "scene.ply", "views.json"]
     status, _, error = command_line(*ask, cwd=tmp_path)
     assert status == 1
     assert "run" in error
     assert "-w" in error
+
+
+def test_a_loss_in_any_kind_of_views_is_told() -> None:
+    from g2ard.cli.commands.distill import _warn
+
+    def told(pool: float, near: float | None, unseen: float | None) -> list[str]:
+        def scores(gain: float) -> dict[str, dict[str, float]]:
+            return {"simplified": {"psnr": 30.0}, "recovered": {"psnr": 30.0 + gain}}
+
+        said: list[str] = []
+        apart = None if near is None else scores(near)
+        _warn(SimpleNamespace(say=said.append), {"scores": scores(pool), "apart": apart, "unseen": unseen})
+        return said
+
+    assert told(1.0, 0.5, 0.0) == []
+    assert told(1.0, None, None) == []
+    (line,) = told(1.0, -0.5, 0.0)
+    assert "lost 0.50 dB in views of another kind" in line
+    lines = told(-0.2, -0.3, 0.25)
+    assert "lost 0.20 dB in unseen views" in lines[0]
+    assert "no view sees 25% of the scene's matter" in lines[2]
+
+
+def test_steps_by_need_are_for_teachers() -> None:
+    from g2ard.distill import _Rounds
+
+    part = replace(around(12), Ks=around(12).Ks * [[[4], [4], [1]]])  # a sixteenth of the ball in each
+
+    def horizon(targets: Targets, config: DistillConfig) -> int | None:
+        return _Rounds(PRIOR, 300, targets, config, 1, None, None, None, silent, None)._steps()
+
+    teacher, config = TeacherRenders(PRIOR, part, lazy=True), DistillConfig(schedule=TUNED)
+    assert horizon(teacher, config) > 1.5 * TUNED.steps
+    assert horizon(TeacherRenders(PRIOR, around(12), lazy=True), config) < 1.2 * TUNED.steps
+    assert horizon(teacher, replace(config, steps=7)) == 7
+    assert horizon(teacher, replace(config, schedule=PAPER)) is None
 
 
 def cloud_with_photos(folder: Path) -> None:
@@ -126,6 +171,8 @@ def test_command_on_a_cloud_with_photos(command_line: CommandLine, tmp_path: Pat
     assert status == 0, error
     report = json.loads(out)
     assert report["against"] == "photos"
+    assert report["apart"] is None  # photos are only where they were taken
+    assert report["unseen"] is None
     simplified, recovered = (report["scores"][stage]["psnr"] for stage in ("simplified", "recovered"))
     assert simplified > 21.3
     assert recovered > max(21.5, simplified)
