@@ -93,13 +93,13 @@ def test_few_images_change_what_no_image_shows_too() -> None:
     targets = TeacherRenders(lit, VIEWS)
     facing = VIEWS.positions @ VIEWS.positions[0]
     rows, others = np.argsort(-facing)[:3], Subset(targets, np.argsort(facing)[:6])
-    compact = simplify(ball, 150).splats
+    compact = simplify(ball, 300).splats  # of fewer the reduction's error hides the light's
     psnr = {}
     for prior_views in (0.0, 1.0):
         config = AdaptConfig(steps=300, prior_views=prior_views)
         done = adapt(compact, Subset(targets, rows), config)
         psnr[prior_views] = evaluate(done.splats, others).psnr
-    assert psnr[1.0] > evaluate(compact, others).psnr + 1
+    assert psnr[1.0] > evaluate(compact, others).psnr + 2
     assert psnr[1.0] > psnr[0.0] + 0.3
     assert 0.3 < done.report["prior_share"] < 0.95
 
