@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,14 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import read_json
 
+if TYPE_CHECKING:
+    from g2ard.cameras import Cameras
+
 __all__ = [
     "HOLD_OUT",
     "for_scores",
     "for_training",
+    "not_held_out",
     "split_mask",
     "split_names",
     "splits_of",
@@ -187,3 +191,25 @@ def _listed(names: Sequence[str], wanted: Sequence[str]) -> NDArray[np.bool_]:
         return np.array([name in exact for name in names], bool)
     chosen = {PurePosixPath(name).stem for name in wanted}
     return np.array([stem in chosen for stem in stems], bool)
+
+
+def not_held_out(cameras: Cameras, held_out: Cameras) -> NDArray[np.bool_]:
+    """Which views are none of the held-out ones, by photo or, exactly, by pose.
+
+    Args:
+        cameras: C views to train on.
+        held_out: views to score on, of another file.
+
+    Returns:
+        (C,) bool.
+    """
+    photos = {path.resolve() for path in held_out.image_paths if path is not None}
+    poses = {view.tobytes() for view in np.round(held_out.viewmats, 9) + 0.0}
+    mine = np.round(cameras.viewmats, 9) + 0.0
+    return np.array(
+        [
+            (path is None or path.resolve() not in photos) and view.tobytes() not in poses
+            for path, view in zip(cameras.image_paths, mine, strict=True)
+        ],
+        bool,
+    )

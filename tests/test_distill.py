@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -117,20 +116,22 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
 
 
 def test_a_loss_in_any_kind_of_views_is_told() -> None:
-    from g2ard.cli.commands.distill import _warn
+    from g2ard.cli.commands.distill import _told
 
     def told(pool: float, near: float | None, unseen: float | None) -> list[str]:
-        def scores(gain: float) -> dict[str, dict[str, float]]:
-            return {"simplified": {"psnr": 30.0}, "recovered": {"psnr": 30.0 + gain}}
+        def scores(gain: float) -> dict[str, dict[str, Any]]:
+            views = [[{"psnr": 30.0 + share * gain} for share in part] for part in ((0, 0), (2.5, -0.5))]
+            return {
+                "simplified": {"psnr": 30.0, "views": views[0]},
+                "recovered": {"psnr": 30.0 + gain, "views": views[1]},
+            }
 
-        said: list[str] = []
         apart = None if near is None else scores(near)
-        _warn(SimpleNamespace(say=said.append), {"scores": scores(pool), "apart": apart, "unseen": unseen})
-        return said
+        return _told({"rounds": [], "scores": scores(pool), "apart": apart, "unseen": unseen})
 
-    assert told(1.0, 0.5, 0.0) == []
-    assert told(1.0, None, None) == []
-    (line,) = told(1.0, -0.5, 0.0)
+    assert told(1.0, None, None) == ["1 of 2 unseen views lost, though all together gained"]
+    assert told(0.02, 0.02, 0.0) == []
+    line = told(0.02, -0.5, 0.0)[0]
     assert "lost 0.50 dB in views of another kind" in line
     lines = told(-0.2, -0.3, 0.25)
     assert "lost 0.20 dB in unseen views" in lines[0]

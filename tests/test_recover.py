@@ -466,3 +466,10 @@ def test_both_engines_count_the_same_steps(student: Splats, targets: TeacherRend
 def test_refuses_a_horizon_that_is_none(wrong: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=next(iter(wrong))):
         RecoverConfig(**wrong)
+
+
+def test_views_that_see_nothing_of_the_scene_are_refused() -> None:
+    ahead = VIEWS.take([0])
+    behind = replace(TEACHER, means=(TEACHER.means - 99 * ahead.forwards[0]).astype(np.float32))
+    with pytest.raises(InputError, match="none of the 1 views sees the scene"):
+        recover(behind, TeacherRenders(TEACHER, ahead), RecoverConfig(steps=2))

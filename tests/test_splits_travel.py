@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from g2ard.images import write_png
 from g2ard.io import Points, read_points, read_view_set, write_points, write_splats, write_views
 from g2ard.lift import lift
 from g2ard.render import render
-from g2ard.splits import for_scores, for_training, split_mask, splits_of
+from g2ard.splits import for_scores, for_training, not_held_out, split_mask, splits_of
 
 CommandLine = Callable[..., tuple[int, str, str]]
 Program = Callable[..., None]
@@ -178,6 +179,22 @@ def test_views_beside_held_out_ones_train_without_their_own_test_views(
     g2ard(*ask, "--held-out", "photos", "-o", "pool")
     assert [part for part in watch.scored if part == TEST] == [TEST] * 4
     assert set(read_view_set(folder / "pool" / "views.json").splits) == {"train"}
+
+
+def test_a_view_that_is_held_out_never_trains_whatever_its_file_states(
+    folder: Path, g2ard: Program, watch: Watch
+) -> None:
+    whole = read_view_set(folder / "photos").cameras
+    write_views(folder / "bare.json", whole)  # states no splits
+    ask = ("distill", "ball.ply", "-n", 200, "--steps", 4, "--photos", "--held-out", "photos")
+    g2ard(*ask, "--views", "bare.json", "-o", "run")
+    assert watch.trained == [set(whole.names) - TEST]
+    held_out = whole.take([name in TEST for name in whole.names])
+    assert not_held_out(held_out, whole).sum() == 0
+    elsewhere = replace(held_out, image_paths=(None,) * len(TEST))
+    assert not_held_out(elsewhere, whole).sum() == 0  # by pose alone
+    moved = elsewhere.recentred([0.0, 0.0, 1.0])
+    assert not_held_out(moved, whole).all()
 
 
 def test_pools_state_their_splits(folder: Path, g2ard: Program, watch: Watch) -> None:

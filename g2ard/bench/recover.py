@@ -30,7 +30,7 @@ from g2ard.recover.schedule import PAPER
 from g2ard.render import looker
 from g2ard.simplify import simplify
 from g2ard.splats import Splats
-from g2ard.splits import HOLD_OUT, for_scores, for_training, split_mask
+from g2ard.splits import HOLD_OUT, for_scores, for_training, not_held_out, split_mask
 from g2ard.targets import Photos, Targets, TeacherRenders
 
 __all__ = ["STUDIES", "Look", "RecoverBench", "bench_recover"]
@@ -156,8 +156,12 @@ class RecoverBench:
         if self.held_out is not None:
             keep = for_training(self.views, found.cameras.names, found.splits)
             other = io.read_view_set(self.held_out)
-            score = for_scores(self.held_out, other.cameras.names, other.splits)
-            return found.take(keep).resized(self.size).cameras, other.take(score).resized(self.size).cameras
+            test = other.take(for_scores(self.held_out, other.cameras.names, other.splits)).cameras
+            train = found.take(keep).cameras
+            train = train.take(not_held_out(train, test))
+            if not len(train):
+                raise InputError(f"{self.views}: all views to train on are held out")
+            return train.resized(self.size), test.resized(self.size)
         masks = (
             split_mask(self.views, found.cameras.names, split, stated=found.splits)
             for split in ("train", "test")

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from g2ard.targets import Targets
 
 __all__ = [
+    "drop_held_out",
     "load_for_training",
     "load_held_out",
     "load_scene",
@@ -113,6 +114,23 @@ def load_held_out(run: Run, path: Path, size: int | None) -> ViewSet:
 
     found = _read(run, path)
     return found.take(for_scores(path, found.cameras.names, found.splits)).resized(size)
+
+
+def drop_held_out(run: Run, train: ViewSet, held_out: Cameras) -> ViewSet:
+    """The views to train on that are none of those to score on; says how many were.
+
+    Raises:
+        InputError: all of them are.
+    """
+    from g2ard.errors import InputError
+    from g2ard.splits import not_held_out
+
+    keep = not_held_out(train.cameras, held_out)
+    if not keep.any():
+        raise InputError(f"--held-out: all {len(keep)} views to train on are held out")
+    if not keep.all():
+        run.say(f"{len(keep) - int(keep.sum())} of {len(keep)} views are held out: not trained on")
+    return train.take(keep)
 
 
 def load_trained(run: Run, path: Path, split: str, size: int | None) -> ViewSet:

@@ -47,6 +47,8 @@ def find_views(scene: str | Path) -> Path | None:
         found = own
     if found is None and own.name == "ply" and _is_run(own.parent / gsplat_run.NAME):
         found = own.parent / gsplat_run.NAME
+    if found is None:  # one that cannot be read is told of by whoever reads it
+        found = next((file for file in places if file.is_file()), None)
     return found if found is None or scene.is_absolute() else Path(os.path.relpath(found))
 
 

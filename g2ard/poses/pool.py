@@ -13,7 +13,8 @@ from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.poses.aerial import plan_aerial
 from g2ard.poses.auto import plan_auto
-from g2ard.poses.inside import find_inside
+from g2ard.poses.focus import Glance, plan_focus
+from g2ard.poses.inside import find_inside, plan_inside
 from g2ard.poses.lattice import strata
 from g2ard.poses.near import Reach, plan_near, reach_of
 from g2ard.poses.orbit import plan_orbit
@@ -27,7 +28,7 @@ from g2ard.splits import HOLD_OUT
 
 __all__ = ["KINDS", "Pool", "plan_pool"]
 
-KINDS = ("auto", "orbit", "walk", "aerial")
+KINDS = ("auto", "orbit", "walk", "aerial", "inside", "focus")
 
 _FOV, _FOV_INSIDE = 50.0, 70.0
 """Degrees: within rooms people take wider lenses."""
@@ -93,7 +94,7 @@ def plan_pool(
             lens = _lens(size, _FOV_INSIDE)
         poses, used, why = plan_auto(site, splats, inside, count, lens, seed, tell)
     else:
-        poses, used, why = _planned(site, kind, count, lens, seed, tell), [kind], "as asked"
+        poses, used, why = _planned(site, splats, kind, count, lens, seed, tell), [kind], "as asked"
     reach = reach_of(site, poses, lens)
     if len(poses) < count:
         raise InputError(
@@ -123,9 +124,19 @@ def _apart(site: Site, poses: Poses, reach: Reach, count: int, lens: Lens, seed:
 
 
 def _planned(
-    site: Site, kind: str, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]
+    site: Site,
+    splats: Splats,
+    kind: str,
+    count: int,
+    lens: Lens,
+    seed: int,
+    tell: Callable[[int, int], None],
 ) -> Poses:
     """Poses of a kind that was asked for."""
+    if kind == "inside":
+        return plan_inside(site, find_inside(site, seed), count, lens, seed, tell)
+    if kind == "focus":
+        return plan_focus(site, Glance(splats), count, lens, seed, tell)
     if kind == "walk":
         return plan_walk(site, count, lens, seed, tell, indoors=shape_of(site)[0] == "room")
     return {"orbit": plan_orbit, "aerial": plan_aerial}[kind](site, count, lens, seed, tell)

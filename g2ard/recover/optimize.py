@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.recover import checkpoint as checkpoints
@@ -137,6 +138,8 @@ def recover(
     config = config or RecoverConfig()
     if not len(student) or not len(targets.cameras):
         raise InputError(f"recover: {len(student)} Gaussians and {len(targets.cameras)} views: nothing to do")
+    if not _seen(student, targets.cameras):
+        raise InputError(f"recover: none of the {len(targets.cameras)} views sees the scene")
     if config.sh_degree is not None:
         student = student.with_sh_degree(config.sh_degree)
     anchors = anchors or Anchors.of(student)
@@ -208,9 +211,20 @@ def outcome(report: dict[str, Any]) -> str | None:
         return f"recovery fell to {', '.join(lines)}: it went on from the best with {thirds} of the rates"
     if report["way"] < 1:
         return (
-            f"recovery ended below its start: the scene goes {report['way']:.0%} of the way to where it ended"
+            "recovery ended below its start in the training views: the scene goes"
+            f" {report['way']:.0%} of the way to where it ended, which is above both"
         )
     return None
+
+
+def _seen(scene: Splats, cameras: Cameras) -> bool:
+    """Whether any view has the middle of a Gaussian in its image; a sample usually tells."""
+    some = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), 1024)).round().astype(int))
+    for rows in (some, slice(None)):
+        points = scene.means[rows].astype(np.float64) + scene.offset
+        if any(cameras.take([view]).holds(points).any() for view in range(len(cameras))):
+            return True
+    return False
 
 
 class _Loop:

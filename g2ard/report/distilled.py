@@ -29,6 +29,8 @@ def distill_report(
     targets: Targets,
     report: dict[str, Any],
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    told: Sequence[str] = (),
 ) -> None:
     """Write an HTML page about one run: error against seconds and count, the loss, worst views first.
 
@@ -39,6 +41,7 @@ def distill_report(
         targets: held-out photos or teacher renders.
         report: what `g2ard distill` writes as report.json.
         background: RGB behind the scenes.
+        told: what the command says of the run: what was kept, where it lost, what no view saw.
     """
     against = report["against"]
     page = Page(title, f"{len(targets.cameras)} unseen views against {against}")
@@ -47,8 +50,10 @@ def distill_report(
     took = [seconds["simplify"], seconds["simplify"] + seconds["recover"]]
     page.html(legend(names))
     page.charts([*_error_charts(scenes, scores, took), *_loss_charts(report["rounds"])])
+    apart = report.get("apart")
+    near = ["PSNR near", "SSIM near"] if apart else []
     page.table(
-        ["scene", "Gaussians", "MB", "PSNR", "SSIM", "seconds"],
+        ["scene", "Gaussians", "MB", "PSNR", "SSIM", *near, "seconds"],
         [
             [
                 name,
@@ -56,6 +61,7 @@ def distill_report(
                 f"{splats.nbytes / 1e6:.2f}",
                 f"{scores[name]['psnr']:.2f}",
                 f"{scores[name]['ssim']:.4f}",
+                *([f"{apart[name]['psnr']:.2f}", f"{apart[name]['ssim']:.4f}"] if apart else []),
                 f"{spent:.1f}",
             ]
             for (name, splats), spent in zip(scenes, took, strict=True)
@@ -66,6 +72,11 @@ def distill_report(
         f"From {report['input_count']:,} Gaussians ({report['bytes']['input'] / 1e6:.2f} MB). "
         f"Regularisers: {report['preset']}."
     )
+    if apart:
+        count = len(apart[names[-1]]["views"])
+        page.paragraph(f"Near: {count} views of another kind, nearer, that recovery did not learn from.")
+    for line in told:
+        page.paragraph(line)
     page.heading("Worst views first")
     last = names[-1]
     figures = [view["psnr"] for view in scores[last]["views"]]

@@ -34,6 +34,7 @@ from g2ard.cli.options import (
 )
 from g2ard.cli.resume import check_stopped, left_at
 from g2ard.cli.scenes import (
+    drop_held_out,
     load_for_training,
     load_held_out,
     load_scene,
@@ -157,7 +158,6 @@ def distill(
     from g2ard.distill import distill as pipeline
     from g2ard.io import kind, write_views
     from g2ard.io.atomic import check_output
-    from g2ard.recover.optimize import outcome
     from g2ard.recover.presets import preset_for
     from g2ard.recover.schedule import schedule_named
     from g2ard.report.distilled import distill_report
@@ -222,16 +222,15 @@ def distill(
             unseen,
             report,
             colour,
+            told=_told(report),
         )
         _write(run, output, result, unseen, colour, report)
     if looks.pool is not None:
         write_views(output / "views.json", looks.pool.cameras, splits=looks.pool.splits, overwrite=True)
     shutil.rmtree(output / _WORK)
     _table(run, report)
-    for done in (done for entry in report["rounds"] for done in entry.get("recover", [])):
-        if (told := outcome(done)) is not None:
-            run.say(told)
-    _warn(run, report)
+    for line in _told(report):
+        run.say(line)
     _say_views(run, report["views"], k is not None)
     run.say(
         f"scene: {output / 'scene.ply'}\npicture: {output / 'preview.png'}\n"
@@ -292,6 +291,7 @@ def _views(
             train, test = load_view_sets(run, views, ["train", "test"], size)
         else:
             train, test = load_for_training(run, views, size), load_held_out(run, held_out, size)
+            train = drop_held_out(run, train, test.cameras)
         if found and not size:
             train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
         return _Views(train, test.cameras, _planned(run, prior, needed=False).apart if teach else None)
@@ -302,7 +302,8 @@ def _views(
     if held_out is not None:
         pool = ViewSet(planned.cameras, splits=("train",) * len(names))
         test = load_held_out(run, held_out, size)
-        return _Views(pool.resized(size), test.cameras, apart, pool, planned.unseen)
+        train = drop_held_out(run, pool.resized(size), test.cameras)
+        return _Views(train, test.cameras, apart, pool, planned.unseen)
     pool = ViewSet(planned.cameras, splits=splits_of(None, names))
     mask = split_mask(None, names, "test")
     train = pool.take(~mask).resized(size)
@@ -418,19 +419,33 @@ def _table(run: Run, report: dict[str, Any]) -> None:
     )
 
 
-def _warn(run: Run, report: dict[str, Any]) -> None:
-    """Where recovery lost, and what no view saw."""
+def _told(report: dict[str, Any]) -> list[str]:
+    """What recovery kept, where it lost, and what no view saw, a line each."""
+    from g2ard.recover.optimize import outcome
+
+    lines = [outcome(done) for entry in report["rounds"] for done in entry.get("recover", [])]
+    told = [line for line in lines if line is not None]
     for kind, what in (("scores", "unseen views"), ("apart", "views of another kind")):
         if not report[kind]:
             continue
         before, after = (report[kind][name]["psnr"] for name in ("simplified", "recovered"))
         if after < before - _LOSS:
-            run.say(
+            told.append(
                 f"warning: recovery lost {before - after:.2f} dB in {what}: the simplified scene is better"
                 " there (g2ard simplify makes it)"
             )
+            continue
+        pairs = zip(*(report[kind][name]["views"] for name in ("simplified", "recovered")), strict=True)
+        lost = sum(b["psnr"] < a["psnr"] - _LOSS for a, b in pairs)
+        if lost:
+            told.append(
+                f"{lost} of {len(report[kind]['recovered']['views'])} {what} lost, though all together gained"
+            )
     if report["unseen"]:
-        run.say(f"no view sees {report['unseen']:.0%} of the scene's matter: it is simplified, not recovered")
+        told.append(
+            f"no view sees {report['unseen']:.0%} of the scene's matter: it is simplified, not recovered"
+        )
+    return told
 
 
 def _say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:

@@ -11,7 +11,7 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import OutputOption, SceneArgument, Triple
 
-_KINDS = ("auto", "orbit", "walk", "aerial")
+_KINDS = ("auto", "orbit", "walk", "aerial", "inside", "focus")
 
 
 class _Size(tuple[int, int]):
@@ -51,7 +51,7 @@ def poses(
         typer.Option(
             parser=_kind,
             metavar="|".join(_KINDS),
-            help="Around an object, through rooms and streets, from the air; auto: by the scene's shape.",
+            help="Around, through rooms and streets, from the air, within rooms, where it is sharp.",
         ),
     ] = "auto",
     count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many poses.")] = 128,
@@ -92,4 +92,14 @@ def poses(
     write_views(output, pool.cameras, splits=splits, overwrite=run.overwrite)
     direction = ", ".join(f"{v:.2f}" for v in pool.up)
     run.say(f"{output}: {count} poses, {pool.kind} ({pool.why}; up is {direction})")
-    run.result({"count": count, "kind": pool.kind, "why": pool.why, "up": pool.up.tolist()})
+    run.say(f"no pose sees {pool.unseen:.0%} of the scene's matter; {pool.coarse:.0%} only under a pixel")
+    run.result(
+        {
+            "count": count,
+            "kind": pool.kind,
+            "why": pool.why,
+            "up": pool.up.tolist(),
+            "unseen": pool.unseen,
+            "coarse": pool.coarse,
+        }
+    )

@@ -86,6 +86,9 @@ def simplify(
     io.write_splats(output, small.splats, overwrite=run.overwrite)
     written = time.perf_counter()
     _tell(run, small)
+    if small.report["unseen"]:
+        share = small.report["unseen"] / len(found.splats)
+        run.say(f"no view sees {share:.0%} of the Gaussians: they count by their own size alone")
     run.say(f"{output}: {len(small.splats):,} of {len(found.splats):,} Gaussians in {written - began:.1f} s")
     run.result(
         {
