@@ -270,7 +270,7 @@ def looker(
     """A function that tells what a few small renders see of a scene, as `g2ard.simplify.simplify` takes it.
 
     It looks from sixteen views at a time until the next sixteen find under 1 % more of the Gaussians: an
-    object takes 32 views, a room all (`docs/benchmarks.md`). The first scene decides how many; for the later
+    object of half a million takes 32 views, a small one 80, a room all (`docs/benchmarks.md`). The first scene decides how many; for the later
     ones the views stay the same, so that the sums compare. What it tells depends on the scene's content
     alone, not on the order of its rows.
 
@@ -303,7 +303,8 @@ def looker(
             views = [view_of(here, i, settings) for i in glance]
             before, seen = seen, sums.add(views, settings.choices, counter(progress, "visibility"))
             converged = number > 1 and seen - before < _CONVERGED * len(scene)
-            if number == enough or (not enough and converged):
+            cheap = number * _GLANCE * len(scene) < _CHEAP
+            if number == enough or (not enough and converged and not cheap):
                 break
         enough = number
         weight, pixel_size = sums.by_row()
@@ -314,6 +315,9 @@ def looker(
 
 _GLANCE = 16
 """Views looked from at a time."""
+
+_CHEAP = 6_000_000
+"""Gaussians times views up to which looking on costs next to nothing."""
 
 _NEAR_SAMPLE = 65_536
 """Gaussians, at most, that tell how large a scene is."""
