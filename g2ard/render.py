@@ -270,9 +270,9 @@ def looker(
     """A function that tells what a few small renders see of a scene, as `g2ard.simplify.simplify` takes it.
 
     It looks from sixteen views at a time until the next sixteen find under 1 % more of the Gaussians: an
-    object of half a million takes 32 views, a small one 80, a room all (`docs/benchmarks.md`). The first scene decides how many; for the later
-    ones the views stay the same, so that the sums compare. What it tells depends on the scene's content
-    alone, not on the order of its rows.
+    object of half a million takes 32 views, a small one 80, a room all (`docs/decisions.md`). The first scene
+    decides how many; for the later ones the views stay the same, so that the sums compare. What it tells
+    depends on the scene's content alone, not on the order of its rows.
 
     Args:
         cameras: at most `views` of them are used, evenly spaced.
