@@ -70,7 +70,7 @@ def test_rounds_take_the_time_they_are_given(bench: RecoverBench, tmp_path: Path
     assert [look.variant for look in ends] == ["one-shot", "rounds", "light-rounds"]
     assert {look.count for look in ends} == {500}
     for look in ends:
-        assert 1.0 <= look.seconds < 1.6
+        assert 0.9 <= look.seconds < 1.6  # a round that only loses ends at three quarters of its time
     assert any(look.count > 500 for look in found)  # looks within rounds
 
 
