@@ -109,7 +109,7 @@ def distill(
         config: see `DistillConfig`.
         weights: (C,) how often to draw each view, where that is known already; None weighs them here.
         validation: a few views of another kind, never learned from, which decide how much of recovery's
-            changes stays, see `g2ard.recover.recover`.
+            changes stays where they lose, see `g2ard.recover.recover`.
         work: a folder for finished rounds and checkpoints; a second call with the same inputs goes on there.
         progress: told of all stages.
         watch: called after every step of every recovery, see `g2ard.recover.recover`.
@@ -284,11 +284,7 @@ class _Rounds:
         self.seconds["recover"] += entry["recover"][-1]["seconds"]
 
     def _steps(self) -> int | None:
-        """The final horizon: as asked for, the paper's, or by need.
-
-        A teacher can be learned from as long as it pays; photos are learned by heart: the city's 84 at
-        2,250 steps 21.54 dB in others, at 1,000 21.55.
-        """
+        """The final horizon: as asked for, the schedule's, or by need where a teacher renders the targets."""
         from g2ard.recover.need import steps_for
 
         schedule = self.config.schedule

@@ -24,7 +24,7 @@ from g2ard.recover import RecoverConfig, probe, recover
 from g2ard.recover import checkpoint as checkpoint_module
 from g2ard.recover.anchors import PRESETS, Anchors, Regularizers
 from g2ard.recover.guard import Guard, blended
-from g2ard.recover.optimize import outcome
+from g2ard.recover.outcome import outcome
 from g2ard.recover.schedule import PAPER, TUNED
 from g2ard.simplify import simplify
 from g2ard.splats import Splats

@@ -36,7 +36,8 @@ def make_pool(
         splats: the scene, any unit, origin and orientation.
         count: how many.
         kind: "orbit" (around an object, elevations −5° to 50°), "walk" (in free space at eye height, through
-            rooms and streets), "aerial" (straight down and oblique), or "auto": within rooms as far as the
+            rooms and streets), "aerial" (straight down and oblique), "inside" (where matter is all around),
+            "focus" (free places whose image is full and fine), or "auto": within rooms as far as the
             scene lies within such; orbit for an object, three quarters aerial and a quarter walk for a
             landscape, as far as it is in focus from there; the rest walks or stands where it is in focus.
         size: width and height in pixels.

@@ -14,7 +14,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.recover import checkpoint as checkpoints
@@ -28,7 +27,7 @@ from g2ard.recover.sizes import typical_share
 from g2ard.splats import Splats
 from g2ard.targets import Targets, fingerprint_of, mask_of
 
-__all__ = ["Recovered", "Watch", "outcome", "recover"]
+__all__ = ["Recovered", "Watch", "recover"]
 
 _TRIAL_STEPS = 20
 _TRIAL_SHARE, _CALM_SHARE = 0.1, 0.3
@@ -119,9 +118,9 @@ def recover(
         weights: (C,) how often each view is drawn, in proportion; None draws all equally often.
         anchors: frozen geometry; None freezes the student as given.
         validation: a few views of another kind than `targets` (nearer, or from where people stand), never
-            learned from: they decide how much of what the steps changed stays, Gaussian by Gaussian as it
-            was seen (`g2ard.recover.guard`), and end a recovery that they only lose by. At most eight are
-            looked at.
+            learned from: where they lose, they decide how much of what the steps changed stays, Gaussian by
+            Gaussian as it was seen (`g2ard.recover.guard`), and end a recovery that they only lose by. At
+            most eight are looked at.
         checkpoint: a file written every minute and at Ctrl-C; if it is there, recovery goes on from it, and
             the result is bitwise that of never having stopped.
         progress: told of every step, with loss, PSNR of a few training views and steps/s.
@@ -138,7 +137,7 @@ def recover(
     config = config or RecoverConfig()
     if not len(student) or not len(targets.cameras):
         raise InputError(f"recover: {len(student)} Gaussians and {len(targets.cameras)} views: nothing to do")
-    if not _seen(student, targets.cameras):
+    if not targets.cameras.facing(student.means.astype(np.float64) + student.offset).any():
         raise InputError(f"recover: none of the {len(targets.cameras)} views sees the scene")
     if config.sh_degree is not None:
         student = student.with_sh_degree(config.sh_degree)
@@ -183,48 +182,6 @@ def recover(
             "skipped": {"non_finite": loop.skipped},
         },
     )
-
-
-def outcome(report: dict[str, Any]) -> str | None:
-    """One line about a recovery that did not simply go well; None for one that did.
-
-    >>> outcome({"kept_start": False, "backed_off": [], "stopped": None, "way": 1.0}) is None
-    True
-    >>> lost = [{"step": 30, "psnr": 23.35}]
-    >>> outcome({"kept_start": False, "backed_off": lost, "stopped": None, "psnr": {"before": 32.9}})
-    'recovery fell to 23.35 dB (start 32.90) at step 30: it went on from the best with a third of the rates'
-    """
-    start = f"(start {report['psnr']['before']:.2f})" if report["backed_off"] else ""
-    lines = [f"{found['psnr']:.2f} dB {start} at step {found['step']}" for found in report["backed_off"]]
-    if report["kept_start"]:
-        why = "every step only made the training views worse"
-        looks = (report["validation"] or {"looks": []})["looks"]
-        if len(looks) > 2 and looks[-1]["psnr"] == looks[0]["psnr"]:
-            first, worst = looks[0]["psnr"], looks[-2]["psnr"]
-            why = f"views of another kind only lost by the steps ({first:.2f} → {worst:.2f} dB)"
-        if lines:
-            why = f"recovery fell to {', '.join(lines)}, and slower rates gained nothing"
-        given_up = "" if report["stopped"] is None else f"; given up at step {report['stopped']}"
-        return f"kept the simplified scene: {why}{given_up}"
-    if lines:
-        thirds = "a third" if len(lines) == 1 else f"1/{3 ** len(lines)}"
-        return f"recovery fell to {', '.join(lines)}: it went on from the best with {thirds} of the rates"
-    if report["way"] < 1:
-        return (
-            "recovery ended below its start in the training views: the scene goes"
-            f" {report['way']:.0%} of the way to where it ended, which is above both"
-        )
-    return None
-
-
-def _seen(scene: Splats, cameras: Cameras) -> bool:
-    """Whether any view has the middle of a Gaussian in its image; a sample usually tells."""
-    some = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), 1024)).round().astype(int))
-    for rows in (some, slice(None)):
-        points = scene.means[rows].astype(np.float64) + scene.offset
-        if any(cameras.take([view]).holds(points).any() for view in range(len(cameras))):
-            return True
-    return False
 
 
 class _Loop:

@@ -58,7 +58,7 @@ _WORK = ".unfinished"
 _POOL = 160
 """Poses of a pool made for a scene without views; every 8th is held out for scoring."""
 _APART = 24
-"""Views of another kind: half of them decide how much of recovery's changes stays, half are scored."""
+"""Views of another kind: half of them validate recovery, half are scored."""
 _ROWS = 200_000
 """Gaussians that poses are planned on."""
 _LOSS = 0.05
@@ -294,8 +294,8 @@ def _views(
             train = drop_held_out(run, train, test.cameras)
         if found and not size:
             train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
-        return _Views(train, test.cameras, _planned(run, prior, needed=False).apart if teach else None)
-    planned = _planned(run, prior, needed=True)
+        return _Views(train, test.cameras, _near(run, prior, size) if teach else None)
+    planned = _planned(run, prior, _POOL)
     apart = planned.apart and planned.apart.resized(size)
     names = planned.cameras.names
     run.say(f"poses: {planned.kind} ({planned.why})")
@@ -310,27 +310,22 @@ def _views(
     return _Views(train, pool.take(mask).resized(size).cameras, apart, pool, planned.unseen)
 
 
-def _planned(run: Run, prior: Splats, *, needed: bool) -> Pool:
-    """A pool for the scene; where only views of another kind are wanted, a small one, empty if need be."""
-    import numpy as np
+def _planned(run: Run, prior: Splats, count: int) -> Pool:
+    """A pool of `count` views, and views of another kind."""
+    from g2ard.poses import plan_pool
 
-    from g2ard.cameras import Cameras
+    return plan_pool(prior, count, seed=run.seed, rows=_ROWS, apart=_APART, progress=run.progress)
+
+
+def _near(run: Run, prior: Splats, size: int | None) -> Cameras | None:
+    """Views of another kind beside those that were given; None where the scene has no place for any."""
     from g2ard.errors import InputError
-    from g2ard.poses import Pool, plan_pool
 
     try:
-        return plan_pool(
-            prior,
-            _POOL if needed else _APART,
-            seed=run.seed,
-            rows=_ROWS,
-            apart=_APART,
-            progress=run.progress,
-        )
+        apart = _planned(run, prior, _APART).apart
     except InputError:
-        if needed:
-            raise
-        return Pool(Cameras.from_lists([], [], [], []), "none", "no free place", np.zeros(3))
+        return None
+    return apart and apart.resized(size)
 
 
 def _apart_targets(
@@ -339,9 +334,9 @@ def _apart_targets(
     """Every second view of another kind to validate with, the others to score; None without a teacher."""
     if cameras is None or teacher is None or len(cameras) < 2:
         return None, None
-    rows = range(len(cameras))
-    parts = [cameras.take([i for i in rows if i % 2 == which]) for which in (0, 1)]
-    validation, scored = (make_targets(run, part, teacher, colour) for part in parts)
+    validation, scored = (
+        make_targets(run, cameras.take(range(first, len(cameras), 2)), teacher, colour) for first in (0, 1)
+    )
     return validation, scored
 
 
@@ -421,7 +416,7 @@ def _table(run: Run, report: dict[str, Any]) -> None:
 
 def _told(report: dict[str, Any]) -> list[str]:
     """What recovery kept, where it lost, and what no view saw, a line each."""
-    from g2ard.recover.optimize import outcome
+    from g2ard.recover.outcome import outcome
 
     lines = [outcome(done) for entry in report["rounds"] for done in entry.get("recover", [])]
     told = [line for line in lines if line is not None]

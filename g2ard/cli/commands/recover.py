@@ -54,7 +54,7 @@ def recover(
     from g2ard.io import check_scene_output, write_splats
     from g2ard.recover import RecoverConfig
     from g2ard.recover import recover as optimize
-    from g2ard.recover.optimize import outcome
+    from g2ard.recover.outcome import outcome
     from g2ard.recover.presets import preset_for
     from g2ard.recover.schedule import schedule_named
 
