@@ -15,7 +15,7 @@ _VIEWS, _POINTS = 16, 4096
 """Looked at to find out."""
 
 _MOST = 2.25
-"""Times the schedule's steps, at most: what a room of 275,000 Gaussians does in four minutes on two cores."""
+"""Times the schedule's steps, at most: recovery must end in minutes."""
 
 
 def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
