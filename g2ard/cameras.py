@@ -14,6 +14,9 @@ from g2ard.errors import InputError
 
 __all__ = ["Cameras", "look_at"]
 
+_MEDIAN_OF = 16
+"""Views that stand for all of them."""
+
 
 @dataclass(frozen=True, eq=False)
 class Cameras:
@@ -145,6 +148,11 @@ class Cameras:
         ahead = np.where(front, z, 1.0)
         u, v = K[0, 0] * x / ahead + K[0, 2], K[1, 1] * y / ahead + K[1, 2]
         return front & (u >= 0) & (u <= self.widths[0]) & (v >= 0) & (v <= self.heights[0])
+
+    def usual_share(self, points: ArrayLike) -> float:
+        """Share of some points, (N, 3) in the world, that a view holds: the median over 16 views at most."""
+        some = np.unique(np.linspace(0, len(self) - 1, min(len(self), _MEDIAN_OF)).round().astype(int))
+        return float(np.median([self.take([view]).holds(points).mean() for view in some]))
 
     def recentred(self, offset: ArrayLike) -> Cameras:
         """The same views in coordinates whose origin is the world point `offset` (see `Splats.offset`)."""

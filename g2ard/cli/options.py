@@ -95,10 +95,10 @@ RatioOption = Annotated[
 SceneArgument = Annotated[
     Path, typer.Argument(metavar="SCENE", help="A .ply (3DGS), SOG, .spz, .splat or .compressed.ply.")
 ]
+Protocol = Literal["pool", "standing", "both"]
 ProtocolOption = Annotated[
-    str,
+    Protocol,
     typer.Option(
-        metavar="pool|standing|both",
         help="Views that are scored: held out of the pool, or near ones and those where people stand.",
     ),
 ]
@@ -177,6 +177,24 @@ def _colour(text: str) -> Triple:
     return Triple((values[0], values[1], values[2]))
 
 
+def _direction(text: str) -> Triple:
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not (all(abs(v) < 1e30 for v in (x, y, z)) and any((x, y, z))):
+        raise typer.BadParameter(f"a direction such as 0,0,1 or 0,-1,0, not {text!r}")
+    return Triple((x, y, z))
+
+
+UpOption = Annotated[
+    Triple | None,
+    typer.Option(
+        parser=_direction,
+        metavar="X,Y,Z",
+        help="Away from the ground, for poses that are made; estimated unless given.",
+    ),
+]
 SplitOption = Annotated[
     str, typer.Option(metavar="train|test|all", help="By the views' split file, else every 8th name is test.")
 ]

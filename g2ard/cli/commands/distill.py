@@ -24,6 +24,8 @@ from g2ard.cli.options import (
     ScheduleName,
     SizeOption,
     TimeLimitOption,
+    Triple,
+    UpOption,
     ViewsOrMadeOption,
     budget_of,
     can_judge,
@@ -55,8 +57,9 @@ if TYPE_CHECKING:
 
 _WORK = ".unfinished"
 """In the folder of the run: finished rounds and checkpoints. Nobody else has a folder of this name."""
-_POOL = 160
-"""Poses of a pool made for a scene without views; every 8th is held out for scoring."""
+_POOL, _GROW = 160, 2.0
+"""Poses of a pool made for a scene without views, and how many times as many there may be where a view holds
+little of it; every 8th is held out for scoring."""
 _APART = 24
 """Views of another kind: half of them validate recovery, half are scored."""
 _ROWS = 200_000
@@ -141,6 +144,7 @@ def distill(
     resume: ResumeOption = False,
     size: SizeOption = None,
     background: BackgroundOption = None,
+    up: UpOption = None,
 ) -> None:
     """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget.
 
@@ -149,6 +153,8 @@ def distill(
     one_budget(count, ratio)
     one_horizon(steps, time_limit)
     can_judge(k, policy)
+    if is_made(str(held_out)):
+        raise typer.BadParameter("--held-out: a file of views; those that are made hold out every 8th anyway")
     given = views is not None and not is_made(views)
     run.spare_inputs(output / "scene.ply", *([output / "views.json"] if not given else []))
     import shutil
@@ -167,18 +173,22 @@ def distill(
     lifted = kind(scene) != "splats"
     if lifted and not given:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
+    if photos and is_made(views):
+        raise typer.BadParameter("--photos: views that are made have none")
     if not left_at(output / _WORK):
         check_output(output, run.overwrite, folder=True)
     check_stopped(run, output / _WORK, resume)
     prior = _lift(run, scene) if lifted else load_scene(run, scene)
     budget = budget_of(scene, count, ratio, len(prior))
-    looks = _views(run, scene, prior, views, held_out, size, teach=not lifted and photos is not True)
+    looks = _views(run, scene, prior, views, held_out, size, up, teach=not lifted and photos is not True)
     train, test = looks.train.cameras, looks.test
     pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
     use_photos = lifted or (pictured if photos is None else photos)
     teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
     colour = background or (0.0, 0.0, 0.0)
-    regularizers, why, measured = preset_for(preset, prior, train, paper=schedule == "paper")
+    regularizers, why, measured = preset_for(
+        preset, prior, train if use_photos else None, paper=schedule == "paper"
+    )
     run.say(f"{len(prior):,} → {budget:,} Gaussians; {len(train)} views against {against}")
     run.say(f"regularisers: {why}")
     config = DistillConfig(
@@ -276,6 +286,7 @@ def _views(
     views: Path | None,
     held_out: Path | None,
     size: int | None,
+    up: Triple | None,
     *,
     teach: bool,
 ) -> _Views:
@@ -294,8 +305,8 @@ def _views(
             train = drop_held_out(run, train, test.cameras)
         if found and not size:
             train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
-        return _Views(train, test.cameras, _near(run, prior, size) if teach else None)
-    planned = _planned(run, prior, _POOL)
+        return _Views(train, test.cameras, _near(run, prior, size, up) if teach else None)
+    planned = _planned(run, prior, _POOL, up, _GROW)
     apart = planned.apart and planned.apart.resized(size)
     names = planned.cameras.names
     run.say(f"poses: {planned.kind} ({planned.why})")
@@ -310,19 +321,21 @@ def _views(
     return _Views(train, pool.take(mask).resized(size).cameras, apart, pool, planned.unseen)
 
 
-def _planned(run: Run, prior: Splats, count: int) -> Pool:
-    """A pool of `count` views, and views of another kind."""
+def _planned(run: Run, prior: Splats, count: int, up: Triple | None, grow: float = 1.0) -> Pool:
+    """A pool of `count` views or up to `grow` times as many, and views of another kind."""
     from g2ard.poses import plan_pool
 
-    return plan_pool(prior, count, seed=run.seed, rows=_ROWS, apart=_APART, progress=run.progress)
+    return plan_pool(
+        prior, count, up=up, seed=run.seed, rows=_ROWS, apart=_APART, grow=grow, progress=run.progress
+    )
 
 
-def _near(run: Run, prior: Splats, size: int | None) -> Cameras | None:
+def _near(run: Run, prior: Splats, size: int | None, up: Triple | None) -> Cameras | None:
     """Views of another kind beside those that were given; None where the scene has no place for any."""
     from g2ard.errors import InputError
 
     try:
-        apart = _planned(run, prior, _APART).apart
+        apart = _planned(run, prior, _APART, up).apart
     except InputError:
         return None
     return apart and apart.resized(size)

@@ -71,7 +71,7 @@ def recover(
     if weights is not None:
         run.say(f"{len(weights)} views, drawn by their weights")
     regularizers, why, measured = preset_for(
-        preset, dense or splats, chosen.cameras, paper=schedule == "paper"
+        preset, dense or splats, None if dense else chosen.cameras, paper=schedule == "paper"
     )
     run.say(f"regularisers: {why}")
     config = RecoverConfig(

@@ -106,6 +106,11 @@ def _write(run: Run, output: Path, pool: ViewSet, chosen: Any, weights: Any) -> 
         weights=[*weights, *[np.nan] * len(held_out)],
         overwrite=run.overwrite,
     )
+    tests = sum(pool.splits[i] not in ("train", None) for i in chosen)
+    if tests:
+        run.say(
+            f"{tests} of the chosen views are held out: they keep their split, and recovery leaves them out"
+        )
     if held_out:
         words = ", ".join(sorted({str(pool.splits[i]) for i in held_out}))
         run.say(f"{len(held_out)} views held out ({words}) follow the chosen ones")

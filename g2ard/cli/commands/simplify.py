@@ -14,6 +14,7 @@ from g2ard.cli.options import (
     OutputOption,
     RatioOption,
     SceneArgument,
+    UpOption,
     ViewsOrMadeOption,
     budget_of,
     is_made,
@@ -22,6 +23,7 @@ from g2ard.cli.options import (
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
+    from g2ard.cli.options import Triple
     from g2ard.simplify import Simplified
     from g2ard.splats import Splats
 
@@ -49,6 +51,7 @@ def simplify(
         float | None,
         typer.Option(help="Share of the Gaussians that a round keeps; the method's own if absent."),
     ] = None,
+    up: UpOption = None,
 ) -> None:
     """Reduce a scene to an exact number of Gaussians; no images needed.
 
@@ -73,7 +76,7 @@ def simplify(
     read = time.perf_counter()
     budget = budget_of(scene, count, ratio, len(found.splats))
     looks = not no_views and budget < len(found.splats)
-    cameras = _cameras(run, scene, found.splats, views, method) if looks else None
+    cameras = _cameras(run, scene, found.splats, views, method, up) if looks else None
     small = reduce(
         found.splats,
         budget,
@@ -106,7 +109,9 @@ def simplify(
     )
 
 
-def _cameras(run: Run, scene: Path, splats: Splats, views: Path | None, method: str) -> Cameras | None:
+def _cameras(
+    run: Run, scene: Path, splats: Splats, views: Path | None, method: str, up: Triple | None
+) -> Cameras | None:
     """The views given, else those beside the scene, else a few of its own where it leaves room for them."""
     from g2ard.cli.found import as_pool, found_views
     from g2ard.cli.scenes import load_views
@@ -126,7 +131,7 @@ def _cameras(run: Run, scene: Path, splats: Splats, views: Path | None, method: 
     from g2ard.poses import make_pool
 
     try:
-        return make_pool(splats, _VIEWS, seed=run.seed, rows=_ROWS, progress=run.progress)
+        return make_pool(splats, _VIEWS, up=up, seed=run.seed, rows=_ROWS, progress=run.progress)
     except InputError as e:
         run.say(f"goes on without views: {e}")
         return None
