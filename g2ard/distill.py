@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from g2ard.progress import Progress, silent
 from g2ard.recover import checkpoint as checkpoints
-from g2ard.recover.anchors import PRESETS, Regularizers
+from g2ard.recover.anchors import PRESETS, Anchors, Regularizers
 from g2ard.recover.draw import checked_weights
 from g2ard.recover.schedule import TUNED, Schedule
 from g2ard.splats import Splats
@@ -73,7 +73,8 @@ class Distilled:
 
     Args:
         splats: exactly `budget` Gaussians.
-        simplified: the same Gaussians before their last recovery: its anchors.
+        simplified: the same Gaussians as they were made, before any recovery at this count: the anchors of all
+            that followed, and what Drift95 is measured from.
         report: rounds [{simplify, recover}], seconds {select, simplify, recover}, and views {policy,
             candidates, chosen [names], weighted, refused [names], left_out}: the last is what the views not
             chosen would have added to the policy's objective, as a share of the whole pool's; None where
@@ -270,6 +271,7 @@ class _Rounds:
                 self.supervision.targets,
                 config,
                 weights=self.supervision.weights,
+                anchors=Anchors.of(self.simplified, self.config.regularizers.in_plane),
                 validation=self.validation,
                 checkpoint=checkpoint,
                 progress=self.progress,
