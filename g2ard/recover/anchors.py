@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.errors import require
 from g2ard.splats import Splats
 
 __all__ = [
@@ -35,6 +36,9 @@ class Regularizers:
         period: steps from one addition to the next.
         in_plane: r∥ of the trust region, over the mean tangential scale; r⊥ is the smallest scale. The paper
             says r∥ ≫ r⊥ only.
+
+    Raises:
+        InputError: a value out of range.
     """
 
     anchor: float
@@ -42,6 +46,13 @@ class Regularizers:
     effective_rank: bool
     period: int = 100
     in_plane: float = 3.0
+
+    def __post_init__(self) -> None:
+        for name in ("anchor", "shape"):
+            value = getattr(self, name)
+            require(name, value, 0 <= value < float("inf"), "a weight, at least 0")
+        require("period", self.period, self.period >= 1, "at least 1")
+        require("in_plane", self.in_plane, 0 < self.in_plane < float("inf"), "more than 0")
 
     @property
     def active(self) -> bool:

@@ -109,8 +109,8 @@ def recover(
 
     L = (1−λ)·L1 + λ·(1−SSIM), and every `period` steps + λ_a·L_anchor + λ_s·L_shape. No Gaussian is added
     or removed. Where the steps lose against the student, by PSNR of some training views, recovery goes back,
-    and on with a third of the rates; a student that is only made worse is returned as it is. (A schedule that is
-    not `guarded`, the paper's, takes all its steps, whatever comes of them.)
+    and on with a third of the rates; a student that is only made worse is returned as it is.
+    A schedule that is not `guarded`, as the paper's, takes all its steps, whatever comes of them.
 
     Args:
         student: the scene to recover; its offset counts, cameras are in world coordinates.
@@ -306,9 +306,7 @@ class _Loop:
     def _learn(
         self, engine: Engine, step: int, share: float, multiplier: float, *, regularize: bool = False
     ) -> float:
-        rates = self.schedule.at(
-            share, final=self.config.final, multiplier=multiplier, reach=self.reach
-        )
+        rates = self.schedule.at(share, final=self.config.final, multiplier=multiplier, reach=self.reach)
         view = self._view(step)
         target, mask = self.targets[view], mask_of(self.targets, view)
         return engine.step(view, target, rates, regularize=regularize, mask=mask)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from g2ard.errors import InputError
 
@@ -89,6 +89,14 @@ class SimplifyConfig:
     def min_opacity_of(self, method: str) -> float:
         """The α below which `method` drops."""
         return _MIN_OPACITY[method] if self.min_opacity is None else self.min_opacity
+
+    def resolved(self, method: str) -> SimplifyConfig:
+        """The same with the method's own constants where None stands for them.
+
+        >>> SimplifyConfig().resolved("paper").retention
+        0.75
+        """
+        return replace(self, retention=self.retention_of(method), min_opacity=self.min_opacity_of(method))
 
 
 def schedule(count: int, budget: int, retention: float = 0.75) -> list[int]:

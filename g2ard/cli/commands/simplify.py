@@ -12,6 +12,7 @@ from g2ard.cli.options import (
     CountOption,
     Method,
     OutputOption,
+    PaperOption,
     RatioOption,
     SceneArgument,
     ViewsOrMadeOption,
@@ -32,7 +33,7 @@ _ROWS = 100_000
 """Gaussians that those are planned on."""
 
 
-@command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply")
+@command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply", constants=True)
 def simplify(
     run: Run,
     scene: SceneArgument,
@@ -49,6 +50,7 @@ def simplify(
         float | None,
         typer.Option(help="Share of the Gaussians that a round keeps; the method's own if absent."),
     ] = None,
+    preset: PaperOption = None,
 ) -> None:
     """Reduce a scene to an exact number of Gaussians; no images needed.
 
@@ -58,6 +60,7 @@ def simplify(
     import time
 
     from g2ard import io
+    from g2ard.constants import changed, listed
     from g2ard.render import looker
     from g2ard.simplify import SimplifyConfig
     from g2ard.simplify import simplify as reduce
@@ -65,6 +68,8 @@ def simplify(
     one_budget(count, ratio)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other")
+    values = run.constants(simplify=SimplifyConfig(), over_options=True)
+    config = changed(SimplifyConfig(retention=retention), "simplify", values)
     io.check_scene_output(output, run.overwrite)
     began = time.perf_counter()
     found = io.read_scene(scene)
@@ -79,7 +84,7 @@ def simplify(
         budget,
         method=method,
         visibility=None if cameras is None else looker(cameras, progress=run.progress),
-        config=SimplifyConfig(retention=retention),
+        config=config,
         progress=run.progress,
     )
     simplified = time.perf_counter()
@@ -94,6 +99,7 @@ def simplify(
         {
             **small.report,
             "method": method,
+            "constants": listed({"simplify": config.resolved(method)}),
             "notes": {note.code: note.count for note in found.notes},
             "seconds": {
                 "read": read - began,
