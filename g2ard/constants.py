@@ -1,7 +1,7 @@
 """Constants by name: the fields of config dataclasses, as `--set`, config files and reports write them.
 
 A config is a dataclass whose fields are constants, or configs in their turn. A constant has its field's name
-after that of the config it stands in: `rates.means`, `simplify.max_energy`. What a new field is called follows
+after that of the config it stands in: `rates.means`, `simplify.max_energy`. What a new field is called comes
 from its class: nothing is listed. A field whose metadata says `constant=False` is worked out by the program,
 and none; one with a `prefix` names the constants of the config it holds by that.
 """
