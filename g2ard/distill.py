@@ -140,8 +140,8 @@ def distill(
 
     config = config or DistillConfig()
     many = config.schedule.round_steps > 0
-    retention = config.simplify.retention or 0.75
-    counts = counts_of(len(prior), budget, retention) if many else [budget]
+    kept, fold = config.simplify.retention or 0.75, config.simplify.fold
+    counts = counts_of(len(prior), budget, kept, fold) if many else [budget]
     rounds = _Rounds(prior, budget, targets, config, len(counts), weights, validation, work, progress, watch)
     for number, count in enumerate(counts, start=1):
         rounds.advance(number, count, final=number == len(counts))
