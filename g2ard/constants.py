@@ -133,14 +133,13 @@ def _full(name: str, known: Mapping[str, Any]) -> str:
         return same[0]
     if same:
         raise InputError(f"{name!r} could be {' or '.join(same)}")
-    last = {full.rpartition(".")[2]: full for full in known}
-    near = get_close_matches(name, known, 3, 0.6)
-    near += [last[key] for key in get_close_matches(name.rpartition(".")[2], last, 3, 0.6)]
-    prefix = name.partition(".")[0] + "."
-    hint = list(dict.fromkeys(near))[:3] or [full for full in known if full.startswith(prefix)]
-    if hint:
-        raise InputError(f"no constant {name!r}; did you mean {' or '.join(hint)}?")
-    raise InputError(f"no constant {name!r}; there are {', '.join(known)}")
+    prefix, _, last = name.rpartition(".")
+    close = get_close_matches(last, sorted({full.rpartition(".")[2] for full in known}), 3, 0.6)
+    near = [full for word in close for full in known if full.endswith(f".{word}")]
+    if near:
+        raise InputError(f"no constant {name!r}; did you mean {' or '.join(near)}?")
+    within = [full for full in known if full.startswith(f"{prefix}.")]
+    raise InputError(f"no constant {name!r}; there are {', '.join(within or known)}")
 
 
 def _read(name: str, text: str, kind: Any) -> Any:

@@ -51,15 +51,15 @@ class Recovered:
     Args:
         splats: same count and order as the student.
         report: steps, seconds, loss (one mean per 1 % of the horizon), psnr {before, after} over a sample of
-            the training views, multiplier, reach (None is no limit), trials (those that chose the
-            multiplier), drift95, needle, geometry (ten of {step, drift95, needle} on the way), regularizers
-            {steps, share of the time}, skipped, backed_off (a list of {step, psnr}: where so much was lost
-            that recovery went on from the best scene with a third of the rates), stopped (the step at which
-            it was given up, else None), way (how far the result goes from the student to where the steps
-            ended: 1 but where that lost), kept_start: whether the student was better than all that came of
-            it, and is the result, and validation: None without such views, else looks (a list of {step,
-            psnr}, last of the result) and doubt (a Gaussian that v views touched keeps v/(v + doubt) of its
-            change; None where all keep the same part, or none).
+            the training views, multiplier, reach (None is no limit), extent (of the cameras), trials (those
+            that chose the multiplier), drift95, needle, geometry (ten of {step, drift95, needle} on the way),
+            regularizers {steps, share of the time}, skipped, backed_off (a list of {step, psnr}: where so
+            much was lost that recovery went on from the best scene with a third of the rates), stopped (the
+            step at which it was given up, else None), way (how far the result goes from the student to where
+            the steps ended: 1 but where that lost), kept_start: whether the student was better than all that
+            came of it, and is the result, and validation: None without such views, else looks (a list of
+            {step, psnr}, last of the result) and doubt (a Gaussian that v views touched keeps v/(v + doubt)
+            of its change; None where all keep the same part, or none).
     """
 
     splats: Splats
@@ -170,6 +170,7 @@ def recover(
             "psnr": {"before": before, "after": after},
             "multiplier": loop.multiplier,
             "reach": _finite(loop.reach),
+            "extent": targets.cameras.extent,
             "trials": loop.trials,
             "drift95": drift95(anchors, result.means),
             "needle": needle(result.scales),
