@@ -33,7 +33,7 @@ _ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 
 @dataclass(frozen=True)
 class DistillConfig:
-    """How a scene is distilled.
+    """How a scene is distilled; the paper's way is `g2ard.preset("paper").distill`.
 
     Args:
         method: simplification's: default, fast or paper.
