@@ -131,13 +131,13 @@ def test_commands_take_constants_and_report_them(
 
 
 def test_constants_in_a_config_file_and_over_it(folder: Path, command_line: CommandLine) -> None:
-    table = "[simplify]\nratio = 4\n[simplify.set]\nsimplify.max_growth = 1.5\nneighbors = 5\n"
-    (folder / "c.toml").write_text(table)
     ask = ("simplify", "a.ply", "-o", "out.ply", "--config", "c.toml", "--json", "-", "-w")
-    status, out, error = command_line(*ask, "--set", "neighbors=4", cwd=folder)
-    assert status == 0, error
-    constants = json.loads(out)["constants"]["simplify"]
-    assert (constants["max_growth"], constants["neighbors"], constants["retention"]) == (1.5, 4, 0.65)
+    for tables in ("[simplify]\nratio = 4\n[simplify.set]\n", "ratio = 4\n[set]\n"):
+        (folder / "c.toml").write_text(f"{tables}simplify.max_growth = 1.5\nneighbors = 5\n")
+        status, out, error = command_line(*ask, "--set", "neighbors=4", cwd=folder)
+        assert status == 0, error
+        constants = json.loads(out)["constants"]["simplify"]
+        assert (constants["max_growth"], constants["neighbors"], constants["retention"]) == (1.5, 4, 0.65)
     for content, words in (
         ("[simplify.set]\nmax_grow = 1.5\n", "did you mean simplify.max_growth"),
         ("[simplify]\nset = 3\n", "a table of constants"),

@@ -61,7 +61,9 @@ def _load_config(ctx: typer.Context, path: Path | None) -> Path | None:
         raise typer.BadParameter(f"{path}: not a text file") from None
     except tomllib.TOMLDecodeError as e:
         raise typer.BadParameter(f"{path}: {e}") from None
-    table = values.get(str(ctx.info_name), {k: v for k, v in values.items() if not isinstance(v, dict)})
+    table = values.get(
+        str(ctx.info_name), {k: v for k, v in values.items() if k == "set" or not isinstance(v, dict)}
+    )
     constants = _flat(table.pop("set", {}))
     table = {key.replace("-", "_"): _as_typed(value) for key, value in table.items()}
     if constants:
