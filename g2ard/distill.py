@@ -259,13 +259,13 @@ class _Rounds:
             done = simplify(
                 self.state,
                 count,
+                config=self.config.simplify,
                 method=self.config.method,
                 visibility=None
                 if self.config.method == "paper"
                 else looker(self.targets.cameras, progress=self.progress),
                 protected=self.protected,
                 flag_budget=self.budget,
-                config=self.config.simplify,
                 progress=self.progress,
             )
             self.state, self.protected = done.splats, done.protected

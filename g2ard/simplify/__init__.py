@@ -191,7 +191,7 @@ def _paper(
 ) -> dict[str, Any]:
     return _core.simplify_paper(
         scene,
-        schedule(len(scene), budget, config.retention_of("paper"), config.fold),
+        schedule(len(scene), budget, config.retention_of("paper")),
         flag_budget,
         protected=flags,
         min_opacity=config.min_opacity_of("paper"),
