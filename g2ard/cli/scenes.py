@@ -12,13 +12,11 @@ if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.cli.frame import Run
     from g2ard.io import ViewSet
-    from g2ard.recover.anchors import Anchors
     from g2ard.splats import Splats
     from g2ard.targets import Targets
 
 __all__ = [
     "drop_held_out",
-    "load_anchors",
     "load_for_training",
     "load_held_out",
     "load_scene",
@@ -172,21 +170,6 @@ def _read(run: Run, path: Path) -> ViewSet:
     for note in found.notes:
         run.say(f"{path}: {note}")
     return found
-
-
-def load_anchors(run: Run, path: Path, student: Splats, in_plane: float) -> Anchors:
-    """The anchors that a file's Gaussians are to those of `student`, row by row, in its coordinates.
-
-    Raises:
-        InputError: there are more or fewer of them.
-    """
-    from g2ard.errors import InputError
-    from g2ard.recover.anchors import Anchors
-
-    scene = load_scene(run, path)
-    if len(scene) != len(student):
-        raise InputError(f"{path}: {len(scene)} Gaussians, the student has {len(student)}")
-    return Anchors.of(scene.recentred(student.offset), in_plane)
 
 
 def make_targets(

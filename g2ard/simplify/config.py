@@ -23,8 +23,8 @@ class SimplifyConfig:
     Args:
         retention: share of the Gaussians that a round keeps; None means the method's own, 0.75 in the paper,
             0.65 for the others (fewer rounds, as good).
-        fold: a last cut by less than this share is folded into the round before: the paper's eight rounds from
-            500,000 to 50,000 are seven cuts by a quarter and one of less.
+        fold: a last cut by less than this share is folded into the round before, in 0–1; not in the paper. A
+            cut of a few Gaussians would cost a whole recovery.
         min_opacity: below this α a Gaussian is dropped; None means the method's own, 0.01 in the paper, 0.004
             (what no renderer draws) for the others.
         neighbors: `default`: nearest clusters that one may merge with. More lets far ones in: 16 is worse.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,6 +22,10 @@ from g2ard.cli.options import (
     TimeLimitOption,
     one_horizon,
 )
+
+if TYPE_CHECKING:
+    from g2ard.recover.anchors import Anchors
+    from g2ard.splats import Splats
 
 
 @command(
@@ -59,7 +63,6 @@ def recover(
     """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
     from g2ard.cli.resume import check_stopped, stoppable
     from g2ard.cli.scenes import (
-        load_anchors,
         load_scene,
         load_trained,
         make_targets,
@@ -104,7 +107,7 @@ def recover(
         engine=engine,
     )
     config = changed(config, "recover", values)
-    frozen = load_anchors(run, anchors, splats, config.regularizers.in_plane) if anchors else None
+    frozen = _anchors(run, anchors, splats, config.regularizers.in_plane) if anchors else None
     targets = make_targets(run, chosen.cameras, dense, colour)
     with stoppable(run, checkpoint, resume):
         result = optimize(
@@ -127,3 +130,19 @@ def recover(
     report = {**result.report, "preset": why, "prior": measured.as_dict()}
     report["constants"] = listed({"recover": config}, run.config)
     run.result({**report, "output": str(output)})
+
+
+def _anchors(run: Run, path: Path, student: Splats, in_plane: float) -> Anchors:
+    """The anchors that a file's Gaussians are to those of `student`, row by row, in its coordinates.
+
+    Raises:
+        InputError: there are more or fewer of them.
+    """
+    from g2ard.cli.scenes import load_scene
+    from g2ard.errors import InputError
+    from g2ard.recover.anchors import Anchors
+
+    scene = load_scene(run, path)
+    if len(scene) != len(student):
+        raise InputError(f"{path}: {len(scene)} Gaussians, the student has {len(student)}")
+    return Anchors.of(scene.recentred(student.offset), in_plane)
