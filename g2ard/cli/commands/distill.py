@@ -56,8 +56,6 @@ if TYPE_CHECKING:
 
 _WORK = ".unfinished"
 """In the folder of the run: finished rounds and checkpoints. Nobody else has a folder of this name."""
-_KEPT = Path("simplified", "scene.ply")
-"""In the folder of the run, with --keep: the anchors of the last recovery, for `evaluate --anchors`."""
 _POOL = 160
 """Poses of a pool made for a scene without views; every 8th is held out for scoring."""
 _APART = 24
@@ -66,6 +64,8 @@ _ROWS = 200_000
 """Gaussians that poses are planned on."""
 _LOSS = 0.05
 """dB under the simplified scene that the command speaks of."""
+_KEPT = Path("simplified", "scene.ply")
+"""In the folder of the run, with --keep: the anchors of the last recovery, for `evaluate --anchors`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,12 +45,12 @@ def simplify(
         bool,
         typer.Option("--no-views", help="Use no cameras at all, neither found ones nor a pool of its own."),
     ] = False,
+    preset: PaperOption = None,
     method: Annotated[Method, typer.Option(help="The policy.")] = "default",
     retention: Annotated[
         float | None,
         typer.Option(help="Share of the Gaussians that a round keeps; the method's own if absent."),
     ] = None,
-    preset: PaperOption = None,
 ) -> None:
     """Reduce a scene to an exact number of Gaussians; no images needed.
 
