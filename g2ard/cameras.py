@@ -91,6 +91,15 @@ class Cameras:
         """(C, 3) unit viewing directions in the world."""
         return self.viewmats[:, 2, :3]
 
+    @property
+    def extent(self) -> float:
+        """1.1 × the greatest distance of a camera from the middle of them all, scene units (3DGS's
+        `cameras_extent`); 0 where they all stand in one place, or there are none."""
+        if not len(self):
+            return 0.0
+        away = np.linalg.norm(self.positions - self.positions.mean(0), axis=1).max()
+        return 1.1 * float(away) if away > 1e-9 * np.abs(self.positions).max() else 0.0
+
     def take(self, index: ArrayLike) -> Cameras:
         """The views `index` selects (a mask or indices), in its order."""
         index = np.asarray(index)

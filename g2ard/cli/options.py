@@ -15,7 +15,10 @@ __all__ = [
     "CountOption",
     "LookOption",
     "OutputOption",
+    "PaperOption",
     "PolicyOption",
+    "Preset",
+    "PresetOption",
     "ProtocolOption",
     "RatioOption",
     "SceneArgument",
@@ -217,9 +220,48 @@ TeacherOption = Annotated[
 
 Method = Literal["default", "fast", "paper"]
 ScheduleName = Literal["fast", "default", "best", "paper"]
+Preset = Literal["auto", "trained", "lift", "noisy", "paper", "paper-trained", "paper-lift", "paper-noisy"]
+
+_PAPER = {
+    "method": "paper",
+    "schedule": "paper",
+    "policy": "directional",
+    "k": "50%",
+    "weighted": "false",
+    "reselect": "false",
+    "sh_degree": "3",
+    "tolerance": "0",
+}
+"""What `--preset paper` makes of the options that a command has, as they would be typed; in Python it is
+`g2ard.preset`."""
+
+
+def _whole_paper(ctx: typer.Context, preset: str | None) -> str | None:
+    """Make the paper's options the defaults: what the command line or a config file says stands."""
+    if (preset or "").startswith("paper"):
+        own = {parameter.name for parameter in ctx.command.params}
+        options = {name: value for name, value in _PAPER.items() if name in own}
+        ctx.default_map = {**options, **(ctx.default_map or {})}
+    return preset
+
+
 PresetOption = Annotated[
-    Literal["auto", "trained", "lift", "noisy"],
-    typer.Option(help="Which regularisers hold the geometry; auto measures the scene."),
+    Preset,
+    typer.Option(
+        callback=_whole_paper,
+        is_eager=True,
+        help="Which regularisers hold the geometry; auto measures the scene. paper: the paper's, measured"
+        " alike, and all else as in the paper, but for what other options say.",
+    ),
+]
+PaperOption = Annotated[
+    Literal["paper"] | None,
+    typer.Option(
+        "--preset",
+        callback=_whole_paper,
+        is_eager=True,
+        help="paper: all as in the paper, but for what other options say.",
+    ),
 ]
 
 

@@ -12,6 +12,7 @@ from g2ard.cli.options import (
     CountOption,
     Method,
     OutputOption,
+    PaperOption,
     RatioOption,
     SceneArgument,
     UpOption,
@@ -34,7 +35,7 @@ _ROWS = 100_000
 """Gaussians that those are planned on."""
 
 
-@command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply")
+@command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply", constants=True)
 def simplify(
     run: Run,
     scene: SceneArgument,
@@ -46,6 +47,7 @@ def simplify(
         bool,
         typer.Option("--no-views", help="Use no cameras at all, neither found ones nor a pool of its own."),
     ] = False,
+    preset: PaperOption = None,
     method: Annotated[Method, typer.Option(help="The policy.")] = "default",
     retention: Annotated[
         float | None,
@@ -61,6 +63,7 @@ def simplify(
     import time
 
     from g2ard import io
+    from g2ard.constants import changed, listed
     from g2ard.render import looker
     from g2ard.simplify import SimplifyConfig
     from g2ard.simplify import simplify as reduce
@@ -68,6 +71,8 @@ def simplify(
     one_budget(count, ratio)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other")
+    values = run.constants(simplify=SimplifyConfig(), over_options=True)
+    config = changed(SimplifyConfig(retention=retention), "simplify", values)
     io.check_scene_output(output, run.overwrite)
     began = time.perf_counter()
     found = io.read_scene(scene)
@@ -82,7 +87,7 @@ def simplify(
         budget,
         method=method,
         visibility=None if cameras is None else looker(cameras, progress=run.progress),
-        config=SimplifyConfig(retention=retention),
+        config=config,
         progress=run.progress,
     )
     simplified = time.perf_counter()
@@ -97,6 +102,7 @@ def simplify(
         {
             **small.report,
             "method": method,
+            "constants": listed({"simplify": config.resolved(method)}),
             "notes": {note.code: note.count for note in found.notes},
             "seconds": {
                 "read": read - began,
