@@ -43,7 +43,7 @@ class Pool:
 
     Args:
         cameras: in world coordinates; every 8th is a fair sample of all.
-        kind: "orbit", "walk", "aerial", or several joined by " + ".
+        kind: "orbit", "walk", "aerial", "near", …, or several joined by " + ".
         why: what in the scene decided it.
         up: (3,) unit vector in the world.
         unseen: share of a sample of the matter that no pose sees.
@@ -72,12 +72,14 @@ def plan_pool(
     rows: int | None = None,
     apart: int = 0,
     grow: float = 1.0,
+    near: float = 0.0,
     progress: Progress = silent,
 ) -> Pool:
     """As `make_pool` (see there for all but the result), and what was found out about the scene.
 
-    `apart` asks for so many views of another kind, at most. `count` is then for views that hold all of the
-    scene: where they hold a share of it there are 1/√share times as many, at most `grow` times.
+    `apart` asks for so many views of another kind, at most. `count` and `grow`, `near`: where a view holds
+    a share h of the scene there are 1/√h times as many views, at most `grow` times, and near·(1 − h) of them
+    step nearer to what the others see: an object is whole in each of `count` views from around it.
 
     Raises:
         InputError: as `make_pool`.
@@ -103,36 +105,40 @@ def plan_pool(
         return _planned(site, splats, kind, count, lens, seed, tell), [kind], "as asked"
 
     poses, used, why = plan(count)
-    wanted = _needed(site, poses, count, grow, lens)
+    held = _held(site, poses, lens)
+    wanted = round(count * max(1.0, min(grow, 1 / np.sqrt(held))))
     if len(poses) == count < wanted:
         poses, used, why = plan(wanted)
-    reach = reach_of(site, poses, lens)
     if len(poses) < count:
         raise InputError(
             f"{len(poses)} of {count} poses found a free place with a view ({kind}: {why}): "
             "ask for fewer, or for another kind"
         )
+    reach = reach_of(site, poses, lens)
+    others = _apart(site, poses, reach, apart, lens, seed)
+    close = plan_near(site, poses, reach, int(near * (1 - held) * len(poses)), lens, seed + 1)
+    if len(close):
+        kept = np.linspace(0, len(poses) - 1, len(poses) - len(close)).round().astype(int)
+        poses, used = Poses.joined([poses.take(kept), close]), [*used, "near"]
+        reach = reach_of(site, poses, lens)
     order = strata(_features(poses), HOLD_OUT, seed)
-    cameras = poses.take(order).cameras(site, lens)
     return Pool(
-        cameras,
+        poses.take(order).cameras(site, lens),
         " + ".join(used),
         f"{why}; {site.up.why}",
         site.up.axis,
         unseen=reach.unseen(),
         coarse=float(reach.coarse(lens).mean()),
-        apart=_apart(site, poses, reach, apart, lens, seed),
+        apart=others,
     )
 
 
-def _needed(site: Site, poses: Poses, count: int, grow: float, lens: Lens) -> int:
-    """How many poses there should be, from what each of `count` holds."""
-    if grow <= 1 or not len(poses):
-        return count
-    share = poses.cameras(site, lens).usual_share(
-        site.origin + site.size * (site.points[:_POINTS] @ site.axes)
-    )
-    return round(count * min(grow, 1 / np.sqrt(max(share, np.finfo(float).tiny))))
+def _held(site: Site, poses: Poses, lens: Lens) -> float:
+    """Share of the scene's matter that a pose has in its frame."""
+    if not len(poses):
+        return 1.0
+    points = site.origin + site.size * (site.points[:_POINTS] @ site.axes)
+    return max(poses.cameras(site, lens).usual_share(points), 1 / _POINTS)
 
 
 def _apart(site: Site, poses: Poses, reach: Reach, count: int, lens: Lens, seed: int) -> Cameras | None:

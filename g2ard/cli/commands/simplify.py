@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from g2ard.simplify import Simplified
     from g2ard.splats import Splats
 
-_VIEWS = 96
-"""Poses of a pool of its own; as many of them are used as the scene needs."""
+_VIEWS, _NEAR = 96, 0.25
+"""Poses of a pool of its own, as many of them are used as the scene needs; and the share that steps nearer in
+a scene of which a view holds little."""
 
 _ROWS = 100_000
 """Gaussians that those are planned on."""
@@ -134,13 +135,14 @@ def _cameras(
         return load_views(run, views, "train", None)
     if method != "default" and not made:
         return None
-    from g2ard.poses import make_pool
+    from g2ard.poses import plan_pool
 
     try:
-        return make_pool(splats, _VIEWS, up=up, seed=run.seed, rows=_ROWS, progress=run.progress)
+        pool = plan_pool(splats, _VIEWS, up=up, seed=run.seed, rows=_ROWS, near=_NEAR, progress=run.progress)
     except InputError as e:
         run.say(f"goes on without views: {e}")
         return None
+    return pool.cameras
 
 
 def _tell(run: Run, small: Simplified) -> None:
