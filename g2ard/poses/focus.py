@@ -13,7 +13,7 @@ from g2ard import _core
 from g2ard.cameras import Cameras
 from g2ard.poses.lattice import halton
 from g2ard.poses.numbers import canonical_order, norms, quantile
-from g2ard.poses.sight import Lens, Poses, look
+from g2ard.poses.sight import Lens, Poses, clearance
 from g2ard.poses.site import Site
 from g2ard.splats import Splats
 
@@ -166,4 +166,4 @@ def _anywhere(site: Site, start: int, stop: int, lens: Lens, seed: int) -> Poses
     gazes = np.stack([np.cos(rise) * np.cos(around), np.cos(rise) * np.sin(around), np.sin(rise)], axis=1)
     free = site.grid.distance(points) > 3 * site.grid.cell
     poses = Poses(points[free], gazes[free])
-    return poses.take(look(site, poses, lens).close > 4 * site.grid.cell)
+    return poses.take(clearance(site, poses, lens) > 4 * site.grid.cell)

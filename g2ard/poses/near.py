@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from g2ard.poses.lattice import halton
 from g2ard.poses.numbers import norms
-from g2ard.poses.sight import Lens, Poses, look
+from g2ard.poses.sight import Lens, Poses, clearance
 from g2ard.poses.site import Site
 
 __all__ = ["Reach", "plan_near", "reach_of"]
@@ -94,5 +94,5 @@ def plan_near(site: Site, poses: Poses, reach: Reach, count: int, lens: Lens, se
     gazes /= norms(gazes)[:, None]
     free = (site.grid.distance(eyes) > 2 * site.grid.cell) & (site.above_ground(eyes) > 0.01)
     near = Poses(eyes[free], gazes[free])
-    clear = look(site, near, lens).close > 2 * site.grid.cell
+    clear = clearance(site, near, lens) > 2 * site.grid.cell
     return near.take(clear).take(slice(count))

@@ -20,7 +20,7 @@ def quantile(values: Floats, weights: Floats, shares: Any) -> Floats:
     >>> quantile(np.array([3.0, 1.0, 2.0]), np.array([1.0, 1.0, 2.0]), [0.2, 0.5, 1.0]).tolist()
     [1.0, 2.0, 3.0]
     """
-    order = np.argsort(values, kind="stable")
+    order = np.argsort(values)
     total = np.cumsum(weights[order])
     at = np.searchsorted(total, np.asarray(shares) * total[-1])
     return values[order][np.minimum(at, len(order) - 1)]
