@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import typer
 
 __all__ = [
+    "ConventionOption",
     "Count",
     "CountOption",
     "LookOption",
@@ -195,6 +196,11 @@ BackgroundOption = Annotated[
 TeacherOption = Annotated[
     Path | None,
     typer.Option("--teacher", metavar="SCENE", help="Its renders are the targets; without it, the photos."),
+]
+
+ConventionOption = Annotated[
+    Literal["gsplat", "inria"],
+    typer.Option(help="The renderer's conventions; inria: near plane 0.2, splats cut to their 3σ tiles."),
 ]
 
 Method = Literal["default", "fast", "paper"]
