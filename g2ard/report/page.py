@@ -85,6 +85,10 @@ class Page:
         """Add a paragraph."""
         self._parts.append(f"<p>{escape(text)}</p>")
 
+    def items(self, lines: Sequence[str]) -> None:
+        """Add a list."""
+        self._parts.append(f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>")
+
     def table(
         self, columns: Sequence[str], rows: Sequence[Sequence[str]], best: set[tuple[int, int]]
     ) -> None:
