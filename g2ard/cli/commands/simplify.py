@@ -49,6 +49,10 @@ def simplify(
         float | None,
         typer.Option(help="Share of the Gaussians that a round keeps; the method's own if absent."),
     ] = None,
+    parents: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.npy", help="Also write the row that each Gaussian went to; -1 is none."),
+    ] = None,
 ) -> None:
     """Reduce a scene to an exact number of Gaussians; no images needed.
 
@@ -58,6 +62,7 @@ def simplify(
     import time
 
     from g2ard import io
+    from g2ard.io.atomic import check_output
     from g2ard.render import looker
     from g2ard.simplify import SimplifyConfig
     from g2ard.simplify import simplify as reduce
@@ -66,6 +71,10 @@ def simplify(
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other")
     io.check_scene_output(output, run.overwrite)
+    if parents is not None:
+        if parents.resolve() in {path.resolve() for path in (scene, views) if path and not is_made(path)}:
+            raise typer.BadParameter(f"--parents: {parents} is an input; name another output")
+        check_output(parents, run.overwrite)
     began = time.perf_counter()
     found = io.read_scene(scene)
     for note in found.notes:
@@ -84,6 +93,8 @@ def simplify(
     )
     simplified = time.perf_counter()
     io.write_splats(output, small.splats, overwrite=run.overwrite)
+    if parents is not None:
+        _write_parents(run, parents, small)
     written = time.perf_counter()
     _tell(run, small)
     if small.report["unseen"]:
@@ -130,6 +141,16 @@ def _cameras(run: Run, scene: Path, splats: Splats, views: Path | None, method: 
     except InputError as e:
         run.say(f"goes on without views: {e}")
         return None
+
+
+def _write_parents(run: Run, path: Path, small: Simplified) -> None:
+    """(N,) int64 in the order of the scene's rows, for `render --color parents`."""
+    import numpy as np
+
+    from g2ard.io.atomic import atomic_output
+
+    with atomic_output(path, overwrite=run.overwrite) as temporary, temporary.open("wb") as file:
+        np.save(file, small.parents)
 
 
 def _tell(run: Run, small: Simplified) -> None:
