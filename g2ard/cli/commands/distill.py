@@ -16,6 +16,7 @@ from g2ard.cli.options import (
     BackgroundOption,
     Count,
     CountOption,
+    CropOption,
     Method,
     PolicyOption,
     PresetOption,
@@ -139,6 +140,7 @@ def distill(
         typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own, 3 from a cloud."),
     ] = None,
     resume: ResumeOption = False,
+    crop: CropOption = None,
     size: SizeOption = None,
     background: BackgroundOption = None,
 ) -> None:
@@ -160,7 +162,7 @@ def distill(
     from g2ard.io.atomic import check_output
     from g2ard.recover.presets import preset_for
     from g2ard.recover.schedule import schedule_named
-    from g2ard.report.distilled import distill_report
+    from g2ard.report.distilled import check_crops, distill_report
 
     began = time.monotonic()
     engine = recovery_engine(run)
@@ -174,6 +176,7 @@ def distill(
     budget = budget_of(scene, count, ratio, len(prior))
     looks = _views(run, scene, prior, views, held_out, size, teach=not lifted and photos is not True)
     train, test = looks.train.cameras, looks.test
+    check_crops(crop or [], test.names)
     pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
     use_photos = lifted or (pictured if photos is None else photos)
     teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
@@ -223,6 +226,7 @@ def distill(
             report,
             colour,
             told=_told(report),
+            crops=crop or [],
         )
         _write(run, output, result, unseen, colour, report)
     if looks.pool is not None:
