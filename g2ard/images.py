@@ -199,8 +199,8 @@ def to_bytes(image: ArrayLike) -> NDArray[np.uint8]:
 def as_saved(image: ArrayLike) -> NDArray[np.float32]:
     """An image in [0, 1] as it comes back from an 8-bit PNG: clipped, and rounded to multiples of 1/255.
 
-    >>> as_saved([[-1.0, 0.5, 2.0]]).round(6).tolist()
-    [[0.0, 0.501961, 1.0]]
+    >>> (255 * as_saved([[-1.0, 0.5, 2.0]])).tolist()
+    [[0.0, 128.0, 255.0]]
     """
     return to_bytes(image).astype(np.float32) / np.float32(255)
 

@@ -39,8 +39,8 @@ def painted(splats: Splats, colors: ArrayLike) -> Splats:
         InputError: another number of colours.
 
     >>> scene = Splats.create(np.zeros((2, 3)), scales=np.ones((2, 3)), sh0=np.full((2, 1, 3), 9.0))
-    >>> painted(scene, [[1, 0, 0], [0, 0, 1]]).colors.round(3).tolist()
-    [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    >>> painted(scene, [[1, 0, 0], [0, 0, 1]]).colors.round(3).tolist() == [[1, 0, 0], [0, 0, 1]]
+    True
     """
     paint = np.asarray(colors, np.float64)
     if paint.shape != (len(splats), 3):

@@ -29,9 +29,7 @@ class Window:
         spans = ((self.left, self.width), (self.top, self.height))
         if not all(start >= 0 and extent > 0 and start + extent <= 1 + 1e-6 for start, extent in spans):
             given = ",".join(f"{value:g}" for value in (self.left, self.top, self.width, self.height))
-            raise InputError(
-                f"crop {given}: expected left, top, width and height in shares of the image, such as 0.4,0.2,0.2,0.2"
-            )
+            raise InputError(f"crop {given}: expected left, top, width and height in shares of the image")
 
     def pixels(self, height: int, width: int) -> tuple[slice, slice]:
         """Rows and columns of an image of that size; at least one of each."""
