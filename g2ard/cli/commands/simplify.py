@@ -44,14 +44,14 @@ def simplify(
         bool,
         typer.Option("--no-views", help="Use no cameras at all, neither found ones nor a pool of its own."),
     ] = False,
+    parents: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.npy", help="Also write the row that each Gaussian went to; -1 is none."),
+    ] = None,
     method: Annotated[Method, typer.Option(help="The policy.")] = "default",
     retention: Annotated[
         float | None,
         typer.Option(help="Share of the Gaussians that a round keeps; the method's own if absent."),
-    ] = None,
-    parents: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.npy", help="Also write the row that each Gaussian went to; -1 is none."),
     ] = None,
 ) -> None:
     """Reduce a scene to an exact number of Gaussians; no images needed.
@@ -62,7 +62,6 @@ def simplify(
     import time
 
     from g2ard import io
-    from g2ard.io.atomic import check_output
     from g2ard.render import looker
     from g2ard.simplify import SimplifyConfig
     from g2ard.simplify import simplify as reduce
@@ -72,9 +71,7 @@ def simplify(
         raise typer.BadParameter("--views and --no-views exclude each other")
     io.check_scene_output(output, run.overwrite)
     if parents is not None:
-        if parents.resolve() in {path.resolve() for path in (scene, views) if path and not is_made(path)}:
-            raise typer.BadParameter(f"--parents: {parents} is an input; name another output")
-        check_output(parents, run.overwrite)
+        _check_parents(run, parents, scene, views)
     began = time.perf_counter()
     found = io.read_scene(scene)
     for note in found.notes:
@@ -141,6 +138,14 @@ def _cameras(run: Run, scene: Path, splats: Splats, views: Path | None, method: 
     except InputError as e:
         run.say(f"goes on without views: {e}")
         return None
+
+
+def _check_parents(run: Run, parents: Path, scene: Path, views: Path | None) -> None:
+    from g2ard.io.atomic import check_output
+
+    if parents.resolve() in {path.resolve() for path in (scene, views) if path and not is_made(path)}:
+        raise typer.BadParameter(f"--parents: {parents} is an input; name another output")
+    check_output(parents, run.overwrite)
 
 
 def _write_parents(run: Run, path: Path, small: Simplified) -> None:
