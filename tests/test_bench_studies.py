@@ -282,3 +282,12 @@ def test_a_study_is_one_command(command_line: Callable[..., tuple[int, str, str]
     status, _, err = command_line("bench", "run", "balls.toml", cwd=tmp_path)
     assert status == 0, err
     assert (tmp_path / "figures" / "report.html").exists()
+
+
+def test_rows_from_before_later_columns_can_be_read() -> None:
+    files = sorted((ROOT / "benches" / "record").glob("*/run-*.csv"))
+    assert files
+    for path in files:
+        rows = read_rows(path)
+        assert rows
+        assert {(row.black, row.delta_psnr) for row in rows} == {(None, None)}

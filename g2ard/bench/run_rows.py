@@ -13,7 +13,7 @@ from g2ard.io.atomic import atomic_output
 
 __all__ = ["Row", "read_rows", "with_deltas", "write_csv"]
 
-_LATER = ("black", "delta_psnr")
+_LATER = ("select_cpu_s", "select_peak_mb", "adapt_peak_mb", "black", "delta_psnr")
 """Columns that files from before they came lack."""
 
 _SURVEY = {
@@ -55,7 +55,7 @@ class Row:
         drift95: of the last recovery, in thicknesses of its anchors; 0 without one.
         needle: share of needles.
         views: how many the means are of.
-        steps: optimiser steps taken.
+        steps: optimiser steps taken, those that led to a shared start included.
         reduce_cpu_s: user + system seconds of all reductions, each a whole process.
         reduce_wall_s: by the clock, without a program's start and its files: in one process there is one
             start however many the rounds. A rival program's whole.
