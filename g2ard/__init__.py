@@ -15,7 +15,8 @@ Each stage is a module with a function of its name, or nearly so:
 | `g2ard.synth` | `city`: a procedural city |
 
 What they pass on, and files, are here: `Splats`, `Cameras`, `read_splats`, `write_splats`, `read_points`,
-`read_views`, `write_views`. Nothing heavy loads before it is used.
+`read_views`, `write_views`; and `preset`, which holds the paper's configuration of every stage. Nothing heavy
+loads before it is used.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
     from g2ard.cameras import Cameras
     from g2ard.io import read_points, read_splats, read_views, write_splats, write_views
+    from g2ard.presets import preset
     from g2ard.splats import Splats
 
 __version__ = "0.1.0"
@@ -34,6 +36,7 @@ __all__ = [
     "Cameras",
     "Splats",
     "__version__",
+    "preset",
     "read_points",
     "read_splats",
     "read_views",
@@ -41,7 +44,7 @@ __all__ = [
     "write_views",
 ]
 
-_HOMES = {"Splats": "g2ard.splats", "Cameras": "g2ard.cameras"}
+_HOMES = {"Splats": "g2ard.splats", "Cameras": "g2ard.cameras", "preset": "g2ard.presets"}
 
 
 def __getattr__(name: str) -> Any:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from g2ard.appearance import blended, colour_change, recoloured, views_seeing
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.progress import Progress, silent
 from g2ard.recover import RecoverConfig, checkpoint, recover
 from g2ard.recover.anchors import Regularizers
@@ -19,11 +19,8 @@ from g2ard.recover.schedule import PAPER, TUNED, Schedule
 from g2ard.splats import Splats
 from g2ard.targets import Targets, fingerprint_of
 
-__all__ = ["AdaptConfig", "Adapted", "adapt"]
+__all__ = ["AdaptConfig", "Adapted", "adapt", "appearance_only"]
 
-_FIRST_STRETCH = 500
-_WORTH = 0.3
-"""dB that a change of all colours at once must bring on the images."""
 _FREE = Regularizers(anchor=0.0, shape=0.0, effective_rank=False)
 """Geometry that cannot move needs nothing to hold it."""
 
@@ -43,9 +40,13 @@ class AdaptConfig:
         sh_degree: of the result; None keeps the scene's. A scene without higher bands has no place for shine.
         background: RGB behind the scene.
         seed: of the order of views.
+        first_stretch: steps of the first stretch.
+        colour_worth: dB that a change of all colours at once must bring on the images.
+        ssim_weight: λ of the photometric loss, see `RecoverConfig`.
+        recovery: rates and decay of a stretch, see `appearance_only`; None means those of `schedule`.
 
     Raises:
-        InputError: no steps, or a negative tolerance.
+        InputError: a value out of its range.
     """
 
     steps: int = 7000
@@ -55,6 +56,10 @@ class AdaptConfig:
     sh_degree: int | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     seed: int = 0
+    first_stretch: int = 500
+    colour_worth: float = 0.3
+    ssim_weight: float = 0.2
+    recovery: Schedule | None = field(default=None, metadata={"prefix": "schedule"})
 
     def __post_init__(self) -> None:
         if self.steps < 1 or not self.tolerance >= 0:
@@ -63,6 +68,9 @@ class AdaptConfig:
             raise InputError(f"prior_views: expected a number of views, at least 0, got {self.prior_views}")
         if self.schedule not in ("default", "paper"):
             raise InputError(f"schedule: expected default or paper, got {self.schedule!r}")
+        require("first_stretch", self.first_stretch, self.first_stretch >= 1, "at least 1")
+        if self.recovery is not None and self.recovery != appearance_only(self.recovery):
+            raise InputError("adapt: geometry stays: the rates of means, log_scales and quats are 0")
 
     def stretches(self) -> list[int]:
         """Steps of each stretch, doubling; what would be left over for a shorter one joins the last.
@@ -72,7 +80,7 @@ class AdaptConfig:
         """
         if self.schedule == "paper":
             return [self.steps]
-        out, length, left = [], _FIRST_STRETCH, self.steps
+        out, length, left = [], self.first_stretch, self.steps
         while left >= 2 * length:
             out.append(length)
             left -= length
@@ -155,7 +163,7 @@ def adapt(
     change, start = None, given
     if config.schedule == "default" and len(given) and len(targets.cameras):
         change = colour_change(given, targets, config.background)
-        change = change if change.gain >= _WORTH else None
+        change = change if change.gain >= config.colour_worth else None
         start = given if change is None else recoloured(given, change)
     state = _State(start)
     parts = (repr(config), compact.fingerprint(), fingerprint_of(targets))
@@ -200,15 +208,16 @@ def _stretch(
     progress: Progress,
 ) -> None:
     """Steps under one cosine."""
-    base = PAPER if config.schedule == "paper" else TUNED
-    recovery = RecoverConfig(
-        schedule=_appearance_only(base),
+    recovery = config.recovery or appearance_only(PAPER if config.schedule == "paper" else TUNED)
+    how = RecoverConfig(
+        schedule=recovery,
         steps=steps,
         regularizers=_FREE,
+        ssim_weight=config.ssim_weight,
         background=config.background,
         seed=config.seed + number,
     )
-    found = recover(state.splats, targets, recovery, checkpoint=within, progress=progress, stage="adapt")
+    found = recover(state.splats, targets, how, checkpoint=within, progress=progress, stage="adapt")
     before, after = found.report["psnr"]["before"], found.report["psnr"]["after"]
     state.splats = replace(found.splats, means=compact.means, quats=compact.quats, scales=compact.scales)
     state.stretches.append({"steps": steps, "psnr": after})
@@ -216,5 +225,6 @@ def _stretch(
     state.converged = after - before < config.tolerance
 
 
-def _appearance_only(schedule: Schedule) -> Schedule:
+def appearance_only(schedule: Schedule) -> Schedule:
+    """A schedule under which geometry stays: its rates are 0."""
     return replace(schedule, rates=replace(schedule.rates, means=0.0, log_scales=0.0, quats=0.0))

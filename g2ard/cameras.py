@@ -14,6 +14,9 @@ from g2ard.errors import InputError
 
 __all__ = ["Cameras", "look_at"]
 
+_MEDIAN_OF = 16
+"""Views that stand for all of them."""
+
 
 @dataclass(frozen=True, eq=False)
 class Cameras:
@@ -88,6 +91,15 @@ class Cameras:
         """(C, 3) unit viewing directions in the world."""
         return self.viewmats[:, 2, :3]
 
+    @property
+    def extent(self) -> float:
+        """1.1 × the greatest distance of a camera from the middle of them all, scene units (3DGS's
+        `cameras_extent`); 0 where they all stand in one place, or there are none."""
+        if not len(self):
+            return 0.0
+        away = np.linalg.norm(self.positions - self.positions.mean(0), axis=1).max()
+        return 1.1 * float(away) if away > 1e-9 * np.abs(self.positions).max() else 0.0
+
     def take(self, index: ArrayLike) -> Cameras:
         """The views `index` selects (a mask or indices), in its order."""
         index = np.asarray(index)
@@ -145,6 +157,11 @@ class Cameras:
         ahead = np.where(front, z, 1.0)
         u, v = K[0, 0] * x / ahead + K[0, 2], K[1, 1] * y / ahead + K[1, 2]
         return front & (u >= 0) & (u <= self.widths[0]) & (v >= 0) & (v <= self.heights[0])
+
+    def usual_share(self, points: ArrayLike) -> float:
+        """Share of some points, (N, 3) in the world, that a view holds: the median over 16 views at most."""
+        some = np.unique(np.linspace(0, len(self) - 1, min(len(self), _MEDIAN_OF)).round().astype(int))
+        return float(np.median([self.take([view]).holds(points).mean() for view in some]))
 
     def recentred(self, offset: ArrayLike) -> Cameras:
         """The same views in coordinates whose origin is the world point `offset` (see `Splats.offset`)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,11 +12,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from g2ard.errors import require
 from g2ard.progress import Progress, silent
 from g2ard.recover import checkpoint as checkpoints
-from g2ard.recover.anchors import PRESETS, Regularizers
+from g2ard.recover.anchors import PRESETS, Anchors, Regularizers
 from g2ard.recover.draw import checked_weights
 from g2ard.recover.schedule import TUNED, Schedule
+from g2ard.select.surfaces import CoverageOptions
+from g2ard.simplify.config import SimplifyConfig
 from g2ard.splats import Splats
 from g2ard.targets import Photos, Subset, Targets, fingerprint_of
 
@@ -29,7 +33,7 @@ _ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 
 @dataclass(frozen=True)
 class DistillConfig:
-    """How a scene is distilled.
+    """How a scene is distilled; the paper's way is `g2ard.preset("paper").distill`.
 
     Args:
         method: simplification's: default, fast or paper.
@@ -42,14 +46,17 @@ class DistillConfig:
         regularizers: weights of L_anchor and L_shape.
         sh_degree: of the result; None keeps the prior's.
         background: RGB behind the scene.
-        views: how many of the targets' views recovery looks at, best first; "auto" takes as many as the
-            curve of gains asks for, None all that see the scene.
+        views: how many of the targets' views recovery looks at, best first; a float is a share of them,
+            rounded up; "auto" takes as many as the curve of gains asks for, None all that see the scene.
         policy: how views are chosen, see `g2ard.select`.
         weighted: draw views by the weights of the selection, so that crowded poses do not rule: on a
             crowded pool all views drawn so beat an even draw, and every choice of a tenth of them.
         reselect: choose again from every round's scene; else once, from the raw prior.
         seed: of the order of views, and of the policy "random".
         engine: what takes recovery's steps, see `RecoverConfig`.
+        ssim_weight: λ of the photometric loss, see `RecoverConfig`.
+        simplify: simplification's constants; its retention also sets the counts of rounds, 0.75 if None.
+        select: those of the policies that look at surfaces.
     """
 
     method: str = "default"
@@ -59,12 +66,19 @@ class DistillConfig:
     regularizers: Regularizers = PRESETS["trained"]
     sh_degree: int | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    views: int | Literal["auto"] | None = None
+    views: int | float | Literal["auto"] | None = None
     policy: str = "auto"
     weighted: bool = True
     reselect: bool = False
     seed: int = 0
     engine: Literal["fused", "torch", "gsplat"] = "fused"
+    ssim_weight: float = 0.2
+    simplify: SimplifyConfig = field(default_factory=SimplifyConfig)
+    select: CoverageOptions = field(default_factory=CoverageOptions)
+
+    def __post_init__(self) -> None:
+        share = not isinstance(self.views, float) or 0 < self.views <= 1
+        require("views", self.views, share, "a count, auto, none, or a share in (0, 1]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +87,8 @@ class Distilled:
 
     Args:
         splats: exactly `budget` Gaussians.
-        simplified: the same Gaussians before their last recovery: its anchors.
+        simplified: the same Gaussians before any recovery at their count: the anchors of all that followed,
+            and what Drift95 is measured from.
         report: rounds [{simplify, recover}], seconds {select, simplify, recover}, and views {policy,
             candidates, chosen [names], weighted, refused [names], left_out}: the last is what the views not
             chosen would have added to the policy's objective, as a share of the whole pool's; None where
@@ -125,7 +140,8 @@ def distill(
 
     config = config or DistillConfig()
     many = config.schedule.round_steps > 0
-    counts = counts_of(len(prior), budget) if many else [budget]
+    kept, fold = config.simplify.retention or 0.75, config.simplify.fold
+    counts = counts_of(len(prior), budget, kept, fold) if many else [budget]
     rounds = _Rounds(prior, budget, targets, config, len(counts), weights, validation, work, progress, watch)
     for number, count in enumerate(counts, start=1):
         rounds.advance(number, count, final=number == len(counts))
@@ -151,9 +167,18 @@ class _Supervision:
         cameras = targets.cameras
         if config.views is None and (weights is not None or not config.weighted):
             return cls(targets, weights, None)
-        wanted = len(cameras) if config.views is None else config.views
+        wanted = 1.0 if config.views is None else config.views
+        k = math.ceil(wanted * len(cameras) - 1e-9) if isinstance(wanted, float) else wanted
         policy = config.policy if config.views is not None else "auto"
-        chosen = select(scene, cameras, wanted, policy=policy, seed=config.seed, progress=progress)
+        chosen = select(
+            scene,
+            cameras,
+            k,
+            policy=policy,
+            seed=config.seed,
+            options=config.select,
+            progress=progress,
+        )
         rows = np.argsort(chosen.order)
         subset = Subset(targets, chosen.order[rows])
         if weights is not None:
@@ -234,6 +259,7 @@ class _Rounds:
             done = simplify(
                 self.state,
                 count,
+                config=self.config.simplify,
                 method=self.config.method,
                 visibility=None
                 if self.config.method == "paper"
@@ -259,6 +285,7 @@ class _Rounds:
                 steps=self._steps() if final else None,
                 time_limit=self._seconds(final),
                 regularizers=self.config.regularizers,
+                ssim_weight=self.config.ssim_weight,
                 background=self.config.background,
                 final=final,
                 seed=self.config.seed,
@@ -270,6 +297,7 @@ class _Rounds:
                 self.supervision.targets,
                 config,
                 weights=self.supervision.weights,
+                anchors=Anchors.of(self.simplified, self.config.regularizers.in_plane),
                 validation=self.validation,
                 checkpoint=checkpoint,
                 progress=self.progress,

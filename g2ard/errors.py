@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["G2ardError", "InputError", "MissingDependencyError", "OutputError"]
+__all__ = ["G2ardError", "InputError", "MissingDependencyError", "OutputError", "require"]
 
 
 class G2ardError(Exception):
@@ -19,3 +19,9 @@ class OutputError(G2ardError, OSError):
 
 class MissingDependencyError(G2ardError, ImportError):
     """An optional package is needed for this input; the message names the extra to install."""
+
+
+def require(name: str, value: object, fits: bool, expected: str) -> None:
+    """Raise an `InputError` for the value of a field unless it fits."""
+    if not fits:
+        raise InputError(f"{name}: expected {expected}, got {value}")

@@ -5,6 +5,8 @@ A prior to distil *from*, with photos as targets; rendered as it is, it looks fl
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -13,7 +15,17 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
 from g2ard.splats import SH_C0, Splats
 
-__all__ = ["lift"]
+__all__ = ["LiftConfig", "lift"]
+
+
+@dataclass(frozen=True)
+class LiftConfig:
+    """The constants of `lift`, for those who keep them together: `lift(points, colors, **vars(config))`."""
+
+    neighbors: int = 10
+    normal_ratio: float = 0.1
+    max_anisotropy: float = 4.0
+    opacity: float = 0.5
 
 
 def lift(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable
@@ -50,6 +51,48 @@ def test_a_bad_value_is_named_with_what_is_allowed(
     table = f'[simplify]\n{option[2:]} = "{value}"\n'
     (folder / "c.toml").write_text(table)
     assert f"{words} (from c.toml)" in refused(command_line, folder, *simplify, "--config", "c.toml")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("distill", "a.ply", "-n", 5, "-o", "run", "--held-out", "made"), "--held-out: a file of views"),
+        (("distill", "a.ply", "-n", 5, "-o", "run", "--views", "made", "--photos"), "--photos: views that"),
+        (
+            ("bench", "simplify", "a.ply", "--protocol", "x"),
+            "'--protocol': one of pool, standing, both, not 'x'",
+        ),
+        (("simplify", "a.ply", "-n", 5, "-o", "o.ply", "--up", "0,0,0"), "a direction such as 0,0,1"),
+    ],
+)
+def test_what_cannot_go_together_is_told_before_any_work(
+    folder: Path, command_line: CommandLine, arguments: tuple[object, ...], words: str
+) -> None:
+    before = sorted(path.name for path in folder.iterdir())
+    assert words in refused(command_line, folder, *arguments)
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+def test_a_scene_that_lies_down_is_seen_upright_if_told(folder: Path, command_line: CommandLine) -> None:
+    for up in ("0,0,1", "1,0,0"):
+        status, _, error = command_line(
+            "distill",
+            "a.ply",
+            "-n",
+            20,
+            "--views",
+            "made",
+            "--steps",
+            1,
+            "--up",
+            up,
+            "-o",
+            up[:1],
+            cwd=folder,
+        )
+        assert status == 0, error
+    upright, lying = (json.loads((folder / name / "views.json").read_text()) for name in "01")
+    assert upright != lying
 
 
 def test_a_config_that_is_none_is_named(folder: Path, command_line: CommandLine) -> None:

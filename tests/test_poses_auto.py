@@ -147,6 +147,17 @@ def test_views_apart_are_nearer_and_free(make) -> None:
     np.testing.assert_array_equal(again.viewmats, pool.apart.viewmats)
 
 
+@pytest.mark.parametrize(("make", "grown"), [(naive.statue, False), (naive.room, True)])
+def test_a_pool_grows_where_a_view_holds_little_of_the_scene(make, grown) -> None:
+    splats = make()
+    plain, more = plan_pool(splats, 32), plan_pool(splats, 32, grow=2)
+    if not grown:
+        np.testing.assert_array_equal(more.cameras.viewmats, plain.cameras.viewmats)
+    else:
+        assert 40 <= len(more.cameras) <= 64
+        assert more.unseen < plain.unseen + 0.02
+
+
 def test_a_pool_tells_what_it_does_not_see(room) -> None:
     all_around, few = plan_pool(room, 64), plan_pool(room, 1)
     assert all_around.unseen < 0.3

@@ -261,7 +261,7 @@ def bench_recover(
     check_protocol(bench.protocol)
     kept = _whole(rows.read(csv_path, Look))
     rows.rewrite(csv_path, kept, Look)
-    preset, why, _ = preset_for("auto", bench.prior, bench.cameras[0])
+    preset, why, _ = preset_for("auto", bench.prior, bench.cameras[0] if bench.from_photos else None)
     plans = STUDIES[study](steps, seconds, preset)
     papers = PAPER_PRESETS[why.split()[0]]
     unknown = [v for v in variants or () if v not in plans]

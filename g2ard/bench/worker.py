@@ -141,7 +141,8 @@ def _recover(job: Job) -> dict[str, Any]:
         final=job["final"],
         seed=job["seed"],
     )
-    anchors = Anchors.of(io.read_splats(job["anchors"])) if job.get("anchors") else None
+    built = io.read_splats(job["anchors"]) if job.get("anchors") else None
+    anchors = None if built is None else Anchors.of(built, config.regularizers.in_plane)
     done = recover(student, targets, config, anchors=anchors)
     io.write_splats(job["output"], done.splats, overwrite=True)
     return {key: done.report[key] for key in ("steps", "seconds", "psnr", "drift95", "needle", "multiplier")}

@@ -61,13 +61,28 @@ def _load_config(ctx: typer.Context, path: Path | None) -> Path | None:
         raise typer.BadParameter(f"{path}: not a text file") from None
     except tomllib.TOMLDecodeError as e:
         raise typer.BadParameter(f"{path}: {e}") from None
-    table = values.get(str(ctx.info_name), {k: v for k, v in values.items() if not isinstance(v, dict)})
+    table = values.get(
+        str(ctx.info_name), {k: v for k, v in values.items() if k == "set" or not isinstance(v, dict)}
+    )
+    constants = _flat(table.pop("set", {}))
     table = {key.replace("-", "_"): _as_typed(value) for key, value in table.items()}
+    if constants:
+        table["set"] = [f"{name}={_as_typed(value)}" for name, value in constants.items()]
     unknown = sorted(set(table) - {p.name for p in ctx.command.params})
     if unknown:
         raise typer.BadParameter(f"{path}: no option of `{ctx.info_name}` is called {', '.join(unknown)}")
     ctx.default_map = {**(ctx.default_map or {}), **table}
     return path
+
+
+def _flat(table: Any, prefix: str = "") -> dict[str, Any]:
+    """A table of constants by their dotted names: `simplify.max_energy = 0.02` is a table within one."""
+    if not isinstance(table, dict):
+        raise typer.BadParameter("set: a table of constants, such as set = { simplify.max_energy = 0.02 }")
+    out: dict[str, Any] = {}
+    for key, value in table.items():
+        out |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return out
 
 
 def _as_typed(value: Any) -> Any:
@@ -115,6 +130,16 @@ _COMMON: dict[str, tuple[Any, Any]] = {
 }
 
 
+_SET = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="A constant, such as rates.means=1e-3; reports list all. Repeatable.",
+    ),
+]
+
+
 class Run:
     """One invocation of a command: its common options, its console and its result."""
 
@@ -132,6 +157,28 @@ class Run:
         paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
         self._inputs = [p for p in paths if isinstance(p, Path) and p is not options.get("output")]
         self.config = {**options, "seed": self.seed, "threads": self.threads, "device": self.device}
+        if "set" in common:
+            self.config["set"] = common["set"]
+
+    def constants(self, *, over_options: bool = False, **configs: Any) -> dict[str, Any]:
+        """What --set and the config file say of configs' constants (`g2ard.constants.parsed`), as a usage
+        check: names and types, and values as far as the other constants' defaults allow to say.
+
+        Args:
+            over_options: constants that are options of the command too may be set; they win.
+            configs: prefix → a dataclass that holds constants.
+        """
+        from g2ard.constants import changed, parsed
+        from g2ard.errors import InputError
+
+        try:
+            without = () if over_options else self.config
+            values = parsed(self.config["set"] or [], configs, without)
+            for root, config in configs.items():
+                changed(config, root, values)
+        except InputError as e:
+            raise typer.BadParameter(f"--set: {e}") from None
+        return values
 
     def progress(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
         """The callback that stages report to; what befell the GPU in the meantime is told first."""
@@ -206,20 +253,31 @@ def group(name: str, text: str) -> typer.Typer:
 
 
 def command(
-    name: str, *, example: str, parent: typer.Typer = app, cuda: bool = False
+    name: str, *, example: str, parent: typer.Typer = app, cuda: bool = False, constants: bool = False
 ) -> Callable[[Any], Any]:
-    """Register `fn(run, **options)` as a command; `example` ends its help; `cuda`: it knows --device cuda."""
+    """Register `fn(run, **options)` as a command; `example` ends its help.
+
+    Args:
+        name: of the command.
+        example: a line.
+        parent: the group it belongs to.
+        cuda: it knows --device cuda.
+        constants: it takes --set, see `Run.constants`.
+    """
 
     def register(fn: Callable[..., None]) -> Callable[..., None]:
         own = list(inspect.signature(fn, eval_str=True).parameters.values())[1:]
+        shared_options = {**_COMMON, "set": (_SET, None)} if constants else _COMMON
         common = [
             inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-            for key, (kind, default) in _COMMON.items()
+            for key, (kind, default) in shared_options.items()
         ]
 
         def call(ctx: typer.Context, **values: Any) -> None:
             _flags_win(ctx, values, {p.name: p.default for p in own})
-            shared = {key: values.pop(key) for key in _COMMON}
+            shared = {key: values.pop(key) for key in shared_options}
+            if typed(ctx, "set"):  # after those of the config file, for the last counts
+                shared["set"] = [*(ctx.default_map or {}).get("set", []), *shared["set"]]
             ours = interrupt.raises()
             try:
                 _execute(Run(name, shared, dict(values)), fn, values, cuda)

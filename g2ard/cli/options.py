@@ -19,7 +19,10 @@ __all__ = [
     "CropOption",
     "LookOption",
     "OutputOption",
+    "PaperOption",
     "PolicyOption",
+    "Preset",
+    "PresetOption",
     "ProtocolOption",
     "RatioOption",
     "SceneArgument",
@@ -99,10 +102,10 @@ RatioOption = Annotated[
 SceneArgument = Annotated[
     Path, typer.Argument(metavar="SCENE", help="A .ply (3DGS), SOG, .spz, .splat or .compressed.ply.")
 ]
+Protocol = Literal["pool", "standing", "both"]
 ProtocolOption = Annotated[
-    str,
+    Protocol,
     typer.Option(
-        metavar="pool|standing|both",
         help="Views that are scored: held out of the pool, or near ones and those where people stand.",
     ),
 ]
@@ -181,6 +184,24 @@ def _colour(text: str) -> Triple:
     return Triple((values[0], values[1], values[2]))
 
 
+def _direction(text: str) -> Triple:
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not (all(abs(v) < 1e30 for v in (x, y, z)) and any((x, y, z))):
+        raise typer.BadParameter(f"a direction such as 0,0,1 or 0,-1,0, not {text!r}")
+    return Triple((x, y, z))
+
+
+UpOption = Annotated[
+    Triple | None,
+    typer.Option(
+        parser=_direction,
+        metavar="X,Y,Z",
+        help="Away from the ground, for poses that are made; estimated unless given.",
+    ),
+]
 SplitOption = Annotated[
     str, typer.Option(metavar="train|test|all", help="By the views' split file, else every 8th name is test.")
 ]
@@ -228,9 +249,48 @@ CropOption = Annotated[
 
 Method = Literal["default", "fast", "paper"]
 ScheduleName = Literal["fast", "default", "best", "paper"]
+Preset = Literal["auto", "trained", "lift", "noisy", "paper", "paper-trained", "paper-lift", "paper-noisy"]
+
+_PAPER = {
+    "method": "paper",
+    "schedule": "paper",
+    "policy": "directional",
+    "k": "50%",
+    "weighted": "false",
+    "reselect": "false",
+    "sh_degree": "3",
+    "tolerance": "0",
+}
+"""What `--preset paper` makes of the options that a command has, as they would be typed; in Python it is
+`g2ard.preset`."""
+
+
+def _whole_paper(ctx: typer.Context, preset: str | None) -> str | None:
+    """Make the paper's options the defaults: what the command line or a config file says stands."""
+    if (preset or "").startswith("paper"):
+        own = {parameter.name for parameter in ctx.command.params}
+        options = {name: value for name, value in _PAPER.items() if name in own}
+        ctx.default_map = {**options, **(ctx.default_map or {})}
+    return preset
+
+
 PresetOption = Annotated[
-    Literal["auto", "trained", "lift", "noisy"],
-    typer.Option(help="Which regularisers hold the geometry; auto measures the scene."),
+    Preset,
+    typer.Option(
+        callback=_whole_paper,
+        is_eager=True,
+        help="Which regularisers hold the geometry; auto measures the scene. paper: the paper's, measured"
+        " alike, and all else as in the paper, but for what other options say.",
+    ),
+]
+PaperOption = Annotated[
+    Literal["paper"] | None,
+    typer.Option(
+        "--preset",
+        callback=_whole_paper,
+        is_eager=True,
+        help="paper: all as in the paper, but for what other options say.",
+    ),
 ]
 
 

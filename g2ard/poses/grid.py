@@ -28,6 +28,9 @@ _OPAQUE = 0.3
 _MURKY = 0.04
 """Above it a cell has something in it: leaves, glass, haze. No place for a camera."""
 
+_BATCH = 2_000_000
+"""Points counted at once."""
+
 _REACH = 12
 """Distances are known up to this many cells, enough for rays to stride through free space."""
 
@@ -67,14 +70,19 @@ class Grid:
         optical = matter.stand_for * matter.opacities * faces
         parts = np.clip(np.ceil(1.6 * matter.scales[:, 2] / cell), 1, 9).astype(np.int8)
         for count in np.unique(parts):
-            rows = np.flatnonzero(parts == count)
-            share = optical[rows] / count**2
+            rows, offsets = np.flatnonzero(parts == count), _lattice(int(count))
             spans = turned(matter.spans(rows).reshape(-1, 3), axes).reshape(-1, 2, 3) if count > 1 else None
-            for a, b in _lattice(int(count)):
-                at = points[rows] if spans is None else points[rows] + a * spans[:, 0] + b * spans[:, 1]
+            for some in np.array_split(offsets, -(-len(offsets) * len(rows) // _BATCH)):
+                at = points[rows]
+                if spans is not None:
+                    a, b = some.T[:, :, None, None]
+                    at = (at + a * spans[:, 0] + b * spans[:, 1]).reshape(-1, 3)
                 index, inside = _index(at, low, cell, shape)
-                filled += np.bincount(index[inside], share[inside], filled.size)
-                logs += np.bincount(index[inside], (share * sizes[rows])[inside], filled.size)
+                share, size = (
+                    np.tile(part, len(some))[inside] for part in (optical[rows] / count**2, sizes[rows])
+                )
+                filled += np.bincount(index[inside], share, filled.size)
+                logs += np.bincount(index[inside], share * size, filled.size)
         scale = np.where(filled > 0, np.exp(logs / np.where(filled > 0, filled, 1)), 0).astype(np.float32)
         opaque, murky = (_steps((filled > limit).reshape(shape)) for limit in (_OPAQUE, _MURKY))
         return cls(low, cell, opaque, murky, scale.reshape(shape))
@@ -108,10 +116,10 @@ class Grid:
         )
 
 
-def _lattice(count: int) -> list[tuple[float, float]]:
-    """Offsets in standard deviations that stand for a Gaussian too wide for one cell."""
-    line = (1.6 * ((np.arange(count) + 0.5) / count * 2 - 1)).tolist()
-    return [(a, b) for a in line for b in line]
+def _lattice(count: int) -> Floats:
+    """(count², 2) offsets in standard deviations that stand for a Gaussian too wide for one cell."""
+    line = 1.6 * ((np.arange(count) + 0.5) / count * 2 - 1)
+    return np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def _index(points: Floats, low: Floats, cell: float, shape: NDArray[Any]) -> tuple[Any, NDArray[np.bool_]]:

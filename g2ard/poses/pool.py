@@ -30,6 +30,9 @@ __all__ = ["KINDS", "Pool", "plan_pool"]
 
 KINDS = ("auto", "orbit", "walk", "aerial", "inside", "focus")
 
+_POINTS = 4096
+"""Of the scene's matter, looked for in the views."""
+
 _FOV, _FOV_INSIDE = 50.0, 70.0
 """Degrees: within rooms people take wider lenses."""
 
@@ -68,11 +71,13 @@ def plan_pool(
     seed: int = 0,
     rows: int | None = None,
     apart: int = 0,
+    grow: float = 1.0,
     progress: Progress = silent,
 ) -> Pool:
     """As `make_pool` (see there for all but the result), and what was found out about the scene.
 
-    `apart` asks for so many views of another kind, at most.
+    `apart` asks for so many views of another kind, at most. `count` is then for views that hold all of the
+    scene: where they hold a share of it there are 1/√share times as many, at most `grow` times.
 
     Raises:
         InputError: as `make_pool`.
@@ -88,13 +93,19 @@ def plan_pool(
     site = Site.of(splats, up, rows)
     progress("scene", 1, 1)
     tell = counter(progress, "poses")
-    if kind == "auto":
-        inside = find_inside(site, seed)
-        if fov is None and inside.weight > 0.5:
-            lens = _lens(size, _FOV_INSIDE)
-        poses, used, why = plan_auto(site, splats, inside, count, lens, seed, tell)
-    else:
-        poses, used, why = _planned(site, splats, kind, count, lens, seed, tell), [kind], "as asked"
+    inside = find_inside(site, seed) if kind == "auto" else None
+    if inside is not None and fov is None and inside.weight > 0.5:
+        lens = _lens(size, _FOV_INSIDE)
+
+    def plan(count: int) -> tuple[Poses, list[str], str]:
+        if inside is not None:
+            return plan_auto(site, splats, inside, count, lens, seed, tell)
+        return _planned(site, splats, kind, count, lens, seed, tell), [kind], "as asked"
+
+    poses, used, why = plan(count)
+    wanted = _needed(site, poses, count, grow, lens)
+    if len(poses) == count < wanted:
+        poses, used, why = plan(wanted)
     reach = reach_of(site, poses, lens)
     if len(poses) < count:
         raise InputError(
@@ -112,6 +123,16 @@ def plan_pool(
         coarse=float(reach.coarse(lens).mean()),
         apart=_apart(site, poses, reach, apart, lens, seed),
     )
+
+
+def _needed(site: Site, poses: Poses, count: int, grow: float, lens: Lens) -> int:
+    """How many poses there should be, from what each of `count` holds."""
+    if grow <= 1 or not len(poses):
+        return count
+    share = poses.cameras(site, lens).usual_share(
+        site.origin + site.size * (site.points[:_POINTS] @ site.axes)
+    )
+    return round(count * min(grow, 1 / np.sqrt(max(share, np.finfo(float).tiny))))
 
 
 def _apart(site: Site, poses: Poses, reach: Reach, count: int, lens: Lens, seed: int) -> Cameras | None:

@@ -63,10 +63,13 @@ def estimate_up(matter: Sample) -> Up:
     if flat:
         axis = _mean_normal(matter, thin, np.abs(along(matter.normals, thin)) > np.cos(np.radians(35)))
         return _signed(matter, axis, True, "the scene is flat")
-    axis, strength = _best_plane(matter)
+    few = matter.take(slice(_SEARCHED))
+    directions = np.concatenate([np.eye(3), fibonacci(600)[:300]])
+    layers = [_layer(few, axis) for axis in directions]
+    axis, strength = _best_plane(matter, few, directions, layers)
     if strength > 0.12:
         return _signed(matter, axis, True, "a ground plane")
-    axis, contrast = _layered(matter)
+    axis, contrast = _layered(matter, directions, np.array([share for share, _ in layers]))
     if contrast > _LAYERED and _habit(axis) > 1:
         return _signed(matter, axis, True, "its layers face that way")
     if long is not None:
@@ -97,25 +100,28 @@ def _layer(matter: Sample, axis: Floats) -> tuple[float, float]:
     return float(pairs[best] / matter.weights.sum()), float((low + best + 1) * _SLAB)
 
 
-def _best_plane(matter: Sample) -> tuple[Floats, float]:
-    """The direction whose strongest layer holds most and has matter on one side only, refined."""
-    few = matter.take(slice(_SEARCHED))
-    directions = np.concatenate([np.eye(3), fibonacci(600)[:300]])
-    scores = [_edge(few, axis) * _habit(axis) for axis in directions]
+def _best_plane(
+    matter: Sample, few: Sample, directions: Floats, layers: list[tuple[float, float]]
+) -> tuple[Floats, float]:
+    """The direction whose strongest layer holds most and has matter on one side only, refined.
+
+    `layers` are those of `few` rows along the directions.
+    """
+    scores = [
+        _edge(few, axis, *layer) * _habit(axis) if layer[0] else 0.0
+        for axis, layer in zip(directions, layers, strict=True)
+    ]
     axis = directions[int(np.argmax(scores))]
     for _ in range(3):
         _, height = _layer(matter, axis)
         inside = np.abs(along(matter.points, axis) - height) < 2 * _SLAB
         axis = _mean_normal(matter, axis, inside & (np.abs(along(matter.normals, axis)) > _FACING))
-    return axis, _edge(matter, axis)
+    return axis, _edge(matter, axis, *_layer(matter, axis))
 
 
-def _layered(matter: Sample) -> tuple[Floats, float]:
+def _layered(matter: Sample, directions: Floats, shares: Floats) -> tuple[Floats, float]:
     """The direction whose strongest layer holds most, refined, and how many times what the strongest layer
     that faces away from it (by 60° or more) holds: a floor under noise, a path among reeds."""
-    few = matter.take(slice(_SEARCHED))
-    directions = np.concatenate([np.eye(3), fibonacci(600)[:300]])
-    shares = np.array([_layer(few, axis)[0] for axis in directions])
     axis = directions[int(np.argmax(shares))]
     across = np.abs(directions @ axis) < 0.5
     contrast = shares.max() / max(shares[across].max(), np.finfo(float).tiny)
@@ -123,9 +129,8 @@ def _layered(matter: Sample) -> tuple[Floats, float]:
     return _mean_normal(matter, axis, facing), float(contrast)
 
 
-def _edge(matter: Sample, axis: Floats) -> float:
+def _edge(matter: Sample, axis: Floats, share: float, height: float) -> float:
     """The strongest layer's share, less what lies on both its sides: ground and walls have one side."""
-    share, height = _layer(matter, axis)
     beside = along(matter.points, axis) - height
     above = matter.weights[beside > 2 * _SLAB].sum()
     below = matter.weights[beside < -2 * _SLAB].sum()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.errors import require
 from g2ard.splats import Splats
 
 __all__ = [
@@ -26,12 +27,32 @@ NEEDLE_RANK = 1.1
 
 @dataclass(frozen=True)
 class Regularizers:
-    """Weights of the paper's `eq:objective`: λ_a·L_anchor + λ_s·L_shape, every `period` steps."""
+    """The paper's `eq:objective`: λ_a·L_anchor + λ_s·L_shape, added every `period` steps.
+
+    Args:
+        anchor: λ_a.
+        shape: λ_s.
+        effective_rank: whether L_shape has its barrier against needles.
+        period: steps from one addition to the next.
+        in_plane: r∥ of the trust region, over the mean tangential scale; r⊥ is the smallest scale. The paper
+            says r∥ ≫ r⊥ only.
+
+    Raises:
+        InputError: a value out of range.
+    """
 
     anchor: float
     shape: float
     effective_rank: bool
     period: int = 100
+    in_plane: float = 3.0
+
+    def __post_init__(self) -> None:
+        for name in ("anchor", "shape"):
+            value = getattr(self, name)
+            require(name, value, 0 <= value < float("inf"), "a weight, at least 0")
+        require("period", self.period, self.period >= 1, "at least 1")
+        require("in_plane", self.in_plane, 0 < self.in_plane < float("inf"), "more than 0")
 
     @property
     def active(self) -> bool:
@@ -63,7 +84,7 @@ class Anchors:
     Args:
         means: (N, 3) float32.
         frames: (N, 3, 3) float32, columns t1, t2, n: the normal is the axis of the smallest scale.
-        r_parallel: (N,) float32 in-plane radius, 3 × the mean tangential scale.
+        r_parallel: (N,) float32 in-plane radius, 3 × the mean tangential scale, or what `of` is told.
         r_perp: (N,) float32 normal radius, the smallest scale.
     """
 
@@ -73,8 +94,8 @@ class Anchors:
     r_perp: NDArray[np.float32]
 
     @classmethod
-    def of(cls, splats: Splats) -> Anchors:
-        """Freeze a scene as it stands."""
+    def of(cls, splats: Splats, in_plane: float = 3.0) -> Anchors:
+        """Freeze a scene as it stands; `in_plane` as in `Regularizers`."""
         order = np.argsort(-splats.scales, axis=1, kind="stable")
         frames = np.take_along_axis(rotation_matrices(splats.quats), order[:, None, :], axis=2)
         scales = np.take_along_axis(splats.scales, order, axis=1).astype(np.float64)
@@ -83,7 +104,7 @@ class Anchors:
         return cls(
             means=splats.means.astype(np.float32),
             frames=frames.astype(np.float32),
-            r_parallel=(3 * np.maximum(tangential, floor)).astype(np.float32),
+            r_parallel=(in_plane * np.maximum(tangential, floor)).astype(np.float32),
             r_perp=np.maximum(scales[:, 2], floor).astype(np.float32),
         )
 

@@ -46,12 +46,14 @@ class Guard:
         best: the start at first.
         before: the start's score.
         others: dB of a scene in views of another kind than those that are learned from; None without any.
+        active: whether anything is done about a loss; else the steps are taken as they come.
     """
 
     score: Callable[[Splats], float]
     best: Splats
     before: float
     others: Callable[[Splats], float] | None = None
+    active: bool = True
     looked: int = 0
     backed_off: list[dict[str, float]] = field(default_factory=list)
     stopped: int | None = None
@@ -65,7 +67,7 @@ class Guard:
 
     def due(self, share: float) -> bool:
         """Whether the scene is to be looked at."""
-        return self.looked < len(LOOKS) and LOOKS[self.looked] <= share < 1
+        return self.active and self.looked < len(LOOKS) and LOOKS[self.looked] <= share < 1
 
     def look(self, scene: Splats, share: float, step: int) -> Literal["on", "back", "stop"]:
         """What to do about the scene of a step: go on, go back to the best with smaller steps, or stop."""
@@ -133,7 +135,7 @@ class Guard:
             The scene, its score, and how much of the way to the result it went: 1, or 0 for the start.
         """
         value = self.score(result)
-        if value >= self.best_score:
+        if value >= self.best_score or not self.active:
             return result, value, 1.0
         if self.best is not self.start:
             return self.best, self.best_score, 1.0

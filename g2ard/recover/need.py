@@ -11,8 +11,8 @@ from g2ard.splats import Splats
 
 __all__ = ["steps_for"]
 
-_VIEWS, _POINTS = 16, 4096
-"""Looked at to find out."""
+_POINTS = 4096
+"""Gaussians looked for to find out."""
 
 _MOST = 2.25
 """Times the schedule's steps, at most: recovery must end in minutes."""
@@ -41,7 +41,4 @@ def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
     """
     some = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), _POINTS)).round().astype(int))
     points = scene.means[some].astype(np.float64) + scene.offset
-    views = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), _VIEWS)).round().astype(int))
-    shares = [float(cameras.take([view]).holds(points).mean()) for view in views]
-    share = max(float(np.median(shares)), 1 / _MOST**2)
-    return round(steps / math.sqrt(share))
+    return round(steps / math.sqrt(max(cameras.usual_share(points), 1 / _MOST**2)))

@@ -51,15 +51,15 @@ class Recovered:
     Args:
         splats: same count and order as the student.
         report: steps, seconds, loss (one mean per 1 % of the horizon), psnr {before, after} over a sample of
-            the training views, multiplier, reach (None is no limit), trials (those that chose the
-            multiplier), drift95, needle, geometry (ten of {step, drift95, needle} on the way), regularizers
-            {steps, share of the time}, skipped, backed_off (a list of {step, psnr}: where so much was lost
-            that recovery went on from the best scene with a third of the rates), stopped (the step at which
-            it was given up, else None), way (how far the result goes from the student to where the steps
-            ended: 1 but where that lost), kept_start: whether the student was better than all that came of
-            it, and is the result, and validation: None without such views, else looks (a list of {step,
-            psnr}, last of the result) and doubt (a Gaussian that v views touched keeps v/(v + doubt) of its
-            change; None where all keep the same part, or none).
+            the training views, multiplier, reach (None is no limit), extent (of the cameras), trials (those
+            that chose the multiplier), drift95, needle, geometry (ten of {step, drift95, needle} on the way),
+            regularizers {steps, share of the time}, skipped, backed_off (a list of {step, psnr}: where so
+            much was lost that recovery went on from the best scene with a third of the rates), stopped (the
+            step at which it was given up, else None), way (how far the result goes from the student to where
+            the steps ended: 1 but where that lost), kept_start: whether the student was better than all that
+            came of it, and is the result, and validation: None without such views, else looks (a list of
+            {step, psnr}, last of the result) and doubt (a Gaussian that v views touched keeps v/(v + doubt)
+            of its change; None where all keep the same part, or none).
     """
 
     splats: Splats
@@ -110,13 +110,15 @@ def recover(
     L = (1−λ)·L1 + λ·(1−SSIM), and every `period` steps + λ_a·L_anchor + λ_s·L_shape. No Gaussian is added
     or removed. Where the steps lose against the student, by PSNR of some training views, recovery goes back,
     and on with a third of the rates; a student that is only made worse is returned as it is.
+    A schedule that is not `guarded`, as the paper's, takes all its steps, whatever comes of them.
 
     Args:
         student: the scene to recover; its offset counts, cameras are in world coordinates.
         targets: photos or teacher renders with their cameras.
         config: see `RecoverConfig`.
         weights: (C,) how often each view is drawn, in proportion; None draws all equally often.
-        anchors: frozen geometry; None freezes the student as given.
+        anchors: frozen geometry; None freezes the student as given. A student that has been recovered before
+            wants those of its construction.
         validation: a few views of another kind than `targets` (nearer, or from where people stand), never
             learned from: where they lose, they decide how much of what the steps changed stays, Gaussian by
             Gaussian as it was seen (`g2ard.recover.guard`), and end a recovery that they only lose by. At
@@ -141,12 +143,13 @@ def recover(
         raise InputError(f"recover: none of the {len(targets.cameras)} views sees the scene")
     if config.sh_degree is not None:
         student = student.with_sh_degree(config.sh_degree)
-    anchors = anchors or Anchors.of(student)
+    anchors = anchors or Anchors.of(student, config.regularizers.in_plane)
+    validation = validation if config.schedule.guarded else None
     probe = Probe(targets, config.background)
     before = probe.all_of(student)
     often = checked_weights(weights, len(targets.cameras))
     others = None if validation is None else Probe(validation, config.background).all_of
-    guard = Guard(probe.all_of, student, before, others)
+    guard = Guard(probe.all_of, student, before, others, config.schedule.guarded)
     held = None if validation is None else fingerprint_of(validation)
     loop = _Loop(student, targets, config, often, anchors, probe, guard, held)
     if checkpoint is None or not checkpoint.exists():
@@ -167,6 +170,7 @@ def recover(
             "psnr": {"before": before, "after": after},
             "multiplier": loop.multiplier,
             "reach": _finite(loop.reach),
+            "extent": targets.cameras.extent,
             "trials": loop.trials,
             "drift95": drift95(anchors, result.means),
             "needle": needle(result.scales),
@@ -200,6 +204,7 @@ class _Loop:
     ) -> None:
         self.targets = targets
         self.config = config
+        self.schedule = config.schedule.within(targets.cameras.extent)
         self.weights = weights
         self.anchors = anchors
         self.multiplier = 1.0
@@ -302,9 +307,7 @@ class _Loop:
     def _learn(
         self, engine: Engine, step: int, share: float, multiplier: float, *, regularize: bool = False
     ) -> float:
-        rates = self.config.schedule.at(
-            share, final=self.config.final, multiplier=multiplier, reach=self.reach
-        )
+        rates = self.schedule.at(share, final=self.config.final, multiplier=multiplier, reach=self.reach)
         view = self._view(step)
         target, mask = self.targets[view], mask_of(self.targets, view)
         return engine.step(view, target, rates, regularize=regularize, mask=mask)

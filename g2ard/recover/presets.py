@@ -138,7 +138,8 @@ def preset_for(
     scene; anything else is taken for a faithful one.
 
     Args:
-        name: auto, trained, lift or noisy.
+        name: auto, trained, lift or noisy; paper is auto with the paper's weights, paper-trained, paper-lift
+            and paper-noisy are rows of its table.
         prior: the scene the anchors come from, before simplification where it is at hand.
         cameras: views to measure consistency in; None leaves that out.
         paper: take the paper's weights, which go with its schedule.
@@ -149,11 +150,14 @@ def preset_for(
     Raises:
         InputError: no such preset.
     """
-    if name != "auto" and name not in PRESETS:
-        raise InputError(f"preset: expected auto, {', '.join(PRESETS)}, got {name!r}")
+    kind = {"paper": "auto"}.get(name, name.removeprefix("paper-"))
+    if kind != "auto" and kind not in PRESETS:
+        raise InputError(f"preset: expected auto, paper, {', '.join(PRESETS)}, got {name!r}")
+    paper = paper or name.startswith("paper")
     found = measure_prior(prior, cameras)
-    kind, why = (name, "as asked") if name != "auto" else _judged(found)
-    return (PAPER_PRESETS if paper else PRESETS)[kind], f"{kind} ({why})", found
+    kind, why = (kind, "as asked") if kind != "auto" else _judged(found)
+    said = f"the paper's for {kind}" if paper else kind
+    return (PAPER_PRESETS if paper else PRESETS)[kind], f"{said} ({why})", found
 
 
 def _judged(m: PriorMeasures) -> tuple[str, str]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.cameras import Cameras
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, silent
 from g2ard.render import settings_for
 from g2ard.splats import Splats
@@ -41,6 +41,9 @@ class CoverageOptions:
         alpha: exponent of the fair utility u(x) = x^(1−α)/(1−α).
         offset: g(x) = u(offset + x); the paper's λ.
         lazy: look again only at the view that leads (CELF): the same views, fewer evaluations.
+
+    Raises:
+        InputError: a value out of range.
     """
 
     cells: int = 300_000
@@ -48,6 +51,13 @@ class CoverageOptions:
     alpha: float = 2.0
     offset: float = 1.0
     lazy: bool = True
+
+    def __post_init__(self) -> None:
+        require("cells", self.cells, self.cells >= 1, "at least 1")
+        for name in ("kappa", "offset"):
+            value = getattr(self, name)
+            require(name, value, 0 < value < float("inf"), "more than 0")
+        require("alpha", self.alpha, 0 <= self.alpha < float("inf"), "at least 0")
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from g2ard.errors import InputError
 
@@ -15,9 +15,6 @@ METHODS = ("default", "fast", "paper")
 _RETENTION = {"default": 0.65, "fast": 0.65, "paper": 0.75}
 _MIN_OPACITY = {"default": 0.004, "fast": 0.004, "paper": 0.01}
 
-_FOLD = 0.05
-"""A last cut smaller than this is folded into the round before."""
-
 
 @dataclass(frozen=True)
 class SimplifyConfig:
@@ -26,6 +23,8 @@ class SimplifyConfig:
     Args:
         retention: share of the Gaussians that a round keeps; None means the method's own, 0.75 in the paper,
             0.65 for the others (fewer rounds, as good).
+        fold: a last cut by less than this share is folded into the round before, in 0–1; not in the paper. A
+            cut of a few Gaussians would cost a whole recovery.
         min_opacity: below this α a Gaussian is dropped; None means the method's own, 0.01 in the paper, 0.004
             (what no renderer draws) for the others.
         neighbors: `default`: nearest clusters that one may merge with. More lets far ones in: 16 is worse.
@@ -46,6 +45,7 @@ class SimplifyConfig:
     """
 
     retention: float | None = None
+    fold: float = 0.05
     min_opacity: float | None = None
     neighbors: int = 6
     geometric_weight: float = 0.03
@@ -61,6 +61,8 @@ class SimplifyConfig:
     def __post_init__(self) -> None:
         if self.retention is not None and not 0 < self.retention < 1:
             raise InputError(f"retention: expected a number between 0 and 1, got {self.retention}")
+        if not 0 <= self.fold < 1:
+            raise InputError(f"fold: expected a number in [0, 1), got {self.fold}")
         if not self.max_growth >= 1:
             raise InputError(f"max_growth: expected at least 1, got {self.max_growth}")
         if self.neighbors < 1:
@@ -82,6 +84,14 @@ class SimplifyConfig:
             if value is not None and not value >= 0:
                 raise InputError(f"{name}: expected a number ≥ 0, got {value}")
 
+    def resolved(self, method: str) -> SimplifyConfig:
+        """The same with the method's own constants where None stands for them.
+
+        >>> SimplifyConfig().resolved("paper").retention
+        0.75
+        """
+        return replace(self, retention=self.retention_of(method), min_opacity=self.min_opacity_of(method))
+
     def retention_of(self, method: str) -> float:
         """The share a round of `method` keeps."""
         return _RETENTION[method] if self.retention is None else self.retention
@@ -91,8 +101,8 @@ class SimplifyConfig:
         return _MIN_OPACITY[method] if self.min_opacity is None else self.min_opacity
 
 
-def schedule(count: int, budget: int, retention: float = 0.75) -> list[int]:
-    """Counts after each round: N_r = max(N_S, ⌈retention·N_{r−1}⌉), a last cut under 5 % folded in.
+def schedule(count: int, budget: int, retention: float = 0.75, fold: float = 0.05) -> list[int]:
+    """Counts after each round: N_r = max(N_S, ⌈retention·N_{r−1}⌉), a last cut by less than `fold` folded in.
 
     >>> schedule(500_000, 50_000)
     [375000, 281250, 210938, 158204, 118653, 88990, 66743, 50000]
@@ -102,7 +112,7 @@ def schedule(count: int, budget: int, retention: float = 0.75) -> list[int]:
     rounds: list[int] = []
     while count > budget:
         count = max(budget, min(count - 1, math.ceil(retention * count)))
-        if budget > (1 - _FOLD) * count:
+        if budget > (1 - fold) * count:
             count = budget
         rounds.append(count)
     return rounds

@@ -73,7 +73,7 @@ def merge(
     ladder, steps = _LADDER[method]
     return _core.simplify_pairwise(
         scene,
-        schedule(len(scene), budget, config.retention_of(method)),
+        schedule(len(scene), budget, config.retention_of(method), config.fold),
         protected=flags,
         weight=None if seen is None else seen.weight,
         pixel_size=None if seen is None else seen.pixel_size,

@@ -12,6 +12,7 @@ from g2ard.cli.options import (
     BackgroundOption,
     LookOption,
     OutputOption,
+    PaperOption,
     ResumeOption,
     ShDegreeOption,
     SizeOption,
@@ -20,7 +21,7 @@ from g2ard.cli.options import (
 )
 
 
-@command("adapt", example="g2ard adapt small.ply --views winter/ -o winter.ply")
+@command("adapt", example="g2ard adapt small.ply --views winter/ -o winter.ply", constants=True)
 def adapt(
     run: Run,
     compact: Annotated[Path, typer.Argument(metavar="COMPACT", help="The scene whose geometry stays.")],
@@ -40,31 +41,36 @@ def adapt(
     split: SplitOption = "train",
     size: SizeOption = None,
     background: BackgroundOption = None,
+    preset: PaperOption = None,
 ) -> None:
     """Refit colours and opacities to new images; means, rotations and scales stay as they are."""
-    from g2ard.adapt import AdaptConfig
+    from g2ard.adapt import AdaptConfig, appearance_only
     from g2ard.adapt import adapt as refit
     from g2ard.cli.resume import check_stopped, stoppable
     from g2ard.cli.scenes import load_scene, load_trained, make_targets, trained_on
+    from g2ard.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
+    from g2ard.recover.schedule import schedule_named
 
-    work = output.parent / f".{output.name}.work"
-    check_stopped(run, work, resume)
-    check_scene_output(output, run.overwrite)
-    colour = background or (0.0, 0.0, 0.0)
-    splats = load_scene(run, compact)
-    dense = load_scene(run, teacher) if teacher else None
-    cameras = load_trained(run, views, split, size).cameras
+    recovery = appearance_only(schedule_named(schedule))
     config = AdaptConfig(
         steps=steps,
         tolerance=tolerance,
         schedule=schedule,
         prior_views=prior_views,
         sh_degree=sh_degree,
-        background=colour,
+        background=background or (0.0, 0.0, 0.0),
         seed=run.seed,
+        recovery=recovery,
     )
-    targets = make_targets(run, cameras, dense, colour)
+    config = changed(config, "adapt", run.constants(adapt=config))
+    work = output.parent / f".{output.name}.work"
+    check_stopped(run, work, resume)
+    check_scene_output(output, run.overwrite)
+    splats = load_scene(run, compact)
+    dense = load_scene(run, teacher) if teacher else None
+    cameras = load_trained(run, views, split, size).cameras
+    targets = make_targets(run, cameras, dense, config.background)
     with stoppable(run, work, resume):
         work.mkdir(exist_ok=True)
         result = refit(splats, targets, config, work=work, progress=run.progress)
@@ -74,4 +80,5 @@ def adapt(
         f"{output}: {len(splats):,} Gaussians, {result.report['steps']:,} steps ({end}), "
         f"{trained_on(split)} {gain['before']:.2f} → {gain['after']:.2f} dB"
     )
-    run.result({**result.report, "output": str(output)})
+    constants = listed({"adapt": config}, run.config)
+    run.result({**result.report, "output": str(output), "constants": constants})

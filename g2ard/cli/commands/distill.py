@@ -25,6 +25,8 @@ from g2ard.cli.options import (
     ScheduleName,
     SizeOption,
     TimeLimitOption,
+    Triple,
+    UpOption,
     ViewsOrMadeOption,
     budget_of,
     can_judge,
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.distill import Distilled
     from g2ard.io import ViewSet
+    from g2ard.lift import LiftConfig
     from g2ard.poses import Pool
     from g2ard.splats import Splats
     from g2ard.targets import Targets
@@ -56,14 +59,17 @@ if TYPE_CHECKING:
 
 _WORK = ".unfinished"
 """In the folder of the run: finished rounds and checkpoints. Nobody else has a folder of this name."""
-_POOL = 160
-"""Poses of a pool made for a scene without views; every 8th is held out for scoring."""
+_POOL, _GROW = 160, 2.0
+"""Poses of a pool made for a scene without views, and how many times as many there may be where a view holds
+little of it; every 8th is held out for scoring."""
 _APART = 24
 """Views of another kind: half of them validate recovery, half are scored."""
 _ROWS = 200_000
 """Gaussians that poses are planned on."""
 _LOSS = 0.05
 """dB under the simplified scene that the command speaks of."""
+_KEPT = Path("simplified", "scene.ply")
+"""In the folder of the run, with --keep: the anchors of the last recovery, for `evaluate --anchors`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +91,7 @@ class _Views:
     unseen: float | None = None
 
 
-@command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True)
+@command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True, constants=True)
 def distill(
     run: Run,
     scene: Annotated[
@@ -139,10 +145,17 @@ def distill(
         int | None,
         typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own, 3 from a cloud."),
     ] = None,
+    keep: Annotated[
+        bool,
+        typer.Option(
+            "--keep", help="Keep the simplified scene too, in RUN/simplified: it takes as many bytes again."
+        ),
+    ] = False,
     resume: ResumeOption = False,
     crop: CropOption = None,
     size: SizeOption = None,
     background: BackgroundOption = None,
+    up: UpOption = None,
 ) -> None:
     """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget.
 
@@ -151,37 +164,48 @@ def distill(
     one_budget(count, ratio)
     one_horizon(steps, time_limit)
     can_judge(k, policy)
+    if is_made(str(held_out)):
+        raise typer.BadParameter("--held-out: a file of views; those that are made hold out every 8th anyway")
     given = views is not None and not is_made(views)
-    run.spare_inputs(output / "scene.ply", *([output / "views.json"] if not given else []))
+    run.spare_inputs(output / "scene.ply", output / _KEPT, *([output / "views.json"] if not given else []))
     import shutil
     import time
 
+    from g2ard.constants import changed, listed
     from g2ard.distill import DistillConfig
     from g2ard.distill import distill as pipeline
     from g2ard.io import kind, write_views
     from g2ard.io.atomic import check_output
+    from g2ard.lift import LiftConfig
     from g2ard.recover.presets import preset_for
     from g2ard.recover.schedule import schedule_named
     from g2ard.report.distilled import check_crops, distill_report
 
     began = time.monotonic()
+    values = run.constants(recover=DistillConfig(), lift=LiftConfig())
     engine = recovery_engine(run)
     lifted = kind(scene) != "splats"
     if lifted and not given:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
+    if photos and is_made(views):
+        raise typer.BadParameter("--photos: views that are made have none")
     if not left_at(output / _WORK):
         check_output(output, run.overwrite, folder=True)
     check_stopped(run, output / _WORK, resume)
-    prior = _lift(run, scene) if lifted else load_scene(run, scene)
+    lifting = changed(LiftConfig(), "lift", values)
+    prior = _lift(run, scene, lifting) if lifted else load_scene(run, scene)
     budget = budget_of(scene, count, ratio, len(prior))
-    looks = _views(run, scene, prior, views, held_out, size, teach=not lifted and photos is not True)
+    looks = _views(run, scene, prior, views, held_out, size, up, teach=not lifted and photos is not True)
     train, test = looks.train.cameras, looks.test
     check_crops(crop or [], test.names)
     pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
     use_photos = lifted or (pictured if photos is None else photos)
     teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
     colour = background or (0.0, 0.0, 0.0)
-    regularizers, why, measured = preset_for(preset, prior, train, paper=schedule == "paper")
+    kind_of = "paper-lift" if lifted and preset == "paper" else preset
+    regularizers, why, measured = preset_for(
+        kind_of, prior, train if use_photos else None, paper=schedule == "paper"
+    )
     run.say(f"{len(prior):,} → {budget:,} Gaussians; {len(train)} views against {against}")
     run.say(f"regularisers: {why}")
     config = DistillConfig(
@@ -199,6 +223,9 @@ def distill(
         seed=run.seed,
         engine=engine,
     )
+    config = changed(config, "recover", values)
+    used: dict[str, Any] = {"recover": replace(config, simplify=config.simplify.resolved(method))}
+    used |= {"lift": lifting} if lifted else {}
     targets = make_targets(run, train, teacher, colour, lazy=k is not None)
     unseen = make_targets(run, test, teacher, colour)
     validation, apart = _apart_targets(run, looks.apart, teacher, colour)
@@ -217,6 +244,7 @@ def distill(
         report["unseen"] = looks.unseen
         report |= {"against": against, "preset": why, "prior": measured.as_dict()}
         report |= {key: result.report[key] for key in ("rounds", "views")}
+        report["constants"] = listed(used, run.config)
         report["seconds"] = {**result.report["seconds"], "total": time.monotonic() - began}
         distill_report(
             output / "report.html",
@@ -229,6 +257,7 @@ def distill(
             crops=crop or [],
         )
         _write(run, output, result, unseen, colour, report)
+        _keep(output / _KEPT, result.simplified if keep else None)
     if looks.pool is not None:
         write_views(output / "views.json", looks.pool.cameras, splits=looks.pool.splits, overwrite=True)
     shutil.rmtree(output / _WORK)
@@ -263,14 +292,14 @@ def _work_folder(run: Run, output: Path, resume: bool) -> Iterator[Path]:
         raise
 
 
-def _lift(run: Run, path: Path) -> Splats:
+def _lift(run: Run, path: Path, config: LiftConfig) -> Splats:
     from g2ard.io import read_cloud
     from g2ard.lift import lift
 
     cloud = read_cloud(path)
     for note in cloud.notes:
         run.say(f"{path}: {note}")
-    return lift(cloud.points.positions, cloud.points.colors, progress=run.progress)
+    return lift(cloud.points.positions, cloud.points.colors, **vars(config), progress=run.progress)
 
 
 def _views(
@@ -280,6 +309,7 @@ def _views(
     views: Path | None,
     held_out: Path | None,
     size: int | None,
+    up: Triple | None,
     *,
     teach: bool,
 ) -> _Views:
@@ -298,8 +328,8 @@ def _views(
             train = drop_held_out(run, train, test.cameras)
         if found and not size:
             train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
-        return _Views(train, test.cameras, _near(run, prior, size) if teach else None)
-    planned = _planned(run, prior, _POOL)
+        return _Views(train, test.cameras, _near(run, prior, size, up) if teach else None)
+    planned = _planned(run, prior, _POOL, up, _GROW)
     apart = planned.apart and planned.apart.resized(size)
     names = planned.cameras.names
     run.say(f"poses: {planned.kind} ({planned.why})")
@@ -314,19 +344,21 @@ def _views(
     return _Views(train, pool.take(mask).resized(size).cameras, apart, pool, planned.unseen)
 
 
-def _planned(run: Run, prior: Splats, count: int) -> Pool:
-    """A pool of `count` views, and views of another kind."""
+def _planned(run: Run, prior: Splats, count: int, up: Triple | None, grow: float = 1.0) -> Pool:
+    """A pool of `count` views or up to `grow` times as many, and views of another kind."""
     from g2ard.poses import plan_pool
 
-    return plan_pool(prior, count, seed=run.seed, rows=_ROWS, apart=_APART, progress=run.progress)
+    return plan_pool(
+        prior, count, up=up, seed=run.seed, rows=_ROWS, apart=_APART, grow=grow, progress=run.progress
+    )
 
 
-def _near(run: Run, prior: Splats, size: int | None) -> Cameras | None:
+def _near(run: Run, prior: Splats, size: int | None, up: Triple | None) -> Cameras | None:
     """Views of another kind beside those that were given; None where the scene has no place for any."""
     from g2ard.errors import InputError
 
     try:
-        apart = _planned(run, prior, _APART).apart
+        apart = _planned(run, prior, _APART, up).apart
     except InputError:
         return None
     return apart and apart.resized(size)
@@ -383,6 +415,17 @@ def _write(
     with atomic_output(output / "report.json", overwrite=True) as temporary:
         temporary.write_text(json.dumps({**report, "config": run.config}, indent=2, default=str) + "\n")
     write_splats(output / "scene.ply", result.splats, overwrite=True)
+
+
+def _keep(path: Path, scene: Splats | None) -> None:
+    """Write the simplified scene; without one, what an earlier run kept there is no longer of this one."""
+    from g2ard.io import write_splats
+
+    if scene is None:
+        path.unlink(missing_ok=True)
+        return
+    path.parent.mkdir(exist_ok=True)
+    write_splats(path, scene, overwrite=True)
 
 
 def _table(run: Run, report: dict[str, Any]) -> None:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import re
 from typing import Annotated
 
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import OutputOption, SceneArgument, Triple
+from g2ard.cli.options import OutputOption, SceneArgument, UpOption
 
 _KINDS = ("auto", "orbit", "walk", "aerial", "inside", "focus")
 
 
 class _Size(tuple[int, int]):
-    """Width and height in one argument (see `Triple`)."""
+    """Width and height in one argument (see `g2ard.cli.options.Triple`)."""
 
 
 def _size(text: str) -> _Size:
@@ -23,16 +22,6 @@ def _size(text: str) -> _Size:
     if match is None or not all(16 <= int(side) <= 16384 for side in match.groups()):
         raise typer.BadParameter(f"width x height in pixels from 16 to 16384, such as 800x600, not {text!r}")
     return _Size((int(match[1]), int(match[2])))
-
-
-def _direction(text: str) -> Triple:
-    try:
-        x, y, z = (float(part) for part in text.split(","))
-    except ValueError:
-        x = y = z = math.nan
-    if not (all(abs(v) < 1e30 for v in (x, y, z)) and any((x, y, z))):
-        raise typer.BadParameter(f"a direction such as 0,0,1 or 0,-1,0, not {text!r}")
-    return Triple((x, y, z))
 
 
 def _kind(text: str) -> str:
@@ -63,12 +52,7 @@ def poses(
         float | None,
         typer.Option(min=1, max=170, help="Horizontal field of view, degrees; 50 unless given, 70 in rooms."),
     ] = None,
-    up: Annotated[
-        Triple | None,
-        typer.Option(
-            parser=_direction, metavar="X,Y,Z", help="Away from the ground; estimated unless given."
-        ),
-    ] = None,
+    up: UpOption = None,
 ) -> None:
     """Make a pool of candidate views for a scene without photos: poses in free space that see it well."""
     from g2ard.cli.scenes import load_scene

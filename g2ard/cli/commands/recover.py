@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,11 +23,16 @@ from g2ard.cli.options import (
     one_horizon,
 )
 
+if TYPE_CHECKING:
+    from g2ard.recover.anchors import Anchors
+    from g2ard.splats import Splats
+
 
 @command(
     "recover",
     example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply",
     cuda=True,
+    constants=True,
 )
 def recover(
     run: Run,
@@ -35,6 +40,13 @@ def recover(
     views: LookOption,
     output: OutputOption,
     teacher: TeacherOption = None,
+    anchors: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SCENE",
+            help="The same Gaussians as they were simplified, where the student has been recovered since.",
+        ),
+    ] = None,
     preset: PresetOption = "auto",
     schedule: Annotated[ScheduleName, typer.Option(help="Rates, decay and horizon.")] = "default",
     steps: Annotated[int | None, typer.Option(min=1, help="Overrides the schedule's horizon.")] = None,
@@ -50,7 +62,14 @@ def recover(
 ) -> None:
     """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
     from g2ard.cli.resume import check_stopped, stoppable
-    from g2ard.cli.scenes import load_scene, load_trained, make_targets, recovery_engine, trained_on
+    from g2ard.cli.scenes import (
+        load_scene,
+        load_trained,
+        make_targets,
+        recovery_engine,
+        trained_on,
+    )
+    from g2ard.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
     from g2ard.recover import RecoverConfig
     from g2ard.recover import recover as optimize
@@ -59,6 +78,7 @@ def recover(
     from g2ard.recover.schedule import schedule_named
 
     one_horizon(steps, time_limit)
+    values = run.constants(recover=RecoverConfig())
     checkpoint = output.parent / f".{output.name}.checkpoint.npz"
     check_stopped(run, checkpoint, resume)
     check_scene_output(output, run.overwrite)
@@ -71,9 +91,11 @@ def recover(
     if weights is not None:
         run.say(f"{len(weights)} views, drawn by their weights")
     regularizers, why, measured = preset_for(
-        preset, dense or splats, chosen.cameras, paper=schedule == "paper"
+        preset, dense or splats, None if dense else chosen.cameras, paper=schedule == "paper"
     )
     run.say(f"regularisers: {why}")
+    if sh_degree is None and schedule == "paper":
+        sh_degree = 3
     config = RecoverConfig(
         schedule=schedule_named(schedule),
         steps=steps,
@@ -84,10 +106,18 @@ def recover(
         seed=run.seed,
         engine=engine,
     )
+    config = changed(config, "recover", values)
+    frozen = _anchors(run, anchors, splats, config.regularizers.in_plane) if anchors else None
     targets = make_targets(run, chosen.cameras, dense, colour)
     with stoppable(run, checkpoint, resume):
         result = optimize(
-            splats, targets, config, weights=weights, checkpoint=checkpoint, progress=run.progress
+            splats,
+            targets,
+            config,
+            weights=weights,
+            anchors=frozen,
+            checkpoint=checkpoint,
+            progress=run.progress,
         )
         write_splats(output, result.splats, overwrite=run.overwrite)
     if (told := outcome(result.report)) is not None:
@@ -98,4 +128,21 @@ def recover(
         f"{trained_on(split)} {gain['before']:.2f} → {gain['after']:.2f} dB"
     )
     report = {**result.report, "preset": why, "prior": measured.as_dict()}
+    report["constants"] = listed({"recover": config}, run.config)
     run.result({**report, "output": str(output)})
+
+
+def _anchors(run: Run, path: Path, student: Splats, in_plane: float) -> Anchors:
+    """The anchors that a file's Gaussians are to those of `student`, row by row, in its coordinates.
+
+    Raises:
+        InputError: there are more or fewer of them.
+    """
+    from g2ard.cli.scenes import load_scene
+    from g2ard.errors import InputError
+    from g2ard.recover.anchors import Anchors
+
+    scene = load_scene(run, path)
+    if len(scene) != len(student):
+        raise InputError(f"{path}: {len(scene)} Gaussians, the student has {len(student)}")
+    return Anchors.of(scene.recentred(student.offset), in_plane)

@@ -11,6 +11,7 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     Count,
     OutputOption,
+    PaperOption,
     PolicyOption,
     SceneArgument,
     SplitOption,
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from g2ard.io import ViewSet
 
 
-@command("select", example="g2ard select scene.ply --views poses.json -k 100 -o chosen.json")
+@command("select", example="g2ard select scene.ply --views poses.json -k 100 -o chosen.json", constants=True)
 def select(
     run: Run,
     scene: SceneArgument,
@@ -38,12 +39,14 @@ def select(
     policy: PolicyOption = "auto",
     split: SplitOption = "train",
     cells: Annotated[int, typer.Option(min=1, help="Surface cells, of directional and coverage.")] = 300_000,
+    preset: PaperOption = None,
 ) -> None:
     """Choose the views worth having, best first, with a weight for how often to draw each.
 
     Views that are not for training follow after them, with their split and no weight, to score on.
     """
     from g2ard.cli.scenes import load_scene, load_split_views
+    from g2ard.constants import changed, listed
     from g2ard.io import check_views_output
     from g2ard.select import CoverageOptions
     from g2ard.select import select as choose
@@ -51,6 +54,8 @@ def select(
     if views is None:
         raise typer.BadParameter("--views VIEWS: the candidates to select from")
     can_judge(k, policy)
+    values = run.constants(select=CoverageOptions(), over_options=True)
+    options = changed(CoverageOptions(cells=cells), "select", values)
     check_views_output(output, run.overwrite)
     splats = load_scene(run, scene)
     pool, candidates = load_split_views(run, views, split)
@@ -61,7 +66,7 @@ def select(
         k.of(len(cameras)) if isinstance(k, Count) else "auto",
         policy=policy,
         seed=run.seed,
-        options=CoverageOptions(cells=cells),
+        options=options,
         progress=run.progress,
     )
     kept = cameras.take(chosen.order)
@@ -86,6 +91,7 @@ def select(
             "refused": [cameras.names[i] for i in chosen.refused],
             "evaluations": chosen.evaluations,
             "seconds": chosen.seconds,
+            "constants": listed({"select": options}),
         }
     )
 
@@ -106,6 +112,11 @@ def _write(run: Run, output: Path, pool: ViewSet, chosen: Any, weights: Any) -> 
         weights=[*weights, *[np.nan] * len(held_out)],
         overwrite=run.overwrite,
     )
+    tests = sum(pool.splits[i] not in ("train", None) for i in chosen)
+    if tests:
+        run.say(
+            f"{tests} of the chosen views are held out: they keep their split, and recovery leaves them out"
+        )
     if held_out:
         words = ", ".join(sorted({str(pool.splits[i]) for i in held_out}))
         run.say(f"{len(held_out)} views held out ({words}) follow the chosen ones")

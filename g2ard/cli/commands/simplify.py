@@ -12,8 +12,10 @@ from g2ard.cli.options import (
     CountOption,
     Method,
     OutputOption,
+    PaperOption,
     RatioOption,
     SceneArgument,
+    UpOption,
     ViewsOrMadeOption,
     budget_of,
     is_made,
@@ -22,6 +24,7 @@ from g2ard.cli.options import (
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
+    from g2ard.cli.options import Triple
     from g2ard.simplify import Simplified
     from g2ard.splats import Splats
 
@@ -32,7 +35,7 @@ _ROWS = 100_000
 """Gaussians that those are planned on."""
 
 
-@command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply")
+@command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply", constants=True)
 def simplify(
     run: Run,
     scene: SceneArgument,
@@ -48,11 +51,13 @@ def simplify(
         Path | None,
         typer.Option(metavar="FILE.npy", help="Also write the row that each Gaussian went to; -1 is none."),
     ] = None,
+    preset: PaperOption = None,
     method: Annotated[Method, typer.Option(help="The policy.")] = "default",
     retention: Annotated[
         float | None,
         typer.Option(help="Share of the Gaussians that a round keeps; the method's own if absent."),
     ] = None,
+    up: UpOption = None,
 ) -> None:
     """Reduce a scene to an exact number of Gaussians; no images needed.
 
@@ -62,6 +67,7 @@ def simplify(
     import time
 
     from g2ard import io
+    from g2ard.constants import changed, listed
     from g2ard.render import looker
     from g2ard.simplify import SimplifyConfig
     from g2ard.simplify import simplify as reduce
@@ -69,6 +75,8 @@ def simplify(
     one_budget(count, ratio)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other")
+    values = run.constants(simplify=SimplifyConfig(), over_options=True)
+    config = changed(SimplifyConfig(retention=retention), "simplify", values)
     io.check_scene_output(output, run.overwrite)
     if parents is not None:
         _check_parents(run, parents, scene, views)
@@ -79,13 +87,13 @@ def simplify(
     read = time.perf_counter()
     budget = budget_of(scene, count, ratio, len(found.splats))
     looks = not no_views and budget < len(found.splats)
-    cameras = _cameras(run, scene, found.splats, views, method) if looks else None
+    cameras = _cameras(run, scene, found.splats, views, method, up) if looks else None
     small = reduce(
         found.splats,
         budget,
         method=method,
         visibility=None if cameras is None else looker(cameras, progress=run.progress),
-        config=SimplifyConfig(retention=retention),
+        config=config,
         progress=run.progress,
     )
     simplified = time.perf_counter()
@@ -102,6 +110,7 @@ def simplify(
         {
             **small.report,
             "method": method,
+            "constants": listed({"simplify": config.resolved(method)}),
             "notes": {note.code: note.count for note in found.notes},
             "seconds": {
                 "read": read - began,
@@ -114,7 +123,9 @@ def simplify(
     )
 
 
-def _cameras(run: Run, scene: Path, splats: Splats, views: Path | None, method: str) -> Cameras | None:
+def _cameras(
+    run: Run, scene: Path, splats: Splats, views: Path | None, method: str, up: Triple | None
+) -> Cameras | None:
     """The views given, else those beside the scene, else a few of its own where it leaves room for them."""
     from g2ard.cli.found import as_pool, found_views
     from g2ard.cli.scenes import load_views
@@ -134,7 +145,7 @@ def _cameras(run: Run, scene: Path, splats: Splats, views: Path | None, method: 
     from g2ard.poses import make_pool
 
     try:
-        return make_pool(splats, _VIEWS, seed=run.seed, rows=_ROWS, progress=run.progress)
+        return make_pool(splats, _VIEWS, up=up, seed=run.seed, rows=_ROWS, progress=run.progress)
     except InputError as e:
         run.say(f"goes on without views: {e}")
         return None

@@ -12,6 +12,7 @@ import typer
 from g2ard.cli.commands.bench.group import bench
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
+    PaperOption,
     SizeOption,
     ViewsOption,
     parse_ratio,
@@ -57,6 +58,7 @@ def run_(
         Path | None, typer.Option(metavar="DIR", help="Weights of LPIPS; without them it is absent.")
     ] = None,
     size: SizeOption = None,
+    preset: PaperOption = None,
     keep: Annotated[bool, typer.Option("--keep", help="Keep intermediate scenes.")] = False,
 ) -> None:
     """Compare methods under matched compute: CSV, and an HTML report of error against time and count.
@@ -88,6 +90,8 @@ def run_(
         studies = [_ad_hoc(scene, views, photos, names, options)]
     else:
         studies = [_narrowed(run, path, only, names, options) for path in definitions or []]
+    if preset:
+        studies = [_as_in_the_paper(study) for study in studies]
     rows = bench_run(studies, output, keep=keep, again=run.overwrite, progress=run.progress)
     write_report(output, studies, rows)
     run.console.table(
@@ -149,6 +153,17 @@ def _narrowed(
     shared = {key: options[key] for key in ("ratios", "seeds", "released", "size", "lpips")}
     methods = _chosen(study, names) if names else None
     return study.narrowed(**own, **shared, scenes=scenes, methods=methods)
+
+
+def _as_in_the_paper(study: Definition) -> Definition:
+    """The study with the paper's method and views in g2ard's place, and each method's own schedule."""
+    from dataclasses import replace
+
+    from g2ard.bench.definition import METHODS
+
+    paper = replace(METHODS["g2ard-paper"], policy="directional", k=0.5)
+    methods = dict.fromkeys(paper if m.name in ("g2ard", paper.name) else m for m in study.methods)
+    return study.narrowed(methods=tuple(methods), released=True)
 
 
 def _chosen(study: Definition, names: list[str]) -> tuple[MethodSpec, ...]:

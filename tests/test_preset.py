@@ -1,0 +1,231 @@
+"""`--preset paper` and `preset("paper")` mean the whole paper; anchors are those of construction."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import around, checkered_ball
+
+import g2ard
+from g2ard.cameras import Cameras
+from g2ard.constants import listed
+from g2ard.distill import DistillConfig, distill
+from g2ard.errors import InputError
+from g2ard.images import write_png
+from g2ard.io import Points, read_splats, write_points, write_splats, write_views
+from g2ard.presets import preset
+from g2ard.recover import RecoverConfig, recover
+from g2ard.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, drift95
+from g2ard.recover.schedule import PAPER, Schedule
+from g2ard.render import render
+from g2ard.simplify import simplify
+from g2ard.splats import SH_C0, Splats
+from g2ard.targets import TeacherRenders
+
+CommandLine = Callable[..., tuple[int, str, str]]
+PRIOR = checkered_ball()
+FEW = PAPER.scaled(75)  # 20 steps a round
+FREE = Regularizers(0.0, 0.0, effective_rank=False)
+
+
+@pytest.fixture(scope="module")
+def targets() -> TeacherRenders:
+    return TeacherRenders(PRIOR, around())
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_splats(tmp_path / "ball.ply", PRIOR)
+    write_views(tmp_path / "v.json", around(24), splits=["train"] * 20 + ["test"] * 4)
+    return tmp_path
+
+
+def run(command_line: CommandLine, folder: Path, *arguments: object) -> dict[str, Any]:
+    status, out, error = command_line(*arguments, "-w", "--json", "-", cwd=folder)
+    assert status == 0, error
+    return json.loads(out)
+
+
+DISTILL = ("distill", "ball.ply", "-r", 3, "--views", "v.json", "-o", "run", "--steps", 75)
+
+
+def test_distill_does_all_that_the_paper_says(folder: Path, command_line: CommandLine) -> None:
+    report = run(command_line, folder, *DISTILL, "--preset", "paper")
+    whole = preset("paper").distill
+    used = replace(whole, simplify=whole.simplify.resolved("paper"), schedule=FEW)
+    wanted = json.loads(json.dumps(listed({"recover": used}, report["config"])))
+    assert report["constants"] == wanted
+    config = report["config"]
+    options = ("method", "schedule", "policy", "weighted", "reselect", "sh_degree")
+    assert [config[key] for key in options] == ["paper", "paper", whole.policy, False, False, 3]
+    views = report["views"]
+    assert (views["policy"], len(views["chosen"]), views["weighted"]) == ("directional", 10, False)
+    assert [entry["count"] for entry in report["rounds"]] == [2250, 1688, 1266, 1000]
+    taken = [[done["steps"] for done in entry["recover"]] for entry in report["rounds"]]
+    assert taken == [[20], [20], [20], [20, 75]]
+    assert not any(done["kept_start"] for entry in report["rounds"] for done in entry["recover"])
+    assert read_splats(folder / "run" / "scene.ply").sh_degree == 3
+    assert (PAPER.steps, PAPER.round_steps) == (30_000, 8_000)
+
+
+def test_what_is_said_beside_the_preset_stands(folder: Path, command_line: CommandLine) -> None:
+    (folder / "c.toml").write_text('[distill]\npolicy = "pose-diverse"\nmethod = "default"\n')
+    said = ("--config", "c.toml", "--method", "fast", "-k", 4, "--set", "regularizers.anchor=0.3")
+    report = run(command_line, folder, *DISTILL, "--preset", "paper", *said, "--sh-degree", 1)
+    assert (report["views"]["policy"], len(report["views"]["chosen"])) == ("pose-diverse", 4)
+    assert (report["config"]["method"], report["config"]["schedule"]) == ("fast", "paper")
+    assert report["constants"]["regularizers"]["anchor"] == 0.3
+    assert read_splats(folder / "run" / "scene.ply").sh_degree == 1
+    (folder / "c.toml").write_text('[distill]\npreset = "paper-noisy"\n[distill.set]\nperiod = 7\n')
+    report = run(command_line, folder, *DISTILL, "--config", "c.toml", "--weights")
+    assert (report["config"]["method"], report["views"]["weighted"]) == ("paper", True)
+    regularizers = report["constants"]["regularizers"]
+    assert (regularizers["shape"], regularizers["period"]) == (1e-3, 7)
+
+
+def test_a_cloud_takes_the_lift_s_row(folder: Path, command_line: CommandLine) -> None:
+    colors = np.clip(0.5 + SH_C0 * PRIOR.sh0[:, 0], 0, 1).astype(np.float32)
+    write_points(folder / "cloud.ply", Points(PRIOR.means.astype(np.float64), colors))
+    views = around(12)
+    paths = tuple(folder / f"{name}.png" for name in views.names)
+    for i, path in enumerate(paths):
+        write_png(path, render(PRIOR, views, i).image)
+    write_views(folder / "photos.json", replace(views, image_paths=paths))
+    ask = ("distill", "cloud.ply", "-r", 3, "--views", "photos.json", "-o", "run", "--steps", 8)
+    report = run(command_line, folder, *ask, "--preset", "paper", "--set", "lift.neighbors=8")
+    regularizers = report["constants"]["regularizers"]
+    assert [regularizers[key] for key in ("anchor", "shape", "effective_rank")] == [1e-3, 1e-4, True]
+    assert report["preset"].startswith("the paper's for lift (as asked)")
+    assert report["constants"]["lift"]["neighbors"] == 8
+
+
+def test_recover_raises_sh_for_the_schedule_and_the_rest_for_the_preset(
+    folder: Path, command_line: CommandLine
+) -> None:
+    ask = ("recover", "ball.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "o.ply", "--steps", 4)
+    for option, weighted in (("--schedule", True), ("--preset", False)):
+        report = run(command_line, folder, *ask, option, "paper")
+        assert read_splats(folder / "o.ply").sh_degree == 3
+        assert report["config"]["weighted"] is weighted
+        assert report["constants"]["schedule"]["guarded"] is False
+    run(command_line, folder, *ask, "--preset", "paper", "--sh-degree", 0)
+    assert read_splats(folder / "o.ply").sh_degree == 0
+
+
+def test_the_other_commands_know_it(folder: Path, command_line: CommandLine) -> None:
+    for asked in (("--method", "paper"), ("--preset", "paper")):
+        run(command_line, folder, "simplify", "ball.ply", "-r", 3, "-o", f"{asked[0][2:]}.ply", *asked)
+    assert (folder / "method.ply").read_bytes() == (folder / "preset.ply").read_bytes()
+    found = run(
+        command_line, folder, "select", "ball.ply", "--views", "v.json", "-o", "k.json", "--preset", "paper"
+    )
+    assert (found["policy"], len(found["views"])) == ("directional", 10)
+    ask = ("adapt", "ball.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "o.ply", "--steps", 6)
+    done = run(command_line, folder, *ask, "--preset", "paper")
+    assert done["constants"]["rates"] == {
+        **listed({"rates": PAPER.rates})["rates"],
+        **dict.fromkeys(("means", "log_scales", "quats"), 0.0),
+    }
+    assert (done["steps"], done["config"]["tolerance"], done["colour_change"]) == (6, 0.0, None)
+
+
+def test_a_study_takes_it_in_g2ard_s_place() -> None:
+    from g2ard.bench.definition import METHODS, Definition
+    from g2ard.cli.commands.bench.run import _as_in_the_paper
+
+    study = Definition(
+        "s", "", (), tuple(METHODS[name] for name in ("g2ard", "pup", "g2ard-paper")), steps=(5,)
+    )
+    paper, pup = _as_in_the_paper(study).methods
+    assert (paper.name, paper.reduce, paper.rounds, paper.k) == ("g2ard-paper", "paper", "paper", 0.5)
+    assert (pup, _as_in_the_paper(study).released) == (METHODS["pup"], True)
+
+
+def test_in_python() -> None:
+    noisy = g2ard.preset("paper", prior="noisy")
+    assert noisy.distill.regularizers == noisy.recover.regularizers == PAPER_PRESETS["noisy"]
+    assert noisy.adapt.stretches() == [7000]
+    for wrong in ({"name": "peer"}, {"prior": "gentle"}):
+        with pytest.raises(InputError, match="expected"):
+            preset(**wrong)
+    with pytest.raises(InputError, match="share"):
+        DistillConfig(views=1.5)
+
+
+def test_anchors_hold_from_construction_to_the_end(targets: TeacherRenders) -> None:
+    config = DistillConfig(method="paper", schedule=FEW, regularizers=FREE)
+    result = distill(PRIOR, 1000, targets, config)
+    first, last = result.report["rounds"][-1]["recover"]
+    anchors = Anchors.of(result.simplified)
+    assert last["drift95"] == drift95(anchors, result.splats.means)
+    assert last["geometry"][0]["drift95"] > first["drift95"] > 0.1  # the drift of the round is not forgotten
+    held = replace(config, regularizers=Regularizers(100.0, 0.0, effective_rank=False, period=1))
+    assert (
+        distill(PRIOR, 1000, targets, held).report["rounds"][-1]["recover"][-1]["drift95"] < last["drift95"]
+    )
+
+
+def test_the_paper_s_steps_are_kept_whatever_comes_of_them(targets: TeacherRenders) -> None:
+    config = RecoverConfig(schedule=PAPER, steps=30, regularizers=FREE)
+    grain = np.random.default_rng(0).normal(0, 1e-3, PRIOR.sh0.shape).astype(np.float32)
+    start = replace(PRIOR, sh0=PRIOR.sh0 + grain)  # so near that such steps only lose
+    done = recover(start, targets, config, validation=targets)
+    assert done.report["psnr"]["after"] < done.report["psnr"]["before"]
+    assert (done.report["kept_start"], done.report["way"], done.report["validation"]) == (False, 1.0, None)
+    assert (done.splats.sh0 != start.sh0).any()
+    guarded = replace(config, schedule=replace(PAPER, guarded=True))
+    assert recover(start, targets, guarded).report["kept_start"]
+
+
+def scaled(scene: Splats, cameras: Cameras, unit: float) -> tuple[Splats, Cameras]:
+    """The same in another unit."""
+    viewmats = cameras.viewmats.copy()
+    viewmats[:, :3, 3] *= unit
+    size = np.float32(unit)
+    return replace(scene, means=scene.means * size, scales=scene.scales * size), replace(
+        cameras, viewmats=viewmats
+    )
+
+
+def test_the_paper_s_rates_do_not_depend_on_the_unit() -> None:
+    student = simplify(PRIOR, 500, method="paper").splats
+
+    def moved(unit: float, schedule: Schedule = PAPER) -> float:
+        start, cameras = scaled(student, around(), unit)
+        teacher, _ = scaled(PRIOR, around(), unit)
+        config = RecoverConfig(schedule=schedule, steps=60, regularizers=FREE)
+        done = recover(start, TeacherRenders(teacher, cameras), config).splats
+        return float(np.abs(done.means - start.means).mean()) / unit
+
+    assert math.isclose(moved(64.0), moved(1.0), rel_tol=0.02)
+    stated = replace(PAPER, reference_extent=None)
+    assert moved(64.0, stated) < 0.1 * moved(1.0, stated)
+    assert math.isclose(around().extent, 1.1 * 3.0, rel_tol=0.1)
+    assert around().take([0]).extent == 0.0
+    assert PAPER.within(0.0) == PAPER
+
+
+def test_what_was_kept_gives_the_drift_again(folder: Path, command_line: CommandLine) -> None:
+    report = run(command_line, folder, *DISTILL, "--preset", "paper", "--keep")
+    kept = folder / "run" / "simplified" / "scene.ply"
+    ask = ("evaluate", "run/scene.ply", "--views", "v.json", "--teacher", "ball.ply", "--anchors", kept)
+    found = run(command_line, folder, *ask)["scenes"][0]["drift95"]
+    assert math.isclose(found, report["rounds"][-1]["recover"][-1]["drift95"], rel_tol=1e-4)
+    ask = ("recover", "run/scene.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "more.ply")
+    short = ("--schedule", "paper", "--steps", 2)
+    again = run(command_line, folder, *ask, *short, "--anchors", kept)["drift95"]
+    assert abs(again - found) < abs(run(command_line, folder, *ask, *short)["drift95"] - found)
+    status, _, error = command_line(*ask, *short, "-w", "--anchors", "ball.ply", cwd=folder)
+    assert (status, error.splitlines()[-1]) == (
+        1,
+        "g2ard: ball.ply: 3000 Gaussians, the student has 1000",
+    )
+    run(command_line, folder, *DISTILL, "--schedule", "fast")
+    assert not kept.exists()  # it would not be of this run
