@@ -87,22 +87,8 @@ def evaluate(
             row["drift95"] = drift95(Anchors.of(frozen), splats.means)
         rows.append(row)
     against = _against(rows[0]["views"])
-    run.console.table(
-        f"{len(targets.cameras)} views, against {_named(against)}; {_protocol(convention, eight_bit)}",
-        ["scene", "Gaussians", "MB", "PSNR", "SSIM", "LPIPS", "needle"],
-        [
-            [
-                Path(r["scene"]).name,
-                f"{r['count']:,}",
-                f"{r['bytes'] / 1e6:.2f}",
-                f"{r['psnr']:.2f}",
-                f"{r['ssim']:.4f}",
-                " ".join(f"{net} {value:.4f}" for net, value in (r["lpips"] or {}).items()) or "–",
-                f"{r['needle']:.1%}",
-            ]
-            for r in rows
-        ],
-    )
+    said = f"{len(cameras)} views, against {_named(against)}; {_protocol(convention, eight_bit)}"
+    _table(run, said, rows)
     protocol = {"convention": convention, "8bit": eight_bit, "lpips_input": lpips_input if lpips else None}
     single = {"photo": "photos", "teacher": "teacher"}
     kind = single[next(iter(against))] if len(against) == 1 else against
@@ -125,3 +111,22 @@ def _named(against: dict[str, int]) -> str:
 
 def _protocol(convention: str, eight_bit: bool) -> str:
     return f"{convention}'s conventions, {'8-bit' if eight_bit else 'float'} renders"
+
+
+def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
+    run.console.table(
+        title,
+        ["scene", "Gaussians", "MB", "PSNR", "SSIM", "LPIPS", "needle"],
+        [
+            [
+                Path(r["scene"]).name,
+                f"{r['count']:,}",
+                f"{r['bytes'] / 1e6:.2f}",
+                f"{r['psnr']:.2f}",
+                f"{r['ssim']:.4f}",
+                " ".join(f"{net} {value:.4f}" for net, value in (r["lpips"] or {}).items()) or "–",
+                f"{r['needle']:.1%}",
+            ]
+            for r in rows
+        ],
+    )
