@@ -4,27 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from g2ard.images import as_saved
 from g2ard.lpips import Lpips
 from g2ard.metrics import psnr, ssim
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
-from g2ard.targets import Targets, mask_of
+from g2ard.targets import Targets, against_of, mask_of
+
+if TYPE_CHECKING:
+    from g2ard.render import RasterSettings
 
 __all__ = ["Evaluation", "ViewScore", "evaluate"]
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One view's figures; LPIPS by network, empty without weights."""
+    """One view's figures; LPIPS by network, empty without weights; `against` "photo" or "teacher" where the
+    targets say so."""
 
     name: str
     psnr: float
     ssim: float
     lpips: Mapping[str, float] = field(default_factory=dict)
+    against: str | None = None
 
 
 @dataclass(frozen=True)
@@ -64,7 +70,11 @@ class Evaluation:
             "psnr": self.psnr,
             "ssim": self.ssim,
             "lpips": self.lpips or None,
-            "views": [{"name": v.name, "psnr": v.psnr, "ssim": v.ssim} for v in self.views],
+            "views": [
+                {"name": v.name, "psnr": v.psnr, "ssim": v.ssim}
+                | ({"against": v.against} if v.against else {})
+                for v in self.views
+            ],
         }
 
 
@@ -74,19 +84,24 @@ def evaluate(
     *,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     lpips: Mapping[str, Lpips] | None = None,
+    settings: RasterSettings | None = None,
+    eight_bit: bool = False,
     progress: Progress = silent,
     stage: str = "evaluate",
 ) -> Evaluation:
     """Render every view of `targets` and score it.
 
-    Renders are clamped to [0, 1] without 8-bit rounding; SSIM has an 11×11 Gaussian window, σ 1.5,
-    zero-padded. Where a photo has a mask, only its pixels count.
+    Renders are clamped to [0, 1] without 8-bit rounding, unless asked for; SSIM has an 11×11 Gaussian window,
+    σ 1.5, zero-padded. Where a photo has a mask, only its pixels count.
 
     Args:
         splats: the scene; its offset counts, cameras are in world coordinates.
         targets: photos or teacher renders; photo-relative and teacher-relative figures never mix.
         background: RGB behind the scene.
         lpips: networks to score with as well, as `g2ard.lpips.load_lpips` finds them.
+        settings: the renderer's conventions; None means gsplat's. A teacher's renders have their own, see
+            `g2ard.targets.TeacherRenders`.
+        eight_bit: round renders and targets to multiples of 1/255, as evaluations from saved PNGs do.
         progress: told after each view.
         stage: the name progress is reported under.
 
@@ -101,10 +116,13 @@ def evaluate(
     cameras = targets.cameras
     scores = []
     for view, name in enumerate(cameras.names):
-        image = np.clip(render(splats, cameras, view, background=background).image, 0, 1)
-        target = targets[view]
+        image = render(splats, cameras, view, background=background, settings=settings).image
+        image, target = np.clip(image, 0, 1), targets[view]
+        if eight_bit:
+            image, target = as_saved(image), as_saved(target)
         perceived = {net: model(image, target) for net, model in (lpips or {}).items()}
         mask = mask_of(targets, view)
-        scores.append(ViewScore(name, psnr(image, target, mask), ssim(image, target, mask), perceived))
+        figures = psnr(image, target, mask), ssim(image, target, mask)
+        scores.append(ViewScore(name, *figures, perceived, against_of(targets, view)))
         progress(stage, view + 1, len(cameras))
     return Evaluation(len(splats), splats.nbytes, tuple(scores))

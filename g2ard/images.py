@@ -17,7 +17,7 @@ from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.progress import Progress, silent
 
-__all__ = ["contact_sheet", "load_image", "load_images", "load_mask", "to_bytes", "write_png"]
+__all__ = ["as_saved", "contact_sheet", "load_image", "load_images", "load_mask", "to_bytes", "write_png"]
 
 _ASPECT_SLACK = 0.02
 """Relative difference of aspect ratio that rounding a resized photo may cause; more is another photo."""
@@ -194,6 +194,15 @@ def to_bytes(image: ArrayLike) -> NDArray[np.uint8]:
     if values.dtype == np.uint8:
         return values
     return np.rint(np.clip(np.nan_to_num(values, nan=0.0), 0, 1) * 255).astype(np.uint8)
+
+
+def as_saved(image: ArrayLike) -> NDArray[np.float32]:
+    """An image in [0, 1] as it comes back from an 8-bit PNG: clipped, and rounded to multiples of 1/255.
+
+    >>> (255 * as_saved([[-1.0, 0.5, 2.0]])).tolist()
+    [[0.0, 128.0, 255.0]]
+    """
+    return to_bytes(image).astype(np.float32) / np.float32(255)
 
 
 def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) -> None:

@@ -34,13 +34,18 @@ class Lpips:
         net: "alex" or "vgg".
         backbone: torchvision's state dict of the network: features.N.weight, features.N.bias.
         linear: LPIPS's own: linN.model.1.weight (1, C, 1, 1).
+        scaled: bring images from [0, 1] to the [−1, 1] that the networks were fitted for; False feeds them as
+            they are, as 3DGS's own evaluation does (graphdeco-inria/gaussian-splatting#1239). The figures
+            of the two do not compare.
 
     Raises:
         InputError: weights that are missing.
     """
 
-    def __init__(self, net: str, backbone: dict[str, Any], linear: dict[str, Any]) -> None:
-        self.net = net
+    def __init__(
+        self, net: str, backbone: dict[str, Any], linear: dict[str, Any], *, scaled: bool = True
+    ) -> None:
+        self.net, self.scaled = net, scaled
         self._layers: dict[int, tuple[Any, Any]] = {}
         try:
             for i in _CONV[net]:
@@ -64,7 +69,8 @@ class Lpips:
         import torch
         from torch.nn import functional
 
-        x = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None] * 2 - 1
+        x = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None]
+        x = 2 * x - 1 if self.scaled else x
         x = (x - torch.tensor(_MEAN).reshape(1, 3, 1, 1)) / torch.tensor(_STD).reshape(1, 3, 1, 1)
         taps = []
         for i in range(_TAPS[self.net][-1] + 1):
@@ -82,10 +88,14 @@ class Lpips:
         return taps
 
 
-def load_lpips(folder: Path) -> dict[str, Lpips]:
+def load_lpips(folder: Path, *, scaled: bool = True) -> dict[str, Lpips]:
     """The networks whose weights lie in a folder: alexnet*.pth with alex.pth, vgg16*.pth with vgg.pth.
 
     The former are torchvision's ImageNet weights, the latter LPIPS's linear layers (v0.1), both as published.
+
+    Args:
+        folder: where they lie.
+        scaled: see `Lpips`.
 
     Raises:
         InputError: the folder holds neither pair, or a file that is no state dict.
@@ -103,7 +113,7 @@ def load_lpips(folder: Path) -> dict[str, Lpips]:
                 files.append(torch.load(path, map_location="cpu", weights_only=True))
             except Exception as error:  # torch raises whatever the pickle met
                 raise InputError(f"{path}: no weights of torch's ({type(error).__name__})") from None
-        out[net] = Lpips(net, files[0], files[1])
+        out[net] = Lpips(net, files[0], files[1], scaled=scaled)
     if not out:
         raise InputError(f"{folder}: no LPIPS weights (alexnet*.pth and alex.pth, or vgg16*.pth and vgg.pth)")
     return out

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,20 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
 
-__all__ = ["CACHE_BYTES", "Photos", "Subset", "Targets", "TeacherRenders", "fingerprint_of", "mask_of"]
+if TYPE_CHECKING:
+    from g2ard.render import RasterSettings
+
+__all__ = [
+    "CACHE_BYTES",
+    "Photos",
+    "PhotosOrRenders",
+    "Subset",
+    "Targets",
+    "TeacherRenders",
+    "against_of",
+    "fingerprint_of",
+    "mask_of",
+]
 
 CACHE_BYTES = 2_000_000_000
 """Targets are kept in memory up to this many bytes; beyond it they are made again when they are asked for."""
@@ -33,6 +46,12 @@ def mask_of(targets: Targets, view: int) -> NDArray[np.bool_] | None:
     """(H, W), where a target counts; None where all of it does, which is the rule."""
     masks = getattr(targets, "mask", None)
     return None if masks is None else masks(view)
+
+
+def against_of(targets: Targets, view: int) -> str | None:
+    """What a view's target is, "photo" or "teacher"; None where the targets do not say."""
+    says: Callable[[int], str | None] | None = getattr(targets, "against", None)
+    return None if says is None else says(view)
 
 
 def fingerprint_of(targets: Targets) -> str:
@@ -63,6 +82,10 @@ class Subset:
     def mask(self, view: int) -> NDArray[np.bool_] | None:
         """See `mask_of`."""
         return mask_of(self._targets, int(self._rows[view]))
+
+    def against(self, view: int) -> str | None:
+        """See `against_of`."""
+        return against_of(self._targets, int(self._rows[view]))
 
 
 class _Cached(ABC):
@@ -137,6 +160,10 @@ class Photos(_Cached):
         if self._undo:
             self.source += f" exposures {[(v, m.tolist()) for v, m in self._undo.items()]}"
 
+    def against(self, view: int) -> str:
+        """See `against_of`."""
+        return "photo"
+
     def mask(self, view: int) -> NDArray[np.bool_] | None:
         """Where the photo counts; None if it has no mask."""
         if view not in self._masks:
@@ -170,7 +197,8 @@ def _inverse(name: str, exposure: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 class TeacherRenders(_Cached):
-    """The dense scene rendered into each view, in [0, 1] and float32; `lazy`, when first asked for."""
+    """The dense scene rendered into each view, in [0, 1] and float32, by gsplat's conventions or `settings`;
+    `lazy`, when first asked for."""
 
     def __init__(
         self,
@@ -178,22 +206,93 @@ class TeacherRenders(_Cached):
         cameras: Cameras,
         *,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        settings: RasterSettings | None = None,
         limit: int = CACHE_BYTES,
         lazy: bool = False,
         progress: Progress = silent,
     ) -> None:
         super().__init__(cameras, limit)
         self._teacher = teacher
-        self._background = background
+        self._background, self._settings = background, settings
         self.source = f"teacher {teacher.fingerprint()} {background}"
+        if settings is not None:
+            self.source += f" {settings}"
         if not lazy:
             self.fill(progress, "teacher")
 
     def _make(self, view: int) -> NDArray[np.float32]:
         from g2ard.render import render
 
-        image = render(self._teacher, self.cameras, view, background=self._background).image
+        image = render(
+            self._teacher, self.cameras, view, background=self._background, settings=self._settings
+        ).image
         return np.clip(image, 0, 1)
+
+    def against(self, view: int) -> str:
+        """See `against_of`."""
+        return "teacher"
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         return self._stored(view)
+
+
+class PhotosOrRenders:
+    """The photo of a view where there is one, else the dense scene's render (sec. 3.1: "real images are used
+    when available, otherwise teacher renders").
+
+    Args:
+        cameras: with photos or without.
+        teacher: the dense scene.
+        background: RGB behind it.
+        exposures: of the photos, see `Photos`.
+        settings: the renderer's conventions; None means gsplat's.
+        limit: bytes kept in memory, of each kind.
+        lazy: render when first asked for.
+        progress: told of every render.
+
+    Raises:
+        InputError: an exposure that cannot be undone.
+    """
+
+    def __init__(
+        self,
+        cameras: Cameras,
+        teacher: Splats,
+        *,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        exposures: Mapping[str, NDArray[np.float64]] | None = None,
+        settings: RasterSettings | None = None,
+        limit: int = CACHE_BYTES,
+        lazy: bool = False,
+        progress: Progress = silent,
+    ) -> None:
+        self.cameras = cameras
+        pictured = np.array([path is not None for path in cameras.image_paths], bool)
+        photos = Photos(cameras.take(np.flatnonzero(pictured)), exposures=exposures, limit=limit)
+        renders = TeacherRenders(
+            teacher,
+            cameras.take(np.flatnonzero(~pictured)),
+            background=background,
+            settings=settings,
+            limit=limit,
+            lazy=lazy,
+            progress=progress,
+        )
+        rows = np.where(pictured, np.cumsum(pictured), np.cumsum(~pictured)) - 1
+        self._places: list[tuple[Photos | TeacherRenders, int]] = [
+            (photos if photo else renders, int(row)) for photo, row in zip(pictured, rows, strict=True)
+        ]
+        self.source = f"{photos.source} | {renders.source}"
+
+    def __getitem__(self, view: int) -> NDArray[np.float32]:
+        targets, row = self._places[view]
+        return targets[row]
+
+    def mask(self, view: int) -> NDArray[np.bool_] | None:
+        """See `mask_of`."""
+        targets, row = self._places[view]
+        return mask_of(targets, row)
+
+    def against(self, view: int) -> str:
+        """See `against_of`."""
+        return self._places[view][0].against(view)

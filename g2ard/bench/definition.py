@@ -10,100 +10,12 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from g2ard import baselines
+from g2ard.bench.methods import METHODS, SCHEDULES, Matched, MethodSpec
 from g2ard.errors import InputError
 
 __all__ = ["METHODS", "Definition", "Matched", "MethodSpec", "SceneSpec", "read_definition"]
 
-_OURS = ("default", "no-views", "fast", "paper")
-_RIVALS = ("splat-transform", "splat-transform-adaptive")
-_REDUCERS = (*_OURS, *baselines.METHODS, *_RIVALS)
-_POLICIES = ("auto", "directional", "coverage", "pose-diverse", "random", "uniform")
-
-
-@dataclass(frozen=True)
-class MethodSpec:
-    """One method: how it reduces, in which rounds, and what of the recovery is its own.
-
-    Args:
-        name: as the rows call it.
-        reduce: one of g2ard's policies (default, no-views, fast, paper), a baseline, or a rival program.
-        rounds: "one" shot; "paper", 75 % a round with recovery after each; "pup", its two.
-        round_share: share of the matched steps or seconds that the rounds before the last recovery take.
-        prior: "lift", "trained" or "given": which of the scene's priors; None means the scene's own choice.
-        policy: of view selection; None trains on all views.
-        k: share of the training views that the policy keeps.
-        preset: of the regularisers.
-        anchor: overrides the preset's weight of L_anchor.
-        shape: overrides the preset's weight of L_shape; 0 also ends the effective rank's barrier.
-        period: overrides how many steps there are from one addition of the regularisers to the next, 100.
-        protection: λ_h of the `paper` policy; 0 takes the flags away.
-        released_steps: steps of each recovery in the method's own release; None where there is none.
-        released_schedule: their rates.
-    """
-
-    name: str
-    reduce: str
-    rounds: str = "one"
-    round_share: float = 0.5
-    prior: str | None = None
-    policy: str | None = None
-    k: float = 1.0
-    preset: str = "auto"
-    anchor: float | None = None
-    shape: float | None = None
-    period: int | None = None
-    protection: float | None = None
-    released_steps: int | None = None
-    released_schedule: str = "3dgs"
-
-    def __post_init__(self) -> None:
-        for key, known in (
-            ("reduce", _REDUCERS),
-            ("rounds", ("one", "paper", "pup")),
-            ("prior", (None, "lift", "trained", "given")),
-            ("policy", (None, *_POLICIES)),
-            ("preset", ("auto", "trained", "lift", "noisy")),
-            ("released_schedule", ("3dgs", "paper", "default")),
-        ):
-            if getattr(self, key) not in known:
-                options = ", ".join(str(option) for option in known if option)
-                raise InputError(
-                    f"method {self.name}: {key}: expected one of {options}, got {getattr(self, key)!r}"
-                )
-        if self.period is not None and self.period < 1:
-            raise InputError(f"method {self.name}: period: expected at least 1, got {self.period}")
-        if not 0 < self.k <= 1 or not 0 <= self.round_share < 1:
-            raise InputError(f"method {self.name}: k {self.k} and round_share {self.round_share}: shares")
-
-
-_3DGS = {"released_schedule": "3dgs"}
-METHODS: dict[str, MethodSpec] = {
-    m.name: m
-    for m in (
-        MethodSpec("g2ard", "default"),
-        MethodSpec("g2ard-fast", "fast"),
-        MethodSpec(
-            "g2ard-paper",
-            "paper",
-            rounds="paper",
-            round_share=0.6,
-            released_steps=38_000,
-            released_schedule="paper",
-        ),
-        MethodSpec("lightgaussian", "lightgaussian", released_steps=5_000),
-        MethodSpec("pup", "pup", rounds="pup", released_steps=5_000),
-        MethodSpec("mini-splatting", "mini-splatting", released_steps=15_000),
-        MethodSpec("nanogs", "nanogs", released_steps=0),
-        MethodSpec("opacity-area", "opacity-area"),
-        MethodSpec("random", "random"),
-        MethodSpec("splat-transform", "splat-transform", released_steps=0),
-        MethodSpec("splat-transform-adaptive", "splat-transform-adaptive", released_steps=0),
-    )
-}
-"""What a definition may name without describing it. PUP's and LightGaussian's released steps are those of
-their papers; Mini-Splatting trains on for 15,000 once it has simplified; NanoGS and splat-transform do not
-recover. The paper's method takes 8,000 after each round, and after the last 30,000 more (`tab:s_config`)."""
+_TARGETS = ("teacher", "photos", "either")
 
 
 @dataclass(frozen=True)
@@ -117,8 +29,10 @@ class SceneSpec:
             None takes the training part of a pool made for the scene.
         score: name → views to score on, but for those stated as train; empty takes the test part of `train`,
             or of the pool.
-        adapt: views of new appearance, for studies that adapt; every third is scored if they state no split.
-        targets: "teacher", the prior's renders, or "photos".
+        adapt: views of new appearance, for studies that adapt; every third is scored if they state no split,
+            unless the study adapts on all.
+        targets: "teacher", the prior's renders, "photos", or "either": of each view its photo where it has
+            one, else the prior's render.
         background: behind the scene.
         indoor: whether Mini-Splatting uses its importance for rooms.
         train_prior: steps that make a "trained" prior of a lift, at its own count.
@@ -138,19 +52,6 @@ class SceneSpec:
 
 
 @dataclass(frozen=True)
-class Matched:
-    """What a cell may spend: `amount` steps or seconds, or what the method's release spends."""
-
-    kind: str
-    amount: float = 0.0
-
-    @property
-    def label(self) -> str:
-        """As rows and charts call it."""
-        return {"steps": f"{self.amount:g} steps", "seconds": f"{self.amount:g} s"}.get(self.kind, self.kind)
-
-
-@dataclass(frozen=True)
 class Definition:
     """A study.
 
@@ -164,11 +65,17 @@ class Definition:
         steps: budgets in optimiser steps; each is a cell.
         seconds: budgets in wall seconds of reduction and recovery together; each is a cell.
         released: also each method's own schedule, where it has one.
-        schedule: rates of the matched cells, the same for all.
+        schedule: rates of the matched cells, the same for all methods that state none.
         size: longer side of the views, pixels; None keeps them.
         sh_degree: of the results; None keeps the prior's, and 3 where photos are the targets.
         adapt_steps: steps of appearance on frozen geometry before scoring; 0 does not adapt.
+        adapt_schedule: "default", or "paper": all steps at its rates, nothing blended.
+        adapt_on: "train", or "all" views of `adapt` that are not stated as another split.
+        convention: of the renderer that scores, "gsplat" or "inria".
+        eight_bit: round renders and targets to 8 bits before they are scored, as saved PNGs are.
         lpips: folder of the networks' weights.
+        lpips_input: "scaled" to [−1, 1], or "unscaled" as 3DGS's evaluation has it, see `g2ard.lpips.Lpips`.
+        differs: in what the study differs from the paper's, a line each; reports print them.
     """
 
     name: str
@@ -184,7 +91,13 @@ class Definition:
     size: int | None = None
     sh_degree: int | None = None
     adapt_steps: int = 0
+    adapt_schedule: str = "default"
+    adapt_on: str = "train"
+    convention: str = "gsplat"
+    eight_bit: bool = False
     lpips: str | None = None
+    lpips_input: str = "scaled"
+    differs: tuple[str, ...] = ()
     folder: Path = Path()
 
     def __post_init__(self) -> None:
@@ -209,21 +122,40 @@ class Definition:
             value = getattr(self, key)
             if value is not None and (not isinstance(value, int) or value < least):
                 raise InputError(f"{key}: expected a whole number, at least {least}, got {value!r}")
-        if self.schedule not in ("default", "paper", "fast", "best"):
-            raise InputError(f"schedule: expected default, fast, best or paper, got {self.schedule!r}")
+        for key, known in (
+            ("schedule", SCHEDULES),
+            ("adapt_schedule", ("default", "paper")),
+            ("adapt_on", ("train", "all")),
+            ("convention", ("gsplat", "inria")),
+            ("lpips_input", ("scaled", "unscaled")),
+            ("eight_bit", (False, True)),
+        ):
+            value = getattr(self, key)
+            if value not in known:
+                options = "true or false" if key == "eight_bit" else " or ".join(map(str, known))
+                raise InputError(f"{key}: expected {options}, got {value!r}")
+        if not isinstance(self.differs, tuple) or not all(isinstance(line, str) for line in self.differs):
+            raise InputError(f"differs: expected a list of lines, got {self.differs!r}")
 
     def matched(self, method: MethodSpec) -> list[Matched]:
         """The budgets under which a method is measured."""
+        if not method.recovers:
+            return [Matched("none")]
         out = [Matched("steps", n) for n in self.steps] + [Matched("seconds", s) for s in self.seconds]
         if self.released and method.released_steps is not None:
             out.append(Matched("released"))
         return out
 
     def cells(self) -> Iterator[tuple[SceneSpec, float, MethodSpec, Matched, int]]:
-        """Scene by scene, all that is to be measured."""
+        """Scene by scene, all that is to be measured; a teacher's row once a scene."""
         for scene in self.scenes:
+            for method in self.methods:
+                if not method.recovers:
+                    yield scene, 1.0, method, self.matched(method)[0], self.seeds[0]
             for ratio in self.ratios:
                 for method in self.methods:
+                    if not method.recovers:
+                        continue
                     for matched in self.matched(method):
                         for seed in self.seeds:
                             yield scene, ratio, method, matched, seed
@@ -237,7 +169,7 @@ def read_definition(path: Path) -> Definition:
     """Read a study.
 
     Tables `[[scene]]` are `SceneSpec`s; `methods` lists names of `METHODS` or of tables `[method.NAME]`,
-    which take over the fields of their `base`.
+    which take over the fields of their `base`. `keep = [0.033]` is `ratios = [1 / 0.033]`.
 
     Raises:
         InputError: it cannot be read, or a key or value is not known; the message names the file.
@@ -257,6 +189,8 @@ def read_definition(path: Path) -> Definition:
         if missing is not None:
             raise InputError(f"methods: no {missing!r} (there are {', '.join(known)})")
         scenes = tuple(_scene(values) for values in content.pop("scene", []))
+        if "keep" in content:
+            content["ratios"] = _ratios_of(content.pop("keep"), "ratios" in content)
         values = _checked(Definition, {"title": path.stem, **content}, {"name", "folder", "scenes"})
         made = Definition(
             name=path.stem,
@@ -285,12 +219,22 @@ def _method(name: str, values: dict[str, Any]) -> MethodSpec:
     return replace(METHODS[base], **{"name": name, **_checked(MethodSpec, values, {"name"})})
 
 
+def _ratios_of(keep: Any, both: bool) -> list[float]:
+    """Ratios of shares that are kept: the paper's 99,044 Gaussians are 0.033 of N."""
+    if both:
+        raise InputError("keep and ratios exclude each other")
+    numbers = isinstance(keep, list) and all(type(share) in (int, float) for share in keep)
+    if not numbers or not all(0 < share <= 1 for share in keep):
+        raise InputError(f"keep: expected a list of shares in (0, 1], got {keep!r}")
+    return [1 / share for share in keep]
+
+
 def _scene(values: dict[str, Any]) -> SceneSpec:
     if "name" not in values:
         raise InputError("scene: lacks 'name'")
     made = SceneSpec(**_checked(SceneSpec, values, set()))
-    if made.targets not in ("teacher", "photos"):
-        raise InputError(f"scene {made.name}: targets: teacher or photos, not {made.targets!r}")
+    if made.targets not in _TARGETS:
+        raise InputError(f"scene {made.name}: targets: {', '.join(_TARGETS)}, not {made.targets!r}")
     return made
 
 

@@ -22,7 +22,7 @@ from g2ard.report.page import COLORS, Comparison, Page, Shown, legend
 __all__ = ["write_report"]
 
 _VIEWS = 3
-_MARKS = ("steps", "seconds", "released")
+_MARKS = ("steps", "seconds", "released", "none")
 _COLUMNS = (
     "method",
     "matched",
@@ -64,6 +64,9 @@ def write_report(folder: Path, definitions: Sequence[Definition], rows: Sequence
 
 def _study(page: Page, folder: Path, definition: Definition, rows: Sequence[Row]) -> None:
     page.heading(definition.title or definition.name)
+    if definition.differs:
+        page.paragraph("Differs from the paper:")
+        page.items(definition.differs)
     names = [method.name for method in definition.methods]
     kinds = [kind for kind in _MARKS if any(row.matched == kind for row in rows)]
     page.html(legend(names, [_kind_label(kind) for kind in kinds]))
@@ -71,6 +74,8 @@ def _study(page: Page, folder: Path, definition: Definition, rows: Sequence[Row]
         if row.error:
             matched = Matched(row.matched, row.amount).label
             page.paragraph(f"Failed: {row.scene} {row.ratio:g}× {row.method} ({matched}): {row.error}")
+    for line in _notes(folder, definition, rows):
+        page.paragraph(line)
     whole = [row for row in rows if not row.error]
 
     def place(row: Row) -> tuple[str, str, str]:
@@ -84,16 +89,44 @@ def _study(page: Page, folder: Path, definition: Definition, rows: Sequence[Row]
         _views(page, folder, definition, scene, split, group)
 
 
+def _notes(folder: Path, definition: Definition, rows: Sequence[Row]) -> list[str]:
+    """What was left out: training views that are scored on, and renders that came out black."""
+    lines = []
+    for scene in definition.scenes:
+        cells = [cell for cell in cells_of([definition]) if cell.scene.name == scene.name]
+        paths = [folder / "cells" / f"{cell.key}.json" for cell in cells]
+        dropped = max((json.loads(p.read_text()).get("dropped", 0) for p in paths if p.exists()), default=0)
+        if dropped:
+            lines.append(
+                f"{scene.name}: {dropped} views to train on are scored on: they were not trained on."
+            )
+    lines += [
+        f"{row.scene} {row.ratio:g}× {row.method} ({Matched(row.matched, row.amount).label}): {row.black} of "
+        f"{row.black + (row.views or 0)} {row.split} renders are all black, and left out of its means."
+        for row in rows
+        if row.black
+    ]
+    return lines
+
+
 def _against(against: str) -> str:
-    return "the photos" if against == "photos" else "the teacher's renders"
+    named = {"photos": "the photos", "teacher": "the teacher's renders"}
+    return named.get(against, "photos, and the teacher's renders where there is none")
 
 
 def _kind_label(kind: str) -> str:
-    return {"steps": "step-matched", "seconds": "time-matched", "released": "as released"}[kind]
+    named = {
+        "steps": "step-matched",
+        "seconds": "time-matched",
+        "released": "as released",
+        "none": "as it is",
+    }
+    return named[kind]
 
 
 def _charts(page: Page, rows: Sequence[Row], names: Sequence[str]) -> None:
     charts = []
+    rows = [row for row in rows if row.matched != "none"]
     for ratio in sorted({row.ratio for row in rows}):
         points = [_point(row, row.cpu_s or 0.0, names) for row in rows if row.ratio == ratio]
         best = {id(point) for point in pareto(points)}
@@ -129,14 +162,20 @@ def _table(page: Page, rows: Sequence[Row], names: Sequence[str]) -> None:
     def place(row: Row) -> tuple[float, str, float]:
         return row.ratio, row.matched, row.amount
 
-    for (ratio, matched, amount), members in groupby(sorted(rows, key=place), place):
+    teachers = [row for row in rows if row.matched == "none"]
+    others = [row for row in rows if row.matched != "none"]
+    columns = _COLUMNS + (("ΔPSNR",) if teachers else ())
+    if not others:
+        page.table(columns, [_cells(row)[: len(columns)] for row in teachers], set())
+    for (ratio, matched, amount), members in groupby(sorted(others, key=place), place):
         group = sorted(members, key=lambda row: -(row.psnr or 0))
         best = {
             (int(np.argmax([getattr(row, name) or 0.0 for row in group])), column)
             for column, name in ((4, "psnr"), (5, "ssim"))
         }
         page.html(f'<p class="sub">{ratio:g}×, {Matched(matched, amount).label}</p>')
-        page.table(_COLUMNS, [_cells(row) for row in group], best)
+        cells = [_cells(row)[: len(columns)] for row in [*group, *teachers]]
+        page.table(columns, cells, best)
 
 
 def _cells(row: Row) -> list[str]:
@@ -145,7 +184,7 @@ def _cells(row: Row) -> list[str]:
 
     overran = row.matched == "seconds" and not row.steps
     return [
-        row.method + (f" (seed {row.seed})" if row.seed else ""),
+        row.method + (f" (seed {row.seed})" if row.seed else "") + ("†" if row.black else ""),
         Matched(row.matched, row.amount).label,
         f"{row.count:,}",
         f"{(row.bytes or 0) / 1e6:.2f}",
@@ -160,6 +199,7 @@ def _cells(row: Row) -> list[str]:
         figure(row.recover_cpu_s, ".1f"),
         figure(row.seconds, ".1f") + (" (reduction alone)" if overran else ""),
         figure(max(row.reduce_peak_mb or 0.0, row.recover_peak_mb or 0.0), ".0f"),
+        figure(row.delta_psnr, "+.2f"),
     ]
 
 
@@ -167,7 +207,7 @@ def _views(
     page: Page, folder: Path, definition: Definition, scene: str, split: str, rows: Sequence[Row]
 ) -> None:
     """The worst pictured views of the first method, at its first budget, for every ratio."""
-    for ratio in sorted({row.ratio for row in rows}):
+    for ratio in sorted({row.ratio for row in rows if row.matched != "none"}):
         cells = _cell_files(folder, definition, scene, ratio)
         if not cells:
             continue

@@ -13,7 +13,7 @@ from typing import Any
 from g2ard import __version__, io
 from g2ard.bench.definition import Definition
 from g2ard.bench.pipeline import Cell, Pipeline
-from g2ard.bench.run_rows import Row, write_csv
+from g2ard.bench.run_rows import Row, with_deltas, write_csv
 from g2ard.bench.score import Scored, pictured, save_jpeg, score
 from g2ard.bench.simplify import machine
 from g2ard.bench.stand import Stand, folder_of
@@ -57,7 +57,11 @@ def bench_run(
     """
     cells = cells_of(definitions)
     (folder / "cells").mkdir(parents=True, exist_ok=True)
-    weights = {d.lpips: load_lpips(d.folder / d.lpips) for d in definitions if d.lpips is not None}
+    weights = {
+        (d.lpips, d.lpips_input): load_lpips(d.folder / d.lpips, scaled=d.lpips_input == "scaled")
+        for d in definitions
+        if d.lpips is not None
+    }
     stand: Stand | None = None
     if again:
         for definition in definitions:
@@ -70,7 +74,8 @@ def bench_run(
         try:
             if stand is None or (stand.definition, stand.scene) != (cell.definition, cell.scene):
                 stand = Stand(folder / "work", cell.definition, cell.scene)
-            answer = _measure(stand, cell, folder, weights.get(cell.definition.lpips or "", {}))
+            networks = weights.get((cell.definition.lpips or "", cell.definition.lpips_input), {})
+            answer = _measure(stand, cell, folder, networks)
         except Exception as error:  # one cell must not end hours of others; its row and the exit status tell
             stand = None
             answer = {"rows": [asdict(_failed(cell, error))], "views": {}}
@@ -104,7 +109,7 @@ def _read_cell(folder: Path, cell: Cell) -> list[Row]:
 
 
 def _rows(folder: Path, cells: Sequence[Cell]) -> list[Row]:
-    return [row for cell in cells for row in _read_cell(folder, cell)]
+    return with_deltas([row for cell in cells for row in _read_cell(folder, cell)])
 
 
 def _others(folder: Path, cells: Sequence[Cell]) -> list[Row]:
@@ -116,7 +121,7 @@ def _others(folder: Path, cells: Sequence[Cell]) -> list[Row]:
         rows = [Row(**row) for row in held["rows"]]
         if rows:
             found[rows[0].study, held["label"], rows[0].seed] = rows
-    return [row for key in sorted(found) if key not in ours for row in found[key]]
+    return with_deltas([row for key in sorted(found) if key not in ours for row in found[key]])
 
 
 def _head(cell: Cell, prior: str, split: str) -> Row:
@@ -173,17 +178,26 @@ def _measure(stand: Stand, cell: Cell, folder: Path, lpips: dict[str, Lpips]) ->
     for split, targets in stand.test.items():
         _picture_targets(folder, stand, split)
         pictures = folder / "images" / cell.key / split
-        scored = score(splats, targets, cell.scene.background, lpips=lpips, pictures=pictures)
+        scored = score(
+            splats,
+            targets,
+            cell.scene.background,
+            lpips=lpips,
+            settings=stand.settings,
+            eight_bit=cell.definition.eight_bit,
+            pictures=pictures,
+        )
         measured: dict[str, Any] = {**figures, **_means(scored)}
         rows.append(asdict(replace(_head(cell, work.prior, split), **measured)))
         views[split] = [asdict(view) for view in scored.views]
-    return {"rows": rows, "views": views, "scene_key": stand.key}
+    return {"rows": rows, "views": views, "scene_key": stand.key, "dropped": stand.dropped}
 
 
 def _means(scored: Scored) -> dict[str, Any]:
     names = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
     means: dict[str, Any] = {name: scored.mean(name) for name in names}
-    return {**means, "luma_drift": scored.luma_drift, "views": len(scored.views)}
+    counted = {"views": len(scored.counted), "black": scored.black}
+    return {**means, **counted, "luma_drift": scored.luma_drift}
 
 
 def _picture_targets(folder: Path, stand: Stand, split: str) -> None:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 
-__all__ = ["Row", "read_rows", "write_csv"]
+__all__ = ["Row", "read_rows", "with_deltas", "write_csv"]
+
+_LATER = ("select_cpu_s", "select_peak_mb", "adapt_peak_mb", "black", "delta_psnr")
+"""Columns that files from before they came lack."""
 
 _SURVEY = {
     "submethod": "Submethod",
@@ -34,11 +37,11 @@ class Row:
         prior: given, lift or trained.
         method: the method's name.
         ratio: prior over compact.
-        matched: "steps", "seconds" or "released".
+        matched: "steps", "seconds" or "released"; "none" of a teacher's row, the prior as it is.
         amount: how many of them.
         seed: of the cell.
         split: which views were scored.
-        against: "photos" or "teacher"; the two are never comparable.
+        against: "photos", "teacher", or "either" of the two; figures of different ones never compare.
         submethod: method and budget in one word.
         input_count: Gaussians before.
         budget: Gaussians asked for.
@@ -51,8 +54,8 @@ class Row:
         luma_drift: mean of |mean luma of the render − the target's|.
         drift95: of the last recovery, in thicknesses of its anchors; 0 without one.
         needle: share of needles.
-        views: how many were scored.
-        steps: optimiser steps taken.
+        views: how many the means are of.
+        steps: optimiser steps taken, those that led to a shared start included.
         reduce_cpu_s: user + system seconds of all reductions, each a whole process.
         reduce_wall_s: by the clock, without a program's start and its files: in one process there is one
             start however many the rounds. A rival program's whole.
@@ -70,6 +73,8 @@ class Row:
         version: of g2ard.
         machine: processor and cores.
         error: why there are no figures; "" if there are.
+        black: how many more came out black, and are left out of the means (`tab:geobase`, †).
+        delta_psnr: PSNR less the teacher's on the same views, dB (`tab:s_mip360`); None without its row.
     """
 
     study: str
@@ -111,6 +116,23 @@ class Row:
     version: str = ""
     machine: str = ""
     error: str = ""
+    black: int | None = None
+    delta_psnr: float | None = None
+
+
+def with_deltas(rows: Sequence[Row]) -> list[Row]:
+    """The rows, each with its distance from the teacher's row of its study, scene, prior and split."""
+
+    def place(row: Row) -> tuple[str, str, str, str]:
+        return row.study, row.scene, row.prior, row.split
+
+    teachers = {place(row): row.psnr for row in rows if row.matched == "none" and not row.error}
+
+    def delta(row: Row) -> float | None:
+        teacher = teachers.get(place(row))
+        return None if teacher is None or row.psnr is None or row.matched == "none" else row.psnr - teacher
+
+    return [replace(row, delta_psnr=delta(row)) for row in rows]
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -124,7 +146,8 @@ def read_rows(path: Path) -> list[Row]:
     try:
         with path.open(newline="", encoding="utf-8") as file:
             lines = csv.DictReader(file)
-            if set(lines.fieldnames or ()) != set(names):
+            held = set(lines.fieldnames or ())
+            if not set(names) - set(_LATER) <= held <= set(names):
                 raise InputError(f"{path}: not a CSV of `g2ard bench run`")
             return [Row(**{names[k]: _typed(v, types[names[k]]) for k, v in line.items()}) for line in lines]
     except OSError as error:

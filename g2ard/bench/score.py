@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from g2ard.images import to_bytes
+from g2ard.images import as_saved, to_bytes
 from g2ard.lpips import Lpips
 from g2ard.metrics import psnr, ssim
-from g2ard.render import render
+from g2ard.render import RasterSettings, render
 from g2ard.splats import Splats
 from g2ard.targets import Targets, mask_of
 
@@ -25,7 +25,8 @@ _QUALITY = 88
 
 @dataclass(frozen=True)
 class ViewFigures:
-    """One view's figures; `luma` is the mean luma of the render less the target's."""
+    """One view's figures; `luma` is the mean luma of the render less the target's, `black` whether all pixels
+    of the render are 0 in 8 bits, though not the target's."""
 
     name: str
     psnr: float
@@ -33,11 +34,13 @@ class ViewFigures:
     luma: float
     lpips_alex: float | None = None
     lpips_vgg: float | None = None
+    black: bool = False
 
 
 @dataclass(frozen=True)
 class Scored:
-    """Means over the views.
+    """Means over the views, but for those that came out black (`tab:geobase`, †); of nothing but black ones
+    over all.
 
     Args:
         views: in the cameras' order.
@@ -45,16 +48,26 @@ class Scored:
 
     views: tuple[ViewFigures, ...]
 
+    @property
+    def black(self) -> int:
+        """Views that came out black."""
+        return sum(view.black for view in self.views)
+
+    @property
+    def counted(self) -> tuple[ViewFigures, ...]:
+        """The views that the means are of."""
+        return tuple(view for view in self.views if not view.black) or self.views
+
     def mean(self, name: str) -> float | None:
         """Of one figure; None where it was not measured."""
-        values = [getattr(view, name) for view in self.views]
+        values = [getattr(view, name) for view in self.counted]
         return None if None in values else float(np.mean(values))
 
     @property
     def luma_drift(self) -> float:
         """Mean over views of |mean luma of the render − the target's|, in [0, 1]: exposure that wandered
         off."""
-        return float(np.mean([abs(view.luma) for view in self.views]))
+        return float(np.mean([abs(view.luma) for view in self.counted]))
 
 
 def luma(image: NDArray[np.float32], mask: NDArray[np.bool_] | None = None) -> float:
@@ -73,18 +86,39 @@ def score(
     background: tuple[float, float, float],
     *,
     lpips: dict[str, Lpips] | None = None,
+    settings: RasterSettings | None = None,
+    eight_bit: bool = False,
     pictures: Path | None = None,
 ) -> Scored:
-    """Render and score every view; JPEGs of `pictured` ones go to `pictures`, by the view's number."""
+    """Render and score every view; JPEGs of `pictured` ones go to `pictures`, by the view's number.
+
+    Args:
+        splats: the scene.
+        targets: photos or renders.
+        background: RGB behind the scene.
+        lpips: networks to score with as well.
+        settings: the renderer's conventions; None means gsplat's.
+        eight_bit: as for `g2ard.evaluate.evaluate`.
+        pictures: a folder; None keeps no pictures.
+    """
     views = []
     for number, name in enumerate(targets.cameras.names):
-        image = np.clip(render(splats, targets.cameras, number, background=background).image, 0, 1)
-        target = targets[number]
+        image = render(splats, targets.cameras, number, background=background, settings=settings).image
+        image, target = np.clip(image, 0, 1), targets[number]
+        if eight_bit:
+            image, target = as_saved(image), as_saved(target)
         mask = mask_of(targets, number)
         off = luma(image, mask) - luma(target, mask)
         perceived = {f"lpips_{net}": model(image, target) for net, model in (lpips or {}).items()}
         views.append(
-            ViewFigures(name, psnr(image, target, mask), ssim(image, target, mask), off, **perceived)
+            ViewFigures(
+                name,
+                psnr(image, target, mask),
+                ssim(image, target, mask),
+                off,
+                **perceived,
+                black=not to_bytes(image).any() and bool(to_bytes(target).any()),
+            )
         )
         if pictures is not None and number in pictured(len(targets.cameras)):
             save_jpeg(pictures / f"{number}.jpg", image)

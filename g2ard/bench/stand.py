@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,18 @@ from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
-from g2ard.splits import for_scores, for_training, split_mask, splits_of, states_splits
-from g2ard.targets import Photos, Targets, TeacherRenders
+from g2ard.splits import (
+    for_scores,
+    for_training,
+    not_held_out,
+    split_mask,
+    splits_of,
+    states_splits,
+)
+from g2ard.targets import Photos, PhotosOrRenders, Targets, TeacherRenders
+
+if TYPE_CHECKING:
+    from g2ard.render import RasterSettings
 
 __all__ = ["Stage", "Stand", "fingerprint", "folder_of", "scene_key"]
 
@@ -101,7 +111,7 @@ class Stand:
         """The priors there are, the usual one first."""
         if io.kind(self.place / self.scene.prior) == "splats":
             return ("given",)
-        if self.scene.targets == "teacher":
+        if self.scene.targets != "photos":
             raise InputError(f"scene {self.scene.name}: a cloud is no teacher: targets must be photos")
         return ("trained", "lift") if self.scene.train_prior else ("lift",)
 
@@ -143,7 +153,7 @@ class Stand:
 
     @cached_property
     def train(self) -> Path:
-        """Training views, at the study's size, photos named by absolute path."""
+        """Training views, at the study's size, photos named by absolute path; none that is scored on."""
         path = self.folder / "train.json"
         if not path.exists():
             if self.scene.train is None:
@@ -152,20 +162,43 @@ class Stand:
                 whole = self.place / self.scene.train
                 apart = bool(self.scene.score)
                 cameras = self._apart(whole, for_training) if apart else self._views(whole, "train")
+            cameras = self._not_scored(cameras, "train")
             io.write_views(path, cameras, splits=["train"] * len(cameras))
         return path
 
-    def adaptation(self, split: str) -> Cameras:
+    @property
+    def dropped(self) -> int:
+        """How many views were given both to train or adapt on and to score on; they are scored on alone."""
+        path = self.folder / "dropped.json"
+        return sum(json.loads(path.read_text()).values()) if path.exists() else 0
+
+    def _not_scored(self, cameras: Cameras, what: str) -> Cameras:
+        """Those that no split scores on, by photo or pose; how many were is kept in dropped.json."""
+        keep = np.ones(len(cameras), bool)
+        for name, scored in self.scored.items():
+            if what == "adapt" or name != "adapt-val":  # another light's photos may be of places trained on
+                keep &= not_held_out(cameras, scored)
+        if not keep.any():
+            raise InputError(f"scene {self.scene.name}: all {len(keep)} views to {what} on are scored on")
+        path = self.folder / "dropped.json"
+        counts = json.loads(path.read_text()) if path.exists() else {}
+        path.write_text(json.dumps({**counts, what: int(np.count_nonzero(~keep))}))
+        return cameras.take(keep)
+
+    def adaptation(self, split: str) -> Cameras | None:
         """Views of new appearance: "train" to adapt on and "test", as they state; where they state no split
-        every third, by name, is "test", for they are few."""
+        every third, by name, is "test", for they are few, or None where the study adapts on all."""
         if self.scene.adapt is None:
             raise InputError(f"scene {self.scene.name}: the study adapts, and it has no `adapt` views")
         path = self.place / self.scene.adapt
-        found = io.read_view_set(path)
+        found = self._read(path)
         if states_splits(path, found.splits):
             return self._views(path, split)
         held_out = np.argsort(np.argsort(found.cameras.names)) % 3 == 1
-        return self._small(found, held_out if split == "test" else ~held_out)
+        if self.definition.adapt_on == "all":
+            held_out[:] = False
+        chosen = held_out if split == "test" else ~held_out
+        return self._small(found, chosen) if chosen.any() else None
 
     @cached_property
     def adapt(self) -> Path:
@@ -173,11 +206,16 @@ class Stand:
         path = self.folder / "adapt.json"
         if not path.exists():
             cameras = self.adaptation("train")
+            assert cameras is not None  # of a third there are two thirds left, and of none all
+            cameras = self._not_scored(cameras, "adapt")
             io.write_views(path, cameras, splits=["train"] * len(cameras))
         return path
 
+    def _read(self, path: Path) -> io.ViewSet:
+        return io.read_view_set(path, unpictured=self.scene.targets == "either")
+
     def _views(self, path: Path, split: str) -> Cameras:
-        found = io.read_view_set(path)
+        found = self._read(path)
         return self._small(found, split_mask(path, found.cameras.names, split, stated=found.splits))
 
     def _small(self, found: io.ViewSet, mask: NDArray[np.bool_]) -> Cameras:
@@ -185,7 +223,7 @@ class Stand:
 
     def _apart(self, path: Path, chosen: Callable[..., NDArray[np.bool_]]) -> Cameras:
         """The views that `for_training` or `for_scores` chooses, where a scene is scored on its own files."""
-        found = io.read_view_set(path)
+        found = self._read(path)
         return self._small(found, chosen(path, found.cameras.names, found.splits))
 
     def _pool(self, split: str) -> Cameras:
@@ -199,8 +237,8 @@ class Stand:
         return self._views(path, split)
 
     @cached_property
-    def test(self) -> dict[str, Targets]:
-        """Split → targets to score against."""
+    def scored(self) -> dict[str, Cameras]:
+        """Split → views to score on."""
         spec = self.scene
         if spec.score:
             views = {name: self._apart(self.place / path, for_scores) for name, path in spec.score.items()}
@@ -208,29 +246,45 @@ class Stand:
             views = {"test": self._views(self.place / spec.train, "test")}
         else:
             views = {"test": self._pool("test")}
-        if self.definition.adapt_steps:
-            views["adapt-val"] = self.adaptation("test")
-        return {name: self._scored(name, cameras) for name, cameras in views.items()}
+        if self.definition.adapt_steps and (held_out := self.adaptation("test")) is not None:
+            views["adapt-val"] = held_out
+        return views
+
+    @cached_property
+    def test(self) -> dict[str, Targets]:
+        """Split → targets to score against."""
+        return {name: self._scored(name, cameras) for name, cameras in self.scored.items()}
+
+    @cached_property
+    def settings(self) -> RasterSettings:
+        """Of the renderer that scores."""
+        from g2ard.render import RasterSettings
+
+        return RasterSettings(convention="inria" if self.definition.convention == "inria" else "gsplat")
 
     def _scored(self, name: str, cameras: Cameras) -> Targets:
-        return StoredTargets(cameras, self._stored(f"targets-{name}", cameras))
+        apart = "" if self.definition.convention == "gsplat" else f"-{self.definition.convention}"
+        return StoredTargets(cameras, self._stored(f"targets-{name}{apart}", cameras, self.settings))
 
     @cached_property
     def train_targets(self) -> Path:
         """Where the targets of the training views lie."""
-        return self._stored("targets-train", io.read_views(self.train))
+        return self._stored("targets-train", self._read(self.train).cameras)
 
-    def _stored(self, name: str, cameras: Cameras) -> Path:
+    def _stored(self, name: str, cameras: Cameras, settings: RasterSettings | None = None) -> Path:
         folder = self.folder / name
         if not (folder / "names.json").exists():  # written last
-            store_targets(self._made(cameras), folder)
+            store_targets(self._made(cameras, settings), folder)
         return folder
 
-    def _made(self, cameras: Cameras) -> Targets:
+    def _made(self, cameras: Cameras, settings: RasterSettings | None) -> Targets:
         if self.scene.targets == "photos":
             return Photos(cameras, limit=0)
+        kind = TeacherRenders if self.scene.targets == "teacher" else PhotosOrRenders
         teacher = io.read_splats(self.prior(None).output)
-        return TeacherRenders(teacher, cameras, background=self.scene.background, limit=0)
+        return kind(
+            teacher=teacher, cameras=cameras, background=self.scene.background, settings=settings, limit=0
+        )
 
     def reduce(self, source: Stage, views: Path, options: dict[str, Any], flags: Path | None = None) -> Stage:
         """Fewer Gaussians; `options` are those of the worker's job."""
@@ -254,21 +308,28 @@ class Stand:
 
     def select(self, source: Stage, policy: str, k: float, seed: int) -> Stage:
         """Part of the training views, chosen by what the prior shows."""
-        count = max(1, round(k * len(io.read_views(self.train))))
+        count = max(1, round(k * len(self._read(self.train).cameras)))
         job = {"kind": "select", "policy": policy, "k": count, "seed": seed}
         files = {"scene": source.output, "views": self.train}
         return self._run(job, source.key, "views.json", files)
 
-    def recover(self, source: Stage, views: Path, options: dict[str, Any]) -> Stage:
-        """Recovery against the training targets."""
+    def recover(
+        self, source: Stage, views: Path, options: dict[str, Any], anchors: Stage | None = None
+    ) -> Stage:
+        """Recovery against the training targets, held to the geometry of `anchors`, else of the source."""
         job = {"kind": "recover", **options, "background": list(self.scene.background)}
-        return self._run(job, source.key, "out.ply", self._inputs(source, views))
+        files = self._inputs(source, views)
+        if anchors is not None:
+            job["anchored"] = anchors.key
+            files["anchors"] = anchors.output
+        return self._run(job, source.key, "out.ply", files)
 
     def readapt(self, source: Stage, sh_degree: int | None, seed: int) -> Stage:
         """New appearance on frozen geometry."""
         job = {
             "kind": "adapt",
             "steps": self.definition.adapt_steps,
+            "schedule": self.definition.adapt_schedule,
             "sh_degree": sh_degree,
             "seed": seed,
             "background": list(self.scene.background),
@@ -278,7 +339,7 @@ class Stand:
 
     @cached_property
     def _adapt_targets(self) -> Path:
-        return self._stored("targets-adapt", self.adaptation("train"))
+        return self._stored("targets-adapt", self._read(self.adapt).cameras)
 
     def _inputs(self, source: Stage, views: Path) -> dict[str, Path]:
         return {"scene": source.output, "views": views, "targets": self.train_targets}

@@ -22,9 +22,9 @@ from g2ard.cameras import Cameras
 from g2ard.errors import G2ardError
 from g2ard.images import to_bytes
 from g2ard.io.atomic import atomic_output
-from g2ard.recover.anchors import Regularizers
+from g2ard.recover.anchors import Anchors, Regularizers
 from g2ard.recover.schedule import Rates, Schedule, schedule_named
-from g2ard.targets import CACHE_BYTES, Photos, Targets, mask_of
+from g2ard.targets import CACHE_BYTES, Targets, against_of, mask_of
 
 __all__ = ["StoredTargets", "store_targets"]
 
@@ -62,7 +62,7 @@ def store_targets(targets: Targets, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for view in range(len(targets.cameras)):
         image = targets[view]
-        np.save(folder / f"{view}.npy", to_bytes(image) if isinstance(targets, Photos) else image)
+        np.save(folder / f"{view}.npy", to_bytes(image) if against_of(targets, view) == "photo" else image)
         mask = mask_of(targets, view)
         if mask is not None:
             np.save(folder / f"{view}.mask.npy", mask)
@@ -75,7 +75,7 @@ def _reduce(job: Job) -> dict[str, Any]:
     from g2ard.render import looker
     from g2ard.simplify import SimplifyConfig, simplify
 
-    splats, cameras = io.read_splats(job["scene"]), io.read_views(job["views"])
+    splats, cameras = io.read_splats(job["scene"]), _cameras(job["views"])
     output, began = Path(job["output"]), time.monotonic()
     if job["method"] in baselines.METHODS:
         small = baselines.reduce(
@@ -109,15 +109,20 @@ def _reduce(job: Job) -> dict[str, Any]:
 def _select(job: Job) -> dict[str, Any]:
     from g2ard.select import select
 
-    cameras = io.read_views(job["views"])
+    cameras = _cameras(job["views"])
     chosen = select(io.read_splats(job["scene"]), cameras, job["k"], policy=job["policy"], seed=job["seed"])
     kept = cameras.take(np.sort(chosen.order))  # of training views alone: the stand has taken the others out
     io.write_views(job["output"], kept, splits=["train"] * len(kept), overwrite=True)
     return {"views": len(chosen.order)}
 
 
+def _cameras(path: str) -> Cameras:
+    """All views of a file that the stand has written, with a photo or without."""
+    return io.read_view_set(path, unpictured=True).cameras
+
+
 def _targets(job: Job) -> StoredTargets:
-    return StoredTargets(io.read_views(job["views"]), Path(job["targets"]))
+    return StoredTargets(_cameras(job["views"]), Path(job["targets"]))
 
 
 def _recover(job: Job) -> dict[str, Any]:
@@ -136,7 +141,9 @@ def _recover(job: Job) -> dict[str, Any]:
         final=job["final"],
         seed=job["seed"],
     )
-    done = recover(student, targets, config)
+    built = io.read_splats(job["anchors"]) if job.get("anchors") else None
+    anchors = None if built is None else Anchors.of(built, config.regularizers.in_plane)
+    done = recover(student, targets, config, anchors=anchors)
     io.write_splats(job["output"], done.splats, overwrite=True)
     return {key: done.report[key] for key in ("steps", "seconds", "psnr", "drift95", "needle", "multiplier")}
 
@@ -145,7 +152,11 @@ def _adapt(job: Job) -> dict[str, Any]:
     from g2ard.adapt import AdaptConfig, adapt
 
     config = AdaptConfig(
-        steps=job["steps"], sh_degree=job["sh_degree"], background=tuple(job["background"]), seed=job["seed"]
+        steps=job["steps"],
+        schedule=job["schedule"],
+        sh_degree=job["sh_degree"],
+        background=tuple(job["background"]),
+        seed=job["seed"],
     )
     done = adapt(io.read_splats(job["scene"]), _targets(job), config)
     io.write_splats(job["output"], done.splats, overwrite=True)

@@ -10,9 +10,13 @@ from typing import Annotated, Literal
 
 import typer
 
+from g2ard.report.window import Crop
+
 __all__ = [
+    "ConventionOption",
     "Count",
     "CountOption",
+    "CropOption",
     "LookOption",
     "OutputOption",
     "PaperOption",
@@ -216,6 +220,31 @@ BackgroundOption = Annotated[
 TeacherOption = Annotated[
     Path | None,
     typer.Option("--teacher", metavar="SCENE", help="Its renders are the targets; without it, the photos."),
+]
+
+ConventionOption = Annotated[
+    Literal["gsplat", "inria"],
+    typer.Option(help="The renderer's conventions; inria: near plane 0.2, splats cut to their 3σ tiles."),
+]
+
+
+def _crop(text: str) -> Crop:
+    from g2ard.errors import InputError
+
+    try:
+        return Crop.parse(text)
+    except InputError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
+CropOption = Annotated[
+    list[Crop] | None,
+    typer.Option(
+        "--crop",
+        parser=_crop,
+        metavar="[VIEW:]X,Y,W,H",
+        help="Magnify this in the report: left, top, width, height in shares of the image; may be repeated.",
+    ),
 ]
 
 Method = Literal["default", "fast", "paper"]

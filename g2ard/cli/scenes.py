@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.cli.frame import Run
     from g2ard.io import ViewSet
+    from g2ard.render import RasterSettings
     from g2ard.splats import Splats
     from g2ard.targets import Targets
 
@@ -60,13 +61,13 @@ def load_scene(run: Run, path: Path) -> Splats:
     return scene.splats
 
 
-def load_views(run: Run, path: Path, split: str, size: int | None) -> Cameras:
-    """Read views, pick a split, shrink them.
+def load_views(run: Run, path: Path, split: str, size: int | None, *, unpictured: bool = False) -> Cameras:
+    """Read views, pick a split, shrink them; `unpictured` keeps views without a photo beside others.
 
     Raises:
         InputError: the file has no views, or the split is empty.
     """
-    return load_splits(run, path, [split], size)[0]
+    return load_view_sets(run, path, [split], size, unpictured=unpictured)[0].cameras
 
 
 def load_splits(run: Run, path: Path, splits: list[str], size: int | None) -> list[Cameras]:
@@ -78,7 +79,9 @@ def load_splits(run: Run, path: Path, splits: list[str], size: int | None) -> li
     return [found.cameras for found in load_view_sets(run, path, splits, size)]
 
 
-def load_view_sets(run: Run, path: Path, splits: list[str], size: int | None) -> list[ViewSet]:
+def load_view_sets(
+    run: Run, path: Path, splits: list[str], size: int | None, *, unpictured: bool = False
+) -> list[ViewSet]:
     """As `load_splits`, with the views' weights where the file has them.
 
     Raises:
@@ -86,7 +89,7 @@ def load_view_sets(run: Run, path: Path, splits: list[str], size: int | None) ->
     """
     from g2ard.splits import split_mask
 
-    found = _read(run, path)
+    found = _read(run, path, unpictured=unpictured)
     masks = [split_mask(path, found.cameras.names, split, stated=found.splits) for split in splits]
     return [found.take(mask).resized(size) for mask in masks]
 
@@ -163,10 +166,10 @@ def load_split_views(run: Run, path: Path, split: str) -> tuple[ViewSet, NDArray
     return replace(found, splits=splits_of(path, names, found.splits)), mask
 
 
-def _read(run: Run, path: Path) -> ViewSet:
+def _read(run: Run, path: Path, *, unpictured: bool = False) -> ViewSet:
     from g2ard.io import read_view_set
 
-    found = read_view_set(path)
+    found = read_view_set(path, unpictured=unpictured)
     for note in found.notes:
         run.say(f"{path}: {note}")
     return found
@@ -179,14 +182,29 @@ def make_targets(
     background: tuple[float, float, float],
     *,
     lazy: bool = False,
+    photos: bool = False,
+    settings: RasterSettings | None = None,
 ) -> Targets:
-    """The teacher's renders (`lazy`: when first asked for), or the photos where no teacher is given."""
+    """The teacher's renders (`lazy`: when first asked for), or the photos where no teacher is given; with
+    `photos` the photo of each view that has one, and the teacher's render of the others."""
     from g2ard.io.exposures import find_exposures
-    from g2ard.targets import Photos, TeacherRenders
+    from g2ard.targets import Photos, PhotosOrRenders, TeacherRenders
 
+    if teacher is not None and not photos:
+        return TeacherRenders(
+            teacher, cameras, background=background, settings=settings, lazy=lazy, progress=run.progress
+        )
+    exposures = find_exposures(cameras)
+    if exposures:
+        run.say(f"exposure.json: {len(exposures)} photos brought to the scene's own colours")
     if teacher is None:
-        exposures = find_exposures(cameras)
-        if exposures:
-            run.say(f"exposure.json: {len(exposures)} photos brought to the scene's own colours")
         return Photos(cameras, exposures=exposures)
-    return TeacherRenders(teacher, cameras, background=background, lazy=lazy, progress=run.progress)
+    return PhotosOrRenders(
+        cameras,
+        teacher,
+        background=background,
+        exposures=exposures,
+        settings=settings,
+        lazy=lazy,
+        progress=run.progress,
+    )

@@ -240,13 +240,20 @@ def read_views(path: str | Path, *, images: str | Path | None = None, split: str
     return read_view_set(path, images=images, split=split).cameras
 
 
-def read_view_set(path: str | Path, *, images: str | Path | None = None, split: str = "all") -> ViewSet:
+def read_view_set(
+    path: str | Path,
+    *,
+    images: str | Path | None = None,
+    split: str = "all",
+    unpictured: bool = False,
+) -> ViewSet:
     """Read views and what their file says beside the cameras.
 
     Args:
         path: as for `read_views`.
         images: as for `read_views`.
         split: as for `read_views`.
+        unpictured: keep views without a photo beside those with one; else they are left out, and counted.
 
     Returns:
         A `ViewSet` of cameras, notes, splits and weights.
@@ -258,6 +265,7 @@ def read_view_set(path: str | Path, *, images: str | Path | None = None, split: 
 
     from g2ard.errors import InputError
     from g2ard.io.detect import KINDS, file_format
+    from g2ard.io.photos import pictured
     from g2ard.splits import split_mask
 
     path, found = Path(path), file_format(path)
@@ -266,6 +274,7 @@ def read_view_set(path: str | Path, *, images: str | Path | None = None, split: 
     if images is not None and not Path(images).is_dir():
         raise InputError(f"{images}: no such folder of photos")
     views = import_module(f"g2ard.io.{found}").read(path, Path(images) if images else None)
+    views = views if unpictured else pictured(views)
     return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,17 @@ from g2ard.errors import InputError
 from g2ard.io.clean import plural
 from g2ard.io.types import Note, ViewSet
 
-__all__ = ["Frame", "find_photo", "inverse", "photo_size", "pixels", "rigid", "rotation", "view_set"]
+__all__ = [
+    "Frame",
+    "find_photo",
+    "inverse",
+    "photo_size",
+    "pictured",
+    "pixels",
+    "rigid",
+    "rotation",
+    "view_set",
+]
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 
@@ -131,9 +142,7 @@ def _mask(frame: Frame) -> Path | None:
 
 
 def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
-    """Stack frames; those whose photo is missing are skipped and counted.
-
-    Where not one photo is there, the file is taken as poses alone and all frames stay.
+    """Stack frames; those whose photo is missing become poses alone (`pictured` leaves them out).
 
     Raises:
         InputError: no frame, or two of one name.
@@ -147,12 +156,8 @@ def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
     present = [frame for frame in frames if frame.photo is not None and frame.photo.is_file()]
     notes = []
     if present and len(present) < len(frames):
-        missing = len(frames) - len(present)
         there = {frame.name for frame in present}
-        first = next(frame.name for frame in frames if frame.name not in there)
-        text = f"{plural(missing, 'view')} of {len(frames)} skipped: no photo (the first is {first!r})"
-        notes.append(Note("missing_photos", missing, text))
-        frames = present
+        frames = [f if f.name in there else f._replace(photo=None, mask=None) for f in frames]
     elif not present and listed:
         notes.append(
             Note("no_photos", len(listed), f"none of {plural(len(listed), 'photo')} found: poses only")
@@ -162,7 +167,7 @@ def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
     masked = sum(mask is not None for mask in cameras.mask_paths)
     if masked:
         notes.append(
-            Note("masks", masked, f"{plural(masked, 'photo')} of {len(frames)} counted in part: masks")
+            Note("masks", masked, f"{plural(masked, 'photo')} of {len(present)} counted in part: masks")
         )
     splits = tuple(f.split for f in frames)
     weights = [f.weight for f in frames]
@@ -172,3 +177,15 @@ def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
         splits if any(splits) else (),
         None if set(weights) == {None} else np.array([1.0 if w is None else w for w in weights]),
     )
+
+
+def pictured(found: ViewSet) -> ViewSet:
+    """The views that have a photo, with a note that counts the others; all of them where none has any."""
+    has = np.array([path is not None for path in found.cameras.image_paths], bool)
+    missing = int(np.count_nonzero(~has))
+    if not missing or missing == len(has):
+        return found
+    first = found.cameras.names[int(np.argmin(has))]
+    text = f"{plural(missing, 'view')} of {len(has)} skipped: no photo (the first is {first!r})"
+    notes = (*found.notes, Note("missing_photos", missing, text))
+    return replace(found.take(has), notes=notes)

@@ -1,4 +1,4 @@
-"""g2ard's own views .json: what `poses`, `select` and `register` write. docs/formats.md describes it."""
+"""g2ard's own views .json: what `poses`, `select` and `distill` write. docs/formats.md describes it."""
 
 from __future__ import annotations
 

@@ -8,14 +8,16 @@ from typing import Any
 
 import numpy as np
 
+from g2ard.errors import InputError
 from g2ard.images import to_bytes
 from g2ard.render import render
 from g2ard.report.charts import Point, chart
 from g2ard.report.page import Comparison, Page, Shown, legend
+from g2ard.report.window import Crop
 from g2ard.splats import Splats
 from g2ard.targets import Targets
 
-__all__ = ["distill_report"]
+__all__ = ["check_crops", "distill_report"]
 
 _VIEWS = 6
 _STRETCHES = 25
@@ -31,8 +33,11 @@ def distill_report(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     *,
     told: Sequence[str] = (),
+    crops: Sequence[Crop] = (),
 ) -> None:
     """Write an HTML page about one run: error against seconds and count, the loss, worst views first.
+
+    Views that crops name come before those.
 
     Args:
         path: the file.
@@ -42,7 +47,12 @@ def distill_report(
         report: what `g2ard distill` writes as report.json.
         background: RGB behind the scenes.
         told: what the command says of the run: what was kept, where it lost, what no view saw.
+        crops: what to magnify; where a view has none, where it is worst.
+
+    Raises:
+        InputError: a crop of a view that is not among the targets'.
     """
+    check_crops(crops, targets.cameras.names)
     against = report["against"]
     page = Page(title, f"{len(targets.cameras)} unseen views against {against}")
     scores, seconds = report["scores"], report["seconds"]
@@ -80,13 +90,29 @@ def distill_report(
     page.heading("Worst views first")
     last = names[-1]
     figures = [view["psnr"] for view in scores[last]["views"]]
-    for view in map(int, np.argsort(figures, kind="stable")[:_VIEWS]):
+    asked = [targets.cameras.names.index(crop.view) for crop in crops if crop.view is not None]
+    worst = map(int, np.argsort(figures, kind="stable")[:_VIEWS])
+    for view in dict.fromkeys([*asked, *worst]):
+        name = targets.cameras.names[view]
+        windows = [crop.window for crop in crops if crop.view in (None, name)]
         shown = []
         for name, splats in reversed(scenes):
             image = render(splats, targets.cameras, view, background=background).image
             shown.append(Shown(name, to_bytes(image), f"{scores[name]['views'][view]['psnr']:.2f} dB"))
-        page.comparison(Comparison(targets.cameras.names[view], to_bytes(targets[view]), shown))
+        page.comparison(Comparison(targets.cameras.names[view], to_bytes(targets[view]), shown, windows))
     page.write(path)
+
+
+def check_crops(crops: Sequence[Crop], names: Sequence[str]) -> None:
+    """Refuse a crop of a view that will not be scored, before anything else is done.
+
+    Raises:
+        InputError: there is one.
+    """
+    for crop in crops:
+        if crop.view is not None and crop.view not in names:
+            few = ", ".join(names[:4]) + (", …" if len(names) > 4 else "")
+            raise InputError(f"--crop {crop.view}: not among the {len(names)} views that are scored ({few})")
 
 
 def _error_charts(

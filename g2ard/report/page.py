@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from g2ard.images import to_bytes
 from g2ard.io.atomic import atomic_output
+from g2ard.report.window import Window
 
-__all__ = ["COLORS", "Comparison", "Page", "Shown", "legend", "worst_window"]
+__all__ = ["COLORS", "Comparison", "Page", "Shown", "legend", "worst_windows"]
 
 COLORS = ("#2563eb", "#d97706", "#059669", "#db2777", "#7c3aed", "#64748b", "#0891b2", "#b91c1c", "#65a30d")
-_WINDOW = 0.28
-"""Side of a crop, as a share of the image's."""
+_WINDOW, _CROPS = 0.28, 2
+"""Side of a crop where a view is worst, as a share of the image's, and how many of them."""
 
 _LONGEST = 640
 _QUALITY = 86
@@ -37,21 +38,28 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A view as it should be and as several methods show it; the first of them is the one looked at."""
+    """A view as it should be and as several methods show it; the first of them is the one looked at. Without
+    `crops` those are magnified where it is worst."""
 
     title: str
     target: NDArray[np.uint8]
     shown: Sequence[Shown]
+    crops: Sequence[Window] = ()
 
 
-def worst_window(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> tuple[float, float]:
-    """The middle (x, y), in shares of the image, of the window that differs most.
+def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8], count: int = _CROPS) -> list[Window]:
+    """The windows that differ most, worst first, none of which overlap.
+
+    Args:
+        image: (H, W, 3).
+        target: of the same shape.
+        count: how many, at most.
 
     >>> target = np.zeros((100, 100, 3), np.uint8)
     >>> image = target.copy()
     >>> image[70:80, 20:30] = 255
-    >>> x, y = worst_window(image, target)
-    >>> abs(x - 0.25) < 0.15, abs(y - 0.75) < 0.15
+    >>> found = worst_windows(image, target)[0]
+    >>> bool(found.left <= 0.2 and 0.3 <= found.left + found.width), bool(found.top <= 0.7)
     (True, True)
     """
     error = ((image.astype(np.float64) - target) ** 2).sum(-1)
@@ -61,8 +69,12 @@ def worst_window(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> tuple[f
     sums = (
         total[rows:, columns:] - total[:-rows, columns:] - total[rows:, :-columns] + total[:-rows, :-columns]
     )
-    top, left = np.unravel_index(int(np.argmax(sums)), sums.shape)
-    return (float(left) + columns / 2) / width, (float(top) + rows / 2) / height
+    found: list[Window] = []
+    while len(found) < count and sums.max() >= 0:
+        top, left = (int(k) for k in np.unravel_index(int(np.argmax(sums)), sums.shape))
+        found.append(Window(left / width, top / height, columns / width, rows / height))
+        sums[max(0, top - rows + 1) : top + rows, max(0, left - columns + 1) : left + columns] = -1
+    return found
 
 
 class Page:
@@ -84,6 +96,10 @@ class Page:
     def paragraph(self, text: str) -> None:
         """Add a paragraph."""
         self._parts.append(f"<p>{escape(text)}</p>")
+
+    def items(self, lines: Sequence[str]) -> None:
+        """Add a list."""
+        self._parts.append(f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>")
 
     def table(
         self, columns: Sequence[str], rows: Sequence[Sequence[str]], best: set[tuple[int, int]]
@@ -112,34 +128,44 @@ class Page:
         self._parts.append(f'<div class="row">{"".join(figures)}</div>')
 
     def comparison(self, view: Comparison) -> None:
-        """Add a view: a slider between target and any rendering, and the worst window of each."""
+        """Add a view: a slider between target and any rendering, and the same crops of each, magnified.
+
+        The crops are cut from the images as they are given; the rest is shrunk.
+        """
         target = self._image(view.target)
         numbers = [self._image(shown.image) for shown in view.shown]
-        x, y = worst_window(view.shown[0].image, view.target)
+        windows = list(view.crops) or worst_windows(view.shown[0].image, view.target)
         height, width = view.target.shape[:2]
         options = "".join(
             f'<option value="{n}">{escape(s.name)} {escape(s.caption)}</option>'
             for n, s in zip(numbers, view.shown, strict=True)
         )
-        crops = [self._crop(target, "target", "", x, y)]
-        crops += [self._crop(n, s.name, s.caption, x, y) for n, s in zip(numbers, view.shown, strict=True)]
+        marks = "".join(
+            f'<i class="roi r{k % 2}" style="left:{w.left:.2%};top:{w.top:.2%};width:{w.width:.2%};'
+            f'height:{w.height:.2%}"></i>'
+            for k, w in enumerate(windows)
+        )
+        named = [Shown("target", view.target), *view.shown]
+        crops = [
+            f'<div class="crops r{k % 2}">{"".join(self._crop(shown, w) for shown in named)}</div>'
+            for k, w in enumerate(windows)
+        ]
         self._parts.append(
             f'<section class="view"><h4>{escape(view.title)}</h4><div class="pair">'
             f'<div class="slider" style="aspect-ratio:{width}/{height}">'
             f'<img data-i="{target}" alt="target"><img class="over" data-i="{numbers[0]}" alt="rendering">'
-            f'<span class="tag left">target</span><span class="tag right"></span>'
+            f'{marks}<span class="tag left">target</span><span class="tag right"></span>'
             f'<input type="range" min="0" max="100" value="50" aria-label="target or rendering"></div>'
             f'<label class="pick">right: <select>{options}</select></label></div>'
-            f'<div class="crops" style="--shape:{width}/{height}">{"".join(crops)}</div></section>'
+            f"{''.join(crops)}</section>"
         )
 
-    def _crop(self, number: int, name: str, caption: str, x: float, y: float) -> str:
-        zoom = 1 / _WINDOW
-        left, top = (0.5 - x * zoom) * 100, (0.5 - y * zoom) * 100
+    def _crop(self, shown: Shown, window: Window) -> str:
+        rows, columns = window.pixels(*shown.image.shape[:2])
+        number = self._image(shown.image[rows, columns])
         return (
-            f'<figure class="crop"><div><img data-i="{number}" alt="{escape(name)}" '
-            f'style="width:{zoom * 100:.0f}%;left:{left:.1f}%;top:{top:.1f}%;height:{zoom * 100:.0f}%"></div>'
-            f"<figcaption>{escape(name)}<br><b>{escape(caption)}</b></figcaption></figure>"
+            f'<figure class="crop"><img data-i="{number}" alt="{escape(shown.name)}">'
+            f"<figcaption>{escape(shown.name)}<br><b>{escape(shown.caption)}</b></figcaption></figure>"
         )
 
     def _image(self, image: NDArray[np.uint8]) -> int:
@@ -213,9 +239,10 @@ box-shadow:0 0 3px #000;pointer-events:none}
 .tag{position:absolute;top:8px;background:#000a;color:#fff;font-size:12px;padding:2px 8px;border-radius:4px}
 .tag.left{left:8px}.tag.right{right:8px}.pick{display:block;margin:8px 0;font-size:13px}
 select{font:inherit;max-width:100%}
-.crops{display:flex;flex-wrap:wrap;gap:10px}.crop{margin:0;width:132px}
-.crop div{position:relative;overflow:hidden;width:132px;aspect-ratio:var(--shape);border-radius:4px}
-.crop img{position:absolute;max-width:none}
+.r0{--roi:#2563eb}.r1{--roi:#d97706}
+.roi{position:absolute;box-sizing:border-box;border:2px solid var(--roi);pointer-events:none}
+.crops{display:flex;flex-wrap:wrap;gap:10px;margin-top:10px}.crop{margin:0;width:190px}
+.crop img{display:block;width:100%;box-sizing:border-box;border:2px solid var(--roi)}
 @media(max-width:600px){.row figure{flex-basis:100%}}
 """
 

@@ -16,6 +16,7 @@ from g2ard.cli.options import (
     BackgroundOption,
     Count,
     CountOption,
+    CropOption,
     Method,
     PolicyOption,
     PresetOption,
@@ -151,6 +152,7 @@ def distill(
         ),
     ] = False,
     resume: ResumeOption = False,
+    crop: CropOption = None,
     size: SizeOption = None,
     background: BackgroundOption = None,
     up: UpOption = None,
@@ -177,7 +179,7 @@ def distill(
     from g2ard.lift import LiftConfig
     from g2ard.recover.presets import preset_for
     from g2ard.recover.schedule import schedule_named
-    from g2ard.report.distilled import distill_report
+    from g2ard.report.distilled import check_crops, distill_report
 
     began = time.monotonic()
     values = run.constants(recover=DistillConfig(), lift=LiftConfig())
@@ -195,6 +197,7 @@ def distill(
     budget = budget_of(scene, count, ratio, len(prior))
     looks = _views(run, scene, prior, views, held_out, size, up, teach=not lifted and photos is not True)
     train, test = looks.train.cameras, looks.test
+    check_crops(crop or [], test.names)
     pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
     use_photos = lifted or (pictured if photos is None else photos)
     teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
@@ -251,6 +254,7 @@ def distill(
             report,
             colour,
             told=_told(report),
+            crops=crop or [],
         )
         _write(run, output, result, unseen, colour, report)
         _keep(output / _KEPT, result.simplified if keep else None)

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import BackgroundOption, LookOption, SizeOption, SplitOption, TeacherOption
+from g2ard.cli.options import (
+    BackgroundOption,
+    ConventionOption,
+    LookOption,
+    SizeOption,
+    SplitOption,
+    TeacherOption,
+)
 
 
 @command("evaluate", example="g2ard evaluate small.ply --views poses.json --teacher scene.ply --json -")
@@ -17,6 +24,10 @@ def evaluate(
     scenes: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scenes to score.")],
     views: LookOption,
     teacher: TeacherOption = None,
+    photos: Annotated[
+        bool,
+        typer.Option("--photos", help="With --teacher: each view's photo where it has one, else the render."),
+    ] = False,
     anchors: Annotated[
         Path | None,
         typer.Option(metavar="SCENE", help="The same Gaussians before recovery: adds Drift95 and its kin."),
@@ -24,27 +35,49 @@ def evaluate(
     lpips: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Weights of LPIPS; without them it is absent.")
     ] = None,
+    lpips_input: Annotated[
+        Literal["scaled", "unscaled"],
+        typer.Option(help="Images in [-1, 1], LPIPS's own, or in [0, 1] as 3DGS's evaluation feeds them."),
+    ] = "scaled",
+    convention: ConventionOption = "gsplat",
+    eight_bit: Annotated[
+        bool, typer.Option("--8bit", help="Round renders and targets to 8 bits, as saved PNGs are.")
+    ] = False,
     split: SplitOption = "test",
     size: SizeOption = None,
     background: BackgroundOption = None,
 ) -> None:
-    """PSNR, SSIM, size and needle share of scenes, against photos or a teacher's renders."""
+    """PSNR, SSIM, size and needle share of scenes, against photos or a teacher's renders.
+
+    3DGS's own evaluation is --convention inria --8bit --lpips-input unscaled.
+    """
     from g2ard.cli.scenes import load_scene, load_views, make_targets
     from g2ard.errors import InputError
     from g2ard.evaluate import evaluate as score
     from g2ard.lpips import load_lpips
     from g2ard.recover.anchors import Anchors, drift95, needle
+    from g2ard.render import RasterSettings
 
-    colour = background or (0.0, 0.0, 0.0)
+    if photos and teacher is None:
+        raise typer.BadParameter("--photos goes with --teacher: without a teacher all targets are photos")
+    colour, settings = background or (0.0, 0.0, 0.0), RasterSettings(convention=convention)
     dense = load_scene(run, teacher) if teacher else None
     frozen = load_scene(run, anchors) if anchors else None
-    targets = make_targets(run, load_views(run, views, split, size), dense, colour)
-    networks = load_lpips(lpips) if lpips else None
+    cameras = load_views(run, views, split, size, unpictured=photos)
+    targets = make_targets(run, cameras, dense, colour, photos=photos, settings=settings)
+    networks = load_lpips(lpips, scaled=lpips_input == "scaled") if lpips else None
     rows: list[dict[str, Any]] = []
     for path in scenes:
         splats = load_scene(run, path)
         scored = score(
-            splats, targets, background=colour, lpips=networks, progress=run.progress, stage=path.name
+            splats,
+            targets,
+            background=colour,
+            lpips=networks,
+            settings=settings,
+            eight_bit=eight_bit,
+            progress=run.progress,
+            stage=path.name,
         )
         row = {"scene": str(path), **scored.as_dict(), "drift95": None, "needle": needle(splats.scales)}
         row["file_bytes"] = path.stat().st_size if path.is_file() else None
@@ -53,8 +86,36 @@ def evaluate(
                 raise InputError(f"{anchors}: {len(frozen)} Gaussians, {path} has {len(splats)}")
             row["drift95"] = drift95(Anchors.of(frozen), splats.means)
         rows.append(row)
+    against = _against(rows[0]["views"])
+    said = f"{len(cameras)} views, against {_named(against)}; {_protocol(convention, eight_bit)}"
+    _table(run, said, rows)
+    protocol = {"convention": convention, "8bit": eight_bit, "lpips_input": lpips_input if lpips else None}
+    single = {"photo": "photos", "teacher": "teacher"}
+    kind = single[next(iter(against))] if len(against) == 1 else against
+    run.result({"against": kind, "protocol": protocol, "scenes": rows})
+
+
+def _against(views: list[dict[str, Any]]) -> dict[str, int]:
+    """How many of the targets are photos, and how many a teacher's renders."""
+    counts: dict[str, int] = {}
+    for view in views:
+        counts[view["against"]] = counts.get(view["against"], 0) + 1
+    return counts
+
+
+def _named(against: dict[str, int]) -> str:
+    if len(against) == 1:
+        return "photos" if "photo" in against else "the teacher"
+    return f"{against['photo']} photos and {against['teacher']} renders of the teacher"
+
+
+def _protocol(convention: str, eight_bit: bool) -> str:
+    return f"{convention}'s conventions, {'8-bit' if eight_bit else 'float'} renders"
+
+
+def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
     run.console.table(
-        f"{len(targets.cameras)} views, against {'the teacher' if dense else 'photos'}",
+        title,
         ["scene", "Gaussians", "MB", "PSNR", "SSIM", "LPIPS", "needle"],
         [
             [
@@ -69,4 +130,3 @@ def evaluate(
             for r in rows
         ],
     )
-    run.result({"against": "teacher" if dense else "photos", "scenes": rows})

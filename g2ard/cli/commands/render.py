@@ -3,12 +3,33 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import BackgroundOption, LookOption, SceneArgument, SizeOption, SplitOption
+from g2ard.cli.options import (
+    BackgroundOption,
+    ConventionOption,
+    Count,
+    CountOption,
+    LookOption,
+    Method,
+    RatioOption,
+    SceneArgument,
+    SizeOption,
+    SplitOption,
+    budget_of,
+    one_budget,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from g2ard.splats import Splats
+
+Color = Literal["scene", "flags", "cells", "parents"]
 
 
 @command("render", example="g2ard render scene.ply --views poses.json -o renders/")
@@ -18,24 +39,43 @@ def render(
     views: LookOption,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the PNGs.")],
     depth: Annotated[bool, typer.Option("--depth", help="Also write NAME.depth.npy, scene units.")] = False,
+    color: Annotated[
+        Color,
+        typer.Option(help="What simplification to -n or -r sees: protection flags, cells, where rows went."),
+    ] = "scene",
+    count: CountOption = None,
+    ratio: RatioOption = None,
+    method: Annotated[Method, typer.Option(help="Of --color parents, without views.")] = "default",
+    parents: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.npy", help="With --color parents: as `simplify --parents` wrote them."),
+    ] = None,
+    convention: ConventionOption = "gsplat",
     split: SplitOption = "all",
     size: SizeOption = None,
     background: BackgroundOption = None,
 ) -> None:
-    """Render a scene into every view as PNG."""
+    """Render a scene into every view as PNG, or what simplification makes of it painted on its surfaces."""
     import numpy as np
 
     from g2ard.cli.scenes import load_scene, load_views
     from g2ard.images import write_png
     from g2ard.io.atomic import atomic_folder, check_output
+    from g2ard.render import RasterSettings
     from g2ard.render import render as rasterize
 
+    _check(color, count, ratio, parents)
     check_output(output, run.overwrite, folder=True)
-    splats = load_scene(run, scene)
+    splats, settings = load_scene(run, scene), RasterSettings(convention=convention)
+    if color != "scene":
+        budget = None if parents else budget_of(scene, count, ratio, len(splats))
+        splats = _painted(run, splats, color, budget, method, parents)
     cameras = load_views(run, views, split, size)
     with atomic_folder(output, overwrite=run.overwrite) as folder:
         for view, name in enumerate(cameras.names):
-            rendered = rasterize(splats, cameras, view, background=background or (0.0, 0.0, 0.0))
+            rendered = rasterize(
+                splats, cameras, view, background=background or (0.0, 0.0, 0.0), settings=settings
+            )
             stem = folder / Path(name).with_suffix("")
             stem.parent.mkdir(parents=True, exist_ok=True)
             write_png(stem.with_name(stem.name + ".png"), rendered.image)
@@ -44,3 +84,55 @@ def render(
             run.progress("render", view + 1, len(cameras))
     run.say(f"{len(cameras)} images in {output}")
     run.result({"images": len(cameras), "output": str(output)})
+
+
+def _check(color: Color, count: Count | None, ratio: float | None, parents: Path | None) -> None:
+    """Usage check: a budget where it decides something, and nothing that would be ignored."""
+    if parents is not None and color != "parents":
+        raise typer.BadParameter("--parents goes with --color parents")
+    if color != "scene" and parents is None:
+        one_budget(count, ratio)
+    elif count is not None or ratio is not None:
+        raise typer.BadParameter("-n and -r go with --color flags, cells or parents (without --parents)")
+
+
+def _painted(
+    run: Run, splats: Splats, color: Color, budget: int | None, method: Method, parents: Path | None
+) -> Splats:
+    from g2ard.paint import cell_labels, flag_colors, label_colors, painted
+    from g2ard.simplify import flag, simplify
+
+    if color == "flags":
+        assert budget is not None  # _check has seen to it
+        flags = flag(splats, budget, progress=run.progress)
+        run.say(
+            f"flags: {flags.mean():.1%} of {len(splats):,} Gaussians are protected, over {budget:,} cells"
+        )
+        return painted(splats, flag_colors(flags))
+    if color == "cells":
+        assert budget is not None
+        labels = cell_labels(splats, budget)
+        run.say(f"cells: {labels.max() + 1:,}")
+        return painted(splats, label_colors(labels))
+    if parents is not None:
+        labels = _read_parents(parents, len(splats))
+    else:
+        assert budget is not None
+        labels = simplify(splats, budget, method=method, progress=run.progress).parents
+    gone = int((labels < 0).sum())
+    run.say(f"parents: {labels.max() + 1:,} Gaussians of {len(splats):,}; {gone:,} went nowhere (black)")
+    return painted(splats, label_colors(labels))
+
+
+def _read_parents(path: Path, count: int) -> NDArray[np.int64]:
+    import numpy as np
+
+    from g2ard.errors import InputError
+
+    try:
+        labels = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{path}: not an array of numpy's ({error})") from None
+    if not isinstance(labels, np.ndarray) or labels.dtype.kind not in "iu" or labels.shape != (count,):
+        raise InputError(f"{path}: expected {count} whole numbers, one for each Gaussian of the scene")
+    return labels.astype(np.int64)

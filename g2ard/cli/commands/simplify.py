@@ -48,6 +48,10 @@ def simplify(
         bool,
         typer.Option("--no-views", help="Use no cameras at all, neither found ones nor a pool of its own."),
     ] = False,
+    parents: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.npy", help="Also write the row that each Gaussian went to; -1 is none."),
+    ] = None,
     preset: PaperOption = None,
     method: Annotated[Method, typer.Option(help="The policy.")] = "default",
     retention: Annotated[
@@ -75,6 +79,8 @@ def simplify(
     values = run.constants(simplify=SimplifyConfig(), over_options=True)
     config = changed(SimplifyConfig(retention=retention), "simplify", values)
     io.check_scene_output(output, run.overwrite)
+    if parents is not None:
+        _check_parents(run, parents, scene, views)
     began = time.perf_counter()
     found = io.read_scene(scene)
     for note in found.notes:
@@ -93,6 +99,8 @@ def simplify(
     )
     simplified = time.perf_counter()
     io.write_splats(output, small.splats, overwrite=run.overwrite)
+    if parents is not None:
+        _write_parents(run, parents, small)
     written = time.perf_counter()
     _tell(run, small)
     if small.report["unseen"]:
@@ -143,6 +151,24 @@ def _cameras(
         run.say(f"goes on without views: {e}")
         return None
     return pool.cameras
+
+
+def _check_parents(run: Run, parents: Path, scene: Path, views: Path | None) -> None:
+    from g2ard.io.atomic import check_output
+
+    if parents.resolve() in {path.resolve() for path in (scene, views) if path and not is_made(path)}:
+        raise typer.BadParameter(f"--parents: {parents} is an input; name another output")
+    check_output(parents, run.overwrite)
+
+
+def _write_parents(run: Run, path: Path, small: Simplified) -> None:
+    """(N,) int64 in the order of the scene's rows, for `render --color parents`."""
+    import numpy as np
+
+    from g2ard.io.atomic import atomic_output
+
+    with atomic_output(path, overwrite=run.overwrite) as temporary, temporary.open("wb") as file:
+        np.save(file, small.parents)
 
 
 def _tell(run: Run, small: Simplified) -> None:

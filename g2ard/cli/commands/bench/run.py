@@ -23,13 +23,15 @@ if TYPE_CHECKING:
     from g2ard.bench.run_rows import Row
 
 
-@command("run", parent=bench, example="g2ard bench run benches/definitions/compression.toml -o figures/")
+@command("run", parent=bench, example="g2ard bench run benches/definitions/compression.toml")
 def run_(
     run: Run,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the run.")],
     definitions: Annotated[
         list[Path] | None, typer.Argument(metavar="[DEFINITION.toml...]", help="Studies.")
     ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the run.")] = Path(
+        "figures"
+    ),
     scene: Annotated[
         list[Path] | None,
         typer.Option("--scene", metavar="SCENE", help="Instead of a study: scenes to measure on."),
@@ -195,7 +197,9 @@ def _whole(text: str) -> int:
 
 
 def _bench_row(row: Row) -> list[str]:
-    matched = row.matched if row.matched == "released" else f"{row.amount:g} {row.matched}"
+    from g2ard.bench.methods import Matched
+
+    matched = Matched(row.matched, row.amount).label
     head = [row.study, row.scene, f"{row.ratio:g}", row.method, matched, row.split, row.against]
     if row.error:
         return [*head, row.error, "", "", ""]
