@@ -54,6 +54,16 @@ def test_grid_equals_its_naive_twin() -> None:
     assert (got[hit] > want[hit] - 0.02 * grid.cell).all()
 
 
+@pytest.mark.parametrize("batch", [1, 500, 10**6])
+def test_a_grid_does_not_depend_on_how_many_points_are_counted_at_once(batch, monkeypatch) -> None:
+    matter = Matter.of(naive.statue())
+    whole = Grid.of(np.full(3, -0.5), np.full(3, 0.5), matter, np.eye(3), cells=2000)
+    monkeypatch.setattr("g2ard.poses.grid._BATCH", batch)
+    parts = Grid.of(np.full(3, -0.5), np.full(3, 0.5), matter, np.eye(3), cells=2000)
+    np.testing.assert_array_equal(parts.opaque, whole.opaque)
+    np.testing.assert_allclose(parts.scale, whole.scale, rtol=1e-6)
+
+
 _CAST = """
 import sys
 import numpy as np

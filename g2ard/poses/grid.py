@@ -72,7 +72,8 @@ class Grid:
         for count in np.unique(parts):
             rows, offsets = np.flatnonzero(parts == count), _lattice(int(count))
             spans = turned(matter.spans(rows).reshape(-1, 3), axes).reshape(-1, 2, 3) if count > 1 else None
-            for some in np.array_split(offsets, -(-len(offsets) * len(rows) // _BATCH)):
+            parts_of = min(len(offsets), -(-len(offsets) * len(rows) // _BATCH))
+            for some in np.array_split(offsets, parts_of):
                 at = points[rows]
                 if spans is not None:
                     a, b = some.T[:, :, None, None]
