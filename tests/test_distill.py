@@ -116,9 +116,9 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
 
 
 def test_a_loss_in_any_kind_of_views_is_told() -> None:
-    from g2ard.cli.commands.distill import _told
+    from g2ard.cli.run_result import told
 
-    def told(pool: float, near: float | None, unseen: float | None) -> list[str]:
+    def said(pool: float, near: float | None, unseen: float | None) -> list[str]:
         def scores(gain: float) -> dict[str, dict[str, Any]]:
             views = [[{"psnr": 30.0 + share * gain} for share in part] for part in ((0, 0), (2.5, -0.5))]
             return {
@@ -127,13 +127,13 @@ def test_a_loss_in_any_kind_of_views_is_told() -> None:
             }
 
         apart = None if near is None else scores(near)
-        return _told({"rounds": [], "scores": scores(pool), "apart": apart, "unseen": unseen})
+        return told({"rounds": [], "scores": scores(pool), "apart": apart, "unseen": unseen})
 
-    assert told(1.0, None, None) == ["1 of 2 unseen views lost, though all together gained"]
-    assert told(0.02, 0.02, 0.0) == []
-    line = told(0.02, -0.5, 0.0)[0]
+    assert said(1.0, None, None) == ["1 of 2 unseen views lost, though all together gained"]
+    assert said(0.02, 0.02, 0.0) == []
+    line = said(0.02, -0.5, 0.0)[0]
     assert "lost 0.50 dB in views of another kind" in line
-    lines = told(-0.2, -0.3, 0.25)
+    lines = said(-0.2, -0.3, 0.25)
     assert "lost 0.20 dB in unseen views" in lines[0]
     assert "no view sees 25% of the scene's matter" in lines[2]
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from g2ard.cli.found import as_pool, found_views
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
@@ -25,7 +24,6 @@ from g2ard.cli.options import (
     ScheduleName,
     SizeOption,
     TimeLimitOption,
-    Triple,
     UpOption,
     ViewsOrMadeOption,
     budget_of,
@@ -36,12 +34,10 @@ from g2ard.cli.options import (
     views_count,
 )
 from g2ard.cli.resume import check_stopped, left_at
+from g2ard.cli.run_result import say_views, told, write_table
+from g2ard.cli.run_views import views_of
 from g2ard.cli.scenes import (
-    drop_held_out,
-    load_for_training,
-    load_held_out,
     load_scene,
-    load_view_sets,
     make_targets,
     recovery_engine,
 )
@@ -49,9 +45,7 @@ from g2ard.cli.scenes import (
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.distill import Distilled
-    from g2ard.io import ViewSet
     from g2ard.lift import LiftConfig
-    from g2ard.poses import Pool
     from g2ard.splats import Splats
     from g2ard.targets import Targets
 
@@ -59,36 +53,8 @@ if TYPE_CHECKING:
 
 _WORK = ".unfinished"
 """In the folder of the run: finished rounds and checkpoints. Nobody else has a folder of this name."""
-_POOL, _GROW = 160, 2.0
-"""Poses of a pool made for a scene without views, and how many times as many there may be where a view holds
-little of it; every 8th is held out for scoring."""
-_APART = 24
-"""Views of another kind: half of them validate recovery, half are scored."""
-_ROWS = 200_000
-"""Gaussians that poses are planned on."""
-_LOSS = 0.05
-"""dB under the simplified scene that the command speaks of."""
 _KEPT = Path("simplified", "scene.ply")
 """In the folder of the run, with --keep: the anchors of the last recovery, for `evaluate --anchors`."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Views:
-    """What a run looks at.
-
-    Args:
-        train: to recover from.
-        test: of their kind, for scoring.
-        apart: of another kind, nearer; None where none can be made.
-        pool: all of a pool made for the scene, to be written beside the result.
-        unseen: share of a sample of the scene's matter that no view of that pool sees.
-    """
-
-    train: ViewSet
-    test: Cameras
-    apart: Cameras | None = None
-    pool: ViewSet | None = None
-    unseen: float | None = None
 
 
 @command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True, constants=True)
@@ -195,7 +161,7 @@ def distill(
     lifting = changed(LiftConfig(), "lift", values)
     prior = _lift(run, scene, lifting) if lifted else load_scene(run, scene)
     budget = budget_of(scene, count, ratio, len(prior))
-    looks = _views(run, scene, prior, views, held_out, size, up, teach=not lifted and photos is not True)
+    looks = views_of(run, scene, prior, views, held_out, size, up, teach=not lifted and photos is not True)
     train, test = looks.train.cameras, looks.test
     check_crops(crop or [], test.names)
     pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
@@ -253,7 +219,7 @@ def distill(
             unseen,
             report,
             colour,
-            told=_told(report),
+            told=told(report),
             crops=crop or [],
         )
         _write(run, output, result, unseen, colour, report)
@@ -261,10 +227,10 @@ def distill(
     if looks.pool is not None:
         write_views(output / "views.json", looks.pool.cameras, splits=looks.pool.splits, overwrite=True)
     shutil.rmtree(output / _WORK)
-    _table(run, report)
-    for line in _told(report):
+    write_table(run, report)
+    for line in told(report):
         run.say(line)
-    _say_views(run, report["views"], k is not None)
+    say_views(run, report["views"], k is not None)
     run.say(
         f"scene: {output / 'scene.ply'}\npicture: {output / 'preview.png'}\n"
         f"report: {output / 'report.html'}, {output / 'report.json'}"
@@ -300,68 +266,6 @@ def _lift(run: Run, path: Path, config: LiftConfig) -> Splats:
     for note in cloud.notes:
         run.say(f"{path}: {note}")
     return lift(cloud.points.positions, cloud.points.colors, **vars(config), progress=run.progress)
-
-
-def _views(
-    run: Run,
-    scene: Path,
-    prior: Splats,
-    views: Path | None,
-    held_out: Path | None,
-    size: int | None,
-    up: Triple | None,
-    *,
-    teach: bool,
-) -> _Views:
-    """Views for recovery and for scoring; `teach`: the scene can be rendered into others than those given."""
-    from g2ard.io import ViewSet
-    from g2ard.splits import split_mask, splits_of
-
-    found = None
-    if views is None:
-        found = views = found_views(run, scene, prior, ["train"] if held_out else ["train", "test"])
-    if views is not None and not is_made(views):
-        if held_out is None:
-            train, test = load_view_sets(run, views, ["train", "test"], size)
-        else:
-            train, test = load_for_training(run, views, size), load_held_out(run, held_out, size)
-            train = drop_held_out(run, train, test.cameras)
-        if found and not size:
-            train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
-        return _Views(train, test.cameras, _near(run, prior, size, up) if teach else None)
-    planned = _planned(run, prior, _POOL, up, _GROW)
-    apart = planned.apart and planned.apart.resized(size)
-    names = planned.cameras.names
-    run.say(f"poses: {planned.kind} ({planned.why})")
-    if held_out is not None:
-        pool = ViewSet(planned.cameras, splits=("train",) * len(names))
-        test = load_held_out(run, held_out, size)
-        train = drop_held_out(run, pool.resized(size), test.cameras)
-        return _Views(train, test.cameras, apart, pool, planned.unseen)
-    pool = ViewSet(planned.cameras, splits=splits_of(None, names))
-    mask = split_mask(None, names, "test")
-    train = pool.take(~mask).resized(size)
-    return _Views(train, pool.take(mask).resized(size).cameras, apart, pool, planned.unseen)
-
-
-def _planned(run: Run, prior: Splats, count: int, up: Triple | None, grow: float = 1.0) -> Pool:
-    """A pool of `count` views or up to `grow` times as many, and views of another kind."""
-    from g2ard.poses import plan_pool
-
-    return plan_pool(
-        prior, count, up=up, seed=run.seed, rows=_ROWS, apart=_APART, grow=grow, progress=run.progress
-    )
-
-
-def _near(run: Run, prior: Splats, size: int | None, up: Triple | None) -> Cameras | None:
-    """Views of another kind beside those that were given; None where the scene has no place for any."""
-    from g2ard.errors import InputError
-
-    try:
-        apart = _planned(run, prior, _APART, up).apart
-    except InputError:
-        return None
-    return apart and apart.resized(size)
 
 
 def _apart_targets(
@@ -426,78 +330,3 @@ def _keep(path: Path, scene: Splats | None) -> None:
         return
     path.parent.mkdir(exist_ok=True)
     write_splats(path, scene, overwrite=True)
-
-
-def _table(run: Run, report: dict[str, Any]) -> None:
-    kinds = [report["scores"]] + ([report["apart"]] if report["apart"] else [])
-
-    def row(name: str, count: int, size: int) -> list[str]:
-        figures = []
-        for scores in kinds:
-            score = scores.get(name)
-            figures += [f"{score['psnr']:.2f}", f"{score['ssim']:.4f}"] if score else ["–", "–"]
-        return [name, f"{count:,}", f"{size / 1e6:.2f}", f"{size / count:.0f}", *figures]
-
-    size = report["bytes"]
-    times = ", ".join(f"{name} {value:.1f} s" for name, value in report["seconds"].items())
-    counts = [str(len(scores["recovered"]["views"])) for scores in kinds]
-    apart = f" and {counts[1]} of another kind (nearer)" if len(kinds) > 1 else ""
-    run.console.table(
-        f"{counts[0]} unseen views{apart} against {report['against']}; {times}",
-        [
-            "scene",
-            "Gaussians",
-            "MB",
-            "bytes each",
-            "PSNR",
-            "SSIM",
-            *["PSNR near", "SSIM near"][: 2 * (len(kinds) - 1)],
-        ],
-        [
-            row("dense", report["input_count"], size["input"]),
-            row("simplified", report["output_count"], size["output"]),
-            row("recovered", report["output_count"], size["output"]),
-        ],
-    )
-
-
-def _told(report: dict[str, Any]) -> list[str]:
-    """What recovery kept, where it lost, and what no view saw, a line each."""
-    from g2ard.recover.outcome import outcome
-
-    lines = [outcome(done) for entry in report["rounds"] for done in entry.get("recover", [])]
-    told = [line for line in lines if line is not None]
-    for kind, what in (("scores", "unseen views"), ("apart", "views of another kind")):
-        if not report[kind]:
-            continue
-        before, after = (report[kind][name]["psnr"] for name in ("simplified", "recovered"))
-        if after < before - _LOSS:
-            told.append(
-                f"warning: recovery lost {before - after:.2f} dB in {what}: the simplified scene is better"
-                " there (g2ard simplify makes it)"
-            )
-            continue
-        pairs = zip(*(report[kind][name]["views"] for name in ("simplified", "recovered")), strict=True)
-        lost = sum(b["psnr"] < a["psnr"] - _LOSS for a, b in pairs)
-        if lost:
-            told.append(
-                f"{lost} of {len(report[kind]['recovered']['views'])} {what} lost, though all together gained"
-            )
-    if report["unseen"]:
-        told.append(
-            f"no view sees {report['unseen']:.0%} of the scene's matter: it is simplified, not recovered"
-        )
-    return told
-
-
-def _say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:
-    """What was made of the candidates, where it is not simply all of them."""
-    if views is None:
-        return
-    if views["refused"]:
-        run.say(f"{len(views['refused'])} views not used: they see nothing of the scene, or stand within it")
-    if chosen:
-        run.say(
-            f"views: {len(views['chosen'])} of {views['candidates']} by {views['policy']};"
-            f" those left out would have added {100 * views['left_out']:.1f} %"
-        )

@@ -1,0 +1,88 @@
+"""What `g2ard distill` says of its result: the table, warnings, what was made of the views."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from g2ard.cli.frame import Run
+
+__all__ = ["say_views", "told", "write_table"]
+
+_LOSS = 0.05
+"""dB under the simplified scene that the command speaks of."""
+
+
+def write_table(run: Run, report: dict[str, Any]) -> None:
+    """Both scenes beside the dense one: counts, bytes, figures in each kind of views."""
+    kinds = [report["scores"]] + ([report["apart"]] if report["apart"] else [])
+
+    def row(name: str, count: int, size: int) -> list[str]:
+        figures = []
+        for scores in kinds:
+            score = scores.get(name)
+            figures += [f"{score['psnr']:.2f}", f"{score['ssim']:.4f}"] if score else ["–", "–"]
+        return [name, f"{count:,}", f"{size / 1e6:.2f}", f"{size / count:.0f}", *figures]
+
+    size = report["bytes"]
+    times = ", ".join(f"{name} {value:.1f} s" for name, value in report["seconds"].items())
+    counts = [str(len(scores["recovered"]["views"])) for scores in kinds]
+    apart = f" and {counts[1]} of another kind (nearer)" if len(kinds) > 1 else ""
+    run.console.table(
+        f"{counts[0]} unseen views{apart} against {report['against']}; {times}",
+        [
+            "scene",
+            "Gaussians",
+            "MB",
+            "bytes each",
+            "PSNR",
+            "SSIM",
+            *["PSNR near", "SSIM near"][: 2 * (len(kinds) - 1)],
+        ],
+        [
+            row("dense", report["input_count"], size["input"]),
+            row("simplified", report["output_count"], size["output"]),
+            row("recovered", report["output_count"], size["output"]),
+        ],
+    )
+
+
+def told(report: dict[str, Any]) -> list[str]:
+    """What recovery kept, where it lost, and what no view saw, a line each."""
+    from g2ard.recover.outcome import outcome
+
+    lines = [outcome(done) for entry in report["rounds"] for done in entry.get("recover", [])]
+    found = [line for line in lines if line is not None]
+    for kind, what in (("scores", "unseen views"), ("apart", "views of another kind")):
+        if not report[kind]:
+            continue
+        before, after = (report[kind][name]["psnr"] for name in ("simplified", "recovered"))
+        if after < before - _LOSS:
+            found.append(
+                f"warning: recovery lost {before - after:.2f} dB in {what}: the simplified scene is better"
+                " there (--keep writes it too)"
+            )
+            continue
+        pairs = zip(*(report[kind][name]["views"] for name in ("simplified", "recovered")), strict=True)
+        lost = sum(b["psnr"] < a["psnr"] - _LOSS for a, b in pairs)
+        if lost:
+            found.append(
+                f"{lost} of {len(report[kind]['recovered']['views'])} {what} lost, though all together gained"
+            )
+    if report["unseen"]:
+        found.append(
+            f"no view sees {report['unseen']:.0%} of the scene's matter: it is simplified, not recovered"
+        )
+    return found
+
+
+def say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:
+    """What was made of the candidates, where it is not simply all of them."""
+    if views is None:
+        return
+    if views["refused"]:
+        run.say(f"{len(views['refused'])} views not used: they see nothing of the scene, or stand within it")
+    if chosen:
+        run.say(
+            f"views: {len(views['chosen'])} of {views['candidates']} by {views['policy']};"
+            f" those left out would have added {100 * views['left_out']:.1f} %"
+        )
