@@ -15,17 +15,17 @@ METHODS = ("default", "fast", "paper")
 _RETENTION = {"default": 0.65, "fast": 0.65, "paper": 0.75}
 _MIN_OPACITY = {"default": 0.004, "fast": 0.004, "paper": 0.01}
 
-_FOLD = 0.05
-"""A last cut smaller than this is folded into the round before."""
-
 
 @dataclass(frozen=True)
 class SimplifyConfig:
-    """The constants of simplification: `paper`'s are the paper's (`tab:s_config`), the others measured.
+    """The constants of simplification: `paper`'s are the paper's (`tab:s_config`), but where it states none;
+    the others are measured. Readings and figures are in `docs/paper.md`.
 
     Args:
         retention: share of the Gaussians that a round keeps; None means the method's own, 0.75 in the paper,
             0.65 for the others (fewer rounds, as good).
+        fold: a last cut by less than this share is folded into the round before: the paper's eight rounds from
+            500,000 to 50,000 are seven cuts by a quarter and one of less.
         min_opacity: below this α a Gaussian is dropped; None means the method's own, 0.01 in the paper, 0.004
             (what no renderer draws) for the others.
         neighbors: `default`: nearest clusters that one may merge with. More lets far ones in: 16 is worse.
@@ -38,14 +38,24 @@ class SimplifyConfig:
         max_growth: of `default` and `fast`: how many times the area that its moments say a cluster may take,
             along its two longer axes, where α ≤ 0.99 alone cannot hold its mass. At 1 opaque surfaces show
             gaps.
-        color_bin: `paper`: edge of the colour bins within a cell, in colour units (0–1).
-        max_energy: `paper`: largest affine energy of a merged group, colour units squared.
-        min_coverage: `paper`: least share of the members' footprint that the merged footprint covers.
-        flag_threshold: ε_h, the affine residual of a cell above which its Gaussians are protected.
-        protection: `paper`: λ_h, what a protected Gaussian's priority π is raised by.
+        color_bin: `paper`: edge of the colour bins that part [0, 1] within a cell, in colour units
+            (`tab:s_config`).
+        max_energy: `paper`: largest affine energy of a merged group, summed over channels, colour units squared
+            (`tab:s_config`; E_j of eq. `frequency`).
+        min_coverage: `paper`: least share of the members' footprint area that the merged footprint covers
+            (`tab:s_config`).
+        support: `paper`: where a footprint ends for that, in standard deviations; not in the paper. 3 is where
+            3DGS's renderer ends it.
+        flag_threshold: ε_h, the affine residual of a cell above which its Gaussians are protected, colour units
+            squared (eq. `frequency`, `tab:s_config`).
+        flag_members: a cell with fewer Gaussians borrows those of its face neighbours for the fit behind its
+            residual; not in the paper. 8 are two for each of the four affine coefficients.
+        protection: `paper`: λ_h, what a protected Gaussian's priority π is raised by (eq. `importance`,
+            `tab:s_config`).
     """
 
     retention: float | None = None
+    fold: float = 0.05
     min_opacity: float | None = None
     neighbors: int = 6
     geometric_weight: float = 0.03
@@ -55,17 +65,21 @@ class SimplifyConfig:
     color_bin: float = 0.25
     max_energy: float = 0.01
     min_coverage: float = 0.6
+    support: float = 3.0
     flag_threshold: float = 0.01
+    flag_members: int = 8
     protection: float = 10.0
 
     def __post_init__(self) -> None:
         if self.retention is not None and not 0 < self.retention < 1:
             raise InputError(f"retention: expected a number between 0 and 1, got {self.retention}")
+        if not 0 <= self.fold < 1:
+            raise InputError(f"fold: expected a number in [0, 1), got {self.fold}")
         if not self.max_growth >= 1:
             raise InputError(f"max_growth: expected at least 1, got {self.max_growth}")
         if self.neighbors < 1:
             raise InputError(f"neighbors: expected at least 1, got {self.neighbors}")
-        for name in ("color_bin", "pixel_scale"):
+        for name in ("color_bin", "pixel_scale", "support"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise InputError(f"{name}: expected a positive number, got {value}")
@@ -76,6 +90,7 @@ class SimplifyConfig:
             "max_energy",
             "min_coverage",
             "flag_threshold",
+            "flag_members",
             "protection",
         ):
             value = getattr(self, name)
@@ -91,8 +106,8 @@ class SimplifyConfig:
         return _MIN_OPACITY[method] if self.min_opacity is None else self.min_opacity
 
 
-def schedule(count: int, budget: int, retention: float = 0.75) -> list[int]:
-    """Counts after each round: N_r = max(N_S, ⌈retention·N_{r−1}⌉), a last cut under 5 % folded in.
+def schedule(count: int, budget: int, retention: float = 0.75, fold: float = 0.05) -> list[int]:
+    """Counts after each round: N_r = max(N_S, ⌈retention·N_{r−1}⌉), a last cut by less than `fold` folded in.
 
     >>> schedule(500_000, 50_000)
     [375000, 281250, 210938, 158204, 118653, 88990, 66743, 50000]
@@ -102,7 +117,7 @@ def schedule(count: int, budget: int, retention: float = 0.75) -> list[int]:
     rounds: list[int] = []
     while count > budget:
         count = max(budget, min(count - 1, math.ceil(retention * count)))
-        if budget > (1 - _FOLD) * count:
+        if budget > (1 - fold) * count:
             count = budget
         rounds.append(count)
     return rounds
