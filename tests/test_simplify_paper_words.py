@@ -53,7 +53,8 @@ def test_a_round_on_the_way_has_the_cells_of_the_final_budget():
     assert abs(out.report["rounds"][0]["cells"] - 360) <= 0.03 * 360
 
 
-# "Third, if the count still exceeds the round budget, primitives are ranked": merging comes first, and ends there.
+# "Third, if the count still exceeds the round budget, primitives are ranked": merging comes first, and ends
+# there.
 
 
 def test_flat_smooth_discs_reach_the_budget_by_merging():
@@ -71,8 +72,8 @@ def test_merging_ends_at_the_round_budget():
     assert first["undone_groups"] > 100
 
 
-# "A surface-coverage guard prevents merging across incompatible geometric support" (section 3.2), ">= 0.6 of member
-# footprint area".
+# "A surface-coverage guard prevents merging across incompatible geometric support" (section 3.2), ">= 0.6 of
+# member footprint area" (tab:s_config).
 
 
 @pytest.mark.parametrize("gap", [0.13, 0.2, 0.5, 1.0, 2.0, 3.0])

@@ -60,8 +60,8 @@ def flag(
 ) -> NDArray[np.bool_]:
     """Protection flags of a raw prior: p_i = 1[E_c(i) > ε_h] (eq. `frequency`).
 
-    E_j is the mean squared residual of an affine colour predictor within cell j, over about `budget` cells, of
-    colours clamped to [0, 1]; a cell of few members borrows those of its face neighbours for the fit.
+    E_j is the mean squared residual of an affine predictor of colour, clamped to [0, 1], within cell j, over
+    about `budget` cells; a cell of few members borrows those of its face neighbours for the fit.
 
     Args:
         splats: the raw prior, never a recovered scene: fitting hides the residual.
@@ -119,9 +119,9 @@ def simplify(
     `fast` merges along Morton order all the way, on two lattices in turn: no graph of neighbours.
 
     `paper`: rounds of 75 %; each drops α < 0.01, merges cell × colour-bin groups by moment matching where the
-    affine-energy and surface-coverage guards pass, at most down to the round's count, and trims what is left by
-    π = −log(1 − α)·A·(1 + λ_h·p) (eq. `importance`). There is about one cell for each Gaussian of the final
-    budget, in every round.
+    affine-energy and surface-coverage guards pass, at most down to the round's count, and trims what is left
+    by π = −log(1 − α)·A·(1 + λ_h·p) (eq. `importance`). There is about one cell for each Gaussian of the
+    final budget, in every round (`docs/paper.md` holds how the paper is read).
 
     Rows below the methods' α are dropped first, unless the budget needs them, or there are no others.
 
@@ -136,8 +136,8 @@ def simplify(
             a function that finds it for a scene, asked again for the result, whose opacities it fits.
         protected: (N,) bool flags to inherit. With None, `paper` computes them (see `flag`), the others,
             which have no use for them, go without.
-        final_budget: for `paper`: N_S, where this call is one round on the way to a smaller count; it sets the
-            size of all cells. None means `budget`.
+        final_budget: for `paper`: N_S, where this call is one round on the way to a smaller count; it sets
+            the size of all cells. None means `budget`.
         config: the constants.
         progress: told of Gaussians shed, round by round.
 

@@ -18,14 +18,14 @@ _MIN_OPACITY = {"default": 0.004, "fast": 0.004, "paper": 0.01}
 
 @dataclass(frozen=True)
 class SimplifyConfig:
-    """The constants of simplification: `paper`'s are the paper's (`tab:s_config`), but where it states none;
-    the others are measured. Readings and figures are in `docs/paper.md`.
+    """The constants of simplification: those of `paper` are the paper's (`tab:s_config`) where it states
+    them, the others are measured (`docs/paper.md`, `docs/decisions.md`).
 
     Args:
         retention: share of the Gaussians that a round keeps; None means the method's own, 0.75 in the paper,
             0.65 for the others (fewer rounds, as good).
-        fold: a last cut by less than this share is folded into the round before: the paper's eight rounds from
-            500,000 to 50,000 are seven cuts by a quarter and one of less.
+        fold: a last cut by less than this share is folded into the round before, in 0–1; not in the paper. A
+            cut of a few Gaussians would cost a whole recovery.
         min_opacity: below this α a Gaussian is dropped; None means the method's own, 0.01 in the paper, 0.004
             (what no renderer draws) for the others.
         neighbors: `default`: nearest clusters that one may merge with. More lets far ones in: 16 is worse.
@@ -40,16 +40,16 @@ class SimplifyConfig:
             gaps.
         color_bin: `paper`: edge of the colour bins that part [0, 1] within a cell, in colour units
             (`tab:s_config`).
-        max_energy: `paper`: largest affine energy of a merged group, summed over channels, colour units squared
-            (`tab:s_config`; E_j of eq. `frequency`).
+        max_energy: `paper`: largest affine energy of a merged group, summed over channels, colour units
+            squared (`tab:s_config`; E_j of eq. `frequency`).
         min_coverage: `paper`: least share of the members' footprint area that the merged footprint covers
             (`tab:s_config`).
-        support: `paper`: where a footprint ends for that, in standard deviations; not in the paper. 3 is where
-            3DGS's renderer ends it.
-        flag_threshold: ε_h, the affine residual of a cell above which its Gaussians are protected, colour units
-            squared (eq. `frequency`, `tab:s_config`).
+        support: `paper`: where a footprint ends for that, in standard deviations; not in the paper. 3 is
+            where 3DGS's renderer ends it.
+        flag_threshold: ε_h, the affine residual of a cell above which its Gaussians are protected, colour
+            units squared (eq. `frequency`, `tab:s_config`).
         flag_members: a cell with fewer Gaussians borrows those of its face neighbours for the fit behind its
-            residual; not in the paper. 8 are two for each of the four affine coefficients.
+            residual; not in the paper. 8 are two for each of the four affine coefficients; 1 borrows nothing.
         protection: `paper`: λ_h, what a protected Gaussian's priority π is raised by (eq. `importance`,
             `tab:s_config`).
     """

@@ -182,8 +182,9 @@ mod tests {
         let turned = |angle: f64| [(angle / 2.0).cos(), (angle / 2.0).sin(), 0.0, 0.0];
         let mut members = vec![disc_at([0.0; 3], FLAT); 4];
         members.push(disc_at([0.0; 3], turned(1.2)));
+        // Four discs stick out by a tenth of a narrower ellipse; of the fifth cos 1.2 counts.
         let got = covered(&members);
-        assert!((0.85..0.93).contains(&got), "{got}");
+        assert!((0.75..0.88).contains(&got), "{got}");
         let ball = |q| Gaussian {
             scales: [1.0; 3],
             ..disc_at([0.0; 3], q)
