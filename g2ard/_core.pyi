@@ -36,21 +36,24 @@ def cast_rays(
 def simplify_flags(
     scene: Splats,
     cells: int,
-    threshold: float,
     *,
+    threshold: float,
+    members: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> NDArray[np.bool_]: ...
 def simplify_paper(
     scene: Splats,
     schedule: list[int],
-    flag_cells: int,
+    cells: int,
     *,
     protected: NDArray[np.bool_] | None,
     min_opacity: float,
     color_bin: float,
     max_energy: float,
     min_coverage: float,
+    support: float,
     flag_threshold: float,
+    flag_members: int,
     protection: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]: ...

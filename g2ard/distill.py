@@ -265,7 +265,7 @@ class _Rounds:
                 if self.config.method == "paper"
                 else looker(self.targets.cameras, progress=self.progress),
                 protected=self.protected,
-                flag_budget=self.budget,
+                final_budget=self.budget,
                 progress=self.progress,
             )
             self.state, self.protected = done.splats, done.protected

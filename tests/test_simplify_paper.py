@@ -76,11 +76,29 @@ def test_flags_find_texture_and_borrow_in_sparse_cells():
 
 def test_flag_residual_equals_the_naive_twin():
     rng = np.random.default_rng(5)
-    for n in (2, 5, 8, 9, 30):
-        points, colors = rng.normal(size=(n, 3)), rng.normal(size=(n, 3)) * 0.05
+    for n in (5, 8, 9, 30):
+        points, colors = rng.normal(size=(n, 3)), rng.normal(size=(n, 3)) * 0.2
         prior = Splats.create(points, scales=np.ones((n, 3)), sh0=colors[:, None] / naive.C0)
-        colors = 0.5 + naive.C0 * prior.sh0[:, 0].astype(np.float64)
-        energy = naive.affine_energy(prior.means.astype(np.float64), colors, n)
+        energy = naive.affine_energy(prior.means.astype(np.float64), naive.color(prior), n)
         for factor, want in ((0.98, True), (1.02, False)):
             config = SimplifyConfig(flag_threshold=factor * energy)
             assert flag(prior, 1, config=config).all() == want, n
+
+
+def test_coverage_equals_the_naive_twin():
+    rng = np.random.default_rng(6)
+    partly = 0
+    for n in (2, 3, 5, 9, 17, 30):
+        prior = Splats.create(
+            rng.normal(size=(n, 3)) * [1, 1, 0.1],
+            quats=rng.normal(size=(n, 4)) * [3, 1, 1, 1],
+            scales=np.exp(rng.normal(-2, 0.7, (n, 3))) * [1, 1, 0.3],
+            logit_opacities=rng.normal(size=n),
+        )
+        covered = naive.coverage(prior, np.arange(n))
+        partly += 0.1 < covered < 0.9
+        for margin, refused in ((-0.06, 0), (0.06, 1)):
+            least = max(0, covered + margin)
+            out = one_round(prior, 1, np.zeros(n, bool), min_opacity=0, max_energy=10, min_coverage=least)
+            assert out.report["rounds"][0]["refused"] == {"energy": 0, "coverage": refused}, n
+    assert partly > 3

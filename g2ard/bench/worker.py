@@ -97,7 +97,7 @@ def _reduce(job: Job) -> dict[str, Any]:
         method="default" if job["method"] == "no-views" else job["method"],
         visibility=looker(cameras) if looks else None,
         protected=flags,
-        flag_budget=job["budget"],
+        final_budget=job["budget"],
         config=config,
     )
     seconds = time.monotonic() - began

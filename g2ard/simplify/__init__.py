@@ -60,13 +60,13 @@ def flag(
 ) -> NDArray[np.bool_]:
     """Protection flags of a raw prior: p_i = 1[E_c(i) > ε_h] (eq. `frequency`).
 
-    E_j is the mean squared leave-one-out residual of an affine colour predictor within cell j, over about
-    `budget` cells; a cell of under 8 members borrows those of its face neighbours.
+    E_j is the mean squared residual of an affine predictor of colour, clamped to [0, 1], within cell j, over
+    about `budget` cells; a cell of few members borrows those of its face neighbours for the fit.
 
     Args:
         splats: the raw prior, never a recovered scene: fitting hides the residual.
         budget: the final count N_S, which sets the cell size.
-        config: `flag_threshold` is read.
+        config: `flag_threshold` and `flag_members` are read.
         progress: told when done.
 
     Returns:
@@ -84,7 +84,13 @@ def flag(
     """
     _check_budget(budget, None)
     scene, finite = _clean(splats)
-    found = _core.simplify_flags(scene, budget, config.flag_threshold, progress=counter(progress, "flag"))
+    found = _core.simplify_flags(
+        scene,
+        budget,
+        threshold=config.flag_threshold,
+        members=config.flag_members,
+        progress=counter(progress, "flag"),
+    )
     flags = np.zeros(len(splats), bool)
     flags[finite] = found
     return flags
@@ -97,7 +103,7 @@ def simplify(
     method: str = "default",
     visibility: Visibility | None = None,
     protected: NDArray[np.bool_] | None = None,
-    flag_budget: int | None = None,
+    final_budget: int | None = None,
     config: SimplifyConfig = _DEFAULTS,
     progress: Progress = silent,
 ) -> Simplified:
@@ -113,8 +119,9 @@ def simplify(
     `fast` merges along Morton order all the way, on two lattices in turn: no graph of neighbours.
 
     `paper`: rounds of 75 %; each drops α < 0.01, merges cell × colour-bin groups by moment matching where the
-    affine-energy and surface-coverage guards pass, and trims by π = −log(1 − α)·A·(1 + λ_h·p)
-    (eq. `importance`).
+    affine-energy and surface-coverage guards pass, at most down to the round's count, and trims what is left
+    by π = −log(1 − α)·A·(1 + λ_h·p) (eq. `importance`). There is about one cell for each Gaussian of the
+    final budget, in every round (`docs/paper.md` holds how the paper is read).
 
     Rows below the methods' α are dropped first, unless the budget needs them, or there are no others.
 
@@ -129,8 +136,8 @@ def simplify(
             a function that finds it for a scene, asked again for the result, whose opacities it fits.
         protected: (N,) bool flags to inherit. With None, `paper` computes them (see `flag`), the others,
             which have no use for them, go without.
-        flag_budget: the count that sets the flags' cell size, where this call is one round on the way to a
-            smaller one; None means `budget`.
+        final_budget: for `paper`: N_S, where this call is one round on the way to a smaller count; it sets
+            the size of all cells. None means `budget`.
         config: the constants.
         progress: told of Gaussians shed, round by round.
 
@@ -158,7 +165,7 @@ def simplify(
     if not (scene.opacities >= config.min_opacity_of(method)).any():
         scene, config = _unseen(scene), replace(config, min_opacity=0.0)
     if method == "paper":
-        out = _paper(scene, budget, flags, flag_budget or budget, config, progress)
+        out = _paper(scene, budget, flags, final_budget or budget, config, progress)
     else:
         out = _pairs(scene, budget, method, visibility, len(splats), finite, flags, config, progress)
     return _simplified(splats, finite, out)
@@ -185,20 +192,22 @@ def _paper(
     scene: Splats,
     budget: int,
     flags: NDArray[np.bool_] | None,
-    flag_budget: int,
+    cells: int,
     config: SimplifyConfig,
     progress: Progress,
 ) -> dict[str, Any]:
     return _core.simplify_paper(
         scene,
-        schedule(len(scene), budget, config.retention_of("paper")),
-        flag_budget,
+        schedule(len(scene), budget, config.retention_of("paper"), config.fold),
+        cells,
         protected=flags,
         min_opacity=config.min_opacity_of("paper"),
         color_bin=config.color_bin,
         max_energy=config.max_energy,
         min_coverage=config.min_coverage,
+        support=config.support,
         flag_threshold=config.flag_threshold,
+        flag_members=config.flag_members,
         protection=config.protection,
         progress=counter(progress, "simplify"),
     )

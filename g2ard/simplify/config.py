@@ -18,7 +18,8 @@ _MIN_OPACITY = {"default": 0.004, "fast": 0.004, "paper": 0.01}
 
 @dataclass(frozen=True)
 class SimplifyConfig:
-    """The constants of simplification: `paper`'s are the paper's (`tab:s_config`), the others measured.
+    """The constants of simplification: those of `paper` are the paper's (`tab:s_config`) where it states
+    them, the others are measured (`docs/paper.md`, `docs/decisions.md`).
 
     Args:
         retention: share of the Gaussians that a round keeps; None means the method's own, 0.75 in the paper,
@@ -37,11 +38,20 @@ class SimplifyConfig:
         max_growth: of `default` and `fast`: how many times the area that its moments say a cluster may take,
             along its two longer axes, where α ≤ 0.99 alone cannot hold its mass. At 1 opaque surfaces show
             gaps.
-        color_bin: `paper`: edge of the colour bins within a cell, in colour units (0–1).
-        max_energy: `paper`: largest affine energy of a merged group, colour units squared.
-        min_coverage: `paper`: least share of the members' footprint that the merged footprint covers.
-        flag_threshold: ε_h, the affine residual of a cell above which its Gaussians are protected.
-        protection: `paper`: λ_h, what a protected Gaussian's priority π is raised by.
+        color_bin: `paper`: edge of the colour bins that part [0, 1] within a cell, in colour units
+            (`tab:s_config`).
+        max_energy: `paper`: largest affine energy of a merged group, summed over channels, colour units
+            squared (`tab:s_config`; E_j of eq. `frequency`).
+        min_coverage: `paper`: least share of the members' footprint area that the merged footprint covers
+            (`tab:s_config`).
+        support: `paper`: where a footprint ends for that, in standard deviations; not in the paper. 3 is
+            where 3DGS's renderer ends it.
+        flag_threshold: ε_h, the affine residual of a cell above which its Gaussians are protected, colour
+            units squared (eq. `frequency`, `tab:s_config`).
+        flag_members: a cell with fewer Gaussians borrows those of its face neighbours for the fit behind its
+            residual; not in the paper. 8 are two for each of the four affine coefficients; 1 borrows nothing.
+        protection: `paper`: λ_h, what a protected Gaussian's priority π is raised by (eq. `importance`,
+            `tab:s_config`).
     """
 
     retention: float | None = None
@@ -55,7 +65,9 @@ class SimplifyConfig:
     color_bin: float = 0.25
     max_energy: float = 0.01
     min_coverage: float = 0.6
+    support: float = 3.0
     flag_threshold: float = 0.01
+    flag_members: int = 8
     protection: float = 10.0
 
     def __post_init__(self) -> None:
@@ -67,7 +79,7 @@ class SimplifyConfig:
             raise InputError(f"max_growth: expected at least 1, got {self.max_growth}")
         if self.neighbors < 1:
             raise InputError(f"neighbors: expected at least 1, got {self.neighbors}")
-        for name in ("color_bin", "pixel_scale"):
+        for name in ("color_bin", "pixel_scale", "support"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise InputError(f"{name}: expected a positive number, got {value}")
@@ -78,6 +90,7 @@ class SimplifyConfig:
             "max_energy",
             "min_coverage",
             "flag_threshold",
+            "flag_members",
             "protection",
         ):
             value = getattr(self, name)

@@ -47,21 +47,45 @@ def merge(splats, rows):
     return mean, cov, alpha, np.einsum("i,ikc->kc", w, sh), m.sum()
 
 
+def color(splats):
+    """(N, 3), clamped to what an image can show."""
+    return np.clip(0.5 + C0 * splats.sh0[:, 0].astype(np.float64), 0, 1)
+
+
 def affine_energy(points, colors, own):
-    """Leave-one-out by refitting: rank at most (n − 1) // 2, so two points for each coefficient."""
+    """(1/n) Σ‖c − ĉ‖² over the first `own` points, ĉ by least squares on [1, x] over all of them."""
     if len(points) < 2:
         return 0.0
-    total = 0.0
-    for i in range(own):
-        rest = np.arange(len(points)) != i
-        x, c = points[rest], colors[rest]
-        center, mean = x.mean(0), c.mean(0)
-        rank = min(3, (len(points) - 1) // 2)
-        _, _, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
-        axes = axes[:rank]
-        slope, *_ = np.linalg.lstsq((x - center) @ axes.T, c - mean, rcond=1e-9)
-        total += ((colors[i] - mean - (points[i] - center) @ axes.T @ slope) ** 2).sum()
-    return total / own
+    design = np.c_[np.ones(len(points)), points - points.mean(0)]
+    fit, *_ = np.linalg.lstsq(design, colors, rcond=1e-9)
+    return float(((colors - design @ fit)[:own] ** 2).sum() / own)
+
+
+def disc(count=4000):
+    """Points that divide the unit disc into equal areas; the kernel makes do with 16."""
+    i = np.arange(count)
+    r, angle = np.sqrt((i + 0.5) / count), i * np.pi * (3 - np.sqrt(5))
+    return np.stack([r * np.cos(angle), r * np.sin(angle)], 1)
+
+
+def coverage(splats, rows, support=3.0):
+    """Share of the members' footprint area that their merged Gaussian covers."""
+    mean, cov, *_ = merge(splats, rows)
+    values, axes = np.linalg.eigh(cov)
+    normal, plane = axes[:, 0], axes[:, :0:-1]
+    areas = np.array([footprint(splats.scales[i]) for i in rows])
+    covs = [covariance(splats, i) for i in rows]
+    extent = np.sqrt(sum(a * (normal @ c @ normal) for a, c in zip(areas, covs, strict=True)) / areas.sum())
+    covered = 0.0
+    for i, c in zip(rows, covs, strict=True):
+        offset = splats.means[i].astype(np.float64) - mean
+        if abs(normal @ offset) > support * extent:
+            continue
+        root = np.linalg.cholesky(plane.T @ c @ plane)
+        points = plane.T @ offset + support * disc() @ root.T
+        inside = (points**2 / (support**2 * values[:0:-1])).sum(1) <= 1
+        covered += np.linalg.det(root) * inside.mean()
+    return covered / areas.sum()
 
 
 def priority(splats, protected, weight=10.0):

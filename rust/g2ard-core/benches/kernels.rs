@@ -97,8 +97,8 @@ mod simplify {
 
     #[divan::bench(args = COUNTS)]
     fn paper_flags(bencher: Bencher, count: usize) {
-        let (splats, threshold) = (Scene::of(count).splats(), Paper::default().flag_threshold);
-        let run = || flags(&splats, count / RATIO, threshold, &Cpu, &Control::default());
+        let (splats, texture) = (Scene::of(count).splats(), Paper::default().texture);
+        let run = || flags(&splats, count / RATIO, texture, &Cpu, &Control::default());
         bencher.bench(|| run().expect("never cancelled"));
     }
 

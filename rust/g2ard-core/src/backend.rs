@@ -73,11 +73,12 @@ pub trait Run: Sync {
         control: &Control,
     ) -> Result<Vec<f64>>;
 
-    /// Each group merged into one, and how much of it that covers.
+    /// Each group merged into one, and how much of it that [`coverage`] finds covered.
     fn merges(
         &self,
         rows: Numbered<'_>,
         groups: &[&[u32]],
+        support: f64,
         control: &Control,
     ) -> Result<Vec<(Merged, f64)>>;
 }
@@ -144,12 +145,13 @@ impl Run for Cpu {
         &self,
         Numbered { splats, .. }: Numbered<'_>,
         groups: &[&[u32]],
+        support: f64,
         control: &Control,
     ) -> Result<Vec<(Merged, f64)>> {
         in_chunks(groups.len(), control, |g| {
             let merged = merge(splats, groups[g]);
             let members = groups[g].iter().map(|&i| Gaussian::of(splats, i as usize));
-            let covered = coverage(&members.collect::<Vec<_>>(), &merged.gaussian);
+            let covered = coverage(&members.collect::<Vec<_>>(), &merged.gaussian, support);
             (merged, covered)
         })
     }

@@ -267,12 +267,13 @@ impl Run for OnDevice<'_> {
         &self,
         rows: Numbered<'_>,
         groups: &[&[u32]],
+        support: f64,
         control: &Control,
     ) -> Result<Vec<(Merged, f64)>> {
         self.either(
             rows,
-            |gpu, held| groups::merges(gpu, held, rows, groups, control),
-            || Cpu.merges(rows, groups, control),
+            |gpu, held| groups::merges(gpu, held, rows, groups, support, control),
+            || Cpu.merges(rows, groups, support, control),
         )
     }
 }

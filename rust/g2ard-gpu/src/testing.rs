@@ -103,7 +103,7 @@ pub fn scenes(count: usize) -> Vec<(&'static str, Splats)> {
         s.scales[i] = s.scales[0];
     });
     let flat = with(&|i, s| s.means[i][2] = 0.0);
-    // Fits that rest on one row alone: they are made anew without it.
+    // Fits that rest on one row alone.
     let spikes = with(&|i, s| {
         s.means[i][2] = if i % 9 == 0 {
             0.02 + 1e-3 * i as f64

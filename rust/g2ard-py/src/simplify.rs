@@ -2,7 +2,7 @@
 
 use g2ard_core::simplify::{
     Look, Means, Ordered, Outcome, Pairwise, PairwiseRound, Paper, PaperRound, SceneRef, Seen,
-    flags,
+    Texture, flags,
 };
 use numpy::{
     PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
@@ -54,20 +54,22 @@ impl PyScene<'_> {
 
 /// `protected` (N,) bool of the raw prior over about `cells` cells.
 #[pyfunction]
-#[pyo3(signature = (scene, cells, threshold, *, progress=None))]
+#[pyo3(signature = (scene, cells, *, threshold, members, progress=None))]
 fn simplify_flags<'py>(
     py: Python<'py>,
     scene: PyScene<'py>,
     cells: usize,
     threshold: f64,
+    members: usize,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyArray1<bool>>> {
     let scene = scene.borrow()?;
+    let texture = Texture { threshold, members };
     let kernels = kernels();
     let found = long(py, progress, |control| {
         let ordered = Ordered::new(&scene)?;
         let splats = ordered.splats(&scene);
-        let found = flags(&splats, cells, threshold, backend(&kernels), control)?;
+        let found = flags(&splats, cells, texture, backend(&kernels), control)?;
         let mut by_row = vec![false; found.len()];
         for (&row, &flag) in ordered.rows.iter().zip(&found) {
             by_row[row as usize] = flag;
@@ -77,23 +79,25 @@ fn simplify_flags<'py>(
     Ok(PyArray1::from_vec(py, found))
 }
 
-/// The paper's rounds, down to each count of `schedule`.
+/// The paper's rounds, down to each count of `schedule`, over about `cells` cells each.
 #[pyfunction]
 #[pyo3(signature = (
-    scene, schedule, flag_cells, *, protected, min_opacity, color_bin, max_energy, min_coverage,
-    flag_threshold, protection, progress=None
+    scene, schedule, cells, *, protected, min_opacity, color_bin, max_energy, min_coverage, support,
+    flag_threshold, flag_members, protection, progress=None
 ))]
 fn simplify_paper<'py>(
     py: Python<'py>,
     scene: PyScene<'py>,
     schedule: Vec<usize>,
-    flag_cells: usize,
+    cells: usize,
     protected: Option<PyReadonlyArray1<'py, bool>>,
     min_opacity: f64,
     color_bin: f64,
     max_energy: f64,
     min_coverage: f64,
+    support: f64,
     flag_threshold: f64,
+    flag_members: usize,
     protection: f64,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
@@ -107,13 +111,17 @@ fn simplify_paper<'py>(
         color_bin,
         max_energy,
         min_coverage,
-        flag_threshold,
+        support,
+        texture: Texture {
+            threshold: flag_threshold,
+            members: flag_members,
+        },
         protection,
     };
     let kernels = kernels();
     let outcome = long(py, progress, |control| {
         let backend = backend(&kernels);
-        policy.run(&scene, protected, flag_cells, &schedule, backend, control)
+        policy.run(&scene, protected, cells, &schedule, backend, control)
     })?;
     let rounds = outcome
         .rounds

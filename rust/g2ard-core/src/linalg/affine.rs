@@ -5,107 +5,84 @@ use super::{Sym3, dot, outer, sub, symmetric_eigen};
 /// Directions flatter than this share of the widest carry no slope.
 const RANK_FLOOR: f64 = 1e-12;
 
-/// Leverage this close to 1: the fit rests on that one point, so it is left out by fitting anew.
-const FULL_LEVERAGE: f64 = 1.0 - 1e-6;
-
 /// Centred least squares c ≈ a + B(x − x̄), by the principal directions of x.
 struct Fit {
     center: [f64; 3],
     color: [f64; 3],
-    inverse_count: f64,
     rank: usize,
     axes: [[f64; 3]; 3],
-    /// Σ z² along each axis.
-    spread: [f64; 3],
     slopes: [[f64; 3]; 3],
 }
 
 impl Fit {
-    /// At least two points for each coefficient: fewer would fit noise exactly.
-    fn new(points: &[[f64; 3]], colors: &[[f64; 3]], skip: Option<usize>) -> Self {
-        let rows = || (0..points.len()).filter(move |&i| Some(i) != skip);
-        let n = points.len() - usize::from(skip.is_some());
-        let inverse_count = 1.0 / n as f64;
+    fn new(points: &[[f64; 3]], colors: &[[f64; 3]]) -> Self {
+        let inverse_count = 1.0 / points.len() as f64;
         let mean = |values: &[[f64; 3]]| {
             // About the first row, so that a far-away origin costs no digits.
-            let base = values[rows().next().unwrap_or(0)];
+            let base = values[0];
             let mut sum = [0.0; 3];
-            for i in rows() {
-                let d = sub(values[i], base);
+            for &v in values {
+                let d = sub(v, base);
                 (0..3).for_each(|k| sum[k] += d[k]);
             }
             [0, 1, 2].map(|k| base[k] + sum[k] * inverse_count)
         };
         let (center, color) = (mean(points), mean(colors));
         let mut scatter: Sym3 = [0.0; 6];
-        for i in rows() {
-            let o = outer(sub(points[i], center));
+        for &x in points {
+            let o = outer(sub(x, center));
             (0..6).for_each(|k| scatter[k] += o[k]);
         }
         let e = symmetric_eigen(&scatter);
-        let wide = e
-            .values
-            .iter()
-            .filter(|&&v| v > RANK_FLOOR * e.values[0])
-            .count();
+        let narrow = RANK_FLOOR * e.values[0];
         let mut fit = Self {
             center,
             color,
-            inverse_count,
-            rank: wide.min(n.saturating_sub(1) / 2),
+            rank: e.values.iter().filter(|&&v| v > narrow).count(),
             axes: e.vectors,
-            spread: [1.0; 3],
             slopes: [[0.0; 3]; 3],
         };
         for k in 0..fit.rank {
             let (mut zz, mut zc) = (0.0, [0.0; 3]);
-            for i in rows() {
-                let z = dot(fit.axes[k], sub(points[i], center));
-                let c = sub(colors[i], color);
+            for (&x, &c) in points.iter().zip(colors) {
+                let z = dot(fit.axes[k], sub(x, center));
+                let c = sub(c, color);
                 zz += z * z;
                 (0..3).for_each(|j| zc[j] += z * c[j]);
             }
-            fit.spread[k] = zz;
             fit.slopes[k] = zc.map(|v| v / zz);
         }
         fit
     }
 
-    /// The predicted colour at `x`, and the leverage of a point there.
-    fn predict(&self, x: [f64; 3]) -> ([f64; 3], f64) {
+    /// The predicted colour at `x`.
+    fn predict(&self, x: [f64; 3]) -> [f64; 3] {
         let d = sub(x, self.center);
-        let (mut color, mut leverage) = (self.color, self.inverse_count);
+        let mut color = self.color;
         for k in 0..self.rank {
             let z = dot(self.axes[k], d);
-            leverage += z * z / self.spread[k];
             (0..3).for_each(|j| color[j] += z * self.slopes[k][j]);
         }
-        (color, leverage)
+        color
     }
 }
 
-/// Mean over the first `own` points of ‖c_i − ĉ_i‖², where ĉ_i is predicted by an affine fit of all
-/// points *but i* (leave-one-out: few points fitted exactly must not read as smooth).
+/// E_j of eq. `frequency`: mean over the first `own` points of ‖c_i − ĉ_i‖², ĉ_i predicted by the affine
+/// least-squares fit of all points.
 ///
-/// The rest only support the fit (borrowed from neighbouring cells). One point alone has energy 0.
+/// The rest only support the fit (borrowed from neighbouring cells). Up to four points in general position are
+/// fitted exactly.
 pub fn affine_energy(points: &[[f64; 3]], colors: &[[f64; 3]], own: usize) -> f64 {
     if points.len() < 2 || own == 0 {
         return 0.0;
     }
-    let fit = Fit::new(points, colors, None);
-    let mut energy = 0.0;
-    for i in 0..own {
-        let (predicted, leverage) = fit.predict(points[i]);
-        let residual = if leverage < FULL_LEVERAGE {
-            sub(colors[i], predicted).map(|v| v / (1.0 - leverage))
-        } else {
-            sub(
-                colors[i],
-                Fit::new(points, colors, Some(i)).predict(points[i]).0,
-            )
-        };
-        energy += dot(residual, residual);
-    }
+    let fit = Fit::new(points, colors);
+    let energy: f64 = (0..own)
+        .map(|i| {
+            let residual = sub(colors[i], fit.predict(points[i]));
+            dot(residual, residual)
+        })
+        .sum();
     energy / own as f64
 }
 
@@ -124,24 +101,28 @@ mod tests {
         (0..n).map(|_| [next(), next(), next()]).collect()
     }
 
-    /// Leave-one-out by refitting for each point.
-    fn naive(points: &[[f64; 3]], colors: &[[f64; 3]]) -> f64 {
-        let total: f64 = (0..points.len())
-            .map(|i| {
-                let p = Fit::new(points, colors, Some(i)).predict(points[i]).0;
-                let r = sub(colors[i], p);
-                dot(r, r)
-            })
-            .sum();
-        total / points.len() as f64
-    }
-
     #[test]
-    fn leverage_formula_is_leave_one_out() {
-        for n in [8, 9, 20, 100] {
-            let (points, colors) = (cloud(n, 3), cloud(n, 4));
-            let (got, want) = (affine_energy(&points, &colors, n), naive(&points, &colors));
-            assert!((got - want).abs() <= 1e-10 * want, "{n}: {got} {want}");
+    fn no_other_affine_function_leaves_less() {
+        let (points, colors) = (cloud(40, 3), cloud(40, 4));
+        let fit = Fit::new(&points, &colors);
+        let energy = |shift: [f64; 3], tilt: [f64; 3]| {
+            let left = points.iter().zip(&colors).map(|(&x, &c)| {
+                let z = dot(tilt, x);
+                let p = fit.predict(x);
+                let r = [0, 1, 2].map(|k| c[k] - p[k] - shift[k] * (1.0 + z));
+                dot(r, r)
+            });
+            left.sum::<f64>() / 40.0
+        };
+        let least = affine_energy(&points, &colors, 40);
+        assert!((energy([0.0; 3], [0.0; 3]) - least).abs() < 1e-15);
+        for step in [1e-3, -1e-3] {
+            for axis in 0..3 {
+                let mut tilt = [0.0; 3];
+                tilt[axis] = 100.0;
+                assert!(energy([step, 0.0, 0.0], tilt) > least);
+                assert!(energy([step; 3], [0.0; 3]) > least);
+            }
         }
     }
 
@@ -161,19 +142,20 @@ mod tests {
     }
 
     #[test]
-    fn few_points_do_not_read_as_smooth() {
-        let points = cloud(2, 1);
-        let colors = [[0.0; 3], [0.3, 0.0, 0.4]];
-        assert!((affine_energy(&points, &colors, 2) - 0.25).abs() < 1e-15);
-        assert_eq!(affine_energy(&points[..1], &colors[..1], 1), 0.0);
-        let line = [[0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 5.0, 0.0]];
-        let colors = [[0.0; 3], [0.0; 3], [0.0; 3], [1.0, 0.0, 0.0]];
-        assert!(affine_energy(&line, &colors, 4) > 0.2);
+    fn four_points_are_fitted_exactly_five_are_not() {
+        let (points, colors) = (cloud(5, 1), cloud(5, 2));
+        for n in 1..=4 {
+            assert!(affine_energy(&points[..n], &colors[..n], n) < 1e-24, "{n}");
+        }
+        assert!(affine_energy(&points, &colors, 5) > 1e-4);
     }
 
     #[test]
-    fn duplicates_at_one_point() {
+    fn points_at_one_place_leave_the_variance() {
         let points = vec![[1.0, 2.0, 3.0]; 10];
         assert_eq!(affine_energy(&points, &vec![[0.5; 3]; 10], 10), 0.0);
+        let colors = [[0.0; 3], [0.3, 0.0, 0.4]];
+        let energy = affine_energy(&points[..2], &colors, 2);
+        assert!((energy - 0.0625).abs() < 1e-15, "{energy}");
     }
 }

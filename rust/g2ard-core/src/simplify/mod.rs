@@ -25,7 +25,7 @@ pub use ordered::{Means, Ordered, SceneRef};
 pub use outcome::Outcome;
 pub use pairwise::{Pairwise, PairwiseRound, Seen};
 pub use paper::{Paper, PaperRound};
-pub use residual::{color, flags};
+pub use residual::{Texture, color, flags};
 
 use crate::Splats;
 

@@ -4,25 +4,26 @@ use rayon::prelude::*;
 
 use super::moments::{Merged, optical_mass, sigmoid};
 use super::outcome::Trail;
-use super::residual::{color, flags_in};
+use super::residual::{Texture, color, flags_in};
 use super::trim::best;
 use super::{GONE, Ordered, Outcome, SceneRef, Step};
 use crate::backend::{Numbered, Run};
 use crate::{Backend, Control, Error, Result, Splats};
 
-/// Defaults are the paper's (`tab:s_config`).
+/// Defaults are the paper's (`tab:s_config`) but `support` and `texture.members`, which it does not state.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Paper {
     /// Below this α a Gaussian is dropped.
     pub min_opacity: f64,
-    /// Edge of the colour bins, in colour units.
+    /// Edge of the colour bins, which part [0, 1].
     pub color_bin: f64,
-    /// Largest affine energy of a merged group.
+    /// Largest affine energy of a merged group, in-sample as E_j of eq. `frequency`.
     pub max_energy: f64,
     /// Least share of the members' footprint that the merged one covers.
     pub min_coverage: f64,
-    /// ε_h: a cell of higher affine residual is protected.
-    pub flag_threshold: f64,
+    /// Where a footprint ends, in standard deviations: see [`super::coverage`].
+    pub support: f64,
+    pub texture: Texture,
     /// λ_h of π.
     pub protection: f64,
 }
@@ -34,7 +35,8 @@ impl Default for Paper {
             color_bin: 0.25,
             max_energy: 0.01,
             min_coverage: 0.6,
-            flag_threshold: 0.01,
+            support: 3.0,
+            texture: Texture::default(),
             protection: 10.0,
         }
     }
@@ -61,19 +63,28 @@ pub struct PaperRound {
     pub after: usize,
 }
 
+/// What a round aims at.
+#[derive(Clone, Copy)]
+struct Target {
+    budget: usize,
+    cells: usize,
+    /// New means are rounded to multiples of this.
+    grid: f64,
+}
+
 struct Candidate {
     merged: Merged,
     cost: f64,
 }
 
 impl Paper {
-    /// Rounds down to each count of `schedule`. Without `flags` they are computed first, on the raw
-    /// scene over about `flag_cells` cells.
+    /// Rounds down to each count of `schedule`, over about `cells` cells each: one for every Gaussian of the
+    /// final budget. Without `flags` they are computed first, on the raw scene over such cells.
     pub fn run(
         &self,
         scene: &SceneRef,
         flags: Option<&[bool]>,
-        flag_cells: usize,
+        cells: usize,
         schedule: &[usize],
         backend: &dyn Backend,
         control: &Control,
@@ -91,15 +102,19 @@ impl Paper {
                     flags.len(),
                 ));
             }
-            None => flags_in(rows, flag_cells, self.flag_threshold, run, control)?,
+            None => flags_in(rows, cells, self.texture, run, control)?,
         };
         let mut rounds = Vec::new();
         let shed = |budget: usize| ordered.rows.len().saturating_sub(budget) as u64;
         control.begin(shed(schedule.last().copied().unwrap_or(usize::MAX)));
         for &budget in schedule {
             let flags = &trail.step.flags;
-            let (step, report) =
-                self.round(trail.rows(), flags, budget, ordered.grid, run, control)?;
+            let target = Target {
+                budget,
+                cells,
+                grid: ordered.grid,
+            };
+            let (step, report) = self.round(trail.rows(), flags, target, run, control)?;
             control.advance((report.before - report.after) as u64);
             trail.then(step);
             rounds.push(report);
@@ -113,17 +128,16 @@ impl Paper {
         Ok(outcome)
     }
 
-    /// One round, to exactly `budget` rows (all of them when there are no more than that).
+    /// One round, to exactly the budget (all rows when there are no more than that).
     fn round(
         &self,
         rows: Numbered<'_>,
         flags: &[bool],
-        budget: usize,
-        grid: f64,
+        target: Target,
         run: &dyn Run,
         control: &Control,
     ) -> Result<(Step, PaperRound)> {
-        let splats = rows.splats;
+        let (splats, budget) = (rows.splats, target.budget);
         let mut report = PaperRound {
             before: splats.len(),
             after: splats.len().min(budget),
@@ -132,13 +146,13 @@ impl Paper {
         let kept = self.drop_transparent(splats, flags, budget);
         report.dropped = splats.len() - kept.len();
         let groups = if kept.len() > budget {
-            self.groups(rows, &kept, budget, run, &mut report)?
+            self.groups(rows, &kept, target.cells, run, &mut report)?
         } else {
             kept.iter().map(|&i| vec![i]).collect()
         };
         let mut merges = self.judge(rows, &groups, run, &mut report, control)?;
         undo_costliest(&groups, &mut merges, budget, &mut report);
-        let built = build(splats, flags, &groups, merges, grid, &mut report);
+        let built = build(splats, flags, &groups, merges, target.grid, &mut report);
         Ok((self.trim(built, budget, &mut report), report))
     }
 
@@ -170,11 +184,11 @@ impl Paper {
         &self,
         rows: Numbered<'_>,
         kept: &[u32],
-        budget: usize,
+        target: usize,
         run: &dyn Run,
         report: &mut PaperRound,
     ) -> Result<Vec<Vec<u32>>> {
-        let cells = run.cells(rows, kept, budget)?;
+        let cells = run.cells(rows, kept, target)?;
         report.cells = cells.len();
         let ids: Vec<usize> = (0..cells.len()).collect();
         let mut groups: Vec<Vec<u32>> = ids
@@ -201,8 +215,10 @@ impl Paper {
         Ok(groups)
     }
 
+    /// The last bin is closed: 1 is in it.
     fn bin(&self, color: [f64; 3]) -> [i32; 3] {
-        color.map(|c| (c / self.color_bin).floor() as i32)
+        let last = (1.0 / self.color_bin).ceil() as i32 - 1;
+        color.map(|c| ((c / self.color_bin) as i32).min(last))
     }
 
     /// Each group's merged Gaussian where both guards pass: energy is asked first.
@@ -228,7 +244,7 @@ impl Paper {
             .collect();
         report.refused_energy = examined - smooth.len();
         let candidates: Vec<&[u32]> = smooth.iter().map(|&(g, _)| &groups[g][..]).collect();
-        let merges = run.merges(rows, &candidates, control)?;
+        let merges = run.merges(rows, &candidates, self.support, control)?;
         let mut accepted: Vec<_> = groups.iter().map(|_| None).collect();
         for (&(g, energy), (merged, covered)) in smooth.iter().zip(merges) {
             if covered < self.min_coverage {

@@ -6,19 +6,35 @@ use crate::{Backend, Control, Result, Splats};
 /// Band-0 spherical harmonic: colour = 0.5 + SH_C0·sh0.
 const SH_C0: f64 = 0.282_094_791_773_878_14;
 
-/// A cell with fewer members borrows those of its face neighbours: two for each affine coefficient.
-const ENOUGH: usize = 8;
-
-/// The base colour, not clamped.
+/// The base colour as it is seen from everywhere alike: renderers clamp at 0, images at 1.
 pub fn color(splats: &Splats, i: usize) -> [f64; 3] {
-    splats.sh_of(i)[0].map(|v| 0.5 + SH_C0 * f64::from(v))
+    splats.sh_of(i)[0].map(|v| (0.5 + SH_C0 * f64::from(v)).clamp(0.0, 1.0))
+}
+
+/// Which cells are textured.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Texture {
+    /// ε_h: a cell of higher affine residual is protected.
+    pub threshold: f64,
+    /// A cell with fewer members borrows those of its face neighbours for the fit.
+    pub members: usize,
+}
+
+impl Default for Texture {
+    /// ε_h is the paper's; two members for each of the four affine coefficients.
+    fn default() -> Self {
+        Self {
+            threshold: 0.01,
+            members: 8,
+        }
+    }
 }
 
 /// p_i = 1[E_c(i) > ε_h] (eq. `frequency`), over about `cells` cells.
 pub fn flags(
     splats: &Splats,
     cells: usize,
-    threshold: f64,
+    texture: Texture,
     backend: &dyn Backend,
     control: &Control,
 ) -> Result<Vec<bool>> {
@@ -27,14 +43,14 @@ pub fn flags(
         splats,
         numbers: &numbers,
     };
-    flags_in(rows, cells, threshold, &*backend.run(), control)
+    flags_in(rows, cells, texture, &*backend.run(), control)
 }
 
 /// The same within a run.
 pub(super) fn flags_in(
     rows: Numbered<'_>,
     cells: usize,
-    threshold: f64,
+    texture: Texture,
     run: &dyn Run,
     control: &Control,
 ) -> Result<Vec<bool>> {
@@ -43,14 +59,14 @@ pub(super) fn flags_in(
     let group = |cell: usize, rows: &mut Vec<u32>| {
         let own = grid.members_of(cell);
         rows.extend_from_slice(own);
-        if own.len() < ENOUGH {
+        if own.len() < texture.members {
             rows.extend(grid.face_neighbors(cell).flat_map(|c| grid.members_of(c)));
         }
         own.len()
     };
     let energies = run.energies(rows, grid.len(), &group, control)?;
     let mut out = vec![false; all.len()];
-    for cell in (0..grid.len()).filter(|&c| energies[c] > threshold) {
+    for cell in (0..grid.len()).filter(|&c| energies[c] > texture.threshold) {
         grid.members_of(cell)
             .iter()
             .for_each(|&i| out[i as usize] = true);

@@ -22,6 +22,8 @@ pub struct Source<'a> {
     pub rows: &'a Rows,
     pub numbers: &'a [u32],
     pub extra: Option<&'a Buffer>,
+    /// One number that a kernel reads beside them.
+    pub constant: f64,
 }
 
 pub struct Found {
@@ -162,7 +164,8 @@ impl Batch {
         let answers = gpu.buffer("answers", groups.len() * twin.answer)?;
         let mut buffers = vec![&members, &segments, &answers];
         buffers.extend(source.extra);
-        let constants = [groups.len() as u32, 0, 0, 0];
+        let bits = source.constant.to_bits();
+        let constants = [groups.len() as u32, bits as u32, (bits >> 32) as u32, 0];
         work.run(
             &twin.kernel,
             groups.len().div_ceil(THREADS),

@@ -1,6 +1,6 @@
 // affine_energy of g2ard_core::linalg. A thread takes one group: it fits colour by an affine function of
-// position along the principal axes, then sums the leave-one-out residuals of the group's own rows. Rows lie
-// group by group; sums run in their order.
+// position along the principal axes, then sums the squared residuals of the group's own rows. Rows lie group by
+// group; sums run in their order.
 
 struct Member {
     mean: array<F64, 3>,
@@ -13,84 +13,66 @@ struct Member {
 @group(0) @binding(3) var<storage, read_write> energies: array<F64>;
 
 const RANK_FLOOR = F64(0x812dea11u, 0x3d719799u); // 1e-12
-const FULL_LEVERAGE = F64(0xe7210be9u, 0x3feffffdu); // 1 − 1e-6
-const NOBODY = 0xffffffffu;
 
 struct Fit {
     center: array<F64, 3>,
     color: array<F64, 3>,
-    inverse_count: F64,
     rank: u32,
     axes: array<array<F64, 3>, 3>,
-    spread: array<F64, 3>,
     slopes: array<array<F64, 3>, 3>,
 }
 
-// Centred least squares over a group's rows but `skip`.
-fn fit(g: Group, skip: u32) -> Fit {
+// Centred least squares over a group's rows.
+fn fit(g: Group) -> Fit {
     var f: Fit;
     let end = g.first + g.count;
-    let n = g.count - u32(skip != NOBODY);
-    f.inverse_count = div(ONE, from_count(n));
+    let inverse_count = div(ONE, from_count(g.count));
     // Means about the first row, so that a far-away origin costs no digits.
-    let base = members[select(g.first, g.first + 1u, skip == g.first)];
+    let base = members[g.first];
     var point_sum: array<F64, 3>;
     var color_sum: array<F64, 3>;
     for (var i = g.first; i < end; i++) {
-        if i == skip { continue; }
         for (var k = 0; k < 3; k++) {
             point_sum[k] = add(point_sum[k], sub(members[i].mean[k], base.mean[k]));
             color_sum[k] = add(color_sum[k], sub(members[i].color[k], base.color[k]));
         }
     }
     for (var k = 0; k < 3; k++) {
-        f.center[k] = add(base.mean[k], mul(point_sum[k], f.inverse_count));
-        f.color[k] = add(base.color[k], mul(color_sum[k], f.inverse_count));
+        f.center[k] = add(base.mean[k], mul(point_sum[k], inverse_count));
+        f.color[k] = add(base.color[k], mul(color_sum[k], inverse_count));
     }
     var scatter: array<F64, 6>;
     for (var i = g.first; i < end; i++) {
-        if i == skip { continue; }
         let o = outer(sub3(members[i].mean, f.center));
         for (var k = 0; k < 6; k++) { scatter[k] = add(scatter[k], o[k]); }
     }
     let e = symmetric_eigen(scatter);
     let narrow = mul(RANK_FLOOR, e.values[0]);
-    var wide = 0u;
-    for (var k = 0; k < 3; k++) { wide += u32(lt(narrow, e.values[k])); }
-    f.rank = min(wide, (n - 1u) / 2u);
+    for (var k = 0; k < 3; k++) { f.rank += u32(lt(narrow, e.values[k])); }
     f.axes = e.vectors;
     for (var k = 0u; k < f.rank; k++) {
         var zz = ZERO;
         var zc: array<F64, 3>;
         for (var i = g.first; i < end; i++) {
-            if i == skip { continue; }
             let z = dot3(f.axes[k], sub3(members[i].mean, f.center));
             let c = sub3(members[i].color, f.color);
             zz = add(zz, mul(z, z));
             for (var j = 0; j < 3; j++) { zc[j] = add(zc[j], mul(z, c[j])); }
         }
-        f.spread[k] = zz;
         for (var j = 0; j < 3; j++) { f.slopes[k][j] = div(zc[j], zz); }
     }
     return f;
 }
 
-struct Residual {
-    color: array<F64, 3>,
-    leverage: F64,
-}
-
 // A row's colour less what the fit predicts there.
-fn residual(f: Fit, i: u32) -> Residual {
+fn residual(f: Fit, i: u32) -> array<F64, 3> {
     let d = sub3(members[i].mean, f.center);
     var color = f.color;
-    var leverage = f.inverse_count;
     for (var k = 0u; k < f.rank; k++) {
         let z = dot3(f.axes[k], d);
-        leverage = add(leverage, div(mul(z, z), f.spread[k]));
         for (var j = 0; j < 3; j++) { color[j] = add(color[j], mul(z, f.slopes[k][j])); }
     }
-    return Residual(sub3(members[i].color, color), leverage);
+    return sub3(members[i].color, color);
 }
 
 @compute @workgroup_size(64)
@@ -105,33 +87,11 @@ fn energy(
         energies[at] = ZERO;
         return;
     }
-    var whole: Fit;
-    var skip = NOBODY;
+    let f = fit(g);
     var sum = ZERO;
-    var i = g.first;
-    let end = g.first + g.own;
-    // The fit of all rows; then, for each row that one rests on alone, a fit without it. One loop, for compilers
-    // inline every call of `fit`.
-    loop {
-        var f = fit(g, skip);
-        if skip == NOBODY { whole = f; }
-        while i < end {
-            var r = residual(f, i);
-            if skip == NOBODY {
-                if !lt(r.leverage, FULL_LEVERAGE) {
-                    skip = i;
-                    break;
-                }
-                let rest = sub(ONE, r.leverage);
-                for (var k = 0; k < 3; k++) { r.color[k] = div(r.color[k], rest); }
-            } else {
-                skip = NOBODY;
-                f = whole;
-            }
-            sum = add(sum, dot3(r.color, r.color));
-            i++;
-        }
-        if i >= end { break; }
+    for (var i = g.first; i < g.first + g.own; i++) {
+        let r = residual(f, i);
+        sum = add(sum, dot3(r, r));
     }
     energies[at] = div(sum, from_count(g.own));
 }

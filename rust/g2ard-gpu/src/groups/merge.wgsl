@@ -16,7 +16,7 @@ struct Merged {
     covered: F64,
 }
 
-@group(0) @binding(0) var<uniform> groups: vec4<u32>; // how many
+@group(0) @binding(0) var<uniform> groups: vec4<u32>; // how many; then the support, a double
 @group(0) @binding(1) var<storage, read> members: array<Member>;
 @group(0) @binding(2) var<storage, read> segments: array<vec2<u32>>;
 @group(0) @binding(3) var<storage, read_write> merged: array<Merged>;
@@ -137,6 +137,43 @@ fn hits(w: array<array<F64, 3>, 2>) -> u32 {
     return count;
 }
 
+// Σn·n, not below 0.
+fn along(c: array<F64, 6>, n: array<F64, 3>) -> F64 {
+    let rows = array<F64, 3>(
+        dot3(array<F64, 3>(c[0], c[1], c[2]), n),
+        dot3(array<F64, 3>(c[1], c[3], c[4]), n),
+        dot3(array<F64, 3>(c[2], c[4], c[5]), n),
+    );
+    return larger(dot3(n, rows), ZERO);
+}
+
+// Shadow::of: L of the covariance that a Gaussian has in the plane of the first two axes.
+fn shadow(
+    r: array<array<F64, 3>, 3>,
+    scales: array<F64, 3>,
+    axes: array<array<F64, 3>, 3>,
+) -> array<array<F64, 2>, 2> {
+    var p: array<F64, 3>;
+    var q: array<F64, 3>;
+    for (var k = 0; k < 3; k++) {
+        let axis = array<F64, 3>(r[0][k], r[1][k], r[2][k]);
+        p[k] = mul(scales[k], dot3(axes[0], axis));
+        q[k] = mul(scales[k], dot3(axes[1], axis));
+    }
+    let first = root(dot3(p, p));
+    var second = ZERO;
+    var lean = ZERO;
+    if !is_zero(first) {
+        second = div(dot3(p, q), first);
+        lean = div(second, first);
+    }
+    for (var k = 0; k < 3; k++) { q[k] = sub(q[k], mul(p[k], lean)); }
+    return array<array<F64, 2>, 2>(
+        array<F64, 2>(first, ZERO),
+        array<F64, 2>(second, root(dot3(q, q))),
+    );
+}
+
 @compute @workgroup_size(64)
 fn merge(
     @builtin(global_invocation_id) id: vec3<u32>,
@@ -162,6 +199,9 @@ fn merge(
     var cov: array<F64, 6>;
     var covered = ZERO;
     var area_sum = ZERO;
+    var within: array<F64, 6>;
+    var reach = ZERO;
+    let support = F64(groups.y, groups.z);
     // First over the members' moments, then over their footprints: both need their rotations, and compilers
     // inline every call.
     for (var phase = 0; phase < 2; phase++) {
@@ -174,22 +214,23 @@ fn merge(
                 let c = covariance(r, scales);
                 let o = outer(offset);
                 let w = select(members[i].weight, ONE, massless);
-                for (var k = 0; k < 6; k++) { cov[k] = add(cov[k], mul(w, add(c[k], o[k]))); }
+                let axes = by_scale(scales);
+                let area = mul(scales[axes[0]], scales[axes[1]]);
+                area_sum = add(area_sum, area);
+                for (var k = 0; k < 6; k++) {
+                    cov[k] = add(cov[k], mul(w, add(c[k], o[k])));
+                    within[k] = add(within[k], mul(area, c[k]));
+                }
                 continue;
             }
-            let axes = by_scale(scales);
-            let area = mul(scales[axes[0]], scales[axes[1]]);
-            area_sum = add(area_sum, area);
-            if lt(m.scales[2], mag(dot3(m.axes[2], offset))) { continue; }
+            if lt(reach, mag(dot3(m.axes[2], offset))) { continue; }
+            let l = shadow(r, scales, m.axes);
             var w: array<array<F64, 3>, 2>;
             for (var t = 0; t < 2; t++) {
-                w[t][0] = div(dot3(m.axes[t], offset), m.scales[t]);
-                for (var k = 0; k < 2; k++) {
-                    let a = axes[k];
-                    let axis = array<F64, 3>(r[0][a], r[1][a], r[2][a]);
-                    w[t][1 + k] = div(mul(scales[a], dot3(m.axes[t], axis)), m.scales[t]);
-                }
+                w[t][0] = div(dot3(m.axes[t], offset), mul(support, m.scales[t]));
+                for (var k = 0; k < 2; k++) { w[t][1 + k] = div(l[t][k], m.scales[t]); }
             }
+            let area = mul(l[0][0], l[1][1]);
             covered = add(covered, mul(mul(area, from_count(hits(w))), SIXTEENTH));
         }
         if phase == 0 {
@@ -198,6 +239,8 @@ fn merge(
             let floor = larger(mul(VARIANCE_FLOOR, e.values[0]), LEAST_VARIANCE);
             for (var k = 0; k < 3; k++) { m.scales[k] = root(larger(e.values[k], floor)); }
             m.axes = e.vectors;
+            if is_zero(area_sum) { break; }
+            reach = mul(support, root(div(along(within, m.axes[2]), area_sum)));
         }
     }
     m.covered = ONE;

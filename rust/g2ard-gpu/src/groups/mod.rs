@@ -48,6 +48,7 @@ pub fn energies(
         rows: held,
         numbers: rows.numbers,
         extra: None,
+        constant: 0.0,
     };
     let found = run(gpu, &ENERGY, source, count, group, control)?;
     let mut energies: Vec<f64> = bytemuck::pod_collect_to_vec(&found.answers);
@@ -65,6 +66,7 @@ pub fn merges(
     held: &Rows,
     rows: Numbered<'_>,
     groups: &[&[u32]],
+    support: f64,
     control: &Control,
 ) -> Result<Vec<(Merged, f64)>> {
     let group = |at: usize, rows: &mut Vec<u32>| {
@@ -76,6 +78,7 @@ pub fn merges(
         rows: held,
         numbers: rows.numbers,
         extra: Some(&disc),
+        constant: support,
     };
     let found = run(gpu, &MERGE, source, groups.len(), &group, control)?;
     let splats = rows.splats;
@@ -94,7 +97,7 @@ pub fn merges(
         })
         .collect();
     let large: Vec<&[u32]> = found.large.iter().map(|&g| groups[g]).collect();
-    let rest = Cpu.merges(rows, &large, control)?;
+    let rest = Cpu.merges(rows, &large, support, control)?;
     found
         .large
         .iter()
@@ -160,8 +163,8 @@ mod tests {
             let rows: Vec<u32> = (0..splats.len() as u32).collect();
             groups.extend(rows.chunks(700)); // of every size up to those that are left to the CPU
             groups.extend(rows[..splats.len().min(900)].chunks(125));
-            let want = Cpu.merges(numbered, &groups, &control).unwrap();
-            let got = merges(gpu, &held, numbered, &groups, &control).unwrap();
+            let want = Cpu.merges(numbered, &groups, 3.0, &control).unwrap();
+            let got = merges(gpu, &held, numbered, &groups, 3.0, &control).unwrap();
             let merge = share(&want, &got);
             eprintln!(
                 "{what} {name}: {:.4} % of {} energies and {:.4} % of merges are the same bits",

@@ -60,7 +60,8 @@ fn gather_colored(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_wor
     if at == ELSEWHERE { return; }
     colored[i].mean = means[at];
     for (var k = 0; k < 3; k++) {
-        colored[i].color[k] = add(HALF, mul(SH_C0, widen(looks[at].color[k])));
+        let c = add(HALF, mul(SH_C0, widen(looks[at].color[k])));
+        colored[i].color[k] = select(select(c, ZERO, lt(c, ZERO)), ONE, lt(ONE, c));
     }
 }
 

@@ -1,0 +1,176 @@
+"""The paper's policy against the paper's words: small scenes whose outcome they decide (`docs/paper.md`)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from simplify_cases import ARRAYS
+
+from g2ard.simplify import SimplifyConfig, flag, simplify
+from g2ard.splats import Splats
+
+C0 = 0.28209479177387814
+
+
+def discs(points, colors=0.4, width=0.6, thickness=0.02, **options):
+    """Discs that lie flat on z, of these colours (0–1)."""
+    n = len(points)
+    color = np.broadcast_to(np.asarray(colors, np.float64), (n, 3))
+    scales = np.tile([width, width, thickness], (n, 1))
+    return Splats.create(points, scales=scales, sh0=(color[:, None] - 0.5) / C0, **options)
+
+
+def sheet(side, height=0.0):
+    """(side², 3) points a unit apart."""
+    x, y = np.meshgrid(np.arange(side), np.arange(side))
+    return np.stack([x.ravel(), y.ravel(), np.full(side**2, height)], 1).astype(np.float64)
+
+
+def one_group(points, colors, **options):
+    """The report of a reduction to one cell, in one round."""
+    config = SimplifyConfig(retention=1e-9, **options)
+    return simplify(discs(points, colors), 1, method="paper", config=config).report["rounds"][0]
+
+
+def shed(result, how):
+    return sum(r[how] for r in result.report["rounds"])
+
+
+# "Locality cells: adaptive voxels, |C| ≈ N_S … one cell per retained primitive" (tab:s_config).
+
+
+def test_one_cell_for_each_retained_primitive_in_every_round():
+    rounds = simplify(discs(sheet(60)), 360, method="paper").report["rounds"]
+    assert len(rounds) == 8
+    for r in rounds:
+        assert abs(r["cells"] - 360) <= 0.03 * 360, r
+
+
+def test_a_round_on_the_way_has_the_cells_of_the_final_budget():
+    prior = discs(sheet(60))
+    config = SimplifyConfig(retention=1e-9)
+    out = simplify(prior, 2700, method="paper", final_budget=360, config=config)
+    assert abs(out.report["rounds"][0]["cells"] - 360) <= 0.03 * 360
+
+
+# "Third, if the count still exceeds the round budget, primitives are ranked": merging comes first, and ends
+# there.
+
+
+def test_flat_smooth_discs_reach_the_budget_by_merging():
+    points = sheet(60)
+    smooth = np.stack([0.3 + 0.002 * points[:, 0], 0.3 + 0.002 * points[:, 1], 0 * points[:, 0] + 0.4], 1)
+    out = simplify(discs(points, smooth), 360, method="paper")
+    assert shed(out, "merged") >= 0.98 * (3600 - 360)
+    assert [r["after"] for r in out.report["rounds"]][-1] == 360
+
+
+def test_merging_ends_at_the_round_budget():
+    first = simplify(discs(sheet(60)), 360, method="paper").report["rounds"][0]
+    assert first["after"] == 2700
+    assert first["trimmed"] <= 8  # a group that is taken back returns all of its members
+    assert first["undone_groups"] > 100
+
+
+# "A surface-coverage guard prevents merging across incompatible geometric support" (section 3.2), ">= 0.6 of
+# member footprint area" (tab:s_config).
+
+
+@pytest.mark.parametrize("gap", [0.13, 0.2, 0.5, 1.0, 2.0, 3.0])
+def test_two_parallel_sheets_do_not_merge(gap):
+    for side in (1, 2, 4):
+        pair = np.concatenate([sheet(side), sheet(side, gap)])
+        assert one_group(pair, 0.4)["refused"] == {"energy": 0, "coverage": 1}, side
+    prior = discs(np.concatenate([sheet(30), sheet(30, gap)]))
+    out = simplify(prior, 180, method="paper", config=SimplifyConfig(retention=1e-9))
+    of = out.parents
+    both = np.intersect1d(of[:900][of[:900] >= 0], of[900:][of[900:] >= 0])
+    assert both.size == 0
+
+
+def test_one_sheet_twice_as_dense_does():
+    prior = discs(np.concatenate([sheet(30), sheet(30, 0.01)]))
+    out = simplify(prior, 180, method="paper")
+    assert shed(out, "merged") >= 0.95 * (1800 - 180)
+
+
+def test_a_wall_does_not_merge_with_a_floor_it_stands_on():
+    floor = sheet(4)
+    wall = discs(sheet(4)[:, [0, 2, 1]] + [0, 1.5, 0.5], width=0.6)
+    wall.quats[:] = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]  # about x: the normal along y
+    ground = discs(floor)
+    prior = Splats.create(
+        np.concatenate([ground.means, wall.means]),
+        quats=np.concatenate([ground.quats, wall.quats]),
+        scales=np.concatenate([ground.scales, wall.scales]),
+    )
+    config = SimplifyConfig(retention=1e-9)
+    report = simplify(prior, 1, method="paper", config=config).report["rounds"][0]
+    assert report["refused"]["coverage"] == 1
+
+
+# "E_j = (1/|C_j|) Σ ‖c_i − ĉ_i‖²" (eq. frequency): in-sample.
+
+
+@pytest.mark.parametrize(("count", "least"), [(2, 1.0), (3, 1.0), (4, 1.0), (10, 0.5)])
+def test_groups_of_one_color_bin_pass_the_energy(count, least):
+    rng = np.random.default_rng(count)
+    passed = 0
+    for _ in range(100):
+        points = np.c_[rng.uniform(0, 2, (count, 2)), rng.uniform(0, 0.04, count)]
+        report = one_group(points, rng.uniform(0.25, 0.5, (count, 3)), min_coverage=0)
+        passed += report["merged"] == count - 1
+    assert passed >= 100 * least
+
+
+def test_texture_of_more_than_the_threshold_is_refused_and_flagged():
+    points = sheet(4)
+    checks = np.where((points[:, 0] + points[:, 1]) % 2 == 0, 0.26, 0.49)[:, None]
+    assert one_group(points, checks)["refused"] == {"energy": 1, "coverage": 0}
+    assert flag(discs(points, checks), 1).all()
+    ramp = 0.26 + 0.05 * points[:, :1]
+    assert one_group(points, ramp)["merged"] == 15
+    assert not flag(discs(points, ramp), 1).any()
+
+
+# "Cell × color bin, bin size 0.25": of colours, which end at 0 and 1.
+
+
+def test_colors_beyond_white_are_white():
+    points = sheet(4)
+    bright = np.linspace(0.8, 3, 16)[:, None]
+    assert one_group(points, bright)["merged"] == 15
+    assert not flag(discs(points, 1 + bright), 1).any()
+    assert one_group(points, -bright)["merged"] == 15
+
+
+def test_bins_part_a_cell():
+    points = sheet(4)
+    halves = np.where(points[:, :1] < 2, 0.2, 0.3)
+    out = simplify(discs(points, halves), 2, method="paper", config=SimplifyConfig(retention=1e-9))
+    for rows in (points[:, 0] < 2, points[:, 0] >= 2):
+        assert np.unique(out.parents[rows]).size == 1
+
+
+# "When any guard fails, the originals are retained"; "p_i is inherited … (logical OR)".
+
+
+def test_refused_groups_keep_their_originals():
+    prior = discs(sheet(20), np.random.default_rng(0).uniform(0, 1, (400, 3)))
+    config = SimplifyConfig(retention=1e-9, min_coverage=2)
+    out = simplify(prior, 40, method="paper", config=config)
+    kept = np.flatnonzero(out.parents >= 0)
+    assert shed(out, "merged") == 0
+    for name in ARRAYS:
+        np.testing.assert_array_equal(
+            getattr(out.splats, name)[out.parents[kept]], getattr(prior, name)[kept]
+        )
+
+
+def test_flags_are_inherited_by_or():
+    prior = discs(sheet(60))
+    flags = np.random.default_rng(1).random(3600) < 0.05
+    out = simplify(prior, 360, method="paper", protected=flags)
+    want = np.zeros(360, bool)
+    want[out.parents[flags & (out.parents >= 0)]] = True
+    np.testing.assert_array_equal(out.protected, want)
