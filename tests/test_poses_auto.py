@@ -158,6 +158,23 @@ def test_a_pool_grows_where_a_view_holds_little_of_the_scene(make, grown) -> Non
         assert more.unseen < plain.unseen + 0.02
 
 
+def test_some_step_nearer_to_what_is_seen_under_a_pixel_only() -> None:
+    statue = naive.statue()
+    fine = replace(statue, scales=statue.scales * np.float32(0.1))
+    coarse, fair = plan_pool(fine, 32, near=0.25), plan_pool(statue, 32, near=0.25)
+    assert fair.coarse < 0.2
+    assert "near" not in fair.kind
+    assert "near" in coarse.kind
+    assert len(coarse.cameras) == 32
+    assert coarse.coarse < plan_pool(fine, 32).coarse
+
+
+def test_pools_for_looks_step_nearer_where_a_view_holds_little(room) -> None:
+    assert "near" in plan_pool(room, 32, near=0.25, looks=True).kind
+    assert "near" not in plan_pool(room, 32, near=0.25).kind
+    assert "near" not in plan_pool(naive.statue(), 32, near=0.25, looks=True).kind
+
+
 def test_a_pool_tells_what_it_does_not_see(room) -> None:
     all_around, few = plan_pool(room, 64), plan_pool(room, 1)
     assert all_around.unseen < 0.3

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["RunViews", "views_of"]
 
-_POOL, _GROW = 160, 2.0
-"""Poses of a pool made for a scene without views, and how many times as many there may be where a view holds
-little of it; every 8th is held out for scoring."""
+_POOL, _GROW, _NEAR = 160, 2.0, 0.25
+"""Poses of a pool made for a scene without views, how many times as many there may be where a view holds
+little of it, and the most that step nearer; every 8th is held out for scoring."""
 _APART = 24
 """Views of another kind: half of them validate recovery, half are scored."""
 _ROWS = 200_000
@@ -94,7 +94,15 @@ def _planned(run: Run, prior: Splats, count: int, up: Triple | None, grow: float
     from g2ard.poses import plan_pool
 
     return plan_pool(
-        prior, count, up=up, seed=run.seed, rows=_ROWS, apart=_APART, grow=grow, progress=run.progress
+        prior,
+        count,
+        up=up,
+        seed=run.seed,
+        rows=_ROWS,
+        apart=_APART,
+        grow=grow,
+        near=_NEAR,
+        progress=run.progress,
     )
 
 

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from g2ard.splats import Splats
 
 _VIEWS, _NEAR = 96, 0.25
-"""Poses of a pool of its own, as many of them are used as the scene needs; and the share that steps nearer in
-a scene of which a view holds little."""
+"""Poses of a pool of its own, as many of them are used as the scene needs; and the most that step nearer."""
 
 _ROWS = 100_000
 """Gaussians that those are planned on."""
@@ -146,7 +145,9 @@ def _cameras(
     from g2ard.poses import plan_pool
 
     try:
-        pool = plan_pool(splats, _VIEWS, up=up, seed=run.seed, rows=_ROWS, near=_NEAR, progress=run.progress)
+        pool = plan_pool(
+            splats, _VIEWS, up=up, seed=run.seed, rows=_ROWS, near=_NEAR, looks=True, progress=run.progress
+        )
     except InputError as e:
         run.say(f"goes on without views: {e}")
         return None
