@@ -165,7 +165,8 @@ def test_anchors_hold_from_construction_to_the_end(targets: TeacherRenders) -> N
     first, last = result.report["rounds"][-1]["recover"]
     anchors = Anchors.of(result.simplified)
     assert last["drift95"] == drift95(anchors, result.splats.means)
-    assert last["geometry"][0]["drift95"] > first["drift95"] > 0.1  # the drift of the round is not forgotten
+    # The round's drift is not forgotten.
+    assert last["geometry"][0]["drift95"] > 0.5 * first["drift95"] > 0.05
     held = replace(config, regularizers=Regularizers(100.0, 0.0, effective_rank=False, period=1))
     assert (
         distill(PRIOR, 1000, targets, held).report["rounds"][-1]["recover"][-1]["drift95"] < last["drift95"]
