@@ -135,7 +135,7 @@ def test_a_loss_in_any_kind_of_views_is_told() -> None:
     assert "lost 0.50 dB in views of another kind" in line
     lines = said(-0.2, -0.3, 0.25)
     assert "lost 0.20 dB in unseen views" in lines[0]
-    assert "no view sees 25% of the scene's matter" in lines[2]
+    assert "no view sees 25% of the scene" in lines[2]
 
 
 def test_steps_by_need_are_for_teachers() -> None:

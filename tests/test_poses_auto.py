@@ -70,6 +70,13 @@ def test_nobody_stands_inside_objects_and_houses(make) -> None:
     assert not len(plan_inside(site, inside, 0, Lens(), 0, tell))
 
 
+def test_a_closed_shell_is_seen_from_outside_as_well() -> None:
+    points = fibonacci(20_000)
+    shell = naive.discs(points, points, 0.02)
+    eyes = np.linalg.norm(plan_pool(shell, 32).cameras.positions, axis=1)
+    assert 8 <= (eyes > 1.2).sum() <= 24
+
+
 def test_an_open_scene_is_seen_from_below_its_sky(open_scene) -> None:
     pool = plan_pool(open_scene, 48)
     assert pool.up[2] > 0.99

@@ -11,6 +11,9 @@ __all__ = ["say_views", "told", "write_table"]
 _LOSS = 0.05
 """dB under the simplified scene that the command speaks of."""
 
+_FEW = 0.005
+"""Share of the scene that rounds to nothing."""
+
 
 def write_table(run: Run, report: dict[str, Any]) -> None:
     """Both scenes beside the dense one: counts, bytes, figures in each kind of views."""
@@ -68,10 +71,8 @@ def told(report: dict[str, Any]) -> list[str]:
             found.append(
                 f"{lost} of {len(report[kind]['recovered']['views'])} {what} lost, though all together gained"
             )
-    if report["unseen"]:
-        found.append(
-            f"no view sees {report['unseen']:.0%} of the scene's matter: it is simplified, not recovered"
-        )
+    if report["unseen"] and report["unseen"] >= _FEW:
+        found.append(f"no view sees {report['unseen']:.0%} of the scene: that is simplified, not recovered")
     return found
 
 

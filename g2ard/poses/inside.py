@@ -35,6 +35,9 @@ _SOME_INSIDE, _ALL_INSIDE = 0.005, 0.025
 """Share of the box that lies within rooms: below the first nobody stands inside, from the second on everybody
 does. Measured: showroom .026–.079, objects and open scenes 0.000."""
 
+_SHELL = 0.5
+"""At most so much of a pool stands within what has no ground."""
+
 _PITCHES = (-0.3, 0.2)
 """Radians above the horizon that people gaze at."""
 
@@ -44,15 +47,18 @@ _WIDE = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Inside:
-    """Places (K, 3) within rooms, those with most clearance first, and their share of the scene's box."""
+    """Places (K, 3) within rooms, those with most clearance first, their share of the scene's box, and
+    whether the scene has a ground."""
 
     places: Floats
     share: float
+    grounded: bool
 
     @property
     def weight(self) -> float:
-        """How much of a pool stands within: 0 to 1."""
-        return float(np.clip((self.share - _SOME_INSIDE) / (_ALL_INSIDE - _SOME_INSIDE), 0, 1))
+        """How much of a pool stands within: up to 1, to ½ without a ground: a closed shell may be an object."""
+        most = 1.0 if self.grounded else _SHELL
+        return most * float(np.clip((self.share - _SOME_INSIDE) / (_ALL_INSIDE - _SOME_INSIDE), 0, 1))
 
 
 def find_inside(site: Site, seed: int) -> Inside:
@@ -63,7 +69,7 @@ def find_inside(site: Site, seed: int) -> Inside:
     free = clearance > 2 * grid.cell
     points, clearance = points[free], clearance[free]
     if not len(points):
-        return Inside(points, 0.0)
+        return Inside(points, 0.0, site.up.grounded)
     directions = fibonacci(_DIRECTIONS)
     eyes, rays = np.repeat(points, _DIRECTIONS, axis=0), np.tile(directions, (len(points), 1))
     distances = grid.cast(eyes, rays)
@@ -75,7 +81,7 @@ def find_inside(site: Site, seed: int) -> Inside:
     sharply = sharp.reshape(-1, _DIRECTIONS).mean(axis=1) > 0.75 * around
     rows = np.flatnonzero((around > _ENCLOSED) & sharply)
     rows = rows[np.argsort(-clearance[rows], kind="stable")]
-    return Inside(points[rows], len(rows) / _TRIES)
+    return Inside(points[rows], len(rows) / _TRIES, site.up.grounded)
 
 
 def plan_inside(

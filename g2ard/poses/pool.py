@@ -121,7 +121,7 @@ def plan_pool(
     if len(poses) < count:
         raise InputError(
             f"{len(poses)} of {count} poses found a free place with a view ({kind}: {why}): "
-            "ask for fewer, or for another kind"
+            f"ask for {'fewer, or for ' if len(poses) else ''}another kind"
         )
     reach = reach_of(site, poses, lens)
     others = _apart(site, poses, reach, apart, lens, seed)

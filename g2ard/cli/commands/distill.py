@@ -207,7 +207,7 @@ def distill(
             progress=run.progress,
         )
         report = _score(run, prior, result, {"scores": unseen, "apart": apart}, colour)
-        report["unseen"] = looks.unseen
+        report["unseen"] = looks.unseen if looks.unseen is not None else _unseen(result, len(prior))
         report |= {"against": against, "preset": why, "prior": measured.as_dict()}
         report |= {key: result.report[key] for key in ("rounds", "views")}
         report["constants"] = listed(used, run.config)
@@ -303,6 +303,12 @@ def _score(
         "bytes": {"input": prior.nbytes, "output": result.splats.nbytes},
         **scores,
     }
+
+
+def _unseen(result: Distilled, count: int) -> float | None:
+    """Share of the Gaussians that no view sees that simplification looked from; None for `paper`."""
+    unseen = result.report["rounds"][0]["simplify"].get("unseen")
+    return None if unseen is None else unseen / count
 
 
 def _write(

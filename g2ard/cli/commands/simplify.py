@@ -102,8 +102,8 @@ def simplify(
         _write_parents(run, parents, small)
     written = time.perf_counter()
     _tell(run, small)
-    if small.report["unseen"]:
-        share = small.report["unseen"] / len(found.splats)
+    share = (small.report["unseen"] or 0) / len(found.splats)
+    if share >= 0.005:
         run.say(f"no view sees {share:.0%} of the Gaussians: they count by their own size alone")
     run.say(f"{output}: {len(small.splats):,} of {len(found.splats):,} Gaussians in {written - began:.1f} s")
     run.result(
