@@ -56,7 +56,7 @@ class Inside:
 
     @property
     def weight(self) -> float:
-        """How much of a pool stands within: up to 1, to ½ without a ground: a closed shell may be an object."""
+        """How much of a pool stands within: up to 1, or ½ without a ground: a shell may be an object."""
         most = 1.0 if self.grounded else _SHELL
         return most * float(np.clip((self.share - _SOME_INSIDE) / (_ALL_INSIDE - _SOME_INSIDE), 0, 1))
 
