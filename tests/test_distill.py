@@ -173,7 +173,7 @@ def test_command_on_a_cloud_with_photos(command_line: CommandLine, tmp_path: Pat
     report = json.loads(out)
     assert report["against"] == "photos"
     assert report["apart"] is None  # photos are only where they were taken
-    assert report["unseen"] is None
+    assert 0 <= report["unseen"] < 0.05
     simplified, recovered = (report["scores"][stage]["psnr"] for stage in ("simplified", "recovered"))
     assert simplified > 21.3
     assert recovered > max(21.5, simplified)
