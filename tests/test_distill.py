@@ -118,12 +118,12 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
 def test_a_loss_in_any_kind_of_views_is_told() -> None:
     from g2ard.cli.run_result import told
 
-    def said(pool: float, near: float | None, unseen: float | None) -> list[str]:
+    def said(pool: float, near: float | None, unseen: float | None, ssim: float = 0.0) -> list[str]:
         def scores(gain: float) -> dict[str, dict[str, Any]]:
             views = [[{"psnr": 30.0 + share * gain} for share in part] for part in ((0, 0), (2.5, -0.5))]
             return {
-                "simplified": {"psnr": 30.0, "views": views[0]},
-                "recovered": {"psnr": 30.0 + gain, "views": views[1]},
+                "simplified": {"psnr": 30.0, "ssim": 0.9, "views": views[0]},
+                "recovered": {"psnr": 30.0 + gain, "ssim": 0.9 + ssim, "views": views[1]},
             }
 
         apart = None if near is None else scores(near)
@@ -133,6 +133,7 @@ def test_a_loss_in_any_kind_of_views_is_told() -> None:
     assert said(0.02, 0.02, 0.0) == []
     line = said(0.02, -0.5, 0.0)[0]
     assert "lost 0.50 dB in views of another kind" in line
+    assert "lost 0.004 of SSIM in unseen views" in said(0.3, 0.3, 0.0, ssim=-0.004)[0]
     lines = said(-0.2, -0.3, 0.25)
     assert "lost 0.20 dB in unseen views" in lines[0]
     assert "no view sees 25% of the scene" in lines[2]

@@ -8,8 +8,8 @@ from g2ard.cli.frame import Run
 
 __all__ = ["say_views", "told", "write_table"]
 
-_LOSS = 0.05
-"""dB under the simplified scene that the command speaks of."""
+_LOSS, _SSIM_LOSS = 0.05, 0.001
+"""dB, and SSIM, under the simplified scene that the command speaks of."""
 
 _FEW = 0.005
 """Share of the scene that rounds to nothing."""
@@ -58,11 +58,13 @@ def told(report: dict[str, Any]) -> list[str]:
     for kind, what in (("scores", "unseen views"), ("apart", "views of another kind")):
         if not report[kind]:
             continue
-        before, after = (report[kind][name]["psnr"] for name in ("simplified", "recovered"))
-        if after < before - _LOSS:
+        before, after = (report[kind][name] for name in ("simplified", "recovered"))
+        lost_db, lost_ssim = before["psnr"] - after["psnr"], before["ssim"] - after["ssim"]
+        if lost_db > _LOSS or lost_ssim > _SSIM_LOSS:
+            how = f"{lost_db:.2f} dB" if lost_db > _LOSS else f"{lost_ssim:.3f} of SSIM"
             found.append(
-                f"warning: recovery lost {before - after:.2f} dB in {what}: the simplified scene is better"
-                " there (--keep writes it too)"
+                f"warning: recovery lost {how} in {what}: the simplified scene is better there"
+                " (--keep writes it too)"
             )
             continue
         pairs = zip(*(report[kind][name]["views"] for name in ("simplified", "recovered")), strict=True)
