@@ -145,7 +145,9 @@ def test_a_study_takes_it_in_g2ard_s_place() -> None:
     )
     paper, pup = _as_in_the_paper(study).methods
     assert (paper.name, paper.reduce, paper.rounds, paper.k) == ("g2ard-paper", "paper", "paper", 0.5)
+    assert (paper.schedule, _as_in_the_paper(study).sh_degree) == ("paper", 3)
     assert (pup, _as_in_the_paper(study).released) == (METHODS["pup"], True)
+    assert not _as_in_the_paper(study, False).released
 
 
 def test_in_python() -> None:

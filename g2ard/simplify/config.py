@@ -96,6 +96,8 @@ class SimplifyConfig:
             value = getattr(self, name)
             if value is not None and not value >= 0:
                 raise InputError(f"{name}: expected a number ≥ 0, got {value}")
+        if self.min_opacity is not None and self.min_opacity > 1:
+            raise InputError(f"min_opacity: expected a number in [0, 1], got {self.min_opacity}")
 
     def resolved(self, method: str) -> SimplifyConfig:
         """The same with the method's own constants where None stands for them.

@@ -91,7 +91,7 @@ def run_(
     else:
         studies = [_narrowed(run, path, only, names, options) for path in definitions or []]
     if preset:
-        studies = [_as_in_the_paper(study) for study in studies]
+        studies = [_as_in_the_paper(study, released) for study in studies]
     rows = bench_run(studies, output, keep=keep, again=run.overwrite, progress=run.progress)
     write_report(output, studies, rows)
     run.console.table(
@@ -152,18 +152,29 @@ def _narrowed(
             run.say(f"{path}: has no {key}, and --{key.replace('_', '-')} is left out there")
     shared = {key: options[key] for key in ("ratios", "seeds", "released", "size", "lpips")}
     methods = _chosen(study, names) if names else None
-    return study.narrowed(**own, **shared, scenes=scenes, methods=methods)
+    given = ", ".join(f"{key} {_told(value)}" for key, value in (own | shared).items() if value is not None)
+    line = (f"run with {given} instead of what the study and the lines below say",) if given else ()
+    differs = (*line, *study.differs)
+    return study.narrowed(**own, **shared, scenes=scenes, methods=methods, differs=differs)
 
 
-def _as_in_the_paper(study: Definition) -> Definition:
-    """The study with the paper's method and views in g2ard's place, and each method's own schedule."""
+def _told(value: object) -> str:
+    return " and ".join(f"{part:g}" for part in value) if isinstance(value, tuple) else str(value)
+
+
+def _as_in_the_paper(study: Definition, released: bool | None = None) -> Definition:
+    """The study with the paper's method, views and rates in g2ard's place, and SH of degree 3.
+
+    Each method's own schedule is run as well, unless `released` says otherwise; methods that the study
+    itself defines stay as they are.
+    """
     from dataclasses import replace
 
     from g2ard.bench.definition import METHODS
 
-    paper = replace(METHODS["g2ard-paper"], policy="directional", k=0.5)
+    paper = replace(METHODS["g2ard-paper"], policy="directional", k=0.5, schedule="paper")
     methods = dict.fromkeys(paper if m.name in ("g2ard", paper.name) else m for m in study.methods)
-    return study.narrowed(methods=tuple(methods), released=True)
+    return study.narrowed(methods=tuple(methods), sh_degree=3, released=released is not False)
 
 
 def _chosen(study: Definition, names: list[str]) -> tuple[MethodSpec, ...]:
