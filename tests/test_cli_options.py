@@ -59,6 +59,10 @@ def test_a_bad_value_is_named_with_what_is_allowed(
         (("distill", "a.ply", "-n", 5, "-o", "run", "--held-out", "made"), "--held-out: a file of views"),
         (("distill", "a.ply", "-n", 5, "-o", "run", "--views", "made", "--photos"), "--photos: views that"),
         (
+            ("distill", "a.ply", "-n", 5, "-o", "run", "--steps", 5, "--set", "schedule.steps=9"),
+            "--steps and --set schedule.steps exclude each other",
+        ),
+        (
             ("bench", "simplify", "a.ply", "--protocol", "x"),
             "'--protocol': one of pool, standing, both, not 'x'",
         ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -332,7 +333,9 @@ def can_judge(k: Count | str | None, policy: str) -> None:
         raise typer.BadParameter(f"-k auto: --policy {policy} does not measure what views add; give a count")
 
 
-def one_horizon(steps: int | None, time_limit: float | None) -> None:
-    """Usage check: --steps and --time-limit both set the horizon."""
+def one_horizon(steps: int | None, time_limit: float | None, constants: Mapping[str, object]) -> None:
+    """Usage check: --steps, --time-limit and --set schedule.steps all set the horizon."""
     if steps is not None and time_limit is not None:
         raise typer.BadParameter("--steps and --time-limit exclude each other")
+    if steps is not None and "schedule.steps" in constants:
+        raise typer.BadParameter("--steps and --set schedule.steps exclude each other")

@@ -74,15 +74,15 @@ def views_of(
         if found and not size:
             train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
         return RunViews(train, test.cameras, _near(run, prior, size, up) if teach else None)
+    held = None if held_out is None else load_held_out(run, held_out, size)
     planned = _planned(run, prior, _POOL, up, _GROW)
     apart = planned.apart and planned.apart.resized(size)
     names = planned.cameras.names
     run.say(f"poses: {planned.kind} ({planned.why})")
-    if held_out is not None:
+    if held is not None:
         pool = ViewSet(planned.cameras, splits=("train",) * len(names))
-        test = load_held_out(run, held_out, size)
-        train = drop_held_out(run, pool.resized(size), test.cameras)
-        return RunViews(train, test.cameras, apart, pool, planned.unseen)
+        train = drop_held_out(run, pool.resized(size), held.cameras)
+        return RunViews(train, held.cameras, apart, pool, planned.unseen)
     pool = ViewSet(planned.cameras, splits=splits_of(None, names))
     mask = split_mask(None, names, "test")
     train = pool.take(~mask).resized(size)

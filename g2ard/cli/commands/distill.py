@@ -128,7 +128,6 @@ def distill(
     Views are those of --views, else the cameras that lie beside the scene, else a pool of poses of its own.
     """
     one_budget(count, ratio)
-    one_horizon(steps, time_limit)
     can_judge(k, policy)
     if is_made(str(held_out)):
         raise typer.BadParameter("--held-out: a file of views; those that are made hold out every 8th anyway")
@@ -149,6 +148,7 @@ def distill(
 
     began = time.monotonic()
     values = run.constants(recover=DistillConfig(), lift=LiftConfig())
+    one_horizon(steps, time_limit, values)
     engine = recovery_engine(run)
     lifted = kind(scene) != "splats"
     if lifted and not given:

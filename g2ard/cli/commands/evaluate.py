@@ -117,7 +117,7 @@ def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
     drifts = any(r["drift95"] is not None for r in rows)
     run.console.table(
         title,
-        ["scene", "Gaussians", "MB", "PSNR", "SSIM", "LPIPS", "needle", *["Drift95"][: int(drifts)]],
+        ["scene", "Gaussians", "MB", "PSNR", "SSIM", "LPIPS", "needle", *(["Drift95"] if drifts else [])],
         [
             [
                 Path(r["scene"]).name,
@@ -127,7 +127,7 @@ def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
                 f"{r['ssim']:.4f}",
                 " ".join(f"{net} {value:.4f}" for net, value in (r["lpips"] or {}).items()) or "–",
                 f"{r['needle']:.1%}",
-                *[f"{r['drift95']:.3g}" for _ in range(int(drifts))],
+                *([f"{r['drift95']:.3g}"] if drifts else []),
             ]
             for r in rows
         ],

@@ -77,8 +77,8 @@ def recover(
     from g2ard.recover.presets import preset_for
     from g2ard.recover.schedule import schedule_named
 
-    one_horizon(steps, time_limit)
     values = run.constants(recover=RecoverConfig())
+    one_horizon(steps, time_limit, values)
     checkpoint = output.parent / f".{output.name}.checkpoint.npz"
     check_stopped(run, checkpoint, resume)
     check_scene_output(output, run.overwrite)
