@@ -9,9 +9,9 @@ from g2ard.evaluate import evaluate
 from g2ard.lift import lift
 from g2ard.recover import RecoverConfig, recover
 from g2ard.recover.anchors import PRESETS
-from g2ard.render import looker
 from g2ard.simplify import simplify
 from g2ard.synth import City, city
+from g2ard.visibility import looker
 
 SKY = (0.6, 0.8, 1.0)
 

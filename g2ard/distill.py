@@ -250,8 +250,8 @@ class _Rounds:
             self.supervision.fill(self.progress)
 
     def _simplify(self, number: int, count: int, entry: dict[str, Any]) -> None:
-        from g2ard.render import looker
         from g2ard.simplify import simplify
+        from g2ard.visibility import looker
 
         name = f"simplified-{number}"
         if not self._restore(name, entry):

@@ -111,13 +111,13 @@ def evaluate(
     Raises:
         InputError: a photo cannot be read.
     """
-    from g2ard.render import render
+    from g2ard.render import Renderer
 
     cameras = targets.cameras
+    renderer = Renderer(splats, background=background, settings=settings)
     scores = []
     for view, name in enumerate(cameras.names):
-        image = render(splats, cameras, view, background=background, settings=settings).image
-        image, target = np.clip(image, 0, 1), targets[view]
+        image, target = np.clip(renderer.image(cameras, view), 0, 1), targets[view]
         if eight_bit:
             image, target = as_saved(image), as_saved(target)
         perceived = {net: model(image, target) for net, model in (lpips or {}).items()}

@@ -1,9 +1,8 @@
-"""Rendering and visibility with the CPU rasteriser: numpy in, numpy out."""
+"""Rendering with the CPU rasteriser: numpy in, numpy out."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -13,20 +12,17 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.progress import Progress, counter, silent
 from g2ard.splats import Splats
 
 __all__ = [
     "RasterSettings",
     "Rendered",
-    "Seen",
-    "Visibility",
+    "Renderer",
     "arrays_of",
     "centred",
-    "looker",
     "render",
     "settings_for",
-    "visibility",
+    "view_of",
 ]
 
 _Floats = NDArray[np.float32]
@@ -125,12 +121,20 @@ def arrays_of(splats: Splats) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floa
     return a, b, c, d, e, f
 
 
-def centred(splats: Splats, cameras: Cameras) -> tuple[Splats, Cameras]:
-    """Both about a point that float32 means can be taken from: float64 means may be map coordinates."""
-    cameras = cameras.recentred(splats.offset)
+def middle_of(splats: Splats) -> NDArray[np.float64] | None:
+    """(3,) a point that float32 means can be taken from: float64 means may be map coordinates; None where the
+    means are float32 already."""
     if splats.means.dtype == np.float32 or not len(splats):
+        return None
+    return np.median(splats.means, axis=0)
+
+
+def centred(splats: Splats, cameras: Cameras) -> tuple[Splats, Cameras]:
+    """Both about `middle_of` the scene."""
+    cameras = cameras.recentred(splats.offset)
+    middle = middle_of(splats)
+    if middle is None:
         return splats, cameras
-    middle = np.median(splats.means, axis=0)
     return splats.recentred(splats.offset + middle), cameras.recentred(middle)
 
 
@@ -152,6 +156,82 @@ class Rendered:
     median: _Floats | None = None
 
 
+class Renderer:
+    """One scene, rendered into any number of views; the scene is prepared once and buffers are kept.
+
+    Args:
+        splats: the scene, SH degree 0–3.
+        background: RGB seen where the scene lets light through.
+        settings: conventions; None means gsplat's.
+
+    Raises:
+        InputError: a background that is not three numbers.
+
+    >>> import numpy as np
+    >>> from g2ard.cameras import Cameras, look_at
+    >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
+    >>> K = [[50, 0, 16], [0, 50, 12], [0, 0, 1]]
+    >>> views = Cameras.from_lists([look_at([0, -2, 0], [0, 0, 0])], [K], [(32, 24)], ["front"])
+    >>> renderer = Renderer(dot, background=(1, 1, 1))
+    >>> renderer.image(views, 0).shape, round(float(renderer.render(views, 0).depth[12, 16]))
+    ((24, 32, 3), 2)
+    """
+
+    def __init__(
+        self,
+        splats: Splats,
+        *,
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+        settings: RasterSettings | None = None,
+    ) -> None:
+        self._background = [float(c) for c in background]
+        if len(self._background) != 3:
+            raise InputError(f"background: expected 3 numbers, got {len(self._background)}")
+        self._offset, middle = splats.offset, middle_of(splats)
+        if middle is not None:
+            splats = splats.recentred(splats.offset + middle)
+        self._middle = middle
+        self._settings = settings_for(splats.means, settings)
+        self._arrays = arrays_of(splats)
+        self._rasterizer = _core.Rasterizer()
+
+    def image(self, cameras: Cameras, index: int) -> _Floats:
+        """View `index`'s (H, W, 3) image alone, see `Rendered.image`; without depths it takes less time.
+
+        Raises:
+            InputError: an index out of range.
+        """
+        image, _, _, _ = self._forward(cameras, index, depth=False, median=False)
+        return image
+
+    def render(self, cameras: Cameras, index: int, *, median: bool = False) -> Rendered:
+        """View `index`: C = Σᵢ cᵢ αᵢ Πⱼ<ᵢ (1 − αⱼ), front to back, in world coordinates.
+
+        Args:
+            cameras: the views; their Ks and sizes decide the image.
+            index: which of them.
+            median: also return the median depth.
+
+        Raises:
+            InputError: an index out of range.
+        """
+        image, alpha, depth, middle = self._forward(cameras, index, depth=True, median=median)
+        assert depth is not None
+        return Rendered(image, alpha, depth, middle)
+
+    def _forward(
+        self, cameras: Cameras, index: int, *, depth: bool, median: bool
+    ) -> tuple[_Floats, _Floats, _Floats | None, _Floats | None]:
+        if not 0 <= index < len(cameras):
+            raise InputError(f"view {index}: there are {len(cameras)} views")
+        camera = cameras.take([index]).recentred(self._offset)
+        if self._middle is not None:
+            camera = camera.recentred(self._middle)
+        settings = self._settings
+        view = (*view_of(camera, 0, settings)[:3], settings.near_of(index))
+        return self._rasterizer.forward(self._arrays, view, settings.choices, self._background, depth, median)
+
+
 def render(
     splats: Splats,
     cameras: Cameras,
@@ -161,23 +241,11 @@ def render(
     settings: RasterSettings | None = None,
     median: bool = False,
 ) -> Rendered:
-    """Render view `index`: C = Σᵢ cᵢ αᵢ Πⱼ<ᵢ (1 − αⱼ), front to back, in world coordinates.
-
-    Args:
-        splats: the scene, SH degree 0–3.
-        cameras: the views; their Ks and sizes decide the image.
-        index: which of them.
-        background: RGB seen where the scene lets light through.
-        settings: conventions; None means gsplat's.
-        median: also return the median depth.
-
-    Returns:
-        The image, alpha and depth.
+    """Render one view of a scene once; see `Renderer`, which many views of one scene want.
 
     Raises:
         InputError: an index out of range, a background that is not three numbers.
 
-    >>> import numpy as np
     >>> from g2ard.cameras import Cameras, look_at
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
     >>> K = [[50, 0, 16], [0, 50, 12], [0, 0, 1]]
@@ -186,154 +254,8 @@ def render(
     >>> out.image.shape, bool(out.alpha[12, 16] > 0.9), out.image[0, 0].tolist()
     ((24, 32, 3), True, [1.0, 1.0, 1.0])
     """
-    if not 0 <= index < len(cameras):
-        raise InputError(f"view {index}: there are {len(cameras)} views")
-    colour = [float(c) for c in background]
-    if len(colour) != 3:
-        raise InputError(f"background: expected 3 numbers, got {len(colour)}")
-    splats, cameras = centred(splats, cameras)
-    settings = settings_for(splats.means, settings)
-    image, alpha, depth, mid = _core.Rasterizer().forward(
-        arrays_of(splats), view_of(cameras, index, settings), settings.choices, colour, True, median
-    )
-    assert depth is not None
-    return Rendered(image, alpha, depth, mid)
+    return Renderer(splats, background=background, settings=settings).render(cameras, index, median=median)
 
-
-@dataclass(frozen=True, eq=False)
-class Visibility:
-    """What every Gaussian contributes to a set of views, summed over their pixels.
-
-    Args:
-        weight: (N,) float64, Σ αT: the light it sends to the cameras.
-        transmittance: (N,) float64, Σ T over the pixels it touches.
-        hits: (N,) uint64, pixels it touches (α ≥ 1/255, light left).
-        dominant: (N,) uint64, pixels where no other Gaussian has a larger αT.
-        peak: (N,) float32, its largest αT.
-        pixel_size: (N,) float32, the smallest depth / focal length over the views whose image contains its
-            mean: the size of a pixel there, scene units; ∞ where no view contains it.
-    """
-
-    weight: NDArray[np.float64]
-    transmittance: NDArray[np.float64]
-    hits: NDArray[np.uint64]
-    dominant: NDArray[np.uint64]
-    peak: _Floats
-    pixel_size: _Floats
-
-
-def visibility(
-    splats: Splats,
-    cameras: Cameras,
-    progress: Progress = silent,
-    *,
-    settings: RasterSettings | None = None,
-) -> Visibility:
-    """Sum every Gaussian's contributions αT over all pixels of all views.
-
-    The sums have a fixed order: the result does not depend on the number of threads.
-
-    >>> import numpy as np
-    >>> from g2ard.cameras import Cameras, look_at
-    >>> pair = Splats.create([[0, 0, 0], [0, 9, 0]], scales=np.full((2, 3), 0.1), logit_opacities=[9, 9])
-    >>> K = [[50, 0, 16], [0, 50, 12], [0, 0, 1]]
-    >>> views = Cameras.from_lists([look_at([0, -2, 0], [0, 0, 0])], [K], [(32, 24)], ["front"])
-    >>> seen = visibility(pair, views)
-    >>> bool(seen.weight[0] > 30 * seen.weight[1]), np.round(seen.pixel_size.astype(float), 3).tolist()
-    (True, [0.04, 0.22])
-    """
-    splats, cameras = centred(splats, cameras)
-    settings = settings_for(splats.means, settings)
-    views = [view_of(cameras, i, settings) for i in range(len(cameras))]
-    sums: dict[str, Any] = _core.accumulate(
-        arrays_of(splats), views, settings.choices, counter(progress, "visibility")
-    )
-    return Visibility(**sums)
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """What `looker` keeps of a visibility.
-
-    Args:
-        weight: (N,) float32, Σ αT.
-        pixel_size: (N,) float32, that of the full image, scene units; ∞ where no view looks.
-    """
-
-    weight: _Floats
-    pixel_size: _Floats
-
-
-def looker(
-    cameras: Cameras, *, views: int = 96, longest: int = 300, progress: Progress = silent
-) -> Callable[[Splats], Seen]:
-    """A function that tells what a few small renders see of a scene, as `g2ard.simplify.simplify` takes it.
-
-    It looks from sixteen views at a time until the next sixteen find under 1 % more of the Gaussians: an
-    object of half a million takes 32 views, a small one 80, a room all (`docs/decisions.md`). The first scene
-    decides how many; for the later ones the views stay the same, so that the sums compare. What it tells
-    depends on the scene's content alone, not on the order of its rows.
-
-    Args:
-        cameras: at most `views` of them are used, evenly spaced.
-        views: the most.
-        longest: longer side of the renders, pixels; `pixel_size` stays that of the full image.
-        progress: told after each view.
-
-    Returns:
-        scene → `Seen`; the scene's arrays are C-contiguous and float32, but for its means.
-    """
-    sample = np.unique(np.linspace(0, len(cameras) - 1, min(views, len(cameras))).round().astype(int))
-    full = cameras.take(sample)
-    small = full.resized(longest)
-    factor = np.float32((small.widths / full.widths).mean())
-    apart = max(1, math.ceil(len(small) / _GLANCE))
-    glances = [range(first, len(small), apart) for first in _spread(apart)]
-    enough, settings = 0, RasterSettings()
-
-    def look(scene: Splats) -> Seen:
-        nonlocal enough, settings
-        sums = _core.Look(scene)
-        here = small.recentred(scene.offset)
-        if not enough:  # a near plane in the scene's own unit
-            distance = np.median(np.linalg.norm(here.positions - sums.origin, axis=1))
-            settings = RasterSettings(near=_NEAR * float(distance) or None)
-        seen = 0
-        for number, glance in enumerate(glances, 1):
-            views = [view_of(here, i, settings) for i in glance]
-            before, seen = seen, sums.add(views, settings.choices, counter(progress, "visibility"))
-            converged = number > 1 and seen - before < _CONVERGED * len(scene)
-            cheap = number * _GLANCE * len(scene) < _CHEAP
-            if number == enough or (not enough and converged and not cheap):
-                break
-        enough = number
-        weight, pixel_size = sums.by_row()
-        return Seen(weight, pixel_size * factor)
-
-    return look
-
-
-_GLANCE = 16
-"""Views looked from at a time."""
-
-_CHEAP = 6_000_000
-"""Gaussians times views up to which looking on costs next to nothing."""
 
 _NEAR_SAMPLE = 65_536
 """Gaussians, at most, that tell how large a scene is."""
-
-_NEAR = 1e-3
-"""Nearest depth that counts, over the median distance of the cameras from the scene's middle."""
-
-_CONVERGED = 0.01
-"""Glances that find a smaller share of the Gaussians for the first time are the last."""
-
-
-def _spread(count: int) -> list[int]:
-    """0 … count − 1, each far from those before.
-
-    >>> _spread(6)
-    [0, 3, 1, 4, 2, 5]
-    """
-    half = (count + 1) // 2
-    return [i for pair in zip(range(half), range(half, half + half), strict=True) for i in pair if i < count]

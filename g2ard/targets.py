@@ -16,7 +16,7 @@ from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
 
 if TYPE_CHECKING:
-    from g2ard.render import RasterSettings
+    from g2ard.render import RasterSettings, Renderer
 
 __all__ = [
     "CACHE_BYTES",
@@ -217,16 +217,17 @@ class TeacherRenders(_Cached):
         self.source = f"teacher {teacher.fingerprint()} {background}"
         if settings is not None:
             self.source += f" {settings}"
+        self._renderer: Renderer | None = None
         if not lazy:
             self.fill(progress, "teacher")
+            self._renderer = None  # its buffers are larger than the scene
 
     def _make(self, view: int) -> NDArray[np.float32]:
-        from g2ard.render import render
+        if self._renderer is None:
+            from g2ard.render import Renderer
 
-        image = render(
-            self._teacher, self.cameras, view, background=self._background, settings=self._settings
-        ).image
-        return np.clip(image, 0, 1)
+            self._renderer = Renderer(self._teacher, background=self._background, settings=self._settings)
+        return np.clip(self._renderer.image(self.cameras, view), 0, 1)
 
     def against(self, view: int) -> str:
         """See `against_of`."""

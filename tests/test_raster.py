@@ -14,8 +14,9 @@ from g2ard import _core
 from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
 from g2ard.recover.rasterize import rasterize
-from g2ard.render import RasterSettings, render, visibility
+from g2ard.render import RasterSettings, render
 from g2ard.splats import Splats
+from g2ard.visibility import visibility
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 Params = dict[str, NDArray[np.float32]]

@@ -83,7 +83,8 @@ def test_clusters_conserve_mass_mean_and_covariance(method, growth):
 
 @pytest.mark.parametrize("method", ["default", "fast"])
 def test_an_opaque_wall_stays_opaque_and_thin(method):
-    from g2ard.render import looker, render
+    from g2ard.render import render
+    from g2ard.visibility import looker
 
     wall, cameras = opaque_wall()
     alpha = {}
@@ -133,7 +134,7 @@ def test_no_merged_cluster_is_dropped():
 @pytest.mark.parametrize("method", ["default", "fast"])
 @pytest.mark.parametrize("scale", [1.0, 2.0**-10])
 def test_what_is_seen_does_not_depend_on_the_order_of_rows(method, scale):
-    from g2ard.render import looker
+    from g2ard.visibility import looker
 
     wall, cameras = opaque_wall()
     viewmats = cameras.viewmats.copy()

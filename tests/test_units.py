@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from g2ard.cameras import Cameras, look_at
-from g2ard.render import RasterSettings, looker, render, settings_for, visibility
+from g2ard.render import RasterSettings, render, settings_for
 from g2ard.select import select
 from g2ard.simplify import simplify
 from g2ard.splats import Splats
+from g2ard.visibility import looker, visibility
 
 ARRAYS = ("means", "scales", "quats", "logit_opacities", "sh0", "shN")
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from g2ard.baselines.ranking import check_budget
 from g2ard.cameras import Cameras
 from g2ard.progress import Progress, silent
-from g2ard.render import visibility
 from g2ard.splats import Splats
+from g2ard.visibility import visibility
 
 __all__ = ["importance", "mini_splatting", "sample"]
 

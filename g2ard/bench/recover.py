@@ -27,11 +27,11 @@ from g2ard.recover import RecoverConfig, recover
 from g2ard.recover.anchors import PAPER_PRESETS, Anchors, drift95, effective_rank, needle
 from g2ard.recover.presets import preset_for
 from g2ard.recover.schedule import PAPER
-from g2ard.render import looker
 from g2ard.simplify import simplify
 from g2ard.splats import Splats
 from g2ard.splits import HOLD_OUT, for_scores, for_training, not_held_out, split_mask
 from g2ard.targets import Photos, Targets, TeacherRenders
+from g2ard.visibility import looker
 
 __all__ = ["STUDIES", "Look", "RecoverBench", "bench_recover"]
 

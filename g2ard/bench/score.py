@@ -12,7 +12,7 @@ from PIL import Image
 from g2ard.images import as_saved, to_bytes
 from g2ard.lpips import Lpips
 from g2ard.metrics import psnr, ssim
-from g2ard.render import RasterSettings, render
+from g2ard.render import RasterSettings, Renderer
 from g2ard.splats import Splats
 from g2ard.targets import Targets, mask_of
 
@@ -101,10 +101,10 @@ def score(
         eight_bit: as for `g2ard.evaluate.evaluate`.
         pictures: a folder; None keeps no pictures.
     """
+    renderer = Renderer(splats, background=background, settings=settings)
     views = []
     for number, name in enumerate(targets.cameras.names):
-        image = render(splats, targets.cameras, number, background=background, settings=settings).image
-        image, target = np.clip(image, 0, 1), targets[number]
+        image, target = np.clip(renderer.image(targets.cameras, number), 0, 1), targets[number]
         if eight_bit:
             image, target = as_saved(image), as_saved(target)
         mask = mask_of(targets, number)

@@ -18,7 +18,7 @@ from g2ard.lift import lift
 from g2ard.poses import make_pool, plan_pool
 from g2ard.progress import Progress, silent
 from g2ard.recover.anchors import PRESETS, Regularizers
-from g2ard.render import render
+from g2ard.render import Renderer
 from g2ard.simplify import simplify
 from g2ard.splats import Splats
 from g2ard.splits import splits_of, states_splits
@@ -164,15 +164,13 @@ def _trained(scene: Path, size: Size, cache: Path | None, progress: Progress) ->
     else:
         outside = make_pool(prior, size.tests, kind="orbit", seed=2).resized(size.pixels)
 
-    def shown(cameras: Cameras, view: int) -> Image:
-        return render(prior, cameras, view).image
-
+    renderer = Renderer(prior)
     return Stand(
         prior=prior,
         student=_reduced(prior, size),
-        targets=_Made(universe, shown, cache),
+        targets=_Made(universe, renderer.image, cache),
         tests=_evenly(rows[::8], size.tests),
-        outside=_Made(outside, shown),
+        outside=_Made(outside, renderer.image),
         regularizers=PRESETS["trained"],
         candidates=size.candidates,
     )

@@ -72,8 +72,8 @@ def store_targets(targets: Targets, folder: Path) -> None:
 
 def _reduce(job: Job) -> dict[str, Any]:
     from g2ard import baselines
-    from g2ard.render import looker
     from g2ard.simplify import SimplifyConfig, simplify
+    from g2ard.visibility import looker
 
     splats, cameras = io.read_splats(job["scene"]), _cameras(job["views"])
     output, began = Path(job["output"]), time.monotonic()

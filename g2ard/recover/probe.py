@@ -5,12 +5,16 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from g2ard.metrics import psnr
 from g2ard.splats import Splats
 from g2ard.targets import Targets, mask_of
+
+if TYPE_CHECKING:
+    from g2ard.render import Renderer
 
 __all__ = ["MULTIPLIERS", "Probe", "calm", "climb", "trial_steps"]
 
@@ -103,7 +107,10 @@ class Probe:
 
     def all_of(self, splats: Splats) -> float:
         """Mean over all of the views."""
-        return float(np.mean([self._score(splats, view) for view in self._views]))
+        from g2ard.render import Renderer
+
+        renderer = Renderer(splats, background=self._background)
+        return float(np.mean([self._score(renderer, view) for view in self._views]))
 
     def latest(self, splats: Callable[[], Splats], step: int, seconds: float) -> tuple[float, int]:
         """The mean, and the step it is of: an earlier one where looking has had its share of the time.
@@ -120,8 +127,6 @@ class Probe:
             self._next = seconds + (time.monotonic() - began) / (_FIRST_SHARE if first else _SHARE)
         return self._latest
 
-    def _score(self, splats: Splats, view: int) -> float:
-        from g2ard.render import render
-
-        image = render(splats, self._targets.cameras, view, background=self._background).image
+    def _score(self, renderer: Renderer, view: int) -> float:
+        image = renderer.image(self._targets.cameras, view)
         return psnr(np.clip(image, 0, 1), self._targets[view], mask_of(self._targets, view))

@@ -10,7 +10,7 @@ import numpy as np
 
 from g2ard.errors import InputError
 from g2ard.images import to_bytes
-from g2ard.render import render
+from g2ard.render import Renderer
 from g2ard.report.charts import Point, chart
 from g2ard.report.page import Comparison, Page, Shown, legend
 from g2ard.report.window import Crop
@@ -92,12 +92,13 @@ def distill_report(
     figures = [view["psnr"] for view in scores[last]["views"]]
     asked = [targets.cameras.names.index(crop.view) for crop in crops if crop.view is not None]
     worst = map(int, np.argsort(figures, kind="stable")[:_VIEWS])
+    renderers = [(name, Renderer(splats, background=background)) for name, splats in reversed(scenes)]
     for view in dict.fromkeys([*asked, *worst]):
         name = targets.cameras.names[view]
         windows = [crop.window for crop in crops if crop.view in (None, name)]
         shown = []
-        for name, splats in reversed(scenes):
-            image = render(splats, targets.cameras, view, background=background).image
+        for name, renderer in renderers:
+            image = renderer.image(targets.cameras, view)
             shown.append(Shown(name, to_bytes(image), f"{scores[name]['views'][view]['psnr']:.2f} dB"))
         page.comparison(Comparison(targets.cameras.names[view], to_bytes(targets[view]), shown, windows))
     page.write(path)

@@ -61,8 +61,7 @@ def render(
     from g2ard.cli.scenes import load_scene, load_views
     from g2ard.images import write_png
     from g2ard.io.atomic import atomic_folder, check_output
-    from g2ard.render import RasterSettings
-    from g2ard.render import render as rasterize
+    from g2ard.render import RasterSettings, Renderer
 
     _check(color, count, ratio, parents)
     check_output(output, run.overwrite, folder=True)
@@ -71,11 +70,10 @@ def render(
         budget = None if parents else budget_of(scene, count, ratio, len(splats))
         splats = _painted(run, splats, color, budget, method, parents)
     cameras = load_views(run, views, split, size)
+    renderer = Renderer(splats, background=background or (0.0, 0.0, 0.0), settings=settings)
     with atomic_folder(output, overwrite=run.overwrite) as folder:
         for view, name in enumerate(cameras.names):
-            rendered = rasterize(
-                splats, cameras, view, background=background or (0.0, 0.0, 0.0), settings=settings
-            )
+            rendered = renderer.render(cameras, view)
             stem = folder / Path(name).with_suffix("")
             stem.parent.mkdir(parents=True, exist_ok=True)
             write_png(stem.with_name(stem.name + ".png"), rendered.image)

@@ -68,9 +68,9 @@ def simplify(
 
     from g2ard import io
     from g2ard.constants import changed, listed
-    from g2ard.render import looker
     from g2ard.simplify import SimplifyConfig
     from g2ard.simplify import simplify as reduce
+    from g2ard.visibility import looker
 
     one_budget(count, ratio)
     if views is not None and no_views:
