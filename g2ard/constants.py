@@ -84,7 +84,13 @@ def changed(config: Config, root: str, values: Mapping[str, Any]) -> Config:
                 new[f.name] = inner
         elif f"{root}.{f.name}" in values:
             new[f.name] = values[f"{root}.{f.name}"]
-    return replace(config, **new) if new else config  # type: ignore[type-var]
+    if not new:
+        return config
+    try:
+        return replace(config, **new)  # type: ignore[type-var]
+    except InputError as error:
+        name, _, reason = str(error).partition(": ")
+        raise InputError(f"{root}.{name}: {reason}" if name in new else str(error)) from None
 
 
 def listed(configs: Mapping[str, Any], without: Iterable[str] = ()) -> dict[str, dict[str, Any]]:

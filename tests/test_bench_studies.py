@@ -172,8 +172,10 @@ def test_black_renders_are_told(tmp_path: Path) -> None:
     text = HEAD.replace("12", "4") + 'methods = ["random"]\n' + SCENE
     definition, (row,), out = run(tmp_path, text)
     assert row.black == 0
-    write_report(out, [definition], [replace(row, black=11, views=484)])
+    other = replace(row, seed=1, psnr=(row.psnr or 0) + 2)
+    write_report(out, [definition], [replace(row, black=11, views=484), other])
     html = (out / "report.html").read_text()
+    assert f"random, 2 seeds: {row.psnr + 1:.2f} ± {2**0.5:.2f} dB" in html
     assert "11 of 495 test renders are all black" in html
     assert "random†" in html
 
@@ -291,3 +293,13 @@ def test_rows_from_before_later_columns_can_be_read() -> None:
         rows = read_rows(path)
         assert rows
         assert {(row.black, row.delta_psnr) for row in rows} == {(None, None)}
+
+
+def test_a_variable_that_is_not_set_is_told_before_anything_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("G2ARD_NOWHERE", raising=False)
+    text = HEAD + 'methods = ["random"]\n[[scene]]\nname = "block"\nprior = "${G2ARD_NOWHERE}/block.ply"\n'
+    with pytest.raises(InputError, match=r"scene block: \$G2ARD_NOWHERE is not set"):
+        bench_run([read_definition(study(tmp_path, text))], tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -117,7 +117,7 @@ def test_commands_take_constants_and_report_them(
         ("nothing.of_the_kind=1", "no constant"),
         (SOME[str(command[0])].replace("=", "x="), f"did you mean {SOME[str(command[0])].split('=')[0]}"),
         (SOME[str(command[0])] + "?", "expected a"),
-        (SOME[str(command[0])].split("=")[0] + "=-1", "expected"),
+        (SOME[str(command[0])].split("=")[0] + "=-1", SOME[str(command[0])].split("=")[0] + ": expected"),
     ):
         status, _, error = command_line(*command, "--set", wrong, cwd=folder)
         assert (status, len(error.splitlines())) == (2, 1), error

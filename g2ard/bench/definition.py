@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -15,6 +16,7 @@ from g2ard.errors import InputError
 
 __all__ = ["METHODS", "Definition", "Matched", "MethodSpec", "SceneSpec", "read_definition"]
 
+_VARIABLE = re.compile(r"\$\{?(\w+)")
 _TARGETS = ("teacher", "photos", "either")
 
 
@@ -145,6 +147,18 @@ class Definition:
         if self.released and method.released_steps is not None:
             out.append(Matched("released"))
         return out
+
+    def require_variables(self) -> None:
+        """Refuse paths that name an environment variable which is not set.
+
+        Raises:
+            InputError: there is one; the message names the first.
+        """
+        for scene in self.scenes:
+            paths = (scene.prior, scene.train, scene.adapt, *scene.score.values())
+            missing = next(filter(None, (_VARIABLE.search(path) for path in paths if path)), None)
+            if missing is not None:
+                raise InputError(f"{self.name}: scene {scene.name}: ${missing[1]} is not set")
 
     def cells(self) -> Iterator[tuple[SceneSpec, float, MethodSpec, Matched, int]]:
         """Scene by scene, all that is to be measured; a teacher's row once a scene."""

@@ -174,8 +174,24 @@ def _table(page: Page, rows: Sequence[Row], names: Sequence[str]) -> None:
             for column, name in ((4, "psnr"), (5, "ssim"))
         }
         page.html(f'<p class="sub">{ratio:g}×, {Matched(matched, amount).label}</p>')
+        for line in _over_seeds(group):
+            page.paragraph(line)
         cells = [_cells(row)[: len(columns)] for row in [*group, *teachers]]
         page.table(columns, cells, best)
+
+
+def _over_seeds(rows: Sequence[Row]) -> list[str]:
+    """Mean ± standard deviation (n − 1) of PSNR and SSIM of each method that was run with several seeds."""
+    lines = []
+    for method in dict.fromkeys(row.method for row in rows):
+        runs = [row for row in rows if row.method == method and row.psnr is not None and row.ssim is not None]
+        if len(runs) > 1:
+            psnr, ssim = (np.array([getattr(row, name) for row in runs]) for name in ("psnr", "ssim"))
+            lines.append(
+                f"{method}, {len(runs)} seeds: {psnr.mean():.2f} ± {psnr.std(ddof=1):.2f} dB, "
+                f"SSIM {ssim.mean():.4f} ± {ssim.std(ddof=1):.4f}"
+            )
+    return lines
 
 
 def _cells(row: Row) -> list[str]:

@@ -52,9 +52,12 @@ def bench_run(
         The rows, in the order of the definitions.
 
     Raises:
-        InputError: LPIPS weights that cannot be read. What goes wrong in a cell is its row's error.
+        InputError: a path with an environment variable that is not set, LPIPS weights that cannot be
+            read. What goes wrong in a cell is its row's error.
         KeyboardInterrupt: after Ctrl-C; the next call goes on.
     """
+    for definition in definitions:
+        definition.require_variables()
     cells = cells_of(definitions)
     (folder / "cells").mkdir(parents=True, exist_ok=True)
     weights = {

@@ -244,7 +244,8 @@ CropOption = Annotated[
         "--crop",
         parser=_crop,
         metavar="[VIEW:]X,Y,W,H",
-        help="Magnify this in the report: left, top, width, height in shares of the image; may be repeated.",
+        help="Magnify this in the report: left, top, width, height in shares of the image "
+        "(front.png:0.4,0.3,0.2,0.2); may be repeated.",
     ),
 ]
 

@@ -373,10 +373,16 @@ class _Loop:
 
     @property
     def regularizers(self) -> dict[str, float]:
-        """How many steps were regularised, and which share of the time that cost above plain steps."""
+        """How many steps were regularised, which share of the time that cost above plain steps, and their
+        period, 0 where none has weight."""
         (plain, plain_s), (held, held_s) = self._seconds_of[False], self._seconds_of[True]
         extra = held_s - held * plain_s / plain if plain and held else 0.0
-        return {"steps": held, "share": max(0.0, extra) / max(plain_s + held_s, 1e-9)}
+        weights = self.config.regularizers
+        return {
+            "steps": held,
+            "share": max(0.0, extra) / max(plain_s + held_s, 1e-9),
+            "period": weights.period if weights.active else 0,
+        }
 
     def _tell(self, progress: Progress, stage: str) -> None:
         speed = self.done / max(self.seconds, 1e-9)

@@ -10,12 +10,32 @@ __all__ = ["outcome"]
 def outcome(report: dict[str, Any]) -> str | None:
     """One line about a recovery that did not simply go well; None for one that did.
 
-    >>> outcome({"kept_start": False, "backed_off": [], "stopped": None, "way": 1.0}) is None
+    >>> well = {"kept_start": False, "backed_off": [], "stopped": None, "way": 1.0, "steps": 60}
+    >>> outcome({**well, "regularizers": {"steps": 1, "period": 50}}) is None
     True
+    >>> outcome({**well, "regularizers": {"steps": 0, "period": 100}})
+    'the regularisers never acted: they do every 100 steps, and there were 60 (--set regularizers.period=…)'
     >>> lost = [{"step": 30, "psnr": 23.35}]
-    >>> outcome({"kept_start": False, "backed_off": lost, "stopped": None, "psnr": {"before": 32.9}})
+    >>> fell = {**well, "backed_off": lost, "psnr": {"before": 32.9}, "regularizers": {"steps": 3}}
+    >>> outcome(fell)
     'recovery fell to 23.35 dB (start 32.90) at step 30: it went on from the best with a third of the rates'
     """
+    told = [line for line in (_outcome(report), _unregularized(report)) if line]
+    return "; ".join(told) or None
+
+
+def _unregularized(report: dict[str, Any]) -> str | None:
+    """Weights that never acted: fewer steps than one period."""
+    held = report["regularizers"]
+    if report["kept_start"] or held["steps"] or not held["period"] or not report["steps"]:
+        return None
+    return (
+        f"the regularisers never acted: they do every {held['period']} steps, and there were "
+        f"{report['steps']} (--set regularizers.period=…)"
+    )
+
+
+def _outcome(report: dict[str, Any]) -> str | None:
     start = f"(start {report['psnr']['before']:.2f})" if report["backed_off"] else ""
     lines = [f"{found['psnr']:.2f} dB {start} at step {found['step']}" for found in report["backed_off"]]
     if report["kept_start"]:
