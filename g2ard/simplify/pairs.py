@@ -123,7 +123,8 @@ def _fitted(scene: Splats, parents: NDArray[np.int64], wanted: NDArray[Any], now
     """The scene with opacities by which the views see of each row about what they saw of its members.
 
     α is multiplied by the fourth root of the ratio, within 0.84–1.19: neighbours share what is missing, and
-    other views than these want less of it. What α ≤ 0.99 cannot hold goes to the area of the two longer axes. A floor of 5 % of the mean keeps what is hardly seen as it is.
+    other views than these want less of it. What α ≤ 0.99 cannot hold goes to the area of the two longer axes.
+    A floor of 5 % of the mean keeps what is hardly seen as it is.
 
     Args:
         scene: M merged Gaussians.
