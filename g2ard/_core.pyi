@@ -24,6 +24,16 @@ def lift_points(
     max_anisotropy: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
+def codebook(
+    values: NDArray[np.float32], count: int, weights: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]: ...
+def palette(
+    points: NDArray[np.float32],
+    count: int,
+    steps: int,
+    weights: NDArray[np.float32] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.uint32]]: ...
 def knn(points: NDArray[np.float64], k: int) -> NDArray[np.uint32]: ...
 def cast_rays(
     steps: NDArray[np.int8],

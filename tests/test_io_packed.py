@@ -202,9 +202,9 @@ def test_spz(tmp_path: Path, version: int, degree: int) -> None:
 
 def test_spz_flips_are_a_half_turn_about_x() -> None:
     """Colour seen along d in our axes equals colour seen along (x, −y, −z) in SPZ's."""
-    from g2ard.io.spz import _FLIPS
+    from g2ard.io.spz import FLIPS
 
-    assert [parity(band, m) for band in (1, 2, 3) for m in range(-band, band + 1)] == _FLIPS.tolist()
+    assert [parity(band, m) for band in (1, 2, 3) for m in range(-band, band + 1)] == FLIPS.tolist()
 
 
 @pytest.mark.parametrize("version", [3, 4])

@@ -2,7 +2,7 @@
 
 | reads | from |
 |---|---|
-| `read_splats`, `read_scene` | 3DGS .ply, .compressed.ply, SOG folder or .sog, .spz, .splat |
+| `read_splats`, `read_scene` | 3DGS .ply, .compressed.ply, SOG folder or .sog, .spz, .glb, .splat |
 | `read_points`, `read_cloud` | .ply, .las, .laz, COLMAP points3D |
 | `read_views`, `read_view_set` | COLMAP, transforms.json, INRIA's, nerfstudio, gsplat, Cambridge, g2ard's |
 
@@ -67,7 +67,7 @@ def read_splats(path: str | Path) -> Splats:
     """Read a Gaussian scene; `read_scene` also says what was noticed.
 
     Args:
-        path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .splat.
+        path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .glb, .splat.
 
     Returns:
         The scene: linear scales, logit opacities, means relative to `offset`.
@@ -104,7 +104,7 @@ def read_scene(path: str | Path) -> Scene:
     from g2ard.io.detect import file_format
 
     path, found = Path(path), file_format(path)
-    if found not in ("ply", "compressed_ply", "sog", "spz", "splat"):
+    if found not in ("ply", "compressed_ply", "sog", "spz", "glb", "splat"):
         what = {"cloud_ply": "a point cloud (no f_dc, scale, rot)", "las": "a point cloud"}.get(found, found)
         raise InputError(f"{path}: a Gaussian scene is needed, this is {what}")
     return import_module(f"g2ard.io.{found}").read(path)
@@ -115,7 +115,7 @@ def _named(path: str | Path, suffixes: tuple[str, ...], rule: str) -> Path:
     from g2ard.errors import OutputError
 
     path = Path(path)
-    if path.suffix not in suffixes or path.name.endswith(".compressed.ply"):
+    if path.suffix not in suffixes:
         raise OutputError(f"{path}: {rule}")
     return path
 
@@ -126,7 +126,12 @@ def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
     Raises:
         OutputError: as `write_splats` would, before the work rather than after it.
     """
-    return check_output(_named(path, (".ply", ".splat"), "scenes are written as .ply or .splat"), overwrite)
+    from g2ard.io.scene_formats import scene_format
+
+    if scene_format(path).function == "write_folder":
+        check_output(Path(path).parent, overwrite, folder=True)
+        return Path(path)
+    return check_output(path, overwrite)
 
 
 def check_views_output(path: str | Path, overwrite: bool = False) -> Path:
@@ -142,20 +147,25 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
     """Write a Gaussian scene, whole or not at all.
 
     Args:
-        path: .ply (3DGS) or .splat.
+        path: .ply (3DGS), .compressed.ply, .sog, .spz, .glb (KHR_gaussian_splatting) or .splat, in any case;
+            NAME/meta.json for a SOG folder. What each holds: `docs/formats.md`.
         splats: the scene.
         overwrite: whether an existing file may be replaced.
-        **options: of the format; `normals=True` adds nx ny nz to a .ply.
+        **options: of the format; `normals=True` adds nx ny nz to a .ply, `version=2` (or 3) is an older .spz.
 
     Raises:
         OutputError: the file exists, its folder is absent or not writable, or the extension is no format that
-            g2ard writes.
-        InputError: the scene is empty, or has a value that is not finite.
+            g2ard writes, or has no such option.
+        InputError: the scene is empty, has a value that is not finite, or one that the format cannot hold.
+        MissingDependencyError: .spz of version 4 before Python 3.14 without `pip install g2ard[spz]`.
     """
     from importlib import import_module
 
-    path = _named(path, (".ply", ".splat"), "scenes are written as .ply or .splat")
-    import_module(f"g2ard.io.{path.suffix[1:]}").write(path, splats, overwrite=overwrite, **options)
+    from g2ard.io.scene_formats import check_options
+
+    found = check_options(path, options)
+    writer = getattr(import_module(f"g2ard.io.{found.module}"), found.function)
+    writer(Path(path), splats, overwrite=overwrite, **options)
 
 
 def read_points(path: str | Path) -> Points:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.clean import Raw, cleaned
-from g2ard.io.plyfiles import read_element, read_header, require
+from g2ard.io.plyfiles import offset_of, read_element, read_header, require
 from g2ard.io.types import Scene
 from g2ard.splats import SH_C0
 
@@ -44,6 +44,7 @@ def read(path: Path) -> Scene:
     if len(chunk) * _CHUNK < len(vertex) or (sh and len(sh[0]) != len(vertex)):
         raise InputError(f"{path}: {len(chunk)} chunks and {len(vertex):,} Gaussians do not fit")
     raw = Raw.empty(len(vertex), len(rest) // 3)
+    raw.offset = offset_of(path, header)
     of = np.arange(len(vertex)) // _CHUNK
     raw.means[:] = _between(chunk, of, "{}_{}", "xyz", _three(vertex["packed_position"]))
     raw.log_scales[:] = _between(chunk, of, "{}_scale_{}", "xyz", _three(vertex["packed_scale"]))

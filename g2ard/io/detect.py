@@ -14,6 +14,7 @@ Format = Literal[
     "compressed_ply",
     "sog",
     "spz",
+    "glb",
     "splat",
     "cloud_ply",
     "las",
@@ -30,7 +31,7 @@ Format = Literal[
 Kind = Literal["splats", "points", "views"]
 
 KINDS: dict[str, Kind] = {
-    **dict.fromkeys(("ply", "compressed_ply", "sog", "spz", "splat"), "splats"),
+    **dict.fromkeys(("ply", "compressed_ply", "sog", "spz", "glb", "splat"), "splats"),
     **dict.fromkeys(("cloud_ply", "las", "points3d"), "points"),
     **dict.fromkeys(("colmap", "transforms", "cambridge", "views"), "views"),
     **dict.fromkeys(("inria", "nerfstudio", "nerfstudio_export", "gsplat_run"), "views"),
@@ -71,6 +72,7 @@ def file_format(path: str | Path) -> Format:
     by_suffix: dict[str, Format] = {
         ".sog": "sog",
         ".spz": "spz",
+        ".glb": "glb",
         ".splat": "splat",
         ".las": "las",
         ".laz": "las",
@@ -82,8 +84,8 @@ def file_format(path: str | Path) -> Format:
     if suffix == ".json":
         return _json_format(path)
     raise InputError(
-        f"{path}: unknown format {path.suffix!r} (scenes: .ply .sog .spz .splat; clouds: .ply .las .laz; "
-        "views: a COLMAP folder, a .json, or a trainer's run)"
+        f"{path}: unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .splat; clouds: .ply .las "
+        ".laz; views: a COLMAP folder, a .json, or a trainer's run)"
     )
 
 

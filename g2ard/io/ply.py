@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.clean import BLOCK, LOG_SCALE_LIMIT, Raw, cleaned, plural
-from g2ard.io.plyfiles import PlyHeader, read_element, read_header, require
+from g2ard.io.plyfiles import offset_of, read_element, read_header, require
 from g2ard.io.types import Note, Scene
 from g2ard.splats import Splats
 
@@ -26,7 +26,6 @@ _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 _NEEDED = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
 _NORMALS = ["nx", "ny", "nz"]
 _REST_OF_BANDS = (0, 3, 8, 15)
-_OFFSET = re.compile(r"g2ard offset (\S+) (\S+) (\S+)$")
 
 
 def read(path: Path) -> Scene:
@@ -45,7 +44,7 @@ def read(path: Path) -> Scene:
     (rows,) = read_element(path, header, "vertex")
     rows = np.asarray(rows)
     raw = Raw.empty(len(rows), kept)
-    raw.offset, notes = _offset(path, header), _ignored(properties, rest, stored, kept)
+    raw.offset, notes = offset_of(path, header), _ignored(properties, rest, stored, kept)
     shift = _recentre(rows) if rows.dtype["x"].itemsize == 8 else np.zeros(3)
     raw.offset = raw.offset + shift
     with np.errstate(
@@ -63,16 +62,6 @@ def _bands(path: Path, rest: list[str]) -> tuple[int, int]:
             f"{path}: expected f_rest_0 to f_rest_n with 0, 9, 24 or 45 of them, got {len(rest)}"
         )
     return len(rest) // 3, min(len(rest) // 3, 15)
-
-
-def _offset(path: Path, header: PlyHeader) -> NDArray[np.float64]:
-    for comment in header.comments:
-        if match := _OFFSET.match(comment):
-            try:
-                return np.array([float(word) for word in match.groups()])
-            except ValueError as error:
-                raise InputError(f"{path}: broken comment {comment!r}") from error
-    return np.zeros(3)
 
 
 def _ignored(properties: list[str], rest: list[str], stored: int, kept: int) -> list[Note]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 from g2ard.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["PlyHeader", "read_element", "read_header", "require"]
+__all__ = ["PlyHeader", "offset_of", "read_element", "read_header", "require"]
 
+_OFFSET = re.compile(r"g2ard offset (\S+) (\S+) (\S+)$")
 _HEADER_LIMIT = 1 << 20
 """No sane header is longer; a file without `end_header` by then is not a PLY."""
 
@@ -67,6 +70,23 @@ def _header_line(header: PlyHeader, words: list[str]) -> None:
     elif words[0] == "property":
         owner = list(header.properties)[-1]
         (header.lists if words[1] == "list" else header.properties)[owner].append(words[-1])
+
+
+def offset_of(path: Path, header: PlyHeader) -> NDArray[np.float64]:
+    """(3,) what a comment `g2ard offset X Y Z` says; zeros without one.
+
+    Raises:
+        InputError: the comment holds no numbers.
+    """
+    import numpy as np
+
+    for comment in header.comments:
+        if match := _OFFSET.match(comment):
+            try:
+                return np.array([float(word) for word in match.groups()])
+            except ValueError as error:
+                raise InputError(f"{path}: broken comment {comment!r}") from error
+    return np.zeros(3)
 
 
 def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any]]:

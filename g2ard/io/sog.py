@@ -104,7 +104,21 @@ def read(path: Path) -> Scene:
         for chunk, count in zip(chunks, counts, strict=True):
             _decode(chunk, raw, slice(start, start + count))
             start += count
+        raw.offset = _offset(chunks)
     return cleaned(path, raw, _left_out(path, len(chunks)))
+
+
+def _offset(chunks: list[_Chunk]) -> NDArray[np.float64]:
+    """What g2ard's own writer left under "g2ard"; zeros without it, or where chunks differ."""
+    import numpy as np
+
+    found = set()
+    for chunk in chunks:
+        with _meta_errors(chunk):
+            own = chunk.meta.get("g2ard", {})
+            x, y, z = own.get("offset", (0, 0, 0))
+            found.add((float(x), float(y), float(z)))
+    return np.array(found.pop() if len(found) == 1 else (0, 0, 0), np.float64)
 
 
 def _left_out(path: Path, read_count: int) -> list[Note]:
@@ -147,7 +161,7 @@ def _meta_errors(chunk: _Chunk) -> Iterator[None]:
     """Turn what a malformed meta.json causes into one line that names it."""
     try:
         yield
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{chunk.name}: malformed meta.json ({error!r})") from error

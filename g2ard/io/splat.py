@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.clean import Raw, cleaned
+from g2ard.io.packing import world_means, writable
 from g2ard.io.types import Scene
 from g2ard.splats import SH_C0, Splats
 
@@ -45,17 +46,13 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
 
     Raises:
         OutputError: see `atomic_output`.
-        InputError: the scene is empty or has a non-finite value.
+        InputError: the scene is empty, has a non-finite value, or an offset that float32 does not hold.
     """
-    if not len(splats):
-        raise InputError(f"{path}: a scene without Gaussians is not written")
-    bad = np.flatnonzero(~splats.finite_rows())
-    if len(bad):
-        raise InputError(f"{path}: not written: Gaussian {bad[0]} is not finite")
+    splats = writable(path, splats)
     weight = splats.scales.astype(np.float64).prod(1) * splats.opacities
     splats = splats.take(np.argsort(-weight, kind="stable"))
     rows = np.empty(len(splats), _ROW)
-    rows["mean"] = splats.means + splats.offset
+    rows["mean"] = world_means(path, splats, ".splat")
     rows["scale"] = splats.scales
     rows["rgba"][:, :3] = _bytes(splats.colors * 255)
     rows["rgba"][:, 3] = _bytes(splats.opacities * 255)

@@ -20,15 +20,15 @@ from g2ard.errors import InputError, MissingDependencyError
 from g2ard.io.clean import Raw, cleaned
 from g2ard.io.types import Note, Scene
 
-__all__ = ["read"]
+__all__ = ["COLOR_SCALE", "FLIPS", "MAGIC", "read", "zstandard"]
 
-_MAGIC = b"NGSP"
+MAGIC = b"NGSP"
 _COEFFICIENTS = (0, 3, 8, 15, 24)
 _HAS_EXTENSIONS = 0x2
-_COLOR_SCALE = 0.15
+COLOR_SCALE = 0.15
 """SPZ's own factor for band 0, wider than the harmonic's so that colours past [0, 1] survive."""
 
-_FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 """Sign of each harmonic of bands 1–3 when y and z change sign (PLY order: y z x | xy yz z² xz x²−y² | …)."""
 
 
@@ -42,7 +42,7 @@ def read(path: Path) -> Scene:
     data = path.read_bytes()
     if data[:2] == b"\x1f\x8b":
         data = _gunzip(path, data)
-    if data[:4] != _MAGIC or len(data) < 16:
+    if data[:4] != MAGIC or len(data) < 16:
         raise InputError(f"{path}: not an SPZ file (begins with {data[:4]!r})")
     version, count, degree, fraction_bits, flags, stream_count = struct.unpack_from("<IIBBBB", data, 4)
     if version not in (2, 3, 4):
@@ -61,9 +61,9 @@ def read(path: Path) -> Scene:
     raw.quats[:] = (_quats_xyz if version == 2 else _quats_packed)(rotations) * (1, 1, -1, -1)
     with np.errstate(divide="ignore"):
         raw.logit_opacities[:] = np.log(alphas / 255) - np.log1p(-(alphas / 255))
-    raw.sh0[:, 0] = (colors.reshape(-1, 3) / 255 - 0.5) / _COLOR_SCALE
+    raw.sh0[:, 0] = (colors.reshape(-1, 3) / 255 - 0.5) / COLOR_SCALE
     bands = sh.reshape(count, stored, 3)[:, :kept]
-    raw.shN[:] = (bands.astype(np.float32) - 128) / 128 * _FLIPS[:kept, None]
+    raw.shN[:] = (bands.astype(np.float32) - 128) / 128 * FLIPS[:kept, None]
     notes = []
     if stored > kept:
         notes.append(Note("ignored_bands", 1, "spherical harmonics past degree 3 ignored"))
@@ -110,7 +110,12 @@ def _zstd_streams(path: Path, data: bytes, stream_count: int, sizes: list[int]) 
     return streams
 
 
-def _zstd(path: Path) -> Callable[[bytes], bytes]:
+def zstandard(path: Path) -> Any:
+    """The module that packs and unpacks Zstandard frames.
+
+    Raises:
+        MissingDependencyError: there is none.
+    """
     try:
         if sys.version_info >= (3, 14):
             from compression import zstd
@@ -118,6 +123,11 @@ def _zstd(path: Path) -> Callable[[bytes], bytes]:
             from backports import zstd
     except ImportError as error:
         raise MissingDependencyError(f"{path}: SPZ version 4 needs `pip install g2ard[spz]`") from error
+    return zstd
+
+
+def _zstd(path: Path) -> Callable[[bytes], bytes]:
+    zstd = zstandard(path)
 
     def decompress(frame: bytes) -> bytes:
         try:

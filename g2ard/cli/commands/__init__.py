@@ -10,6 +10,7 @@ COMMANDS = (
     "recover",
     "adapt",
     "lift",
+    "convert",
     "poses",
     "select",
     "render",

@@ -1,6 +1,6 @@
 //! Geometry kernels of g2ard, in pure Rust.
 //!
-//! Data flows one way: points → [`lift`] → [`splats`] → [`simplify`] → [`raster`] and [`ssim`].
+//! Data flows one way: points → [`lift`] → [`splats`] → [`simplify`] → [`raster`] and [`ssim`]; [`quantize`] serves file formats.
 //! Results never depend on the number of threads: every reduction has a fixed order.
 
 pub mod backend;
@@ -8,6 +8,7 @@ pub mod control;
 pub mod error;
 pub mod lift;
 pub mod linalg;
+pub mod quantize;
 pub mod raster;
 pub mod select;
 pub mod simplify;

@@ -6,6 +6,7 @@ mod arrays;
 mod device;
 mod error;
 mod lift;
+mod quantize;
 mod raster;
 mod select;
 mod simplify;
@@ -22,6 +23,7 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     lift::register(m)?;
     simplify::register(m)?;
     spatial::register(m)?;
+    quantize::register(m)?;
     raster::register(m)?;
     select::register(m)?;
     ssim::register(m)?;

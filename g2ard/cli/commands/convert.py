@@ -1,0 +1,122 @@
+"""`g2ard convert`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from g2ard.cli.frame import Run, command
+from g2ard.cli.lists import numbers
+from g2ard.cli.options import ShDegreeOption
+
+if TYPE_CHECKING:
+    from g2ard.splats import Splats
+
+
+@command("convert", example="g2ard convert room.ply tree.spz --box -2,-2,-2,2,2,2 both.sog")
+def convert(
+    run: Run,
+    scenes: Annotated[list[Path], typer.Argument(metavar="SCENE…", help="What to read; several are merged.")],
+    output: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT", help=".ply, .compressed.ply, .sog, .spz, .glb, .splat or NAME/meta.json."
+        ),
+    ],
+    box: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z,X,Y,Z", help="Keep what lies between two corners, scene units."),
+    ] = None,
+    sphere: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z,R", help="Keep what lies within R of a point.")
+    ] = None,
+    transform: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE.json|NUMBERS",
+            help="Then move all: 4×4 numbers, row-major, of one scale, a rotation and a translation.",
+        ),
+    ] = None,
+    recentre: Annotated[
+        bool, typer.Option("--recentre", help="Drop the offset that keeps map coordinates.")
+    ] = False,
+    sh_degree: ShDegreeOption = None,
+    spz_version: Annotated[
+        int | None, typer.Option(min=2, max=4, help="Of an .spz: 4, or 3 or 2 for older programs.")
+    ] = None,
+) -> None:
+    """Write scenes in another format: merged, cropped, moved, with fewer harmonics."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from g2ard import io
+    from g2ard.cli.scenes import load_scene
+    from g2ard.io.scene_formats import check_options
+    from g2ard.transform import in_box, in_sphere, merge
+    from g2ard.transform import transform as moved
+
+    options: dict[str, Any] = {} if spz_version is None else {"version": spz_version}
+    corners = None if box is None else numbers("--box", box, 6)
+    ball = None if sphere is None else numbers("--sphere", sphere, 4)
+    matrix = None if transform is None else _matrix(transform)
+    check_options(output, options)
+    io.check_scene_output(output, run.overwrite)
+    splats = merge([load_scene(run, path) for path in scenes])
+    read = len(splats)
+    if corners is not None:
+        splats = splats.take(in_box(splats, corners[:3], corners[3:]))
+    if ball is not None:
+        splats = splats.take(in_sphere(splats, ball[:3], ball[3]))
+    _check_left(splats, read)
+    if matrix is not None:
+        splats = moved(splats, matrix)
+    if recentre:
+        splats = replace(splats, offset=np.zeros(3))
+    if sh_degree is not None:
+        splats = splats.with_sh_degree(sh_degree)
+    io.write_splats(output, splats, overwrite=run.overwrite, **options)
+    size = _size(output)
+    kept = f"{len(splats):,}" if len(splats) == read else f"{len(splats):,} of {read:,}"
+    run.say(f"{output}: {kept} Gaussians, {size / 1e6:.2f} MB, {size / len(splats):.1f} bytes each")
+    run.result({"output": str(output), "input_count": read, "output_count": len(splats), "bytes": size})
+
+
+def _check_left(splats: Splats, read: int) -> None:
+    from g2ard.errors import InputError
+
+    if not len(splats):
+        raise InputError(f"nothing is left: none of {read:,} Gaussians lies in --box and --sphere")
+
+
+def _size(output: Path) -> int:
+    """Bytes of a file, or of the folder of a meta.json."""
+    from g2ard.io.scene_formats import scene_format
+
+    if scene_format(output).function == "write_folder":
+        return sum(file.stat().st_size for file in output.parent.iterdir() if file.is_file())
+    return output.stat().st_size
+
+
+def _matrix(given: str) -> list[list[float]]:
+    """16 numbers, or a JSON file of them, flat or in rows, alone or as "transform" or "matrix"."""
+    path = Path(given)
+    if path.suffix.lower() != ".json":
+        flat = numbers("--transform", given, 16)
+        return [flat[row : row + 4] for row in (0, 4, 8, 12)]
+    from g2ard.errors import InputError
+    from g2ard.io.jsonfile import read_any_json
+
+    content = read_any_json(path)
+    if isinstance(content, dict):
+        content = content.get("transform", content.get("matrix"))
+    try:
+        rows = [content[at : at + 4] for at in (0, 4, 8, 12)] if len(content) == 16 else content
+        matrix = [[float(value) for value in row] for row in rows]
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: expected a matrix of 4×4 numbers ({error})") from error
+    if [len(row) for row in matrix] != [4] * 4:
+        raise InputError(f"{path}: expected a matrix of 4×4 numbers")
+    return matrix

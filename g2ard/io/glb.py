@@ -1,0 +1,265 @@
+"""glTF 2.0 with KHR_gaussian_splatting, as one .glb: float32 attributes of a point primitive.
+
+glTF has y up and z forward; a 3DGS .ply has y down and z forward. Both are the same turned by half a turn
+about z, which only changes signs: of x and y, of the quaternion's x and y, of harmonics of odd order m.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.io.atomic import atomic_output
+from g2ard.io.clean import Raw, cleaned
+from g2ard.io.packing import unit_quats, writable
+from g2ard.io.types import Note, Scene
+from g2ard.splats import Splats
+
+__all__ = ["EXTENSION", "read", "write"]
+
+EXTENSION = "KHR_gaussian_splatting"
+_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
+_FLOAT, _USHORT = 5126, 5123
+_TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_FLIPS = np.array([-1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1], np.float32)
+"""Sign of each harmonic of bands 1–3 after half a turn about z: (−1)^m."""
+_TURN = np.array([-1.0, -1, 1])
+
+
+def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
+    """Write a .glb with KHR_gaussian_splatting; equal scenes give equal bytes.
+
+    SCALE and OPACITY are linear, ROTATION is x y z w. COLOR_0 is for viewers that know points alone: the base
+    colour clipped to [0, 1], decoded from sRGB as glTF wants it, and α. `offset` is the node's translation.
+
+    Raises:
+        OutputError: see `atomic_output`.
+        InputError: the scene is empty, has a non-finite value, or more than a .glb's 4 GiB hold.
+    """
+    splats = writable(path, splats)
+    attributes = _attributes(splats)
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    blobs, start = [], 0
+    for name, values in attributes.items():
+        blob = values.tobytes()
+        blob += b"\0" * (-len(blob) % 4)
+        accessor = {
+            "bufferView": len(views),
+            "componentType": _USHORT if values.dtype == np.uint16 else _FLOAT,
+            "count": len(splats),
+            "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]],
+        }
+        if values.dtype == np.uint16:
+            accessor["normalized"] = True
+        if name == "POSITION":
+            accessor |= {end: getattr(values, end)(axis=0).tolist() for end in ("min", "max")}
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": values.nbytes, "target": 34962})
+        accessors.append(accessor)
+        blobs.append(blob)
+        start += len(blob)
+    document = _document(splats, list(attributes), views, accessors, start)
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    total = 12 + 8 + len(text) + 8 + start
+    if total >= 1 << 32:
+        raise InputError(f"{path}: not written: {total:,} bytes are more than a .glb holds")
+    with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
+        file.write(struct.pack("<III", _MAGIC, 2, total))
+        file.write(struct.pack("<II", len(text), _JSON) + text)
+        file.write(struct.pack("<II", start, _BIN))
+        file.writelines(blobs)
+
+
+def _attributes(splats: Splats) -> dict[str, NDArray[Any]]:
+    """The primitive's attributes, (N, C) each."""
+    linear = np.clip(splats.colors.astype(np.float64), 0, 1)
+    linear = np.where(linear <= 0.04045, linear / 12.92, ((linear + 0.055) / 1.055) ** 2.4)
+    alphas = splats.opacities[:, None]
+    quats = unit_quats(splats.quats)
+    turned = quats[:, [1, 2, 3, 0]] * (*_TURN, 1)
+    out: dict[str, NDArray[Any]] = {
+        "POSITION": (splats.means * _TURN).astype("<f4"),
+        "COLOR_0": np.rint(np.column_stack([linear, alphas]) * 65535).astype("<u2"),
+        f"{EXTENSION}:ROTATION": turned.astype("<f4"),
+        f"{EXTENSION}:SCALE": splats.scales.astype("<f4"),
+        f"{EXTENSION}:OPACITY": alphas.astype("<f4"),
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": splats.sh0[:, 0].astype("<f4"),
+    }
+    for name, k in _harmonics(splats.sh_degree):
+        out[name] = (splats.shN[:, k] * _FLIPS[k]).astype("<f4")
+    return out
+
+
+def _harmonics(degree: int) -> list[tuple[str, int]]:
+    """The names of the coefficients past band 0, and where they are in `shN`."""
+    return [
+        (f"{EXTENSION}:SH_DEGREE_{band}_COEF_{c}", band * band - 1 + c)
+        for band in range(1, degree + 1)
+        for c in range(2 * band + 1)
+    ]
+
+
+def _document(
+    splats: Splats, names: list[str], views: list[Any], accessors: list[Any], size: int
+) -> dict[str, Any]:
+    from g2ard import __version__
+
+    node: dict[str, Any] = {"mesh": 0}
+    if splats.offset.any():
+        node["translation"] = (splats.offset * _TURN).tolist()
+    splatting = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    primitive = {
+        "mode": 0,
+        "attributes": {name: i for i, name in enumerate(names)},
+        "extensions": {EXTENSION: splatting},
+    }
+    return {
+        "asset": {"version": "2.0", "generator": f"g2ard {__version__}"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": size}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+
+
+def read(path: Path) -> Scene:
+    """Read the one splat primitive of a .glb, its data in the file; its node's translation gives `offset`.
+
+    Raises:
+        InputError: not a .glb, no splat primitive or several, packed, turned or scaled by a node, or broken.
+    """
+    document, binary = _chunks(path)
+    try:
+        return _scene(path, document, binary)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: malformed glTF ({error!r})") from error
+
+
+def _chunks(path: Path) -> tuple[dict[str, Any], bytes]:
+    data = path.read_bytes()
+    if len(data) < 20 or struct.unpack_from("<II", data) != (_MAGIC, 2):
+        raise InputError(f"{path}: not a .glb of glTF 2.0 (begins with {data[:4]!r})")
+    found: dict[int, bytes] = {}
+    at = 12
+    while at + 8 <= len(data):
+        size, kind = struct.unpack_from("<II", data, at)
+        if at + 8 + size > len(data):
+            raise InputError(f"{path}: truncated: a chunk of {size:,} bytes is cut off")
+        found.setdefault(kind, data[at + 8 : at + 8 + size])
+        at += 8 + size
+    try:
+        document = json.loads(found[_JSON])
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: its JSON is absent or broken") from error
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: its JSON is no object")
+    return document, found.get(_BIN, b"")
+
+
+def _scene(path: Path, document: dict[str, Any], binary: bytes) -> Scene:
+    meshes = document.get("meshes", [])
+    splatting = [
+        (at, p) for at, mesh in enumerate(meshes) for p in mesh["primitives"] if EXTENSION in _extensions(p)
+    ]
+    if len(splatting) != 1:
+        raise InputError(f"{path}: holds {len(splatting)} primitives of {EXTENSION}; one is read")
+    mesh, primitive = splatting[0]
+    if packed := sorted(_extensions(_extensions(primitive)[EXTENSION])):
+        raise InputError(f"{path}: {packed[0]} is not read")
+    if primitive.get("extensions", {})[EXTENSION].get("kernel") != "ellipse":
+        raise InputError(f"{path}: kernels other than 'ellipse' are not read")
+    names: dict[str, int] = primitive["attributes"]
+
+    def values(name: str, width: int) -> NDArray[np.float32]:
+        if name not in names:
+            raise InputError(f"{path}: its splats lack the attribute {name!r}")
+        return _accessor(path, document, binary, names[name], name, width)
+
+    degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names)
+    means = values("POSITION", 3)
+    raw = Raw.empty(len(means), (degree + 1) ** 2 - 1)
+    raw.means[:] = means * _TURN
+    raw.quats[:] = values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]] * (1, *_TURN)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a negative scale becomes NaN: the row is dropped
+        raw.log_scales[:] = np.log(values(f"{EXTENSION}:SCALE", 3).astype(np.float64))
+        alphas = values(f"{EXTENSION}:OPACITY", 1)[:, 0].astype(np.float64)
+        raw.logit_opacities[:] = np.log(alphas) - np.log1p(-alphas)
+    raw.sh0[:, 0] = values(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3)
+    for name, k in _harmonics(degree):
+        raw.shN[:, k] = values(name, 3) * _FLIPS[k]
+    raw.offset = _translation(path, document, mesh)
+    others = sum(len(m["primitives"]) for m in meshes) - 1
+    notes = [Note("ignored_meshes", others, f"{others} other primitive(s) left out")] if others else []
+    return cleaned(path, raw, notes)
+
+
+def _extensions(of: dict[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = of.get("extensions", {})
+    return found
+
+
+def _accessor(
+    path: Path, document: dict[str, Any], binary: bytes, index: int, name: str, width: int
+) -> NDArray[np.float32]:
+    """(count, width) of an accessor; normalised integers become fractions."""
+    accessor = document["accessors"][index]
+    kind = accessor["componentType"]
+    if kind not in _DTYPES or _TYPES.get(accessor["type"]) != width or "sparse" in accessor:
+        raise InputError(f"{path}: attribute {name!r} is of a form that is not read")
+    view = document["bufferViews"][accessor["bufferView"]]
+    if view["buffer"] != 0 or "uri" in document["buffers"][0]:
+        raise InputError(f"{path}: attribute {name!r} lies outside the file")
+    dtype, count = np.dtype(_DTYPES[kind]), int(accessor["count"])
+    step = int(view.get("byteStride", width * dtype.itemsize))
+    start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
+    if start + step * (count - 1) + width * dtype.itemsize > len(binary) or min(start, count) < 0:
+        raise InputError(f"{path}: truncated: attribute {name!r} ends past the file")
+    rows = np.ndarray((count, width), dtype, binary, start, (step, dtype.itemsize))
+    if not accessor.get("normalized"):
+        return rows.astype(np.float32)
+    top = np.iinfo(dtype).max
+    return np.maximum(rows.astype(np.float32) / np.float32(top), np.float32(-1))
+
+
+def _translation(path: Path, document: dict[str, Any], mesh: int) -> NDArray[np.float64]:
+    """(3,) where the mesh's one node puts it.
+
+    Raises:
+        InputError: several nodes, or one that does more than translate.
+    """
+    nodes = document.get("nodes", [])
+    at = [i for i, node in enumerate(nodes) if node.get("mesh") == mesh]
+    if len(at) > 1:
+        raise InputError(f"{path}: {len(at)} nodes show its splats; one is read")
+    total = np.zeros(3)
+    while at:
+        node = nodes[at[0]]
+        moved = np.array(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
+        matrix = np.array(node.get("matrix", np.eye(4).ravel()), np.float64).reshape(4, 4).T
+        turned = tuple(node.get("rotation", (0, 0, 0, 1))) != (0, 0, 0, 1)
+        if turned or tuple(node.get("scale", (1, 1, 1))) != (1, 1, 1) or (matrix[:3, :3] != np.eye(3)).any():
+            raise InputError(f"{path}: a node turns or scales its splats, which is not read")
+        total += moved + matrix[:3, 3]
+        at = [i for i, parent in enumerate(nodes) if at[0] in parent.get("children", ())]
+        if len(at) > 1:
+            raise InputError(f"{path}: a node has {len(at)} parents")
+    return total * _TURN

@@ -1,0 +1,71 @@
+"""Which writer a scene's path names: by its suffix, in any case, or by meta.json for a SOG folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from g2ard.errors import OutputError
+
+__all__ = ["FORMATS", "SceneFormat", "check_options", "scene_format"]
+
+
+class SceneFormat(NamedTuple):
+    """A format that scenes are written in.
+
+    Args:
+        suffix: that names it.
+        module: in `g2ard.io`, with `write` or what `function` says.
+        function: `fn(path, splats, *, overwrite, **options)`.
+        options: what it takes beside.
+    """
+
+    suffix: str
+    module: str
+    function: str = "write"
+    options: tuple[str, ...] = ()
+
+
+FORMATS = {
+    "compressed.ply": SceneFormat(".compressed.ply", "compressed_ply_write"),
+    "ply": SceneFormat(".ply", "ply", options=("normals",)),
+    "sog": SceneFormat(".sog", "sog_write"),
+    "spz": SceneFormat(".spz", "spz_write", options=("version",)),
+    "glb": SceneFormat(".glb", "glb"),
+    "splat": SceneFormat(".splat", "splat"),
+}
+"""By name, the longer suffixes first."""
+
+_FOLDER = SceneFormat("meta.json", "sog_write", "write_folder")
+
+
+def scene_format(path: str | Path) -> SceneFormat:
+    """The format that a path to write names.
+
+    Raises:
+        OutputError: it names none.
+
+    >>> scene_format("a.COMPRESSED.PLY").module, scene_format("room/meta.json").function
+    ('compressed_ply_write', 'write_folder')
+    """
+    name = Path(path).name.lower()
+    if name == "meta.json":
+        return _FOLDER
+    for found in FORMATS.values():
+        if name.endswith(found.suffix):
+            return found
+    known = ", ".join(f.suffix for f in FORMATS.values())
+    raise OutputError(f"{path}: scenes are written as {known}, or as a SOG folder (NAME/meta.json)")
+
+
+def check_options(path: str | Path, options: dict[str, object]) -> SceneFormat:
+    """`scene_format`, if it takes these options.
+
+    Raises:
+        OutputError: it does not.
+    """
+    found = scene_format(path)
+    for name in options:
+        if name not in found.options:
+            raise OutputError(f"{path}: {found.suffix} has no option {name!r}")
+    return found

@@ -1,0 +1,9 @@
+//! Quantisers of file formats: codebooks of numbers, palettes of vectors.
+
+mod cells;
+mod codebook;
+mod near;
+mod palette;
+
+pub use codebook::codebook;
+pub use palette::{Palette, palette};

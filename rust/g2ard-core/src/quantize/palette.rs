@@ -1,0 +1,260 @@
+//! A palette of vectors by k-means: rows split top down, then Lloyd's steps among neighbouring entries.
+
+use rayon::prelude::*;
+
+use super::{cells, near};
+use crate::{Control, Error, Result};
+
+/// Steps between looks at which entries are neighbours.
+const RENEWED: usize = 3;
+
+/// Which entry stands for each row.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Palette {
+    /// Entries × dims.
+    pub entries: Vec<f32>,
+    /// (N,) rows of `entries`.
+    pub labels: Vec<u32>,
+}
+
+/// N rows of `dims` values and what each of them counts.
+pub struct Rows<'a> {
+    pub dims: usize,
+    values: &'a [f32],
+    weights: Option<&'a [f32]>,
+}
+
+impl Rows<'_> {
+    pub fn len(&self) -> usize {
+        self.values.len() / self.dims
+    }
+
+    pub fn row(&self, row: u32) -> &[f32] {
+        &self.values[row as usize * self.dims..][..self.dims]
+    }
+
+    pub fn weight(&self, row: u32) -> f64 {
+        self.weights.map_or(1.0, |w| f64::from(w[row as usize]))
+    }
+
+    pub fn distance(&self, row: u32, to: &[f32]) -> f32 {
+        distance(self.row(row), to)
+    }
+
+    /// Σ w row / Σ w, in the order given; the plain mean where nothing has weight.
+    pub fn mean(&self, rows: &[u32]) -> Vec<f32> {
+        let total: f64 = rows.iter().map(|&r| self.weight(r)).sum();
+        let weighted = total > 0.0;
+        let mut sums = vec![0.0_f64; self.dims];
+        for &row in rows {
+            let weight = if weighted { self.weight(row) } else { 1.0 };
+            let values = sums.iter_mut().zip(self.row(row));
+            values.for_each(|(sum, &v)| *sum += weight * f64::from(v));
+        }
+        let total = if weighted { total } else { rows.len() as f64 };
+        sums.into_iter().map(|sum| (sum / total) as f32).collect()
+    }
+}
+
+/// |a − b|², summed in eight lanes: the compiler may use vectors, the result is the same everywhere.
+pub fn distance(a: &[f32], b: &[f32]) -> f32 {
+    let ((a, a_left), (b, b_left)) = (a.as_chunks::<8>(), b.as_chunks::<8>());
+    let mut lanes = [0.0_f32; 8];
+    for (a, b) in a.iter().zip(b) {
+        for lane in 0..8 {
+            let d = a[lane] - b[lane];
+            lanes[lane] += d * d;
+        }
+    }
+    for (lane, (a, b)) in lanes.iter_mut().zip(a_left.iter().zip(b_left)) {
+        *lane += (a - b) * (a - b);
+    }
+    let [p, q, r, s] = [0, 1, 2, 3].map(|i| lanes[i] + lanes[i + 4]);
+    (p + r) + (q + s)
+}
+
+/// At most `count` entries with a small Σ w |row − entry|², and each row's entry.
+///
+/// Cells with the most error are split until there are `count`; then `steps` of Lloyd's: rows move to the
+/// nearest among their entry and its neighbours, entries to the mean of their rows. Fewer entries come back
+/// only where there are fewer distinct rows. Sums are in the order of the rows: the threads decide nothing.
+///
+/// # Errors
+///
+/// No rows, rows of another length, values or weights that are not finite, a negative weight, or `count` of
+/// 0 or over 65,536.
+pub fn palette(
+    values: &[f32],
+    dims: usize,
+    weights: Option<&[f32]>,
+    count: usize,
+    steps: usize,
+    control: &Control,
+) -> Result<Palette> {
+    if dims == 0 || values.is_empty() || !values.len().is_multiple_of(dims) {
+        return Err(Error::invalid("points", "rows of one length", values.len()));
+    }
+    if count == 0 || count > 1 << 16 {
+        return Err(Error::invalid("count", "1 to 65536", count));
+    }
+    let points = Rows {
+        dims,
+        values,
+        weights,
+    };
+    check_weights(weights, points.len())?;
+    check_finite("points", values, dims)?;
+    control.begin(steps as u64 + 1);
+    let (mut entries, mut labels) = cells::split(&points, count.min(points.len()));
+    control.advance(1);
+    let mut around = Vec::new();
+    for step in 0..steps {
+        control.check()?;
+        if step % RENEWED == 0 {
+            around = near::neighbors(&entries, dims);
+        }
+        let moved = assign(&points, &entries, &around, &mut labels);
+        update(&points, &mut entries, &labels);
+        control.advance(1);
+        if moved == 0 {
+            break;
+        }
+    }
+    Ok(Palette { entries, labels })
+}
+
+/// Rows go to the nearest of their entry and its neighbours; how many moved.
+fn assign(points: &Rows, entries: &[f32], around: &[Vec<u32>], labels: &mut [u32]) -> usize {
+    let at = |label: u32| &entries[label as usize * points.dims..][..points.dims];
+    let move_one = |(row, label): (usize, &mut u32)| {
+        let before = *label;
+        let mut least = points.distance(row as u32, at(before));
+        for &other in &around[before as usize] {
+            let far = points.distance(row as u32, at(other));
+            if far < least {
+                (least, *label) = (far, other);
+            }
+        }
+        usize::from(*label != before)
+    };
+    labels.par_iter_mut().enumerate().map(move_one).sum()
+}
+
+/// Entries go to the means of their rows; those without any stay.
+fn update(points: &Rows, entries: &mut [f32], labels: &[u32]) {
+    let mut ends = vec![0_usize; entries.len() / points.dims + 1];
+    labels
+        .iter()
+        .for_each(|&label| ends[label as usize + 1] += 1);
+    (1..ends.len()).for_each(|i| ends[i] += ends[i - 1]);
+    let (mut members, mut next) = (vec![0_u32; labels.len()], ends.clone());
+    for (row, &label) in labels.iter().enumerate() {
+        members[next[label as usize]] = row as u32;
+        next[label as usize] += 1;
+    }
+    let move_one = |(label, entry): (usize, &mut [f32])| {
+        let rows = &members[ends[label]..ends[label + 1]];
+        if !rows.is_empty() {
+            entry.copy_from_slice(&points.mean(rows));
+        }
+    };
+    entries
+        .par_chunks_mut(points.dims)
+        .enumerate()
+        .for_each(move_one);
+}
+
+pub fn check_weights(weights: Option<&[f32]>, count: usize) -> Result<()> {
+    let Some(weights) = weights else {
+        return Ok(());
+    };
+    if weights.len() != count {
+        let wanted = format!("one for each of {count} rows");
+        return Err(Error::invalid("weights", wanted, weights.len()));
+    }
+    match weights.iter().position(|w| !(w.is_finite() && *w >= 0.0)) {
+        Some(row) => {
+            let got = format!("{} in row {row}", weights[row]);
+            Err(Error::invalid("weights", "finite and not negative", got))
+        }
+        None => Ok(()),
+    }
+}
+
+pub fn check_finite(name: &'static str, values: &[f32], dims: usize) -> Result<()> {
+    match values.iter().position(|v| !v.is_finite()) {
+        Some(at) => {
+            let got = format!("{} in row {}", values[at], at / dims);
+            Err(Error::invalid(name, "finite values", got))
+        }
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn noise(count: usize, seed: u32) -> Vec<f32> {
+        let mut state = seed;
+        let mut draw = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 8) as f32 / (1 << 24) as f32
+        };
+        (0..count).map(|_| draw() + draw() + draw() - 1.5).collect()
+    }
+
+    fn made(values: &[f32], count: usize, steps: usize) -> Palette {
+        palette(values, 9, None, count, steps, &Control::default()).unwrap()
+    }
+
+    #[test]
+    fn few_entries_are_where_lloyd_ends() {
+        let values = noise(9 * 500, 1);
+        let found = made(&values, 12, 400);
+        for (row, &label) in found.labels.iter().enumerate() {
+            let far = |entry: usize| -> f64 {
+                let pair = values[row * 9..][..9]
+                    .iter()
+                    .zip(&found.entries[entry * 9..][..9]);
+                pair.map(|(a, b)| f64::from(a - b).powi(2)).sum()
+            };
+            let least = (0..12).map(far).fold(f64::INFINITY, f64::min);
+            assert!(far(label as usize) <= least * (1.0 + 1e-5));
+        }
+        for entry in 0..12_u32 {
+            let rows: Vec<usize> = (0..500).filter(|&r| found.labels[r] == entry).collect();
+            for d in 0..9 {
+                let sum: f64 = rows.iter().map(|r| f64::from(values[r * 9 + d])).sum();
+                let mean = sum / rows.len() as f64;
+                assert!((mean - f64::from(found.entries[entry as usize * 9 + d])).abs() < 1e-6);
+            }
+        }
+    }
+
+    #[test]
+    fn threads_decide_nothing_and_equal_rows_need_no_entries() {
+        let values = noise(9 * 4000, 2);
+        let with = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+            pool.unwrap().install(|| made(&values, 300, 5))
+        };
+        let one = with(1);
+        assert_eq!(one.entries.len(), 300 * 9);
+        assert_eq!(one, with(2));
+        assert_eq!(one, with(8));
+        assert_eq!(made(&[0.5; 90], 4, 3).entries.len(), 9);
+    }
+
+    #[test]
+    fn every_row_has_its_entry_where_there_are_as_many() {
+        let values = noise(9 * 50, 3);
+        let found = made(&values, 50, 1);
+        for (row, &label) in found.labels.iter().enumerate() {
+            assert_eq!(
+                values[row * 9..][..9],
+                found.entries[label as usize * 9..][..9]
+            );
+        }
+    }
+}

@@ -1,0 +1,70 @@
+"""Other people's readers, for tests that hold our files against them.
+
+Looked for in $G2ARD_NODE_MODULES, where `npm i node@22 @playcanvas/splat-transform@3.7 @adobe/spz@0.2.3
+gltf-validator` has been run; tests that need one skip where it is absent.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+_ADOBE = """
+import fs from 'node:fs';
+const create = (await import('file://' + process.argv[2])).default;
+const spz = await create();
+const data = new Uint8Array(fs.readFileSync(process.argv[3]));
+const cloud = spz.loadSpzFromBuffer(data, { to: spz.CoordinateSystem.RDF });
+const keys = ['positions', 'scales', 'rotations', 'alphas', 'colors', 'sh'];
+console.log(JSON.stringify(Object.fromEntries(keys.map(key => [key, Array.from(cloud[key])]))));
+"""
+
+_VALIDATOR = """
+import fs from 'node:fs';
+import { createRequire } from 'node:module';
+const validator = createRequire(process.argv[2] + '/')('gltf-validator');
+const report = await validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[3])));
+console.log(JSON.stringify(report));
+"""
+
+
+def _package(*parts: str) -> Path:
+    root = Path(os.environ.get("G2ARD_NODE_MODULES", "node_modules")).absolute()
+    if not root.joinpath(*parts).exists():
+        pytest.skip(f"no {'/'.join(parts)} (set G2ARD_NODE_MODULES)")
+    return root.joinpath(*parts)
+
+
+def _node() -> str:
+    root = Path(os.environ.get("G2ARD_NODE_MODULES", "node_modules")).absolute()
+    return str(root / ".bin" / "node") if (root / ".bin" / "node").exists() else "node"
+
+
+def _run(*arguments: str | Path) -> str:
+    found = subprocess.run([_node(), *map(str, arguments)], capture_output=True, text=True)
+    assert found.returncode == 0, found.stdout + found.stderr
+    return found.stdout
+
+
+def splat_transform(*arguments: str | Path) -> None:
+    """Run splat-transform; fails with what it said."""
+    _run(_package("@playcanvas", "splat-transform", "bin", "cli.mjs"), "-q", "-w", *arguments)
+
+
+def adobe_spz(path: Path) -> dict[str, np.ndarray]:
+    """What Adobe's and Niantic's own library reads, in the axes of a .ply: flat arrays, rotations x y z w."""
+    module = _package("@adobe", "spz", "dist", "spz.js")
+    out = _run("--input-type=module", "-e", _ADOBE, "-", module, path)
+    return {key: np.array(values) for key, values in json.loads(out.splitlines()[-1]).items()}
+
+
+def gltf_report(path: Path) -> dict[str, Any]:
+    """What Khronos' glTF validator says of a file."""
+    modules = _package("gltf-validator").parent
+    return json.loads(_run("--input-type=module", "-e", _VALIDATOR, "-", modules, path))

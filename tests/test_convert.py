@@ -1,0 +1,137 @@
+"""Moving, cropping and merging scenes, and the command that does it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import around, checkered_ball
+
+from g2ard.errors import InputError
+from g2ard.io import read_splats, write_splats
+from g2ard.render import render
+from g2ard.splats import Splats
+from g2ard.transform import in_box, in_sphere, merge, rotate_harmonics, similarity, transform
+
+
+def turn(seed: int = 0) -> np.ndarray:
+    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    return q * np.sign(np.linalg.det(q))
+
+
+def matrix(scale: float, rotation: np.ndarray, shift: list[float]) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = scale * rotation, shift
+    return out
+
+
+def directional(degree: int = 3) -> Splats:
+    ball = checkered_ball(800)
+    rng = np.random.default_rng(5)
+    return replace(ball, shN=rng.normal(0, 0.2, (800, (degree + 1) ** 2 - 1, 3)).astype(np.float32))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_moved_scene_looks_the_same_from_moved_cameras(degree: int) -> None:
+    splats, views = directional(degree), around(4)
+    move = matrix(2.5, turn(), [3, -7, 2])
+    there = transform(splats, move)
+    viewmats = views.viewmats @ np.linalg.inv(move)
+    viewmats[:, :3] *= 2.5  # rigid: distances grow, the image does not
+    after = replace(views, viewmats=viewmats)
+    for i in range(4):
+        a, b = render(splats, views, i), render(there, after, i)
+        assert np.abs(a.image - b.image).max() < 2e-3
+    wrong = replace(there, shN=splats.shN)
+    if degree:  # harmonics that stay behind show
+        assert np.abs(render(wrong, after, 0).image - render(splats, views, 0).image).max() > 0.05
+
+
+def test_a_full_turn_in_three_steps_is_none() -> None:
+    splats, third = directional(), turn(1)
+    a, b = turn(2), turn(3)
+    rest = np.linalg.inv(third @ b @ a)
+    shN = splats.shN
+    for step in (a, b, third, rest):
+        shN = rotate_harmonics(shN, step)
+    np.testing.assert_allclose(shN, splats.shN, atol=3e-6)
+
+
+def test_offsets_move_along() -> None:
+    splats = replace(directional(), offset=np.array([443_000.0, 5_411_000, 100]))
+    moved = transform(splats, matrix(2, turn(), [1, 2, 3]))
+    world = splats.means.astype(float) + splats.offset
+    np.testing.assert_allclose(
+        moved.means + moved.offset, 2 * world @ turn().T + [1, 2, 3], rtol=0, atol=1e-5
+    )
+    far = transform(directional(), matrix(1, np.eye(3), [443_000, 0, 0]))
+    np.testing.assert_array_equal(far.offset, [443_000, 0, 0])
+    np.testing.assert_array_equal(far.means, directional().means)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (np.eye(3), "4×4"),
+        (np.diag([1, 1, -1, 1]), "mirrors"),
+        (np.diag([1, 2, 1, 1]), "differently along"),
+        (np.diag([0, 0, 0, 1]), "flattens"),
+    ],
+)
+def test_no_similarity(given: np.ndarray, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        similarity(given)
+
+
+def test_crops_are_in_world_coordinates() -> None:
+    splats = replace(directional(), offset=np.array([10.0, 0, 0]))
+    x = splats.means[:, 0] + 10
+    np.testing.assert_array_equal(in_box(splats, [10, -9, -9], [11, 9, 9]), (x >= 10) & (x <= 11))
+    near = np.linalg.norm(splats.means - [0, 0, 1], axis=1) <= 0.5
+    np.testing.assert_array_equal(in_sphere(splats, [10, 0, 1], 0.5), near)
+    with pytest.raises(InputError, match="holds nothing"):
+        in_box(splats, [1, 0, 0], [0, 1, 1])
+
+
+# ── the command ──────────────────────────────────────────────────────────────────────────────────────
+
+
+CommandLine = Callable[..., tuple[int, str, str]]
+
+
+def test_convert_merges_crops_moves(tmp_path: Path, command_line: CommandLine) -> None:
+    a, b = directional(1), transform(directional(3), matrix(1, np.eye(3), [5, 0, 0]))
+    write_splats(tmp_path / "a.ply", a)
+    write_splats(tmp_path / "b.glb", b)
+    (tmp_path / "m.json").write_text(json.dumps({"transform": matrix(1, turn(), [0, 0, 1]).tolist()}))
+    out = tmp_path / "c.ply"
+    words = ["a.ply", "b.glb", "c.ply", "--box", "-9,-9,0,9,9,9", "--transform", "m.json"]
+    code, _, told = command_line("convert", *words, cwd=tmp_path)
+    assert code == 0, told
+    whole = merge([a, b])
+    expected = transform(whole.take(whole.means[:, 2] >= 0), matrix(1, turn(), [0, 0, 1]))
+    found = read_splats(out)
+    np.testing.assert_allclose(found.means, expected.means, atol=1e-6)
+    np.testing.assert_allclose(found.shN, expected.shN, atol=1e-5)
+
+
+def test_convert_says_what_is_wrong(tmp_path: Path, command_line: CommandLine) -> None:
+    write_splats(tmp_path / "a.ply", directional())
+    for words, code, message in (
+        (("b.ksplat",), 1, "scenes are written as"),
+        (("b.ply", "--spz-version", "3"), 1, "no option 'version'"),
+        (("b.ply", "--box", "1,2"), 2, "expected 6 numbers"),
+        (("b.ply", "--box", "8,8,8,9,9,9"), 1, "nothing is left"),
+        (("b.ply", "--transform", "1 2 3"), 2, "expected 16 numbers"),
+        (("a.ply", "-w"), 2, "is an input"),
+    ):
+        found, _, told = command_line("convert", "a.ply", *words, cwd=tmp_path)
+        assert (found, message in told, told.count("\n")) == (code, True, 1), told
+        assert not (tmp_path / "b.ply").exists()
+    words = ("a.ply", "b.spz", "--spz-version", "2", "--sh-degree", "1")
+    assert command_line("convert", *words, cwd=tmp_path)[0] == 0
+    assert read_splats(tmp_path / "b.spz").sh_degree == 1
