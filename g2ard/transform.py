@@ -169,7 +169,8 @@ def in_box(splats: Splats, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]
     if not (low <= high).all():
         raise InputError(f"box: from {low.tolist()} to {high.tolist()} holds nothing")
     world = splats.means.astype(np.float64) + splats.offset
-    return ((world >= low) & (world <= high)).all(axis=1)
+    inside: NDArray[np.bool_] = np.all((world >= low) & (world <= high), axis=1)
+    return inside
 
 
 def in_sphere(splats: Splats, center: ArrayLike, radius: float) -> NDArray[np.bool_]:

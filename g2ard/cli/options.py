@@ -18,6 +18,7 @@ __all__ = [
     "Count",
     "CountOption",
     "CropOption",
+    "FormatOption",
     "LookOption",
     "OutputOption",
     "PaperOption",
@@ -209,6 +210,10 @@ SplitOption = Annotated[
 ShDegreeOption = Annotated[
     int | None,
     typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own if not given."),
+]
+FormatOption = Annotated[
+    Literal["ply", "sog", "spz", "glb", "compressed.ply", "splat"],
+    typer.Option("--format", help="Of the scene's file in RUN."),
 ]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on with a stopped run.")]
 SizeOption = Annotated[

@@ -16,6 +16,7 @@ from g2ard.cli.options import (
     Count,
     CountOption,
     CropOption,
+    FormatOption,
     Method,
     PolicyOption,
     PresetOption,
@@ -117,6 +118,7 @@ def distill(
             "--keep", help="Keep the simplified scene too, in RUN/simplified: it takes as many bytes again."
         ),
     ] = False,
+    format: FormatOption = "ply",
     resume: ResumeOption = False,
     crop: CropOption = None,
     size: SizeOption = None,
@@ -132,7 +134,8 @@ def distill(
     if is_made(str(held_out)):
         raise typer.BadParameter("--held-out: a file of views; those that are made hold out every 8th anyway")
     given = views is not None and not is_made(views)
-    run.spare_inputs(output / "scene.ply", output / _KEPT, *([output / "views.json"] if not given else []))
+    place = output / f"scene.{format}"
+    run.spare_inputs(place, output / _KEPT, *([output / "views.json"] if not given else []))
     import shutil
     import time
 
@@ -222,7 +225,7 @@ def distill(
             told=told(report),
             crops=crop or [],
         )
-        _write(run, output, result, unseen, colour, report)
+        _write(run, place, result, unseen, colour, report)
         _keep(output / _KEPT, result.simplified if keep else None)
     if looks.pool is not None:
         write_views(output / "views.json", looks.pool.cameras, splits=looks.pool.splits, overwrite=True)
@@ -232,7 +235,7 @@ def distill(
         run.say(line)
     say_views(run, report["views"], k is not None)
     run.say(
-        f"scene: {output / 'scene.ply'}\npicture: {output / 'preview.png'}\n"
+        f"scene: {place} ({place.stat().st_size / 1e6:.2f} MB)\npicture: {output / 'preview.png'}\n"
         f"report: {output / 'report.html'}, {output / 'report.json'}"
     )
     run.result(report)
@@ -312,8 +315,9 @@ def _unseen(result: Distilled, count: int) -> float | None:
 
 
 def _write(
-    run: Run, output: Path, result: Distilled, unseen: Targets, colour: Colour, report: dict[str, Any]
+    run: Run, place: Path, result: Distilled, unseen: Targets, colour: Colour, report: dict[str, Any]
 ) -> None:
+    """The picture, the scene and, last, what is said of both."""
     import json
 
     from g2ard.io import write_splats
@@ -321,10 +325,11 @@ def _write(
     from g2ard.preview import preview
 
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
-    preview(output / "preview.png", unseen, scenes, colour)
-    with atomic_output(output / "report.json", overwrite=True) as temporary:
+    preview(place.parent / "preview.png", unseen, scenes, colour)
+    write_splats(place, result.splats, overwrite=True)
+    report["bytes"]["file"] = place.stat().st_size
+    with atomic_output(place.parent / "report.json", overwrite=True) as temporary:
         temporary.write_text(json.dumps({**report, "config": run.config}, indent=2, default=str) + "\n")
-    write_splats(output / "scene.ply", result.splats, overwrite=True)
 
 
 def _keep(path: Path, scene: Splats | None) -> None:
