@@ -11,6 +11,7 @@ COMMANDS = (
     "adapt",
     "lift",
     "convert",
+    "clean",
     "poses",
     "select",
     "render",

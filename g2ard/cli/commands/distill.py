@@ -119,6 +119,9 @@ def distill(
         ),
     ] = False,
     format: FormatOption = "ply",
+    clean: Annotated[
+        bool, typer.Option("--clean", help="First take out what no picture needs, as `g2ard clean` does.")
+    ] = False,
     resume: ResumeOption = False,
     crop: CropOption = None,
     size: SizeOption = None,
@@ -163,6 +166,7 @@ def distill(
     check_stopped(run, output / _WORK, resume)
     lifting = changed(LiftConfig(), "lift", values)
     prior = _lift(run, scene, lifting) if lifted else load_scene(run, scene)
+    prior = _cleaned(run, prior) if clean else prior
     budget = budget_of(scene, count, ratio, len(prior))
     looks = views_of(run, scene, prior, views, held_out, size, up, teach=not lifted and photos is not True)
     train, test = looks.train.cameras, looks.test
@@ -269,6 +273,13 @@ def _lift(run: Run, path: Path, config: LiftConfig) -> Splats:
     for note in cloud.notes:
         run.say(f"{path}: {note}")
     return lift(cloud.points.positions, cloud.points.colors, **vars(config), progress=run.progress)
+
+
+def _cleaned(run: Run, prior: Splats) -> Splats:
+    from g2ard.clean import KINDS
+    from g2ard.cli.cleaning import found_clutter
+
+    return prior.take(found_clutter(run, prior, KINDS)[0].keep)
 
 
 def _apart_targets(
