@@ -92,7 +92,13 @@ def _as_typed(value: Any) -> Any:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-_RIVALS = (("count", "ratio"), ("steps", "time_limit"), ("views", "no_views"))
+_RIVALS = (
+    ("count", "ratio"),
+    ("count", "fit"),
+    ("ratio", "fit"),
+    ("steps", "time_limit"),
+    ("views", "no_views"),
+)
 """Options that exclude each other."""
 
 

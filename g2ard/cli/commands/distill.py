@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.cli.fit import FitOption, MinPsnrOption, MinSsimOption, asked_budget, check_budget, shrunk_to_fit
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
@@ -27,10 +28,8 @@ from g2ard.cli.options import (
     TimeLimitOption,
     UpOption,
     ViewsOrMadeOption,
-    budget_of,
     can_judge,
     is_made,
-    one_budget,
     one_horizon,
     views_count,
 )
@@ -67,6 +66,9 @@ def distill(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN", help="Folder of the run.")],
     count: CountOption = None,
     ratio: RatioOption = None,
+    fit: FitOption = None,
+    min_psnr: MinPsnrOption = None,
+    min_ssim: MinSsimOption = None,
     views: ViewsOrMadeOption = None,
     photos: Annotated[
         bool | None,
@@ -132,7 +134,7 @@ def distill(
 
     Views are those of --views, else the cameras that lie beside the scene, else a pool of poses of its own.
     """
-    one_budget(count, ratio)
+    check_budget(count, ratio, fit, min_psnr, min_ssim)
     can_judge(k, policy)
     if is_made(str(held_out)):
         raise typer.BadParameter("--held-out: a file of views; those that are made hold out every 8th anyway")
@@ -167,7 +169,8 @@ def distill(
     lifting = changed(LiftConfig(), "lift", values)
     prior = _lift(run, scene, lifting) if lifted else load_scene(run, scene)
     prior = _cleaned(run, prior) if clean else prior
-    budget = budget_of(scene, count, ratio, len(prior))
+    asked = asked_budget(run, scene, prior, place.name, count, ratio, fit, min_psnr, min_ssim)
+    budget = asked.count
     looks = views_of(run, scene, prior, views, held_out, size, up, teach=not lifted and photos is not True)
     train, test = looks.train.cameras, looks.test
     check_crops(crop or [], test.names)
@@ -213,6 +216,7 @@ def distill(
             work=work,
             progress=run.progress,
         )
+        result = replace(result, splats=shrunk_to_fit(run, result.splats, fit, place.name))
         report = _score(run, prior, result, {"scores": unseen, "apart": apart}, colour)
         report["unseen"] = looks.unseen if looks.unseen is not None else _unseen(result, len(prior))
         report |= {"against": against, "preset": why, "prior": measured.as_dict()}
@@ -243,6 +247,7 @@ def distill(
         f"report: {output / 'report.html'}, {output / 'report.json'}"
     )
     run.result(report)
+    asked.judge(result.splats)
 
 
 @contextmanager

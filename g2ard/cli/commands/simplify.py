@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from g2ard.cli.fit import FitOption, MinPsnrOption, MinSsimOption
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     CountOption,
@@ -17,9 +18,7 @@ from g2ard.cli.options import (
     SceneArgument,
     UpOption,
     ViewsOrMadeOption,
-    budget_of,
     is_made,
-    one_budget,
 )
 
 if TYPE_CHECKING:
@@ -42,6 +41,9 @@ def simplify(
     output: OutputOption,
     count: CountOption = None,
     ratio: RatioOption = None,
+    fit: FitOption = None,
+    min_psnr: MinPsnrOption = None,
+    min_ssim: MinSsimOption = None,
     views: ViewsOrMadeOption = None,
     no_views: Annotated[
         bool,
@@ -65,14 +67,18 @@ def simplify(
     scene, else from a pool of poses of its own. The fast one looks only at given views, the paper's at none.
     """
     import time
+    from dataclasses import replace
 
     from g2ard import io
+    from g2ard.cli.fit import asked_budget, check_budget, shrunk_to_fit
     from g2ard.constants import changed, listed
     from g2ard.simplify import SimplifyConfig
     from g2ard.simplify import simplify as reduce
     from g2ard.visibility import looker
 
-    one_budget(count, ratio)
+    check_budget(count, ratio, fit, min_psnr, min_ssim)
+    if fit is not None and parents is not None:
+        raise typer.BadParameter("--parents: the rows of a scene that --fit shrinks are not known beforehand")
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other")
     values = run.constants(simplify=SimplifyConfig(), over_options=True)
@@ -85,7 +91,8 @@ def simplify(
     for note in found.notes:
         run.say(f"{scene}: {note}")
     read = time.perf_counter()
-    budget = budget_of(scene, count, ratio, len(found.splats))
+    asked = asked_budget(run, scene, found.splats, output.name, count, ratio, fit, min_psnr, min_ssim)
+    budget = asked.count
     looks = not no_views and budget < len(found.splats)
     cameras = _cameras(run, scene, found.splats, views, method, up) if looks else None
     small = reduce(
@@ -96,6 +103,7 @@ def simplify(
         config=config,
         progress=run.progress,
     )
+    small = replace(small, splats=shrunk_to_fit(run, small.splats, fit, output.name))
     simplified = time.perf_counter()
     io.write_splats(output, small.splats, overwrite=run.overwrite)
     if parents is not None:
@@ -121,6 +129,7 @@ def simplify(
             "peak_rss_bytes": _peak_rss(),
         }
     )
+    asked.judge(small.splats)
 
 
 def _cameras(
