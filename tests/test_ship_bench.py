@@ -1,0 +1,32 @@
+"""`bench ship` on a small scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from scenes import checkered_ball
+
+from g2ard.bench.ship import bench_ship
+from g2ard.errors import InputError
+from g2ard.io import write_splats
+
+
+def test_formats_lose_what_their_quanta_say(tmp_path: Path) -> None:
+    write_splats(tmp_path / "ball.ply", checkered_ball(600))
+    cells = bench_ship([tmp_path / "ball.ply"], tmp_path / "f.csv", ratios=[1, 5], formats=["sog", "splat"])
+    pool = {(c.ratio, c.format): c for c in cells if c.views_kind == "pool"}
+    assert set(pool) == {(r, f) for r in (1, 5) for f in ("ply", "sog", "splat")}
+    assert pool[1, "ply"].psnr > 90
+    assert pool[1, "sog"].bytes < pool[1, "ply"].bytes / 2
+    assert pool[5, "ply"].lost == 0
+    assert abs(pool[5, "sog"].lost) < 0.1
+    assert pool[1, "splat"].psnr < pool[1, "sog"].psnr  # no harmonics, coarse rotations
+    assert len((tmp_path / "f.csv").read_text().splitlines()) == len(cells) + 1
+
+
+def test_bad_words(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="formats: expected"):
+        bench_ship([], tmp_path / "f.csv", formats=["ksplat"])
+    with pytest.raises(InputError, match="ratios: expected"):
+        bench_ship([], tmp_path / "f.csv", ratios=[0.5])
