@@ -34,7 +34,7 @@ def junk() -> tuple[Splats, np.ndarray]:
     up = np.cross(ends, [0, 0, 1])
     quats = np.concatenate([1 + ends[:, 2:], np.cross([0, 0, 1], ends)], axis=1)
     assert np.abs(up).max() > 0
-    needles = Splats.create(1.1 * ends, quats=quats, scales=np.tile([0.002, 0.002, 0.6], (10, 1)))
+    needles = Splats.create(2 * ends, quats=quats, scales=np.tile([0.002, 0.002, 0.1], (10, 1)))
     floaters = Splats.create(
         [[1.8, 0, 0], [1.81, 0, 0], [0, -2, 0.5]], scales=np.full((3, 3), 0.01), logit_opacities=[2, 2, 2]
     )
