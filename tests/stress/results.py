@@ -105,7 +105,7 @@ def _simplified(scene: Splats, views: Cameras) -> Arrays:
         yield from _named(method, out.splats, parents=out.parents, protected=out.protected)
         if method == "paper":
             continue
-        seen = visibility.looker(views, longest=80)
+        seen = visibility.visibility_source(views, longest=80)
         out = simplify.simplify(scene, budget, method=method, visibility=seen)
         yield from _named(f"{method} with views", out.splats, parents=out.parents)
 
@@ -142,7 +142,7 @@ def _rendered(scene: Splats, views: Cameras) -> Arrays:
     for isa in _core.instruction_sets():
         raster = _core.Rasterizer(isa)
         arrays, view = arrays_of(scene), view_of(here, 0, settings)
-        image, alpha, depth, _ = raster.forward(arrays, view, settings.choices, [0.1, 0.2, 0.3])
+        image, alpha, depth, _ = raster.forward(arrays, view, settings, [0.1, 0.2, 0.3])
         assert depth is not None
         grads = raster.backward(arrays, image, alpha, depth)
         yield from ((f"{isa} gradient {i}", g) for i, g in enumerate(grads))
@@ -152,12 +152,12 @@ def _seen(scene: Splats, views: Cameras) -> Arrays:
     out = visibility.visibility(scene, views)
     for part in ("weight", "transmittance", "hits", "dominant", "peak", "pixel_size"):
         yield part, getattr(out, part)
-    sampled = visibility.looker(views, longest=80)(scene)
+    sampled = visibility.visibility_source(views, longest=80)(scene)
     yield "sampled weight", sampled.weight
     yield "sampled pixel_size", sampled.pixel_size
     settings = RasterSettings()
     here = [view_of(views.recentred(scene.offset), i, settings) for i in range(3)]
-    yield "sensitivity", _core.sensitivity(arrays_of(scene), here, settings.choices)
+    yield "sensitivity", _core.sensitivity(arrays_of(scene), here, settings)
 
 
 def _named(name: str, scene: Splats, **others: NDArray[Any]) -> Arrays:
