@@ -11,7 +11,7 @@ from g2ard.recover import RecoverConfig, recover
 from g2ard.recover.anchors import PRESETS
 from g2ard.simplify import simplify
 from g2ard.synth import City, city
-from g2ard.visibility import looker
+from g2ard.visibility import visibility_source
 
 SKY = (0.6, 0.8, 1.0)
 
@@ -34,7 +34,7 @@ def main() -> tuple[float, float]:
     prior = lift(scan.positions, scan.colors)  # every point becomes a disc on its surface
 
     # Ten times fewer; errors weigh by what the views see of them.
-    small = simplify(prior, budget=len(prior) // 10, visibility=looker(town.views["train"]))
+    small = simplify(prior, budget=len(prior) // 10, visibility=visibility_source(town.views["train"]))
     print(f"{len(prior):,} discs → {len(small.splats):,} Gaussians")
 
     train, unseen = CityPhotos(town, "train"), CityPhotos(town, "val")

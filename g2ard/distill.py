@@ -251,7 +251,7 @@ class _Rounds:
 
     def _simplify(self, number: int, count: int, entry: dict[str, Any]) -> None:
         from g2ard.simplify import simplify
-        from g2ard.visibility import looker
+        from g2ard.visibility import visibility_source
 
         name = f"simplified-{number}"
         if not self._restore(name, entry):
@@ -263,7 +263,7 @@ class _Rounds:
                 method=self.config.method,
                 visibility=None
                 if self.config.method == "paper"
-                else looker(self.targets.cameras, progress=self.progress),
+                else visibility_source(self.targets.cameras, progress=self.progress),
                 protected=self.protected,
                 final_budget=self.budget,
                 progress=self.progress,

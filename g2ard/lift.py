@@ -1,6 +1,6 @@
 """Coloured points → a geometric prior of surface-aligned discs, without training.
 
-A prior to distil *from*, with photos as targets; rendered as it is, it looks flat (10 dB in the paper).
+A prior to distil *from*, with photos as targets; rendered as it is, it is flat (10 dB in the paper).
 """
 
 from __future__ import annotations
@@ -17,14 +17,17 @@ from g2ard.splats import SH_C0, Splats
 
 __all__ = ["LiftConfig", "lift"]
 
+_CORE = _core.defaults()["lift"]
+"""The one place of these defaults, which are the paper's."""
+
 
 @dataclass(frozen=True)
 class LiftConfig:
     """The constants of `lift`, for those who keep them together: `lift(points, colors, **vars(config))`."""
 
-    neighbors: int = 10
-    normal_ratio: float = 0.1
-    max_anisotropy: float = 4.0
+    neighbors: int = _CORE["neighbors"]
+    normal_ratio: float = _CORE["normal_ratio"]
+    max_anisotropy: float = _CORE["max_anisotropy"]
     opacity: float = 0.5
 
 
@@ -32,10 +35,10 @@ def lift(
     points: ArrayLike,
     colors: ArrayLike,
     *,
-    neighbors: int = 10,
-    normal_ratio: float = 0.1,
-    max_anisotropy: float = 4.0,
-    opacity: float = 0.5,
+    neighbors: int = LiftConfig.neighbors,
+    normal_ratio: float = LiftConfig.normal_ratio,
+    max_anisotropy: float = LiftConfig.max_anisotropy,
+    opacity: float = LiftConfig.opacity,
     progress: Progress = silent,
 ) -> Splats:
     """One flat disc for each coloured point (supplement, "Dense Prior Construction").

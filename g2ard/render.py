@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
+from g2ard.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS
 from g2ard.splats import Splats
 
 __all__ = [
@@ -27,7 +28,6 @@ __all__ = [
 
 _Floats = NDArray[np.float32]
 View = tuple[list[list[float]], list[float], tuple[int, int], float]
-Choices = tuple[str, bool, float]
 
 
 @dataclass(frozen=True)
@@ -67,11 +67,6 @@ class RasterSettings:
         if isinstance(self.near, (int, float)):
             return float(self.near)
         return float(self.near[index])
-
-    @property
-    def choices(self) -> Choices:
-        """As `_core` takes them."""
-        return self.convention, self.antialiased, self.alpha_max
 
 
 def settings_for(means: NDArray[Any], settings: RasterSettings | None = None) -> RasterSettings:
@@ -114,8 +109,8 @@ def arrays_of(splats: Splats) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floa
     Logits and logarithms are clamped to where float32 can follow them: opacity 255 of a byte decodes to +∞.
     """
     with np.errstate(divide="ignore"):
-        log_scales = np.clip(splats.log_scales, -80, 40)
-    logits = np.clip(splats.logit_opacities, -80, 80)
+        log_scales = np.clip(splats.log_scales, *DRAWN_LOG_SCALES)
+    logits = np.clip(splats.logit_opacities, *DRAWN_LOGITS)
     arrays = (splats.means, splats.quats, log_scales, logits, splats.sh0, splats.shN)
     a, b, c, d, e, f = (np.ascontiguousarray(array, dtype=np.float32) for array in arrays)
     return a, b, c, d, e, f
@@ -229,7 +224,7 @@ class Renderer:
             camera = camera.recentred(self._middle)
         settings = self._settings
         view = (*view_of(camera, 0, settings)[:3], settings.near_of(index))
-        return self._rasterizer.forward(self._arrays, view, settings.choices, self._background, depth, median)
+        return self._rasterizer.forward(self._arrays, view, settings, self._background, depth, median)
 
 
 def render(

@@ -20,6 +20,7 @@ from g2ard.recover.extent import extents, share_of_rate
 from g2ard.recover.losses import l1_ssim
 from g2ard.recover.rasterize import rasterize
 from g2ard.recover.regularize import TorchAnchors, regularization
+from g2ard.recover.schedule import Rates
 from g2ard.render import RasterSettings, view_of
 from g2ard.splats import Splats
 
@@ -40,8 +41,8 @@ def step(
     trainer: _core.Trainer, v: Cameras, target: Any, regularizers: Any = None, reach: float | None = None
 ) -> tuple[float, int]:
     view = view_of(v, 0, SETTINGS)
-    rates = list(RATES.values())
-    return trainer.step(view, SETTINGS.choices, BACKGROUND, target, 0.2, rates, regularizers, None, reach)
+    rates = Rates(**RATES)
+    return trainer.step(view, SETTINGS, BACKGROUND, target, 0.2, rates, regularizers, None, reach)
 
 
 def problem(n: int = 200, degree: int = 3, views: int = 3) -> tuple[Params, list[Cameras], list[Any]]:
@@ -274,7 +275,7 @@ def test_regularizers_are_torch_s(weights: Regularizers) -> None:
     trainer, twin = trainer_of(p), Twin(p)
     trainer.anchor(anchors.means, np.ascontiguousarray(anchors.frames), anchors.r_parallel, anchors.r_perp)
     for i in range(3):
-        step(trainer, cameras[i], targets[i], (weights.anchor, weights.shape, weights.effective_rank))
+        step(trainer, cameras[i], targets[i], weights)
         twin.step(cameras[i], targets[i], extra)
     assert_close(trainer.arrays(), twin.p, p, to=3e-2)
     # The moments hold the gradients themselves: they show the scale that Adam's steps hide.

@@ -193,11 +193,11 @@ def test_auto_reaches_every_pose_and_then_represents(count):
     scene, cameras = ball(), around(count)
     coarse = surface(scene, 1000)
     depths, shares = poses.outlooks(coarse, cameras)
-    alike = poses.likeness(cameras, depths)
-    wanted = poses.demand(alike)
+    alike = poses.pose_kernel(cameras, depths)
+    wanted = poses.inverse_density(alike)
     np.testing.assert_array_equal(alike, alike.T)
     np.testing.assert_array_equal(np.diag(alike), 1.0)
-    order, gains = poses.represent(alike, wanted, np.ones(count, bool), shares)
+    order, gains = poses.facility_location(alike, wanted, np.ones(count, bool), shares)
     assert order.tolist() == naive.represent(count, alike, wanted, shares)
     assert gains.sum() == pytest.approx(1.0)
     assert gains.min() >= 0
@@ -211,7 +211,9 @@ def test_auto_reaches_first():
     far = np.array([[-4.0, 0, 0], [0, 0, 4.0]])
     chosen = select(ball(), views(np.concatenate([crowd, far])), 3)
     assert set(chosen.order.tolist()) >= {30, 31}
-    unreached = poses.represent(np.eye(5), np.full(5, 0.2), np.array([1, 1, 0, 1, 1], bool), np.ones(5))
+    unreached = poses.facility_location(
+        np.eye(5), np.full(5, 0.2), np.array([1, 1, 0, 1, 1], bool), np.ones(5)
+    )
     assert unreached[0].tolist() == [
         0,
         1,
@@ -224,7 +226,7 @@ def test_of_views_alike_the_one_that_sees_more_is_taken():
     """Five pairs of twins, of which the second sees more."""
     alike = np.kron(np.eye(5), np.ones((2, 2)))
     shares = np.tile([0.2, 0.3], 5)
-    order, _ = poses.represent(alike, np.full(10, 0.1), np.ones(10, bool), shares)
+    order, _ = poses.facility_location(alike, np.full(10, 0.1), np.ones(10, bool), shares)
     assert set(order[:5].tolist()) == {1, 3, 5, 7, 9}
 
 

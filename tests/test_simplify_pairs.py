@@ -84,7 +84,7 @@ def test_clusters_conserve_mass_mean_and_covariance(method, growth):
 @pytest.mark.parametrize("method", ["default", "fast"])
 def test_an_opaque_wall_stays_opaque_and_thin(method):
     from g2ard.render import render
-    from g2ard.visibility import looker
+    from g2ard.visibility import visibility_source
 
     wall, cameras = opaque_wall()
     alpha = {}
@@ -93,7 +93,7 @@ def test_an_opaque_wall_stays_opaque_and_thin(method):
         alpha[growth] = render(out, cameras, 0).alpha[15:45, 20:60].mean()
         assert out.scales.min(axis=1).max() < 0.0025
     assert alpha[1.5] > alpha[1.0] + 0.05
-    seen = simplify(wall, 80, method=method, visibility=looker(cameras)).splats
+    seen = simplify(wall, 80, method=method, visibility=visibility_source(cameras)).splats
     assert render(seen, cameras, 0).alpha[15:45, 20:60].mean() > alpha[1.5]
 
 
@@ -134,7 +134,7 @@ def test_no_merged_cluster_is_dropped():
 @pytest.mark.parametrize("method", ["default", "fast"])
 @pytest.mark.parametrize("scale", [1.0, 2.0**-10])
 def test_what_is_seen_does_not_depend_on_the_order_of_rows(method, scale):
-    from g2ard.visibility import looker
+    from g2ard.visibility import visibility_source
 
     wall, cameras = opaque_wall()
     viewmats = cameras.viewmats.copy()
@@ -142,8 +142,8 @@ def test_what_is_seen_does_not_depend_on_the_order_of_rows(method, scale):
     cameras = replace(cameras, viewmats=viewmats)
     wall = replace(wall, means=wall.means * np.float32(scale), scales=wall.scales * np.float32(scale))
     shuffled = np.random.default_rng(8).permutation(len(wall))
-    a = simplify(wall, 80, method=method, visibility=looker(cameras))
-    b = simplify(wall.take(shuffled), 80, method=method, visibility=looker(cameras))
+    a = simplify(wall, 80, method=method, visibility=visibility_source(cameras))
+    b = simplify(wall.take(shuffled), 80, method=method, visibility=visibility_source(cameras))
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(a.splats, name), getattr(b.splats, name), err_msg=name)
     np.testing.assert_array_equal(a.parents[shuffled], b.parents)

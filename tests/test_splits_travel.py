@@ -98,7 +98,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
 
     watched(g2ard.recover, "recover", 1, seen.trained)
     watched(g2ard.adapt, "adapt", 1, seen.trained)
-    watched(g2ard.render, "looker", 0, seen.looked)
+    watched(g2ard.render, "visibility_source", 0, seen.looked)
     watched(g2ard.evaluate, "evaluate", 1, seen.scored)
     return seen
 

@@ -12,7 +12,7 @@ from g2ard.render import RasterSettings, render, settings_for
 from g2ard.select import select
 from g2ard.simplify import simplify
 from g2ard.splats import Splats
-from g2ard.visibility import looker, visibility
+from g2ard.visibility import visibility, visibility_source
 
 ARRAYS = ("means", "scales", "quats", "logit_opacities", "sh0", "shN")
 
@@ -52,8 +52,8 @@ def in_units(scene: Splats, cameras: Cameras, unit: float) -> tuple[Splats, Came
 def test_what_views_see_scales_by_powers_of_two_exactly(method, unit, dtype):
     scene, cameras = replace(ball(), means=ball().means.astype(dtype)), around()
     small, near = in_units(scene, cameras, unit)
-    here = simplify(scene, 150, method=method, visibility=looker(cameras))
-    there = simplify(small, 150, method=method, visibility=looker(near))
+    here = simplify(scene, 150, method=method, visibility=visibility_source(cameras))
+    there = simplify(small, 150, method=method, visibility=visibility_source(near))
     assert here.report["fitted"] > 50
     back = in_units(there.splats, near, 1 / unit)[0]
     for name in ARRAYS:

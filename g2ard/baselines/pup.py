@@ -35,7 +35,7 @@ def fisher(splats: Splats, cameras: Cameras, *, progress: Progress = silent) -> 
     splats, cameras = centred(splats, cameras)
     settings = settings_for(splats.means)
     views = [view_of(cameras, i, settings) for i in range(len(cameras))]
-    upper = _core.sensitivity(arrays_of(splats), views, settings.choices, counter(progress, "sensitivity"))
+    upper = _core.sensitivity(arrays_of(splats), views, settings, counter(progress, "sensitivity"))
     out = np.zeros((len(splats), 6, 6))
     rows, columns = np.triu_indices(6)
     out[:, rows, columns] = out[:, columns, rows] = upper

@@ -31,7 +31,7 @@ from g2ard.simplify import simplify
 from g2ard.splats import Splats
 from g2ard.splits import HOLD_OUT, for_scores, for_training, not_held_out, split_mask
 from g2ard.targets import Photos, Targets, TeacherRenders
-from g2ard.visibility import looker
+from g2ard.visibility import visibility_source
 
 __all__ = ["STUDIES", "Look", "RecoverBench", "bench_recover"]
 
@@ -213,7 +213,7 @@ class RecoverBench:
         """What all one-shot runs of a budget start from, and the seconds it took to make."""
         if budget not in self._starts:
             began = time.monotonic()
-            look = looker(self.cameras[0], progress=progress)
+            look = visibility_source(self.cameras[0], progress=progress)
             small = simplify(self.prior, budget, visibility=look, progress=progress).splats
             if self.sh_degree is not None:
                 small = small.with_sh_degree(self.sh_degree)

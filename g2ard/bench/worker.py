@@ -73,7 +73,7 @@ def store_targets(targets: Targets, folder: Path) -> None:
 def _reduce(job: Job) -> dict[str, Any]:
     from g2ard import baselines
     from g2ard.simplify import SimplifyConfig, simplify
-    from g2ard.visibility import looker
+    from g2ard.visibility import visibility_source
 
     splats, cameras = io.read_splats(job["scene"]), _cameras(job["views"])
     output, began = Path(job["output"]), time.monotonic()
@@ -95,7 +95,7 @@ def _reduce(job: Job) -> dict[str, Any]:
         splats,
         job["count"],
         method="default" if job["method"] == "no-views" else job["method"],
-        visibility=looker(cameras) if looks else None,
+        visibility=visibility_source(cameras) if looks else None,
         protected=flags,
         final_budget=job["budget"],
         config=config,

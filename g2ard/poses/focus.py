@@ -101,7 +101,7 @@ class Glance:
         figures = np.zeros((3, len(here)))
         for i in range(len(here)):
             sums: dict[str, Any] = _core.accumulate(
-                self._arrays, [view_of(here, i, settings)], settings.choices, None
+                self._arrays, [view_of(here, i, settings)], settings, None
             )
             weight = sums["weight"]
             depth = norms(self._means - here.positions[i])

@@ -27,7 +27,7 @@ class RecoverConfig:
         background: RGB behind the scene.
         final: whether this is the recovery at the target count; the paper decays rounds differently.
         seed: of the order of views.
-        engine: "fused" takes whole steps in Rust; "torch" goes through autograd and `RowAdam`, with the
+        engine: "fused" takes whole steps in Rust; "torch" goes through autograd and `SelectiveAdam`, with the
             same result to rounding; "gsplat" is that on an NVIDIA GPU.
 
     Raises:

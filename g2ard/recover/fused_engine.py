@@ -36,7 +36,7 @@ class FusedEngine:
         self._template = splats
         self._cameras = cameras
         self._settings = settings_for(anchors.means)
-        self._weights = (regularizers.anchor, regularizers.shape, regularizers.effective_rank)
+        self._regularizers = regularizers
         self._ssim_weight = ssim_weight
         self._background = list(background)
         units = radii(splats) if means_in_scales else None
@@ -61,19 +61,12 @@ class FusedEngine:
         """One optimiser step on one view; returns its photometric loss."""
         loss, _ = self._trainer.step(
             view_of(self._cameras, view, self._settings),
-            self._settings.choices,
+            self._settings,
             self._background,
             target,
             self._ssim_weight,
-            [
-                rates.means,
-                rates.quats,
-                rates.log_scales,
-                rates.logit_opacities,
-                rates.sh0,
-                rates.shN,
-            ],
-            self._weights if regularize else None,
+            rates,
+            self._regularizers if regularize else None,
             mask,
             self._reach(view, rates.reach),
         )

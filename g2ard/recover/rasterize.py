@@ -12,7 +12,7 @@ from torch import Tensor
 from g2ard import _core
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.render import Choices, RasterSettings, View, view_of
+from g2ard.render import RasterSettings, View, view_of
 
 __all__ = ["rasterize"]
 
@@ -43,13 +43,13 @@ def _numpy(tensor: Tensor) -> np.ndarray[Any, Any]:
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, view: View, choices: Choices, background: list[float], *params: Tensor
+        ctx: Any, view: View, settings: RasterSettings, background: list[float], *params: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         ctx.lease = _Lease()
         ctx.save_for_backward(*params)
         ctx.set_materialize_grads(False)
         arrays = tuple(_numpy(p) for p in params)
-        image, alpha, depth, _ = ctx.lease.rasterizer.forward(arrays, view, choices, background, True, False)
+        image, alpha, depth, _ = ctx.lease.rasterizer.forward(arrays, view, settings, background, True, False)
         return torch.from_numpy(image), torch.from_numpy(alpha), torch.from_numpy(depth)
 
     @staticmethod
@@ -122,6 +122,6 @@ def rasterize(
             raise InputError(f"{name}: expected float32 on the CPU, got {tensor.dtype} on {tensor.device}")
     colour = [float(c) for c in background]
     out: tuple[Tensor, Tensor, Tensor] = _Rasterize.apply(
-        view_of(cameras, index, settings), settings.choices, colour, *params
+        view_of(cameras, index, settings), settings, colour, *params
     )
     return out

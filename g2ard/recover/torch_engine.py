@@ -17,8 +17,8 @@ from g2ard.recover.extent import extents, share_of_rate
 from g2ard.recover.losses import l1_ssim
 from g2ard.recover.rasterize import rasterize
 from g2ard.recover.regularize import TorchAnchors, regularization
-from g2ard.recover.row_adam import RowAdam
 from g2ard.recover.schedule import Rates
+from g2ard.recover.selective_adam import SelectiveAdam
 from g2ard.recover.sizes import radii
 from g2ard.render import settings_for
 from g2ard.splats import Splats
@@ -29,7 +29,7 @@ _NAMES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 
 
 class TorchEngine:
-    """Holds the parameters and `RowAdam`'s moments; one `step` a view.
+    """Holds the parameters and `SelectiveAdam`'s moments; one `step` a view.
 
     With `means_in_scales` the means are optimised as multiples of each Gaussian's initial radius (`radii`):
     Adam is indifferent to the scale of a gradient, so a rate of 0.05 moves a Gaussian by 5 % of its own size.
@@ -70,7 +70,7 @@ class TorchEngine:
         self._parameters = {
             name: torch.from_numpy(start[name].copy()).to(self.device).requires_grad_() for name in _NAMES
         }
-        self._adam = RowAdam({name: p for name, p in self._parameters.items() if p.numel()})
+        self._adam = SelectiveAdam({name: p for name, p in self._parameters.items() if p.numel()})
 
     def step(
         self,

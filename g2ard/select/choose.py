@@ -120,9 +120,9 @@ def select(
     seconds: dict[str, float] = {}
     coarse = surface(splats, min(_COARSE, max(1, len(splats))))
     depths, shares = poses.outlooks(coarse, cameras)
-    alike = poses.likeness(cameras, depths)
-    wanted = poses.demand(alike)
-    usable = (depths > 0) & ~poses.within_matter(splats, cameras, depths, progress)
+    alike = poses.pose_kernel(cameras, depths)
+    wanted = poses.inverse_density(alike)
+    usable = (depths > 0) & ~poses.inside_geometry(splats, cameras, depths, progress)
     if not usable.any():
         raise InputError(f"none of the {len(cameras)} candidate views sees the scene")
     seconds["poses"] = time.perf_counter() - began
@@ -135,7 +135,7 @@ def select(
     elif policy == "pose-diverse":
         order, gains = poses.farthest(alike, usable)
     elif policy == "auto":
-        order, gains = poses.represent(alike, wanted, usable, shares)
+        order, gains = poses.facility_location(alike, wanted, usable, shares)
     else:
         order = _blind(policy, np.flatnonzero(usable), k, seed)
         gains = poses.gains_of(order, alike, wanted)

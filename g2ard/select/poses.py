@@ -1,4 +1,4 @@
-"""Views as poses: how alike two are, which of them stand for the others, and how often to draw each."""
+"""Views as poses: a kernel between them, which of them represent the others, and how often to draw each."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from g2ard.select.surfaces import Surface, core_scene, core_views
 from g2ard.splats import Splats
 
 __all__ = [
-    "demand",
     "draw_weights",
+    "facility_location",
     "farthest",
     "gains_of",
-    "likeness",
+    "inside_geometry",
+    "inverse_density",
     "outlooks",
-    "represent",
-    "within_matter",
+    "pose_kernel",
 ]
 
 Float = NDArray[np.float64]
@@ -30,18 +30,18 @@ Order = NDArray[np.int64]
 _BANDWIDTH = 0.35
 """Of the kernel exp(−(d/0.35)²) between poses: neighbours 20° apart on an orbit are half alike."""
 _REACH = 2.0
-"""Bandwidths within which a chosen view says something of a pose: beyond, they are less than 2 % alike."""
+"""Bandwidths within which a chosen view represents a pose: beyond, the kernel is below 2 %."""
 _WORTH = 0.25
-"""Power of its share of the scene by which a view's claim to be chosen counts."""
+"""Power of its share of the scene by which a view's gain is weighed."""
 _GRID = 48, 36
 _BEHIND = 1.15
 """Times the nearest depth of its place in the grid: what lies farther is hidden."""
 _ROWS = 200_000
-"""Gaussians that tell whether a pose is walled in: of more, a fair sample, each as much larger."""
-_GLANCE = 48
-"""Pixels along the longer side of the images that tell it."""
-_WALLED = 0.02
-"""A pose whose image is mostly nearer than this share of what the median pose sees stands within matter."""
+"""Gaussians by which a pose inside geometry is found: of more, a fair sample, each as much larger."""
+_SIDE = 48
+"""Pixels along the longer side of the images that decide it."""
+_INSIDE = 0.02
+"""A pose whose image is mostly nearer than this share of the median pose's depth is inside geometry."""
 
 
 def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
@@ -75,10 +75,10 @@ def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
     return depths, shares
 
 
-def within_matter(splats: Splats, cameras: Cameras, depths: Float, progress: Progress) -> NDArray[np.bool_]:
+def inside_geometry(splats: Splats, cameras: Cameras, depths: Float, progress: Progress) -> NDArray[np.bool_]:
     """(C,) whether a pose stands inside geometry: what fills its image is next to its lens.
 
-    A photo's pose is taken at its word: there was a camera.
+    A photo's pose is never refused: there was a camera.
 
     Args:
         splats: the scene.
@@ -93,14 +93,14 @@ def within_matter(splats: Splats, cameras: Cameras, depths: Float, progress: Pro
     sample = splats.take(np.arange(0, len(splats), step))
     sample = replace(sample, scales=sample.scales * np.float32(np.sqrt(step)))
     scene, origin = core_scene(sample)
-    glances = core_views(cameras.resized(_GLANCE), origin, scene)
-    share, near = _core.select_looks(scene, glances, progress=counter(progress, "poses")).T
+    small = core_views(cameras.resized(_SIDE), origin, scene)
+    share, near = _core.select_view_statistics(scene, small, progress=counter(progress, "poses")).T
     typical = np.median(np.where(near > 0, near, depths)[depths > 0])
-    walled: NDArray[np.bool_] = made & (share > 0.5) & (near < _WALLED * typical)
-    return walled
+    inside: NDArray[np.bool_] = made & (share > 0.5) & (near < _INSIDE * typical)
+    return inside
 
 
-def likeness(cameras: Cameras, depths: Float) -> Float:
+def pose_kernel(cameras: Cameras, depths: Float) -> Float:
     """(C, C) exp(−(d/0.35)²): d² = |Δposition|²/(depth·depth) + |Δdirection|²: parallax and turn."""
     seen = depths[depths > 0]
     scale = np.where(depths > 0, depths, np.median(seen) if len(seen) else 1.0)
@@ -118,24 +118,25 @@ def _squares(rows: Float) -> Float:
     return out
 
 
-def demand(alike: Float) -> Float:
-    """(C,) how much each pose asks to be represented: less the more poses are like it; sums to 1."""
+def inverse_density(alike: Float) -> Float:
+    """(C,) weights of the poses, one over the kernel density there; they sum to 1."""
     weights = 1 / alike.sum(1)
     return weights / weights.sum()
 
 
-def represent(alike: Float, wanted: Float, usable: NDArray[np.bool_], shares: Float) -> tuple[Order, Float]:
-    """Views that stand for the others: first reach every pose, then represent as many as well as can be.
+def facility_location(
+    alike: Float, wanted: Float, usable: NDArray[np.bool_], shares: Float
+) -> tuple[Order, Float]:
+    """Views that represent all candidates: first within reach of every pose, then by facility location.
 
-    From the pose nearest to all by demand on, the farthest comes next while any is more than two bandwidths
-    from all chosen: there a kernel says nothing about who stands for whom. Then greedy facility location.
-    Of views that would do alike the one that sees more is taken: each counts times the fourth root of its
-    share of the scene.
+    From the weighted medoid of the poses on, the farthest comes next while any is more than two bandwidths
+    from all chosen: there the kernel is flat. Then greedy facility location. Each view counts times the
+    fourth root of its share of the scene, so that of like views the one that sees more is taken.
 
     Args:
-        alike: (C, C) see `likeness`.
-        wanted: (C,) see `demand`.
-        usable: (C,) which may be chosen; the others ask for nothing.
+        alike: (C, C) see `pose_kernel`.
+        wanted: (C,) see `inverse_density`.
+        usable: (C,) which may be chosen; the others weigh nothing.
         shares: (C,) see `outlooks`.
 
     Returns:
@@ -195,8 +196,8 @@ def farthest(alike: Float, usable: NDArray[np.bool_]) -> tuple[Order, Float]:
 
 
 def draw_weights(order: Order, alike: Float, wanted: Float) -> Float:
-    """(K,) the demand of the poses that each chosen view is nearest to, mean 1."""
+    """(K,) the summed weights of the poses that each chosen view is nearest to, mean 1."""
     nearest = order[np.argmax(alike[:, order], axis=1)]
-    nearest[order] = order  # each stands for itself, equals included
+    nearest[order] = order  # each is nearest to itself, equals included
     weights = np.bincount(nearest, wanted, len(alike))[order]
     return weights / weights.mean()

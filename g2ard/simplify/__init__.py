@@ -11,21 +11,31 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.errors import InputError
+from g2ard.prepared import PreparedScene, finite_rows_of, with_some_opacity
 from g2ard.progress import Progress, counter, silent
 from g2ard.simplify.config import METHODS, SimplifyConfig, schedule
-from g2ard.simplify.pairs import Seen, Visibility, merge, merge_looking, rows_of, splats_of
+from g2ard.simplify.pairs import (
+    Visibility,
+    VisibilitySource,
+    merge,
+    merge_and_fit,
+    rows_of,
+    splats_of,
+)
 from g2ard.splats import DRAWN_LOGIT, Splats
 
-__all__ = ["METHODS", "Seen", "Simplified", "SimplifyConfig", "flag", "schedule", "simplify"]
+__all__ = [
+    "METHODS",
+    "Simplified",
+    "SimplifyConfig",
+    "Visibility",
+    "VisibilitySource",
+    "flag",
+    "schedule",
+    "simplify",
+]
 
 _DEFAULTS = SimplifyConfig()
-
-_FAINTEST = np.float32(-16)
-"""A logit; files' readers clamp to it too."""
-
-
-_LARGEST = np.float32(np.exp(43))
-"""A scale whose square is a float32; files' readers clamp to it too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +93,9 @@ def flag(
     (0.0, 1.0)
     """
     _check_budget(budget, None)
-    scene, finite = _clean(splats)
+    scene, finite = finite_rows_of(splats)
     found = _core.simplify_flags(
-        scene,
+        scene.core,
         budget,
         threshold=config.flag_threshold,
         members=config.flag_members,
@@ -101,7 +111,7 @@ def simplify(
     budget: int,
     *,
     method: str = "default",
-    visibility: Visibility | None = None,
+    visibility: Visibility | VisibilitySource | None = None,
     protected: NDArray[np.bool_] | None = None,
     final_budget: int | None = None,
     config: SimplifyConfig = _DEFAULTS,
@@ -156,14 +166,13 @@ def simplify(
     """
     if method not in METHODS:
         raise InputError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
-    scene, finite = _clean(splats)
-    scene = scene.with_sh_degree(_used_degree(scene))
+    scene, finite = finite_rows_of(splats)
     _check_budget(budget, len(scene))
     flags = _check_flags(protected, len(splats))
     if flags is not None:
         flags = np.ascontiguousarray(flags[finite])
     if not (scene.opacities >= config.min_opacity_of(method)).any():
-        scene, config = _unseen(scene), replace(config, min_opacity=0.0)
+        scene, config = with_some_opacity(scene), replace(config, min_opacity=0.0)
     if method == "paper":
         out = _paper(scene, budget, flags, final_budget or budget, config, progress)
     else:
@@ -172,10 +181,10 @@ def simplify(
 
 
 def _pairs(
-    scene: Splats,
+    scene: PreparedScene,
     budget: int,
     method: str,
-    visibility: Visibility | None,
+    visibility: Visibility | VisibilitySource | None,
     count: int,
     finite: NDArray[np.bool_] | slice,
     flags: NDArray[np.bool_] | None,
@@ -183,13 +192,13 @@ def _pairs(
     progress: Progress,
 ) -> dict[str, Any]:
     if callable(visibility):
-        return merge_looking(scene, budget, method, visibility, flags, config, progress)
-    seen = None if visibility is None else rows_of(visibility, count, finite)
-    return merge(scene, budget, method, seen, flags, config, counter(progress, "simplify"))
+        return merge_and_fit(scene, budget, method, visibility, flags, config, progress)
+    of_rows = None if visibility is None else rows_of(visibility, count, finite)
+    return merge(scene, budget, method, of_rows, flags, config, counter(progress, "simplify"))
 
 
 def _paper(
-    scene: Splats,
+    scene: PreparedScene,
     budget: int,
     flags: NDArray[np.bool_] | None,
     cells: int,
@@ -197,7 +206,7 @@ def _paper(
     progress: Progress,
 ) -> dict[str, Any]:
     return _core.simplify_paper(
-        scene,
+        scene.core,
         schedule(len(scene), budget, config.retention_of("paper"), config.fold),
         cells,
         protected=flags,
@@ -227,53 +236,6 @@ def _check_flags(protected: NDArray[np.bool_] | None, count: int) -> NDArray[np.
     if flags.dtype != np.bool_ or flags.shape != (count,):
         raise InputError(f"protected: expected bool of shape ({count},), got {flags.dtype} {flags.shape}")
     return flags
-
-
-def _clean(splats: Splats) -> tuple[Splats, NDArray[np.bool_] | slice]:
-    """The finite rows, C-contiguous, and which they are."""
-    arrays = (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN)
-    everything = all(_all_finite(a) for a in arrays) and not np.isnan(splats.logit_opacities).any()
-    finite = np.ones(len(splats), bool) if everything else splats.finite_rows()
-    if not finite.any():
-        raise InputError(f"splats: none of {len(splats)} rows is finite")
-    scene = splats if everything else splats.take(finite)
-    kind = np.float64 if scene.means.dtype == np.float64 else np.float32
-    scene = replace(
-        scene,
-        means=np.ascontiguousarray(scene.means, kind),
-        quats=np.ascontiguousarray(scene.quats, np.float32),
-        scales=np.minimum(scene.scales, _LARGEST, dtype=np.float32),
-        logit_opacities=np.ascontiguousarray(scene.logit_opacities, np.float32),
-        sh0=np.ascontiguousarray(scene.sh0, np.float32),
-        shN=np.ascontiguousarray(scene.shN, np.float32),
-    )
-    return scene, slice(None) if everything else finite
-
-
-def _all_finite(values: NDArray[Any]) -> bool:
-    """A sum is finite only if all its terms are; where it overflows they are looked at one by one."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return bool(np.isfinite(values.sum()) or np.isfinite(values).all())
-
-
-def _unseen(scene: Splats) -> Splats:
-    """A scene of which nothing shows, with an α that leaves every row some weight in sums.
-
-    Dropping the transparent would leave nothing, and a mass of 0 no reason to keep one place over another.
-    """
-    logits = scene.logit_opacities
-    return replace(scene, logit_opacities=np.where(np.isinf(logits), logits, np.maximum(logits, _FAINTEST)))
-
-
-def _used_degree(scene: Splats) -> int:
-    """The highest SH degree that any Gaussian has a coefficient of."""
-    degree = scene.sh_degree
-    while degree > 0:
-        band = scene.shN[:, degree**2 - 1 :]
-        if band[:1024].any() or band.any():
-            break
-        degree -= 1
-    return degree
 
 
 def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str, Any]) -> Simplified:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from g2ard import _core
 from g2ard.errors import InputError
 
 __all__ = ["METHODS", "SimplifyConfig", "schedule"]
@@ -13,7 +14,15 @@ METHODS = ("default", "fast", "paper")
 """The policies."""
 
 _RETENTION = {"default": 0.65, "fast": 0.65, "paper": 0.75}
-_MIN_OPACITY = {"default": 0.004, "fast": 0.004, "paper": 0.01}
+
+_CORE = _core.defaults()
+"""The core's constants by method: the one place of the defaults below."""
+
+_PAIRWISE, _PAPER = _CORE["default"], _CORE["paper"]
+
+
+_OF_METHOD = ("min_opacity", "morton_premerge_ratio", "morton_premerge_steps")
+"""Constants whose default is the method's own."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +37,11 @@ class SimplifyConfig:
             cut of a few Gaussians would cost a whole recovery.
         min_opacity: below this α a Gaussian is dropped; None means the method's own, 0.01 in the paper, 0.004
             (what no renderer draws) for the others.
+        morton_premerge_ratio: of `default` and `fast`: down to this many times the budget rows merge along
+            Morton order alone, before pairs of neighbours do; at least 1, infinite for never. None means the
+            method's own, 3 for `default`, 1 for `fast`.
+        morton_premerge_steps: of `default` and `fast`: in how many steps, each on a shifted lattice. None
+            means the method's own, 1 for `default`, 2 for `fast`.
         neighbors: `default`: nearest clusters that one may merge with. More lets far ones in: 16 is worse.
         geometric_weight: of `default` and `fast`: weight of the error of coverage beside that of colour; half
             of it without views, for much of what it would then weigh lies hidden.
@@ -57,18 +71,20 @@ class SimplifyConfig:
     retention: float | None = None
     fold: float = 0.05
     min_opacity: float | None = None
-    neighbors: int = 6
-    geometric_weight: float = 0.03
-    dilation: float = 0.4
-    pixel_scale: float = 0.2
-    max_growth: float = 1.25
-    color_bin: float = 0.25
-    max_energy: float = 0.01
-    min_coverage: float = 0.6
-    support: float = 3.0
-    flag_threshold: float = 0.01
-    flag_members: int = 8
-    protection: float = 10.0
+    morton_premerge_ratio: float | None = None
+    morton_premerge_steps: int | None = None
+    neighbors: int = _PAIRWISE["neighbors"]
+    geometric_weight: float = _PAIRWISE["geometric_weight"]
+    dilation: float = _PAIRWISE["dilation"]
+    pixel_scale: float = _PAIRWISE["pixel_scale"]
+    max_growth: float = _PAIRWISE["max_growth"]
+    color_bin: float = _PAPER["color_bin"]
+    max_energy: float = _PAPER["max_energy"]
+    min_coverage: float = _PAPER["min_coverage"]
+    support: float = _PAPER["support"]
+    flag_threshold: float = _PAPER["flag_threshold"]
+    flag_members: int = _PAPER["flag_members"]
+    protection: float = _PAPER["protection"]
 
     def __post_init__(self) -> None:
         if self.retention is not None and not 0 < self.retention < 1:
@@ -77,6 +93,10 @@ class SimplifyConfig:
             raise InputError(f"fold: expected a number in [0, 1), got {self.fold}")
         if not self.max_growth >= 1:
             raise InputError(f"max_growth: expected at least 1, got {self.max_growth}")
+        if self.morton_premerge_ratio is not None and not self.morton_premerge_ratio >= 1:
+            raise InputError(f"morton_premerge_ratio: expected at least 1, got {self.morton_premerge_ratio}")
+        if self.morton_premerge_steps is not None and self.morton_premerge_steps < 1:
+            raise InputError(f"morton_premerge_steps: expected at least 1, got {self.morton_premerge_steps}")
         if self.neighbors < 1:
             raise InputError(f"neighbors: expected at least 1, got {self.neighbors}")
         for name in ("color_bin", "pixel_scale", "support"):
@@ -105,7 +125,12 @@ class SimplifyConfig:
         >>> SimplifyConfig().resolved("paper").retention
         0.75
         """
-        return replace(self, retention=self.retention_of(method), min_opacity=self.min_opacity_of(method))
+        own = {
+            name: value
+            for name, value in _CORE[method].items()
+            if name in _OF_METHOD and getattr(self, name) is None
+        }
+        return replace(self, retention=self.retention_of(method), **own)
 
     def retention_of(self, method: str) -> float:
         """The share a round of `method` keeps."""
@@ -113,7 +138,7 @@ class SimplifyConfig:
 
     def min_opacity_of(self, method: str) -> float:
         """The α below which `method` drops."""
-        return _MIN_OPACITY[method] if self.min_opacity is None else self.min_opacity
+        return self.resolved(method).min_opacity or 0.0
 
 
 def schedule(count: int, budget: int, retention: float = 0.75, fold: float = 0.05) -> list[int]:

@@ -1,4 +1,5 @@
-"""The policies `default` and `fast`: merging weighed by what views see, then sizes fitted to it."""
+"""The methods `default` and `fast`, which the core calls pairwise: merging weighed by what views see, then
+opacities fitted to it."""
 
 from __future__ import annotations
 
@@ -11,17 +12,12 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.errors import InputError
+from g2ard.prepared import PreparedScene
 from g2ard.progress import Progress, counter
 from g2ard.simplify.config import SimplifyConfig, schedule
 from g2ard.splats import DRAWN_LOGIT, Splats
 
-__all__ = ["Seen", "Visibility", "merge", "merge_looking", "rows_of", "splats_of"]
-
-_LADDER = {"default": (3.0, 1), "fast": (1.0, 2)}
-"""Down to how many times the budget rows merge along Morton order, and in how many steps."""
-
-_BLIND = 1 / 2
-"""How much of its weight the error of coverage has where nothing is known of what views see."""
+__all__ = ["Visibility", "VisibilitySource", "merge", "merge_and_fit", "rows_of", "splats_of"]
 
 _FIT = 1 / 4
 """Exponent of the ratio of what views saw to what they see: ½ fits the views looked from by up to 0.1 dB
@@ -34,8 +30,8 @@ DRAWN_OPACITY = float(1 / (1 + np.exp(-DRAWN_LOGIT)))
 """Renderers draw nothing fainter."""
 
 
-class Seen(Protocol):
-    """What views say of N Gaussians, such as `g2ard.render.visibility` returns."""
+class Visibility(Protocol):
+    """What views see of N Gaussians, such as `g2ard.visibility.visibility` returns."""
 
     @property
     def weight(self) -> NDArray[Any]:
@@ -43,71 +39,73 @@ class Seen(Protocol):
 
     @property
     def pixel_size(self) -> NDArray[Any]:
-        """(N,) the size of a pixel there, scene units; ∞ where no view looks."""
+        """(N,) the size of a pixel there, scene units; ∞ where no view contains it."""
 
 
-Visibility = Seen | Callable[[Splats], Seen]
+VisibilitySource = Callable[[Splats], Visibility]
+"""Finds what views see of a scene, such as `g2ard.visibility.visibility_source` returns."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Views:
+class _RowVisibility:
     weight: NDArray[np.float32]
     pixel_size: NDArray[np.float32]
 
 
-def rows_of(seen: Seen, count: int, finite: NDArray[np.bool_] | slice) -> _Views:
+def rows_of(visibility: Visibility, count: int, finite: NDArray[np.bool_] | slice) -> _RowVisibility:
+    """The finite rows of a visibility, contiguous."""
     for name in ("weight", "pixel_size"):
-        shape = getattr(seen, name).shape
+        shape = getattr(visibility, name).shape
         if shape != (count,):
             raise InputError(f"visibility.{name}: expected shape ({count},), got {shape}")
-    weight, pixel = (np.asarray(a, np.float32)[finite] for a in (seen.weight, seen.pixel_size))
-    return _Views(np.ascontiguousarray(weight), np.ascontiguousarray(pixel))
+    weight, pixel = (np.asarray(a, np.float32)[finite] for a in (visibility.weight, visibility.pixel_size))
+    return _RowVisibility(np.ascontiguousarray(weight), np.ascontiguousarray(pixel))
 
 
 def merge(
-    scene: Splats,
+    scene: PreparedScene,
     budget: int,
     method: str,
-    seen: Seen | None,
+    visibility: Visibility | None,
     flags: NDArray[np.bool_] | None,
     config: SimplifyConfig,
     tell: Callable[[int, int], None],
 ) -> dict[str, Any]:
-    """`default` or `fast`; `seen` has a row for each of the scene's."""
-    ladder, steps = _LADDER[method]
+    """`default` or `fast`; `visibility` has a row for each of the scene's."""
+    config = config.resolved(method)
     return _core.simplify_pairwise(
-        scene,
+        scene.core,
         schedule(len(scene), budget, config.retention_of(method), config.fold),
         protected=flags,
-        weight=None if seen is None else seen.weight,
-        pixel_size=None if seen is None else seen.pixel_size,
+        weight=None if visibility is None else visibility.weight,
+        pixel_size=None if visibility is None else visibility.pixel_size,
         min_opacity=config.min_opacity_of(method),
-        ladder=ladder,
-        ladder_steps=steps,
+        morton_premerge_ratio=config.morton_premerge_ratio,
+        morton_premerge_steps=config.morton_premerge_steps,
         neighbors=config.neighbors,
-        geometric=config.geometric_weight * (_BLIND if seen is None else 1.0),
+        geometric_weight=config.geometric_weight,
         dilation=config.dilation,
         pixel_scale=config.pixel_scale,
-        growth=config.max_growth,
+        max_growth=config.max_growth,
         progress=tell,
     )
 
 
-def merge_looking(
-    scene: Splats,
+def merge_and_fit(
+    scene: PreparedScene,
     budget: int,
     method: str,
-    look: Callable[[Splats], Seen],
+    source: VisibilitySource,
     flags: NDArray[np.bool_] | None,
     config: SimplifyConfig,
     progress: Progress,
 ) -> dict[str, Any]:
     """Merge by what views see of the scene, then fit each row's opacity to what they see of the result."""
-    seen = rows_of(look(scene), len(scene), slice(None))
-    out = merge(scene, budget, method, seen, flags, config, counter(progress, "simplify"))
+    visibility = rows_of(source(scene), len(scene), slice(None))
+    out = merge(scene, budget, method, visibility, flags, config, counter(progress, "simplify"))
     merged, parents = splats_of(scene, out), out["parents"]
-    order = _core.simplify_order(scene)  # sums round alike whatever the order of the rows
-    fitted = _fitted(merged, parents[order], seen.weight[order], look(merged).weight)
+    order = scene.core.order  # sums round alike whatever the order of the rows
+    fitted = _fitted(merged, parents[order], visibility.weight[order], source(merged).weight)
     changed = fitted.logit_opacities != merged.logit_opacities
     changed |= (fitted.scales != merged.scales).any(axis=1)
     return {
@@ -115,7 +113,7 @@ def merge_looking(
         "scales": fitted.scales,
         "logit_opacities": fitted.logit_opacities,
         "fitted": int(np.count_nonzero(changed)),
-        "unseen": int(np.count_nonzero((seen.weight == 0) & (parents >= 0))),
+        "unseen": int(np.count_nonzero((visibility.weight == 0) & (parents >= 0))),
     }
 
 

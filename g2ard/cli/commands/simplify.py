@@ -70,7 +70,7 @@ def simplify(
     from g2ard.constants import changed, listed
     from g2ard.simplify import SimplifyConfig
     from g2ard.simplify import simplify as reduce
-    from g2ard.visibility import looker
+    from g2ard.visibility import visibility_source
 
     one_budget(count, ratio)
     if views is not None and no_views:
@@ -92,7 +92,7 @@ def simplify(
         found.splats,
         budget,
         method=method,
-        visibility=None if cameras is None else looker(cameras, progress=run.progress),
+        visibility=None if cameras is None else visibility_source(cameras, progress=run.progress),
         config=config,
         progress=run.progress,
     )

@@ -28,14 +28,14 @@ fn main() {
 
 mod spatial {
     use super::*;
-    use g2ard_core::spatial::{Frame, Tree, codes, order};
+    use g2ard_core::spatial::{RobustBounds, Tree, codes, order};
 
     const NEIGHBORS: usize = 6;
 
     #[divan::bench(args = COUNTS)]
     fn morton_order(bencher: Bencher, count: usize) {
         let points = Scene::of(count).means;
-        bencher.bench(|| order(&codes(&points, &Frame::of(&points))));
+        bencher.bench(|| order(&codes(&points, &RobustBounds::of(&points))));
     }
 
     #[divan::bench(args = COUNTS)]
@@ -60,6 +60,7 @@ mod spatial {
 
 mod simplify {
     use super::*;
+    use g2ard_core::scene::Ordered;
     use g2ard_core::simplify::{Pairwise, Paper, flags};
 
     /// Counts after each round, `retention` of the one before kept.
@@ -75,8 +76,13 @@ mod simplify {
 
     fn pairwise(bencher: Bencher, count: usize, policy: Pairwise) {
         let (scene, counts) = (Scene::of(count), schedule(count, 0.65));
-        let run = || policy.run(&scene.scene(), None, None, &counts, &Control::default());
-        bencher.bench(|| run().expect("a valid scene"));
+        bencher.bench(|| {
+            let (scene, control) = (scene.scene(), Control::default());
+            let ordered = Ordered::new(&scene).expect("a valid scene");
+            policy
+                .run(&scene, &ordered, None, None, &counts, &control)
+                .expect("a valid scene")
+        });
     }
 
     #[divan::bench(args = COUNTS)]
@@ -84,15 +90,9 @@ mod simplify {
         pairwise(bencher, count, Pairwise::default());
     }
 
-    /// Along the Morton tree's ladder all the way.
     #[divan::bench(args = COUNTS)]
     fn fast_policy(bencher: Bencher, count: usize) {
-        let policy = Pairwise {
-            ladder: 1.0,
-            ladder_steps: 3,
-            ..Pairwise::default()
-        };
-        pairwise(bencher, count, policy);
+        pairwise(bencher, count, Pairwise::fast());
     }
 
     #[divan::bench(args = COUNTS)]
@@ -107,17 +107,13 @@ mod simplify {
     fn paper_policy(bencher: Bencher, count: usize) {
         let (scene, counts) = (Scene::of(count), schedule(count, 0.75));
         let (paper, cells) = (Paper::default(), count / RATIO);
-        let run = || {
-            paper.run(
-                &scene.scene(),
-                None,
-                cells,
-                &counts,
-                &Cpu,
-                &Control::default(),
-            )
-        };
-        bencher.bench(|| run().expect("a valid scene"));
+        bencher.bench(|| {
+            let (scene, control) = (scene.scene(), Control::default());
+            let ordered = Ordered::new(&scene).expect("a valid scene");
+            paper
+                .run(&scene, &ordered, None, cells, &counts, &Cpu, &control)
+                .expect("a valid scene")
+        });
     }
 }
 
@@ -218,7 +214,7 @@ mod ssim {
 
 mod select {
     use super::*;
-    use g2ard_core::select::{Coverage, Opaque, Problem, Surface, visible};
+    use g2ard_core::select::{Coverage, Occluders, Problem, Surface, visible_cells};
 
     const VIEWS: usize = 64;
     const CHOSEN: usize = 16;
@@ -232,9 +228,9 @@ mod select {
         Surface::of(&scene.gaussians(), scene.means.len() / 4, &Cpu).expect("a valid scene")
     }
 
-    fn seen(scene: &Scene, surface: &Surface, views: &[Camera]) -> Vec<Vec<u32>> {
-        let opaque = Opaque::of(&scene.gaussians());
-        visible(&opaque, surface, views, &Control::default()).expect("never cancelled")
+    fn seen_cells(scene: &Scene, surface: &Surface, views: &[Camera]) -> Vec<Vec<u32>> {
+        let occluders = Occluders::of(&scene.gaussians());
+        visible_cells(&occluders, surface, views, &Control::default()).expect("never cancelled")
     }
 
     #[divan::bench(args = COUNTS)]
@@ -248,7 +244,7 @@ mod select {
     fn cells_seen(bencher: Bencher, count: usize) {
         let (scene, views) = (Scene::of(count), views());
         let surface = surface(&scene);
-        bencher.bench(|| seen(&scene, &surface, &views));
+        bencher.bench(|| seen_cells(&scene, &surface, &views));
     }
 
     /// 16 of the 64 views by directional coverage, lazily.
@@ -259,7 +255,7 @@ mod select {
         let positions: Vec<_> = views.iter().map(Camera::position).collect();
         let problem = Problem {
             surface: &surface,
-            visible: &seen(&scene, &surface, &views),
+            visible: &seen_cells(&scene, &surface, &views),
             positions: &positions,
         };
         let coverage = Coverage {

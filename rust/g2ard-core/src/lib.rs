@@ -5,18 +5,22 @@
 
 pub mod backend;
 pub mod control;
+mod cpu;
 pub mod error;
 pub mod lift;
 pub mod linalg;
 pub mod raster;
+pub mod scene;
 pub mod select;
 pub mod simplify;
 pub mod spatial;
 pub mod splats;
 pub mod ssim;
 pub mod train;
+pub mod visibility;
 
-pub use backend::{Backend, Cpu};
+pub use backend::Backend;
 pub use control::Control;
+pub use cpu::Cpu;
 pub use error::{Error, Result};
 pub use splats::Splats;

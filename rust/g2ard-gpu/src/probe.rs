@@ -2,11 +2,11 @@
 
 use std::time::{Duration, Instant};
 
-use g2ard_core::backend::{Numbered, Run};
+use g2ard_core::simplify::GroupKernels;
 use g2ard_core::{Control, Cpu, Splats};
 
 use crate::groups;
-use crate::rows::Rows;
+use crate::rows::{Numbered, Rows};
 use crate::runtime::{Error, Gpu, Result};
 
 /// Groups of a check, and of a race; rows of each.
@@ -43,7 +43,7 @@ fn race(gpu: &Gpu, groups: usize) -> Result<(Duration, Duration)> {
         ROWS
     };
     let began = Instant::now();
-    let want = Cpu.energies(rows, groups, &group, &control)?;
+    let want = Cpu.energies(&splats, groups, &group, &control)?;
     let here = began.elapsed();
     let began = Instant::now();
     let mut held = Rows::default();

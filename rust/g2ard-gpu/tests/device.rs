@@ -1,6 +1,7 @@
 //! The device as policies see it: the paper's policy whole, and every way in which a device fails.
 
-use g2ard_core::simplify::{Means, Outcome, Paper, PaperRound, SceneRef};
+use g2ard_core::scene::{Means, Ordered, SceneRef};
+use g2ard_core::simplify::{Outcome, Paper, PaperRound};
 use g2ard_core::{Backend, Control, Cpu};
 use g2ard_gpu::runtime::{Error, Gpu, Options, list};
 use g2ard_gpu::{Choice, Device};
@@ -62,10 +63,11 @@ fn simplify(scene: &Scene, backend: &dyn Backend) -> Outcome<PaperRound> {
     Paper::default()
         .run(
             &borrowed,
+            &Ordered::new(&borrowed).unwrap(),
             None,
             count / 5,
             &schedule,
-            backend,
+            &*backend.group_kernels(),
             &Control::default(),
         )
         .unwrap()

@@ -2,8 +2,9 @@
 
 use g2ard_core::Splats;
 use g2ard_core::raster::{Camera, Gradients, Params};
+use g2ard_core::scene::{Means, SceneRef};
 use g2ard_core::select::Gaussians;
-use g2ard_core::simplify::{Means, SceneRef};
+
 use glam::{DQuat, DVec3};
 
 /// SH of degree 3, as trained scenes have.

@@ -1,6 +1,6 @@
 //! Where the Gaussians' stored values come from, sixteen rows at a time.
 
-use super::simd::{LANES, Lanes, Row};
+use super::simd::{LANES, Lanes, Lanes16};
 use crate::{Error, Result};
 
 /// N Gaussians in the torch layout: row-major borrowed slices, each in its stored (not activated) space.
@@ -84,7 +84,7 @@ pub(crate) trait Source: Copy + Sync {
 /// Every `stride`-th value from a row-major array, `offset` into the row.
 #[inline(always)]
 fn strided<F: Lanes>(values: &[f32], group: usize, stride: usize, offset: usize) -> F {
-    let mut row = Row::default();
+    let mut row = Lanes16::default();
     let first = group * LANES;
     let start = first * stride + offset;
     if values.len() >= (first + LANES) * stride {

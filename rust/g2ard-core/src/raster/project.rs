@@ -4,7 +4,7 @@ mod screen;
 mod unproject;
 
 use super::params::Source;
-use super::simd::{LANES, LOG2_E, Lanes, Mask, Row, Wide};
+use super::simd::{LANES, LOG2_E, Lanes, Lanes16, Mask, Wide};
 use super::{ALPHA_MIN, Camera, Convention, DILATION, Settings};
 
 pub use screen::Project;
@@ -285,7 +285,7 @@ fn on_image<F: Lanes>(centre: F, extent: F, size: f32) -> F::Mask {
 /// ½·log2(x), lane by lane: only antialiasing needs it.
 #[inline(always)]
 fn half_log2<F: Lanes>(x: F) -> F {
-    let mut row = Row::default();
+    let mut row = Lanes16::default();
     x.store(&mut row);
     for l in 0..LANES {
         row.0[l] = 0.5 * row.0[l].log2();

@@ -1,7 +1,7 @@
 //! The scene's median depth at the pixels where it is wanted. No other pixel is worked out, so that this is far
 //! cheaper than an image and yet exactly what it would show.
 
-use super::opaque::Opaque;
+use super::occluders::Occluders;
 use super::pinhole::{ALPHA_MIN, Pinhole, Splat};
 use crate::raster::Camera;
 
@@ -32,7 +32,7 @@ impl Scratch {
     }
 
     /// Depth of the splat behind which less than half the light is left, 0 where there is none.
-    pub fn trace(&mut self, scene: &Opaque, view: &Pinhole) {
+    pub fn trace(&mut self, scene: &Occluders, view: &Pinhole) {
         for row in scene.rows_in(view) {
             if let Some((z, splat)) = view.project(row)
                 && self.touches(view, &splat)
@@ -107,7 +107,7 @@ fn sort_by_high_half(keys: &mut Vec<u64>, spare: &mut Vec<u64>) {
 }
 
 /// Median depths of one camera, row by row.
-pub fn median_depths(scene: &Opaque, camera: &Camera) -> Vec<f32> {
+pub fn median_depths(scene: &Occluders, camera: &Camera) -> Vec<f32> {
     let (view, mut scratch) = (Pinhole::of(camera), Scratch::default());
     scratch.clear(&view, 1.0);
     scratch.trace(scene, &view);
@@ -166,7 +166,7 @@ mod tests {
             height: 47,
             near: 0.01,
         };
-        let opaque = Opaque::of(&scene);
+        let opaque = Occluders::of(&scene);
         let whole = median_depths(&opaque, &camera);
         assert!(whole.iter().filter(|&&d| d > 0.0).count() > 1000);
         let (view, mut scratch) = (Pinhole::of(&camera), Scratch::default());
@@ -202,8 +202,8 @@ mod tests {
             scales: &scales,
             opacities: &(0..n).map(|_| uniform(0.0, 1.0) as f32).collect::<Vec<_>>(),
         };
-        let blocks = Opaque::of(&scene);
-        let mut whole = Opaque::of(&scene);
+        let blocks = Occluders::of(&scene);
+        let mut whole = Occluders::of(&scene);
         for block in &mut whole.blocks {
             block.half = [f32::INFINITY; 3];
         }

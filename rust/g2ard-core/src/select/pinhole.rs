@@ -1,6 +1,6 @@
 //! One camera, and Gaussians as it sees them: by gsplat's conventions.
 
-use super::opaque::{Block, Row};
+use super::occluders::{Block, Occluder};
 use crate::raster::Camera;
 
 /// As gsplat: splats are widened by 0.3 px², less than 1/255 is nothing.
@@ -113,7 +113,7 @@ impl Pinhole {
     }
 
     /// The splat and its depth; None where no pixel can show it.
-    pub(super) fn project(&self, row: &Row) -> Option<(f32, Splat)> {
+    pub(super) fn project(&self, row: &Occluder) -> Option<(f32, Splat)> {
         let [tx, ty, z] = self.to_camera(row.mean);
         if z <= self.near {
             return None;

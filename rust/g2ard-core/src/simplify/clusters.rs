@@ -2,8 +2,9 @@
 
 use rayon::prelude::*;
 
-use super::moments::{Gaussian, MAX_OPACITY, pool, rendered_area, sigmoid};
-use super::{GONE, Ordered, SceneRef, Step};
+use super::moments::{MAX_OPACITY, pool, rendered_area, sigmoid};
+use super::{GONE, Step};
+use crate::scene::{Gaussian, Ordered, SceneRef};
 use crate::{Control, Result, Splats};
 
 /// Which cluster each ordered row belongs to ([`GONE`] for none).

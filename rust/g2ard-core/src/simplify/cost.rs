@@ -39,7 +39,7 @@ pub struct Node {
     /// Σ α·A, A with the dilation: light stopped, as rendered.
     pub mass: f32,
     /// Σ αT over the views, or what stands for it.
-    pub seen: f32,
+    pub visibility: f32,
     /// A_d.
     pub areas: Lanes,
 }
@@ -183,7 +183,7 @@ impl Node {
             blur,
             alpha: (mass / area(&s)).min(MAX_ALPHA),
             mass,
-            seen: self.seen + other.seen,
+            visibility: self.visibility + other.visibility,
             areas: areas(&s),
         }
     }
@@ -225,7 +225,7 @@ impl Node {
             col += u * u * self.areas[l] + v * v * other.areas[l] - 4.0 * u * v * ab[l];
         }
         let error = geometric * geo.max(0.0) + color * col.max(0.0);
-        let cost = error * (PI / USED) * m.seen / m.mass.max(f32::MIN_POSITIVE);
+        let cost = error * (PI / USED) * m.visibility / m.mass.max(f32::MIN_POSITIVE);
         if cost < f32::MAX { cost } else { f32::MAX }
     }
 }
@@ -324,7 +324,7 @@ mod tests {
             error +=
                 geometric * squared([1.0, 1.0, -1.0]) + color * squared([share, share - 1.0, 0.0]);
         }
-        error / 6.0 * f64::from(m.seen / m.mass)
+        error / 6.0 * f64::from(m.visibility / m.mass)
     }
 
     #[test]
@@ -347,7 +347,7 @@ mod tests {
                 ..Node::default()
             }
             .weighed();
-            n.seen = 3.0 * n.mass;
+            n.visibility = 3.0 * n.mass;
             n
         };
         for _ in 0..300 {
@@ -375,7 +375,7 @@ mod tests {
             ..Node::default()
         };
         let mut a = plain.weighed();
-        a.seen = a.mass;
+        a.visibility = a.mass;
         assert!(a.cost(&a, 0.0, 1.0) < 0.2); // α adds up, shape stays
         let mut far = Node {
             mean: [1e15; 3],
@@ -383,7 +383,7 @@ mod tests {
             ..plain
         }
         .weighed();
-        far.seen = far.mass;
+        far.visibility = far.mass;
         let cost = a.cost(&far, 1.0, 0.03);
         assert!(cost.is_finite() && cost >= 0.0);
     }

@@ -3,8 +3,9 @@
 use std::f64::consts::PI;
 use std::sync::OnceLock;
 
-use super::moments::{Gaussian, footprint};
+use super::moments::footprint;
 use crate::linalg::{Sym3, dot, sub};
+use crate::scene::Gaussian;
 
 const SAMPLES: usize = 16;
 

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::GONE;
 use super::cost::{Node, color_distance};
-use crate::spatial::{Frame, Tree, codes, order};
+use crate::spatial::{RobustBounds, Tree, codes, order};
 use crate::{Control, Result};
 
 /// Clusters in Morton order, with their SH, `width` values each.
@@ -23,16 +23,16 @@ impl Nodes {
         self.geometry.len()
     }
 
-    /// The rows of `left` in Morton order on a lattice shifted by shares of the frame's radius, where each node
+    /// The rows of `left` in Morton order on a lattice shifted by shares of the bounds's radius, where each node
     /// then is ([`GONE`] if not in `left`), and the codes in that order.
     pub fn morton(&self, left: &[u32], shift: [f64; 3]) -> (Vec<u32>, Vec<u32>, Vec<u64>) {
         let means: Vec<[f64; 3]> = left
             .par_iter()
             .map(|&i| self.geometry[i as usize].mean.map(f64::from))
             .collect();
-        let mut frame = Frame::of(&means);
-        (0..3).for_each(|k| frame.origin[k] += shift[k] * frame.radius);
-        let keys = codes(&means, &frame);
+        let mut bounds = RobustBounds::of(&means);
+        (0..3).for_each(|k| bounds.origin[k] += shift[k] * bounds.radius);
+        let keys = codes(&means, &bounds);
         let sorted = order(&keys);
         let from: Vec<u32> = sorted.par_iter().map(|&at| left[at as usize]).collect();
         let mut map = vec![GONE; self.len()];

@@ -6,7 +6,7 @@ use std::ops::{AddAssign, Mul, Sub};
 
 use rayon::prelude::*;
 
-use super::{Frame, codes, order};
+use super::{RobustBounds, codes, order};
 
 const WIDTH: usize = 8;
 type Lanes<T> = [T; WIDTH];
@@ -94,7 +94,7 @@ pub struct Tree<T = f64> {
 
 impl Tree<f64> {
     pub fn build(points: &[[f64; 3]]) -> Self {
-        let rows = order(&codes(points, &Frame::of(points)));
+        let rows = order(&codes(points, &RobustBounds::of(points)));
         Self::over(rows, |row| points[row])
     }
 }

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::{Shape, TAPS, window};
 use crate::Result;
-use crate::raster::frame::bytes;
+use crate::raster::memory::bytes;
 use crate::raster::simd::{Isa, LANES, dispatch};
 use bands::{Backward, Forward, span};
 

@@ -3,11 +3,11 @@
 use super::Rates;
 use super::anchors::{Anchors, Regularizers};
 use super::store::{SH, Writer};
-use crate::raster::frame::ChunkSums;
 use crate::raster::gradients::collect;
 use crate::raster::params::Source;
 use crate::raster::project::{RowGradients, unproject};
-use crate::raster::simd::{Kernel, LANES, Lanes, Mask, Row};
+use crate::raster::rasterizer::ChunkSums;
+use crate::raster::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
 
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
@@ -49,7 +49,7 @@ impl Kernel for Update<'_> {
     #[inline(always)]
     fn run<F: Lanes>(self) -> (usize, usize) {
         let sums = self.sums;
-        let packed = self.store.packed;
+        let parameters = self.store.parameters;
         let (mut next, mut updated, mut skipped) = (0, 0, 0);
         for group in sums.first_group..sums.last_group {
             let (mut active, screen) =
@@ -57,13 +57,13 @@ impl Kernel for Update<'_> {
             if active == 0 && self.regularize.is_none() {
                 continue;
             }
-            let mut g = unproject(sums.view, &packed, group, &screen);
+            let mut g = unproject(sums.view, &parameters, group, &screen);
             if let Some((weights, anchors)) = self.regularize {
                 let seen = F::Mask::from_bits(active);
                 zero_unseen(&mut g, seen);
-                let rows = (packed.len() - group * LANES).min(LANES);
+                let rows = (parameters.len() - group * LANES).min(LANES);
                 let real = ((1u32 << rows) - 1) as u16;
-                active |= anchors.add_gradients(weights, &packed, group, &mut g) & real;
+                active |= anchors.add_gradients(weights, &parameters, group, &mut g) & real;
                 if active == 0 {
                     continue;
                 }
@@ -140,7 +140,7 @@ struct Step<F: Lanes> {
 impl Update<'_> {
     #[inline(always)]
     fn step_group<F: Lanes>(&self, group: usize, good: u16, g: &RowGradients<F>) {
-        let mut bias = [Row([1.0; LANES]); 2];
+        let mut bias = [Lanes16([1.0; LANES]); 2];
         for l in 0..LANES {
             if good >> l & 1 == 1 {
                 // SAFETY: the group is this thread's.
@@ -177,7 +177,7 @@ impl Update<'_> {
         }
         self.attribute(&step, 10, g.logit_opacity, F::splat(rates.logit_opacities));
         let rate = F::splat(rates.sh_n);
-        for k in 1..self.store.packed.sh_coeffs() {
+        for k in 1..self.store.parameters.sh_coeffs() {
             for c in 0..3 {
                 // The SH gradient has rank one: it is never written out.
                 self.attribute(&step, SH + 3 * k + c, g.basis[k] * g.rgb[c], rate);
@@ -202,8 +202,8 @@ impl Update<'_> {
 
     #[inline(always)]
     fn attribute<F: Lanes>(&self, step: &Step<F>, attribute: usize, g: F, rate: F) {
-        let packed = &self.store.packed;
-        let at = packed.index(step.group, attribute);
+        let parameters = &self.store.parameters;
+        let at = parameters.index(step.group, attribute);
         // SAFETY: the group is this thread's, and all three arrays have its rows.
         let (first, second) = unsafe {
             (
@@ -218,9 +218,9 @@ impl Update<'_> {
             g * g * F::splat((1.0 - BETA2) as f32),
         );
         let denominator = v_new.sqrt().fma(step.bias2, F::splat(EPSILON));
-        let value = packed.get::<F>(step.group, attribute);
+        let value = parameters.get::<F>(step.group, attribute);
         let moved = (rate * step.bias1 * m_new).fnma(denominator.recip(), value);
-        packed.set(step.group, attribute, F::select(step.good, moved, value));
+        parameters.set(step.group, attribute, F::select(step.good, moved, value));
         F::select(step.good, m_new, m).store(first);
         F::select(step.good, v_new, v).store(second);
     }

@@ -1,10 +1,10 @@
 //! Parameters and moments in blocks of sixteen, attribute after attribute.
 
 use crate::raster::Params;
-use crate::raster::frame::bytes;
-use crate::raster::order::Shared;
+use crate::raster::disjoint::DisjointSlice;
+use crate::raster::memory::bytes;
 use crate::raster::params::Source;
-use crate::raster::simd::{LANES, Lanes, Row};
+use crate::raster::simd::{LANES, Lanes, Lanes16};
 use crate::{Error, Result};
 
 /// Attributes before the SH: 3 means, 4 quats, 3 log-scales, 1 logit.
@@ -19,11 +19,11 @@ pub struct Store {
     rows: usize,
     sh_coeffs: usize,
     /// Block g's attribute a is row `g · attributes + a`.
-    values: Vec<Row>,
-    first: Vec<Row>,
-    second: Vec<Row>,
+    values: Vec<Lanes16>,
+    first: Vec<Lanes16>,
+    second: Vec<Lanes16>,
     /// What the means' rate is multiplied by.
-    units: Vec<Row>,
+    units: Vec<Lanes16>,
     steps: Vec<u32>,
     /// An upper bound of `steps`.
     most_steps: u32,
@@ -58,14 +58,14 @@ impl Store {
         }
         let attributes = SH + 3 * params.sh_coeffs;
         let blocks = rows.div_ceil(LANES);
-        let zeros = vec![Row::default(); blocks * attributes];
+        let zeros = vec![Lanes16::default(); blocks * attributes];
         let mut store = Self {
             rows,
             sh_coeffs: params.sh_coeffs,
             values: zeros.clone(),
             first: zeros.clone(),
             second: zeros,
-            units: vec![Row([1.0; LANES]); blocks],
+            units: vec![Lanes16([1.0; LANES]); blocks],
             steps: vec![0; blocks * LANES],
             most_steps: 0,
             order: morton_order(params.means),
@@ -130,7 +130,7 @@ impl Store {
         self.unblock(&self.values, from, to)
     }
 
-    fn unblock(&self, blocks: &[Row], from: usize, to: usize) -> Vec<f32> {
+    fn unblock(&self, blocks: &[Lanes16], from: usize, to: usize) -> Vec<f32> {
         let mut out = vec![0.0; self.rows * (to - from)];
         for row in 0..self.rows {
             let at = self.order[row] as usize * (to - from);
@@ -141,7 +141,7 @@ impl Store {
         out
     }
 
-    fn block(&self, rows: &[f32], into: &mut [Row]) {
+    fn block(&self, rows: &[f32], into: &mut [Lanes16]) {
         let attributes = self.attributes();
         for row in 0..self.rows {
             let from = self.order[row] as usize * attributes;
@@ -198,7 +198,7 @@ impl Store {
         }
         self.order.clone_from(&state.order);
         let [mut values, mut first, mut second] =
-            [&self.values, &self.first, &self.second].map(|v| vec![Row::default(); v.len()]);
+            [&self.values, &self.first, &self.second].map(|v| vec![Lanes16::default(); v.len()]);
         self.block(&state.values, &mut values);
         self.block(&state.first, &mut first);
         self.block(&state.second, &mut second);
@@ -211,9 +211,9 @@ impl Store {
         Ok(())
     }
 
-    pub(crate) fn packed(&mut self) -> Packed {
-        Packed {
-            values: Shared::new(&mut self.values),
+    pub(crate) fn parameters(&mut self) -> ParameterView {
+        ParameterView {
+            values: DisjointSlice::new(&mut self.values),
             rows: self.rows,
             sh_coeffs: self.sh_coeffs,
             attributes: SH + 3 * self.sh_coeffs,
@@ -222,19 +222,19 @@ impl Store {
 
     pub(crate) fn writer(&mut self) -> Writer {
         Writer {
-            packed: self.packed(),
-            first: Shared::new(&mut self.first),
-            second: Shared::new(&mut self.second),
-            units: Shared::new(&mut self.units),
-            steps: Shared::new(&mut self.steps),
+            parameters: self.parameters(),
+            first: DisjointSlice::new(&mut self.first),
+            second: DisjointSlice::new(&mut self.second),
+            units: DisjointSlice::new(&mut self.units),
+            steps: DisjointSlice::new(&mut self.steps),
         }
     }
 }
 
 /// A store's parameters as the rasteriser reads them. Must not outlive the store, nor be read while a block is written.
 #[derive(Clone, Copy)]
-pub(crate) struct Packed {
-    values: Shared<Row>,
+pub(crate) struct ParameterView {
+    values: DisjointSlice<Lanes16>,
     rows: usize,
     sh_coeffs: usize,
     attributes: usize,
@@ -243,14 +243,14 @@ pub(crate) struct Packed {
 /// The same, and all that a step changes. Each block must be one thread's.
 #[derive(Clone, Copy)]
 pub(crate) struct Writer {
-    pub packed: Packed,
-    pub first: Shared<Row>,
-    pub second: Shared<Row>,
-    pub units: Shared<Row>,
-    pub steps: Shared<u32>,
+    pub parameters: ParameterView,
+    pub first: DisjointSlice<Lanes16>,
+    pub second: DisjointSlice<Lanes16>,
+    pub units: DisjointSlice<Lanes16>,
+    pub steps: DisjointSlice<u32>,
 }
 
-impl Packed {
+impl ParameterView {
     #[inline(always)]
     pub fn index(&self, group: usize, attribute: usize) -> usize {
         group * self.attributes + attribute
@@ -274,7 +274,7 @@ impl Packed {
     }
 }
 
-impl Source for Packed {
+impl Source for ParameterView {
     #[inline(always)]
     fn len(&self) -> usize {
         self.rows

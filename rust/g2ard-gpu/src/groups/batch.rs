@@ -1,7 +1,7 @@
 //! Groups in batches that fit the device; while it computes one, the next is put together here.
 
 use g2ard_core::Control;
-use g2ard_core::backend::Group;
+use g2ard_core::simplify::Group;
 use rayon::prelude::*;
 
 use crate::rows::{Gather, Rows};

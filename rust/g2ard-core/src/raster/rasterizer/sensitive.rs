@@ -3,11 +3,11 @@
 use rayon::prelude::*;
 
 use super::{Image, Rasterizer};
-use crate::raster::order::Shared;
+use crate::raster::disjoint::DisjointSlice;
 use crate::raster::params::Params;
 use crate::raster::sensitivity::{GatherSensitivity, MOMENTS, Sensitivity, TRIANGLE};
 use crate::raster::simd::dispatch;
-use crate::raster::stage::{Place, Staged};
+use crate::raster::tile_batch::{TileBatch, TileRect};
 use crate::raster::{Camera, Settings};
 use crate::{Error, Result};
 
@@ -36,15 +36,15 @@ impl Rasterizer {
         };
         self.forward(params, camera, settings, [0.0; 3], &mut image)?;
         let sensitive = self.sensitivity_tiles();
-        let Some(frame) = &self.frame else {
+        let Some(state) = &self.state else {
             return Ok(());
         };
-        let out = Shared::new(sums);
+        let out = DisjointSlice::new(sums);
         let chunks = self.chunks.par_iter().enumerate();
         chunks.for_each(|(chunk, &(first, count))| {
             let slots = self.bins.slots_of(chunk);
             let gather = GatherSensitivity {
-                view: &frame.view,
+                view: &state.view,
                 source: *params,
                 splats: &self.splats[first..first + count],
                 slots: &sensitive[slots.clone()],
@@ -60,13 +60,13 @@ impl Rasterizer {
     fn sensitivity_tiles(&mut self) -> Vec<[f32; MOMENTS]> {
         self.clear_slots();
         let mut sums = vec![[0.0; MOMENTS]; self.bins.pairs.len()];
-        let Some(frame) = &self.frame else {
+        let Some(state) = &self.state else {
             return sums;
         };
-        let camera = &frame.camera;
+        let camera = &state.camera;
         let tiles_x = camera.tiles().0;
-        let slots = Shared::new(&mut sums);
-        let written = Shared::new(&mut self.written);
+        let slots = DisjointSlice::new(&mut sums);
+        let written = DisjointSlice::new(&mut self.written);
         let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
         let states = self
             .batches
@@ -74,17 +74,17 @@ impl Rasterizer {
             .zip(&self.transmittance)
             .zip(&self.last);
         states.enumerate().for_each_init(
-            Staged::default,
-            |staged, (tile, ((batch, transmittance), last))| {
+            TileBatch::default,
+            |tile_batch, (tile, ((batch, transmittance), last))| {
                 let sensitivity = Sensitivity {
                     pairs: &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize],
                     splats,
-                    place: Place::of(tile, tiles_x, camera.width, camera.height),
-                    settings: &frame.settings,
-                    words: &self.words[batch.0..batch.0 + batch.1],
+                    rect: TileRect::of(tile, tiles_x, camera.width, camera.height),
+                    settings: &state.settings,
+                    block_masks: &self.block_masks[batch.0..batch.0 + batch.1],
                     transmittance,
                     last,
-                    batch: &mut staged.near,
+                    batch: &mut tile_batch.splats,
                     slots,
                     written,
                 };

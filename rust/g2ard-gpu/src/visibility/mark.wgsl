@@ -1,4 +1,4 @@
-// Rows as splats. `look`: a thread marks a row that the image may show; a workgroup sums the tiles of its 256.
+// Rows as splats. `mark`: a thread marks a row that the image may show; a workgroup sums the tiles of its 256.
 // `depths`: the marked rows by the upper bits of their depth. `gather`: marked rows, in order, become splats with
 // their depth as sorting key.
 
@@ -75,7 +75,7 @@ fn project(row: Row) -> Splat {
 }
 
 @compute @workgroup_size(256)
-fn look(
+fn mark(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) t: u32,

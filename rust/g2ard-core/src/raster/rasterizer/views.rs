@@ -62,11 +62,6 @@ pub struct Memory {
     pub images: usize,
 }
 
-/// What a buffer holds, used or not.
-pub(crate) fn bytes<T>(buffer: &Vec<T>) -> usize {
-    buffer.capacity() * size_of::<T>()
-}
-
 fn check(name: &'static str, got: usize, expected: usize) -> Result<()> {
     if got == expected {
         return Ok(());

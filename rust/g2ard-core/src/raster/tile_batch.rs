@@ -1,8 +1,8 @@
 //! Sixty-four of a tile's pairs, brought to the tile's own coordinates, and the 4×4-pixel blocks each of them reaches.
 
-use super::order::prefetch;
+use super::memory::prefetch;
 use super::project::Splat;
-use super::simd::{LANES, Lanes, Mask, Row};
+use super::simd::{LANES, Lanes, Lanes16, Mask};
 use super::tiles::Pair;
 use super::{ALPHA_MIN, BLOCKS, TILE};
 
@@ -15,7 +15,7 @@ const AHEAD: usize = 24;
 /// A pair's splat relative to the tile's first pixel centre: what the pixels' loops read, in one cache line.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
-pub struct Near {
+pub struct TileSplat {
     pub u: f32,
     pub v: f32,
     pub a: f32,
@@ -29,7 +29,7 @@ pub struct Near {
 }
 
 /// A splat that reaches nothing.
-const NOTHING: Near = Near {
+const NOTHING: TileSplat = TileSplat {
     u: 0.0,
     v: 0.0,
     a: 0.0,
@@ -41,11 +41,11 @@ const NOTHING: Near = Near {
     number: 0.0,
 };
 
-impl Near {
+impl TileSplat {
     #[inline(always)]
-    pub fn new(s: &Splat, place: &Place, number: usize) -> Self {
+    pub fn new(s: &Splat, rect: &TileRect, number: usize) -> Self {
         // In f64: far from the centre of a needle u is a small difference of large numbers.
-        let (dx, dy) = (place.x as f64 + 0.5 - s.x, place.y as f64 + 0.5 - s.y);
+        let (dx, dy) = (rect.x as f64 + 0.5 - s.x, rect.y as f64 + 0.5 - s.y);
         Self {
             u: (f64::from(s.a) * dx + f64::from(s.b) * dy) as f32,
             v: (f64::from(s.c) * dy) as f32,
@@ -61,13 +61,13 @@ impl Near {
 }
 
 /// A batch's splats, and one more that reaches nothing.
-pub type Batch = [Near; BATCH + 1];
+pub type TileSplats = [TileSplat; BATCH + 1];
 
 /// A batch, and its splats' ellipses one field after another.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
-pub struct Staged {
-    pub near: Batch,
+pub struct TileBatch {
+    pub splats: TileSplats,
     a: [f32; BATCH],
     b: [f32; BATCH],
     c: [f32; BATCH],
@@ -76,11 +76,11 @@ pub struct Staged {
     centre_y: [f32; BATCH],
 }
 
-impl Default for Staged {
+impl Default for TileBatch {
     fn default() -> Self {
         let zero = [0.0; BATCH];
         Self {
-            near: [NOTHING; BATCH + 1],
+            splats: [NOTHING; BATCH + 1],
             a: zero,
             b: zero,
             c: zero,
@@ -91,9 +91,9 @@ impl Default for Staged {
     }
 }
 
-/// A tile's place in the image.
+/// A tile's rect in the image.
 #[derive(Debug, Clone, Copy)]
-pub struct Place {
+pub struct TileRect {
     /// Its first pixel.
     pub x: usize,
     pub y: usize,
@@ -102,7 +102,7 @@ pub struct Place {
     pub rows: usize,
 }
 
-impl Place {
+impl TileRect {
     pub fn of(tile: usize, tiles_x: usize, width: usize, height: usize) -> Self {
         let (x, y) = (tile % tiles_x * TILE, tile / tiles_x * TILE);
         Self {
@@ -131,8 +131,8 @@ pub fn block_pixel(block: usize, lane: usize) -> (usize, usize) {
 }
 
 /// The pixels' coordinates within the tile, block by block.
-static COORDINATES: [[Row; 2]; BLOCKS] = {
-    let mut rows = [[Row([0.0; LANES]); 2]; BLOCKS];
+static COORDINATES: [[Lanes16; 2]; BLOCKS] = {
+    let mut rows = [[Lanes16([0.0; LANES]); 2]; BLOCKS];
     let mut block = 0;
     while block < BLOCKS {
         let mut l = 0;
@@ -165,32 +165,32 @@ pub fn block_coordinates<F: Lanes>(block: usize) -> (F, F) {
 /// Loads a tile's pairs from the `first` on, 64 at most.
 #[inline(always)]
 pub fn load_batch(
-    batch: &mut Batch,
+    batch: &mut TileSplats,
     pairs: &[Pair],
     first: usize,
     splats: &[Splat],
-    place: &Place,
+    rect: &TileRect,
 ) {
     let places = batch.iter_mut().take(BATCH);
     for (i, (near, pair)) in (first..).zip(places.zip(&pairs[first..])) {
         if let Some(ahead) = pairs.get(i + AHEAD) {
             prefetch(&splats[ahead.splat as usize]);
         }
-        *near = Near::new(&splats[pair.splat as usize], place, i);
+        *near = TileSplat::new(&splats[pair.splat as usize], rect, i);
     }
 }
 
-impl Staged {
+impl TileBatch {
     /// Loads a tile's pairs from the `first` on, 64 at most.
     #[inline(always)]
-    pub fn load(&mut self, pairs: &[Pair], first: usize, splats: &[Splat], place: &Place) {
-        let (x0, y0) = (place.x as f64 + 0.5, place.y as f64 + 0.5);
+    pub fn load(&mut self, pairs: &[Pair], first: usize, splats: &[Splat], rect: &TileRect) {
+        let (x0, y0) = (rect.x as f64 + 0.5, rect.y as f64 + 0.5);
         for (i, pair) in pairs[first..].iter().take(BATCH).enumerate() {
             if let Some(ahead) = pairs.get(first + i + AHEAD) {
                 prefetch(&splats[ahead.splat as usize]);
             }
             let s = &splats[pair.splat as usize];
-            self.near[i] = Near::new(s, place, first + i);
+            self.splats[i] = TileSplat::new(s, rect, first + i);
             self.a[i] = s.a;
             self.b[i] = s.b;
             self.c[i] = s.c;
@@ -203,8 +203,8 @@ impl Staged {
     /// Bit p of word b: whether pair p reaches α = 1/255 anywhere in block b's rectangle of pixel centres. The minimum
     /// of the quadratic over a rectangle lies on one of the two sides nearest to the centre (or is the centre).
     #[inline(always)]
-    pub fn reachable<F: Lanes>(&self, count: usize, words: &mut [u64; BLOCKS]) {
-        *words = [0; BLOCKS];
+    pub fn reachable<F: Lanes>(&self, count: usize, block_masks: &mut [u64; BLOCKS]) {
+        *block_masks = [0; BLOCKS];
         for first in (0..count).step_by(LANES) {
             // SAFETY: `first` is at most 48 and each array holds 64.
             let [a, b, c, cx, cy, log2_opacity] = unsafe {
@@ -240,7 +240,7 @@ impl Staged {
                     let (u2, v2) = (a.fma(dx, b * near_y), c * near_y);
                     let least = u1.fma(u1, v1 * v1).min(u2.fma(u2, v2 * v2));
                     let hit = level.ge(least).bits();
-                    words[row * 4 + column] |= u64::from(hit) << first;
+                    block_masks[row * 4 + column] |= u64::from(hit) << first;
                 }
             }
         }
@@ -250,11 +250,11 @@ impl Staged {
 /// The blocks that each pair reaches, from the pairs that reach each block: four 16×16 bit matrices, transposed by
 /// swapping halves, quarters, …
 #[inline(always)]
-pub fn by_pair(words: &[u64; BLOCKS]) -> [u16; BATCH] {
+pub fn by_pair(block_masks: &[u64; BLOCKS]) -> [u16; BATCH] {
     let mut masks = [0; BATCH];
     for (part, masks) in masks.as_chunks_mut::<BLOCKS>().0.iter_mut().enumerate() {
         for block in 0..BLOCKS {
-            masks[block] = (words[block] >> (16 * part)) as u16;
+            masks[block] = (block_masks[block] >> (16 * part)) as u16;
         }
         swap::<8>(masks, 0x00ff);
         swap::<4>(masks, 0x0f0f);
@@ -277,7 +277,7 @@ fn swap<const BY: usize>(m: &mut [u16; 16], low: u16) {
 
 /// log2 α before clipping, for the pixels (x, y) of a block.
 #[inline(always)]
-pub fn log2_alpha<F: Lanes>(s: &Near, x: F, y: F) -> (F, F, F) {
+pub fn log2_alpha<F: Lanes>(s: &TileSplat, x: F, y: F) -> (F, F, F) {
     let u = F::splat(s.a).fma(x, F::splat(s.b).fma(y, F::splat(s.u)));
     let v = F::splat(s.c).fma(y, F::splat(s.v));
     (u, v, u.fnma(u, v.fnma(v, F::splat(s.log2_opacity))))
@@ -294,15 +294,15 @@ mod tests {
     use super::super::simd::{Isa, Kernel, dispatch};
     use super::*;
 
-    struct Reachable<'a>(&'a Staged, usize);
+    struct Reachable<'a>(&'a TileBatch, usize);
 
     impl Kernel for Reachable<'_> {
         type Output = [u64; BLOCKS];
         #[inline(always)]
         fn run<F: Lanes>(self) -> [u64; BLOCKS] {
-            let mut words = [0; BLOCKS];
-            self.0.reachable::<F>(self.1, &mut words);
-            words
+            let mut block_masks = [0; BLOCKS];
+            self.0.reachable::<F>(self.1, &mut block_masks);
+            block_masks
         }
     }
 
@@ -315,7 +315,7 @@ mod tests {
                 .wrapping_add(1_442_695_040_888_963_407);
             (state >> 40) as f32 / (1u64 << 24) as f32
         };
-        let place = Place {
+        let rect = TileRect {
             x: 32,
             y: 16,
             columns: 16,
@@ -338,11 +338,11 @@ mod tests {
                 })
                 .collect();
             let pairs: Vec<Pair> = (0..50).map(|splat| Pair { splat, slot: 0 }).collect();
-            let mut staged = Staged::default();
-            staged.load(&pairs, 0, &splats, &place);
-            let words = dispatch(Isa::detect(), Reachable(&staged, pairs.len()));
+            let mut tile_batch = TileBatch::default();
+            tile_batch.load(&pairs, 0, &splats, &rect);
+            let block_masks = dispatch(Isa::detect(), Reachable(&tile_batch, pairs.len()));
             for (p, s) in splats.iter().enumerate() {
-                for (block, word) in words.iter().enumerate() {
+                for (block, word) in block_masks.iter().enumerate() {
                     // Twenty points to a pixel: the rectangle of pixel centres, not only the centres.
                     let touched = (0..=60).any(|i| {
                         (0..=60).any(|j| {
@@ -359,7 +359,7 @@ mod tests {
                     extra += usize::from(got && !touched);
                 }
             }
-            assert!(words.iter().all(|w| w >> 50 == 0));
+            assert!(block_masks.iter().all(|w| w >> 50 == 0));
         }
         assert!(
             hit > 5_000 && extra * 50 < hit,

@@ -3,16 +3,16 @@
 use std::ops::Range;
 
 use super::TILE;
-use super::frame::bytes;
-use super::simd::{LANES, Lanes, Row};
+use super::memory::bytes;
+use super::simd::{LANES, Lanes, Lanes16};
 
-/// Tiles a [`Cover`] holds itself: as many as half a cache line has room for.
+/// Tiles a [`TileList`] holds itself: as many as half a cache line has room for.
 const INLINE: usize = 12;
 
 /// One splat's tiles, row by row, left to right.
 #[derive(Debug, Clone, Copy, Default)]
 #[repr(C, align(32))]
-pub struct Cover {
+pub struct TileList {
     /// Its first slot, among those of its chunk.
     pub slot: u32,
     pub tiles: u32,
@@ -21,9 +21,9 @@ pub struct Cover {
     inline: [u16; INLINE],
 }
 
-const _: () = assert!(size_of::<Cover>() == 32);
+const _: () = assert!(size_of::<TileList>() == 32);
 
-impl Cover {
+impl TileList {
     /// Takes the `count` tiles of `rows`, each a stretch of tile numbers; what there is no room for goes to the list.
     #[inline(always)]
     fn set(
@@ -130,16 +130,16 @@ fn whole(value: f32) -> usize {
 
 /// A chunk's tiles, and scratch.
 #[derive(Debug, Default)]
-pub struct Lister {
-    /// Those that its covers have no room for.
+pub struct TileIntersector {
+    /// Those that its tile_lists have no room for.
     pub list: Vec<u32>,
     /// The ends of sixteen ellipses in one row of tiles after another.
-    ends: Vec<[Row; 2]>,
+    ends: Vec<[Lanes16; 2]>,
     /// Slots numbered so far.
     pub slots: u32,
 }
 
-impl Lister {
+impl TileIntersector {
     /// Bytes held.
     pub fn bytes(&self) -> usize {
         bytes(&self.list) + bytes(&self.ends)
@@ -155,7 +155,13 @@ impl<F: Lanes> Ellipses<F> {
     /// Lists the tiles whose pixel centres' rectangle meets the ellipse of each lane in `bits`, lane after lane into
     /// `out`, the slots numbered on from the chunk's last.
     #[inline(always)]
-    pub fn covers(&self, bits: u32, tiles: (usize, usize), lister: &mut Lister, out: &mut [Cover]) {
+    pub fn tile_lists(
+        &self,
+        bits: u32,
+        tiles: (usize, usize),
+        intersector: &mut TileIntersector,
+        out: &mut [TileList],
+    ) {
         let (thousandth, hundredth, most) = (F::splat(1e-4), F::splat(0.01), F::splat(1e6));
         let slack_x = self.half[0].min(most).fma(thousandth, hundredth);
         let slack_y = self.half[1].min(most).fma(thousandth, hundredth);
@@ -164,7 +170,7 @@ impl<F: Lanes> Ellipses<F> {
         let rows = square_span(self.y, self.radius, tiles.1);
         let columns = span(self.x - half_x, self.x + half_x, columns);
         let [first, last] = span(self.y - half_y, self.y + half_y, rows);
-        let (mut from, mut to) = (Row::default(), Row::default());
+        let (mut from, mut to) = (Lanes16::default(), Lanes16::default());
         first.store(&mut from);
         last.store(&mut to);
         let r_a = F::splat(1.0) / self.a;
@@ -177,8 +183,8 @@ impl<F: Lanes> Ellipses<F> {
                 tallest = tallest.max(whole(to.0[l]).saturating_sub(whole(from.0[l])));
             }
         }
-        let Lister { list, ends, slots } = lister;
-        ends.resize(tallest, [Row::default(); 2]);
+        let TileIntersector { list, ends, slots } = intersector;
+        ends.resize(tallest, [Lanes16::default(); 2]);
         let mut count = F::zero();
         for (strip, ends) in ends.iter_mut().enumerate() {
             let row = first + F::splat(strip as f32);
@@ -189,11 +195,11 @@ impl<F: Lanes> Ellipses<F> {
             let tiles = (high - low).max(F::zero());
             count = count + tiles.only(last.gt(row));
         }
-        let mut counts = Row::default();
+        let mut counts = Lanes16::default();
         count.store(&mut counts);
         let narrow = narrow(tiles);
         let mut todo = bits;
-        for cover in out {
+        for tile_list in out {
             let l = todo.trailing_zeros() as usize;
             todo &= todo - 1;
             let rows = (whole(from.0[l])..whole(to.0[l]))
@@ -202,8 +208,8 @@ impl<F: Lanes> Ellipses<F> {
                     let first = (row * tiles.0) as u32;
                     first + whole(e[0].0[l]) as u32..first + whole(e[1].0[l]) as u32
                 });
-            cover.set(*slots, whole(counts.0[l]) as u32, narrow, rows, list);
-            *slots += cover.tiles;
+            tile_list.set(*slots, whole(counts.0[l]) as u32, narrow, rows, list);
+            *slots += tile_list.tiles;
         }
     }
 
@@ -238,12 +244,12 @@ mod tests {
     use super::super::simd::{Isa, Kernel, dispatch};
     use super::*;
 
-    /// One splat's cover, in lane 0.
+    /// One splat's tile_list, in lane 0.
     struct Covers<'a> {
         splat: &'a Splat,
         tiles: (usize, usize),
-        lister: &'a mut Lister,
-        out: &'a mut [Cover],
+        intersector: &'a mut TileIntersector,
+        out: &'a mut [TileList],
     }
 
     impl Kernel for Covers<'_> {
@@ -262,7 +268,7 @@ mod tests {
                 half: [F::splat(half[0]), F::splat(half[1])],
                 radius: None,
             };
-            ellipses.covers(1, self.tiles, self.lister, self.out);
+            ellipses.tile_lists(1, self.tiles, self.intersector, self.out);
         }
     }
 
@@ -310,17 +316,17 @@ mod tests {
                 log2_opacity: -random() * 6.0,
                 ..Splat::default()
             };
-            let mut out = [Cover::default()];
-            let mut lister = Lister::default();
-            let cover = Covers {
+            let mut out = [TileList::default()];
+            let mut intersector = TileIntersector::default();
+            let tile_list = Covers {
                 splat: &splat,
                 tiles,
-                lister: &mut lister,
+                intersector: &mut intersector,
                 out: &mut out,
             };
-            dispatch(Isa::detect(), cover);
+            dispatch(Isa::detect(), tile_list);
             let mut got = Vec::new();
-            out[0].for_each(&lister.list, 0, narrow(tiles), |t, _| got.push(t));
+            out[0].for_each(&intersector.list, 0, narrow(tiles), |t, _| got.push(t));
             let expected = brute(&splat, tiles);
             assert!(
                 expected.iter().all(|t| got.contains(t)),

@@ -10,20 +10,21 @@ use rayon::prelude::*;
 
 use super::accumulate::{ALL, Accumulated, SharedSums, Total, smallest_pixels};
 use super::backward::SUMS;
-use super::covers::{Cover, Lister};
+use super::depth_sort::{self, Key};
+use super::disjoint::DisjointSlice;
 use super::gradients::{Gather, Gradients, Sink};
-use super::order::{self, Key, Shared};
+use super::memory::bytes;
 use super::params::{Params, Source};
 use super::project::{Project, Splat, View};
-use super::simd::{Isa, LANES, Row, dispatch};
-use super::stage::BATCH;
+use super::simd::{Isa, LANES, Lanes16, dispatch};
+use super::tile_batch::BATCH;
+use super::tile_lists::{TileIntersector, TileList};
 use super::tiles::Bins;
 use super::{BLOCKS, Camera, Settings};
 use crate::{Error, Result};
 
 pub use views::{Counts, Image, ImageGradients, Memory, Passes};
 
-pub(crate) use views::bytes;
 use views::lap;
 
 /// Groups of sixteen rows projected as one piece of work.
@@ -39,7 +40,7 @@ pub(crate) struct ChunkSums<'a> {
     pub written: &'a [u8],
 }
 
-struct Frame {
+struct ForwardState {
     camera: Camera,
     settings: Settings,
     view: View,
@@ -50,10 +51,10 @@ struct Frame {
 /// Renders one view and remembers what its backward pass needs; every buffer is reused by the next view.
 pub struct Rasterizer {
     isa: Isa,
-    frame: Option<Frame>,
+    state: Option<ForwardState>,
     splats: Vec<Splat>,
-    covers: Vec<Cover>,
-    listers: Vec<Lister>,
+    tile_lists: Vec<TileList>,
+    intersectors: Vec<TileIntersector>,
     /// (first splat, number visible) of each chunk of rows.
     chunks: Vec<(usize, usize)>,
     order: Vec<Key>,
@@ -61,9 +62,9 @@ pub struct Rasterizer {
     bins: Bins,
     /// First batch of each tile, and how many the forward pass looked at.
     batches: Vec<(usize, usize)>,
-    words: Vec<[u64; BLOCKS]>,
-    transmittance: Vec<[Row; BLOCKS]>,
-    last: Vec<[Row; BLOCKS]>,
+    block_masks: Vec<[u64; BLOCKS]>,
+    transmittance: Vec<[Lanes16; BLOCKS]>,
+    last: Vec<[Lanes16; BLOCKS]>,
     slots: Vec<[f32; SUMS]>,
     /// The sums of visibility, one pair's after another's.
     shares: Vec<f32>,
@@ -81,16 +82,16 @@ impl Rasterizer {
     pub fn new(isa: Isa) -> Self {
         Self {
             isa,
-            frame: None,
+            state: None,
             splats: Vec::new(),
-            covers: Vec::new(),
-            listers: Vec::new(),
+            tile_lists: Vec::new(),
+            intersectors: Vec::new(),
             chunks: Vec::new(),
             order: Vec::new(),
             spare: Vec::new(),
             bins: Bins::default(),
             batches: Vec::new(),
-            words: Vec::new(),
+            block_masks: Vec::new(),
             transmittance: Vec::new(),
             last: Vec::new(),
             slots: Vec::new(),
@@ -120,9 +121,9 @@ impl Rasterizer {
         self.prepare(*params, camera, settings, background);
         let mut clock = Instant::now();
         if image.depth.is_some() || image.median.is_some() {
-            self.blend::<true>(image);
+            self.forward_tiles::<true>(image);
         } else {
-            self.blend::<false>(image);
+            self.forward_tiles::<false>(image);
         }
         self.passes.forward = lap(&mut clock);
         Ok(())
@@ -147,32 +148,32 @@ impl Rasterizer {
         image: &ImageGradients,
         sink: K,
     ) -> Result<()> {
-        let Some(frame) = &self.frame else {
+        let Some(state) = &self.state else {
             return Err(Error::invalid(
                 "backward",
                 "a forward pass before it",
                 "none",
             ));
         };
-        if source.len() != frame.rows {
-            return Err(Error::invalid("rows", frame.rows.to_string(), source.len()));
+        if source.len() != state.rows {
+            return Err(Error::invalid("rows", state.rows.to_string(), source.len()));
         }
-        image.validate(&frame.camera)?;
+        image.validate(&state.camera)?;
         let mut clock = Instant::now();
         if image.depth.is_some() {
-            self.unblend::<true>(image);
+            self.backward_tiles::<true>(image);
         } else {
-            self.unblend::<false>(image);
+            self.backward_tiles::<false>(image);
         }
         self.passes.backward = lap(&mut clock);
-        let Some(frame) = &self.frame else {
+        let Some(state) = &self.state else {
             return Ok(());
         };
         let chunks = self.chunks.par_iter().enumerate();
         chunks.for_each(|(chunk, &(first, count))| {
             let slots = self.bins.slots_of(chunk);
             let gather = Gather {
-                view: &frame.view,
+                view: &state.view,
                 source,
                 sink,
                 splats: &self.splats[first..first + count],
@@ -196,7 +197,7 @@ impl Rasterizer {
     ) {
         self.prepare(source, camera, settings, background);
         let mut clock = Instant::now();
-        self.blend::<false>(image);
+        self.forward_tiles::<false>(image);
         self.passes.forward = lap(&mut clock);
     }
 
@@ -208,16 +209,16 @@ impl Rasterizer {
         finish: impl Fn(&ChunkSums) -> T + Sync,
     ) -> Vec<T> {
         let mut clock = Instant::now();
-        self.unblend::<false>(image);
+        self.backward_tiles::<false>(image);
         self.passes.backward = lap(&mut clock);
-        let Some(frame) = &self.frame else {
+        let Some(state) = &self.state else {
             return Vec::new();
         };
-        let groups = frame.rows.div_ceil(LANES);
+        let groups = state.rows.div_ceil(LANES);
         let finish = |(chunk, &(first, count)): (usize, &(usize, usize))| {
             let slots = self.bins.slots_of(chunk);
             finish(&ChunkSums {
-                view: &frame.view,
+                view: &state.view,
                 first_group: chunk * CHUNK,
                 last_group: groups.min((chunk + 1) * CHUNK),
                 splats: &self.splats[first..first + count],
@@ -281,7 +282,7 @@ impl Rasterizer {
                 tell(splat.row as usize, Total::of(splat, shares, written));
             }
         });
-        self.frame = None; // nothing was blended that a backward pass could go back from
+        self.state = None; // nothing was blended that a backward pass could go back from
     }
 
     /// What the buffers hold now.
@@ -289,12 +290,16 @@ impl Rasterizer {
         let Bins { pairs, starts, .. } = &self.bins;
         Memory {
             gaussians: bytes(&self.splats)
-                + bytes(&self.covers)
-                + self.listers.iter().map(Lister::bytes).sum::<usize>()
+                + bytes(&self.tile_lists)
+                + self
+                    .intersectors
+                    .iter()
+                    .map(TileIntersector::bytes)
+                    .sum::<usize>()
                 + bytes(&self.order)
                 + bytes(&self.spare)
                 + bytes(pairs)
-                + bytes(&self.words)
+                + bytes(&self.block_masks)
                 + bytes(&self.slots)
                 + bytes(&self.shares)
                 + bytes(&self.written),
@@ -311,11 +316,14 @@ impl Rasterizer {
     }
 
     pub fn counts(&self) -> Counts {
-        let words = self
+        let block_masks = self
             .batches
             .iter()
-            .flat_map(|&(first, done)| &self.words[first..first + done]);
-        let blocks: u64 = words.flatten().map(|w| u64::from(w.count_ones())).sum();
+            .flat_map(|&(first, done)| &self.block_masks[first..first + done]);
+        let blocks: u64 = block_masks
+            .flatten()
+            .map(|w| u64::from(w.count_ones()))
+            .sum();
         Counts {
             visible: self.order.len(),
             pairs: self.bins.pairs.len(),
@@ -332,7 +340,7 @@ impl Rasterizer {
         background: [f32; 3],
     ) {
         let view = View::new(camera, settings);
-        self.frame = Some(Frame {
+        self.state = Some(ForwardState {
             camera: *camera,
             settings: *settings,
             view,
@@ -343,12 +351,12 @@ impl Rasterizer {
         self.project(&view, source, camera.tiles());
         self.passes.project = lap(&mut clock);
         self.collect_keys();
-        order::sort(&mut self.order, &mut self.spare);
+        depth_sort::sort(&mut self.order, &mut self.spare);
         self.passes.sort = lap(&mut clock);
         self.bins.fill(
             &self.order,
-            &self.covers,
-            &self.listers,
+            &self.tile_lists,
+            &self.intersectors,
             CHUNK * LANES,
             camera.tiles(),
         );
@@ -359,35 +367,36 @@ impl Rasterizer {
             self.batches.push((first, 0));
             first += ((tile[1] - tile[0]) as usize).div_ceil(BATCH);
         }
-        self.words.resize(first, [0; BLOCKS]);
+        self.block_masks.resize(first, [0; BLOCKS]);
     }
 
     fn project<S: Source>(&mut self, view: &View, source: S, tiles: (usize, usize)) {
         let groups = source.len().div_ceil(LANES);
         let isa = self.isa;
         self.splats.resize(groups * LANES, Splat::default());
-        self.covers.resize(groups * LANES, Cover::default());
-        self.listers
-            .resize_with(groups.div_ceil(CHUNK), Lister::default);
+        self.tile_lists.resize(groups * LANES, TileList::default());
+        self.intersectors
+            .resize_with(groups.div_ceil(CHUNK), TileIntersector::default);
         let parts = self
             .splats
             .par_chunks_mut(CHUNK * LANES)
-            .zip(self.covers.par_chunks_mut(CHUNK * LANES))
-            .zip(&mut self.listers);
-        let project = |(chunk, ((out, covers), lister)): (usize, ((&mut _, &mut _), &mut _))| {
-            let first = chunk * CHUNK;
-            let project = Project {
-                view,
-                source,
-                first,
-                last: groups.min(first + CHUNK),
-                tiles,
-                out,
-                covers,
-                lister,
+            .zip(self.tile_lists.par_chunks_mut(CHUNK * LANES))
+            .zip(&mut self.intersectors);
+        let project =
+            |(chunk, ((out, tile_lists), intersector)): (usize, ((&mut _, &mut _), &mut _))| {
+                let first = chunk * CHUNK;
+                let project = Project {
+                    view,
+                    source,
+                    first,
+                    last: groups.min(first + CHUNK),
+                    tiles,
+                    out,
+                    tile_lists,
+                    intersector,
+                };
+                (first * LANES, dispatch(isa, project))
             };
-            (first * LANES, dispatch(isa, project))
-        };
         parts
             .enumerate()
             .map(project)
@@ -403,7 +412,7 @@ impl Rasterizer {
         });
         let starts: Vec<usize> = starts.collect();
         self.order.resize(first, Key::default());
-        let order = Shared::new(&mut self.order);
+        let order = DisjointSlice::new(&mut self.order);
         let chunks = self.chunks.par_iter().zip(starts);
         chunks.for_each(|(&(first, count), start)| {
             // SAFETY: the chunks' stretches of keys do not overlap.

@@ -2,6 +2,8 @@
 
 use rayon::prelude::*;
 
+use super::disjoint::DisjointSlice;
+
 const BITS: u32 = 11;
 const BINS: usize = 1 << BITS;
 /// Entries per histogram: fixed, so that the passes split alike for any number of threads.
@@ -12,56 +14,6 @@ const CHUNK: usize = 1 << 14;
 pub struct Key {
     pub depth: u32,
     pub splat: u32,
-}
-
-/// Asks for what is read soon.
-#[inline(always)]
-pub fn prefetch<T>(value: &T) {
-    #[cfg(target_arch = "x86_64")]
-    // SAFETY: a prefetch of a valid address has no effect but on the cache.
-    unsafe {
-        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast());
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    let _ = value;
-}
-
-/// A write target shared by threads that write disjoint elements.
-#[derive(Clone, Copy)]
-pub(crate) struct Shared<T>(*mut T);
-
-// SAFETY: every user writes elements that no other thread touches; see each call.
-unsafe impl<T: Send> Sync for Shared<T> {}
-// SAFETY: as above.
-unsafe impl<T: Send> Send for Shared<T> {}
-
-impl<T> Shared<T> {
-    pub fn new(slice: &mut [T]) -> Self {
-        Self(slice.as_mut_ptr())
-    }
-    /// # Safety
-    /// `i` is inside the slice, which is still borrowed, and no other thread touches element `i` meanwhile.
-    #[inline(always)]
-    pub unsafe fn write(self, i: usize, value: T) {
-        // SAFETY: the caller's promise.
-        unsafe { self.0.add(i).write(value) }
-    }
-    /// # Safety
-    /// As for [`Self::write`].
-    #[inline(always)]
-    pub unsafe fn at(self, i: usize) -> *mut T {
-        // SAFETY: the caller's promise.
-        unsafe { self.0.add(i) }
-    }
-    /// # Safety
-    /// As for [`Self::write`], for the `len` elements from `i`.
-    #[inline(always)]
-    #[allow(clippy::mut_from_ref)]
-    pub unsafe fn slice<'a>(self, i: usize, len: usize) -> &'a mut [T] {
-        // SAFETY: the caller's promise.
-        unsafe { std::slice::from_raw_parts_mut(self.0.add(i), len) }
-    }
 }
 
 /// Least-significant-digit radix sort by depth; equal depths keep their order.
@@ -97,7 +49,7 @@ fn scatter(from: &[Key], to: &mut [Key], shift: u32) {
             at += count;
         }
     }
-    let to = Shared::new(to);
+    let to = DisjointSlice::new(to);
     from.par_chunks(CHUNK)
         .zip(&mut starts)
         .for_each(|(chunk, next)| {

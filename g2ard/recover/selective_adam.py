@@ -8,13 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["RowAdam"]
+__all__ = ["SelectiveAdam"]
 
 _LARGEST = 1e18
 """Beyond this the square of a gradient leaves float32."""
 
 
-class RowAdam(torch.optim.Optimizer):
+class SelectiveAdam(torch.optim.Optimizer):
     """`torch.optim.Adam` row by row, as the fused engine has it: rows are Gaussians, in all parameters alike.
 
     A row whose gradients are all zero keeps its values and its moments, and each row has a count of steps t
@@ -28,7 +28,7 @@ class RowAdam(torch.optim.Optimizer):
         eps: ε.
 
     >>> p = torch.zeros(3, 2, requires_grad=True)
-    >>> adam = RowAdam({"p": p})
+    >>> adam = SelectiveAdam({"p": p})
     >>> adam.param_groups[0]["lr"] = 0.1
     >>> p.grad = torch.tensor([[1.0, -1.0], [0.0, 0.0], [torch.nan, 1.0]])
     >>> adam.step()
@@ -57,7 +57,7 @@ class RowAdam(torch.optim.Optimizer):
     def step(self, closure: Any = None) -> None:  # type: ignore[override]
         """One step of every row that has a gradient."""
         if closure is not None:
-            raise ValueError("RowAdam takes no closure")
+            raise ValueError("SelectiveAdam takes no closure")
         groups = [group for group in self.param_groups if group["params"][0].grad is not None]
         grads = [
             group["params"][0].grad.flatten(1)

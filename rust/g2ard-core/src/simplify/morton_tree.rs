@@ -1,8 +1,8 @@
-//! Merging along Morton order, all the way up at once: what each step would cost.
+//! The binary tree of Morton codes, and what merging each of its subtrees into one node costs.
 //!
 //! Rows sorted by Morton code are the leaves of a binary tree whose inner nodes are common prefixes. An inner
 //! node is named by the gap between two neighbouring rows at which it splits, so one number per gap says what
-//! merging everything below it has cost. That number never falls on the way up: cutting at any threshold
+//! merging everything below it costs. That number never falls towards the root: cutting at any threshold
 //! leaves whole subtrees, which are contiguous runs of rows.
 
 use super::clusters::Partition;
@@ -12,59 +12,59 @@ use super::rows::Rows;
 /// Rows below which a subtree is not worth another task.
 const GRAIN: usize = 4096;
 
-/// A subtree as one cluster, the colour it has, and what merging it has cost.
-struct Rung {
+/// A subtree merged into one node, its colour, and the sum of its merges' costs.
+struct Subtree {
     node: Node,
     color: [f32; 3],
-    spent: f32,
+    cost: f32,
 }
 
-struct Ladder<'a, R> {
+struct MortonTree<'a, R> {
     codes: &'a [u64],
     rows: &'a R,
     geometric: f32,
 }
 
-/// For every gap between neighbouring rows, the error of merging all that its tree node spans.
+/// For every gap between neighbouring rows, the cost of merging all rows that its tree node spans.
 ///
 /// `codes` ascend; `rows` are in the same order.
-pub fn climb(codes: &[u64], rows: &impl Rows, geometric: f32) -> Vec<f32> {
-    let mut spent = vec![0.0; rows.len().saturating_sub(1)];
-    if !spent.is_empty() {
-        let ladder = Ladder {
+pub fn merge_costs(codes: &[u64], rows: &impl Rows, geometric: f32) -> Vec<f32> {
+    let mut costs = vec![0.0; rows.len().saturating_sub(1)];
+    if !costs.is_empty() {
+        let tree = MortonTree {
             codes,
             rows,
             geometric,
         };
-        ladder.climb(0, rows.len(), &mut spent);
+        tree.merge(0, rows.len(), &mut costs);
     }
-    spent
+    costs
 }
 
-impl<R: Rows> Ladder<'_, R> {
-    /// Rows `from..to`; `spent` holds their inner gaps.
-    fn climb(&self, from: usize, to: usize, spent: &mut [f32]) -> Rung {
+impl<R: Rows> MortonTree<'_, R> {
+    /// Merges rows `from..to`; `costs` has an element for each gap between them.
+    fn merge(&self, from: usize, to: usize, costs: &mut [f32]) -> Subtree {
         if to - from == 1 {
-            return Rung {
+            return Subtree {
                 node: self.rows.node(from),
                 color: self.rows.color(from),
-                spent: 0.0,
+                cost: 0.0,
             };
         }
         let split = self.split(from, to);
-        let (left, rest) = spent.split_at_mut(split - from - 1);
+        let (left, rest) = costs.split_at_mut(split - from - 1);
         let (gap, right) = rest.split_at_mut(1);
         let (a, b) = if to - from > GRAIN {
             rayon::join(
-                || self.climb(from, split, left),
-                || self.climb(split, to, right),
+                || self.merge(from, split, left),
+                || self.merge(split, to, right),
             )
         } else {
-            (self.climb(from, split, left), self.climb(split, to, right))
+            (self.merge(from, split, left), self.merge(split, to, right))
         };
-        let rung = self.join(&a, &b);
-        gap[0] = rung.spent;
-        rung
+        let subtree = self.join(&a, &b);
+        gap[0] = subtree.cost;
+        subtree
     }
 
     /// The first row whose code has the highest bit in which the range's codes differ; the middle of equals.
@@ -78,7 +78,7 @@ impl<R: Rows> Ladder<'_, R> {
         from + self.codes[from..to].partition_point(|&c| c < prefix)
     }
 
-    fn join(&self, a: &Rung, b: &Rung) -> Rung {
+    fn join(&self, a: &Subtree, b: &Subtree) -> Subtree {
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") {
             // SAFETY: the processor has AVX2.
@@ -91,33 +91,33 @@ impl<R: Rows> Ladder<'_, R> {
 /// The same code with wider registers; no fused operations, so the same bits.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn join_avx2(a: &Rung, b: &Rung, geometric: f32) -> Rung {
+fn join_avx2(a: &Subtree, b: &Subtree, geometric: f32) -> Subtree {
     join(a, b, geometric)
 }
 
 #[inline(always)]
-fn join(a: &Rung, b: &Rung, geometric: f32) -> Rung {
+fn join(a: &Subtree, b: &Subtree, geometric: f32) -> Subtree {
     let share = a.node.share(&b.node);
     let node = a.node.merged(&b.node);
     let color = color_distance(&a.color, &b.color);
     let cost = a.node.cost_as(&b.node, &node, color, geometric);
-    Rung {
+    Subtree {
         node,
         color: [0, 1, 2].map(|k| a.color[k] + share * (b.color[k] - a.color[k])),
-        spent: (a.spent + b.spent + cost).min(f32::MAX),
+        cost: (a.cost + b.cost + cost).min(f32::MAX),
     }
 }
 
 /// The partition into `count` runs that closes the cheapest gaps, between equals the earlier.
-pub fn cut(spent: &[f32], count: usize) -> Partition {
-    let rows = spent.len() + 1;
+pub fn cut(costs: &[f32], count: usize) -> Partition {
+    let rows = costs.len() + 1;
     let close = rows.saturating_sub(count.max(1));
-    let mut keys: Vec<(u32, u32)> = spent
+    let mut keys: Vec<(u32, u32)> = costs
         .iter()
         .enumerate()
         .map(|(g, s)| (s.to_bits(), g as u32))
         .collect();
-    let mut closed = vec![false; spent.len()];
+    let mut closed = vec![false; costs.len()];
     if close > 0 {
         keys.select_nth_unstable(close - 1);
         keys[..close]
@@ -153,7 +153,7 @@ mod tests {
                     ..Node::default()
                 }
                 .weighed();
-                node.seen = node.mass;
+                node.visibility = node.mass;
                 node
             })
             .collect();
@@ -167,21 +167,21 @@ mod tests {
     #[test]
     fn any_cut_leaves_whole_subtrees_and_the_exact_count() {
         let codes: Vec<u64> = (0..64).map(|i| i * 3).collect();
-        let spent = climb(&codes, &nodes(64), 0.03);
+        let costs = merge_costs(&codes, &nodes(64), 0.03);
         for count in 1..=64 {
-            let p = cut(&spent, count);
+            let p = cut(&costs, count);
             assert_eq!((p.count, p.of.len()), (count, 64));
             assert!(p.of.windows(2).all(|w| w[1] - w[0] <= 1));
         }
         // Groups of eight lie far apart: the cheapest eight clusters are those groups.
         let codes: Vec<u64> = (0..64).collect();
-        let p = cut(&climb(&codes, &nodes(64), 0.03), 8);
+        let p = cut(&merge_costs(&codes, &nodes(64), 0.03), 8);
         assert!((0..64).all(|i| p.of[i] == i as u32 / 8), "{:?}", p.of);
     }
 
     #[test]
     fn one_place_and_one_row() {
-        assert_eq!(cut(&climb(&[5; 9], &nodes(9), 0.03), 4).count, 4);
-        assert_eq!(cut(&climb(&[5], &nodes(1), 0.03), 1).count, 1);
+        assert_eq!(cut(&merge_costs(&[5; 9], &nodes(9), 0.03), 4).count, 4);
+        assert_eq!(cut(&merge_costs(&[5], &nodes(1), 0.03), 1).count, 1);
     }
 }

@@ -3,16 +3,16 @@
 use rayon::prelude::*;
 
 /// A cube about the scene. Its numbers are picked from the data (order statistics, no averages): moving
-/// dyadic coordinates, or scaling them by a power of two, moves and scales the frame exactly.
+/// dyadic coordinates, or scaling them by a power of two, moves and scales the bounds exactly.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Frame {
+pub struct RobustBounds {
     /// The per-axis median.
     pub origin: [f64; 3],
     /// Twice the largest distance, along an axis, from the origin to the 1st or 99th percentile. Never 0.
     pub radius: f64,
 }
 
-impl Frame {
+impl RobustBounds {
     pub fn of(points: &[[f64; 3]]) -> Self {
         if points.is_empty() {
             return Self {
@@ -62,17 +62,17 @@ mod tests {
     #[test]
     fn floaters_do_not_move_it() {
         let mut points: Vec<[f64; 3]> = (0..1000).map(|i| [f64::from(i), 0.0, 1.0]).collect();
-        let calm = Frame::of(&points);
+        let calm = RobustBounds::of(&points);
         points[7] = [2e7, -2e7, 2e7];
-        let wild = Frame::of(&points);
+        let wild = RobustBounds::of(&points);
         assert!((calm.radius - wild.radius).abs() <= 4.0);
         assert_eq!(calm.origin[1..], wild.origin[1..]);
     }
 
     #[test]
     fn one_place_has_a_size_too() {
-        assert_eq!(Frame::of(&[[3.0; 3]; 5]).radius, 1.0);
+        assert_eq!(RobustBounds::of(&[[3.0; 3]; 5]).radius, 1.0);
         let mostly = [vec![[0.0; 3]; 999], vec![[5.0, 0.0, 0.0]]].concat();
-        assert_eq!(Frame::of(&mostly).radius, 10.0);
+        assert_eq!(RobustBounds::of(&mostly).radius, 10.0);
     }
 }

@@ -6,32 +6,33 @@ use super::{Image, ImageGradients, Rasterizer};
 use crate::raster::BLOCKS;
 use crate::raster::accumulate::Accumulate;
 use crate::raster::backward::{self, Backward, Incoming, SUMS};
+use crate::raster::disjoint::DisjointSlice;
 use crate::raster::forward::{Forward, Pixels};
-use crate::raster::order::Shared;
-use crate::raster::simd::{Row, dispatch};
-use crate::raster::stage::{BATCH, Place, Staged, for_stretches};
+use crate::raster::simd::{Lanes16, dispatch};
+use crate::raster::tile_batch::{BATCH, TileBatch, TileRect, for_stretches};
 
 #[derive(Default)]
 struct Scratch {
-    staged: Staged,
+    tile_batch: TileBatch,
     pixels: Pixels,
     incoming: Incoming,
 }
 
 impl Rasterizer {
     /// Blends every tile into the image.
-    pub(crate) fn blend<const DEPTH: bool>(&mut self, image: &mut Image) {
-        let Some(frame) = &self.frame else { return };
-        let (camera, background) = (frame.camera, frame.background);
+    pub(crate) fn forward_tiles<const DEPTH: bool>(&mut self, image: &mut Image) {
+        let Some(state) = &self.state else { return };
+        let (camera, background) = (state.camera, state.background);
         let tiles_x = camera.tiles().0;
         let tiles = self.batches.len();
-        self.transmittance.resize(tiles, [Row::default(); BLOCKS]);
-        self.last.resize(tiles, [Row::default(); BLOCKS]);
-        let words = Shared::new(&mut self.words);
-        let rgb = Shared::new(image.rgb);
-        let alpha = Shared::new(image.alpha);
-        let depth = image.depth.as_deref_mut().map(Shared::new);
-        let median = image.median.as_deref_mut().map(Shared::new);
+        self.transmittance
+            .resize(tiles, [Lanes16::default(); BLOCKS]);
+        self.last.resize(tiles, [Lanes16::default(); BLOCKS]);
+        let block_masks = DisjointSlice::new(&mut self.block_masks);
+        let rgb = DisjointSlice::new(image.rgb);
+        let alpha = DisjointSlice::new(image.alpha);
+        let depth = image.depth.as_deref_mut().map(DisjointSlice::new);
+        let median = image.median.as_deref_mut().map(DisjointSlice::new);
         let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
         let tile_states = self
             .batches
@@ -42,32 +43,33 @@ impl Rasterizer {
             Scratch::default,
             |scratch, (tile, ((batch, transmittance), last))| {
                 let pairs = &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize];
-                let place = Place::of(tile, tiles_x, camera.width, camera.height);
+                let rect = TileRect::of(tile, tiles_x, camera.width, camera.height);
                 // SAFETY: every tile has its own batches, and the pixels written below are its own.
-                let words = unsafe { words.slice(batch.0, pairs.len().div_ceil(BATCH)) };
+                let block_masks =
+                    unsafe { block_masks.slice(batch.0, pairs.len().div_ceil(BATCH)) };
                 let forward = Forward::<DEPTH> {
                     pairs,
                     splats,
-                    place,
-                    settings: &frame.settings,
-                    words,
+                    rect,
+                    settings: &state.settings,
+                    block_masks,
                     transmittance,
                     last,
                     pixels: &mut scratch.pixels,
-                    staged: &mut scratch.staged,
+                    tile_batch: &mut scratch.tile_batch,
                 };
                 batch.1 = dispatch(isa, forward);
                 let pixels = &scratch.pixels;
-                for y in 0..place.rows {
-                    let first = (place.y + y) * camera.width + place.x;
+                for y in 0..rect.rows {
+                    let first = (rect.y + y) * camera.width + rect.x;
                     // SAFETY: as above.
                     let (rgb, alpha) = unsafe {
                         (
-                            rgb.slice(3 * first, 3 * place.columns),
-                            alpha.slice(first, place.columns),
+                            rgb.slice(3 * first, 3 * rect.columns),
+                            alpha.slice(first, rect.columns),
                         )
                     };
-                    for_stretches(y, place.columns, |x, block, lane, count| {
+                    for_stretches(y, rect.columns, |x, block, lane, count| {
                         let light: &[f32; 4] = transmittance[block].0[lane..]
                             .first_chunk()
                             .unwrap_or(&[0.0; 4]);
@@ -86,7 +88,7 @@ impl Rasterizer {
                     for (plane, rows) in [(depth, &pixels.depth), (median, &pixels.median)] {
                         let Some(plane) = plane else { continue };
                         // SAFETY: as above.
-                        let row = unsafe { plane.slice(first, place.columns) };
+                        let row = unsafe { plane.slice(first, rect.columns) };
                         for (x, value) in row.iter_mut().enumerate() {
                             *value = rows[y / 4 * 4 + x / 4].0[y % 4 * 4 + x % 4];
                         }
@@ -97,13 +99,13 @@ impl Rasterizer {
     }
 
     /// Fills the slots with every pair's share of the gradient.
-    pub(super) fn unblend<const DEPTH: bool>(&mut self, image: &ImageGradients) {
+    pub(super) fn backward_tiles<const DEPTH: bool>(&mut self, image: &ImageGradients) {
         self.clear_slots();
-        let Some(frame) = &self.frame else { return };
-        let camera = &frame.camera;
+        let Some(state) = &self.state else { return };
+        let camera = &state.camera;
         let tiles_x = camera.tiles().0;
-        let slots = Shared::new(&mut self.slots);
-        let written = Shared::new(&mut self.written);
+        let slots = DisjointSlice::new(&mut self.slots);
+        let written = DisjointSlice::new(&mut self.written);
         let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
         let states = self
             .batches
@@ -117,26 +119,26 @@ impl Rasterizer {
                 if pairs.is_empty() {
                     return;
                 }
-                let place = Place::of(tile, tiles_x, camera.width, camera.height);
+                let rect = TileRect::of(tile, tiles_x, camera.width, camera.height);
                 let incoming = &mut scratch.incoming;
-                incoming.load(backward::RGB, image.rgb, 3, camera.width, &place);
+                incoming.load(backward::RGB, image.rgb, 3, camera.width, &rect);
                 if let Some(alpha) = image.alpha {
-                    incoming.load(backward::ALPHA, alpha, 1, camera.width, &place);
+                    incoming.load(backward::ALPHA, alpha, 1, camera.width, &rect);
                 }
                 if let Some(depth) = image.depth {
-                    incoming.load(backward::DEPTH, depth, 1, camera.width, &place);
+                    incoming.load(backward::DEPTH, depth, 1, camera.width, &rect);
                 }
                 let backward = Backward::<DEPTH> {
                     pairs,
                     splats,
-                    place,
-                    settings: &frame.settings,
-                    background: frame.background,
-                    words: &self.words[batch.0..batch.0 + batch.1],
+                    rect,
+                    settings: &state.settings,
+                    background: state.background,
+                    block_masks: &self.block_masks[batch.0..batch.0 + batch.1],
                     transmittance,
                     last,
                     incoming,
-                    batch: &mut scratch.staged.near,
+                    batch: &mut scratch.tile_batch.splats,
                     slots,
                     written,
                 };
@@ -150,26 +152,27 @@ impl Rasterizer {
         self.shares.resize(pairs * KINDS, 0.0);
         self.written.clear();
         self.written.resize(pairs, 0);
-        let Some(frame) = &self.frame else { return };
-        let camera = &frame.camera;
+        let Some(state) = &self.state else { return };
+        let camera = &state.camera;
         let tiles_x = camera.tiles().0;
-        let slots = Shared::new(self.shares.as_chunks_mut::<KINDS>().0);
-        let written = Shared::new(&mut self.written);
+        let slots = DisjointSlice::new(self.shares.as_chunks_mut::<KINDS>().0);
+        let written = DisjointSlice::new(&mut self.written);
         let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
-        (0..self.batches.len())
-            .into_par_iter()
-            .for_each_init(Staged::default, |staged, tile| {
+        (0..self.batches.len()).into_par_iter().for_each_init(
+            TileBatch::default,
+            |tile_batch, tile| {
                 let accumulate = Accumulate {
                     pairs: &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize],
                     splats,
-                    place: Place::of(tile, tiles_x, camera.width, camera.height),
-                    settings: &frame.settings,
-                    staged,
+                    rect: TileRect::of(tile, tiles_x, camera.width, camera.height),
+                    settings: &state.settings,
+                    tile_batch,
                     slots,
                     written,
                 };
                 dispatch(isa, accumulate);
-            });
+            },
+        );
     }
 
     /// Slots keep stale sums: `written` says which of them count.

@@ -4,22 +4,22 @@ use rayon::prelude::*;
 
 use super::Gaussians;
 use super::pinhole::{ALPHA_MIN, Pinhole};
-use crate::spatial::{Frame, codes, order};
+use crate::spatial::{RobustBounds, codes, order};
 
 /// Rows in a block: few enough that blocks are small, many enough that looking at blocks costs nothing.
 const BLOCK: usize = 64;
 
 /// A scene's Gaussians in Morton order.
 #[derive(Debug)]
-pub struct Opaque {
-    pub rows: Vec<Row>,
+pub struct Occluders {
+    pub rows: Vec<Occluder>,
     pub(super) blocks: Vec<Block>,
 }
 
 /// A Gaussian as `Pinhole` projects it.
 #[derive(Debug, Clone, Copy)]
 #[repr(C)]
-pub struct Row {
+pub struct Occluder {
     pub mean: [f32; 3],
     pub opacity: f32,
     pub covariance: [f32; 6],
@@ -39,21 +39,21 @@ pub(super) struct Block {
     pub reach: f32,
 }
 
-impl Opaque {
+impl Occluders {
     pub fn of(scene: &Gaussians<'_>) -> Self {
-        let codes = codes(scene.means, &Frame::of(scene.means));
+        let codes = codes(scene.means, &RobustBounds::of(scene.means));
         let order = order(&codes);
-        let rows: Vec<Row> = order
+        let rows: Vec<Occluder> = order
             .into_par_iter()
             .filter(|&i| scene.opacities[i as usize] >= ALPHA_MIN)
-            .map(|i| Row::of(scene, i as usize))
+            .map(|i| Occluder::of(scene, i as usize))
             .collect();
         let blocks = rows.par_chunks(BLOCK).map(Block::of).collect();
         Self { rows, blocks }
     }
 
     /// The rows that `view` may show, in order.
-    pub(super) fn rows_in<'a>(&'a self, view: &'a Pinhole) -> impl Iterator<Item = &'a Row> {
+    pub(super) fn rows_in<'a>(&'a self, view: &'a Pinhole) -> impl Iterator<Item = &'a Occluder> {
         let chunks = self.rows.chunks(BLOCK).zip(&self.blocks);
         chunks
             .filter(|(_, block)| !view.misses(block))
@@ -61,7 +61,7 @@ impl Opaque {
     }
 }
 
-impl Row {
+impl Occluder {
     fn of(scene: &Gaussians<'_>, i: usize) -> Self {
         let covariance = scene.covariance(i).map(|v| v as f32);
         Self {
@@ -75,7 +75,7 @@ impl Row {
 }
 
 impl Block {
-    fn of(rows: &[Row]) -> Self {
+    fn of(rows: &[Occluder]) -> Self {
         let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
         for row in rows {
             for k in 0..3 {
@@ -83,7 +83,7 @@ impl Block {
                 high[k] = high[k].max(row.mean[k]);
             }
         }
-        let most = |f: fn(&Row) -> f32| rows.iter().map(f).fold(0.0, f32::max);
+        let most = |f: fn(&Occluder) -> f32| rows.iter().map(f).fold(0.0, f32::max);
         Self {
             center: [0, 1, 2].map(|k| 0.5 * low[k] + 0.5 * high[k]),
             half: [0, 1, 2].map(|k| 0.5 * high[k] - 0.5 * low[k]),
