@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.evaluate import evaluate
-from g2ard.lift import lift
-from g2ard.recover import RecoverConfig, recover
-from g2ard.recover.anchors import PRESETS
-from g2ard.simplify import simplify
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.lift import lift
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.anchors import PRESETS
+from g2ard.stages.simplify import simplify
 from g2ard.synth import City, city
 from g2ard.visibility import looker
 

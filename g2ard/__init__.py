@@ -4,14 +4,14 @@ Each stage is a module with a function of its name, or nearly so:
 
 | module | function |
 |---|---|
-| `g2ard.lift` | `lift`: coloured points → surface-aligned discs |
-| `g2ard.simplify` | `simplify`: fewer Gaussians, at an exact count |
+| `g2ard.stages.lift` | `lift`: coloured points → surface-aligned discs |
+| `g2ard.stages.simplify` | `simplify`: fewer Gaussians, at an exact count |
 | `g2ard.poses` | `make_pool`: views for a scene that has none |
-| `g2ard.select` | `select`: the views worth having |
-| `g2ard.recover` | `recover`: a fixed set of Gaussians against photos or a teacher's renders |
-| `g2ard.adapt` | `adapt`: new appearance on frozen geometry |
-| `g2ard.distill` | `distill`: all of it |
-| `g2ard.render`, `g2ard.evaluate` | `render`, `visibility`; `evaluate` |
+| `g2ard.stages.select` | `select`: the views worth having |
+| `g2ard.stages.recover` | `recover`: a fixed set of Gaussians against photos or a teacher's renders |
+| `g2ard.stages.adapt` | `adapt`: new appearance on frozen geometry |
+| `g2ard.pipeline` | `distill`: all of it |
+| `g2ard.stages.render`, `g2ard.stages.evaluate` | `render`, `visibility`; `evaluate` |
 | `g2ard.synth` | `city`: a procedural city |
 
 What they pass on, and files, are here: `Splats`, `Cameras`, `read_splats`, `write_splats`, `read_points`,

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.cameras import Cameras
-from g2ard.render import Renderer
 from g2ard.splats import SH_C0, Splats
+from g2ard.stages.render import Renderer
 from g2ard.targets import Targets, mask_of
 from g2ard.visibility import visibility
 

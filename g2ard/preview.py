@@ -30,7 +30,7 @@ def preview(
     """
     from g2ard.images import contact_sheet, write_png
     from g2ard.metrics import psnr
-    from g2ard.render import Renderer
+    from g2ard.stages.render import Renderer
 
     count = len(targets.cameras)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _ROWS)).round().astype(int))

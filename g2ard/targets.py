@@ -16,7 +16,7 @@ from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
 
 if TYPE_CHECKING:
-    from g2ard.render import RasterSettings, Renderer
+    from g2ard.stages.render import RasterSettings, Renderer
 
 __all__ = [
     "CACHE_BYTES",
@@ -224,7 +224,7 @@ class TeacherRenders(_Cached):
 
     def _make(self, view: int) -> NDArray[np.float32]:
         if self._renderer is None:
-            from g2ard.render import Renderer
+            from g2ard.stages.render import Renderer
 
             self._renderer = Renderer(self._teacher, background=self._background, settings=self._settings)
         return np.clip(self._renderer.image(self.cameras, view), 0, 1)

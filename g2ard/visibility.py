@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.cameras import Cameras
 from g2ard.progress import Progress, counter, silent
-from g2ard.render import RasterSettings, arrays_of, centred, settings_for, view_of
 from g2ard.splats import Splats
+from g2ard.stages.render import RasterSettings, arrays_of, centred, settings_for, view_of
 
 __all__ = ["Seen", "Visibility", "looker", "visibility"]
 
@@ -88,7 +88,7 @@ class Seen:
 def looker(
     cameras: Cameras, *, views: int = 96, longest: int = 300, progress: Progress = silent
 ) -> Callable[[Splats], Seen]:
-    """A function that tells what a few small renders see of a scene, as `g2ard.simplify.simplify` takes it.
+    """A function that tells what a few small renders see of a scene, as `simplify` takes it.
 
     It looks from sixteen views at a time until the next sixteen find under 1 % more of the Gaussians: an
     object of half a million takes 32 views, a small one 80, a room all (`docs/decisions.md`). The first scene

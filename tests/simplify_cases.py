@@ -47,7 +47,7 @@ def assert_sound(result, count, budget):
 
 
 class Views:
-    """What a caller's views see, as `g2ard.render.visibility` returns it."""
+    """What a caller's views see, as `g2ard.stages.render.visibility` returns it."""
 
     def __init__(self, weight, pixel_size):
         self.weight, self.pixel_size = np.asarray(weight), np.asarray(pixel_size)

@@ -13,9 +13,9 @@ import pytest
 from scenes import around, checkered_ball
 
 from g2ard import io
-from g2ard.adapt import AdaptConfig, adapt
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
+from g2ard.stages.adapt import AdaptConfig, adapt
+from g2ard.stages.evaluate import evaluate
 from g2ard.targets import TeacherRenders
 
 VIEWS = around(24)

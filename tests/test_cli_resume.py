@@ -15,7 +15,7 @@ from g2ard.cli.frame import Run
 from g2ard.cli.resume import stoppable
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
-from g2ard.recover import checkpoint
+from g2ard.stages.recover import checkpoint
 
 CommandLine = Callable[..., tuple[int, str, str]]
 

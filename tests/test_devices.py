@@ -22,9 +22,9 @@ from g2ard.cli.frame import Run
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.poses import make_pool
-from g2ard.select import surface, visible_cells
-from g2ard.simplify import Simplified, flag, simplify
 from g2ard.splats import Splats
+from g2ard.stages.select import surface, visible_cells
+from g2ard.stages.simplify import Simplified, flag, simplify
 
 CommandLine = Callable[..., tuple[int, str, str]]
 

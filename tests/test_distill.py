@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from scenes import around, checkered_ball
 
-from g2ard.distill import DistillConfig, distill
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
 from g2ard.images import write_png
 from g2ard.io import Points, read_splats, write_points, write_splats, write_views
+from g2ard.pipeline import DistillConfig, distill
 from g2ard.progress import silent
-from g2ard.recover.schedule import PAPER, TUNED
-from g2ard.render import render
 from g2ard.splats import SH_C0, Splats
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover.schedule import PAPER, TUNED
+from g2ard.stages.render import render
 from g2ard.targets import Targets, TeacherRenders
 
 CommandLine = Callable[..., tuple[int, str, str]]
@@ -140,7 +140,7 @@ def test_a_loss_in_any_kind_of_views_is_told() -> None:
 
 
 def test_steps_by_need_are_for_teachers() -> None:
-    from g2ard.distill import _Rounds
+    from g2ard.pipeline import _Rounds
 
     part = replace(around(12), Ks=around(12).Ks * [[[4], [4], [1]]])  # a sixteenth of the ball in each
 

@@ -16,17 +16,17 @@ from scenes import around, checkered_ball
 import g2ard
 from g2ard.cameras import Cameras
 from g2ard.constants import listed
-from g2ard.distill import DistillConfig, distill
 from g2ard.errors import InputError
 from g2ard.images import write_png
 from g2ard.io import Points, read_splats, write_points, write_splats, write_views
+from g2ard.pipeline import DistillConfig, distill
 from g2ard.presets import preset
-from g2ard.recover import RecoverConfig, recover
-from g2ard.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, drift95
-from g2ard.recover.schedule import PAPER, Schedule
-from g2ard.render import render
-from g2ard.simplify import simplify
 from g2ard.splats import SH_C0, Splats
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, drift95
+from g2ard.stages.recover.schedule import PAPER, Schedule
+from g2ard.stages.render import render
+from g2ard.stages.simplify import simplify
 from g2ard.targets import TeacherRenders
 
 CommandLine = Callable[..., tuple[int, str, str]]

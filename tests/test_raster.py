@@ -13,9 +13,9 @@ from reference import raster as reference
 from g2ard import _core
 from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
-from g2ard.recover.rasterize import rasterize
-from g2ard.render import RasterSettings, render
 from g2ard.splats import Splats
+from g2ard.stages.recover.rasterize import rasterize
+from g2ard.stages.render import RasterSettings, render
 from g2ard.visibility import visibility
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")

@@ -8,8 +8,8 @@ import pytest
 from g2ard import _core
 from g2ard.bench.raster import bench_raster, built_in_view, drawn
 from g2ard.errors import InputError
-from g2ard.render import render
 from g2ard.splats import Splats
+from g2ard.stages.render import render
 
 
 def cloud(n: int = 3000) -> Splats:

@@ -19,15 +19,15 @@ from scenes import around, checkered_ball, under_a_sky
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
-from g2ard.recover import RecoverConfig, probe, recover
-from g2ard.recover import checkpoint as checkpoint_module
-from g2ard.recover.anchors import PRESETS, Anchors, Regularizers
-from g2ard.recover.guard import Guard, blended
-from g2ard.recover.outcome import outcome
-from g2ard.recover.schedule import PAPER, TUNED
-from g2ard.simplify import simplify
 from g2ard.splats import Splats
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover import RecoverConfig, probe, recover
+from g2ard.stages.recover import checkpoint as checkpoint_module
+from g2ard.stages.recover.anchors import PRESETS, Anchors, Regularizers
+from g2ard.stages.recover.guard import Guard, blended
+from g2ard.stages.recover.outcome import outcome
+from g2ard.stages.recover.schedule import PAPER, TUNED
+from g2ard.stages.simplify import simplify
 from g2ard.targets import TeacherRenders
 
 ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")

@@ -13,11 +13,11 @@ import pytest
 from scenes import around, checkered_ball
 
 from g2ard.cameras import Cameras, look_at
-from g2ard.distill import DistillConfig, distill
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
-from g2ard.recover.schedule import TUNED
-from g2ard.select import select
+from g2ard.pipeline import DistillConfig, distill
+from g2ard.stages.recover.schedule import TUNED
+from g2ard.stages.select import select
 from g2ard.targets import TeacherRenders
 
 CommandLine = Callable[..., tuple[int, str, str]]
@@ -89,7 +89,7 @@ def test_given_weights_stand() -> None:
 
 
 def test_selects_once_unless_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    import g2ard.select as stage
+    import g2ard.stages.select as stage
 
     counts: list[int] = []
     whole = stage.select

@@ -11,8 +11,8 @@ from simplify_cases import ARRAYS, all_alike, assert_same, assert_sound, scene
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.simplify import METHODS, SimplifyConfig, schedule, simplify
 from g2ard.splats import Splats
+from g2ard.stages.simplify import METHODS, SimplifyConfig, schedule, simplify
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -11,8 +11,8 @@ import pytest
 from simplify_cases import ARRAYS, Views, all_alike, assert_sound, opaque_wall, scene
 
 from g2ard.errors import InputError
-from g2ard.simplify import SimplifyConfig, simplify
 from g2ard.splats import Splats
+from g2ard.stages.simplify import SimplifyConfig, simplify
 
 sys.path.insert(0, str(Path(__file__).parent))
 from reference import simplify as naive
@@ -83,7 +83,7 @@ def test_clusters_conserve_mass_mean_and_covariance(method, growth):
 
 @pytest.mark.parametrize("method", ["default", "fast"])
 def test_an_opaque_wall_stays_opaque_and_thin(method):
-    from g2ard.render import render
+    from g2ard.stages.render import render
     from g2ard.visibility import looker
 
     wall, cameras = opaque_wall()

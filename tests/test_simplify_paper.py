@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from simplify_cases import ARRAYS, assert_sound, scene
 
-from g2ard.simplify import SimplifyConfig, flag, schedule, simplify
 from g2ard.splats import Splats
+from g2ard.stages.simplify import SimplifyConfig, flag, schedule, simplify
 
 sys.path.insert(0, str(Path(__file__).parent))
 from reference import simplify as naive

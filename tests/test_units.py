@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from g2ard.cameras import Cameras, look_at
-from g2ard.render import RasterSettings, render, settings_for
-from g2ard.select import select
-from g2ard.simplify import simplify
 from g2ard.splats import Splats
+from g2ard.stages.render import RasterSettings, render, settings_for
+from g2ard.stages.select import select
+from g2ard.stages.simplify import simplify
 from g2ard.visibility import looker, visibility
 
 ARRAYS = ("means", "scales", "quats", "logit_opacities", "sh0", "shN")
@@ -90,7 +90,7 @@ def test_views_are_chosen_in_any_unit(policy):
 
 def test_recovery_works_in_any_unit():
     pytest.importorskip("torch")
-    from g2ard.recover import RecoverConfig, recover
+    from g2ard.stages.recover import RecoverConfig, recover
     from g2ard.targets import TeacherRenders
 
     figures = []

@@ -17,19 +17,19 @@ from g2ard.bench.recover_studies import STUDIES, Plan
 from g2ard.bench.simplify import machine, scene_label
 from g2ard.bench.standing import check_protocol, standing_targets
 from g2ard.cameras import Cameras
-from g2ard.distill import DistillConfig, distill
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
-from g2ard.lift import lift
+from g2ard.pipeline import DistillConfig, distill
 from g2ard.poses import make_pool
 from g2ard.progress import Progress, silent
-from g2ard.recover import RecoverConfig, recover
-from g2ard.recover.anchors import PAPER_PRESETS, Anchors, drift95, effective_rank, needle
-from g2ard.recover.presets import preset_for
-from g2ard.recover.schedule import PAPER
-from g2ard.simplify import simplify
 from g2ard.splats import Splats
 from g2ard.splits import HOLD_OUT, for_scores, for_training, not_held_out, split_mask
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.lift import lift
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.anchors import PAPER_PRESETS, Anchors, drift95, effective_rank, needle
+from g2ard.stages.recover.presets import preset_for
+from g2ard.stages.recover.schedule import PAPER
+from g2ard.stages.simplify import simplify
 from g2ard.targets import Photos, Targets, TeacherRenders
 from g2ard.visibility import looker
 

@@ -12,8 +12,8 @@ from PIL import Image
 from g2ard.images import as_saved, to_bytes
 from g2ard.lpips import Lpips
 from g2ard.metrics import psnr, ssim
-from g2ard.render import RasterSettings, Renderer
 from g2ard.splats import Splats
+from g2ard.stages.render import RasterSettings, Renderer
 from g2ard.targets import Targets, mask_of
 
 __all__ = ["Scored", "ViewFigures", "luma", "pictured", "save_jpeg", "score"]
@@ -98,7 +98,7 @@ def score(
         background: RGB behind the scene.
         lpips: networks to score with as well.
         settings: the renderer's conventions; None means gsplat's.
-        eight_bit: as for `g2ard.evaluate.evaluate`.
+        eight_bit: as for `g2ard.stages.evaluate.evaluate`.
         pictures: a folder; None keeps no pictures.
     """
     renderer = Renderer(splats, background=background, settings=settings)

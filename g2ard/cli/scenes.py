@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.cli.frame import Run
     from g2ard.io import ViewSet
-    from g2ard.render import RasterSettings
     from g2ard.splats import Splats
+    from g2ard.stages.render import RasterSettings
     from g2ard.targets import Targets
 
 __all__ = [
@@ -40,7 +40,7 @@ def recovery_engine(run: Run) -> Literal["fused", "gsplat"]:
     """
     if run.device != "cuda":
         return "fused"
-    from g2ard.recover.gsplat_engine import check_cuda
+    from g2ard.stages.recover.gsplat_engine import check_cuda
 
     check_cuda()
     return "gsplat"

@@ -10,11 +10,11 @@ import numpy as np
 
 from g2ard.errors import InputError
 from g2ard.images import to_bytes
-from g2ard.render import Renderer
 from g2ard.report.charts import Point, chart
 from g2ard.report.page import Comparison, Page, Shown, legend
 from g2ard.report.window import Crop
 from g2ard.splats import Splats
+from g2ard.stages.render import Renderer
 from g2ard.targets import Targets
 
 __all__ = ["check_crops", "distill_report"]

@@ -44,13 +44,13 @@ def adapt(
     preset: PaperOption = None,
 ) -> None:
     """Refit colours and opacities to new images; means, rotations and scales stay as they are."""
-    from g2ard.adapt import AdaptConfig, appearance_only
-    from g2ard.adapt import adapt as refit
     from g2ard.cli.resume import check_stopped, stoppable
     from g2ard.cli.scenes import load_scene, load_trained, make_targets, trained_on
     from g2ard.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
-    from g2ard.recover.schedule import schedule_named
+    from g2ard.stages.adapt import AdaptConfig, appearance_only
+    from g2ard.stages.adapt import adapt as refit
+    from g2ard.stages.recover.schedule import schedule_named
 
     recovery = appearance_only(schedule_named(schedule))
     config = AdaptConfig(

@@ -44,9 +44,9 @@ from g2ard.cli.scenes import (
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
-    from g2ard.distill import Distilled
-    from g2ard.lift import LiftConfig
+    from g2ard.pipeline import Distilled
     from g2ard.splats import Splats
+    from g2ard.stages.lift import LiftConfig
     from g2ard.targets import Targets
 
     Colour = tuple[float, float, float]
@@ -137,14 +137,14 @@ def distill(
     import time
 
     from g2ard.constants import changed, listed
-    from g2ard.distill import DistillConfig
-    from g2ard.distill import distill as pipeline
     from g2ard.io import kind, write_views
     from g2ard.io.atomic import check_output
-    from g2ard.lift import LiftConfig
-    from g2ard.recover.presets import preset_for
-    from g2ard.recover.schedule import schedule_named
+    from g2ard.pipeline import DistillConfig
+    from g2ard.pipeline import distill as pipeline
     from g2ard.report.distilled import check_crops, distill_report
+    from g2ard.stages.lift import LiftConfig
+    from g2ard.stages.recover.presets import preset_for
+    from g2ard.stages.recover.schedule import schedule_named
 
     began = time.monotonic()
     values = run.constants(recover=DistillConfig(), lift=LiftConfig())
@@ -260,7 +260,7 @@ def _work_folder(run: Run, output: Path, resume: bool) -> Iterator[Path]:
 
 def _lift(run: Run, path: Path, config: LiftConfig) -> Splats:
     from g2ard.io import read_cloud
-    from g2ard.lift import lift
+    from g2ard.stages.lift import lift
 
     cloud = read_cloud(path)
     for note in cloud.notes:
@@ -284,7 +284,7 @@ def _score(
     run: Run, prior: Splats, result: Distilled, views: dict[str, Targets | None], colour: Colour
 ) -> dict[str, Any]:
     """Both scenes' figures in each kind of views; None for a kind without any."""
-    from g2ard.evaluate import evaluate
+    from g2ard.stages.evaluate import evaluate
 
     scenes = {"simplified": result.simplified, "recovered": result.splats}
     scores: dict[str, Any] = {

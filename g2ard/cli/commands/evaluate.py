@@ -53,10 +53,10 @@ def evaluate(
     """
     from g2ard.cli.scenes import load_scene, load_views, make_targets
     from g2ard.errors import InputError
-    from g2ard.evaluate import evaluate as score
     from g2ard.lpips import load_lpips
-    from g2ard.recover.anchors import Anchors, drift95, needle
-    from g2ard.render import RasterSettings
+    from g2ard.stages.evaluate import evaluate as score
+    from g2ard.stages.recover.anchors import Anchors, drift95, needle
+    from g2ard.stages.render import RasterSettings
 
     if photos and teacher is None:
         raise typer.BadParameter("--photos goes with --teacher: without a teacher all targets are photos")

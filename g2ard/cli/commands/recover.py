@@ -24,8 +24,8 @@ from g2ard.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from g2ard.recover.anchors import Anchors
     from g2ard.splats import Splats
+    from g2ard.stages.recover.anchors import Anchors
 
 
 @command(
@@ -71,11 +71,11 @@ def recover(
     )
     from g2ard.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
-    from g2ard.recover import RecoverConfig
-    from g2ard.recover import recover as optimize
-    from g2ard.recover.outcome import outcome
-    from g2ard.recover.presets import preset_for
-    from g2ard.recover.schedule import schedule_named
+    from g2ard.stages.recover import RecoverConfig
+    from g2ard.stages.recover import recover as optimize
+    from g2ard.stages.recover.outcome import outcome
+    from g2ard.stages.recover.presets import preset_for
+    from g2ard.stages.recover.schedule import schedule_named
 
     values = run.constants(recover=RecoverConfig())
     one_horizon(steps, time_limit, values)
@@ -140,7 +140,7 @@ def _anchors(run: Run, path: Path, student: Splats, in_plane: float) -> Anchors:
     """
     from g2ard.cli.scenes import load_scene
     from g2ard.errors import InputError
-    from g2ard.recover.anchors import Anchors
+    from g2ard.stages.recover.anchors import Anchors
 
     scene = load_scene(run, path)
     if len(scene) != len(student):

@@ -61,7 +61,7 @@ def render(
     from g2ard.cli.scenes import load_scene, load_views
     from g2ard.images import write_png
     from g2ard.io.atomic import atomic_folder, check_output
-    from g2ard.render import RasterSettings, Renderer
+    from g2ard.stages.render import RasterSettings, Renderer
 
     _check(color, count, ratio, parents)
     check_output(output, run.overwrite, folder=True)
@@ -98,7 +98,7 @@ def _painted(
     run: Run, splats: Splats, color: Color, budget: int | None, method: Method, parents: Path | None
 ) -> Splats:
     from g2ard.paint import cell_labels, flag_colors, label_colors, painted
-    from g2ard.simplify import flag, simplify
+    from g2ard.stages.simplify import flag, simplify
 
     if color == "flags":
         assert budget is not None  # _check has seen to it

@@ -48,8 +48,8 @@ def select(
     from g2ard.cli.scenes import load_scene, load_split_views
     from g2ard.constants import changed, listed
     from g2ard.io import check_views_output
-    from g2ard.select import CoverageOptions
-    from g2ard.select import select as choose
+    from g2ard.stages.select import CoverageOptions
+    from g2ard.stages.select import select as choose
 
     if views is None:
         raise typer.BadParameter("--views VIEWS: the candidates to select from")

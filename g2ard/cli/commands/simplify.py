@@ -25,8 +25,8 @@ from g2ard.cli.options import (
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.cli.options import Triple
-    from g2ard.simplify import Simplified
     from g2ard.splats import Splats
+    from g2ard.stages.simplify import Simplified
 
 _VIEWS, _NEAR = 96, 0.25
 """Poses of a pool of its own, as many of them are used as the scene needs; and the most that step nearer."""
@@ -68,8 +68,8 @@ def simplify(
 
     from g2ard import io
     from g2ard.constants import changed, listed
-    from g2ard.simplify import SimplifyConfig
-    from g2ard.simplify import simplify as reduce
+    from g2ard.stages.simplify import SimplifyConfig
+    from g2ard.stages.simplify import simplify as reduce
     from g2ard.visibility import looker
 
     one_budget(count, ratio)

@@ -14,7 +14,7 @@ from g2ard.splats import Splats
 from g2ard.targets import Targets, mask_of
 
 if TYPE_CHECKING:
-    from g2ard.render import Renderer
+    from g2ard.stages.render import Renderer
 
 __all__ = ["MULTIPLIERS", "Probe", "calm", "climb", "trial_steps"]
 
@@ -107,7 +107,7 @@ class Probe:
 
     def all_of(self, splats: Splats) -> float:
         """Mean over all of the views."""
-        from g2ard.render import Renderer
+        from g2ard.stages.render import Renderer
 
         renderer = Renderer(splats, background=self._background)
         return float(np.mean([self._score(renderer, view) for view in self._views]))

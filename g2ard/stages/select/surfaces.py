@@ -13,8 +13,8 @@ from g2ard import _core
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, silent
-from g2ard.render import settings_for
 from g2ard.splats import Splats
+from g2ard.stages.render import settings_for
 
 __all__ = [
     "CoverageOptions",

@@ -16,7 +16,7 @@ from g2ard.splats import Splats
 from g2ard.targets import Targets, against_of, mask_of
 
 if TYPE_CHECKING:
-    from g2ard.render import RasterSettings
+    from g2ard.stages.render import RasterSettings
 
 __all__ = ["Evaluation", "ViewScore", "evaluate"]
 
@@ -111,7 +111,7 @@ def evaluate(
     Raises:
         InputError: a photo cannot be read.
     """
-    from g2ard.render import Renderer
+    from g2ard.stages.render import Renderer
 
     cameras = targets.cameras
     renderer = Renderer(splats, background=background, settings=settings)

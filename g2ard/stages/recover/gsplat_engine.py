@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from g2ard.errors import InputError
-from g2ard.recover.losses import l1_ssim_anywhere
-from g2ard.recover.torch_engine import TorchEngine
+from g2ard.stages.recover.losses import l1_ssim_anywhere
+from g2ard.stages.recover.torch_engine import TorchEngine
 
 __all__ = ["GsplatEngine", "check_cuda"]
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
-from g2ard.select import poses
-from g2ard.select.surfaces import CoverageOptions, greedy, surface
 from g2ard.splats import Splats
+from g2ard.stages.select import poses
+from g2ard.stages.select.surfaces import CoverageOptions, greedy, surface
 
 __all__ = ["POLICIES", "Selection", "select"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from g2ard.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.anchors import Anchors, Regularizers
 
 __all__ = ["TorchAnchors", "anchor_loss", "regularization", "shape_loss"]
 

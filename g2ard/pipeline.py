@@ -14,17 +14,17 @@ from numpy.typing import ArrayLike
 
 from g2ard.errors import require
 from g2ard.progress import Progress, silent
-from g2ard.recover import checkpoint as checkpoints
-from g2ard.recover.anchors import PRESETS, Anchors, Regularizers
-from g2ard.recover.draw import checked_weights
-from g2ard.recover.schedule import TUNED, Schedule
-from g2ard.select.surfaces import CoverageOptions
-from g2ard.simplify.config import SimplifyConfig
 from g2ard.splats import Splats
+from g2ard.stages.recover import checkpoint as checkpoints
+from g2ard.stages.recover.anchors import PRESETS, Anchors, Regularizers
+from g2ard.stages.recover.draw import checked_weights
+from g2ard.stages.recover.schedule import TUNED, Schedule
+from g2ard.stages.select.surfaces import CoverageOptions
+from g2ard.stages.simplify.config import SimplifyConfig
 from g2ard.targets import Photos, Subset, Targets, fingerprint_of
 
 if TYPE_CHECKING:
-    from g2ard.recover.optimize import Watch
+    from g2ard.stages.recover.optimize import Watch
 
 __all__ = ["DistillConfig", "Distilled", "distill"]
 
@@ -40,7 +40,7 @@ class DistillConfig:
         schedule: recovery's; one with `round_steps` recovers after every round of 75 % (the paper), without
             them the reduction is one shot and all recovery happens at the target count.
         steps: the final horizon; None means the schedule's, more where a view holds little of the scene
-            (`g2ard.recover.need`).
+            (`g2ard.stages.recover.need`).
         time_limit: seconds for all recovery, shared out over rounds in proportion to their steps; horizons
             become what fits into them.
         regularizers: weights of L_anchor and L_shape.
@@ -48,7 +48,7 @@ class DistillConfig:
         background: RGB behind the scene.
         views: how many of the targets' views recovery looks at, best first; a float is a share of them,
             rounded up; "auto" takes as many as the curve of gains asks for, None all that see the scene.
-        policy: how views are chosen, see `g2ard.select`.
+        policy: how views are chosen, see `g2ard.stages.select`.
         weighted: draw views by the weights of the selection, so that crowded poses do not rule: on a
             crowded pool all views drawn so beat an even draw, and every choice of a tenth of them.
         reselect: choose again from every round's scene; else once, from the raw prior.
@@ -124,10 +124,10 @@ def distill(
         config: see `DistillConfig`.
         weights: (C,) how often to draw each view, where that is known already; None weighs them here.
         validation: a few views of another kind, never learned from, which decide how much of recovery's
-            changes stays where they lose, see `g2ard.recover.recover`.
+            changes stays where they lose, see `g2ard.stages.recover.recover`.
         work: a folder for finished rounds and checkpoints; a second call with the same inputs goes on there.
         progress: told of all stages.
-        watch: called after every step of every recovery, see `g2ard.recover.recover`.
+        watch: called after every step of every recovery, see `g2ard.stages.recover.recover`.
 
     Returns:
         A `Distilled`.
@@ -136,7 +136,7 @@ def distill(
         InputError: the budget does not fit, no view sees the prior, or `work` belongs to another run.
         KeyboardInterrupt: after Ctrl-C, with `work` ready for a resume.
     """
-    from g2ard.simplify import schedule as counts_of
+    from g2ard.stages.simplify import schedule as counts_of
 
     config = config or DistillConfig()
     many = config.schedule.round_steps > 0
@@ -162,7 +162,7 @@ class _Supervision:
         cls, scene: Splats, targets: Targets, config: DistillConfig, weights: Any, progress: Progress
     ) -> _Supervision:
         """The views worth having of `scene`; `weights` that are given stand, over what selection says."""
-        from g2ard.select import select
+        from g2ard.stages.select import select
 
         cameras = targets.cameras
         if config.views is None and (weights is not None or not config.weighted):
@@ -250,7 +250,7 @@ class _Rounds:
             self.supervision.fill(self.progress)
 
     def _simplify(self, number: int, count: int, entry: dict[str, Any]) -> None:
-        from g2ard.simplify import simplify
+        from g2ard.stages.simplify import simplify
         from g2ard.visibility import looker
 
         name = f"simplified-{number}"
@@ -277,7 +277,7 @@ class _Rounds:
         self.simplified = self.state
 
     def _recover(self, name: str, entry: dict[str, Any], *, final: bool) -> None:
-        from g2ard.recover import RecoverConfig, recover
+        from g2ard.stages.recover import RecoverConfig, recover
 
         if not self._restore(name, entry):
             config = RecoverConfig(
@@ -313,7 +313,7 @@ class _Rounds:
 
     def _steps(self) -> int | None:
         """The final horizon: as asked for, the schedule's, or by need where a teacher renders the targets."""
-        from g2ard.recover.need import steps_for
+        from g2ard.stages.recover.need import steps_for
 
         schedule = self.config.schedule
         if self.config.steps is not None or not schedule.means_in_scales or isinstance(self.targets, Photos):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from g2ard.select.choose import POLICIES, Selection, select
-from g2ard.select.surfaces import CoverageOptions, Surface, Visible, surface, visible_cells
+from g2ard.stages.select.choose import POLICIES, Selection, select
+from g2ard.stages.select.surfaces import CoverageOptions, Surface, Visible, surface, visible_cells
 
 __all__ = [
     "POLICIES",

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.cameras import Cameras
-from g2ard.recover.anchors import Anchors, Regularizers
-from g2ard.recover.schedule import Rates
-from g2ard.recover.sizes import radii
-from g2ard.render import arrays_of, settings_for, view_of
 from g2ard.splats import Splats
+from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.schedule import Rates
+from g2ard.stages.recover.sizes import radii
+from g2ard.stages.render import arrays_of, settings_for, view_of
 
 __all__ = ["FusedEngine"]
 

@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from g2ard.cameras import Cameras
-from g2ard.recover.anchors import Anchors, Regularizers
-from g2ard.recover.extent import extents, share_of_rate
-from g2ard.recover.losses import l1_ssim
-from g2ard.recover.rasterize import rasterize
-from g2ard.recover.regularize import TorchAnchors, regularization
-from g2ard.recover.row_adam import RowAdam
-from g2ard.recover.schedule import Rates
-from g2ard.recover.sizes import radii
-from g2ard.render import settings_for
 from g2ard.splats import Splats
+from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.extent import extents, share_of_rate
+from g2ard.stages.recover.losses import l1_ssim
+from g2ard.stages.recover.rasterize import rasterize
+from g2ard.stages.recover.regularize import TorchAnchors, regularization
+from g2ard.stages.recover.row_adam import RowAdam
+from g2ard.stages.recover.schedule import Rates
+from g2ard.stages.recover.sizes import radii
+from g2ard.stages.render import settings_for
 
 __all__ = ["TorchEngine"]
 

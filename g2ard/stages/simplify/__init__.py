@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
-from g2ard.simplify.config import METHODS, SimplifyConfig, schedule
-from g2ard.simplify.pairs import Seen, Visibility, merge, merge_looking, rows_of, splats_of
 from g2ard.splats import DRAWN_LOGIT, Splats
+from g2ard.stages.simplify.config import METHODS, SimplifyConfig, schedule
+from g2ard.stages.simplify.pairs import Seen, Visibility, merge, merge_looking, rows_of, splats_of
 
 __all__ = ["METHODS", "Seen", "Simplified", "SimplifyConfig", "flag", "schedule", "simplify"]
 
@@ -132,7 +132,7 @@ def simplify(
             non-finite values are dropped and counted.
         budget: Gaussians to keep, at most as many as there are.
         method: the policy.
-        visibility: for `default` and `fast`: what views see of each Gaussian (`g2ard.render.visibility`), or
+        visibility: for `default` and `fast`: what views see of each Gaussian (`g2ard.visibility`), or
             a function that finds it for a scene, asked again for the result, whose opacities it fits.
         protected: (N,) bool flags to inherit. With None, `paper` computes them (see `flag`), the others,
             which have no use for them, go without.

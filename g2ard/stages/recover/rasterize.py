@@ -12,7 +12,7 @@ from torch import Tensor
 from g2ard import _core
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.render import Choices, RasterSettings, View, view_of
+from g2ard.stages.render import Choices, RasterSettings, View, view_of
 
 __all__ = ["rasterize"]
 

@@ -12,11 +12,11 @@ import numpy as np
 from g2ard.appearance import blended, colour_change, recoloured, views_seeing
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, silent
-from g2ard.recover import RecoverConfig, checkpoint, recover
-from g2ard.recover.anchors import Regularizers
-from g2ard.recover.probe import Probe
-from g2ard.recover.schedule import PAPER, TUNED, Schedule
 from g2ard.splats import Splats
+from g2ard.stages.recover import RecoverConfig, checkpoint, recover
+from g2ard.stages.recover.anchors import Regularizers
+from g2ard.stages.recover.probe import Probe
+from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
 from g2ard.targets import Targets, fingerprint_of
 
 __all__ = ["AdaptConfig", "Adapted", "adapt", "appearance_only"]

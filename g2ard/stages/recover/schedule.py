@@ -22,7 +22,7 @@ class Rates:
 
     What is large in the view a step looks at stands still: a Gaussian whose largest standard deviation there
     is σ, as a share of the image's longer side, takes steps of 1/(1 + (σ/reach)¹⁶) times the rate in means
-    and rotations, and each of its scales by the σ of that axis alone (`g2ard.recover.extent`). Many layers
+    and rotations, and each of its scales by the σ of that axis alone (`recover.extent`). Many layers
     that move together, as those of a sky do, move the image by the sum of their steps.
 
     Args:
@@ -202,7 +202,7 @@ def reach_for(start_rmse: float, typical: float) -> float:
 
     Args:
         start_rmse: before recovery.
-        typical: see `g2ard.recover.sizes.typical_share`.
+        typical: see `g2ard.stages.recover.sizes.typical_share`.
 
     >>> reach_for(0.02, 0.005), reach_for(0.05, 0.04), reach_for(0.15, 0.005)
     (0.01, 0.04, inf)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.progress import Progress, counter
-from g2ard.simplify.config import SimplifyConfig, schedule
 from g2ard.splats import DRAWN_LOGIT, Splats
+from g2ard.stages.simplify.config import SimplifyConfig, schedule
 
 __all__ = ["Seen", "Visibility", "merge", "merge_looking", "rows_of", "splats_of"]
 
@@ -31,7 +31,7 @@ DRAWN_OPACITY = float(1 / (1 + np.exp(-DRAWN_LOGIT)))
 
 
 class Seen(Protocol):
-    """What views say of N Gaussians, such as `g2ard.render.visibility` returns."""
+    """What views say of N Gaussians, such as `g2ard.stages.render.visibility` returns."""
 
     @property
     def weight(self) -> NDArray[Any]:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from g2ard.errors import InputError
-from g2ard.recover.anchors import PRESETS, Regularizers
-from g2ard.recover.schedule import TUNED, Schedule
+from g2ard.stages.recover.anchors import PRESETS, Regularizers
+from g2ard.stages.recover.schedule import TUNED, Schedule
 
 __all__ = ["RecoverConfig"]
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.cameras import Cameras
 from g2ard.progress import Progress, counter
-from g2ard.select.surfaces import Surface, core_scene, core_views
 from g2ard.splats import Splats
+from g2ard.stages.select.surfaces import Surface, core_scene, core_views
 
 __all__ = [
     "demand",

@@ -16,15 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
-from g2ard.recover import checkpoint as checkpoints
-from g2ard.recover.anchors import Anchors, drift95, needle
-from g2ard.recover.config import RecoverConfig
-from g2ard.recover.draw import checked_weights, drawn
-from g2ard.recover.guard import Guard
-from g2ard.recover.probe import MULTIPLIERS, Probe, calm, climb, trial_steps
-from g2ard.recover.schedule import Rates, multiplier_for, reach_for
-from g2ard.recover.sizes import typical_share
 from g2ard.splats import Splats
+from g2ard.stages.recover import checkpoint as checkpoints
+from g2ard.stages.recover.anchors import Anchors, drift95, needle
+from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.draw import checked_weights, drawn
+from g2ard.stages.recover.guard import Guard
+from g2ard.stages.recover.probe import MULTIPLIERS, Probe, calm, climb, trial_steps
+from g2ard.stages.recover.schedule import Rates, multiplier_for, reach_for
+from g2ard.stages.recover.sizes import typical_share
 from g2ard.targets import Targets, fingerprint_of, mask_of
 
 __all__ = ["Recovered", "Watch", "recover"]
@@ -121,7 +121,7 @@ def recover(
             wants those of its construction.
         validation: a few views of another kind than `targets` (nearer, or from where people stand), never
             learned from: where they lose, they decide how much of what the steps changed stays, Gaussian by
-            Gaussian as it was seen (`g2ard.recover.guard`), and end a recovery that they only lose by. At
+            Gaussian as it was seen (`recover.guard`), and end a recovery that they only lose by. At
             most eight are looked at.
         checkpoint: a file written every minute and at Ctrl-C; if it is there, recovery goes on from it, and
             the result is bitwise that of never having stopped.
@@ -433,15 +433,15 @@ def _finite(reach: float) -> float | None:
 
 def _engine_class(name: str) -> Any:
     if name == "fused":
-        from g2ard.recover.fused_engine import FusedEngine
+        from g2ard.stages.recover.fused_engine import FusedEngine
 
         return FusedEngine
     if name == "torch":
-        from g2ard.recover.torch_engine import TorchEngine
+        from g2ard.stages.recover.torch_engine import TorchEngine
 
         return TorchEngine
     if name == "gsplat":
-        from g2ard.recover.gsplat_engine import GsplatEngine
+        from g2ard.stages.recover.gsplat_engine import GsplatEngine
 
         return GsplatEngine
     raise InputError(f"engine: expected fused, torch or gsplat, got {name!r}")
