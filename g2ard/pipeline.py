@@ -14,19 +14,22 @@ from numpy.typing import ArrayLike
 
 from g2ard.errors import require
 from g2ard.progress import Progress, silent
+from g2ard.reports import Report
 from g2ard.splats import Splats
 from g2ard.stages.recover import checkpoint as checkpoints
 from g2ard.stages.recover.anchors import PRESETS, Anchors, Regularizers
 from g2ard.stages.recover.draw import checked_weights
+from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.recover.schedule import TUNED, Schedule
 from g2ard.stages.select.surfaces import CoverageOptions
 from g2ard.stages.simplify.config import SimplifyConfig
+from g2ard.stages.simplify.report import SimplifyReport
 from g2ard.targets import Photos, Subset, Targets, fingerprint_of
 
 if TYPE_CHECKING:
     from g2ard.stages.recover.optimize import Watch
 
-__all__ = ["DistillConfig", "Distilled", "distill"]
+__all__ = ["DistillConfig", "DistillReport", "Distilled", "distill"]
 
 _ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 
@@ -81,6 +84,55 @@ class DistillConfig:
         require("views", self.views, share, "a count, auto, none, or a share in (0, 1]")
 
 
+@dataclass(frozen=True)
+class ViewsReport(Report):
+    """What was made of the candidate views.
+
+    Args:
+        policy: how they were chosen.
+        candidates: how many there were.
+        chosen: names, best first.
+        weighted: whether they were drawn by weight.
+        refused: names of those that see nothing of the scene, or stand within it.
+        left_out: what the views not chosen would have added to the policy's objective, as a share of the
+            whole pool's.
+    """
+
+    policy: str
+    candidates: int
+    chosen: list[str]
+    weighted: bool
+    refused: list[str]
+    left_out: float
+
+
+@dataclass(frozen=True)
+class RoundReport(Report):
+    """A round, recovered once where the schedule asks for it, and once more if it is the last."""
+
+    count: int
+    simplify: SimplifyReport
+    recover: tuple[RecoverReport, ...] = ()
+
+
+@dataclass(frozen=True)
+class StageSeconds(Report):
+    """Wall seconds of each stage."""
+
+    select: float
+    simplify: float
+    recover: float
+
+
+@dataclass(frozen=True)
+class DistillReport(Report):
+    """A distillation in numbers; `views` is None where nothing was selected."""
+
+    rounds: tuple[RoundReport, ...]
+    seconds: StageSeconds
+    views: ViewsReport | None
+
+
 @dataclass(frozen=True, eq=False)
 class Distilled:
     """A compact scene and how it came about.
@@ -89,15 +141,14 @@ class Distilled:
         splats: exactly `budget` Gaussians.
         simplified: the same Gaussians before any recovery at their count: the anchors of all that followed,
             and what Drift95 is measured from.
-        report: rounds [{simplify, recover}], seconds {select, simplify, recover}, and views {policy,
-            candidates, chosen [names], weighted, refused [names], left_out}: the last is what the views not
-            chosen would have added to the policy's objective, as a share of the whole pool's; None where
-            nothing was selected.
+        report: what was done, in numbers.
+        held_out: targets that nothing was learned from, to score on; None where the caller has their own.
     """
 
     splats: Splats
     simplified: Splats
-    report: dict[str, Any] = field(default_factory=dict)
+    report: DistillReport
+    held_out: Targets | None = None
 
 
 def distill(
@@ -145,7 +196,9 @@ def distill(
     rounds = _Rounds(prior, budget, targets, config, len(counts), weights, validation, work, progress, watch)
     for number, count in enumerate(counts, start=1):
         rounds.advance(number, count, final=number == len(counts))
-    report = {"rounds": rounds.log, "seconds": rounds.seconds, "views": rounds.supervision.report}
+    report = DistillReport(
+        tuple(map(RoundReport.of, rounds.log)), StageSeconds.of(rounds.seconds), rounds.supervision.report
+    )
     return Distilled(rounds.state, rounds.simplified, report)
 
 
@@ -155,7 +208,7 @@ class _Supervision:
 
     targets: Targets
     weights: Any
-    report: dict[str, Any] | None
+    report: ViewsReport | None
 
     @classmethod
     def of(
@@ -185,14 +238,14 @@ class _Supervision:
             weights = weights[chosen.order[rows]]
         elif config.weighted:
             weights = chosen.weights[rows]
-        report = {
-            "policy": policy,
-            "candidates": len(cameras),
-            "chosen": [cameras.names[i] for i in chosen.order],
-            "weighted": weights is not None,
-            "refused": [cameras.names[i] for i in chosen.refused],
-            "left_out": chosen.left_out,
-        }
+        report = ViewsReport(
+            policy=policy,
+            candidates=len(cameras),
+            chosen=[cameras.names[i] for i in chosen.order],
+            weighted=weights is not None,
+            refused=[cameras.names[i] for i in chosen.refused],
+            left_out=chosen.left_out,
+        )
         return cls(subset, weights, report)
 
     def fill(self, progress: Progress) -> None:
@@ -269,7 +322,7 @@ class _Rounds:
                 progress=self.progress,
             )
             self.state, self.protected = done.splats, done.protected
-            entry["simplify"] = {**done.report, "seconds": time.monotonic() - began}
+            entry["simplify"] = {**done.report.as_dict(), "seconds": time.monotonic() - began}
             self._save(name, entry)
         self.seconds["simplify"] += entry["simplify"]["seconds"]
         if self.config.sh_degree is not None:
@@ -305,7 +358,7 @@ class _Rounds:
                 watch=self.watch,
             )
             self.state = done.splats
-            entry.setdefault("recover", []).append(done.report)
+            entry.setdefault("recover", []).append(done.report.as_dict())
             self._save(name, entry)
             if checkpoint is not None:
                 checkpoint.unlink(missing_ok=True)

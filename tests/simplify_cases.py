@@ -43,7 +43,7 @@ def assert_sound(result, count, budget):
     used = np.unique(result.parents[result.parents >= 0])
     np.testing.assert_array_equal(used, np.arange(budget))
     assert result.protected.shape == (budget,)
-    assert result.report["output_count"] == budget
+    assert result.report.output_count == budget
 
 
 class Views:

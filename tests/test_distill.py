@@ -38,7 +38,7 @@ def test_views_of_another_kind_are_handed_on(targets: TeacherRenders, tmp_path: 
     near = TeacherRenders(PRIOR, around(4, (64, 48), 2.0))
     config = DistillConfig(steps=20)
     done = distill(PRIOR, 300, targets, config, validation=near, work=tmp_path)
-    assert done.report["rounds"][0]["recover"][0]["validation"]["looks"]
+    assert done.report.rounds[0].recover[0].validation.looks
     with pytest.raises(InputError, match="other options"):
         distill(PRIOR, 300, targets, config, work=tmp_path)
 
@@ -46,14 +46,14 @@ def test_views_of_another_kind_are_handed_on(targets: TeacherRenders, tmp_path: 
 def test_one_shot_reaches_the_budget_and_recovers(targets: TeacherRenders) -> None:
     result = distill(PRIOR, 300, targets, DistillConfig(steps=120))
     assert len(result.splats) == len(result.simplified) == 300
-    assert [entry["count"] for entry in result.report["rounds"]] == [300]
+    assert [entry.count for entry in result.report.rounds] == [300]
     assert evaluate(result.splats, targets).psnr > evaluate(result.simplified, targets).psnr + 3
 
 
 def test_rounds_follow_the_paper_s_counts(targets: TeacherRenders) -> None:
     result = distill(PRIOR, 1000, targets, DistillConfig(method="paper", schedule=ROUNDS))
-    assert [entry["count"] for entry in result.report["rounds"]] == [2250, 1688, 1266, 1000]
-    assert [len(entry["recover"]) for entry in result.report["rounds"]] == [1, 1, 1, 2]
+    assert [entry.count for entry in result.report.rounds] == [2250, 1688, 1266, 1000]
+    assert [len(entry.recover) for entry in result.report.rounds] == [1, 1, 1, 2]
 
 
 def test_an_interrupted_run_goes_on_to_the_same_bits(targets: TeacherRenders, tmp_path: Path) -> None:

@@ -108,8 +108,8 @@ def test_what_a_mask_hides_does_not_matter(student: Splats, tmp_path: Path, engi
     ]
     for name in ("means", "quats", "scales", "logit_opacities", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(found[0].splats, name), getattr(found[1].splats, name))
-    assert found[0].report["loss"] == found[1].report["loss"]
-    assert found[0].report["psnr"] == found[1].report["psnr"]
+    assert found[0].report.loss == found[1].report.loss
+    assert found[0].report.psnr == found[1].report.psnr
 
 
 def test_masked_photos_teach_what_whole_ones_do(student: Splats, tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_masked_photos_teach_what_whole_ones_do(student: Splats, tmp_path: Path)
 def test_both_engines_step_alike_under_a_mask(student: Splats, tmp_path: Path) -> None:
     targets = Photos(photographed(tmp_path, spoil=1.0))
     losses = [
-        recover(student, targets, RecoverConfig(steps=3, engine=engine, regularizers=BARE)).report["loss"]
+        recover(student, targets, RecoverConfig(steps=3, engine=engine, regularizers=BARE)).report.loss
         for engine in ("fused", "torch")
     ]
     assert losses[0] == pytest.approx(losses[1], abs=2e-4)

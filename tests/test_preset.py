@@ -164,15 +164,13 @@ def test_in_python() -> None:
 def test_anchors_hold_from_construction_to_the_end(targets: TeacherRenders) -> None:
     config = DistillConfig(method="paper", schedule=FEW, regularizers=FREE)
     result = distill(PRIOR, 1000, targets, config)
-    first, last = result.report["rounds"][-1]["recover"]
+    first, last = result.report.rounds[-1].recover
     anchors = Anchors.of(result.simplified)
-    assert last["drift95"] == drift95(anchors, result.splats.means)
+    assert last.drift95 == drift95(anchors, result.splats.means)
     # The round's drift is not forgotten.
-    assert last["geometry"][0]["drift95"] > 0.5 * first["drift95"] > 0.05
+    assert last.geometry[0].drift95 > 0.5 * first.drift95 > 0.05
     held = replace(config, regularizers=Regularizers(100.0, 0.0, effective_rank=False, period=1))
-    assert (
-        distill(PRIOR, 1000, targets, held).report["rounds"][-1]["recover"][-1]["drift95"] < last["drift95"]
-    )
+    assert distill(PRIOR, 1000, targets, held).report.rounds[-1].recover[-1].drift95 < last.drift95
 
 
 def test_the_paper_s_steps_are_kept_whatever_comes_of_them(targets: TeacherRenders) -> None:
@@ -180,11 +178,11 @@ def test_the_paper_s_steps_are_kept_whatever_comes_of_them(targets: TeacherRende
     grain = np.random.default_rng(0).normal(0, 1e-3, PRIOR.sh0.shape).astype(np.float32)
     start = replace(PRIOR, sh0=PRIOR.sh0 + grain)  # so near that such steps only lose
     done = recover(start, targets, config, validation=targets)
-    assert done.report["psnr"]["after"] < done.report["psnr"]["before"]
-    assert (done.report["kept_start"], done.report["way"], done.report["validation"]) == (False, 1.0, None)
+    assert done.report.psnr.after < done.report.psnr.before
+    assert (done.report.kept_start, done.report.way, done.report.validation) == (False, 1.0, None)
     assert (done.splats.sh0 != start.sh0).any()
     guarded = replace(config, schedule=replace(PAPER, guarded=True))
-    assert recover(start, targets, guarded).report["kept_start"]
+    assert recover(start, targets, guarded).report.kept_start
 
 
 def scaled(scene: Splats, cameras: Cameras, unit: float) -> tuple[Splats, Cameras]:

@@ -36,7 +36,7 @@ def ready() -> str | None:
 def test_gsplat_recovers_like_the_cpu() -> None:
     student = simplify(BALL, 300, method="paper").splats
     scores = [
-        recover(student, TARGETS, RecoverConfig(steps=60, engine=engine)).report["psnr"]
+        recover(student, TARGETS, RecoverConfig(steps=60, engine=engine)).report.psnr
         for engine in ("torch", "gsplat")
     ]
     assert scores[0]["before"] == scores[1]["before"]

@@ -101,7 +101,7 @@ def test_a_resume_draws_on_where_it_stopped(
         recover(student, targets, config, checkpoint=checkpoint)
     resumed = recover(student, targets, config, weights=WEIGHTS, checkpoint=checkpoint)
     assert same(whole.splats, resumed.splats)
-    assert whole.report["loss"] == resumed.report["loss"]
+    assert whole.report.loss == resumed.report.loss
 
 
 def signal_interrupt() -> None:

@@ -44,7 +44,7 @@ def test_a_function_of_visibility_is_asked_again_for_the_result():
     assert_sound(out, 4000, 100)
     assert asked == [4000, 100]  # the last to fit what was merged
     assert out.protected.all()
-    assert out.report["unseen"] == 0
+    assert out.report.unseen == 0
 
 
 def test_what_no_view_sees_is_counted():
@@ -55,8 +55,8 @@ def test_what_no_view_sees_is_counted():
         return Views(np.where(splats.means[:, 0] < 0, 0.0, 1.0), np.full(len(splats), 0.01))
 
     out = simplify(prior, 100, visibility=look)
-    assert out.report["unseen"] == (unseen & (out.parents >= 0)).sum() > 0
-    assert simplify(prior, 100).report["unseen"] is None
+    assert out.report.unseen == (unseen & (out.parents >= 0)).sum() > 0
+    assert simplify(prior, 100).report.unseen is None
 
 
 @pytest.mark.parametrize("growth", [1.0, 1.5])
@@ -101,7 +101,7 @@ def test_opacities_are_fitted_and_all_else_is_the_members():
     prior = scene(4000, dtype=np.float64)
     config = SimplifyConfig(max_growth=1)
     out = simplify(prior, 100, visibility=all_alike, config=config)
-    assert out.report["fitted"] > 50
+    assert out.report.fitted > 50
     members = np.bincount(out.parents[out.parents >= 0], minlength=100)
     floor = 0.05 * members.mean()  # every row sends 1 to the views, before and after
     factor = np.sqrt(np.clip((members + floor) / (1 + floor), 0.5, 2))
@@ -147,7 +147,7 @@ def test_what_is_seen_does_not_depend_on_the_order_of_rows(method, scale):
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(a.splats, name), getattr(b.splats, name), err_msg=name)
     np.testing.assert_array_equal(a.parents[shuffled], b.parents)
-    assert a.report["fitted"] > 40
+    assert a.report.fitted > 40
 
 
 def test_bands_of_zeros_are_skipped_and_come_back():
@@ -157,5 +157,5 @@ def test_bands_of_zeros_are_skipped_and_come_back():
     np.testing.assert_array_equal(a.splats.shN, b.splats.shN[:, :3])
     assert b.splats.shN.shape == (60, 15, 3)
     assert not b.splats.shN[:, 3:].any()
-    assert (a.report["skipped"]["sh_bands"], b.report["skipped"]["sh_bands"]) == (0, 2)
-    assert b.report["skipped"]["alone"] == (np.bincount(b.parents[b.parents >= 0]) == 1).sum()
+    assert (a.report.skipped["sh_bands"], b.report.skipped["sh_bands"]) == (0, 2)
+    assert b.report.skipped["alone"] == (np.bincount(b.parents[b.parents >= 0]) == 1).sum()

@@ -54,7 +54,7 @@ def test_what_views_see_scales_by_powers_of_two_exactly(method, unit, dtype):
     small, near = in_units(scene, cameras, unit)
     here = simplify(scene, 150, method=method, visibility=looker(cameras))
     there = simplify(small, 150, method=method, visibility=looker(near))
-    assert here.report["fitted"] > 50
+    assert here.report.fitted > 50
     back = in_units(there.splats, near, 1 / unit)[0]
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(back, name), getattr(here.splats, name), err_msg=name)
@@ -98,7 +98,7 @@ def test_recovery_works_in_any_unit():
         scene, cameras = in_units(ball(), around(), unit)
         student = simplify(scene, 300).splats
         done = recover(student, TeacherRenders(scene, cameras), RecoverConfig(steps=30))
-        figures.append((done.report["psnr"]["before"], done.report["psnr"]["after"]))
+        figures.append((done.report.psnr.before, done.report.psnr.after))
     (before, after), (before_small, after_small) = figures
     assert after > before + 1
     assert before_small == pytest.approx(before, abs=0.05)

@@ -145,7 +145,8 @@ def _recover(job: Job) -> dict[str, Any]:
     anchors = None if built is None else Anchors.of(built, config.regularizers.in_plane)
     done = recover(student, targets, config, anchors=anchors)
     io.write_splats(job["output"], done.splats, overwrite=True)
-    return {key: done.report[key] for key in ("steps", "seconds", "psnr", "drift95", "needle", "multiplier")}
+    report = done.report.as_dict()
+    return {key: report[key] for key in ("steps", "seconds", "psnr", "drift95", "needle", "multiplier")}
 
 
 def _adapt(job: Job) -> dict[str, Any]:
@@ -160,7 +161,8 @@ def _adapt(job: Job) -> dict[str, Any]:
     )
     done = adapt(io.read_splats(job["scene"]), _targets(job), config)
     io.write_splats(job["output"], done.splats, overwrite=True)
-    return {key: done.report[key] for key in ("steps", "seconds", "psnr", "converged")}
+    report = done.report.as_dict()
+    return {key: report[key] for key in ("steps", "seconds", "psnr", "converged")}
 
 
 def _schedule(name: str, cameras: Cameras) -> Schedule:

@@ -65,7 +65,9 @@ def _load_config(ctx: typer.Context, path: Path | None) -> Path | None:
         str(ctx.info_name), {k: v for k, v in values.items() if k == "set" or not isinstance(v, dict)}
     )
     constants = _flat(table.pop("set", {}))
-    table = {key.replace("-", "_"): _as_typed(value) for key, value in table.items()}
+    many = {p.name for p in ctx.command.params if getattr(p, "multiple", False)}
+    table = {key.replace("-", "_"): value for key, value in table.items()}
+    table = {key: _several(value) if key in many else _as_typed(value) for key, value in table.items()}
     if constants:
         table["set"] = [f"{name}={_as_typed(value)}" for name, value in constants.items()]
     unknown = sorted(set(table) - {p.name for p in ctx.command.params})
@@ -90,6 +92,11 @@ def _as_typed(value: Any) -> Any:
     if isinstance(value, list):
         return ",".join(str(item) for item in value)
     return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _several(value: Any) -> list[str]:
+    """What an option that may be repeated is given."""
+    return [_as_typed(item) for item in value] if isinstance(value, list) else [_as_typed(value)]
 
 
 _RIVALS = (("count", "ratio"), ("steps", "time_limit"), ("views", "no_views"))

@@ -12,14 +12,16 @@ import numpy as np
 from g2ard.appearance import blended, colour_change, recoloured, views_seeing
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, silent
+from g2ard.reports import Report
 from g2ard.splats import Splats
 from g2ard.stages.recover import RecoverConfig, checkpoint, recover
 from g2ard.stages.recover.anchors import Regularizers
 from g2ard.stages.recover.probe import Probe
+from g2ard.stages.recover.report import Gain
 from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
 from g2ard.targets import Targets, fingerprint_of
 
-__all__ = ["AdaptConfig", "Adapted", "adapt", "appearance_only"]
+__all__ = ["AdaptConfig", "AdaptReport", "Adapted", "adapt", "appearance_only"]
 
 _FREE = Regularizers(anchor=0.0, shape=0.0, effective_rank=False)
 """Geometry that cannot move needs nothing to hold it."""
@@ -88,19 +90,48 @@ class AdaptConfig:
         return [*out, left]
 
 
+@dataclass(frozen=True)
+class Stretch(Report):
+    """Steps under one cosine, and the training views' PSNR after them, dB."""
+
+    steps: int
+    psnr: float
+
+
+@dataclass(frozen=True)
+class AdaptReport(Report):
+    """An adaptation in numbers.
+
+    Args:
+        steps: taken.
+        seconds: for them.
+        converged: whether the last stretch gained less than the tolerance.
+        psnr: over a sample of the training views.
+        stretches: one after another.
+        colour_change: gain (dB), matrix and shift of the change of all colours; None where none is worth it.
+        prior_share: the mean share of the appearance before the fit.
+    """
+
+    steps: int
+    seconds: float
+    converged: bool
+    psnr: Gain
+    stretches: tuple[Stretch, ...]
+    colour_change: dict[str, Any] | None
+    prior_share: float
+
+
 @dataclass(frozen=True, eq=False)
 class Adapted:
     """A scene with new appearance.
 
     Args:
         splats: means, rotations and scales of the scene given, bit for bit; new SH and opacities.
-        report: steps, seconds, converged, psnr {before, after} over a sample of the training views,
-            stretches [{steps, psnr}], colour_change {gain, matrix, shift} or None where none is worth it, and
-            prior_share, the mean share of the appearance before the fit.
+        report: what was done, in numbers.
     """
 
     splats: Splats
-    report: dict[str, Any] = field(default_factory=dict)
+    report: AdaptReport
 
 
 @dataclass
@@ -183,17 +214,17 @@ def adapt(
         seen = views_seeing(start, targets.cameras)
         share = seen / (seen + config.prior_views)
     result = blended(start, state.splats, share)
-    report = {
-        "steps": sum(s["steps"] for s in state.stretches),
-        "seconds": state.seconds,
-        "converged": state.converged,
-        "psnr": {"before": probe.all_of(given), "after": probe.all_of(result)},
-        "stretches": state.stretches,
-        "colour_change": None
+    report = AdaptReport(
+        steps=sum(s["steps"] for s in state.stretches),
+        seconds=state.seconds,
+        converged=state.converged,
+        psnr=Gain(probe.all_of(given), probe.all_of(result)),
+        stretches=tuple(map(Stretch.of, state.stretches)),
+        colour_change=None
         if change is None
         else {k: np.asarray(v).tolist() for k, v in vars(change).items()},
-        "prior_share": float(1 - share.mean()),
-    }
+        prior_share=float(1 - share.mean()),
+    )
     return Adapted(result, report)
 
 
@@ -218,10 +249,10 @@ def _stretch(
         seed=config.seed + number,
     )
     found = recover(state.splats, targets, how, checkpoint=within, progress=progress, stage="adapt")
-    before, after = found.report["psnr"]["before"], found.report["psnr"]["after"]
+    before, after = found.report.psnr.before, found.report.psnr.after
     state.splats = replace(found.splats, means=compact.means, quats=compact.quats, scales=compact.scales)
     state.stretches.append({"steps": steps, "psnr": after})
-    state.seconds += found.report["seconds"]
+    state.seconds += found.report.seconds
     state.converged = after - before < config.tolerance
 
 

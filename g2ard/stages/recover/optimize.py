@@ -6,7 +6,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
@@ -23,6 +23,15 @@ from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import checked_weights, drawn
 from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.probe import MULTIPLIERS, Probe, calm, climb, trial_steps
+from g2ard.stages.recover.report import (
+    Gain,
+    Geometry,
+    Look,
+    RecoverReport,
+    Regularized,
+    Trial,
+    Validation,
+)
 from g2ard.stages.recover.schedule import Rates, multiplier_for, reach_for
 from g2ard.stages.recover.sizes import typical_share
 from g2ard.targets import Targets, fingerprint_of, mask_of
@@ -50,20 +59,11 @@ class Recovered:
 
     Args:
         splats: same count and order as the student.
-        report: steps, seconds, loss (one mean per 1 % of the horizon), psnr {before, after} over a sample of
-            the training views, multiplier, reach (None is no limit), extent (of the cameras), trials (those
-            that chose the multiplier), drift95, needle, geometry (ten of {step, drift95, needle} on the way),
-            regularizers {steps, share of the time}, skipped, backed_off (a list of {step, psnr}: where so
-            much was lost that recovery went on from the best scene with a third of the rates), stopped (the
-            step at which it was given up, else None), way (how far the result goes from the student to where
-            the steps ended: 1 but where that lost), kept_start: whether the student was better than all that
-            came of it, and is the result, and validation: None without such views, else looks (a list of
-            {step, psnr}, last of the result) and doubt (a Gaussian that v views touched keeps v/(v + doubt)
-            of its change; None where all keep the same part, or none).
+        report: what was done, in numbers.
     """
 
     splats: Splats
-    report: dict[str, Any] = field(default_factory=dict)
+    report: RecoverReport
 
 
 class Engine(Protocol):
@@ -163,28 +163,28 @@ def recover(
         after, way = (after, way) if result is end else (probe.all_of(result), float(result is not student))
     return Recovered(
         result,
-        {
-            "steps": loop.done,
-            "seconds": loop.seconds,
-            "loss": loop.curve(),
-            "psnr": {"before": before, "after": after},
-            "multiplier": loop.multiplier,
-            "reach": _finite(loop.reach),
-            "extent": targets.cameras.extent,
-            "trials": loop.trials,
-            "drift95": drift95(anchors, result.means),
-            "needle": needle(result.scales),
-            "geometry": loop.geometry,
-            "regularizers": loop.regularizers,
-            "backed_off": loop.guard.backed_off,
-            "stopped": loop.guard.stopped,
-            "way": way,
-            "kept_start": way == 0,
-            "validation": None
+        RecoverReport(
+            steps=loop.done,
+            seconds=loop.seconds,
+            loss=loop.curve(),
+            psnr=Gain(before, after),
+            multiplier=loop.multiplier,
+            reach=_finite(loop.reach),
+            extent=targets.cameras.extent,
+            trials=tuple(map(Trial.of, loop.trials)),
+            drift95=drift95(anchors, result.means),
+            needle=needle(result.scales),
+            geometry=tuple(map(Geometry.of, loop.geometry)),
+            regularizers=Regularized.of(loop.regularizers),
+            backed_off=tuple(map(Look.of, loop.guard.backed_off)),
+            stopped=loop.guard.stopped,
+            way=way,
+            kept_start=way == 0,
+            validation=None
             if validation is None
-            else {"looks": guard.validation, "doubt": None if doubt is None else _finite(doubt)},
-            "skipped": {"non_finite": loop.skipped},
-        },
+            else Validation(tuple(map(Look.of, guard.validation)), None if doubt is None else _finite(doubt)),
+            skipped={"non_finite": loop.skipped},
+        ),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,8 +15,18 @@ from g2ard.progress import Progress, counter, silent
 from g2ard.splats import DRAWN_LOGIT, Splats
 from g2ard.stages.simplify.config import METHODS, SimplifyConfig, schedule
 from g2ard.stages.simplify.pairs import Seen, Visibility, merge, merge_looking, rows_of, splats_of
+from g2ard.stages.simplify.report import SimplifyReport, SimplifyRound
 
-__all__ = ["METHODS", "Seen", "Simplified", "SimplifyConfig", "flag", "schedule", "simplify"]
+__all__ = [
+    "METHODS",
+    "Seen",
+    "Simplified",
+    "SimplifyConfig",
+    "SimplifyReport",
+    "flag",
+    "schedule",
+    "simplify",
+]
 
 _DEFAULTS = SimplifyConfig()
 
@@ -37,22 +47,13 @@ class Simplified:
             geometry is what recovery takes as anchors.
         parents: (N,) int64, the output row each input row went to; −1 if it was dropped or trimmed.
         protected: (M,) bool, flags inherited by OR from everything merged into the row.
-        report: `input_count`, `output_count`, `merged_members` (rows of the input that share an output row),
-            `rounds` (a dict each: `before` − `dropped` − `merged` − `trimmed` = `after`, where `merged` is by
-            how many rows merging shrank the scene), `protected`, `nonfinite_rows`,
-            `infinite_logits` (taken as α = 0 or 1), `clamped_opacities` (merged α that reached
-            0.99: what `max_growth` could not take was lost), `fitted` (rows whose opacity or, where that is
-            full, area was fitted to what views see), `unseen` (rows of the input that are kept though no
-            view sees them; None without views), `faded` (merged α < 1/255 where a member's was not),
-            `skipped` (`alone`: rows passed on as they were; `sh_bands`: of zeros, left out of all sums; of
-            the paper's, `coverages`: groups that the cheaper guard had refused; rounds without `binnings`, or
-            `trims`: few rows were left already).
+        report: what was done, in numbers.
     """
 
     splats: Splats
     parents: NDArray[np.int64]
     protected: NDArray[np.bool_]
-    report: dict[str, Any] = field(default_factory=dict)
+    report: SimplifyReport
 
 
 def flag(
@@ -283,24 +284,24 @@ def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str
     kept = int(np.count_nonzero(parents >= 0))
     alone = int(np.count_nonzero(np.bincount(parents[parents >= 0], minlength=len(small)) == 1))
     protected: NDArray[np.bool_] = out["protected"]
-    report = {
-        "input_count": len(splats),
-        "output_count": len(small),
-        "merged_members": kept - alone,
-        "rounds": out["rounds"],
-        "protected": int(np.count_nonzero(protected)),
-        "nonfinite_rows": 0 if isinstance(finite, slice) else len(splats) - int(np.count_nonzero(finite)),
-        "infinite_logits": out["infinite_logits"],
-        "clamped_opacities": out["clamped_opacities"],
-        "fitted": out.get("fitted", 0),
-        "unseen": out.get("unseen"),
-        "faded": _faded(splats, small, parents),
-        "skipped": {
+    report = SimplifyReport(
+        input_count=len(splats),
+        output_count=len(small),
+        merged_members=kept - alone,
+        rounds=tuple(SimplifyRound.of(r) for r in out["rounds"]),
+        protected=int(np.count_nonzero(protected)),
+        nonfinite_rows=0 if isinstance(finite, slice) else len(splats) - int(np.count_nonzero(finite)),
+        infinite_logits=out["infinite_logits"],
+        clamped_opacities=out["clamped_opacities"],
+        fitted=out.get("fitted", 0),
+        unseen=out.get("unseen"),
+        faded=_faded(splats, small, parents),
+        skipped={
             "alone": alone,
             "sh_bands": splats.sh_degree - math.isqrt(out["sh"].shape[1]) + 1,
             **_spared(out["rounds"]),
         },
-    }
+    )
     return Simplified(small, parents, protected, report)
 
 

@@ -1,4 +1,4 @@
-"""Cameras that lie beside a scene, for commands that were given none."""
+"""Cameras that lie beside a scene, for runs that were given none."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from g2ard.progress import Say, unsaid
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from g2ard.cameras import Cameras
-    from g2ard.cli.frame import Run
     from g2ard.splats import Splats
 
 __all__ = ["as_pool", "found_views"]
@@ -24,14 +25,14 @@ _SEEING = 0.5
 """Share of the cameras that must see something of the scene, or they are another's."""
 
 
-def found_views(run: Run, scene: Path, splats: Splats, splits: Sequence[str]) -> Path | None:
+def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: Say = unsaid) -> Path | None:
     """The views that lie beside a scene (`g2ard.io.find_views`), if they see it; says what came of it.
 
     Args:
-        run: told in one line which cameras are used, or why those that are there are not.
         scene: the scene's path.
         splats: the scene.
-        splits: what the command needs of them; none may be empty.
+        splits: what the run needs of them; none may be empty.
+        say: told in one line which cameras are used, or why those that are there are not.
 
     Returns:
         A path for `load_views` and its kin; None if there are none, or none that fit.
@@ -48,15 +49,15 @@ def found_views(run: Run, scene: Path, splats: Splats, splits: Sequence[str]) ->
         for split in splits:
             split_mask(path, views.cameras.names, split, stated=views.splits)
     except InputError as error:
-        run.say(f"views beside the scene are not used: {error}")
+        say(f"views beside the scene are not used: {error}")
         return None
     count = len(views.cameras)
     seeing = int(views.cameras.facing(_opaque(splats)).sum())
     if seeing < _SEEING * count:
-        run.say(f"views beside the scene are not used: {path}: {seeing} of {count} cameras see it")
+        say(f"views beside the scene are not used: {path}: {seeing} of {count} cameras see it")
         return None
     cameras = f"{count} camera" + "s" * (count != 1)
-    run.say(f"views: {cameras} of {path} (found beside the scene; --views made for a pool of its own)")
+    say(f"views: {cameras} of {path} (found beside the scene; --views made for a pool of its own)")
     return path
 
 
