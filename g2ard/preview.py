@@ -38,7 +38,7 @@ def preview(
     renderers = [Renderer(splats, background=background) for _, splats in scenes]
     for view in map(int, chosen):
         target = targets[view]
-        images = [renderer.image(targets.cameras, view) for renderer in renderers]
+        images = [renderer.image(targets.cameras[view]) for renderer in renderers]
         rows.append([target, *(np.clip(image, 0, 1) for image in images)])
         scores = [
             f"{name} {psnr(image, target):.2f} dB"

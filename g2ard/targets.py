@@ -227,7 +227,7 @@ class TeacherRenders(_Cached):
             from g2ard.stages.render import Renderer
 
             self._renderer = Renderer(self._teacher, background=self._background, settings=self._settings)
-        return np.clip(self._renderer.image(self.cameras, view), 0, 1)
+        return np.clip(self._renderer.image(self.cameras[view]), 0, 1)
 
     def against(self, view: int) -> str:
         """See `against_of`."""

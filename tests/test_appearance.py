@@ -40,7 +40,7 @@ def test_a_change_of_light_is_found_and_made() -> None:
     assert change.gain > 15
     moved = recoloured(ball, change)
     for view in (0, 7):
-        got, want = (render(s, VIEWS, view, background=BACKGROUND).image for s in (moved, lit))
+        got, want = (render(s, VIEWS[view], background=BACKGROUND).image for s in (moved, lit))
         np.testing.assert_allclose(got, want, atol=0.02)
 
 

@@ -162,7 +162,7 @@ def cloud_with_photos(folder: Path) -> None:
     paths = []
     for i, name in enumerate(views.names):
         paths.append(folder / f"{name}.png")
-        write_png(paths[-1], render(PRIOR, views, i).image)
+        write_png(paths[-1], render(PRIOR, views[i]).image)
     write_views(folder / "views.json", replace(views, image_paths=tuple(paths)))
 
 

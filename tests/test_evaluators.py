@@ -33,8 +33,8 @@ def test_inrias_convention_reaches_renders_and_targets() -> None:
     mixed = evaluate(ball, TeacherRenders(ball, views), settings=INRIA)
     assert mixed.psnr < 60
     expected = psnr(
-        np.clip(render(ball, views, 0, settings=INRIA).image, 0, 1),
-        np.clip(render(ball, views, 0).image, 0, 1),
+        np.clip(render(ball, views[0], settings=INRIA).image, 0, 1),
+        np.clip(render(ball, views[0]).image, 0, 1),
     )
     assert mixed.views[0].psnr == expected
 
@@ -45,7 +45,7 @@ def test_eight_bit_rounds_both_sides_as_png_does(tmp_path: Path) -> None:
     found = evaluate(small, TeacherRenders(ball, views), eight_bit=True)
     images = []
     for scene in (small, ball):
-        write_png(tmp_path / "x.png", render(scene, views, 0).image, overwrite=True)
+        write_png(tmp_path / "x.png", render(scene, views[0]).image, overwrite=True)
         from PIL import Image
 
         with Image.open(tmp_path / "x.png") as image:

@@ -35,7 +35,7 @@ def photographed(folder: Path, *, spoil: float | None = None, masks: bool = True
     """Photos of the ball with a block of rubbish, and masks that leave it out; read back as a user would."""
     paths = []
     for view, name in enumerate(VIEWS.names):
-        image = np.clip(render(BALL, VIEWS, view).image, 0, 1)
+        image = np.clip(render(BALL, VIEWS[view]).image, 0, 1)
         mask = np.ones(image.shape[:2])
         if spoil is not None:
             image[10:30, 20:50] = spoil

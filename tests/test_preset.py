@@ -96,7 +96,7 @@ def test_a_cloud_takes_the_lift_s_row(folder: Path, command_line: CommandLine) -
     views = around(12)
     paths = tuple(folder / f"{name}.png" for name in views.names)
     for i, path in enumerate(paths):
-        write_png(path, render(PRIOR, views, i).image)
+        write_png(path, render(PRIOR, views[i]).image)
     write_views(folder / "photos.json", replace(views, image_paths=paths))
     ask = ("distill", "cloud.ply", "-r", 3, "--views", "photos.json", "-o", "run", "--steps", 8)
     report = run(command_line, folder, *ask, "--preset", "paper", "--set", "lift.neighbors=8")

@@ -42,7 +42,7 @@ def test_figures_hang_together() -> None:
 
 
 def test_the_built_in_view_sees_the_scene() -> None:
-    image = render(drawn(cloud(), 2000), built_in_view(cloud(), 96, 64), 0)
+    image = render(drawn(cloud(), 2000), built_in_view(cloud(), 96, 64)[0])
     assert image.alpha[24:40, 36:60].mean() > 0.3
 
 

@@ -47,7 +47,7 @@ def folder(tmp_path: Path) -> Path:
     transforms(photos / "transforms.json", list(VIEWS.viewmats), **size)
     (photos / "images").mkdir()
     for i in range(16):
-        write_png(photos / "images" / f"{i:03d}.png", render(BALL, VIEWS, i).image)
+        write_png(photos / "images" / f"{i:03d}.png", render(BALL, VIEWS[i]).image)
     split = {"train": sorted(TRAIN), "test": sorted(TEST)}
     (photos / "split.json").write_text(json.dumps(split))
     return tmp_path

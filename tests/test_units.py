@@ -64,7 +64,7 @@ def test_what_views_see_scales_by_powers_of_two_exactly(method, unit, dtype):
 def test_an_image_does_not_depend_on_the_unit():
     scene, cameras = ball(), around()
     small, near = in_units(scene, cameras, 1e-3)
-    here, there = render(scene, cameras, 0), render(small, near, 0)
+    here, there = render(scene, cameras[0]), render(small, near[0])
     assert here.alpha.max() > 0.9
     np.testing.assert_allclose(there.image, here.image, rtol=0, atol=1e-3)
     seen, same = visibility(scene, cameras), visibility(small, near)

@@ -104,7 +104,7 @@ def score(
     renderer = Renderer(splats, background=background, settings=settings)
     views = []
     for number, name in enumerate(targets.cameras.names):
-        image, target = np.clip(renderer.image(targets.cameras, number), 0, 1), targets[number]
+        image, target = np.clip(renderer.image(targets.cameras[number]), 0, 1), targets[number]
         if eight_bit:
             image, target = as_saved(image), as_saved(target)
         mask = mask_of(targets, number)

@@ -165,12 +165,16 @@ def _trained(scene: Path, size: Size, cache: Path | None, progress: Progress) ->
         outside = make_pool(prior, size.tests, kind="orbit", seed=2).resized(size.pixels)
 
     renderer = Renderer(prior)
+
+    def image(cameras: Cameras, view: int) -> Image:
+        return renderer.image(cameras[view])
+
     return Stand(
         prior=prior,
         student=_reduced(prior, size),
-        targets=_Made(universe, renderer.image, cache),
+        targets=_Made(universe, image, cache),
         tests=_evenly(rows[::8], size.tests),
-        outside=_Made(outside, renderer.image),
+        outside=_Made(outside, image),
         regularizers=PRESETS["trained"],
         candidates=size.candidates,
     )

@@ -98,7 +98,7 @@ def distill_report(
         windows = [crop.window for crop in crops if crop.view in (None, name)]
         shown = []
         for name, renderer in renderers:
-            image = renderer.image(targets.cameras, view)
+            image = renderer.image(targets.cameras[view])
             shown.append(Shown(name, to_bytes(image), f"{scores[name]['views'][view]['psnr']:.2f} dB"))
         page.comparison(Comparison(targets.cameras.names[view], to_bytes(targets[view]), shown, windows))
     page.write(path)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.cameras import Cameras
+from g2ard.cameras import Camera, Cameras
 from g2ard.errors import InputError
 from g2ard.splats import Splats
 
@@ -165,15 +165,13 @@ class Renderer:
         settings: conventions; None means gsplat's.
 
     Raises:
-        InputError: a background that is not three numbers.
+        InputError: a background that is not three numbers, or near planes of several cameras.
 
-    >>> import numpy as np
-    >>> from g2ard.cameras import Cameras, look_at
+    >>> from g2ard.cameras import Camera
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
-    >>> K = [[50, 0, 16], [0, 50, 12], [0, 0, 1]]
-    >>> views = Cameras.from_lists([look_at([0, -2, 0], [0, 0, 0])], [K], [(32, 24)], ["front"])
+    >>> front = Camera.facing([0, -2, 0], [0, 0, 0], width=32, height=24)
     >>> renderer = Renderer(dot, background=(1, 1, 1))
-    >>> renderer.image(views, 0).shape, round(float(renderer.render(views, 0).depth[12, 16]))
+    >>> renderer.image(front).shape, round(float(renderer.render(front).depth[12, 16]))
     ((24, 32, 3), 2)
     """
 
@@ -187,6 +185,8 @@ class Renderer:
         self._background = [float(c) for c in background]
         if len(self._background) != 3:
             raise InputError(f"background: expected 3 numbers, got {len(self._background)}")
+        if settings is not None and not isinstance(settings.near, int | float | None):
+            raise InputError("near: expected one distance, for all views of a renderer")
         self._offset, middle = splats.offset, middle_of(splats)
         if middle is not None:
             splats = splats.recentred(splats.offset + middle)
@@ -195,47 +195,43 @@ class Renderer:
         self._arrays = arrays_of(splats)
         self._rasterizer = _core.Rasterizer()
 
-    def image(self, cameras: Cameras, index: int) -> _Floats:
-        """View `index`'s (H, W, 3) image alone, see `Rendered.image`; without depths it takes less time.
+    def image(self, camera: Camera) -> _Floats:
+        """The view's (H, W, 3) image alone, see `Rendered.image`; without depths it takes less time.
 
         Raises:
-            InputError: an index out of range.
+            InputError: a camera that makes no sense, see `Cameras`.
         """
-        image, _, _, _ = self._forward(cameras, index, depth=False, median=False)
+        image, _, _, _ = self._forward(camera, depth=False, median=False)
         return image
 
-    def render(self, cameras: Cameras, index: int, *, median: bool = False) -> Rendered:
-        """View `index`: C = Σᵢ cᵢ αᵢ Πⱼ<ᵢ (1 − αⱼ), front to back, in world coordinates.
+    def render(self, camera: Camera, *, median: bool = False) -> Rendered:
+        """One view: C = Σᵢ cᵢ αᵢ Πⱼ<ᵢ (1 − αⱼ), front to back.
 
         Args:
-            cameras: the views; their Ks and sizes decide the image.
-            index: which of them.
+            camera: the view, in world coordinates; its K and size decide the image.
             median: also return the median depth.
 
         Raises:
-            InputError: an index out of range.
+            InputError: a camera that makes no sense, see `Cameras`.
         """
-        image, alpha, depth, middle = self._forward(cameras, index, depth=True, median=median)
+        image, alpha, depth, middle = self._forward(camera, depth=True, median=median)
         assert depth is not None
         return Rendered(image, alpha, depth, middle)
 
     def _forward(
-        self, cameras: Cameras, index: int, *, depth: bool, median: bool
+        self, camera: Camera, *, depth: bool, median: bool
     ) -> tuple[_Floats, _Floats, _Floats | None, _Floats | None]:
-        if not 0 <= index < len(cameras):
-            raise InputError(f"view {index}: there are {len(cameras)} views")
-        camera = cameras.take([index]).recentred(self._offset)
+        here = Cameras.of([camera]).recentred(self._offset)
         if self._middle is not None:
-            camera = camera.recentred(self._middle)
+            here = here.recentred(self._middle)
         settings = self._settings
-        view = (*view_of(camera, 0, settings)[:3], settings.near_of(index))
+        view = view_of(here, 0, settings)
         return self._rasterizer.forward(self._arrays, view, settings.choices, self._background, depth, median)
 
 
 def render(
     splats: Splats,
-    cameras: Cameras,
-    index: int,
+    camera: Camera,
     *,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     settings: RasterSettings | None = None,
@@ -244,17 +240,15 @@ def render(
     """Render one view of a scene once; see `Renderer`, which many views of one scene want.
 
     Raises:
-        InputError: an index out of range, a background that is not three numbers.
+        InputError: a camera that makes no sense, a background that is not three numbers.
 
-    >>> from g2ard.cameras import Cameras, look_at
+    >>> from g2ard.cameras import Camera
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
-    >>> K = [[50, 0, 16], [0, 50, 12], [0, 0, 1]]
-    >>> views = Cameras.from_lists([look_at([0, -2, 0], [0, 0, 0])], [K], [(32, 24)], ["front"])
-    >>> out = render(dot, views, 0, background=(1, 1, 1))
+    >>> out = render(dot, Camera.facing([0, -2, 0], [0, 0, 0], width=32, height=24), background=(1, 1, 1))
     >>> out.image.shape, bool(out.alpha[12, 16] > 0.9), out.image[0, 0].tolist()
     ((24, 32, 3), True, [1.0, 1.0, 1.0])
     """
-    return Renderer(splats, background=background, settings=settings).render(cameras, index, median=median)
+    return Renderer(splats, background=background, settings=settings).render(camera, median=median)
 
 
 _NEAR_SAMPLE = 65_536

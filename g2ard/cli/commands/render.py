@@ -72,7 +72,7 @@ def render(
     renderer = Renderer(splats, background=background or (0.0, 0.0, 0.0), settings=settings)
     with atomic_folder(output, overwrite=run.overwrite) as folder:
         for view, name in enumerate(cameras.names):
-            rendered = renderer.render(cameras, view)
+            rendered = renderer.render(cameras[view])
             stem = folder / Path(name).with_suffix("")
             stem.parent.mkdir(parents=True, exist_ok=True)
             write_png(stem.with_name(stem.name + ".png"), rendered.image)

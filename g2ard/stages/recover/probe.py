@@ -128,5 +128,5 @@ class Probe:
         return self._latest
 
     def _score(self, renderer: Renderer, view: int) -> float:
-        image = renderer.image(self._targets.cameras, view)
+        image = renderer.image(self._targets.cameras[view])
         return psnr(np.clip(image, 0, 1), self._targets[view], mask_of(self._targets, view))
