@@ -146,7 +146,7 @@ class Photos(_Cached):
             (n for n, p in zip(cameras.names, cameras.image_paths, strict=True) if p is None), None
         )
         if missing is not None:
-            raise InputError(f"view {missing}: has no photo, and no teacher stands in for it")
+            raise InputError(f"view {missing}: has no photo; TeacherRenders of a scene can stand in")
         super().__init__(cameras, limit)
         self.source = "photos " + " ".join(str(path) for path in cameras.image_paths)
         if any(cameras.mask_paths):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from g2ard.cameras import Cameras
-    from g2ard.io import ViewSet
+    from g2ard.io import Note, ViewSet
     from g2ard.splats import Splats
     from g2ard.stages.render import RasterSettings
     from g2ard.targets import Targets
@@ -30,6 +31,7 @@ __all__ = [
     "load_view_sets",
     "load_views",
     "make_targets",
+    "say_notes",
 ]
 
 
@@ -38,9 +40,19 @@ def load_scene(path: str | Path, say: Say = unsaid) -> Splats:
     from g2ard.io import read_scene
 
     scene = read_scene(path)
-    for note in scene.notes:
-        say(f"{path}: {note}")
+    say_notes(path, scene.notes, say)
     return scene.splats
+
+
+def say_notes(path: str | Path, notes: Sequence[Note], say: Say) -> None:
+    """Say what was noticed, but for what changes nothing that is drawn: a logit past ±16 is α = 0 or 1 either
+    way, to 1e-7 (`g2ard info` tells of those too)."""
+    for note in notes:
+        if note.code not in _HARMLESS:
+            say(f"{path}: {note}")
+
+
+_HARMLESS = ("clamped_logits",)
 
 
 def load_views(

@@ -113,7 +113,7 @@ def check_crops(crops: Sequence[Crop], names: Sequence[str]) -> None:
     for crop in crops:
         if crop.view is not None and crop.view not in names:
             few = ", ".join(names[:4]) + (", …" if len(names) > 4 else "")
-            raise InputError(f"--crop {crop.view}: not among the {len(names)} views that are scored ({few})")
+            raise InputError(f"crop {crop.view}: not among the {len(names)} views that are scored ({few})")
 
 
 def _error_charts(

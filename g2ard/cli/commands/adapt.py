@@ -45,7 +45,7 @@ def adapt(
     preset: PaperOption = None,
 ) -> None:
     """Refit colours and opacities to new images; means, rotations and scales stay as they are."""
-    from g2ard.cli.resume import check_stopped, stoppable
+    from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
     from g2ard.policy.inputs import load_scene, load_trained, make_targets
@@ -66,14 +66,15 @@ def adapt(
     )
     config = changed(config, "adapt", run.constants(adapt=config))
     work = output.parent / f".{output.name}.work"
-    check_stopped(run, work, resume)
-    check_scene_output(output, run.overwrite)
+    if left_at(work) or not (resume and output.exists()):
+        check_scene_output(output, run.overwrite)
+    check_stopped(run, work, resume, output)
     splats = load_scene(compact, run.say)
     dense = load_scene(teacher, run.say) if teacher else None
     cameras = load_trained(views, split, size, run.say).cameras
     targets = make_targets(cameras, dense, config.background, progress=run.progress, say=run.say)
     with stoppable(run, work, resume):
-        work.mkdir(exist_ok=True)
+        work.mkdir(parents=True, exist_ok=True)
         result = refit(splats, targets, config, work=work, progress=run.progress)
         write_splats(output, result.splats, overwrite=run.overwrite)
     gain, end = result.report.psnr, "converged" if result.report.converged else "all steps taken"

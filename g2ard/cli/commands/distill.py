@@ -139,10 +139,15 @@ def distill(
     values = run.constants(recover=DistillConfig(), lift=LiftConfig())
     one_horizon(steps, time_limit, values)
     engine = recovery_engine(run)
-    if kind(scene) != "splats" and not given:
-        raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
     outputs = Outputs(run, output, budgets)
     outputs.check(lambda folder: _check_folder(run, folder, given, resume))
+    if kind(scene) != "splats" and not given:
+        raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
+    early = outputs.paths()
+    if early and all(_is_done(run, folder, resume) for folder in early):
+        for folder in early:
+            _tell_resumed(run, folder, resume)
+        return
     job = prepare(
         scene,
         budgets,
@@ -170,10 +175,17 @@ def distill(
     )
     check_crops(crop or [], job.views.test.names)
     outputs.check(lambda folder: _check_folder(run, folder, given, resume), len(job.prior))
+    places = list(zip(job.budgets, outputs.paths(len(job.prior)), strict=True))
+    for _, folder in places:
+        _tell_resumed(run, folder, resume)
+    todo = [(budget, folder) for budget, folder in places if not _is_done(run, folder, resume)]
+    if not todo:
+        return
     job.render_targets()
     reports = []
-    for budget, folder in zip(job.budgets, outputs.paths(len(job.prior)), strict=True):
+    for budget, folder in todo:
         reports.append(_distil(run, scene, job, budget, folder, resume, keep, crop or [], began))
+        run.kept.append(f"{folder} is finished")
         began = time.monotonic()
     run.result(reports[0] if len(reports) == 1 else {"runs": reports})
 
@@ -183,9 +195,28 @@ def _check_folder(run: Run, folder: Path, given: bool, resume: bool) -> None:
     from g2ard.io.atomic import check_output
 
     run.spare_inputs(folder / "scene.ply", folder / _KEPT, *([folder / "views.json"] if not given else []))
-    if not left_at(folder / _WORK):
+    left = left_at(folder / _WORK)
+    if not left and not (resume and _finished(folder)):
         check_output(folder, run.overwrite, folder=True)
-    check_stopped(run, folder / _WORK, resume)
+    if left or not resume:
+        check_stopped(run, folder / _WORK, resume, folder / "scene.ply")
+
+
+def _is_done(run: Run, folder: Path, resume: bool) -> bool:
+    """Whether there is nothing left to go on with in a folder."""
+    return resume and not run.overwrite and _finished(folder)
+
+
+def _tell_resumed(run: Run, folder: Path, resume: bool) -> None:
+    if _is_done(run, folder, resume):
+        run.say(f"{folder}: finished already, nothing is left to resume (-w without --resume starts anew)")
+    elif resume and not left_at(folder / _WORK):
+        run.say(f"{folder}: nothing to go on from: starts anew")
+
+
+def _finished(folder: Path) -> bool:
+    """Whether a run has ended there."""
+    return (folder / "scene.ply").exists() and not left_at(folder / _WORK)
 
 
 def _distil(
@@ -248,7 +279,9 @@ def _work_folder(run: Run, output: Path, resume: bool) -> Iterator[Path]:
         yield work
     except (Exception, KeyboardInterrupt) as error:
         if left_at(work) and (resume or isinstance(error, KeyboardInterrupt)):
-            run.say(f"stopped; the same command with --resume goes on in {output}")
+            run.kept.append(f"the same command with --resume goes on in {output}")
+            if not isinstance(error, KeyboardInterrupt):
+                run.say(run.kept[-1])
         else:
             shutil.rmtree(output if made else work, ignore_errors=True)
         raise

@@ -63,7 +63,7 @@ def recover(
     background: BackgroundOption = None,
 ) -> None:
     """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
-    from g2ard.cli.resume import check_stopped, stoppable
+    from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
     from g2ard.policy.inputs import (
@@ -80,13 +80,15 @@ def recover(
     values = run.constants(recover=RecoverConfig())
     one_horizon(steps, time_limit, values)
     checkpoint = output.parent / f".{output.name}.checkpoint.npz"
-    check_stopped(run, checkpoint, resume)
-    check_scene_output(output, run.overwrite)
+    if left_at(checkpoint) or not (resume and output.exists()):
+        check_scene_output(output, run.overwrite)
+    check_stopped(run, checkpoint, resume, output)
     engine = recovery_engine(run)
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(student, run.say)
     dense = load_scene(teacher, run.say) if teacher else None
     chosen = load_trained(views, split, size, run.say)
+    targets = make_targets(chosen.cameras, dense, colour, progress=run.progress, say=run.say)
     weights = chosen.weights if weighted else None
     if weights is not None:
         run.say(f"{len(weights)} views, drawn by their weights")
@@ -108,7 +110,6 @@ def recover(
     )
     config = changed(config, "recover", values)
     frozen = _anchors(run, anchors, splats, config.regularizers.in_plane) if anchors else None
-    targets = make_targets(chosen.cameras, dense, colour, progress=run.progress, say=run.say)
     with stoppable(run, checkpoint, resume):
         result = optimize(
             splats,

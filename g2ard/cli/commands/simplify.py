@@ -61,6 +61,7 @@ def simplify(
         raise typer.BadParameter("--views and --no-views exclude each other")
     from g2ard import io
     from g2ard.constants import changed
+    from g2ard.policy.inputs import say_notes
     from g2ard.policy.simplify import simplify_each
     from g2ard.stages.simplify import SimplifyConfig
 
@@ -73,8 +74,7 @@ def simplify(
         maps.check(lambda path: _check_parents(run, path, scene, views))
     clock = [time.perf_counter()]
     found = io.read_scene(scene)
-    for note in found.notes:
-        run.say(f"{scene}: {note}")
+    say_notes(scene, found.notes, run.say)
     total = len(found.splats)
     counts = [budget.of(total, str(scene)) for budget in budgets]
     outputs.check(lambda path: io.check_scene_output(path, run.overwrite), total)
@@ -102,6 +102,7 @@ def simplify(
         clock.append(time.perf_counter())
         reports.append(_report(run, found, small, config.resolved(method), method, clock))
         _tell(run, small, place, total, clock[-1] - clock[0])
+        run.kept.append(f"{place} is written")
         clock = [clock[-1] - (clock[1] - clock[0]), clock[-1]]  # reading is shared
     run.result(reports[0] if len(reports) == 1 else {"runs": reports})
 

@@ -19,7 +19,7 @@ from g2ard.io.atomic import atomic_output
 
 __all__ = ["PERIOD", "deferred_interrupt", "load", "save"]
 
-_ANEW = "-w without --resume starts anew"
+_ANEW = "another checkpoint or folder of work starts anew"
 
 PERIOD = 60.0
 """Seconds between two checkpoints."""

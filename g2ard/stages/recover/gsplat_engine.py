@@ -22,9 +22,9 @@ def check_cuda() -> None:
         InputError: torch sees no CUDA device, or gsplat is not installed.
     """
     if not torch.cuda.is_available():
-        raise InputError("--device cuda: torch sees no CUDA device here")
+        raise InputError("engine 'gsplat': torch sees no CUDA device here")
     if find_spec("gsplat") is None:
-        raise InputError("--device cuda: gsplat is not installed (pip install 'g2ard[cuda]')")
+        raise InputError("engine 'gsplat': gsplat is not installed (pip install 'g2ard[cuda]')")
 
 
 class GsplatEngine(TorchEngine):
