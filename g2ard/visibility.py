@@ -14,8 +14,8 @@ from g2ard import _core
 from g2ard.cameras import Cameras
 from g2ard.prepared import as_prepared
 from g2ard.progress import Progress, counter, silent
-from g2ard.render import RasterSettings, arrays_of, centred, settings_for, view_of
 from g2ard.splats import Splats
+from g2ard.stages.render import RasterSettings, arrays_of, centred, settings_for, view_of
 
 __all__ = ["SampledVisibility", "Visibility", "visibility", "visibility_source"]
 
@@ -89,7 +89,7 @@ class SampledVisibility:
 def visibility_source(
     cameras: Cameras, *, views: int = 96, longest: int = 300, progress: Progress = silent
 ) -> Callable[[Splats], SampledVisibility]:
-    """A function that finds what a few small renders see of a scene, as `g2ard.simplify.simplify` takes it.
+    """A function that finds what a few small renders see of a scene, as `simplify` takes it.
 
     It renders sixteen views at a time until the next sixteen find under 1 % more of the Gaussians: an object
     of half a million takes 32 views, a small one 80, a room all (`docs/decisions.md`). The first scene

@@ -12,11 +12,11 @@ import pytest
 from scenes import around, checkered_ball
 
 from g2ard.constants import changed, listed, parsed
-from g2ard.distill import DistillConfig
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
-from g2ard.lift import LiftConfig
+from g2ard.pipeline import DistillConfig
 from g2ard.presets import preset
+from g2ard.stages.lift import LiftConfig
 
 CommandLine = Callable[..., tuple[int, str, str]]
 

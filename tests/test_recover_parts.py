@@ -12,8 +12,9 @@ import torch
 from scenes import around, checkered_ball
 
 from g2ard.errors import InputError
-from g2ard.recover import checkpoint
-from g2ard.recover.anchors import (
+from g2ard.splats import Splats
+from g2ard.stages.recover import checkpoint
+from g2ard.stages.recover.anchors import (
     PAPER_PRESETS,
     PRESETS,
     Anchors,
@@ -22,10 +23,9 @@ from g2ard.recover.anchors import (
     effective_rank,
     needle,
 )
-from g2ard.recover.presets import preset_for, view_consistency
-from g2ard.recover.regularize import TorchAnchors, anchor_loss, regularization, shape_loss
-from g2ard.recover.schedule import PAPER, TUNED, schedule_named
-from g2ard.splats import Splats
+from g2ard.stages.recover.presets import preset_for, view_consistency
+from g2ard.stages.recover.regularize import TorchAnchors, anchor_loss, regularization, shape_loss
+from g2ard.stages.recover.schedule import PAPER, TUNED, schedule_named
 
 
 def random_splats(n: int = 40, seed: int = 0) -> Splats:

@@ -15,10 +15,19 @@ from g2ard import _core
 from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
 from g2ard.io import read_splats, read_view_set, write_splats, write_views
-from g2ard.lift import lift
 from g2ard.poses import make_pool
-from g2ard.select import POLICIES, CoverageOptions, Surface, poses, select, surface, surfaces, visible_cells
 from g2ard.splats import Splats
+from g2ard.stages.lift import lift
+from g2ard.stages.select import (
+    POLICIES,
+    CoverageOptions,
+    Surface,
+    poses,
+    select,
+    surface,
+    surfaces,
+    visible_cells,
+)
 from g2ard.synth import city
 
 SIZE = (96, 72)

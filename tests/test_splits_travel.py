@@ -21,9 +21,9 @@ from g2ard.bench.stand import Stand
 from g2ard.errors import InputError
 from g2ard.images import write_png
 from g2ard.io import Points, read_points, read_view_set, write_points, write_splats, write_views
-from g2ard.lift import lift
-from g2ard.render import render
 from g2ard.splits import for_scores, for_training, not_held_out, split_mask, splits_of
+from g2ard.stages.lift import lift
+from g2ard.stages.render import render
 
 CommandLine = Callable[..., tuple[int, str, str]]
 Program = Callable[..., None]
@@ -47,7 +47,7 @@ def folder(tmp_path: Path) -> Path:
     transforms(photos / "transforms.json", list(VIEWS.viewmats), **size)
     (photos / "images").mkdir()
     for i in range(16):
-        write_png(photos / "images" / f"{i:03d}.png", render(BALL, VIEWS, i).image)
+        write_png(photos / "images" / f"{i:03d}.png", render(BALL, VIEWS[i]).image)
     split = {"train": sorted(TRAIN), "test": sorted(TEST)}
     (photos / "split.json").write_text(json.dumps(split))
     return tmp_path
@@ -79,10 +79,10 @@ class Watch:
 
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
-    import g2ard.adapt
-    import g2ard.evaluate
-    import g2ard.recover
-    import g2ard.render
+    import g2ard.stages.adapt
+    import g2ard.stages.evaluate
+    import g2ard.stages.recover
+    import g2ard.visibility
 
     seen = Watch()
 
@@ -96,10 +96,10 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
 
         monkeypatch.setattr(module, name, told)
 
-    watched(g2ard.recover, "recover", 1, seen.trained)
-    watched(g2ard.adapt, "adapt", 1, seen.trained)
-    watched(g2ard.render, "visibility_source", 0, seen.looked)
-    watched(g2ard.evaluate, "evaluate", 1, seen.scored)
+    watched(g2ard.stages.recover, "recover", 1, seen.trained)
+    watched(g2ard.stages.adapt, "adapt", 1, seen.trained)
+    watched(g2ard.visibility, "visibility_source", 0, seen.looked)
+    watched(g2ard.stages.evaluate, "evaluate", 1, seen.scored)
     return seen
 
 

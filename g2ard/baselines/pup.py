@@ -11,8 +11,8 @@ from g2ard import _core
 from g2ard.baselines.ranking import keep_best
 from g2ard.cameras import Cameras
 from g2ard.progress import Progress, counter, silent
-from g2ard.render import arrays_of, centred, settings_for, view_of
 from g2ard.splats import Splats
+from g2ard.stages.render import arrays_of, centred, settings_for, view_of
 
 __all__ = ["fisher", "pup", "rounds", "sensitivity"]
 

@@ -14,10 +14,10 @@ from g2ard.bench.definition import Definition, SceneSpec
 from g2ard.bench.methods import ROUND_STEPS, Leg, Matched, MethodSpec
 from g2ard.bench.process import Usage
 from g2ard.bench.stand import Stage, Stand, fingerprint, scene_key
-from g2ard.recover.presets import preset_for
-from g2ard.simplify import METHODS as SIMPLIFIERS
-from g2ard.simplify import schedule as paper_rounds
 from g2ard.splats import Splats
+from g2ard.stages.recover.presets import preset_for
+from g2ard.stages.simplify import METHODS as SIMPLIFIERS
+from g2ard.stages.simplify import schedule as paper_rounds
 
 __all__ = ["Cell", "Pipeline", "Spent"]
 

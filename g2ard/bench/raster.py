@@ -14,9 +14,9 @@ from g2ard import _core
 from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
-from g2ard.recover.schedule import Rates
-from g2ard.render import RasterSettings, arrays_of, view_of
 from g2ard.splats import Splats
+from g2ard.stages.recover.schedule import Rates
+from g2ard.stages.render import RasterSettings, arrays_of, view_of
 
 __all__ = ["RasterBench", "SceneFigures", "bench_raster", "built_in_view", "cpu_name", "drawn"]
 

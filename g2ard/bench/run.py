@@ -21,7 +21,7 @@ from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.lpips import Lpips, load_lpips
 from g2ard.progress import Progress, silent
-from g2ard.recover.anchors import needle
+from g2ard.stages.recover.anchors import needle
 
 __all__ = ["bench_run", "cells_of"]
 

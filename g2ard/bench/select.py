@@ -15,10 +15,10 @@ from g2ard.bench import rows as table
 from g2ard.bench.select_stands import KINDS, Pool, Size, Stand, label, pool_of, stand
 from g2ard.bench.simplify import machine
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
 from g2ard.progress import Progress, silent
-from g2ard.recover import RecoverConfig, recover
-from g2ard.select import POLICIES, CoverageOptions, Selection, select
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.select import POLICIES, CoverageOptions, Selection, select
 from g2ard.targets import Subset, Targets
 
 __all__ = ["ARMS", "Trial", "bench_select", "summary"]

@@ -14,14 +14,14 @@ from g2ard.bench.simplify import scene_label
 from g2ard.cameras import Cameras
 from g2ard.images import load_image
 from g2ard.io.atomic import atomic_output
-from g2ard.lift import lift
 from g2ard.poses import make_pool, plan_pool
 from g2ard.progress import Progress, silent
-from g2ard.recover.anchors import PRESETS, Regularizers
-from g2ard.render import Renderer
-from g2ard.simplify import simplify
 from g2ard.splats import Splats
 from g2ard.splits import splits_of, states_splits
+from g2ard.stages.lift import lift
+from g2ard.stages.recover.anchors import PRESETS, Regularizers
+from g2ard.stages.render import Renderer
+from g2ard.stages.simplify import simplify
 from g2ard.synth import CityConfig, city
 from g2ard.targets import Targets
 
@@ -165,12 +165,16 @@ def _trained(scene: Path, size: Size, cache: Path | None, progress: Progress) ->
         outside = make_pool(prior, size.tests, kind="orbit", seed=2).resized(size.pixels)
 
     renderer = Renderer(prior)
+
+    def image(cameras: Cameras, view: int) -> Image:
+        return renderer.image(cameras[view])
+
     return Stand(
         prior=prior,
         student=_reduced(prior, size),
-        targets=_Made(universe, renderer.image, cache),
+        targets=_Made(universe, image, cache),
         tests=_evenly(rows[::8], size.tests),
-        outside=_Made(outside, renderer.image),
+        outside=_Made(outside, image),
         regularizers=PRESETS["trained"],
         candidates=size.candidates,
     )

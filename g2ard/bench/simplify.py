@@ -21,11 +21,11 @@ from g2ard.bench.process import measured
 from g2ard.bench.raster import cpu_name
 from g2ard.bench.standing import check_protocol, standing_targets
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
 from g2ard.poses import make_pool
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
 from g2ard.splits import split_mask, splits_of
+from g2ard.stages.evaluate import evaluate
 from g2ard.targets import TeacherRenders
 
 __all__ = [

@@ -34,7 +34,7 @@ from g2ard.splits import (
 from g2ard.targets import Photos, PhotosOrRenders, Targets, TeacherRenders
 
 if TYPE_CHECKING:
-    from g2ard.render import RasterSettings
+    from g2ard.stages.render import RasterSettings
 
 __all__ = ["Stage", "Stand", "fingerprint", "folder_of", "scene_key"]
 
@@ -134,7 +134,7 @@ class Stand:
         return Stage(f"{self.key}-{kind}", path, Usage(0, 0, 0), {})
 
     def _trained(self) -> Stage:
-        from g2ard.recover.anchors import PRESETS
+        from g2ard.stages.recover.anchors import PRESETS
 
         lift = self.prior("lift")
         return self.recover(
@@ -258,7 +258,7 @@ class Stand:
     @cached_property
     def settings(self) -> RasterSettings:
         """Of the renderer that scores."""
-        from g2ard.render import RasterSettings
+        from g2ard.stages.render import RasterSettings
 
         return RasterSettings(convention="inria" if self.definition.convention == "inria" else "gsplat")
 
@@ -391,7 +391,7 @@ def _readable(path: Path) -> Splats:
 
 
 def _lifted(path: Path) -> Splats:
-    from g2ard.lift import lift
+    from g2ard.stages.lift import lift
 
     points = io.read_points(path)
     return lift(points.positions, points.colors)

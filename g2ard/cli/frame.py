@@ -18,7 +18,7 @@ import typer
 
 from g2ard import __version__, interrupt
 from g2ard.cli.console import Console
-from g2ard.cli.usage import typed
+from g2ard.cli.usage import in_flags, typed
 from g2ard.errors import G2ardError
 
 __all__ = ["Run", "app", "command", "group"]
@@ -26,7 +26,7 @@ __all__ = ["Run", "app", "command", "group"]
 app = typer.Typer(
     help="Distil a dense 3D Gaussian scene into a compact, standard 3DGS model at an exact budget.",
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -41,7 +41,7 @@ def _version(show: bool) -> None:
 @app.callback()
 def _root(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        bool, typer.Option("-V", "--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     pass
@@ -65,7 +65,9 @@ def _load_config(ctx: typer.Context, path: Path | None) -> Path | None:
         str(ctx.info_name), {k: v for k, v in values.items() if k == "set" or not isinstance(v, dict)}
     )
     constants = _flat(table.pop("set", {}))
-    table = {key.replace("-", "_"): _as_typed(value) for key, value in table.items()}
+    many = {p.name for p in ctx.command.params if getattr(p, "multiple", False)}
+    table = {key.replace("-", "_"): value for key, value in table.items()}
+    table = {key: _several(value) if key in many else _as_typed(value) for key, value in table.items()}
     if constants:
         table["set"] = [f"{name}={_as_typed(value)}" for name, value in constants.items()]
     unknown = sorted(set(table) - {p.name for p in ctx.command.params})
@@ -90,6 +92,11 @@ def _as_typed(value: Any) -> Any:
     if isinstance(value, list):
         return ",".join(str(item) for item in value)
     return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _several(value: Any) -> list[str]:
+    """What an option that may be repeated is given."""
+    return [_as_typed(item) for item in value] if isinstance(value, list) else [_as_typed(value)]
 
 
 _RIVALS = (("count", "ratio"), ("steps", "time_limit"), ("views", "no_views"))
@@ -153,6 +160,7 @@ class Run:
         self.json: str | None = common["json"]
         self.console = Console(quiet=common["quiet"])
         self.noted = False  # whether a GPU failed
+        self.kept: list[str] = []  # what a Ctrl-C leaves, in words
         given = (*options.values(), common["config"])
         paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
         self._inputs = [p for p in paths if isinstance(p, Path) and p is not options.get("output")]
@@ -318,7 +326,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
         with run.console, _device(run):
             fn(run, **options)
     except KeyboardInterrupt:
-        run.console.error("interrupted")
+        run.console.error(f"interrupted; {'; '.join(run.kept) or 'nothing was written'}")
         raise typer.Exit(130) from None
     except (G2ardError, OSError, MemoryError) as e:
         run.console.error(_one_line(e))
@@ -361,4 +369,4 @@ def _one_line(error: BaseException) -> str:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, MemoryError):
         return f"out of memory{f': {error}' if str(error) else ''}"
-    return " ".join(str(error).split())
+    return in_flags(" ".join(str(error).split()))

@@ -51,9 +51,12 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
 
 def told(report: dict[str, Any]) -> list[str]:
     """What recovery kept, where it lost, and what no view saw, a line each."""
-    from g2ard.recover.outcome import outcome
+    from g2ard.stages.recover.outcome import outcome
+    from g2ard.stages.recover.report import RecoverReport
 
-    lines = [outcome(done) for entry in report["rounds"] for done in entry.get("recover", [])]
+    lines = [
+        outcome(RecoverReport.of(done)) for entry in report["rounds"] for done in entry.get("recover", [])
+    ]
     found = [line for line in lines if line is not None]
     for kind, what in (("scores", "unseen views"), ("apart", "views of another kind")):
         if not report[kind]:

@@ -115,7 +115,7 @@ def _named(path: str | Path, suffixes: tuple[str, ...], rule: str) -> Path:
     from g2ard.errors import OutputError
 
     path = Path(path)
-    if path.suffix not in suffixes or path.name.endswith(".compressed.ply"):
+    if path.suffix.lower() not in suffixes or path.name.lower().endswith(".compressed.ply"):
         raise OutputError(f"{path}: {rule}")
     return path
 
@@ -148,14 +148,14 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
         **options: of the format; `normals=True` adds nx ny nz to a .ply.
 
     Raises:
-        OutputError: the file exists, its folder is absent or not writable, or the extension is no format that
+        OutputError: the file exists, its folder is not writable, or the extension is no format that
             g2ard writes.
         InputError: the scene is empty, or has a value that is not finite.
     """
     from importlib import import_module
 
     path = _named(path, (".ply", ".splat"), "scenes are written as .ply or .splat")
-    import_module(f"g2ard.io.{path.suffix[1:]}").write(path, splats, overwrite=overwrite, **options)
+    import_module(f"g2ard.io.{path.suffix[1:].lower()}").write(path, splats, overwrite=overwrite, **options)
 
 
 def read_points(path: str | Path) -> Points:
@@ -216,7 +216,7 @@ def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -
     from g2ard.io import cloud_ply
 
     path = Path(path)
-    if path.suffix != ".ply":
+    if path.suffix.lower() != ".ply":
         raise OutputError(f"{path}: clouds are written as .ply")
     cloud_ply.write(path, points, overwrite=overwrite)
 

@@ -91,7 +91,7 @@ class Glance:
 
     def of(self, cameras: Cameras, tell: Callable[[int, int], None], reach: Floats | None = None) -> Focus:
         """Look through each camera; what is farther than `reach`, (C,), is a backdrop and does not count."""
-        from g2ard.render import RasterSettings, view_of
+        from g2ard.stages.render import RasterSettings, view_of
 
         if not len(cameras):
             return Focus(*np.zeros((3, 0)))

@@ -19,7 +19,6 @@ from g2ard.cli.options import (
     SceneArgument,
     SizeOption,
     SplitOption,
-    budget_of,
     one_budget,
 )
 
@@ -58,22 +57,22 @@ def render(
     """Render a scene into every view as PNG, or what simplification makes of it painted on its surfaces."""
     import numpy as np
 
-    from g2ard.cli.scenes import load_scene, load_views
     from g2ard.images import write_png
     from g2ard.io.atomic import atomic_folder, check_output
-    from g2ard.render import RasterSettings, Renderer
+    from g2ard.policy.inputs import load_scene, load_views
+    from g2ard.stages.render import RasterSettings, Renderer
 
     _check(color, count, ratio, parents)
     check_output(output, run.overwrite, folder=True)
-    splats, settings = load_scene(run, scene), RasterSettings(convention=convention)
+    splats, settings = load_scene(scene, run.say), RasterSettings(convention=convention)
     if color != "scene":
-        budget = None if parents else budget_of(scene, count, ratio, len(splats))
+        budget = None if parents else one_budget(count, ratio).of(len(splats), str(scene))
         splats = _painted(run, splats, color, budget, method, parents)
-    cameras = load_views(run, views, split, size)
+    cameras = load_views(views, split, size, run.say)
     renderer = Renderer(splats, background=background or (0.0, 0.0, 0.0), settings=settings)
     with atomic_folder(output, overwrite=run.overwrite) as folder:
         for view, name in enumerate(cameras.names):
-            rendered = renderer.render(cameras, view)
+            rendered = renderer.render(cameras[view])
             stem = folder / Path(name).with_suffix("")
             stem.parent.mkdir(parents=True, exist_ok=True)
             write_png(stem.with_name(stem.name + ".png"), rendered.image)
@@ -98,7 +97,7 @@ def _painted(
     run: Run, splats: Splats, color: Color, budget: int | None, method: Method, parents: Path | None
 ) -> Splats:
     from g2ard.paint import cell_labels, flag_colors, label_colors, painted
-    from g2ard.simplify import flag, simplify
+    from g2ard.stages.simplify import flag, simplify
 
     if color == "flags":
         assert budget is not None  # _check has seen to it

@@ -1,4 +1,4 @@
-//! `g2ard.select`.
+//! `g2ard.stages.select`.
 
 use g2ard_core::raster::Camera;
 use g2ard_core::select::{Coverage, Gaussians, Occluders, Problem, Surface, median_depths};

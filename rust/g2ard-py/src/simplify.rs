@@ -1,4 +1,4 @@
-//! `g2ard.simplify`.
+//! `g2ard.stages.simplify`.
 
 use g2ard_core::simplify::{
     Outcome, Pairwise, PairwiseRound, Paper, PaperRound, Texture, Visibility, flags,

@@ -13,7 +13,7 @@ use crate::raster::{Arrays, Floats, isa_named, slice};
 use crate::views::{RasterOptions, View};
 use crate::work;
 
-/// The attributes of a `g2ard.recover.schedule.Rates` that are learning rates.
+/// The attributes of a `g2ard.stages.recover.schedule.Rates` that are learning rates.
 #[derive(FromPyObject)]
 struct PyRates {
     means: f32,
@@ -38,7 +38,7 @@ impl From<PyRates> for Rates {
     }
 }
 
-/// The attributes of a `g2ard.recover.anchors.Regularizers` that are weights.
+/// The attributes of a `g2ard.stages.recover.anchors.Regularizers` that are weights.
 #[derive(FromPyObject)]
 struct PyRegularizers {
     anchor: f32,
