@@ -22,16 +22,16 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).resolve().parents[2])]
 
 import numpy as np
-from g2ard.stages.recover import RecoverConfig, recover
-from g2ard.stages.recover.anchors import PRESETS
-from g2ard.stages.render import RasterSettings, Renderer, arrays_of, view_of
-from g2ard.stages.select import CoverageOptions, select
 from numpy.typing import NDArray
 from scenes import around, checkered_ball
 
 from g2ard import _core, io, simplify, visibility
 from g2ard.cameras import Cameras
 from g2ard.splats import Splats
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.anchors import PRESETS
+from g2ard.stages.render import RasterSettings, Renderer, arrays_of, view_of
+from g2ard.stages.select import CoverageOptions, select
 from g2ard.targets import TeacherRenders
 
 __all__ = ["lines", "random_scene"]
