@@ -17,6 +17,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from g2ard import __version__, interrupt
+from g2ard.cli.config import load_config, printed
 from g2ard.cli.console import Console
 from g2ard.cli.usage import in_flags, typed
 from g2ard.errors import G2ardError
@@ -47,58 +48,6 @@ def _root(
     pass
 
 
-def _load_config(ctx: typer.Context, path: Path | None) -> Path | None:
-    """Make a TOML file's values the defaults: its table of this command's name, else its top level."""
-    if path is None:
-        return None
-    import tomllib
-
-    try:
-        values = tomllib.loads(path.read_text())
-    except OSError as e:
-        raise typer.BadParameter(f"{path}: {e.strerror}") from None
-    except UnicodeDecodeError:
-        raise typer.BadParameter(f"{path}: not a text file") from None
-    except tomllib.TOMLDecodeError as e:
-        raise typer.BadParameter(f"{path}: {e}") from None
-    table = values.get(
-        str(ctx.info_name), {k: v for k, v in values.items() if k == "set" or not isinstance(v, dict)}
-    )
-    constants = _flat(table.pop("set", {}))
-    many = {p.name for p in ctx.command.params if getattr(p, "multiple", False)}
-    table = {key.replace("-", "_"): value for key, value in table.items()}
-    table = {key: _several(value) if key in many else _as_typed(value) for key, value in table.items()}
-    if constants:
-        table["set"] = [f"{name}={_as_typed(value)}" for name, value in constants.items()]
-    unknown = sorted(set(table) - {p.name for p in ctx.command.params})
-    if unknown:
-        raise typer.BadParameter(f"{path}: no option of `{ctx.info_name}` is called {', '.join(unknown)}")
-    ctx.default_map = {**(ctx.default_map or {}), **table}
-    return path
-
-
-def _flat(table: Any, prefix: str = "") -> dict[str, Any]:
-    """A table of constants by their dotted names: `simplify.max_energy = 0.02` is a table within one."""
-    if not isinstance(table, dict):
-        raise typer.BadParameter("set: a table of constants, such as set = { simplify.max_energy = 0.02 }")
-    out: dict[str, Any] = {}
-    for key, value in table.items():
-        out |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return out
-
-
-def _as_typed(value: Any) -> Any:
-    """A TOML value as it would be typed: options parse text; [1, 1, 1] is 1,1,1."""
-    if isinstance(value, list):
-        return ",".join(str(item) for item in value)
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _several(value: Any) -> list[str]:
-    """What an option that may be repeated is given."""
-    return [_as_typed(item) for item in value] if isinstance(value, list) else [_as_typed(value)]
-
-
 _RIVALS = (("count", "ratio"), ("steps", "time_limit"), ("views", "no_views"))
 """Options that exclude each other."""
 
@@ -125,11 +74,21 @@ _COMMON: dict[str, tuple[Any, Any]] = {
     "seed": (Annotated[int, typer.Option(min=0, help="Seed of everything random.")], 0),
     "threads": (Annotated[int, typer.Option(min=0, max=256, help="Threads; 0 means every core.")], 0),
     "device": (Annotated[str, typer.Option(metavar="auto|cpu|gpu|cuda", help="Where to compute.")], "auto"),
+    "print_config": (
+        Annotated[
+            bool,
+            typer.Option("--print-config", help="Print the options as a file for --config, and do nothing."),
+        ],
+        False,
+    ),
     "config": (
         Annotated[
             Path | None,
             typer.Option(
-                metavar="FILE.toml", callback=_load_config, is_eager=True, help="Defaults; flags win."
+                metavar="FILE.toml",
+                callback=load_config,
+                is_eager=True,
+                help="Defaults; flags win.",
             ),
         ],
         None,
@@ -286,6 +245,9 @@ def command(
             shared = {key: values.pop(key) for key in shared_options}
             if typed(ctx, "set"):  # after those of the config file, for the last counts
                 shared["set"] = [*(ctx.default_map or {}).get("set", []), *shared["set"]]
+            if shared.pop("print_config"):
+                typer.echo(printed(ctx, {**values, **shared}), nl=False)
+                return
             ours = interrupt.raises()
             try:
                 _execute(Run(name, shared, dict(values)), fn, values, cuda)

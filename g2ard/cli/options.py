@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -16,6 +16,7 @@ from g2ard.report.window import Crop
 if TYPE_CHECKING:
     from g2ard.cli.frame import Run
     from g2ard.policy.budget import Budget
+    from g2ard.splats import Splats
 
 __all__ = [
     "ConventionOption",
@@ -36,6 +37,7 @@ __all__ = [
     "Triple",
     "ViewsOption",
     "ViewsOrMadeOption",
+    "can_be_made",
     "can_judge",
     "is_made",
     "one_budget",
@@ -43,6 +45,7 @@ __all__ = [
     "recovery_engine",
     "trained_on",
     "views_count",
+    "views_or_teacher",
 ]
 
 _COUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmM%]?)")
@@ -402,3 +405,18 @@ def recovery_engine(run: Run) -> Literal["fused", "gsplat"]:
 def trained_on(split: str) -> str:
     """What to call the views that a command has fitted."""
     return "training views" if split == "train" else f"{split} views"
+
+
+def can_be_made(views: Path | None, teacher: Path | None) -> None:
+    """Usage check: where no views are given, a teacher is there to be looked at."""
+    if teacher is None and (views is None or is_made(views)):
+        raise typer.BadParameter("give --views, or a --teacher to make views of")
+
+
+def views_or_teacher(run: Run, views: Path | None, teacher: Path | None, dense: Splats | None) -> Any:
+    """The views given, else those beside the teacher, else a pool of it; see `can_be_made`."""
+    from g2ard.policy.views import views_or_pool
+
+    if dense is None:
+        return views
+    return views_or_pool(dense, views, beside=teacher, seed=run.seed, progress=run.progress, say=run.say)

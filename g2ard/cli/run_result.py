@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from g2ard.cli.frame import Run
 
-__all__ = ["say_views", "told", "write_table"]
+if TYPE_CHECKING:
+    from g2ard.splats import Splats
+
+__all__ = ["say_views", "say_weight", "told", "write_table"]
 
 _LOSS, _SSIM_LOSS = 0.05, 0.001
 """dB, and SSIM, under the simplified scene that the command speaks of."""
@@ -92,3 +96,17 @@ def say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:
             f"views: {len(views['chosen'])} of {views['candidates']} by {views['policy']};"
             f" those left out would have added {100 * views['left_out']:.1f} %"
         )
+
+
+def say_weight(run: Run, source: Path, output: Path, splats: Splats) -> None:
+    """A result that outweighs the file it was made from: what of it is colour by direction, and how to be rid
+    of it."""
+    if not source.is_file() or output.stat().st_size < source.stat().st_size:
+        return
+    made, given = (path.stat().st_size / 1e6 for path in (output, source))
+    sizes = f"{output}: {made:.2f} MB, {source.name} has {given:.2f} MB"
+    share = splats.shN.nbytes / splats.nbytes
+    hint = "packed formats are smaller than .ply"
+    if share:
+        hint = f"{share:.0%} of it is SH above degree 0 (--sh-degree 0 on distill and recover leaves it out)"
+    run.say(f"{sizes}: {hint}")

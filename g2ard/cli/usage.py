@@ -13,6 +13,7 @@ _FLAGS = {
     "another checkpoint or folder of work starts anew": "-w without --resume starts anew",
     "engine 'gsplat'": "--device cuda",
     "count, ratio:": "-n, -r:",
+    "to take a ratio of: give a count": "to take a ratio of: give a count, -n COUNT",
     "its photos are needed as views": "give its photos with --views",
     "TeacherRenders of a scene can stand in": "--teacher SCENE stands in with its renders",
     "crop ": "--crop ",

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from g2ard.stages.recover.presets import PriorMeasures
     from g2ard.targets import Targets
 
-    Scene = Splats | Points | str | Path
+    Scene = Splats | Points | str | Path | None
     Colour = tuple[float, float, float]
 
 __all__ = ["DistillJob", "distill", "prepare"]
@@ -299,6 +299,15 @@ def prepare(
     weighted = usual["weighted"] if weighted is None else weighted
     paper, values = schedule == "paper", constants or {}
     lifting = changed(LiftConfig(), "lift", values)
+    if scene is None:
+        if views is None or is_made(views):
+            raise InputError("scene: without one, photos with poses are needed as views")
+        from g2ard.policy.photos import points_of_photos
+
+        wanted = max((budget.count for budget in budgets if budget.count is not None), default=None)
+        scene = points_of_photos(
+            views, held_out, wanted, background=background, seed=seed, progress=progress, say=say
+        )
     prior, lifted, beside, name = _prior(scene, beside, lifting, progress, say)
     if lifted and (views is None or is_made(views)):
         raise InputError(f"{name}: a cloud is no teacher: its photos are needed as views")
@@ -320,9 +329,9 @@ def prepare(
     use_photos = lifted or (pictured if photos is None else photos)
     kind = "paper-lift" if lifted and preset == "paper" else preset
     regularizers, why, measured = preset_for(kind, prior, train if use_photos else None, paper=paper)
-    wanted = ", ".join(f"{count:,}" for count in counts)
+    aims = ", ".join(f"{count:,}" for count in counts)
     against = "photos" if use_photos else "teacher renders"
-    say(f"{len(prior):,} → {wanted} Gaussians; {len(train)} views against {against}")
+    say(f"{len(prior):,} → {aims} Gaussians; {len(train)} views against {against}")
     say(f"regularisers: {why}")
     config = DistillConfig(
         method=method,
@@ -355,7 +364,11 @@ def prepare(
 
 
 def _prior(
-    scene: Scene, beside: str | Path | None, lifting: LiftConfig, progress: Progress, say: Say
+    scene: Splats | Points | str | Path,
+    beside: str | Path | None,
+    lifting: LiftConfig,
+    progress: Progress,
+    say: Say,
 ) -> tuple[Splats, bool, str | Path | None, str]:
     """The dense scene, whether it is a lift, where cameras may lie beside it, and what errors call it."""
     from g2ard.io import kind, read_cloud

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     Up = Sequence[float] | None
 
-__all__ = ["RunViews", "cameras_for_looks", "is_made", "views_of"]
+__all__ = ["RunViews", "cameras_for_looks", "is_made", "views_of", "views_or_pool"]
 
 _POOL, _GROW, _NEAR = 160, 2.0, 0.25
 """Poses of a pool made for a scene without views, how many times as many there may be where a view holds
@@ -120,6 +120,49 @@ def views_of(
     mask = split_mask(None, names, "test")
     train = pool.take(~mask).resized(size)
     return RunViews(train, pool.take(mask).resized(size).cameras, apart, pool, planned.unseen)
+
+
+def views_or_pool(
+    scene: Splats,
+    views: Views | None,
+    *,
+    beside: str | Path | None = None,
+    count: int | None = None,
+    up: Up = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Views:
+    """Views to render, score or learn from: those given, else those beside the scene, else a pool as
+    `distill` makes it, every 8th of it held out.
+
+    Args:
+        scene: the dense scene.
+        views: as for `views_of`.
+        beside: as for `views_of`.
+        count: poses of a pool that is made; None for as many as `distill` makes.
+        up: as for `views_of`.
+        seed: as for `views_of`.
+        progress: as for `views_of`.
+        say: as for `views_of`.
+
+    Raises:
+        InputError: a scene with no room for poses.
+    """
+    from g2ard.io import ViewSet
+    from g2ard.poses import plan_pool
+    from g2ard.splits import splits_of
+
+    if views is not None and not is_made(views):
+        return views
+    if views is None and beside is not None and (found := found_views(beside, scene, [], say)):
+        return found
+    if count is None:
+        planned = _planned(scene, _POOL, up, seed, progress, _GROW)
+    else:
+        planned = plan_pool(scene, count, up=up, seed=seed, rows=_ROWS, progress=progress)
+    say(f"poses: {len(planned.cameras)}, {planned.kind} ({planned.why})")
+    return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
 
 
 def cameras_for_looks(

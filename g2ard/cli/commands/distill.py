@@ -35,7 +35,7 @@ from g2ard.cli.options import (
 )
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.resume import check_stopped, left_at
-from g2ard.cli.run_result import say_views, told, write_table
+from g2ard.cli.run_result import say_views, say_weight, told, write_table
 
 if TYPE_CHECKING:
     from g2ard.pipeline import Distilled
@@ -55,10 +55,14 @@ _KEPT = Path("simplified", "scene.ply")
 @command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True, constants=True)
 def distill(
     run: Run,
-    scene: Annotated[
-        Path, typer.Argument(metavar="SCENE|CLOUD", help="A trained scene, or a coloured cloud.")
-    ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN", help="Folder of the run.")],
+    scene: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[SCENE|CLOUD]",
+            help="A trained scene, or a coloured cloud; without either, --views are photos to start from.",
+        ),
+    ] = None,
     count: CountsOption = None,
     ratio: RatiosOption = None,
     views: ViewsOrMadeOption = None,
@@ -127,6 +131,8 @@ def distill(
     if is_made(str(held_out)):
         raise typer.BadParameter("--held-out: a file of views; those that are made hold out every 8th anyway")
     given = views is not None and not is_made(views)
+    if scene is None and not given:
+        raise typer.BadParameter("give a SCENE, or photos with their poses as --views")
     if photos and is_made(views):
         raise typer.BadParameter("--photos: views that are made have none")
     from g2ard.io import kind
@@ -141,7 +147,7 @@ def distill(
     engine = recovery_engine(run)
     outputs = Outputs(run, output, budgets)
     outputs.check(lambda folder: _check_folder(run, folder, given, resume))
-    if kind(scene) != "splats" and not given:
+    if scene is not None and kind(scene) != "splats" and not given:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
     early = outputs.paths()
     if early and all(_is_done(run, folder, resume) for folder in early):
@@ -184,7 +190,9 @@ def distill(
     job.render_targets()
     reports = []
     for budget, folder in todo:
-        reports.append(_distil(run, scene, job, budget, folder, resume, keep, crop or [], began))
+        reports.append(
+            _distil(run, scene or Path(str(views)), job, budget, folder, resume, keep, crop or [], began)
+        )
         run.kept.append(f"{folder} is finished")
         began = time.monotonic()
     run.result(reports[0] if len(reports) == 1 else {"runs": reports})
@@ -221,7 +229,7 @@ def _finished(folder: Path) -> bool:
 
 def _distil(
     run: Run,
-    scene: Path,
+    source: Path,
     job: DistillJob,
     budget: int,
     output: Path,
@@ -241,7 +249,7 @@ def _distil(
         report["seconds"] = {**report["seconds"], "total": time.monotonic() - began}
         distill_report(
             output / "report.html",
-            f"{scene.name}: {len(job.prior):,} → {budget:,}",
+            f"{source.name}: {len(job.prior):,} → {budget:,}",
             [("simplified", result.simplified), ("recovered", result.splats)],
             job.held_out,
             report,
@@ -260,6 +268,7 @@ def _distil(
     for line in told(report):
         run.say(line)
     say_views(run, report["views"], job.config.views is not None)
+    say_weight(run, source, output / "scene.ply", result.splats)
     run.say(
         f"scene: {output / 'scene.ply'}\npicture: {output / 'preview.png'}\n"
         f"report: {output / 'report.html'}, {output / 'report.json'}"

@@ -11,10 +11,12 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
     ConventionOption,
-    LookOption,
     SizeOption,
     SplitOption,
     TeacherOption,
+    ViewsOrMadeOption,
+    can_be_made,
+    views_or_teacher,
 )
 
 
@@ -22,7 +24,7 @@ from g2ard.cli.options import (
 def evaluate(
     run: Run,
     scenes: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scenes to score.")],
-    views: LookOption,
+    views: ViewsOrMadeOption = None,
     teacher: TeacherOption = None,
     photos: Annotated[
         bool,
@@ -60,9 +62,11 @@ def evaluate(
 
     if photos and teacher is None:
         raise typer.BadParameter("--photos goes with --teacher: without a teacher all targets are photos")
+    can_be_made(views, teacher)
     colour, settings = background or (0.0, 0.0, 0.0), RasterSettings(convention=convention)
     dense = load_scene(teacher, run.say) if teacher else None
     frozen = load_scene(anchors, run.say) if anchors else None
+    views = views_or_teacher(run, views, teacher, dense)
     cameras = load_views(views, split, size, run.say, unpictured=photos)
     targets = make_targets(
         cameras, dense, colour, photos=photos, settings=settings, progress=run.progress, say=run.say

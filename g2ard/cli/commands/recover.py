@@ -10,7 +10,6 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
-    LookOption,
     OutputOption,
     PresetOption,
     ResumeOption,
@@ -20,9 +19,12 @@ from g2ard.cli.options import (
     SplitOption,
     TeacherOption,
     TimeLimitOption,
+    ViewsOrMadeOption,
+    can_be_made,
     one_horizon,
     recovery_engine,
     trained_on,
+    views_or_teacher,
 )
 
 if TYPE_CHECKING:
@@ -39,8 +41,8 @@ if TYPE_CHECKING:
 def recover(
     run: Run,
     student: Annotated[Path, typer.Argument(metavar="STUDENT", help="The compact scene to recover.")],
-    views: LookOption,
     output: OutputOption,
+    views: ViewsOrMadeOption = None,
     teacher: TeacherOption = None,
     anchors: Annotated[
         Path | None,
@@ -79,6 +81,7 @@ def recover(
 
     values = run.constants(recover=RecoverConfig())
     one_horizon(steps, time_limit, values)
+    can_be_made(views, teacher)
     checkpoint = output.parent / f".{output.name}.checkpoint.npz"
     if left_at(checkpoint) or not (resume and output.exists()):
         check_scene_output(output, run.overwrite)
@@ -87,6 +90,7 @@ def recover(
     colour = background or (0.0, 0.0, 0.0)
     splats = load_scene(student, run.say)
     dense = load_scene(teacher, run.say) if teacher else None
+    views = views_or_teacher(run, views, teacher, dense)
     chosen = load_trained(views, split, size, run.say)
     targets = make_targets(chosen.cameras, dense, colour, progress=run.progress, say=run.say)
     weights = chosen.weights if weighted else None

@@ -21,6 +21,7 @@ from g2ard.cli.options import (
     is_made,
 )
 from g2ard.cli.outputs import Outputs, budgets_of
+from g2ard.cli.run_result import say_weight
 
 if TYPE_CHECKING:
     from g2ard.io import Scene
@@ -101,7 +102,7 @@ def simplify(
             _write_parents(run, rows, small)
         clock.append(time.perf_counter())
         reports.append(_report(run, found, small, config.resolved(method), method, clock))
-        _tell(run, small, place, total, clock[-1] - clock[0])
+        _tell(run, scene, small, place, total, clock[-1] - clock[0])
         run.kept.append(f"{place} is written")
         clock = [clock[-1] - (clock[1] - clock[0]), clock[-1]]  # reading is shared
     run.result(reports[0] if len(reports) == 1 else {"runs": reports})
@@ -146,12 +147,13 @@ def _write_parents(run: Run, path: Path, small: Simplified) -> None:
         np.save(file, small.parents)
 
 
-def _tell(run: Run, small: Simplified, output: Path, total: int, seconds: float) -> None:
+def _tell(run: Run, scene: Path, small: Simplified, output: Path, total: int, seconds: float) -> None:
     if run.verbose:
         _table(run, small)
     share = (small.report.unseen or 0) / total
     if share >= 0.005:
         run.say(f"no view sees {share:.0%} of the Gaussians: they count by their own size alone")
+    say_weight(run, scene, output, small.splats)
     run.say(f"{output}: {len(small.splats):,} of {total:,} Gaussians in {seconds:.1f} s")
 
 
