@@ -264,3 +264,14 @@ def test_tables_and_what_stands_above_them(command_line: CommandLine, folder: Pa
     assert status == 0, error
     found = json.loads(out)
     assert (found["output_count"], found["config"]["seed"]) == (120, 5)
+
+
+def test_info_of_several_files_and_of_a_run(command_line: CommandLine, folder: Path) -> None:
+    command_line("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 4, "--size", 48, cwd=folder)
+    status, out, error = command_line("info", "ball.ply", "views.json", "run", "--json", "-", cwd=folder)
+    assert status == 0, error
+    scene, views, made = json.loads(out)["files"]
+    assert (scene["kind"], views["kind"], made["count"]) == ("splats", "views", 120)
+    assert made["run"]["input_count"] == 1200
+    assert made["run"]["scores"]["recovered"]["psnr"] > 10
+    assert "made from" in command_line("info", "run", cwd=folder)[1]

@@ -314,7 +314,7 @@ def test_a_start_that_cannot_be_bettered_is_kept(targets: TeacherRenders) -> Non
     np.testing.assert_array_equal(done.splats.sh0, start.sh0)
     assert done.report.psnr.after == done.report.psnr.before < 100
     calm = recover(start, there, RecoverConfig(steps=100)).report
-    assert calm["multiplier"] < 0.3
+    assert calm.multiplier < 0.3
 
 
 WILD = replace(TUNED, multiplier=20.0, reach=math.inf)
@@ -324,13 +324,13 @@ WILD = replace(TUNED, multiplier=20.0, reach=math.inf)
 def test_what_loses_goes_back_and_on_with_smaller_steps(targets: TeacherRenders) -> None:
     start = simplify(TEACHER, 1500).splats
     done = recover(start, targets, RecoverConfig(schedule=WILD, steps=100)).report
-    assert [found.step for found in done["backed_off"]][:2] == [10, 30]
-    assert done["multiplier"] == pytest.approx(20 / 3 ** len(done["backed_off"]))
-    assert done["psnr"]["after"] > done["psnr"]["before"] + 1
-    assert not done["kept_start"]
+    assert [found.step for found in done.backed_off][:2] == [10, 30]
+    assert done.multiplier == pytest.approx(20 / 3 ** len(done.backed_off))
+    assert done.psnr.after > done.psnr.before + 1
+    assert not done.kept_start
     told = outcome(done)
     assert told is not None
-    assert told.startswith(f"recovery fell to {done['backed_off'][0]['psnr']:.2f} dB (start ")
+    assert told.startswith(f"recovery fell to {done.backed_off[0].psnr:.2f} dB (start ")
 
 
 def test_a_resume_after_going_back_is_never_having_stopped(targets: TeacherRenders, tmp_path: Path) -> None:
