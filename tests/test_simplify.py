@@ -254,7 +254,7 @@ def test_command_line(tmp_path, command_line):
     for arguments, want, part in (
         (("-r", "10", "-o", "small.ply"), 1, "small.ply"),  # exists
         (("-n", "5", "-o", "b.ply", "--no-views", "--views", "x"), 2, "exclude"),
-        (("-n", "1001", "-o", "b.ply"), 1, "prior.ply: the budget of 1001"),
+        (("-n", "1001", "-o", "b.ply"), 1, "prior.ply: a budget of 1,001"),
         (("-n", "0", "-o", "b.ply"), 2, "positive count"),
         (("-o", "b.ply"), 2, "either -n COUNT or -r RATIO"),
         (("-n", "5", "-o", "b.ply", "--method", "best"), 2, "method"),

@@ -235,7 +235,7 @@ def test_training_on_test_views_is_said(command_line: CommandLine, folder: Path)
             output = f"{command}-{split}.ply"
             status, _, error = command_line(command, "small.ply", *look, output, "--split", split, cwd=folder)
             assert status == 0, error
-            said = f"--split {split}: {words} views trained on are test views"
+            said = f"split {split}: {words} views trained on are test views"
             assert (said in error) if words else ("test views" not in error)
 
 
