@@ -310,7 +310,7 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match="target: expected 6720 values"):
         step(trainer_of(p), cameras[0], targets[0][:5])
     with pytest.raises(InputError, match="anchors set before"):
-        step(trainer_of(p), cameras[0], targets[0], (1.0, 1.0, True))
+        step(trainer_of(p), cameras[0], targets[0], Regularizers(1.0, 1.0, True))
     with pytest.raises(InputError, match="reach: expected pixels, more than 0"):
         step(trainer_of(p), cameras[0], targets[0], reach=0.0)
     with pytest.raises(InputError, match="units: expected 10 values"):

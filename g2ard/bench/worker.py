@@ -111,13 +111,15 @@ def _select(job: Job) -> dict[str, Any]:
 
     cameras = _cameras(job["views"])
     chosen = select(io.read_splats(job["scene"]), cameras, job["k"], policy=job["policy"], seed=job["seed"])
-    kept = cameras.take(np.sort(chosen.order))  # of training views alone: the stand has taken the others out
+    kept = cameras.take(
+        np.sort(chosen.order)
+    )  # of training views alone: the workspace holds the others out
     io.write_views(job["output"], kept, splits=["train"] * len(kept), overwrite=True)
     return {"views": len(chosen.order)}
 
 
 def _cameras(path: str) -> Cameras:
-    """All views of a file that the stand has written, with a photo or without."""
+    """All views of a file that the workspace has written, with a photo or without."""
     return io.read_view_set(path, unpictured=True).cameras
 
 

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 
 from g2ard.cameras import Cameras
 
-__all__ = ["extents", "share_of_rate"]
+__all__ = ["extents", "rotations", "share_of_rate"]
 
 
 @torch.no_grad()
@@ -45,7 +45,7 @@ def extents(
     depth = torch.where(seen, camera[:, 2], 1.0)[:, None]
     ray = (camera[:, :2] / depth).clamp(low, high)
     to_screen = focal[:, None] * (pose[:2, :3] - ray[..., None] * pose[2, :3]) / depth[..., None]
-    axes = to_screen @ _rotations(quats) * log_scales.exp()[:, None]  # (N, 2, 3)
+    axes = to_screen @ rotations(quats) * log_scales.exp()[:, None]  # (N, 2, 3)
     x, y = axes.unbind(1)
     xx, xy, yy = (x * x).sum(1), (x * y).sum(1), (y * y).sum(1)
     largest = 0.5 * (xx + yy) + ((0.5 * (xx - yy)) ** 2 + xy**2).sqrt()
@@ -62,7 +62,9 @@ def share_of_rate(variance: Tensor, reach: float) -> Tensor:
     return 1 / (1 + ratio**8)
 
 
-def _rotations(quats: Tensor) -> Tensor:
+def rotations(quats: Tensor) -> Tensor:
+    """(N, 3, 3) of (N, 4) wxyz quaternions, normalised first: `g2ard.recover.anchors.rotation_matrices` with
+    gradients, in the tensors' precision."""
     w, x, y, z = normalize(quats, dim=1).unbind(1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

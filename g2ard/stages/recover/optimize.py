@@ -22,7 +22,7 @@ from g2ard.stages.recover.anchors import Anchors, drift95, needle
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import checked_weights, drawn
 from g2ard.stages.recover.guard import Guard
-from g2ard.stages.recover.probe import MULTIPLIERS, Probe, calm, climb, trial_steps
+from g2ard.stages.recover.probe import MULTIPLIERS, Probe, calm, search_multiplier, trial_steps
 from g2ard.stages.recover.report import (
     Gain,
     Geometry,
@@ -285,12 +285,12 @@ class _Loop:
 
         nearly_there = guess <= min(MULTIPLIERS)
         try:
-            self.multiplier, _ = climb(score, guess, start)
+            self.multiplier, _ = search_multiplier(score, guess, start)
             tight = reach_for(0.0, typical)
             if seen[self.multiplier] < start and self.config.schedule.reach is None and tight < self.reach:
                 self.reach = tight  # not as untrained as it looked
                 seen.clear()
-                self.multiplier, _ = climb(score, guess, start)
+                self.multiplier, _ = search_multiplier(score, guess, start)
             if seen[self.multiplier] < start:  # a few steps on photos that are nearly met say nothing
                 self.multiplier, share = guess, _CALM_SHARE
                 if nearly_there:

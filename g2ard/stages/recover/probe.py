@@ -16,7 +16,7 @@ from g2ard.targets import Targets, mask_of
 if TYPE_CHECKING:
     from g2ard.stages.render import Renderer
 
-__all__ = ["MULTIPLIERS", "Probe", "calm", "climb", "trial_steps"]
+__all__ = ["MULTIPLIERS", "Probe", "calm", "search_multiplier", "trial_steps"]
 
 MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
 """Of all rates; trained scenes want 1 or less, lifts more."""
@@ -43,20 +43,22 @@ def trial_steps(horizon: int) -> int:
     return 0 if horizon < _SHORTEST_HORIZON else min(_MOST, max(_FEWEST, horizon // _PART))
 
 
-def climb(score: Callable[[float], float], guess: float, start: float) -> tuple[float, dict[float, float]]:
+def search_multiplier(
+    score: Callable[[float], float], guess: float, start: float
+) -> tuple[float, dict[float, float]]:
     """The best of `MULTIPLIERS`, walking both ways from the one nearest to `guess`, and all scores seen.
 
-    Of those whose gain is within 4 % of the best the largest is taken: a long run calms down in the end, a
-    trial has no time for what the larger would yet reach.
+    Of those whose gain is within 4 % of the best the largest is taken: a long run decays in the end, a trial
+    is too short for what the larger would reach.
 
     Args:
         score: PSNR that a trial with a multiplier ends at.
         guess: where to begin.
         start: PSNR before.
 
-    >>> climb(lambda m: -abs(m - 1), 0.2, start=0)[0]
+    >>> search_multiplier(lambda m: -abs(m - 1), 0.2, start=0)[0]
     1.0
-    >>> round(climb(lambda m: {1 / 3: 32.0, 3**-0.5: 31.95}.get(m, 30.0), 1 / 3, start=30)[0], 3)
+    >>> round(search_multiplier(lambda m: {1 / 3: 32.0, 3**-0.5: 31.95}.get(m, 30.0), 1 / 3, start=30)[0], 3)
     0.577
     """
     seen: dict[int, float] = {}

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.extent import rotations
 
 __all__ = ["TorchAnchors", "anchor_loss", "regularization", "shape_loss"]
 
@@ -40,7 +41,7 @@ def anchor_loss(means: Tensor, anchors: TorchAnchors) -> Tensor:
 def shape_loss(log_scales: Tensor, quats: Tensor, anchors: TorchAnchors, *, effective_rank: bool) -> Tensor:
     """(1/N) Σ max(0, −log(r_eff − 1 + ε)) + β[log s⊥ − log s̄⊥]₊; s⊥ is taken along the anchor's normal."""
     normal = anchors.frames[:, :, 2]
-    extent = torch.einsum("nji,nj->ni", _rotations(quats), normal) * log_scales.exp()
+    extent = torch.einsum("nji,nj->ni", rotations(quats), normal) * log_scales.exp()
     thickness = extent.square().sum(1).clamp_min(1e-38).log() / 2 - anchors.r_perp.log()
     total = _BETA * thickness.clamp_min(0)
     if effective_rank:
@@ -61,13 +62,3 @@ def regularization(
         shape = shape_loss(log_scales, quats, anchors, effective_rank=weights.effective_rank)
         total = total + weights.shape * shape
     return total
-
-
-def _rotations(quats: Tensor) -> Tensor:
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)

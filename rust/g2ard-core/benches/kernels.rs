@@ -5,12 +5,13 @@
 mod scene;
 
 use divan::{Bencher, Divan, black_box};
+use g2ard_core::random::Lcg;
 use g2ard_core::raster::{
     Accumulated, Camera, Image, ImageGradients, Params, Rasterizer, Settings,
 };
 use g2ard_core::{Control, Cpu};
 use rayon::prelude::*;
-use scene::{Random, Scene, Slopes, cameras};
+use scene::{Scene, Slopes, cameras};
 
 const COUNTS: [usize; 2] = [20_000, 200_000];
 /// Ten times fewer.
@@ -158,7 +159,7 @@ mod raster {
         let scene = Scene::of(count);
         let (params, mut rasterizer) = (scene.params(), Rasterizer::default());
         render(&mut rasterizer, &params, &view(), &mut blank());
-        let mut random = Random(1);
+        let mut random = Lcg(1);
         let rgb: Vec<f32> = (0..3 * WIDTH * HEIGHT)
             .map(|_| random.uniform() as f32 - 0.5)
             .collect();
@@ -198,7 +199,7 @@ mod ssim {
             width: WIDTH,
             channels: 3,
         };
-        let mut random = Random(1);
+        let mut random = Lcg(1);
         let [image, target] = [(); 2].map(|()| -> Vec<f32> {
             (0..shape.values())
                 .map(|_| random.uniform() as f32)

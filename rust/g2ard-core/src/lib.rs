@@ -1,6 +1,7 @@
 //! Geometry kernels of g2ard, in pure Rust.
 //!
-//! Data flows one way: points → [`lift`] → [`splats`] → [`simplify`] → [`raster`] and [`ssim`].
+//! Data flows one way: points → [`lift`] → [`splats`] → [`scene`] → [`raster`] → [`visibility`] → [`simplify`], [`select`]
+//! and [`train`]. [`backend`] alone knows the stages whose kernels a device may run.
 //! Results never depend on the number of threads: every reduction has a fixed order.
 
 pub mod backend;
@@ -9,6 +10,8 @@ mod cpu;
 pub mod error;
 pub mod lift;
 pub mod linalg;
+#[doc(hidden)]
+pub mod random;
 pub mod raster;
 pub mod scene;
 pub mod select;

@@ -1,4 +1,4 @@
-//! The device as policies see it: the twins where they serve, the CPU where they do not, and why.
+//! The device as policies see it: the twins where they work, the CPU where they do not, and the reasons.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -27,7 +27,7 @@ pub enum Choice {
 /// Rows below which opening a device takes longer than the CPU needs for the work.
 const WORTH_OPENING: usize = 200_000;
 
-/// A backend that runs the twins and goes on with the CPU, for good, once a device fails it.
+/// A backend that runs the twins, and only the CPU's kernels once a device has failed: a failed device is not retried.
 #[derive(Debug, Default)]
 pub struct Device {
     choice: Choice,
@@ -118,7 +118,7 @@ impl Device {
         }
     }
 
-    /// A real GPU that is faster than the CPU. Having none, or no room for one, is nothing to tell of.
+    /// A real GPU that is faster than the CPU. Having none, or too little memory for one, is not reported.
     fn worthwhile(&self) -> crate::runtime::Result<Option<Gpu>> {
         guarded(|| match Gpu::open(false, self.options) {
             Ok(gpu) => Ok(probe::pays(&gpu)?.then_some(gpu)),

@@ -1,5 +1,6 @@
 //! The device as policies see it: the paper's policy whole, and every way in which a device fails.
 
+use g2ard_core::random::Lcg;
 use g2ard_core::scene::{Means, Ordered, SceneRef};
 use g2ard_core::simplify::{Outcome, Paper, PaperRound};
 use g2ard_core::{Backend, Control, Cpu};
@@ -16,13 +17,8 @@ struct Scene {
 
 /// A wavy sheet at UTM offsets.
 fn scene(count: usize) -> Scene {
-    let mut state = 3u64;
-    let mut next = || {
-        state = state
-            .wrapping_mul(6364136223846793005)
-            .wrapping_add(1442695040888963407);
-        (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
-    };
+    let mut random = Lcg(3);
+    let mut next = || random.centred();
     let mut scene = Scene {
         means: Vec::new(),
         quats: Vec::new(),

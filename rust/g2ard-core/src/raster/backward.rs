@@ -15,7 +15,7 @@ use super::{ALPHA_MIN, BLOCKS, Settings, TILE};
 pub const SUMS: usize = 10;
 
 /// A tile's incoming gradients and the state carried from back to front, block by block: what a block needs lies side
-/// by side, for rows 4 KiB apart would wait for each other's stores.
+/// by side: loads and stores 4 KiB apart would alias.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Incoming([Block; BLOCKS]);
 
@@ -25,7 +25,7 @@ struct Block {
     given: [Lanes16; 5],
     /// Transmittance in front of the pair last done.
     transmittance: Lanes16,
-    /// What lies behind, seen without the light lost in front and dotted with the gradient: R·g. Carrying it,
+    /// The colour behind, as if unoccluded, dotted with the gradient: R·g. Carrying it,
     /// dα = T(c·g − R·g) never divides by 1 − α.
     behind: Lanes16,
     last: Lanes16,
@@ -84,7 +84,7 @@ pub struct Backward<'a, const WITH_DEPTH: bool> {
     pub rect: TileRect,
     pub settings: &'a Settings,
     pub background: [f32; 3],
-    /// What the forward pass left: one entry per batch it looked at.
+    /// From the forward pass: one entry per batch it processed.
     pub block_masks: &'a [[u64; BLOCKS]],
     pub transmittance: &'a [Lanes16; BLOCKS],
     pub last: &'a [Lanes16; BLOCKS],
@@ -123,24 +123,24 @@ impl<const WITH_DEPTH: bool> Kernel for Backward<'_, WITH_DEPTH> {
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
             load_batch(self.batch, self.pairs, first, self.splats, &self.rect);
             for pair in pairs {
-                // SAFETY: only its address is asked for.
+                // SAFETY: only the address is used.
                 unsafe { prefetch(&*self.slots.at(pair.slot as usize)) };
             }
             let s = &*self.batch;
             let mut list = [0; BATCH * BLOCKS + 1];
             let count = list_items(block_masks, &mut list);
-            let look = Look {
+            let evaluator = Evaluator {
                 batch: s,
                 minimum,
                 clip,
             };
             let mut sums = [F::zero(); SUMS];
-            let mut ahead = look.at(list[0], state);
+            let mut ahead = evaluator.at(list[0], state);
             for i in 0..count {
                 let (item, next) = (list[i], list[i + 1]);
                 let now = ahead;
-                // Looked at one item ahead: nothing here depends on what the other pairs of its block leave behind.
-                ahead = look.at(next, state);
+                // Evaluated one item ahead: nothing here depends on the other pairs of its block.
+                ahead = evaluator.at(next, state);
                 let (pair, block) = split(item);
                 now.blend::<WITH_DEPTH>(&s[pair], &mut state[block], &mut sums);
                 if split(next).0 != pair {
@@ -169,7 +169,7 @@ fn split(item: Item) -> (usize, usize) {
     (pair.min(BATCH), item as usize % BLOCKS)
 }
 
-/// The items of a batch from its last pair to its first, and one past the end that looks at nothing. Returns how many.
+/// The items of a batch from its last pair to its first, and one past the end that evaluates nothing. Returns how many.
 #[inline(always)]
 fn list_items(block_masks: &[u64; BLOCKS], list: &mut [Item; BATCH * BLOCKS + 1]) -> usize {
     const PAIRS: usize = u64::BITS as usize / BLOCKS;
@@ -191,8 +191,8 @@ fn list_items(block_masks: &[u64; BLOCKS], list: &mut [Item; BATCH * BLOCKS + 1]
     count
 }
 
-/// What looking at an item needs that the items of a batch share.
-struct Look<'a, F: Lanes> {
+/// What evaluating the items of a batch needs.
+struct Evaluator<'a, F: Lanes> {
     batch: &'a TileSplats,
     minimum: F,
     clip: F,
@@ -200,7 +200,7 @@ struct Look<'a, F: Lanes> {
 
 /// An item's α and 1/(1 − α), and where α follows its arguments.
 #[derive(Clone, Copy)]
-struct Seen<F: Lanes> {
+struct Evaluated<F: Lanes> {
     u: F,
     v: F,
     a: F,
@@ -208,9 +208,9 @@ struct Seen<F: Lanes> {
     free: F::Mask,
 }
 
-impl<F: Lanes> Look<'_, F> {
+impl<F: Lanes> Evaluator<'_, F> {
     #[inline(always)]
-    fn at(&self, item: Item, state: &[Block; BLOCKS]) -> Seen<F> {
+    fn at(&self, item: Item, state: &[Block; BLOCKS]) -> Evaluated<F> {
         let (p, block) = split(item);
         let (x, y) = block_coordinates::<F>(block);
         let near = &self.batch[p];
@@ -220,7 +220,7 @@ impl<F: Lanes> Look<'_, F> {
             .and(F::load(&state[block].last).ge(F::splat(near.number)));
         let raw = alpha(log2);
         let a = raw.min(self.clip).only(hit);
-        Seen {
+        Evaluated {
             u,
             v,
             a,
@@ -230,7 +230,7 @@ impl<F: Lanes> Look<'_, F> {
     }
 }
 
-impl<F: Lanes> Seen<F> {
+impl<F: Lanes> Evaluated<F> {
     /// Steps the block's state to before the pair, and adds to the pair's sums.
     #[inline(always)]
     fn blend<const WITH_DEPTH: bool>(self, s: &TileSplat, g: &mut Block, sums: &mut [F; SUMS]) {

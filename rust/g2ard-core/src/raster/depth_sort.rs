@@ -65,15 +65,14 @@ fn scatter(from: &[Key], to: &mut [Key], shift: u32) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::random::Lcg;
 
     #[test]
     fn sorts_stably() {
-        let mut state = 1u32;
+        let mut random = Lcg(1);
         let mut keys: Vec<Key> = (0..100_000)
             .map(|splat| {
-                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                let depth = (f32::from_bits(0x3f80_0000 | (state >> 9)) * 3.0).floor()
-                    + (state >> 22) as f32;
+                let depth = (random.uniform_f32() * 3.0).floor() + (random.integer() >> 14) as f32;
                 Key {
                     depth: depth.to_bits(),
                     splat,

@@ -15,7 +15,7 @@ pub struct Pixels {
     pub median: [Lanes16; BLOCKS],
 }
 
-/// Blends a tile. Leaves in `block_masks` the pairs that really contributed, block by block.
+/// Blends a tile. `block_masks` holds the pairs that contributed to each block afterwards.
 pub struct Forward<'a, const DEPTH: bool> {
     pub pairs: &'a [Pair],
     pub splats: &'a [Splat],
@@ -31,7 +31,7 @@ pub struct Forward<'a, const DEPTH: bool> {
 }
 
 impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
-    /// Batches looked at before every pixel had stopped.
+    /// Batches processed before every pixel had stopped.
     type Output = usize;
 
     #[inline(always)]
@@ -40,7 +40,7 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
         *self.transmittance = [Lanes16([1.0; LANES]); BLOCKS];
         *self.last = [Lanes16([-1.0; LANES]); BLOCKS];
         // The light that would be left if nothing ever stopped. A stopped pixel's only falls further below the
-        // minimum, so "would it stop here" needs no memory, and the loop below waits for nothing but one product.
+        // minimum, so whether it would stop here needs no state, and the loop below depends on one product alone.
         // Pixels off the image start without light.
         let mut unstopped = [Lanes16::default(); BLOCKS];
         for b in 0..BLOCKS {

@@ -1,4 +1,4 @@
-//! The fixed-order sum of each Gaussian's slots, and what becomes of the gradient.
+//! The sum of each Gaussian's slots in a fixed order, and where the gradient goes.
 
 use super::backward::SUMS;
 use super::disjoint::DisjointSlice;
@@ -122,7 +122,7 @@ impl Sink for RowMajor {
     }
 }
 
-/// Throws the gradients away: for timing what leads up to them.
+/// Discards the gradients: for timing the passes before.
 #[derive(Clone, Copy)]
 pub(crate) struct Discard;
 

@@ -1,8 +1,8 @@
-//! The tiled differentiable rasteriser: one room per pass.
+//! The tiled differentiable rasteriser: one file per pass.
 //!
 //! [`project`] turns 16 Gaussians at a time into screen splats, and [`tile_lists`] lists the 16×16 tiles that each one's
-//! ellipse at α = 1/255 really meets; [`depth_sort`] sorts them by depth once; [`tiles`] scatters them stably into their tiles;
-//! [`tile_batch`] brings a tile's pairs to its own coordinates; [`forward`] blends each tile, 4×4 pixels to a register; [`backward`] walks the same pairs from back to front, each pair summing into its own slot; [`gradients`]
+//! ellipse at α = 1/255 meets; [`depth_sort`] sorts them by depth once; [`tiles`] scatters them stably into their tiles;
+//! [`tile_batch`] holds a tile's pairs in the tile's coordinates; [`forward`] blends each tile, 4×4 pixels to a register; [`backward`] walks the same pairs from back to front, each pair summing into its own slot; [`gradients`]
 //! adds a Gaussian's slots in order and goes back through the projection. No atomics: the bits do not depend on threads.
 //!
 //! Conventions (gsplat's by default): pixel centres at +0.5; 0.3 px² dilation; α = min(0.99, opacity·exp(−q)); α < 1/255
@@ -122,7 +122,7 @@ impl Camera {
     }
 }
 
-/// Whose rasteriser to agree with where they differ.
+/// Which rasteriser to agree with where they differ.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Convention {
     #[default]

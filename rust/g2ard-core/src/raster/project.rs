@@ -17,7 +17,7 @@ const DET_MAX: f32 = 1e33;
 /// INRIA's floor under det Σ₂ / det(Σ₂ + 0.3 I).
 const INRIA_FLOOR: f32 = 2.5e-5;
 
-/// A camera's numbers in the form the kernels want.
+/// A camera's numbers in the form the kernels take.
 #[derive(Debug, Clone, Copy)]
 pub struct View {
     rotation: [[f64; 3]; 3],
@@ -315,6 +315,8 @@ pub fn unit_quaternion<F: Lanes, S: Source>(source: &S, group: usize) -> ([F; 4]
     (q, rn * shrink)
 }
 
+/// The rotation of unit quaternions, in lanes of f32. [`crate::linalg::rotation_from_quat`] is the scalar f64 one, which
+/// normalises too: SIMD lanes cannot share its code, nor f32 its bits.
 #[inline(always)]
 pub fn rotation<F: Lanes>(q: &[F; 4]) -> [[F; 3]; 3] {
     let [w, x, y, z] = *q;

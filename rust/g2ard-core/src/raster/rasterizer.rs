@@ -1,4 +1,4 @@
-//! The passes in order, and the buffers they share: one view's worth, reused from call to call.
+//! The passes in order, and the buffers they share: those of one view, reused from call to call.
 
 mod sensitive;
 mod tiled;
@@ -60,7 +60,7 @@ pub struct Rasterizer {
     order: Vec<Key>,
     spare: Vec<Key>,
     bins: Bins,
-    /// First batch of each tile, and how many the forward pass looked at.
+    /// First batch of each tile, and how many the forward pass processed.
     batches: Vec<(usize, usize)>,
     block_masks: Vec<[u64; BLOCKS]>,
     transmittance: Vec<[Lanes16; BLOCKS]>,
@@ -129,7 +129,7 @@ impl Rasterizer {
         Ok(())
     }
 
-    /// Goes back from the last forward pass; `params` must be the very ones it rendered.
+    /// Gradients of the last forward pass; `params` must be the ones it rendered.
     pub fn backward(
         &mut self,
         params: &Params,
@@ -256,20 +256,20 @@ impl Rasterizer {
         };
         let rows = SharedSums::new(sums);
         self.accumulate_from::<ALL, _>(colourless, camera, settings, |row, total| {
-            // SAFETY: every row is told of once.
+            // SAFETY: the call comes once for every row.
             unsafe { rows.add(row, &total) };
         });
         smallest_pixels(params, camera, &mut sums.pixel_size);
         Ok(())
     }
 
-    /// Calls `tell(row, its sums)` once for every row that may touch the view's image, in parallel.
+    /// Calls `visit(row, its sums)` once for every row that may touch the view's image, in parallel.
     pub(crate) fn accumulate_from<const KINDS: usize, S: Source>(
         &mut self,
         source: S,
         camera: &Camera,
         settings: &Settings,
-        tell: impl Fn(usize, Total) + Sync,
+        visit: impl Fn(usize, Total) + Sync,
     ) {
         self.prepare(source, camera, settings, [0.0; 3]);
         self.accumulate_tiles::<KINDS>();
@@ -279,10 +279,10 @@ impl Rasterizer {
             let slots = self.bins.slots_of(chunk);
             let (shares, written) = (&shares[slots.clone()], &self.written[slots]);
             for splat in &self.splats[first..first + count] {
-                tell(splat.row as usize, Total::of(splat, shares, written));
+                visit(splat.row as usize, Total::of(splat, shares, written));
             }
         });
-        self.state = None; // nothing was blended that a backward pass could go back from
+        self.state = None; // no state that a backward pass could use
     }
 
     /// What the buffers hold now.

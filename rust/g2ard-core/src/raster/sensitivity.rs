@@ -1,5 +1,5 @@
 //! How much each Gaussian's rect and size matter to a view: F = Σ over pixels and channels of g gᵀ, g = ∂C/∂(mean,
-//! log scale), 6×6 a Gaussian. What pruning by sensitivity (PUP 3D-GS) ranks by.
+//! log scale), 6×6 a Gaussian. Pruning by sensitivity (PUP 3D-GS) ranks by it.
 //!
 //! Of a pixel, g is linear in φ = (u, v, u², uv, v²): g = L·(h φ) + w·d, with h = ∂C/∂(ln α), w = αT, and L (6×5) and d
 //! (by the viewing direction in SH) the same for every pixel of a view. So a pixel adds to moments of u and v only.
@@ -34,7 +34,7 @@ const PRODUCT: [[usize; 5]; 5] = [
 #[derive(Clone, Copy, Default)]
 struct Block {
     transmittance: Lanes16,
-    /// The colour behind, seen without the light lost in front.
+    /// The colour behind, as if unoccluded.
     behind: [Lanes16; 3],
     last: Lanes16,
 }
@@ -45,7 +45,7 @@ pub struct Sensitivity<'a> {
     pub splats: &'a [Splat],
     pub rect: TileRect,
     pub settings: &'a Settings,
-    /// What the forward pass left.
+    /// From the forward pass.
     pub block_masks: &'a [[u64; BLOCKS]],
     pub transmittance: &'a [Lanes16; BLOCKS],
     pub last: &'a [Lanes16; BLOCKS],

@@ -1,4 +1,4 @@
-//! Sixty-four of a tile's pairs, brought to the tile's own coordinates, and the 4×4-pixel blocks each of them reaches.
+//! Sixty-four of a tile's pairs in the tile's own coordinates, and the 4×4-pixel blocks each of them reaches.
 
 use super::memory::prefetch;
 use super::project::Splat;
@@ -6,10 +6,10 @@ use super::simd::{LANES, Lanes, Lanes16, Mask};
 use super::tiles::Pair;
 use super::{ALPHA_MIN, BLOCKS, TILE};
 
-/// Pairs looked at together: a bit each in a block's word.
+/// Pairs processed together: a bit each in a block's mask.
 pub const BATCH: usize = 64;
 
-/// A tile's splats lie scattered in memory: each is asked for this many pairs before it is needed.
+/// A tile's splats lie scattered in memory: each is prefetched this many pairs before it is needed.
 const AHEAD: usize = 24;
 
 /// A pair's splat relative to the tile's first pixel centre: what the pixels' loops read, in one cache line.
@@ -200,7 +200,7 @@ impl TileBatch {
         }
     }
 
-    /// Bit p of word b: whether pair p reaches α = 1/255 anywhere in block b's rectangle of pixel centres. The minimum
+    /// Bit p of mask b: whether pair p reaches α = 1/255 anywhere in block b's rectangle of pixel centres. The minimum
     /// of the quadratic over a rectangle lies on one of the two sides nearest to the centre (or is the centre).
     #[inline(always)]
     pub fn reachable<F: Lanes>(&self, count: usize, block_masks: &mut [u64; BLOCKS]) {
@@ -219,7 +219,7 @@ impl TileBatch {
             };
             // What an earlier batch left past the end reaches nothing.
             let real = F::Mask::from_bits(((1u32 << (count - first).min(LANES)) - 1) as u16);
-            // Room for the rounding of what follows: more than enough costs time, never correctness.
+            // Slack for the rounding of what follows: too much costs time, never correctness.
             let size = a.fma(cx.abs(), (b.abs() + c) * cy.abs());
             let level = log2_opacity - F::splat(ALPHA_MIN.log2() - 0.01);
             let level = F::select(real, size.fma(F::splat(2e-6), level), F::splat(-1.0));
@@ -293,6 +293,7 @@ pub fn alpha<F: Lanes>(log2: F) -> F {
 mod tests {
     use super::super::simd::{Isa, Kernel, dispatch};
     use super::*;
+    use crate::random::Lcg;
 
     struct Reachable<'a>(&'a TileBatch, usize);
 
@@ -308,13 +309,8 @@ mod tests {
 
     #[test]
     fn block_masks_miss_no_pixel_and_little_else() {
-        let mut state = 3u64;
-        let mut random = || {
-            state = state
-                .wrapping_mul(6_364_136_223_846_793_005)
-                .wrapping_add(1_442_695_040_888_963_407);
-            (state >> 40) as f32 / (1u64 << 24) as f32
-        };
+        let mut source = Lcg(3);
+        let mut random = || source.uniform_f32();
         let rect = TileRect {
             x: 32,
             y: 16,

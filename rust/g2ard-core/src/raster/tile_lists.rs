@@ -6,7 +6,7 @@ use super::TILE;
 use super::memory::bytes;
 use super::simd::{LANES, Lanes, Lanes16};
 
-/// Tiles a [`TileList`] holds itself: as many as half a cache line has room for.
+/// Tiles a [`TileList`] holds inline: as many as fit into half a cache line.
 const INLINE: usize = 12;
 
 /// One splat's tiles, row by row, left to right.
@@ -16,15 +16,15 @@ pub struct TileList {
     /// Its first slot, among those of its chunk.
     pub slot: u32,
     pub tiles: u32,
-    /// The tiles; of more than `INLINE`, or in an image of more tiles than a u16 counts, where they start in the
-    /// chunk's list, in two halves.
+    /// The tiles. Of more than `INLINE`, or in an image of more tiles than a u16 counts: where they start in the
+    /// chunk's overflow list, as two halves.
     inline: [u16; INLINE],
 }
 
 const _: () = assert!(size_of::<TileList>() == 32);
 
 impl TileList {
-    /// Takes the `count` tiles of `rows`, each a stretch of tile numbers; what there is no room for goes to the list.
+    /// Stores the `count` tiles of `rows`, each a range of tile numbers; what does not fit goes to the overflow list.
     #[inline(always)]
     fn set(
         &mut self,
@@ -84,7 +84,7 @@ pub struct Ellipses<F: Lanes> {
     pub a: F,
     pub b: F,
     pub c: F,
-    /// u² + v² there, and a little more: kernels test every pixel, so too much costs time, never correctness.
+    /// u² + v² there, with slack: kernels test every pixel, so too much costs time, never correctness.
     pub level: F,
     /// Half its width and height.
     pub half: [F; 2],
@@ -128,10 +128,10 @@ fn whole(value: f32) -> usize {
     unsafe { value.to_int_unchecked::<i32>() as usize }
 }
 
-/// A chunk's tiles, and scratch.
+/// Intersects a chunk's ellipses with tiles: what its lists overflow into, and scratch.
 #[derive(Debug, Default)]
 pub struct TileIntersector {
-    /// Those that its tile_lists have no room for.
+    /// Tiles that do not fit into their lists.
     pub list: Vec<u32>,
     /// The ends of sixteen ellipses in one row of tiles after another.
     ends: Vec<[Lanes16; 2]>,
@@ -243,6 +243,7 @@ mod tests {
     use super::super::project::Splat;
     use super::super::simd::{Isa, Kernel, dispatch};
     use super::*;
+    use crate::random::Lcg;
 
     /// One splat's tile_list, in lane 0.
     struct Covers<'a> {
@@ -296,13 +297,8 @@ mod tests {
 
     #[test]
     fn tiles_are_exact() {
-        let mut state = 7u64;
-        let mut random = || {
-            state = state
-                .wrapping_mul(6_364_136_223_846_793_005)
-                .wrapping_add(1_442_695_040_888_963_407);
-            (state >> 40) as f32 / (1u64 << 24) as f32
-        };
+        let mut source = Lcg(7);
+        let mut random = || source.uniform_f32();
         let tiles = (6, 5);
         let (mut met, mut extra) = (0, 0);
         for _ in 0..200 {

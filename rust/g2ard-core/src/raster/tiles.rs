@@ -11,7 +11,7 @@ use super::tile_lists::{TileIntersector, TileList, narrow};
 
 /// How many stretches the depth order is cut into: fixed, so that the work splits alike for any number of threads.
 const STRETCHES: usize = 16;
-/// Keys a stretch reads ahead of itself: what they point at lies scattered.
+/// Keys a stretch prefetches ahead of itself: what they point at lies scattered.
 const AHEAD: usize = 16;
 /// A splat in a tile, and the slot this pair's gradient goes to.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]

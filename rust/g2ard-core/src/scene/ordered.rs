@@ -1,4 +1,4 @@
-//! The order of a scene: neighbours in space are neighbours in memory, whatever the order of the caller's rows.
+//! The order of a scene: neighbours in space become neighbours in memory, whatever the order of the caller's rows.
 
 use rayon::prelude::*;
 

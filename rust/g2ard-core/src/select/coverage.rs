@@ -78,7 +78,7 @@ impl Problem<'_> {
     /// The `k` views that greedy maximisation of F picks.
     ///
     /// F is monotone and submodular, so a gain once computed bounds all later ones: lazily, only the view
-    /// that leads by its bound is looked at again (CELF). `lazy: false` looks at all of them, each time.
+    /// that leads by its bound is evaluated again (CELF). `lazy: false` evaluates all of them, each time.
     pub fn greedy(
         &self,
         k: usize,

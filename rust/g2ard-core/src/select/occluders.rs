@@ -6,7 +6,7 @@ use super::Gaussians;
 use super::pinhole::{ALPHA_MIN, Pinhole};
 use crate::spatial::{RobustBounds, codes, order};
 
-/// Rows in a block: few enough that blocks are small, many enough that looking at blocks costs nothing.
+/// Rows in a block: few enough that blocks are small, many enough that testing blocks costs next to nothing.
 const BLOCK: usize = 64;
 
 /// A scene's Gaussians in Morton order.

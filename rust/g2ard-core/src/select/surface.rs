@@ -115,7 +115,7 @@ impl Surface {
 fn cell(scene: &Gaussians<'_>, members: &[u32]) -> ([f64; 3], [f64; 3], f64, f64) {
     let rows = || members.iter().map(|&i| i as usize);
     let area: f64 = rows().map(|i| scene.footprint(i)).sum();
-    // Members that cover nothing still have a place.
+    // Members without area still count by position.
     let mass = |i: usize| {
         if area > 0.0 {
             scene.footprint(i) / area

@@ -1,4 +1,4 @@
-//! What each view sees: how far, and which surface cells.
+//! What each view sees: its depths, and which surface cells.
 
 use rayon::prelude::*;
 
@@ -9,7 +9,7 @@ use super::pinhole::Pinhole;
 use crate::raster::Camera;
 use crate::{Control, Result};
 
-/// For each camera what it shows of the scene: see [`statistics_of`].
+/// For each camera the share of its pixels that show the scene, and their median depth: see [`statistics_of`].
 pub fn view_statistics(
     scene: &Occluders,
     cameras: &[Camera],

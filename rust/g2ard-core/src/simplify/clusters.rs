@@ -87,7 +87,7 @@ impl Partition {
 
 const CHUNK: usize = 1024;
 
-/// A cluster's Gaussian; its SH wait for the one array they all go to.
+/// A cluster's Gaussian; its SH are written later, into the one array of all.
 struct Made {
     mean: [f64; 3],
     quat: [f32; 4],

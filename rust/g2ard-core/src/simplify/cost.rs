@@ -38,7 +38,7 @@ pub struct Node {
     pub alpha: f32,
     /// Σ α·A, A with the dilation: light stopped, as rendered.
     pub mass: f32,
-    /// Σ αT over the views, or what stands for it.
+    /// Σ αT over the views, or its estimate.
     pub visibility: f32,
     /// A_d.
     pub areas: Lanes,
@@ -215,7 +215,7 @@ impl Node {
         };
         let (p, q, r) = (self.alpha, other.alpha, m.alpha);
         if r < MIN_ALPHA && p.max(q) >= MIN_ALPHA {
-            return f32::MAX; // what is spread so thin that nobody draws it would be lost
+            return f32::MAX; // spread so thin that it is no longer drawn, its light would be lost
         }
         let (u, v) = (share * p, (1.0 - share) * q);
         let (mut geo, mut col) = (0.0, 0.0);
@@ -253,6 +253,7 @@ pub fn color_distance(a: &[f32], b: &[f32]) -> f32 {
 mod tests {
     use super::*;
     use crate::linalg::{Sym3, covariance, dot, rotation_from_quat};
+    use crate::random::Lcg;
 
     type Flat = ([f64; 2], [f64; 3]);
 
@@ -329,13 +330,8 @@ mod tests {
 
     #[test]
     fn equals_the_projected_squared_error_in_f64() {
-        let mut state = 11u64;
-        let mut next = || {
-            state = state
-                .wrapping_mul(6364136223846793005)
-                .wrapping_add(1442695040888963407);
-            (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
-        };
+        let mut random = Lcg(11);
+        let mut next = || random.centred();
         let mut node = || {
             let r = rotation_from_quat([next(), next(), next(), next()]);
             let scales = [0, 1, 2].map(|_| (3.0 * next()).exp());

@@ -1,4 +1,4 @@
-//! How much a row counts where no view tells.
+//! How much a row counts where there are no views: an estimate of Σ αT.
 
 use super::cost::Node;
 

@@ -10,7 +10,7 @@ use super::pairwise::Visibility;
 use super::rows::Rows;
 use crate::scene::{Ordered, SceneRef};
 
-/// What a few views do not see counts as if this share of its mass were: other views will see some of it.
+/// What a few views do not see counts as this share of its mass: other views will see some of it.
 const UNSEEN: f32 = 0.2;
 
 /// Largest scale and coordinate in typical sizes: beyond, f32 products of four of them would overflow.
@@ -30,7 +30,7 @@ pub struct Leaves<'a> {
     unit: f64,
     /// Σ αT that a unit of mass counts for though no view sees it.
     floor: f32,
-    /// What stands for Σ αT without views.
+    /// Estimates Σ αT without views.
     importance: Importance,
 }
 

@@ -1,7 +1,7 @@
 //! Simplification: shared parts (scene order, moments, residual flags, guards, trim) and the policies over them.
 //!
-//! A scene is first put in an order of its own ([`Ordered`](crate::scene::Ordered)); every policy works on that order, so the
-//! result depends neither on the order of the input's rows nor on the number of threads.
+//! Every policy works on a scene's own order ([`crate::scene::Ordered`]), so the result depends neither on the order of
+//! the input's rows nor on the number of threads.
 
 mod clusters;
 mod cost;

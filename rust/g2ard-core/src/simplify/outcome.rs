@@ -4,7 +4,7 @@ use super::{GONE, Step};
 use crate::Splats;
 use crate::scene::{Ordered, SceneRef};
 
-/// The simplified scene in the caller's coordinates, and what became of each of its rows.
+/// The simplified scene in the caller's coordinates, and where each input row went.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outcome<R> {
     pub splats: Splats,

@@ -6,7 +6,7 @@ use crate::{Control, Result, Splats};
 /// Band-0 spherical harmonic: colour = 0.5 + SH_C0·sh0.
 const SH_C0: f64 = 0.282_094_791_773_878_14;
 
-/// The base colour as it is seen from everywhere alike: renderers clamp at 0, images at 1.
+/// The view-independent colour, clamped as renderers (at 0) and images (at 1) clamp it.
 pub fn color(splats: &Splats, i: usize) -> [f64; 3] {
     splats.sh_of(i)[0].map(|v| (0.5 + SH_C0 * f64::from(v)).clamp(0.0, 1.0))
 }

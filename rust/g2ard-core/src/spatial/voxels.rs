@@ -198,16 +198,12 @@ pub fn search_size<E>(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::random::Lcg;
     use std::collections::HashSet;
 
     fn surface(n: usize) -> Vec<[f64; 3]> {
-        let mut state = 5u64;
-        let mut next = || {
-            state = state
-                .wrapping_mul(6364136223846793005)
-                .wrapping_add(1442695040888963407);
-            (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
-        };
+        let mut random = Lcg(5);
+        let mut next = || random.centred();
         (0..n)
             .map(|_| {
                 let (x, y) = (next() * 10.0, next() * 10.0);

@@ -146,7 +146,7 @@ fn thickness<F: Lanes>(
     group: usize,
     g: &mut RowGradients<F>,
 ) -> u16 {
-    let (q, rq) = unit_quaternion::<F, ParameterView>(parameters, group);
+    let (q, rq) = unit_quaternion::<F, ParameterView<'_>>(parameters, group);
     let r = rotation(&q);
     let normal = [F::load(&block[5]), F::load(&block[8]), F::load(&block[11])];
     let mut scale = [F::zero(); 3];

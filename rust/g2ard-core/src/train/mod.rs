@@ -39,7 +39,7 @@ pub struct Rates {
     pub sh_n: f32,
 }
 
-/// One view to learn from.
+/// What one step takes in: a view, its target, and how to learn from it.
 #[derive(Debug, Clone, Copy)]
 pub struct StepInput<'a> {
     pub camera: &'a Camera,
@@ -59,7 +59,7 @@ pub struct StepInput<'a> {
     pub regularizers: Option<Regularizers>,
 }
 
-/// What became of a step.
+/// The outcome of a step.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Report {
     /// The photometric loss before the step.
@@ -104,7 +104,7 @@ impl Trainer {
         &self.store
     }
 
-    /// Takes up an earlier [`Store::export`]; with it training goes on bit for bit.
+    /// Restores an earlier [`Store::export`]; training then continues bit for bit.
     pub fn import(&mut self, state: &Exported) -> Result<()> {
         self.store.import(state)
     }
@@ -142,7 +142,7 @@ impl Trainer {
         }
     }
 
-    /// Renders the view, compares, goes back and takes one Adam step.
+    /// Renders the view, finds the loss and its gradients, and takes one Adam step.
     pub fn step(&mut self, input: &StepInput) -> Result<Report> {
         let (loss, seconds_loss) = self.photometric_loss(input)?;
         let (updated, skipped) = self.adam_step(input);
@@ -154,7 +154,7 @@ impl Trainer {
         })
     }
 
-    /// A step up to the gradients, which are thrown away: for timing.
+    /// A step up to the gradients, which are discarded: for timing.
     pub fn gradients_only(&mut self, input: &StepInput) -> Result<Report> {
         let (loss, seconds_loss) = self.photometric_loss(input)?;
         let gradients = ImageGradients {
@@ -172,7 +172,7 @@ impl Trainer {
         })
     }
 
-    /// Renders the view and compares it with the target; returns the loss and the seconds it took.
+    /// Renders the view; returns its loss against the target and the seconds that took, and leaves the gradient.
     fn photometric_loss(&mut self, input: &StepInput) -> Result<(f64, f64)> {
         let camera = input.camera;
         camera.validate()?;
@@ -235,14 +235,14 @@ impl Trainer {
     fn adam_step(&mut self, input: &StepInput) -> (usize, usize) {
         self.biases.extend_to(self.store.most_steps() as usize + 1);
         let (biases, anchors, isa) = (&self.biases, self.anchors.as_ref(), self.isa);
-        let writer = self.store.writer();
+        let blocks = self.store.blocks();
         let finish = |sums: &ChunkSums| {
             let regularize = input.regularizers.as_ref().zip(anchors);
             dispatch(
                 isa,
                 Update {
                     sums,
-                    store: writer,
+                    blocks,
                     biases,
                     rates: &input.rates,
                     reach: input.reach,

@@ -1,4 +1,4 @@
-//! Parameters and moments in blocks of sixteen, attribute after attribute.
+//! Parameters and moments in blocks of sixteen Gaussians, attribute after attribute.
 
 use crate::raster::Params;
 use crate::raster::disjoint::DisjointSlice;
@@ -8,9 +8,9 @@ use crate::raster::simd::{LANES, Lanes, Lanes16};
 use crate::{Error, Result};
 
 /// Attributes before the SH: 3 means, 4 quats, 3 log-scales, 1 logit.
-const QUAT: usize = 3;
-const LOG_SCALE: usize = 7;
-const LOGIT: usize = 10;
+pub const QUAT: usize = 3;
+pub const LOG_SCALE: usize = 7;
+pub const LOGIT: usize = 10;
 pub const SH: usize = 11;
 
 /// N Gaussians' parameters, Adam's two moments of each, and how many steps each has taken.
@@ -211,70 +211,119 @@ impl Store {
         Ok(())
     }
 
-    pub(crate) fn parameters(&mut self) -> ParameterView {
+    /// The parameters as the rasteriser reads them.
+    pub(crate) fn parameters(&self) -> ParameterView<'_> {
         ParameterView {
-            values: DisjointSlice::new(&mut self.values),
+            values: &self.values,
+            first_group: 0,
             rows: self.rows,
             sh_coeffs: self.sh_coeffs,
-            attributes: SH + 3 * self.sh_coeffs,
         }
     }
 
-    pub(crate) fn writer(&mut self) -> Writer {
-        Writer {
-            parameters: self.parameters(),
+    /// The blocks as the threads of a step share them.
+    pub(crate) fn blocks(&mut self) -> Blocks<'_> {
+        Blocks {
+            values: DisjointSlice::new(&mut self.values),
             first: DisjointSlice::new(&mut self.first),
             second: DisjointSlice::new(&mut self.second),
-            units: DisjointSlice::new(&mut self.units),
             steps: DisjointSlice::new(&mut self.steps),
+            units: &self.units,
+            rows: self.rows,
+            sh_coeffs: self.sh_coeffs,
         }
     }
 }
 
-/// A store's parameters as the rasteriser reads them. Must not outlive the store, nor be read while a block is written.
+/// Parameters of consecutive groups, borrowed.
 #[derive(Clone, Copy)]
-pub(crate) struct ParameterView {
-    values: DisjointSlice<Lanes16>,
+pub(crate) struct ParameterView<'a> {
+    values: &'a [Lanes16],
+    /// The group that `values` begin with.
+    first_group: usize,
+    /// Of the whole store.
     rows: usize,
     sh_coeffs: usize,
-    attributes: usize,
 }
 
-/// The same, and all that a step changes. Each block must be one thread's.
-#[derive(Clone, Copy)]
-pub(crate) struct Writer {
-    pub parameters: ParameterView,
-    pub first: DisjointSlice<Lanes16>,
-    pub second: DisjointSlice<Lanes16>,
-    pub units: DisjointSlice<Lanes16>,
-    pub steps: DisjointSlice<u32>,
-}
-
-impl ParameterView {
+impl ParameterView<'_> {
     #[inline(always)]
-    pub fn index(&self, group: usize, attribute: usize) -> usize {
-        group * self.attributes + attribute
-    }
-
-    #[inline(always)]
-    pub fn get<F: Lanes>(&self, group: usize, attribute: usize) -> F {
-        // SAFETY: the store is borrowed by whoever made this, and its blocks cover all groups.
-        unsafe { F::load(&*self.values.at(self.index(group, attribute))) }
+    fn get<F: Lanes>(&self, group: usize, attribute: usize) -> F {
+        let attributes = SH + 3 * self.sh_coeffs;
+        F::load(&self.values[(group - self.first_group) * attributes + attribute])
     }
 
     #[inline(always)]
     pub fn log_scale<F: Lanes>(&self, group: usize, axis: usize) -> F {
         self.get(group, LOG_SCALE + axis)
     }
+}
 
+/// A store while threads step it, each its own blocks.
+#[derive(Clone, Copy)]
+pub(crate) struct Blocks<'a> {
+    values: DisjointSlice<Lanes16>,
+    first: DisjointSlice<Lanes16>,
+    second: DisjointSlice<Lanes16>,
+    steps: DisjointSlice<u32>,
+    units: &'a [Lanes16],
+    pub rows: usize,
+    sh_coeffs: usize,
+}
+
+/// One group's parameters, moments and counts of steps.
+pub(crate) struct Block<'a> {
+    pub group: usize,
+    /// Attribute after attribute.
+    pub values: &'a mut [Lanes16],
+    pub first: &'a mut [Lanes16],
+    pub second: &'a mut [Lanes16],
+    /// Of each lane.
+    pub steps: &'a mut [u32],
+    /// What the rate of the means is multiplied by.
+    pub units: &'a Lanes16,
+    rows: usize,
+    pub sh_coeffs: usize,
+}
+
+impl<'a> Blocks<'a> {
+    /// # Safety
+    /// `group` is one of the store's, and no other block of the group exists.
     #[inline(always)]
-    pub fn set<F: Lanes>(&self, group: usize, attribute: usize, value: F) {
-        // SAFETY: as above, and the group is this thread's.
-        unsafe { value.store(&mut *self.values.at(self.index(group, attribute))) }
+    pub unsafe fn block(&self, group: usize) -> Block<'a> {
+        let attributes = SH + 3 * self.sh_coeffs;
+        let at = group * attributes;
+        // SAFETY: the store is borrowed for 'a, its arrays hold `attributes` registers and sixteen counts of every
+        // group, and the caller promises that the group's are not borrowed elsewhere.
+        unsafe {
+            Block {
+                group,
+                values: self.values.slice(at, attributes),
+                first: self.first.slice(at, attributes),
+                second: self.second.slice(at, attributes),
+                steps: self.steps.slice(group * LANES, LANES),
+                units: &self.units[group],
+                rows: self.rows,
+                sh_coeffs: self.sh_coeffs,
+            }
+        }
     }
 }
 
-impl Source for ParameterView {
+impl Block<'_> {
+    /// Its parameters, to be read.
+    #[inline(always)]
+    pub fn parameters(&self) -> ParameterView<'_> {
+        ParameterView {
+            values: self.values,
+            first_group: self.group,
+            rows: self.rows,
+            sh_coeffs: self.sh_coeffs,
+        }
+    }
+}
+
+impl Source for ParameterView<'_> {
     #[inline(always)]
     fn len(&self) -> usize {
         self.rows

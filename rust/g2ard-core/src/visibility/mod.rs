@@ -116,19 +116,15 @@ impl VisibilityAccumulator {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::random::Lcg;
     use crate::raster::{Accumulated, Params};
 
     type Arrays = (Vec<[f32; 3]>, Vec<[f32; 4]>, Vec<[f32; 3]>, Vec<f32>);
 
     /// 1,003 Gaussians of very different sizes around the origin: means, quaternions, scales, logits.
     fn scene() -> Arrays {
-        let mut state = 7u64;
-        let mut random = || {
-            state = state
-                .wrapping_mul(6_364_136_223_846_793_005)
-                .wrapping_add(1_442_695_040_888_963_407);
-            (state >> 40) as f32 / (1u64 << 24) as f32
-        };
+        let mut source = Lcg(7);
+        let mut random = || source.uniform_f32();
         let n = 1003;
         let mut triple = |a: f32, b: f32| [0; 3].map(|_| a + (b - a) * random());
         let means = (0..n).map(|_| triple(-3.0, 3.0)).collect();

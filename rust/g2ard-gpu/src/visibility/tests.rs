@@ -4,7 +4,7 @@ use crate::testing::{gpu, gpu_with, scenes};
 use g2ard_core::Cpu;
 use g2ard_core::select::ViewKernels;
 
-/// Looks from all around, from within, and from far away.
+/// Cameras all around, within, and far away.
 fn cameras(center: [f64; 3], radius: f64) -> Vec<Camera> {
     (0..6)
         .map(|i| {

@@ -1,4 +1,4 @@
-//! The passes whose pieces of work are tiles.
+//! The passes that work tile by tile.
 
 use rayon::prelude::*;
 

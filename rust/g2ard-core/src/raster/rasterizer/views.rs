@@ -1,4 +1,4 @@
-//! What goes into a frame and comes out of it.
+//! Inputs and outputs of the passes.
 
 use std::time::Instant;
 
@@ -43,7 +43,7 @@ pub struct Passes {
     pub forward: f64,
     /// Tiles, from the image's gradient to the slots.
     pub backward: f64,
-    /// From the slots to the parameters, and whatever the caller does with their gradient there.
+    /// From the slots to the parameters, and what the caller does with their gradient.
     pub gather: f64,
 }
 

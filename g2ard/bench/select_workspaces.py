@@ -25,7 +25,7 @@ from g2ard.stages.simplify import simplify
 from g2ard.synth import CityConfig, city
 from g2ard.targets import Targets
 
-__all__ = ["KINDS", "Pool", "Size", "Stand", "label", "pool_of", "stand"]
+__all__ = ["KINDS", "Pool", "Size", "Workspace", "label", "pool_of", "workspace_of"]
 
 KINDS = ("biased", "even")
 _CROWD = 24
@@ -52,7 +52,7 @@ class Size:
 
 
 @dataclass(frozen=True, eq=False)
-class Stand:
+class Workspace:
     """One scene, ready for trials.
 
     Args:
@@ -113,7 +113,9 @@ class _Made(Targets):
         return image
 
 
-def stand(scene: Path, size: Size, *, cache: Path | None = None, progress: Progress = silent) -> Stand:
+def workspace_of(
+    scene: Path, size: Size, *, cache: Path | None = None, progress: Progress = silent
+) -> Workspace:
     """Set a scene up.
 
     A trained scene teaches itself from a made pool; a COLMAP folder with photos is lifted from its points;
@@ -132,18 +134,18 @@ def label(scene: Path) -> str:
     return scene_label(scene) if scene.exists() else scene.name
 
 
-def pool_of(stand: Stand, kind: str, seed: int) -> Pool:
+def pool_of(workspace: Workspace, kind: str, seed: int) -> Pool:
     """Candidates out of the universe.
 
     even: drawn uniformly. biased: a quarter drawn uniformly, the others out of the sixth of the universe
     (a third of a small one) that is nearest to one of its views, as real trajectories crowd somewhere.
     """
     rng = np.random.default_rng([seed, 11])
-    free = np.setdiff1d(np.arange(len(stand.targets.cameras)), stand.tests)
-    count = min(stand.candidates, len(free) * 4 // 5)
+    free = np.setdiff1d(np.arange(len(workspace.targets.cameras)), workspace.tests)
+    count = min(workspace.candidates, len(free) * 4 // 5)
     if kind == "even":
         return Pool(np.sort(rng.choice(free, count, replace=False)), np.zeros(0, np.int64))
-    positions = stand.targets.cameras.positions
+    positions = workspace.targets.cameras.positions
     near = free[np.argsort(np.linalg.norm(positions[free] - positions[rng.choice(free)], axis=1))]
     crowded = near[: len(near) // 6] if len(near) >= 6 * count else near[: len(near) // 3]
     crowded = rng.permutation(crowded)
@@ -154,7 +156,7 @@ def pool_of(stand: Stand, kind: str, seed: int) -> Pool:
     return Pool(np.sort(np.concatenate([many, few])), np.sort(crowd))
 
 
-def _trained(scene: Path, size: Size, cache: Path | None, progress: Progress) -> Stand:
+def _trained(scene: Path, size: Size, cache: Path | None, progress: Progress) -> Workspace:
     prior = io.read_splats(scene)
     planned = plan_pool(prior, 7 * size.candidates, seed=1, progress=progress)
     universe = planned.cameras.resized(size.pixels)
@@ -169,7 +171,7 @@ def _trained(scene: Path, size: Size, cache: Path | None, progress: Progress) ->
     def image(cameras: Cameras, view: int) -> Image:
         return renderer.image(cameras[view])
 
-    return Stand(
+    return Workspace(
         prior=prior,
         student=_reduced(prior, size),
         targets=_Made(universe, image, cache),
@@ -189,7 +191,7 @@ def _nearer(prior: Splats, cameras: Cameras) -> Cameras:
     return replace(cameras, viewmats=viewmats)
 
 
-def _city(size: Size, cache: Path | None) -> Stand:
+def _city(size: Size, cache: Path | None) -> Workspace:
     height = round(size.pixels * 3 / 4)
     config = CityConfig(points=120_000, views=2000, size=(size.pixels, height))
     town = city(config)
@@ -197,7 +199,7 @@ def _city(size: Size, cache: Path | None) -> Stand:
     prior = lift(scan.positions, scan.colors)
     universe, outside = town.views["train"], town.views["ood"]
     rows = np.arange(len(universe))
-    return Stand(
+    return Workspace(
         prior=prior,
         student=_reduced(prior, size),
         targets=_Made(universe, town.photo, cache),
@@ -210,7 +212,7 @@ def _city(size: Size, cache: Path | None) -> Stand:
     )
 
 
-def _photos(folder: Path, size: Size) -> Stand:
+def _photos(folder: Path, size: Size) -> Workspace:
     """Outside is the eighth of the photos at one end of the site; of the others those are tests that the
     folder states as such, else every 8th."""
     found = io.read_view_set(folder)
@@ -222,7 +224,7 @@ def _photos(folder: Path, size: Size) -> Stand:
     centred = cameras.positions - cameras.positions.mean(0)
     along = np.argsort(centred @ np.linalg.svd(centred, full_matrices=False)[2][0])
     far, rest = along[: len(along) // 8], np.sort(along[len(along) // 8 :])
-    return Stand(
+    return Workspace(
         prior=prior,
         student=_reduced(prior, size),
         targets=_Made(cameras.take(rest), load_image),

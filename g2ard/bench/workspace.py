@@ -36,7 +36,7 @@ from g2ard.targets import Photos, PhotosOrRenders, Targets, TeacherRenders
 if TYPE_CHECKING:
     from g2ard.stages.render import RasterSettings
 
-__all__ = ["Stage", "Stand", "fingerprint", "folder_of", "scene_key"]
+__all__ = ["Stage", "Workspace", "fingerprint", "folder_of", "scene_key"]
 
 _POOL = 128
 _MAX_LOGIT = 20.0
@@ -77,7 +77,7 @@ class Stage:
     report: dict[str, Any]
 
 
-class Stand:
+class Workspace:
     """One scene of a definition with its priors, views and targets, and the stages run on it.
 
     All lives in `folder`; a stage whose key is there already is not run again.

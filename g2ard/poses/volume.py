@@ -12,7 +12,7 @@ from g2ard.errors import InputError
 from g2ard.poses.numbers import canonical_order, middle, norms, quantile
 from g2ard.splats import Splats
 
-__all__ = ["Matter", "Sample"]
+__all__ = ["OccupiedVolume", "Sample"]
 
 Floats = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ class Sample:
 
 
 @dataclass(frozen=True, eq=False)
-class Matter:
+class OccupiedVolume:
     """Opaque Gaussians: scene = origin + size·points.
 
     The rows stand in an order that depends on their values alone, and each prefix is a fair sample.
@@ -64,7 +64,7 @@ class Matter:
         opacities: (M,) in (0, 1].
         origin: (3,) relative to the scene's offset.
         size: scene units per unit here: half the diagonal of the box that holds 98 % along each axis.
-        stand_for: how many Gaussians each row stands for: more than 1 in a sample.
+        represents: how many Gaussians each row stands for: more than 1 in a sample.
     """
 
     points: Floats
@@ -75,10 +75,10 @@ class Matter:
     opacities: Floats
     origin: Floats
     size: float
-    stand_for: float = 1.0
+    represents: float = 1.0
 
     @classmethod
-    def of(cls, splats: Splats, limit: int | None = None) -> Matter:
+    def of(cls, splats: Splats, limit: int | None = None) -> OccupiedVolume:
         """Weigh a scene's rows, leave out what is invisible or far off, and normalise the rest.
 
         Of more than `limit` rows only a fair sample is looked at.
@@ -90,7 +90,7 @@ class Matter:
         rows = np.flatnonzero(opacities > 1 / 255)
         visible = len(rows)
         rows = rows[canonical_order(splats, rows)[:limit]]
-        stand_for = visible / max(1, len(rows))
+        represents = visible / max(1, len(rows))
         if len(rows):
             rows = rows[splats.take(rows).finite_rows()]
         opacities = opacities[rows]
@@ -113,7 +113,7 @@ class Matter:
             opacities=opacities[near],
             origin=origin,
             size=size,
-            stand_for=stand_for,
+            represents=represents,
         )
 
     def sample(self) -> Sample:
