@@ -252,8 +252,6 @@ impl Total {
 pub fn smallest_pixels(params: &Params, camera: &Camera, sizes: &mut [f32]) {
     let means = params.means.as_chunks::<3>().0;
     sizes.par_iter_mut().zip(means).for_each(|(size, mean)| {
-        if let Some(here) = camera.pixel_size(mean.map(f64::from)) {
-            *size = size.min(here);
-        }
+        camera.lower_pixel_size(mean.map(f64::from), size);
     });
 }

@@ -71,6 +71,9 @@ pub(crate) fn check_count(rows: usize) -> Result<()> {
 
 /// Sixteen Gaussians' values by attribute. Lanes past the end repeat the last row.
 pub(crate) trait Source: Copy + Sync {
+    /// Whether there are colours; without, splats are black.
+    const COLOURED: bool = true;
+
     fn len(&self) -> usize;
     fn sh_coeffs(&self) -> usize;
     fn mean<F: Lanes>(&self, group: usize, axis: usize) -> F;

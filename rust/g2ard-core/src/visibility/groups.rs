@@ -75,6 +75,8 @@ impl CulledGroups<'_> {
 }
 
 impl Source for CulledGroups<'_> {
+    const COLOURED: bool = false;
+
     #[inline(always)]
     fn len(&self) -> usize {
         self.rows
@@ -99,7 +101,6 @@ impl Source for CulledGroups<'_> {
     fn logit_opacity<F: Lanes>(&self, group: usize) -> F {
         self.value(group, 10)
     }
-    /// No image, no colours.
     #[inline(always)]
     fn sh<F: Lanes>(&self, _group: usize, _k: usize, _c: usize) -> F {
         F::zero()

@@ -105,9 +105,7 @@ impl VisibilityAccumulator {
             // SAFETY: no two groups share rows.
             let sizes = unsafe { pixel_size.slice(first, LANES.min(count - first)) };
             for (lane, size) in sizes.iter_mut().enumerate() {
-                if let Some(here) = camera.pixel_size(self.groups[g as usize].mean(lane)) {
-                    *size = size.min(here);
-                }
+                camera.lower_pixel_size(self.groups[g as usize].mean(lane), size);
             }
         });
     }

@@ -37,10 +37,13 @@ impl<S: Source> Kernel for Project<'_, S> {
             let tile_lists = &mut self.tile_lists[count..some];
             p.ellipses(self.view)
                 .tile_lists(bits, self.tiles, self.intersector, tile_lists);
-            let (dir, _) = direction::<F, S>(self.view, &self.source, group);
-            let mut basis = [F::zero(); 16];
-            sh::basis(self.source.sh_coeffs(), dir[0], dir[1], dir[2], &mut basis);
-            let rgb = colour::<F, S>(&self.source, group, &basis);
+            let mut rgb = [F::zero(); 3];
+            if S::COLOURED {
+                let (dir, _) = direction::<F, S>(self.view, &self.source, group);
+                let mut basis = [F::zero(); 16];
+                sh::basis(self.source.sh_coeffs(), dir[0], dir[1], dir[2], &mut basis);
+                rgb = colour::<F, S>(&self.source, group, &basis);
+            }
             let (mut x, mut y) = ([0.0; LANES], [0.0; LANES]);
             p.x.store(&mut x);
             p.y.store(&mut y);
