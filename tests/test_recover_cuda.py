@@ -71,7 +71,7 @@ def test_the_engine_hands_gsplat_what_it_documents(monkeypatch: pytest.MonkeyPat
         recover(student, TARGETS, RecoverConfig(steps=4, engine=engine, background=(0.2, 0.4, 0.1))).report
         for engine in ("torch", "gsplat")
     ]
-    assert reports[1]["loss"] == pytest.approx(reports[0]["loss"], abs=1e-4)
+    assert reports[1].loss == pytest.approx(reports[0].loss, abs=1e-4)
 
 
 def test_the_loss_in_plain_torch_is_the_fused_one() -> None:

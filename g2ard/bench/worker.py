@@ -111,9 +111,7 @@ def _select(job: Job) -> dict[str, Any]:
 
     cameras = _cameras(job["views"])
     chosen = select(io.read_splats(job["scene"]), cameras, job["k"], policy=job["policy"], seed=job["seed"])
-    kept = cameras.take(
-        np.sort(chosen.order)
-    )  # of training views alone: the workspace holds the others out
+    kept = cameras.take(np.sort(chosen.order))  # of training views alone: the workspace holds the others out
     io.write_views(job["output"], kept, splits=["train"] * len(kept), overwrite=True)
     return {"views": len(chosen.order)}
 
