@@ -189,6 +189,8 @@ def select_greedy(
     kappa: float,
     alpha: float,
     lambda_: float,
+    anchors: int,
+    epsilon: float,
     lazy: bool,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[NDArray[np.uint32], _F64, int]: ...

@@ -248,6 +248,8 @@ def test_bits_do_not_depend_on_threads() -> None:
         Regularizers(0.0, 3.0, False),
         Regularizers(0.0, 3.0, True),
         Regularizers(5, 3, True),
+        Regularizers(5, 3, True, thickness=0.2, rank_offset=1e-2),
+        Regularizers(0, 3, True, thickness=0.0),
     ],
 )
 def test_regularizers_are_torch_s(weights: Regularizers) -> None:

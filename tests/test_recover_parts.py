@@ -135,9 +135,9 @@ def test_regularisers_equal_their_naive_twins() -> None:
     anchors = double_anchors(splats)
     anchor, shape = naive_losses(splats, *(t.detach().numpy() for t in (means, log_scales, quats)))
     assert anchor_loss(means, anchors).item() == pytest.approx(anchor, rel=1e-4)
-    assert shape_loss(log_scales, quats, anchors, effective_rank=True).item() == pytest.approx(
-        shape, rel=1e-4
-    )
+    assert shape_loss(
+        log_scales, quats, anchors, Regularizers(0.5, 0.25, effective_rank=True)
+    ).item() == pytest.approx(shape, rel=1e-4)
     both = regularization(means, quats, log_scales, anchors, Regularizers(0.5, 0.25, effective_rank=True))
     assert both.item() == pytest.approx(0.5 * anchor + 0.25 * shape, rel=1e-4)
 

@@ -161,7 +161,15 @@ def random_problem(rng, count=12, cells=60):
 
 def run_greedy(made, seen, positions, k, lazy, **options):
     starts = np.concatenate([[0], np.cumsum([len(s) for s in seen])]).astype(np.uint64)
-    merged = {"directional": True, "kappa": 20.0, "alpha": 2.0, "lambda_": 1.0, **options}
+    merged = {
+        "directional": True,
+        "kappa": 20.0,
+        "alpha": 2.0,
+        "lambda_": 1.0,
+        "anchors": 32,
+        "epsilon": 1e-9,
+        **options,
+    }
     return _core.select_greedy(
         made.parts, starts, np.concatenate(seen).astype(np.uint32), positions, k, lazy=lazy, **merged
     )
@@ -177,6 +185,18 @@ def test_greedy_is_the_naive_greedy(directional, alpha):
         want, value = naive.greedy(6, made, seen, positions, directional=directional, alpha=alpha)
         assert order.tolist() == want
         np.testing.assert_allclose(gains, value, rtol=1e-6, atol=1e-12)
+
+
+def test_directions_and_epsilon_are_options():
+    made, seen, positions = random_problem(np.random.default_rng(5))
+    order, gains, _ = run_greedy(made, seen, positions, 6, False, anchors=48, epsilon=0.1)
+    want, value = naive.greedy(6, made, seen, positions, directional=True, directions=48, epsilon=0.1)
+    assert order.tolist() == want
+    np.testing.assert_allclose(gains, value, rtol=1e-6, atol=1e-12)
+    _, usual, _ = run_greedy(made, seen, positions, 6, False)
+    assert abs(usual[0] - gains[0]) > 1e-3 * abs(usual[0])
+    with pytest.raises(InputError, match="anchors: expected 1 to 64"):
+        run_greedy(made, seen, positions, 6, False, anchors=65)
 
 
 def test_lazy_is_plain_greedy_on_fifty_pools():

@@ -32,7 +32,12 @@ def report_of(job: DistillJob, done: Distilled, options: Mapping[str, Any] | Non
     from g2ard.constants import listed
 
     kinds = {"scores": job.held_out, "apart": job.apart[1]}
-    config = replace(job.config, simplify=job.config.simplify.resolved(job.config.method))
+    config = job.config
+    config = replace(
+        config,
+        simplify=config.simplify.resolved(config.method),
+        schedule=replace(config.schedule, steps=config.steps or config.schedule.steps),
+    )
     used: dict[str, Any] = {"recover": config} | ({"lift": job.lifting} if job.lifting else {})
     found = done.report.as_dict()
     return {

@@ -33,6 +33,8 @@ class Regularizers:
         anchor: λ_a.
         shape: λ_s.
         effective_rank: whether L_shape has its barrier against needles.
+        thickness: β, L_shape's weight of the term against Gaussians thicker than their anchor.
+        rank_offset: ε of log(r_eff − 1 + ε).
         period: steps from one addition to the next.
         in_plane: r∥ of the trust region, over the mean tangential scale; r⊥ is the smallest scale. The paper
             says r∥ ≫ r⊥ only.
@@ -44,13 +46,16 @@ class Regularizers:
     anchor: float
     shape: float
     effective_rank: bool
+    thickness: float = 1.0
+    rank_offset: float = 1e-6
     period: int = 100
     in_plane: float = 3.0
 
     def __post_init__(self) -> None:
-        for name in ("anchor", "shape"):
+        for name in ("anchor", "shape", "thickness"):
             value = getattr(self, name)
             require(name, value, 0 <= value < float("inf"), "a weight, at least 0")
+        require("rank_offset", self.rank_offset, 0 < self.rank_offset < 1, "a number in (0, 1)")
         require("period", self.period, self.period >= 1, "at least 1")
         require("in_plane", self.in_plane, 0 < self.in_plane < float("inf"), "more than 0")
 

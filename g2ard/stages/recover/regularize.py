@@ -10,9 +10,6 @@ from g2ard.stages.recover.extent import rotations
 
 __all__ = ["TorchAnchors", "anchor_loss", "regularization", "shape_loss"]
 
-_EPSILON = 1e-6
-_BETA = 1.0
-
 
 class TorchAnchors:
     """`Anchors` as tensors."""
@@ -38,16 +35,16 @@ def anchor_loss(means: Tensor, anchors: TorchAnchors) -> Tensor:
     return torch.log1p((squared - 1).clamp_min(0)).mean()
 
 
-def shape_loss(log_scales: Tensor, quats: Tensor, anchors: TorchAnchors, *, effective_rank: bool) -> Tensor:
+def shape_loss(log_scales: Tensor, quats: Tensor, anchors: TorchAnchors, weights: Regularizers) -> Tensor:
     """(1/N) Σ max(0, −log(r_eff − 1 + ε)) + β[log s⊥ − log s̄⊥]₊; s⊥ is taken along the anchor's normal."""
     normal = anchors.frames[:, :, 2]
     extent = torch.einsum("nji,nj->ni", rotations(quats), normal) * log_scales.exp()
     thickness = extent.square().sum(1).clamp_min(1e-38).log() / 2 - anchors.r_perp.log()
-    total = _BETA * thickness.clamp_min(0)
-    if effective_rank:
+    total = weights.thickness * thickness.clamp_min(0)
+    if weights.effective_rank:
         log_q = torch.log_softmax(log_scales, dim=1)  # log(s / Σs)
         rank = torch.exp(-(log_q.exp() * log_q).sum(1))
-        total = total + (-torch.log((rank - 1).clamp_min(0) + _EPSILON)).clamp_min(0)
+        total = total + (-torch.log((rank - 1).clamp_min(0) + weights.rank_offset)).clamp_min(0)
     return total.mean()
 
 
@@ -59,6 +56,6 @@ def regularization(
     if weights.anchor > 0:
         total = total + weights.anchor * anchor_loss(means, anchors)
     if weights.shape > 0:
-        shape = shape_loss(log_scales, quats, anchors, effective_rank=weights.effective_rank)
+        shape = shape_loss(log_scales, quats, anchors, weights)
         total = total + weights.shape * shape
     return total

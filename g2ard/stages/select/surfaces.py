@@ -40,6 +40,8 @@ class CoverageOptions:
         kappa: sharpness of the observation kernel and of the targets.
         alpha: exponent of the fair utility u(x) = x^(1−α)/(1−α).
         offset: g(x) = u(offset + x); the paper's λ.
+        anchors: directions on the sphere, at most 64, that targets and observations are laid out on.
+        epsilon: ε of the coverage ratio C_jk / (P_jk + ε).
         lazy: look again only at the view that leads (CELF): the same views, fewer evaluations.
 
     Raises:
@@ -50,13 +52,16 @@ class CoverageOptions:
     kappa: float = 20.0
     alpha: float = 2.0
     offset: float = 1.0
+    anchors: int = 32
+    epsilon: float = 1e-9
     lazy: bool = True
 
     def __post_init__(self) -> None:
         require("cells", self.cells, self.cells >= 1, "at least 1")
-        for name in ("kappa", "offset"):
+        for name in ("kappa", "offset", "epsilon"):
             value = getattr(self, name)
             require(name, value, 0 < value < float("inf"), "more than 0")
+        require("anchors", self.anchors, 1 <= self.anchors <= 64, "1 to 64")
         require("alpha", self.alpha, 0 <= self.alpha < float("inf"), "at least 0")
 
 
@@ -189,6 +194,8 @@ def greedy(
         kappa=options.kappa,
         alpha=options.alpha,
         lambda_=options.offset,
+        anchors=options.anchors,
+        epsilon=options.epsilon,
         lazy=options.lazy,
         progress=counter(progress, "select"),
     )

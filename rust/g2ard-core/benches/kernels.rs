@@ -264,6 +264,8 @@ mod select {
             kappa: 20.0,
             alpha: 2.0,
             lambda: 1.0,
+            anchors: 32,
+            epsilon: 1e-9,
         };
         let run = || problem.greedy(CHOSEN, &coverage, true, &Control::default());
         bencher.bench(|| run().expect("a valid problem"));

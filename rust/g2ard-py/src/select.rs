@@ -148,7 +148,7 @@ type Choice<'py> = (Bound<'py, PyArray1<u32>>, Bound<'py, PyArray1<f64>>, u64);
 
 /// (views, gains, evaluations) of greedy maximisation.
 #[pyfunction]
-#[pyo3(signature = (surface, starts, cells, positions, k, *, directional, kappa, alpha, lambda_, lazy, progress=None))]
+#[pyo3(signature = (surface, starts, cells, positions, k, *, directional, kappa, alpha, lambda_, anchors, epsilon, lazy, progress=None))]
 fn select_greedy<'py>(
     py: Python<'py>,
     surface: Surfaces<'py>,
@@ -160,6 +160,8 @@ fn select_greedy<'py>(
     kappa: f64,
     alpha: f64,
     lambda_: f64,
+    anchors: usize,
+    epsilon: f64,
     lazy: bool,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Choice<'py>> {
@@ -185,6 +187,8 @@ fn select_greedy<'py>(
         kappa,
         alpha,
         lambda: lambda_,
+        anchors,
+        epsilon,
     };
     let problem = Problem {
         surface: &surface,

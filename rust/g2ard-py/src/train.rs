@@ -44,6 +44,8 @@ struct PyRegularizers {
     anchor: f32,
     shape: f32,
     effective_rank: bool,
+    thickness: f32,
+    rank_offset: f32,
 }
 
 impl From<PyRegularizers> for Regularizers {
@@ -52,6 +54,8 @@ impl From<PyRegularizers> for Regularizers {
             anchor: weights.anchor,
             shape: weights.shape,
             effective_rank: weights.effective_rank,
+            thickness: weights.thickness,
+            rank_offset: weights.rank_offset,
         }
     }
 }

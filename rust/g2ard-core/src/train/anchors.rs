@@ -11,13 +11,16 @@ use crate::{Error, Result};
 pub struct Regularizers {
     /// λ_a of (1/N) Σ log(1 + [D² − 1]₊).
     pub anchor: f32,
-    /// λ_s of (1/N) Σ max(0, −log(r_eff − 1 + ε)) + [log s⊥ − log s̄⊥]₊.
+    /// λ_s of (1/N) Σ max(0, −log(r_eff − 1 + ε)) + β[log s⊥ − log s̄⊥]₊.
     pub shape: f32,
     /// Whether L_shape has its first term.
     pub effective_rank: bool,
+    /// β.
+    pub thickness: f32,
+    /// ε.
+    pub rank_offset: f32,
 }
 
-const EPSILON: f32 = 1e-6;
 /// Rows of a block: 3 of the mean, 9 of the frame, 1/r∥², 1/r⊥².
 const ROWS: usize = 14;
 
@@ -90,9 +93,13 @@ impl Anchors {
         }
         if weights.shape > 0.0 {
             let weight = F::splat(weights.shape / self.count);
-            active |= thickness(block, weight, parameters, group, g);
+            if weights.thickness > 0.0 {
+                let weight = weight * F::splat(weights.thickness);
+                active |= thickness(block, weight, parameters, group, g);
+            }
             if weights.effective_rank {
-                active |= effective_rank(weight, parameters, group, g);
+                let offset = F::splat(weights.rank_offset);
+                active |= effective_rank(weight, offset, parameters, group, g);
             }
         }
         active
@@ -179,6 +186,7 @@ fn thickness<F: Lanes>(
 #[inline(always)]
 fn effective_rank<F: Lanes>(
     weight: F,
+    offset: F,
     parameters: &ParameterView,
     group: usize,
     g: &mut RowGradients<F>,
@@ -222,8 +230,8 @@ fn effective_rank<F: Lanes>(
         series = series.fma(entropy, F::splat(c));
     }
     let rank_less_1 = series * entropy;
-    let low = F::splat(1.0 - EPSILON).gt(rank_less_1).and(one.ge(rest));
-    let slope = (weight * (rank_less_1 + one) / (rank_less_1 + F::splat(EPSILON))).only(low);
+    let low = (one - offset).gt(rank_less_1).and(one.ge(rest));
+    let slope = (weight * (rank_less_1 + one) / (rank_less_1 + offset)).only(low);
     for k in 0..3 {
         let log_share = below[k] - log_sum;
         g.log_scale[k] = (slope * share[k]).fma(log_share + entropy, g.log_scale[k]);
