@@ -132,9 +132,9 @@ def recover(
     run.say(
         f"{output}: {len(splats):,} Gaussians, {trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB"
     )
-    schedule = replace(config.schedule, steps=config.steps or config.schedule.steps)
+    used = replace(config, schedule=replace(config.schedule, steps=config.steps or config.schedule.steps))
     report = {**result.report.as_dict(), "preset": why, "prior": measured.as_dict()}
-    report["constants"] = listed({"recover": replace(config, schedule=schedule)}, run.config)
+    report["constants"] = listed({"recover": used}, run.config)
     run.result({**report, "output": str(output)})
 
 
