@@ -1,22 +1,32 @@
 """g2ard: distil a dense 3D Gaussian scene into a compact, standard 3DGS model at an exact budget.
 
-Each stage is a module with a function of its name, or nearly so:
-
-| module | function |
+| function | does |
 |---|---|
-| `g2ard.lift` | `lift`: coloured points → surface-aligned discs |
-| `g2ard.simplify` | `simplify`: fewer Gaussians, at an exact count |
-| `g2ard.poses` | `make_pool`: views for a scene that has none |
-| `g2ard.select` | `select`: the views worth having |
-| `g2ard.recover` | `recover`: a fixed set of Gaussians against photos or a teacher's renders |
-| `g2ard.adapt` | `adapt`: new appearance on frozen geometry |
-| `g2ard.distill` | `distill`: all of it |
-| `g2ard.render`, `g2ard.evaluate` | `render`, `visibility`; `evaluate` |
-| `g2ard.synth` | `city`: a procedural city |
+| `load`, `save` | scenes, by extension |
+| `load_views`, `save_views`, `load_points` | cameras, and coloured clouds |
+| `distill` | the whole job, as `g2ard distill` does it |
+| `lift` | coloured points → surface-aligned discs |
+| `simplify` | fewer Gaussians, at an exact count, as `g2ard simplify` does it |
+| `make_pool`, `select` | views for a scene that has none; the views worth having |
+| `recover` | a fixed set of Gaussians against photos or a teacher's renders |
+| `adapt` | new appearance on frozen geometry |
+| `render`, `Renderer`, `evaluate` | images, depths; PSNR, SSIM |
 
-What they pass on, and files, are here: `Splats`, `Cameras`, `read_splats`, `write_splats`, `read_points`,
-`read_views`, `write_views`; and `preset`, which holds the paper's configuration of every stage. Nothing heavy
-loads before it is used.
+They pass on `Splats`, a `Camera` or many `Cameras`, and targets: `Photos` or `TeacherRenders`. Configurations
+of stages are dataclasses (`SimplifyConfig`, `RecoverConfig`, …); `preset` holds the paper's. What stages do
+with them is in `g2ard.stages`, how they are joined in `g2ard.pipeline`. All errors are `G2ardError`s.
+
+Nothing heavy loads before it is used.
+
+>>> import numpy as np
+>>> import g2ard
+>>> ball = np.random.default_rng(0).normal(size=(2000, 3))
+>>> ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+>>> scene = g2ard.Splats.create(ball, scales=np.full((2000, 3), 0.05))
+>>> small = g2ard.simplify(scene, ratio=10).splats
+>>> view = g2ard.Camera.facing([0, -3, 0], [0, 0, 0], width=64, height=48)
+>>> len(small), g2ard.render(small, view).image.shape
+(200, (48, 64, 3))
 """
 
 from __future__ import annotations
@@ -25,31 +35,116 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from g2ard.cameras import Cameras
-    from g2ard.io import read_points, read_splats, read_views, write_splats, write_views
+    from g2ard.cameras import Camera, Cameras, look_at
+    from g2ard.errors import G2ardError, InputError, MissingDependencyError, OutputError
+    from g2ard.io import read_points as load_points
+    from g2ard.io import read_splats as load
+    from g2ard.io import read_views as load_views
+    from g2ard.io import write_splats as save
+    from g2ard.io import write_views as save_views
+    from g2ard.pipeline import DistillConfig, Distilled
+    from g2ard.policy.distill import distill
+    from g2ard.policy.simplify import simplify
+    from g2ard.poses import make_pool
     from g2ard.presets import preset
     from g2ard.splats import Splats
+    from g2ard.stages.adapt import AdaptConfig, Adapted, adapt
+    from g2ard.stages.evaluate import Evaluation, evaluate
+    from g2ard.stages.lift import lift
+    from g2ard.stages.recover import RecoverConfig, Recovered, recover
+    from g2ard.stages.recover.anchors import Regularizers
+    from g2ard.stages.render import RasterSettings, Rendered, Renderer, render
+    from g2ard.stages.select import CoverageOptions, Selection, select
+    from g2ard.stages.simplify import Simplified, SimplifyConfig
+    from g2ard.targets import Photos, TeacherRenders
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "AdaptConfig",
+    "Adapted",
+    "Camera",
     "Cameras",
+    "CoverageOptions",
+    "DistillConfig",
+    "Distilled",
+    "Evaluation",
+    "G2ardError",
+    "InputError",
+    "MissingDependencyError",
+    "OutputError",
+    "Photos",
+    "RasterSettings",
+    "RecoverConfig",
+    "Recovered",
+    "Regularizers",
+    "Rendered",
+    "Renderer",
+    "Selection",
+    "Simplified",
+    "SimplifyConfig",
     "Splats",
+    "TeacherRenders",
     "__version__",
+    "adapt",
+    "distill",
+    "evaluate",
+    "lift",
+    "load",
+    "load_points",
+    "load_views",
+    "look_at",
+    "make_pool",
     "preset",
-    "read_points",
-    "read_splats",
-    "read_views",
-    "write_splats",
-    "write_views",
+    "recover",
+    "render",
+    "save",
+    "save_views",
+    "select",
+    "simplify",
 ]
 
-_HOMES = {"Splats": "g2ard.splats", "Cameras": "g2ard.cameras", "preset": "g2ard.presets"}
+_HOMES = {
+    "cameras": ("Camera", "Cameras", "look_at"),
+    "errors": ("G2ardError", "InputError", "MissingDependencyError", "OutputError"),
+    "pipeline": ("DistillConfig", "Distilled"),
+    "policy.distill": ("distill",),
+    "policy.simplify": ("simplify",),
+    "poses": ("make_pool",),
+    "presets": ("preset",),
+    "splats": ("Splats",),
+    "stages.adapt": ("AdaptConfig", "Adapted", "adapt"),
+    "stages.evaluate": ("Evaluation", "evaluate"),
+    "stages.lift": ("lift",),
+    "stages.recover": ("RecoverConfig", "Recovered", "recover"),
+    "stages.recover.anchors": ("Regularizers",),
+    "stages.render": ("RasterSettings", "Rendered", "Renderer", "render"),
+    "stages.select": ("CoverageOptions", "Selection", "select"),
+    "stages.simplify": ("Simplified", "SimplifyConfig"),
+    "targets": ("Photos", "TeacherRenders"),
+}
+"""Module → what it gives under its own name."""
+
+_FILES = {
+    "load": "read_splats",
+    "load_points": "read_points",
+    "load_views": "read_views",
+    "save": "write_splats",
+    "save_views": "write_views",
+}
+"""What `g2ard.io` calls them."""
 
 
 def __getattr__(name: str) -> Any:
-    if name in __all__:
-        from importlib import import_module
+    home = "io" if name in _FILES else next((m for m, names in _HOMES.items() if name in names), None)
+    if home is None:
+        raise AttributeError(f"module 'g2ard' has no attribute {name!r}")
+    from importlib import import_module
 
-        return getattr(import_module(_HOMES.get(name, "g2ard.io")), name)
-    raise AttributeError(f"module 'g2ard' has no attribute {name!r}")
+    found = getattr(import_module(f"g2ard.{home}"), _FILES.get(name, name))
+    globals()[name] = found  # asked for once
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -7,9 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.splats import Splats
+from g2ard.stages.recover.anchors import Regularizers
+from g2ard.stages.recover.schedule import Rates
+from g2ard.stages.render import RasterSettings
 
 __version__: str
 
+def defaults() -> dict[str, dict[str, Any]]: ...
 def set_num_threads(threads: int) -> None: ...
 def num_threads() -> int: ...
 def set_device(name: str, max_binding: int | None = None, timed: bool = False) -> None: ...
@@ -44,7 +48,7 @@ def cast_rays(
     directions: NDArray[np.float64],
 ) -> NDArray[np.float64]: ...
 def simplify_flags(
-    scene: Splats,
+    scene: Scene,
     cells: int,
     *,
     threshold: float,
@@ -52,7 +56,7 @@ def simplify_flags(
     progress: Callable[[int, int], None] | None = None,
 ) -> NDArray[np.bool_]: ...
 def simplify_paper(
-    scene: Splats,
+    scene: Scene,
     schedule: list[int],
     cells: int,
     *,
@@ -68,37 +72,40 @@ def simplify_paper(
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]: ...
 def simplify_pairwise(
-    scene: Splats,
+    scene: Scene,
     schedule: list[int],
     *,
     protected: NDArray[np.bool_] | None,
     weight: NDArray[np.float32] | None,
     pixel_size: NDArray[np.float32] | None,
     min_opacity: float,
-    ladder: float,
-    ladder_steps: int,
+    morton_premerge_ratio: float | None,
+    morton_premerge_steps: int | None,
     neighbors: int,
-    geometric: float,
+    geometric_weight: float,
     dilation: float,
     pixel_scale: float,
-    growth: float,
+    max_growth: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]: ...
-def simplify_order(scene: Splats) -> NDArray[np.uint32]: ...
 
-class Look:
-    def __init__(self, scene: Splats) -> None: ...
+class Scene:
+    def __init__(self, splats: Splats) -> None: ...
     @property
     def origin(self) -> list[float]: ...
+    @property
+    def order(self) -> NDArray[np.uint32]: ...
+
+class VisibilityAccumulator:
+    def __init__(self, scene: Scene) -> None: ...
     def add(
-        self, views: list[_View], choices: _Choices, progress: Callable[[int, int], None] | None = None
+        self, views: list[_View], options: RasterSettings, progress: Callable[[int, int], None] | None = None
     ) -> int: ...
     def by_row(self) -> tuple[_F32, _F32]: ...
 
 _F32 = NDArray[np.float32]
 _Arrays = tuple[_F32, ...]
 _View = tuple[list[list[float]], list[float], tuple[int, int], float]
-_Choices = tuple[str, bool, float]
 
 def instruction_sets() -> list[str]: ...
 def machine_limits(isa: str | None = None) -> tuple[float, float]: ...
@@ -109,7 +116,7 @@ class Rasterizer:
         self,
         arrays: _Arrays,
         view: _View,
-        choices: _Choices,
+        options: RasterSettings,
         background: list[float],
         depth: bool = True,
         median: bool = False,
@@ -126,17 +133,17 @@ class Trainer:
     def step(
         self,
         view: _View,
-        choices: _Choices,
+        options: RasterSettings,
         background: list[float],
         target: _F32,
         ssim_weight: float,
-        rates: list[float],
-        regularizers: tuple[float, float, bool] | None = None,
+        rates: Rates,
+        regularizers: Regularizers | None = None,
         mask: NDArray[np.bool_] | None = None,
         reach: float | None = None,
     ) -> tuple[float, int]: ...
-    def rehearse(
-        self, view: _View, choices: _Choices, background: list[float], target: _F32, ssim_weight: float
+    def gradients_only(
+        self, view: _View, options: RasterSettings, background: list[float], target: _F32, ssim_weight: float
     ) -> float: ...
     def arrays(self) -> list[_F32]: ...
     def state(self) -> dict[str, NDArray[Any]]: ...
@@ -151,13 +158,13 @@ class Trainer:
 def accumulate(
     arrays: _Arrays,
     views: list[_View],
-    choices: _Choices,
+    options: RasterSettings,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]: ...
 def sensitivity(
     arrays: _Arrays,
     views: list[_View],
-    choices: _Choices,
+    options: RasterSettings,
     progress: Callable[[int, int], None] | None = None,
 ) -> NDArray[np.float64]: ...
 def l1_ssim(image: _F32, target: _F32, ssim_weight: float) -> tuple[float, _F32]: ...
@@ -166,17 +173,17 @@ def psnr(image: _F32, target: _F32) -> float: ...
 
 _F64 = NDArray[np.float64]
 _Surface = tuple[_F64, _F64, _F64, _F64, float]
-_Scene = tuple[NDArray[Any], ...]
+_Gaussians = tuple[NDArray[Any], ...]
 
-def select_surface(scene: _Scene, cells: int) -> dict[str, Any]: ...
-def select_depth(scene: _Scene, view: tuple[Any, ...]) -> _F32: ...
-def select_looks(
-    scene: _Scene,
+def select_surface(scene: _Gaussians, cells: int) -> dict[str, Any]: ...
+def select_depth(scene: _Gaussians, view: tuple[Any, ...]) -> _F32: ...
+def select_view_statistics(
+    scene: _Gaussians,
     views: list[tuple[Any, ...]],
     progress: Callable[[int, int], None] | None = None,
 ) -> _F32: ...
 def select_visible(
-    scene: _Scene,
+    scene: _Gaussians,
     surface: _Surface,
     views: list[tuple[Any, ...]],
     progress: Callable[[int, int], None] | None = None,
@@ -192,6 +199,8 @@ def select_greedy(
     kappa: float,
     alpha: float,
     lambda_: float,
+    anchors: int,
+    epsilon: float,
     lazy: bool,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[NDArray[np.uint32], _F64, int]: ...

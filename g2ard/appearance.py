@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.cameras import Cameras
-from g2ard.render import Renderer
 from g2ard.splats import SH_C0, Splats
+from g2ard.stages.render import Renderer
 from g2ard.targets import Targets, mask_of
 from g2ard.visibility import visibility
 
@@ -59,7 +59,7 @@ def colour_change(splats: Splats, targets: Targets, background: tuple[float, flo
     before = pixels = 0.0
     renderer = Renderer(splats, background=background)
     for view in np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), _VIEWS)).round().astype(int)):
-        rendered = renderer.render(cameras, int(view))
+        rendered = renderer.render(cameras[int(view)])
         image, mask = targets[int(view)], mask_of(targets, int(view))
         counts = np.ones(image.shape[:2], bool) if mask is None else mask
         rows = np.flatnonzero(counts)[:: max(1, int(counts.sum()) // _PIXELS)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,80 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 
-__all__ = ["Cameras", "look_at"]
+__all__ = ["Camera", "Cameras", "look_at"]
 
 _MEDIAN_OF = 16
 """Views that stand for all of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One view.
+
+    Args:
+        viewmat: (4, 4) float64, camera_from_world, rigid; see `look_at`.
+        K: (3, 3) float64 pinhole intrinsics in pixels; pixel centres at +0.5.
+        width: pixels.
+        height: pixels.
+        name: of the photo, or of the pose.
+        image_path: the photo; None where there is none.
+        mask_path: which of its pixels count; None where all do.
+        distortion: (5,) float64, OpenCV k1 k2 p1 p2 k3 of the photo.
+
+    Shapes and values are checked where views come together, by `Cameras`.
+
+    >>> camera = Camera.facing([0, -2, 0], [0, 0, 0], width=32, height=24, fov=50)
+    >>> camera.position.tolist(), camera.holds([[0, 0, 0], [0, -3, 0]]).tolist()
+    ([0.0, -2.0, 0.0], [True, False])
+    """
+
+    viewmat: NDArray[np.float64]
+    K: NDArray[np.float64]
+    width: int
+    height: int
+    name: str = "view"
+    image_path: Path | None = None
+    mask_path: Path | None = None
+    distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(5))
+
+    @classmethod
+    def facing(
+        cls,
+        position: ArrayLike,
+        target: ArrayLike,
+        *,
+        width: int = 800,
+        height: int = 600,
+        fov: float = 50.0,
+        up: ArrayLike = (0.0, 0.0, 1.0),
+        name: str = "view",
+    ) -> Camera:
+        """A view from `position` to `target`, image top towards `up`; `fov` is horizontal, in degrees.
+
+        Raises:
+            InputError: position and target coincide, or a field of view that is not between 0 and 180°.
+        """
+        if not 0 < fov < 180:
+            raise InputError(f"fov: expected degrees between 0 and 180, got {fov}")
+        focal = width / 2 / np.tan(np.radians(fov) / 2)
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        return cls(look_at(position, target, up), K, width, height, name)
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """(3,) the camera's centre in the world."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def holds(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Which of some points, (N, 3) in the world, lie within the image, as (N,) bool.
+
+        What hides them does not count.
+        """
+        x, y, z = self.viewmat[:3, :3] @ (np.asarray(points, np.float64) - self.position).T
+        K, front = self.K, z > 0
+        ahead = np.where(front, z, 1.0)
+        u, v = K[0, 0] * x / ahead + K[0, 2], K[1, 1] * y / ahead + K[1, 2]
+        return front & (u >= 0) & (u <= self.width) & (v >= 0) & (v <= self.height)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +149,45 @@ class Cameras:
 
     def __len__(self) -> int:
         return len(self.viewmats)
+
+    def __getitem__(self, index: int) -> Camera:
+        """One view; several are `take`n."""
+        i = range(len(self))[index]
+        return Camera(
+            self.viewmats[i],
+            self.Ks[i],
+            int(self.widths[i]),
+            int(self.heights[i]),
+            self.names[i],
+            self.image_paths[i],
+            self.mask_paths[i],
+            self.distortions[i],
+        )
+
+    def __iter__(self) -> Iterator[Camera]:
+        return (self[i] for i in range(len(self)))
+
+    @classmethod
+    def of(cls, views: Iterable[Camera]) -> Cameras:
+        """Single views, together.
+
+        Raises:
+            InputError: as `Cameras`.
+
+        >>> pair = [Camera.facing([0, y, 0], [0, 0, 0], name=str(y)) for y in (-2, -3)]
+        >>> Cameras.of(pair)[1].name, len(Cameras.of(pair))
+        ('-3', 2)
+        """
+        found = list(views)
+        return cls.from_lists(
+            [v.viewmat for v in found],
+            [v.K for v in found],
+            [(v.width, v.height) for v in found],
+            [v.name for v in found],
+            [v.image_path for v in found],
+            [v.distortion for v in found],
+            [v.mask_path for v in found],
+        )
 
     @property
     def positions(self) -> NDArray[np.float64]:
@@ -144,24 +253,12 @@ class Cameras:
         """
         world = np.asarray(points, np.float64)
         few = world[:: max(1, len(world) // 1024)]  # usually tell
-        views = (self.take([i]) for i in range(len(self)))
-        return np.array([view.holds(few).any() or view.holds(world).any() for view in views], bool)
-
-    def holds(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Which of some points, (N, 3) in the world, lie within the image of the first view, as (N,) bool.
-
-        What hides them does not count.
-        """
-        x, y, z = self.viewmats[0, :3, :3] @ (np.asarray(points, np.float64) - self.positions[0]).T
-        K, front = self.Ks[0], z > 0
-        ahead = np.where(front, z, 1.0)
-        u, v = K[0, 0] * x / ahead + K[0, 2], K[1, 1] * y / ahead + K[1, 2]
-        return front & (u >= 0) & (u <= self.widths[0]) & (v >= 0) & (v <= self.heights[0])
+        return np.array([view.holds(few).any() or view.holds(world).any() for view in self], bool)
 
     def usual_share(self, points: ArrayLike) -> float:
         """Share of some points, (N, 3) in the world, that a view holds: the median over 16 views at most."""
         some = np.unique(np.linspace(0, len(self) - 1, min(len(self), _MEDIAN_OF)).round().astype(int))
-        return float(np.median([self.take([view]).holds(points).mean() for view in some]))
+        return float(np.median([self[int(view)].holds(points).mean() for view in some]))
 
     def recentred(self, offset: ArrayLike) -> Cameras:
         """The same views in coordinates whose origin is the world point `offset` (see `Splats.offset`)."""

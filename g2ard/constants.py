@@ -42,7 +42,7 @@ def parsed(texts: Iterable[str], configs: Mapping[str, Any], without: Iterable[s
         InputError: no `=`, no such constant (near ones are named), several of that name, another type, or one
             of `without`.
 
-    >>> from g2ard.recover.anchors import PRESETS
+    >>> from g2ard.stages.recover.anchors import PRESETS
     >>> parsed(["regularizers.anchor=1e-3", "period=50"], {"regularizers": PRESETS["lift"]})
     {'regularizers.anchor': 0.001, 'regularizers.period': 50}
     """
@@ -71,7 +71,7 @@ def changed(config: Config, root: str, values: Mapping[str, Any]) -> Config:
     Raises:
         InputError: a value out of its range.
 
-    >>> from g2ard.recover.schedule import PAPER
+    >>> from g2ard.stages.recover.schedule import PAPER
     >>> changed(PAPER, "schedule", {"rates.means": 1e-3, "schedule.steps": 300}).rates.means
     0.001
     """
@@ -100,7 +100,7 @@ def listed(configs: Mapping[str, Any], without: Iterable[str] = ()) -> dict[str,
         configs: prefix → dataclass.
         without: fields of theirs, not of configs within them, to leave out.
 
-    >>> from g2ard.recover.anchors import PRESETS
+    >>> from g2ard.stages.recover.anchors import PRESETS
     >>> listed({"regularizers": PRESETS["lift"]})["regularizers"]["shape"]
     1.0
     """

@@ -75,7 +75,7 @@ def label_colors(labels: ArrayLike) -> NDArray[np.float64]:
 def cell_labels(splats: Splats, count: int) -> NDArray[np.int64]:
     """The locality cell of every Gaussian: adaptive voxels, about `count` of them occupied (`tab:s_config`).
 
-    They are the cells of `g2ard.simplify.flag` for a budget of `count`. A Gaussian beyond the lattice is a
+    They are the cells of `simplify.flag` for a budget of `count`. A Gaussian beyond the lattice is a
     cell of its own.
 
     Args:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from g2ard.adapt import AdaptConfig
-from g2ard.distill import DistillConfig
 from g2ard.errors import InputError
-from g2ard.recover.anchors import PAPER_PRESETS
-from g2ard.recover.config import RecoverConfig
-from g2ard.recover.schedule import PAPER
-from g2ard.select.surfaces import CoverageOptions
-from g2ard.simplify.config import SimplifyConfig
+from g2ard.pipeline import DistillConfig
+from g2ard.stages.adapt import AdaptConfig
+from g2ard.stages.recover.anchors import PAPER_PRESETS
+from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.schedule import PAPER
+from g2ard.stages.select.surfaces import CoverageOptions
+from g2ard.stages.simplify.config import SimplifyConfig
 
 __all__ = ["Preset", "preset"]
 
@@ -52,7 +52,7 @@ def preset(name: str = "paper", prior: str = "trained") -> Preset:
     Args:
         name: "paper".
         prior: the row of `tab:s_recovery`: trained, lift (an untrained cloud's), or noisy (trained and less
-            regular). `g2ard.recover.presets.preset_for("paper", …)` measures which.
+            regular). `g2ard.stages.recover.presets.preset_for("paper", …)` measures which.
 
     Raises:
         InputError: no such preset, or prior.

@@ -30,7 +30,7 @@ def preview(
     """
     from g2ard.images import contact_sheet, write_png
     from g2ard.metrics import psnr
-    from g2ard.render import Renderer
+    from g2ard.stages.render import Renderer
 
     count = len(targets.cameras)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _ROWS)).round().astype(int))
@@ -38,7 +38,7 @@ def preview(
     renderers = [Renderer(splats, background=background) for _, splats in scenes]
     for view in map(int, chosen):
         target = targets[view]
-        images = [renderer.image(targets.cameras, view) for renderer in renderers]
+        images = [renderer.image(targets.cameras[view]) for renderer in renderers]
         rows.append([target, *(np.clip(image, 0, 1) for image in images)])
         scores = [
             f"{name} {psnr(image, target):.2f} dB"

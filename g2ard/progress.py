@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-__all__ = ["Progress", "counter", "silent"]
+__all__ = ["Progress", "Say", "counter", "silent", "unsaid"]
 
 
 class Progress(Protocol):
@@ -28,3 +28,11 @@ def counter(progress: Progress, stage: str) -> Callable[[int, int], None]:
     [('simplify', 3, 10)]
     """
     return lambda done, total: progress(stage, done, total)
+
+
+Say = Callable[[str], None]
+"""Called with a line of status: what was noticed in the data, what was decided and why."""
+
+
+def unsaid(text: str) -> None:
+    """Say nothing."""

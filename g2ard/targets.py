@@ -16,7 +16,7 @@ from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
 
 if TYPE_CHECKING:
-    from g2ard.render import RasterSettings, Renderer
+    from g2ard.stages.render import RasterSettings, Renderer
 
 __all__ = [
     "CACHE_BYTES",
@@ -146,7 +146,7 @@ class Photos(_Cached):
             (n for n, p in zip(cameras.names, cameras.image_paths, strict=True) if p is None), None
         )
         if missing is not None:
-            raise InputError(f"view {missing}: has no photo, and no teacher stands in for it")
+            raise InputError(f"view {missing}: has no photo; TeacherRenders of a scene can stand in")
         super().__init__(cameras, limit)
         self.source = "photos " + " ".join(str(path) for path in cameras.image_paths)
         if any(cameras.mask_paths):
@@ -224,10 +224,10 @@ class TeacherRenders(_Cached):
 
     def _make(self, view: int) -> NDArray[np.float32]:
         if self._renderer is None:
-            from g2ard.render import Renderer
+            from g2ard.stages.render import Renderer
 
             self._renderer = Renderer(self._teacher, background=self._background, settings=self._settings)
-        return np.clip(self._renderer.image(self.cameras, view), 0, 1)
+        return np.clip(self._renderer.image(self.cameras[view]), 0, 1)
 
     def against(self, view: int) -> str:
         """See `against_of`."""

@@ -1,4 +1,4 @@
-"""What every Gaussian contributes to views: `visibility` of all pixels, `looker` of a few small renders."""
+"""What every Gaussian contributes to views: over all pixels, or sampled from a few small renders."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.cameras import Cameras
+from g2ard.prepared import as_prepared
 from g2ard.progress import Progress, counter, silent
-from g2ard.render import RasterSettings, arrays_of, centred, settings_for, view_of
 from g2ard.splats import Splats
+from g2ard.stages.render import RasterSettings, arrays_of, centred, settings_for, view_of
 
-__all__ = ["Seen", "Visibility", "looker", "visibility"]
+__all__ = ["SampledVisibility", "Visibility", "visibility", "visibility_source"]
 
 _Floats = NDArray[np.float32]
 
@@ -67,32 +68,32 @@ def visibility(
     settings = settings_for(splats.means, settings)
     views = [view_of(cameras, i, settings) for i in range(len(cameras))]
     sums: dict[str, Any] = _core.accumulate(
-        arrays_of(splats), views, settings.choices, counter(progress, "visibility")
+        arrays_of(splats), views, settings, counter(progress, "visibility")
     )
     return Visibility(**sums)
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """What `looker` keeps of a visibility.
+class SampledVisibility:
+    """The parts of a visibility that simplification weighs by, sampled from a few small renders.
 
     Args:
         weight: (N,) float32, Σ αT.
-        pixel_size: (N,) float32, that of the full image, scene units; ∞ where no view looks.
+        pixel_size: (N,) float32, that of the full image, scene units; ∞ where no view contains it.
     """
 
     weight: _Floats
     pixel_size: _Floats
 
 
-def looker(
+def visibility_source(
     cameras: Cameras, *, views: int = 96, longest: int = 300, progress: Progress = silent
-) -> Callable[[Splats], Seen]:
-    """A function that tells what a few small renders see of a scene, as `g2ard.simplify.simplify` takes it.
+) -> Callable[[Splats], SampledVisibility]:
+    """A function that finds what a few small renders see of a scene, as `simplify` takes it.
 
-    It looks from sixteen views at a time until the next sixteen find under 1 % more of the Gaussians: an
-    object of half a million takes 32 views, a small one 80, a room all (`docs/decisions.md`). The first scene
-    decides how many; for the later ones the views stay the same, so that the sums compare. What it tells
+    It renders sixteen views at a time until the next sixteen find under 1 % more of the Gaussians: an object
+    of half a million takes 32 views, a small one 80, a room all (`docs/decisions.md`). The first scene
+    decides how many; for the later ones the views stay the same, so that the sums compare. The result
     depends on the scene's content alone, not on the order of its rows.
 
     Args:
@@ -102,49 +103,51 @@ def looker(
         progress: told after each view.
 
     Returns:
-        scene → `Seen`; the scene's arrays are C-contiguous and float32, but for its means.
+        scene → `SampledVisibility`; the scene's arrays are C-contiguous and float32, but for its means. A
+        `g2ard.prepared.PreparedScene` is not put in order again.
     """
     sample = np.unique(np.linspace(0, len(cameras) - 1, min(views, len(cameras))).round().astype(int))
     full = cameras.take(sample)
     small = full.resized(longest)
     factor = np.float32((small.widths / full.widths).mean())
-    apart = max(1, math.ceil(len(small) / _GLANCE))
-    glances = [range(first, len(small), apart) for first in _spread(apart)]
+    apart = max(1, math.ceil(len(small) / _ROUND))
+    rounds = [range(first, len(small), apart) for first in _spread(apart)]
     enough, settings = 0, RasterSettings()
 
-    def look(scene: Splats) -> Seen:
+    def find(scene: Splats) -> SampledVisibility:
         nonlocal enough, settings
-        sums = _core.Look(scene)
+        core = as_prepared(scene).core
+        sums = _core.VisibilityAccumulator(core)
         here = small.recentred(scene.offset)
         if not enough:  # a near plane in the scene's own unit
-            distance = np.median(np.linalg.norm(here.positions - sums.origin, axis=1))
+            distance = np.median(np.linalg.norm(here.positions - core.origin, axis=1))
             settings = RasterSettings(near=_NEAR * float(distance) or None)
         seen = 0
-        for number, glance in enumerate(glances, 1):
-            views = [view_of(here, i, settings) for i in glance]
-            before, seen = seen, sums.add(views, settings.choices, counter(progress, "visibility"))
+        for number, some in enumerate(rounds, 1):
+            views = [view_of(here, i, settings) for i in some]
+            before, seen = seen, sums.add(views, settings, counter(progress, "visibility"))
             converged = number > 1 and seen - before < _CONVERGED * len(scene)
-            cheap = number * _GLANCE * len(scene) < _CHEAP
+            cheap = number * _ROUND * len(scene) < _CHEAP
             if number == enough or (not enough and converged and not cheap):
                 break
         enough = number
         weight, pixel_size = sums.by_row()
-        return Seen(weight, pixel_size * factor)
+        return SampledVisibility(weight, pixel_size * factor)
 
-    return look
+    return find
 
 
-_GLANCE = 16
-"""Views looked from at a time."""
+_ROUND = 16
+"""Views at a time."""
 
 _CHEAP = 6_000_000
-"""Gaussians times views up to which looking on costs next to nothing."""
+"""Gaussians times views up to which another round costs next to nothing."""
 
 _NEAR = 1e-3
 """Nearest depth that counts, over the median distance of the cameras from the scene's middle."""
 
 _CONVERGED = 0.01
-"""Glances that find a smaller share of the Gaussians for the first time are the last."""
+"""A round that finds a smaller share of the Gaussians for the first time is the last."""
 
 
 def _spread(count: int) -> list[int]:

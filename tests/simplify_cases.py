@@ -43,11 +43,11 @@ def assert_sound(result, count, budget):
     used = np.unique(result.parents[result.parents >= 0])
     np.testing.assert_array_equal(used, np.arange(budget))
     assert result.protected.shape == (budget,)
-    assert result.report["output_count"] == budget
+    assert result.report.output_count == budget
 
 
 class Views:
-    """What a caller's views see, as `g2ard.render.visibility` returns it."""
+    """What a caller's views see, as `g2ard.stages.render.visibility` returns it."""
 
     def __init__(self, weight, pixel_size):
         self.weight, self.pixel_size = np.asarray(weight), np.asarray(pixel_size)

@@ -13,9 +13,9 @@ import pytest
 from scenes import around, checkered_ball
 
 from g2ard import io
-from g2ard.adapt import AdaptConfig, adapt
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
+from g2ard.stages.adapt import AdaptConfig, adapt
+from g2ard.stages.evaluate import evaluate
 from g2ard.targets import TeacherRenders
 
 VIEWS = around(24)
@@ -39,19 +39,19 @@ def test_colours_come_back_and_geometry_does_not_move(schedule: str, gain: float
     for name in ("means", "quats", "scales"):
         np.testing.assert_array_equal(getattr(found.splats, name), getattr(start, name))
     assert found.splats.sh_degree == ball.sh_degree
-    assert found.report["steps"] == 600
-    assert found.report["psnr"]["after"] > found.report["psnr"]["before"] + gain
+    assert found.report.steps == 600
+    assert found.report.psnr.after > found.report.psnr.before + gain
 
 
 def test_stops_once_it_has_converged_and_not_before() -> None:
     ball = checkered_ball(300)
     targets = TeacherRenders(ball, TRAIN.resized(32))
     there = adapt(ball, targets, AdaptConfig(steps=7000))
-    assert there.report["converged"]
-    assert there.report["steps"] == 500
+    assert there.report.converged
+    assert there.report.steps == 500
     every = adapt(pale(ball), targets, AdaptConfig(steps=1500, tolerance=0))
-    assert every.report["steps"] == 1500
-    assert [s["steps"] for s in every.report["stretches"]] == [500, 1000]
+    assert every.report.steps == 1500
+    assert [s.steps for s in every.report.stretches] == [500, 1000]
 
 
 def test_gives_a_flat_scene_bands_of_its_own() -> None:
@@ -82,7 +82,7 @@ def test_ctrl_c_then_resume_is_never_having_stopped(stop: int, tmp_path: Path) -
     resumed = adapt(start, targets, config, work=tmp_path)
     for name in ("logit_opacities", "sh0", "shN", "means"):
         np.testing.assert_array_equal(getattr(resumed.splats, name), getattr(whole.splats, name))
-    assert resumed.report["stretches"] == whole.report["stretches"]
+    assert resumed.report.stretches == whole.report.stretches
     with pytest.raises(InputError, match="other options"):
         adapt(start, targets, replace(config, seed=1), work=tmp_path)
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from scenes import around, checkered_ball
 
-from g2ard.adapt import AdaptConfig, adapt
 from g2ard.appearance import blended, colour_change, recoloured, views_seeing
-from g2ard.evaluate import evaluate
-from g2ard.render import render
-from g2ard.simplify import simplify
+from g2ard.stages.adapt import AdaptConfig, adapt
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.render import render
+from g2ard.stages.simplify import simplify
 from g2ard.targets import Subset, TeacherRenders
 
 VIEWS = around(24)
@@ -40,7 +40,7 @@ def test_a_change_of_light_is_found_and_made() -> None:
     assert change.gain > 15
     moved = recoloured(ball, change)
     for view in (0, 7):
-        got, want = (render(s, VIEWS, view, background=BACKGROUND).image for s in (moved, lit))
+        got, want = (render(s, VIEWS[view], background=BACKGROUND).image for s in (moved, lit))
         np.testing.assert_allclose(got, want, atol=0.02)
 
 
@@ -48,7 +48,7 @@ def test_no_change_of_light_is_none() -> None:
     ball = checkered_ball(500)
     change = colour_change(ball, TeacherRenders(ball, VIEWS), (0.0, 0.0, 0.0))
     np.testing.assert_allclose(change.matrix, np.eye(3), atol=1e-6)
-    assert adapt(ball, TeacherRenders(ball, VIEWS), AdaptConfig(steps=5)).report["colour_change"] is None
+    assert adapt(ball, TeacherRenders(ball, VIEWS), AdaptConfig(steps=5)).report.colour_change is None
 
 
 def test_masked_pixels_say_nothing(tmp_path: Path) -> None:
@@ -101,10 +101,10 @@ def test_few_images_change_what_no_image_shows_too() -> None:
         psnr[prior_views] = evaluate(done.splats, others).psnr
     assert psnr[1.0] > evaluate(compact, others).psnr + 2
     assert psnr[1.0] > psnr[0.0] + 0.3
-    assert 0.3 < done.report["prior_share"] < 0.95
+    assert 0.3 < done.report.prior_share < 0.95
 
 
 def test_the_paper_s_schedule_takes_the_fit_as_it_is() -> None:
     ball, lit = evening(300)
     done = adapt(ball, TeacherRenders(lit, VIEWS), AdaptConfig(steps=20, schedule="paper"))
-    assert (done.report["colour_change"], done.report["prior_share"]) == (None, 0.0)
+    assert (done.report.colour_change, done.report.prior_share) == (None, 0.0)

@@ -324,7 +324,7 @@ def test_distill_writes_such_a_report(
 
 def test_scores_are_those_of_evaluate(tmp_path: Path) -> None:
     from g2ard.bench.score import score
-    from g2ard.evaluate import evaluate
+    from g2ard.stages.evaluate import evaluate
 
     ball, views = checkered_ball(400), around(3)
     targets = TeacherRenders(ball, views)

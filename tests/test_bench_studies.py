@@ -21,10 +21,10 @@ from g2ard.bench.run import bench_run
 from g2ard.bench.run_rows import Row, read_rows, with_deltas
 from g2ard.bench.score import score
 from g2ard.errors import InputError
-from g2ard.recover.anchors import PAPER_PRESETS, PRESETS, Anchors, drift95
-from g2ard.render import RasterSettings
-from g2ard.simplify import schedule
 from g2ard.splats import Splats
+from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS, Anchors, drift95
+from g2ard.stages.render import RasterSettings
+from g2ard.stages.simplify import schedule
 from g2ard.targets import TeacherRenders
 
 HEAD = 'title = "Balls"\nratios = [4]\nsteps = [12]\n'

@@ -14,8 +14,8 @@ from g2ard.clean import KINDS, find_clutter
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.metrics import psnr
-from g2ard.render import render
 from g2ard.splats import Splats
+from g2ard.stages.render import render
 from g2ard.transform import merge
 from g2ard.visibility import visibility
 
@@ -65,7 +65,7 @@ def test_the_invisible_are_invisible() -> None:
     assert set(np.unique(found.kind)) == {-1, 0}
     views = around(7, distance=2.5)
     for i in range(7):  # other views than were measured
-        with_all, without = (render(s, views, i).image for s in (splats, splats.take(found.keep)))
+        with_all, without = (render(s, views[i]).image for s in (splats, splats.take(found.keep)))
         assert psnr(np.clip(without, 0, 1), np.clip(with_all, 0, 1)) > 55
 
 

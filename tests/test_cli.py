@@ -119,10 +119,10 @@ def test_quiet_says_errors_only(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["simplify", "absent.ply", "-r", "2", "-o", "out.spz"], "out.spz: scenes are written as"),
-        (["lift", "absent.ply", "-o", "out.sog"], "out.sog: scenes are written as"),
-        (["recover", "absent.ply", "--views", "v.json", "-o", "out.spz"], "out.spz: scenes are written as"),
-        (["adapt", "absent.ply", "--views", "v.json", "-o", "out.spz"], "out.spz: scenes are written as"),
+        (["simplify", "absent.ply", "-r", "2", "-o", "out.obj"], "out.obj: scenes are written as"),
+        (["lift", "absent.ply", "-o", "out.gltf"], "out.gltf: scenes are written as"),
+        (["recover", "absent.ply", "--views", "v.json", "-o", "out.obj"], "out.obj: scenes are written as"),
+        (["adapt", "absent.ply", "--views", "v.json", "-o", "out.obj"], "out.obj: scenes are written as"),
         (
             ["select", "absent.ply", "--views", "v.json", "-k", "2", "-o", "out.txt"],
             "out.txt: views are written",

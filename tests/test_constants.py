@@ -12,11 +12,11 @@ import pytest
 from scenes import around, checkered_ball
 
 from g2ard.constants import changed, listed, parsed
-from g2ard.distill import DistillConfig
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
-from g2ard.lift import LiftConfig
+from g2ard.pipeline import DistillConfig
 from g2ard.presets import preset
+from g2ard.stages.lift import LiftConfig
 
 CommandLine = Callable[..., tuple[int, str, str]]
 
@@ -127,7 +127,10 @@ def test_commands_take_constants_and_report_them(
     prefix, _, key = name.partition(".")
     status, out, error = command_line(*command, "--set", f"{name}={value}", "--json", "-", cwd=folder)
     assert status == 0, error
-    assert json.loads(out)["constants"][prefix][key] == float(value)
+    constants = json.loads(out)["constants"]
+    assert constants[prefix][key] == float(value)
+    if command[0] in ("recover", "distill"):
+        assert constants["schedule"]["steps"] == 3  # what --steps made of it
 
 
 def test_constants_in_a_config_file_and_over_it(folder: Path, command_line: CommandLine) -> None:

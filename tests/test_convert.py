@@ -13,8 +13,8 @@ from scenes import around, checkered_ball
 
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
-from g2ard.render import render
 from g2ard.splats import Splats
+from g2ard.stages.render import render
 from g2ard.transform import in_box, in_sphere, merge, rotate_harmonics, similarity, transform
 
 
@@ -44,11 +44,11 @@ def test_a_moved_scene_looks_the_same_from_moved_cameras(degree: int) -> None:
     viewmats[:, :3] *= 2.5  # rigid: distances grow, the image does not
     after = replace(views, viewmats=viewmats)
     for i in range(4):
-        a, b = render(splats, views, i), render(there, after, i)
+        a, b = render(splats, views[i]), render(there, after[i])
         assert np.abs(a.image - b.image).max() < 2e-3
     wrong = replace(there, shN=splats.shN)
     if degree:  # harmonics that stay behind show
-        assert np.abs(render(wrong, after, 0).image - render(splats, views, 0).image).max() > 0.05
+        assert np.abs(render(wrong, after[0]).image - render(splats, views[0]).image).max() > 0.05
 
 
 def test_a_full_turn_in_three_steps_is_none() -> None:

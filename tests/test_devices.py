@@ -22,9 +22,9 @@ from g2ard.cli.frame import Run
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.poses import make_pool
-from g2ard.select import surface, visible_cells
-from g2ard.simplify import Simplified, flag, simplify
 from g2ard.splats import Splats
+from g2ard.stages.select import surface, visible_cells
+from g2ard.stages.simplify import Simplified, flag, simplify
 
 CommandLine = Callable[..., tuple[int, str, str]]
 
@@ -96,10 +96,10 @@ def test_the_papers_policy_makes_the_same_scene(offset: tuple[float, float, floa
 def test_rows_are_sent_once(gpu: None) -> None:
     """72 bytes a row when it comes into being; then four for each time it is in a group or a cell's list."""
     ball = checkered_ball(4000)
-    rounds = simplify(ball, 400, method="paper").report["rounds"]
+    rounds = simplify(ball, 400, method="paper").report.rounds
     assert len(rounds) > 3
-    rows = len(ball) + sum(r["merged"] for r in rounds)  # a group sheds one row at least
-    looked_at = 10 * len(ball) + sum(3 * r["before"] for r in rounds)  # flags borrow neighbours
+    rows = len(ball) + sum(r.merged for r in rounds)  # a group sheds one row at least
+    looked_at = 10 * len(ball) + sum(3 * r.before for r in rounds)  # flags borrow neighbours
     small = 64 * 1024  # constants of dispatches
     assert devices.state().uploaded_bytes < 72 * rows + (4 + 8) * looked_at + small * (len(rounds) + 1)
     assert devices.state().uploaded_bytes > 72 * len(ball)

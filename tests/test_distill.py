@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from scenes import around, checkered_ball
 
-from g2ard.distill import DistillConfig, distill
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
 from g2ard.images import write_png
 from g2ard.io import Points, read_splats, write_points, write_splats, write_views
+from g2ard.pipeline import DistillConfig, distill
 from g2ard.progress import silent
-from g2ard.recover.schedule import PAPER, TUNED
-from g2ard.render import render
 from g2ard.splats import SH_C0, Splats
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover.schedule import PAPER, TUNED
+from g2ard.stages.render import render
 from g2ard.targets import Targets, TeacherRenders
 
 CommandLine = Callable[..., tuple[int, str, str]]
@@ -38,7 +38,7 @@ def test_views_of_another_kind_are_handed_on(targets: TeacherRenders, tmp_path: 
     near = TeacherRenders(PRIOR, around(4, (64, 48), 2.0))
     config = DistillConfig(steps=20)
     done = distill(PRIOR, 300, targets, config, validation=near, work=tmp_path)
-    assert done.report["rounds"][0]["recover"][0]["validation"]["looks"]
+    assert done.report.rounds[0].recover[0].validation.looks
     with pytest.raises(InputError, match="other options"):
         distill(PRIOR, 300, targets, config, work=tmp_path)
 
@@ -46,14 +46,14 @@ def test_views_of_another_kind_are_handed_on(targets: TeacherRenders, tmp_path: 
 def test_one_shot_reaches_the_budget_and_recovers(targets: TeacherRenders) -> None:
     result = distill(PRIOR, 300, targets, DistillConfig(steps=120))
     assert len(result.splats) == len(result.simplified) == 300
-    assert [entry["count"] for entry in result.report["rounds"]] == [300]
+    assert [entry.count for entry in result.report.rounds] == [300]
     assert evaluate(result.splats, targets).psnr > evaluate(result.simplified, targets).psnr + 3
 
 
 def test_rounds_follow_the_paper_s_counts(targets: TeacherRenders) -> None:
     result = distill(PRIOR, 1000, targets, DistillConfig(method="paper", schedule=ROUNDS))
-    assert [entry["count"] for entry in result.report["rounds"]] == [2250, 1688, 1266, 1000]
-    assert [len(entry["recover"]) for entry in result.report["rounds"]] == [1, 1, 1, 2]
+    assert [entry.count for entry in result.report.rounds] == [2250, 1688, 1266, 1000]
+    assert [len(entry.recover) for entry in result.report.rounds] == [1, 1, 1, 2]
 
 
 def test_an_interrupted_run_goes_on_to_the_same_bits(targets: TeacherRenders, tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_a_loss_in_any_kind_of_views_is_told() -> None:
 
 
 def test_steps_by_need_are_for_teachers() -> None:
-    from g2ard.distill import _Rounds
+    from g2ard.pipeline import _Rounds
 
     part = replace(around(12), Ks=around(12).Ks * [[[4], [4], [1]]])  # a sixteenth of the ball in each
 
@@ -162,7 +162,7 @@ def cloud_with_photos(folder: Path) -> None:
     paths = []
     for i, name in enumerate(views.names):
         paths.append(folder / f"{name}.png")
-        write_png(paths[-1], render(PRIOR, views, i).image)
+        write_png(paths[-1], render(PRIOR, views[i]).image)
     write_views(folder / "views.json", replace(views, image_paths=tuple(paths)))
 
 
@@ -201,7 +201,9 @@ def small(folder: Path) -> Splats:
         (["distill", "s.ply", "-r", "0.5", "-o", "run"], 2, "0.5"),
         (["distill", "s.ply", "-o", "run"], 2, "-n COUNT or -r RATIO"),
         (["distill", "s.ply", "-r", "2", "-o", "run", "--views", "none.json"], 1, "none.json"),
-        (["distill", "s.ply", "-r", "2", "-o", "nowhere/run"], 1, "nowhere"),
+        (["distill", "s.ply", "-r", "2", "-o", "s.ply/run"], 1, "s.ply is a file"),
+        (["distill", "s.ply", "-r", "2,5", "-o", "run"], 2, "{ratio}"),
+        (["simplify", "s.ply", "-r", "2", "-r", "2", "-o", "s{ratio}.ply"], 2, "same place"),
         (["distill", "s.ply", "-r", "2", "-o", "run", "--schedule", "hasty"], 2, "hasty"),
         (["distill", "s.ply", "-r", "2", "-o", "run", "--preset", "gentle"], 2, "gentle"),
         (["distill", "s.ply", "-r", "2", "-o", "run", "--method", "magic"], 2, "magic"),
@@ -210,13 +212,13 @@ def small(folder: Path) -> Splats:
             2,
             "--time-limit",
         ),
-        (["distill", "s.ply", "-r", "2", "-o", "run", "--json", "no/where.json"], 1, "where.json"),
+        (["distill", "s.ply", "-r", "2", "-o", "run", "--json", "s.ply/where.json"], 1, "where.json"),
         (["simplify", "s.ply", "-r", "2", "-o", "o.ply", "--json", "o.ply"], 2, "o.ply"),
         (["simplify", "s.ply", "-n", "60", "-o", "o.ply"], 1, "s.ply"),
         (["simplify", "s.ply", "-n", "6", "-o", "o.ply", "--seed", "-1"], 2, "--seed"),
         (["recover", "s.ply", "--views", "none.json", "-o", "out.ply"], 1, "none.json"),
-        (["recover", "s.ply", "--views", "v.json", "-o", "out.ply"], 1, "photo"),
-        (["recover", "s.ply", "--views", "v.json", "-o", "no/out.ply"], 1, "no"),
+        (["recover", "s.ply", "--views", "v.json", "-o", "no/out.ply"], 1, "--teacher"),
+        (["recover", "s.ply", "--views", "v.json", "-o", "s.ply/out.ply"], 1, "s.ply is a file"),
         (["render", "s.ply", "--views", "none.json", "-o", "out"], 1, "none.json"),
         (["render", "v.json", "--views", "v.json", "-o", "out"], 1, "v.json"),
         (["evaluate", "s.ply", "--views", "v.json", "--teacher", "absent.ply"], 1, "absent.ply"),

@@ -14,11 +14,11 @@ from test_lpips import weights
 
 from g2ard import io
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
 from g2ard.images import as_saved, write_png
 from g2ard.lpips import Lpips
 from g2ard.metrics import psnr
-from g2ard.render import RasterSettings, render
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.render import RasterSettings, render
 from g2ard.targets import PhotosOrRenders, TeacherRenders
 
 INRIA = RasterSettings(convention="inria")
@@ -33,8 +33,8 @@ def test_inrias_convention_reaches_renders_and_targets() -> None:
     mixed = evaluate(ball, TeacherRenders(ball, views), settings=INRIA)
     assert mixed.psnr < 60
     expected = psnr(
-        np.clip(render(ball, views, 0, settings=INRIA).image, 0, 1),
-        np.clip(render(ball, views, 0).image, 0, 1),
+        np.clip(render(ball, views[0], settings=INRIA).image, 0, 1),
+        np.clip(render(ball, views[0]).image, 0, 1),
     )
     assert mixed.views[0].psnr == expected
 
@@ -45,7 +45,7 @@ def test_eight_bit_rounds_both_sides_as_png_does(tmp_path: Path) -> None:
     found = evaluate(small, TeacherRenders(ball, views), eight_bit=True)
     images = []
     for scene in (small, ball):
-        write_png(tmp_path / "x.png", render(scene, views, 0).image, overwrite=True)
+        write_png(tmp_path / "x.png", render(scene, views[0]).image, overwrite=True)
         from PIL import Image
 
         with Image.open(tmp_path / "x.png") as image:

@@ -54,16 +54,26 @@ def test_failure_of_an_input_stays_what_it_is(tmp_path: Path) -> None:
 
 def test_existing_needs_overwrite(tmp_path: Path) -> None:
     (tmp_path / "a").write_text("old")
-    with pytest.raises(OutputError, match=r"exists; give -w"):
+    with pytest.raises(OutputError, match="exists; overwrite=True"):
         check_output(tmp_path / "a")
     with atomic_output(tmp_path / "a", overwrite=True) as temporary:
         temporary.write_text("new")
     assert (tmp_path / "a").read_text() == "new"
 
 
-def test_absent_folder(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="does not exist"):
-        check_output(tmp_path / "no" / "a.ply")
+def test_absent_folders_are_made_with_the_output_and_not_before(tmp_path: Path) -> None:
+    path = tmp_path / "no" / "where" / "a.ply"
+    assert check_output(path) == path
+    assert not (tmp_path / "no").exists()
+    with pytest.raises(ValueError):
+        half_write(path, ValueError())
+    assert not (tmp_path / "no").exists()
+    with atomic_output(path) as temporary:
+        temporary.write_text("new")
+    assert path.read_text() == "new"
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="file is a file"):
+        check_output(tmp_path / "file" / "a.ply")
 
 
 def test_unwritable_folder(tmp_path: Path) -> None:

@@ -15,15 +15,15 @@ from scenes import around, checkered_ball
 from g2ard import io
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
 from g2ard.images import load_mask, write_png
 from g2ard.io.exposures import find_exposures
 from g2ard.metrics import psnr, ssim
-from g2ard.recover import RecoverConfig, recover
-from g2ard.recover.anchors import Regularizers
-from g2ard.render import render
-from g2ard.simplify import simplify
 from g2ard.splats import Splats
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.anchors import Regularizers
+from g2ard.stages.render import render
+from g2ard.stages.simplify import simplify
 from g2ard.targets import Photos
 
 BALL = checkered_ball()
@@ -35,7 +35,7 @@ def photographed(folder: Path, *, spoil: float | None = None, masks: bool = True
     """Photos of the ball with a block of rubbish, and masks that leave it out; read back as a user would."""
     paths = []
     for view, name in enumerate(VIEWS.names):
-        image = np.clip(render(BALL, VIEWS, view).image, 0, 1)
+        image = np.clip(render(BALL, VIEWS[view]).image, 0, 1)
         mask = np.ones(image.shape[:2])
         if spoil is not None:
             image[10:30, 20:50] = spoil
@@ -108,8 +108,8 @@ def test_what_a_mask_hides_does_not_matter(student: Splats, tmp_path: Path, engi
     ]
     for name in ("means", "quats", "scales", "logit_opacities", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(found[0].splats, name), getattr(found[1].splats, name))
-    assert found[0].report["loss"] == found[1].report["loss"]
-    assert found[0].report["psnr"] == found[1].report["psnr"]
+    assert found[0].report.loss == found[1].report.loss
+    assert found[0].report.psnr == found[1].report.psnr
 
 
 def test_masked_photos_teach_what_whole_ones_do(student: Splats, tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_masked_photos_teach_what_whole_ones_do(student: Splats, tmp_path: Path)
 def test_both_engines_step_alike_under_a_mask(student: Splats, tmp_path: Path) -> None:
     targets = Photos(photographed(tmp_path, spoil=1.0))
     losses = [
-        recover(student, targets, RecoverConfig(steps=3, engine=engine, regularizers=BARE)).report["loss"]
+        recover(student, targets, RecoverConfig(steps=3, engine=engine, regularizers=BARE)).report.loss
         for engine in ("fused", "torch")
     ]
     assert losses[0] == pytest.approx(losses[1], abs=2e-4)

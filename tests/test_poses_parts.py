@@ -12,9 +12,9 @@ import pytest
 
 from g2ard.poses.grid import Grid
 from g2ard.poses.lattice import halton, strata
-from g2ard.poses.matter import Matter
 from g2ard.poses.site import Site
 from g2ard.poses.terrain import Terrain
+from g2ard.poses.volume import OccupiedVolume
 
 sys.path.insert(0, str(Path(__file__).parent))
 from reference import poses as naive
@@ -33,8 +33,8 @@ def test_halton_goes_on_where_it_stopped() -> None:
 
 
 def test_grid_equals_its_naive_twin() -> None:
-    matter = Matter.of(naive.statue())
-    grid = Grid.of(np.full(3, -0.5), np.full(3, 0.5), matter, np.eye(3), cells=2000)
+    volume = OccupiedVolume.of(naive.statue())
+    grid = Grid.of(np.full(3, -0.5), np.full(3, 0.5), volume, np.eye(3), cells=2000)
     opaque = grid.opaque == 0
     assert 0.02 < opaque.mean() < 0.9
     np.testing.assert_array_equal(grid.opaque, naive.king_steps(opaque, 12))
@@ -56,10 +56,10 @@ def test_grid_equals_its_naive_twin() -> None:
 
 @pytest.mark.parametrize("batch", [1, 500, 10**6])
 def test_a_grid_does_not_depend_on_how_many_points_are_counted_at_once(batch, monkeypatch) -> None:
-    matter = Matter.of(naive.statue())
-    whole = Grid.of(np.full(3, -0.5), np.full(3, 0.5), matter, np.eye(3), cells=2000)
+    volume = OccupiedVolume.of(naive.statue())
+    whole = Grid.of(np.full(3, -0.5), np.full(3, 0.5), volume, np.eye(3), cells=2000)
     monkeypatch.setattr("g2ard.poses.grid._BATCH", batch)
-    parts = Grid.of(np.full(3, -0.5), np.full(3, 0.5), matter, np.eye(3), cells=2000)
+    parts = Grid.of(np.full(3, -0.5), np.full(3, 0.5), volume, np.eye(3), cells=2000)
     np.testing.assert_array_equal(parts.opaque, whole.opaque)
     np.testing.assert_allclose(parts.scale, whole.scale, rtol=1e-6)
 

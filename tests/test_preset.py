@@ -16,17 +16,17 @@ from scenes import around, checkered_ball
 import g2ard
 from g2ard.cameras import Cameras
 from g2ard.constants import listed
-from g2ard.distill import DistillConfig, distill
 from g2ard.errors import InputError
 from g2ard.images import write_png
 from g2ard.io import Points, read_splats, write_points, write_splats, write_views
+from g2ard.pipeline import DistillConfig, distill
 from g2ard.presets import preset
-from g2ard.recover import RecoverConfig, recover
-from g2ard.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, drift95
-from g2ard.recover.schedule import PAPER, Schedule
-from g2ard.render import render
-from g2ard.simplify import simplify
 from g2ard.splats import SH_C0, Splats
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, drift95
+from g2ard.stages.recover.schedule import PAPER, Schedule
+from g2ard.stages.render import render
+from g2ard.stages.simplify import simplify
 from g2ard.targets import TeacherRenders
 
 CommandLine = Callable[..., tuple[int, str, str]]
@@ -96,7 +96,7 @@ def test_a_cloud_takes_the_lift_s_row(folder: Path, command_line: CommandLine) -
     views = around(12)
     paths = tuple(folder / f"{name}.png" for name in views.names)
     for i, path in enumerate(paths):
-        write_png(path, render(PRIOR, views, i).image)
+        write_png(path, render(PRIOR, views[i]).image)
     write_views(folder / "photos.json", replace(views, image_paths=paths))
     ask = ("distill", "cloud.ply", "-r", 3, "--views", "photos.json", "-o", "run", "--steps", 8)
     report = run(command_line, folder, *ask, "--preset", "paper", "--set", "lift.neighbors=8")
@@ -164,15 +164,13 @@ def test_in_python() -> None:
 def test_anchors_hold_from_construction_to_the_end(targets: TeacherRenders) -> None:
     config = DistillConfig(method="paper", schedule=FEW, regularizers=FREE)
     result = distill(PRIOR, 1000, targets, config)
-    first, last = result.report["rounds"][-1]["recover"]
+    first, last = result.report.rounds[-1].recover
     anchors = Anchors.of(result.simplified)
-    assert last["drift95"] == drift95(anchors, result.splats.means)
+    assert last.drift95 == drift95(anchors, result.splats.means)
     # The round's drift is not forgotten.
-    assert last["geometry"][0]["drift95"] > 0.5 * first["drift95"] > 0.05
+    assert last.geometry[0].drift95 > 0.5 * first.drift95 > 0.05
     held = replace(config, regularizers=Regularizers(100.0, 0.0, effective_rank=False, period=1))
-    assert (
-        distill(PRIOR, 1000, targets, held).report["rounds"][-1]["recover"][-1]["drift95"] < last["drift95"]
-    )
+    assert distill(PRIOR, 1000, targets, held).report.rounds[-1].recover[-1].drift95 < last.drift95
 
 
 def test_the_paper_s_steps_are_kept_whatever_comes_of_them(targets: TeacherRenders) -> None:
@@ -180,11 +178,11 @@ def test_the_paper_s_steps_are_kept_whatever_comes_of_them(targets: TeacherRende
     grain = np.random.default_rng(0).normal(0, 1e-3, PRIOR.sh0.shape).astype(np.float32)
     start = replace(PRIOR, sh0=PRIOR.sh0 + grain)  # so near that such steps only lose
     done = recover(start, targets, config, validation=targets)
-    assert done.report["psnr"]["after"] < done.report["psnr"]["before"]
-    assert (done.report["kept_start"], done.report["way"], done.report["validation"]) == (False, 1.0, None)
+    assert done.report.psnr.after < done.report.psnr.before
+    assert (done.report.kept_start, done.report.way, done.report.validation) == (False, 1.0, None)
     assert (done.splats.sh0 != start.sh0).any()
     guarded = replace(config, schedule=replace(PAPER, guarded=True))
-    assert recover(start, targets, guarded).report["kept_start"]
+    assert recover(start, targets, guarded).report.kept_start
 
 
 def scaled(scene: Splats, cameras: Cameras, unit: float) -> tuple[Splats, Cameras]:

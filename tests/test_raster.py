@@ -13,9 +13,9 @@ from reference import raster as reference
 from g2ard import _core
 from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
-from g2ard.recover.rasterize import rasterize
-from g2ard.render import RasterSettings, render
 from g2ard.splats import Splats
+from g2ard.stages.recover.rasterize import rasterize
+from g2ard.stages.render import RasterSettings, render
 from g2ard.visibility import visibility
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
@@ -113,7 +113,7 @@ def test_median_depth_is_the_oracle_s() -> None:
     cameras = camera(64, 48)
     p = scene(5, 300, size=0.1)
     want, _ = oracle(p, cameras, RasterSettings(), (0, 0, 0))
-    got = render(splats_of(p), cameras, 0, median=True).median
+    got = render(splats_of(p), cameras[0], median=True).median
     assert got is not None
     same = np.abs(got - want.median.numpy()) < 1e-4
     assert (want.median > 0).double().mean() > 0.2
@@ -262,12 +262,12 @@ def everything(p: Params, cameras: Cameras) -> list[bytes]:
     arrays = tuple(p[k] for k in NAMES)
     view = (cameras.viewmats[0].tolist(), [200.0, 200, 100, 75], (200, 150), 0.01)
     r = _core.Rasterizer()
-    choices = RasterSettings().choices
-    image, alpha, depth, median = r.forward(arrays, view, choices, [0.1, 0.2, 0.3], True, True)
+    settings = RasterSettings()
+    image, alpha, depth, median = r.forward(arrays, view, settings, [0.1, 0.2, 0.3], True, True)
     assert depth is not None
     assert median is not None
     g = np.random.default_rng(0).normal(size=(150, 200, 3)).astype(np.float32)
-    sums = _core.accumulate(arrays, [view], choices)
+    sums = _core.accumulate(arrays, [view], settings)
     found = [image, alpha, depth, median, *r.backward(arrays, g, alpha, depth), *sums.values()]
     return [a.tobytes() for a in found]
 
@@ -297,7 +297,7 @@ def test_instruction_sets_agree(isa: str) -> None:
     results = []
     for name in ("portable", isa):
         r = _core.Rasterizer(name)
-        image = r.forward(arrays, view, RasterSettings().choices, [0, 0, 0])[0]
+        image = r.forward(arrays, view, RasterSettings(), [0, 0, 0])[0]
         results.append((image, r.backward(arrays, g)))
     (a, ga), (b, gb) = results
     assert np.quantile(np.abs(a - b), 0.999) < 2e-6
@@ -344,7 +344,7 @@ def test_visibility_counts_what_the_oracle_counts() -> None:
 def test_map_coordinates_render_like_centred_ones() -> None:
     p = scene(6, 100, 2)
     cameras = camera(40, 30)
-    here = render(splats_of(p), cameras, 0).image
+    here = render(splats_of(p), cameras[0]).image
     shift = np.array([500_000.0, 5_400_000.0, 120.0])
     far = Splats(
         means=p["means"].astype(np.float64) + shift,
@@ -354,15 +354,15 @@ def test_map_coordinates_render_like_centred_ones() -> None:
         sh0=p["sh0"],
         shN=p["shN"],
     )
-    there = render(far, cameras.recentred(-shift), 0).image
+    there = render(far, cameras.recentred(-shift)[0]).image
     assert np.quantile(np.abs(here - there), 0.99) < 1e-5
 
 
 def test_bad_input_is_named() -> None:
     p = scene(0, 4, 1)
     cameras = camera(8, 8)
-    with pytest.raises(InputError, match="view 1: there are 1 views"):
-        render(splats_of(p), cameras, 1)
+    with pytest.raises(InputError, match="near: expected one distance"):
+        render(splats_of(p), cameras[0], settings=RasterSettings(near=[0.1, 0.2]))
     with pytest.raises(InputError, match="alpha_max"):
         RasterSettings(alpha_max=1.5)
     with pytest.raises(InputError, match="log_scales: expected float32"):
@@ -372,4 +372,4 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match="quats: expected 4 rows of 4"):
         rasterize(*short, cameras, 0)
     with pytest.raises(InputError, match="near"):
-        render(splats_of(p), cameras, 0, settings=RasterSettings(near=-1.0))
+        render(splats_of(p), cameras[0], settings=RasterSettings(near=-1.0))

@@ -8,8 +8,8 @@ import pytest
 from g2ard import _core
 from g2ard.bench.raster import bench_raster, built_in_view, drawn
 from g2ard.errors import InputError
-from g2ard.render import render
 from g2ard.splats import Splats
+from g2ard.stages.render import render
 
 
 def cloud(n: int = 3000) -> Splats:
@@ -42,7 +42,7 @@ def test_figures_hang_together() -> None:
 
 
 def test_the_built_in_view_sees_the_scene() -> None:
-    image = render(drawn(cloud(), 2000), built_in_view(cloud(), 96, 64), 0)
+    image = render(drawn(cloud(), 2000), built_in_view(cloud(), 96, 64)[0])
     assert image.alpha[24:40, 36:60].mean() > 0.3
 
 

@@ -15,13 +15,14 @@ from test_raster import NAMES, Params, camera, scene, tensors_of
 from g2ard import _core
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.recover.anchors import Anchors, Regularizers
-from g2ard.recover.extent import extents, share_of_rate
-from g2ard.recover.losses import l1_ssim
-from g2ard.recover.rasterize import rasterize
-from g2ard.recover.regularize import TorchAnchors, regularization
-from g2ard.render import RasterSettings, view_of
 from g2ard.splats import Splats
+from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.extent import extents, share_of_rate
+from g2ard.stages.recover.losses import l1_ssim
+from g2ard.stages.recover.rasterize import rasterize
+from g2ard.stages.recover.regularize import TorchAnchors, regularization
+from g2ard.stages.recover.schedule import Rates
+from g2ard.stages.render import RasterSettings, view_of
 
 RATES = {"means": 2e-3, "quats": 1e-2, "log_scales": 2e-2, "logit_opacities": 5e-2, "sh0": 2e-2, "shN": 2e-3}
 BACKGROUND = [0.1, 0.2, 0.3]
@@ -40,8 +41,8 @@ def step(
     trainer: _core.Trainer, v: Cameras, target: Any, regularizers: Any = None, reach: float | None = None
 ) -> tuple[float, int]:
     view = view_of(v, 0, SETTINGS)
-    rates = list(RATES.values())
-    return trainer.step(view, SETTINGS.choices, BACKGROUND, target, 0.2, rates, regularizers, None, reach)
+    rates = Rates(**RATES)
+    return trainer.step(view, SETTINGS, BACKGROUND, target, 0.2, rates, regularizers, None, reach)
 
 
 def problem(n: int = 200, degree: int = 3, views: int = 3) -> tuple[Params, list[Cameras], list[Any]]:
@@ -247,6 +248,8 @@ def test_bits_do_not_depend_on_threads() -> None:
         Regularizers(0.0, 3.0, False),
         Regularizers(0.0, 3.0, True),
         Regularizers(5, 3, True),
+        Regularizers(5, 3, True, thickness=0.2, rank_offset=1e-2),
+        Regularizers(0, 3, True, thickness=0.0),
     ],
 )
 def test_regularizers_are_torch_s(weights: Regularizers) -> None:
@@ -274,7 +277,7 @@ def test_regularizers_are_torch_s(weights: Regularizers) -> None:
     trainer, twin = trainer_of(p), Twin(p)
     trainer.anchor(anchors.means, np.ascontiguousarray(anchors.frames), anchors.r_parallel, anchors.r_perp)
     for i in range(3):
-        step(trainer, cameras[i], targets[i], (weights.anchor, weights.shape, weights.effective_rank))
+        step(trainer, cameras[i], targets[i], weights)
         twin.step(cameras[i], targets[i], extra)
     assert_close(trainer.arrays(), twin.p, p, to=3e-2)
     # The moments hold the gradients themselves: they show the scale that Adam's steps hide.
@@ -309,7 +312,7 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match="target: expected 6720 values"):
         step(trainer_of(p), cameras[0], targets[0][:5])
     with pytest.raises(InputError, match="anchors set before"):
-        step(trainer_of(p), cameras[0], targets[0], (1.0, 1.0, True))
+        step(trainer_of(p), cameras[0], targets[0], Regularizers(1.0, 1.0, True))
     with pytest.raises(InputError, match="reach: expected pixels, more than 0"):
         step(trainer_of(p), cameras[0], targets[0], reach=0.0)
     with pytest.raises(InputError, match="units: expected 10 values"):

@@ -19,15 +19,15 @@ from scenes import around, checkered_ball, under_a_sky
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
-from g2ard.recover import RecoverConfig, probe, recover
-from g2ard.recover import checkpoint as checkpoint_module
-from g2ard.recover.anchors import PRESETS, Anchors, Regularizers
-from g2ard.recover.guard import Guard, blended
-from g2ard.recover.outcome import outcome
-from g2ard.recover.schedule import PAPER, TUNED
-from g2ard.simplify import simplify
 from g2ard.splats import Splats
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover import RecoverConfig, probe, recover
+from g2ard.stages.recover import checkpoint as checkpoint_module
+from g2ard.stages.recover.anchors import PRESETS, Anchors, Regularizers
+from g2ard.stages.recover.guard import Guard, blended
+from g2ard.stages.recover.outcome import outcome
+from g2ard.stages.recover.schedule import PAPER, TUNED
+from g2ard.stages.simplify import simplify
 from g2ard.targets import TeacherRenders
 
 ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
@@ -56,16 +56,16 @@ def test_recovery_lifts_unseen_views(student: Splats, targets: TeacherRenders, e
     unseen = TeacherRenders(TEACHER, around(7, (80, 60), 2.5))
     assert len(result.splats) == len(student)
     assert evaluate(result.splats, unseen).psnr > evaluate(student, unseen).psnr + 3
-    assert result.report["psnr"]["after"] > result.report["psnr"]["before"] + 3
-    assert len(result.report["loss"]) == 100
-    assert [point["step"] for point in result.report["geometry"]] == [15 * k for k in range(1, 11)]
-    assert result.report["geometry"][-1]["drift95"] == result.report["drift95"]
-    assert result.report["regularizers"]["steps"] == 1
+    assert result.report.psnr.after > result.report.psnr.before + 3
+    assert len(result.report.loss) == 100
+    assert [point.step for point in result.report.geometry] == [15 * k for k in range(1, 11)]
+    assert result.report.geometry[-1].drift95 == result.report.drift95
+    assert result.report.regularizers.steps == 1
 
 
 def test_both_engines_take_the_same_way(student: Splats, targets: TeacherRenders) -> None:
     fused, torch = (recover(student, targets, RecoverConfig(steps=60, engine=e)) for e in ("fused", "torch"))
-    assert abs(fused.report["psnr"]["after"] - torch.report["psnr"]["after"]) < 0.005
+    assert abs(fused.report.psnr.after - torch.report.psnr.after) < 0.005
     for name in ("means", "scales", "logit_opacities", "sh0", "shN"):
         ours, theirs = getattr(fused.splats, name), getattr(torch.splats, name)
         moved = np.linalg.norm(ours - getattr(student.with_sh_degree(fused.splats.sh_degree), name))
@@ -109,11 +109,11 @@ def test_ctrl_c_then_resume_is_never_having_stopped(
     assert checkpoint.exists()
     resumed = recover(student, targets, config, checkpoint=checkpoint)
     assert_same_bits(whole.splats, resumed.splats)
-    assert whole.report["loss"] == resumed.report["loss"]
-    assert whole.report["trials"] == resumed.report["trials"]
-    assert whole.report["regularizers"]["steps"] == resumed.report["regularizers"]["steps"]
-    assert bool(whole.report["trials"]) == (steps >= 100)
-    assert whole.report["geometry"] == resumed.report["geometry"]
+    assert whole.report.loss == resumed.report.loss
+    assert whole.report.trials == resumed.report.trials
+    assert whole.report.regularizers.steps == resumed.report.regularizers.steps
+    assert bool(whole.report.trials) == (steps >= 100)
+    assert whole.report.geometry == resumed.report.geometry
 
 
 def test_a_run_that_was_killed_goes_on_from_the_last_minute(
@@ -134,7 +134,7 @@ def test_a_run_that_was_killed_goes_on_from_the_last_minute(
     assert meta["done"] == 20
     resumed = recover(student, targets, config, checkpoint=checkpoint)
     assert_same_bits(whole.splats, resumed.splats)
-    assert whole.report["geometry"] == resumed.report["geometry"]
+    assert whole.report.geometry == resumed.report.geometry
 
 
 def test_resume_refuses_other_options(student: Splats, targets: TeacherRenders, tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_resume_refuses_other_options(student: Splats, targets: TeacherRenders, 
 def test_a_strong_anchor_holds_gaussians_to_their_surface(student: Splats, targets: TeacherRenders) -> None:
     free = RecoverConfig(steps=120, regularizers=Regularizers(0, 0, effective_rank=False))
     held = replace(free, regularizers=Regularizers(50.0, 0, effective_rank=False, period=1))
-    drift = [recover(student, targets, config).report["drift95"] for config in (free, held)]
+    drift = [recover(student, targets, config).report.drift95 for config in (free, held)]
     assert drift[1] < 0.8 * drift[0]
 
 
@@ -163,28 +163,28 @@ def test_the_effective_rank_barrier_keeps_needles_away(targets: TeacherRenders) 
     thin = replace(thin, scales=(thin.scales * np.float32([4, 0.01, 0.05])).astype(np.float32))
     free = RecoverConfig(steps=80, regularizers=Regularizers(0, 0, effective_rank=False))
     held = replace(free, regularizers=Regularizers(0, 20.0, effective_rank=True, period=1))
-    needles = [recover(thin, targets, config).report["needle"] for config in (free, held)]
+    needles = [recover(thin, targets, config).report.needle for config in (free, held)]
     assert needles[1] < needles[0]
 
 
 def test_paper_schedule_runs_with_its_own_rates(student: Splats, targets: TeacherRenders) -> None:
     result = recover(student, targets, RecoverConfig(schedule=PAPER, steps=40, sh_degree=3))
     assert result.splats.sh_degree == 3
-    assert result.report["multiplier"] == 1.0
-    assert result.report["psnr"]["after"] > result.report["psnr"]["before"]
+    assert result.report.multiplier == 1.0
+    assert result.report.psnr.after > result.report.psnr.before
 
 
 def test_trials_choose_rates_that_suit_the_scene(student: Splats, targets: TeacherRenders) -> None:
     report = recover(student, targets, RecoverConfig(steps=100)).report
-    most = max(trial["psnr"] for trial in report["trials"]) - report["psnr"]["before"]
-    good = [t for t in report["trials"] if t["psnr"] - report["psnr"]["before"] >= 0.96 * most]
-    assert report["multiplier"] == max(trial["multiplier"] for trial in good)
-    assert len(report["trials"]) >= 2
+    most = max(trial.psnr for trial in report.trials) - report.psnr.before
+    good = [t for t in report.trials if t.psnr - report.psnr.before >= 0.96 * most]
+    assert report.multiplier == max(trial.multiplier for trial in good)
+    assert len(report.trials) >= 2
     nearly = recover(TEACHER, targets, RecoverConfig(steps=100)).report  # nothing to gain: small steps
-    assert nearly["multiplier"] == pytest.approx(1 / 3)
+    assert nearly.multiplier == pytest.approx(1 / 3)
     fixed = RecoverConfig(schedule=replace(TUNED, multiplier=0.7), steps=100)
     report = recover(student, targets, fixed).report
-    assert (report["multiplier"], report["trials"]) == (0.7, [])
+    assert (report.multiplier, report.trials) == (0.7, ())
 
 
 def test_layers_as_wide_as_the_sky_do_not_shake_the_image() -> None:
@@ -196,8 +196,8 @@ def test_layers_as_wide_as_the_sky_do_not_shake_the_image() -> None:
         )
         for reach in (None, math.inf)
     )
-    assert (held.report["reach"], free.report["reach"]) == (pytest.approx(0.0252, rel=1e-2), None)
-    assert held.report["psnr"]["after"] > free.report["psnr"]["after"] + 0.5
+    assert (held.report.reach, free.report.reach) == (pytest.approx(0.0252, rel=1e-2), None)
+    assert held.report.psnr.after > free.report.psnr.after + 0.5
     moved = [np.abs(done.splats.means - start.means)[-300:].max() for done in (held, free)]
     assert moved[0] < 0.01 * moved[1]
 
@@ -219,8 +219,8 @@ def test_both_engines_limit_the_same_gaussians(student: Splats, targets: Teacher
 def test_a_start_that_is_nearly_there_takes_small_steps_without_trials(targets: TeacherRenders) -> None:
     near = replace(TEACHER, sh0=TEACHER.sh0 + np.float32(0.004))
     report = recover(near, targets, RecoverConfig(time_limit=0.05)).report
-    assert report["trials"] == []
-    assert report["multiplier"] < 1 / 3
+    assert report.trials == ()
+    assert report.multiplier < 1 / 3
 
 
 def test_masked_gaussians_are_left_alone(student: Splats) -> None:
@@ -237,15 +237,15 @@ def test_masked_gaussians_are_left_alone(student: Splats) -> None:
 
 def test_trials_stop_where_the_clock_is_short(student: Splats, targets: TeacherRenders) -> None:
     report = recover(student, targets, RecoverConfig(time_limit=0.05)).report
-    assert report["trials"] == []
-    assert report["seconds"] < 1
+    assert report.trials == ()
+    assert report.seconds < 1
 
 
 def test_a_time_limit_sets_the_horizon(student: Splats, targets: TeacherRenders) -> None:
     report = recover(student, targets, RecoverConfig(time_limit=1.0)).report
-    assert report["steps"] > 5
-    assert report["seconds"] >= 1.0
-    assert report["psnr"]["after"] > report["psnr"]["before"] + 1
+    assert report.steps > 5
+    assert report.seconds >= 1.0
+    assert report.psnr.after > report.psnr.before + 1
 
 
 def test_progress_shows_loss_psnr_and_speed(
@@ -283,7 +283,7 @@ def test_watching_costs_no_time_and_changes_no_bit(student: Splats, targets: Tea
     watched = recover(student, targets, RecoverConfig(steps=20), watch=watch)
     assert_same_bits(plain.splats, watched.splats)
     assert counts[0][0] == len(student)
-    assert counts[0][1] == watched.report["seconds"] < plain.report["seconds"] + 0.2
+    assert counts[0][1] == watched.report.seconds < plain.report.seconds + 0.2
 
 
 def test_a_far_offset_changes_nothing_but_the_offset(student: Splats, targets: TeacherRenders) -> None:
@@ -291,8 +291,8 @@ def test_a_far_offset_changes_nothing_but_the_offset(student: Splats, targets: T
     moved = replace(student, offset=student.offset + far)
     views = VIEWS.recentred(-far)
     teacher = replace(TEACHER, offset=TEACHER.offset + far)
-    here = recover(student, targets, RecoverConfig(steps=20)).report["psnr"]["after"]
-    there = recover(moved, TeacherRenders(teacher, views), RecoverConfig(steps=20)).report["psnr"]["after"]
+    here = recover(student, targets, RecoverConfig(steps=20)).report.psnr.after
+    there = recover(moved, TeacherRenders(teacher, views), RecoverConfig(steps=20)).report.psnr.after
     assert there == pytest.approx(here, abs=0.05)
 
 
@@ -309,12 +309,12 @@ def test_a_start_that_cannot_be_bettered_is_kept(targets: TeacherRenders) -> Non
     start = replace(ball, sh0=ball.sh0 + grain)
     there = TeacherRenders(ball, targets.cameras)
     done = recover(start, there, RecoverConfig(schedule=replace(TUNED, multiplier=3**0.5), steps=5))
-    assert done.report["kept_start"]
+    assert done.report.kept_start
     np.testing.assert_array_equal(done.splats.means, start.means)
     np.testing.assert_array_equal(done.splats.sh0, start.sh0)
-    assert done.report["psnr"]["after"] == done.report["psnr"]["before"] < 100
+    assert done.report.psnr.after == done.report.psnr.before < 100
     calm = recover(start, there, RecoverConfig(steps=100)).report
-    assert calm["multiplier"] < 0.3
+    assert calm.multiplier < 0.3
 
 
 WILD = replace(TUNED, multiplier=20.0, reach=math.inf)
@@ -324,20 +324,20 @@ WILD = replace(TUNED, multiplier=20.0, reach=math.inf)
 def test_what_loses_goes_back_and_on_with_smaller_steps(targets: TeacherRenders) -> None:
     start = simplify(TEACHER, 1500).splats
     done = recover(start, targets, RecoverConfig(schedule=WILD, steps=100)).report
-    assert [found["step"] for found in done["backed_off"]][:2] == [10, 30]
-    assert done["multiplier"] == pytest.approx(20 / 3 ** len(done["backed_off"]))
-    assert done["psnr"]["after"] > done["psnr"]["before"] + 1
-    assert not done["kept_start"]
+    assert [found.step for found in done.backed_off][:2] == [10, 30]
+    assert done.multiplier == pytest.approx(20 / 3 ** len(done.backed_off))
+    assert done.psnr.after > done.psnr.before + 1
+    assert not done.kept_start
     told = outcome(done)
     assert told is not None
-    assert told.startswith(f"recovery fell to {done['backed_off'][0]['psnr']:.2f} dB (start ")
+    assert told.startswith(f"recovery fell to {done.backed_off[0].psnr:.2f} dB (start ")
 
 
 def test_a_resume_after_going_back_is_never_having_stopped(targets: TeacherRenders, tmp_path: Path) -> None:
     start = simplify(TEACHER, 1500).splats
     config = RecoverConfig(schedule=replace(WILD, multiplier=6.0), steps=60)
     whole = recover(start, targets, config)
-    assert whole.report["backed_off"]
+    assert whole.report.backed_off
     for step in (9, 35, 58):
         checkpoint = tmp_path / f"{step}.npz"
         with pytest.raises(KeyboardInterrupt):
@@ -345,15 +345,15 @@ def test_a_resume_after_going_back_is_never_having_stopped(targets: TeacherRende
         resumed = recover(start, targets, config, checkpoint=checkpoint)
         assert_same_bits(whole.splats, resumed.splats)
         for key in ("backed_off", "multiplier", "psnr", "stopped", "way"):
-            assert whole.report[key] == resumed.report[key], key
+            assert getattr(whole.report, key) == getattr(resumed.report, key), key
 
 
 def test_a_hopeless_recovery_stops_early_and_says_so(targets: TeacherRenders) -> None:
     grain = np.random.default_rng(0).normal(0, 1e-3, TEACHER.sh0.shape).astype(np.float32)
     start = replace(TEACHER, sh0=TEACHER.sh0 + grain)
     done = recover(start, targets, RecoverConfig(schedule=WILD, steps=100))
-    assert done.report["kept_start"]
-    assert done.report["steps"] == done.report["stopped"] == 75
+    assert done.report.kept_start
+    assert done.report.steps == done.report.stopped == 75
     assert_same_bits(done.splats, start)
     told = outcome(done.report)
     assert told is not None
@@ -416,11 +416,11 @@ def test_a_recovery_that_other_views_only_lose_by_ends_at_half(targets: TeacherR
     start = simplify(TEACHER, 1500).splats
     elsewhere = TeacherRenders(start, around(5, (64, 48), 2.0))
     done = recover(start, targets, RecoverConfig(steps=100), validation=elsewhere)
-    assert done.report["stopped"] == done.report["steps"] == 50
-    assert done.report["kept_start"]
+    assert done.report.stopped == done.report.steps == 50
+    assert done.report.kept_start
     assert_same_bits(done.splats, start)
-    looks = done.report["validation"]["looks"]
-    assert [found["step"] for found in looks] == [0, 10, 30, 50, 50, 50]
+    looks = done.report.validation.looks
+    assert [found.step for found in looks] == [0, 10, 30, 50, 50, 50]
     told = outcome(done.report)
     assert told is not None
     assert told.startswith("kept the simplified scene: views of another kind only lost by the steps (")
@@ -432,12 +432,10 @@ def test_other_views_gain_where_training_views_can_spare_it(student: Splats, tmp
     config = RecoverConfig(steps=100)
     plain = recover(student, targets, config)
     held = recover(student, targets, config, validation=near)
-    assert plain.report["validation"] is None
-    assert held.report["psnr"]["after"] >= plain.report["psnr"]["after"] - 0.2
+    assert plain.report.validation is None
+    assert held.report.psnr.after >= plain.report.psnr.after - 0.2
     assert evaluate(held.splats, near).psnr >= evaluate(plain.splats, near).psnr
-    assert held.report["validation"]["looks"][-1]["psnr"] == pytest.approx(
-        evaluate(held.splats, near).psnr, abs=1e-3
-    )
+    assert held.report.validation.looks[-1].psnr == pytest.approx(evaluate(held.splats, near).psnr, abs=1e-3)
     checkpoint = tmp_path / "c.npz"
     with pytest.raises(KeyboardInterrupt):
         recover(student, targets, config, validation=near, checkpoint=checkpoint, progress=_StopAt(60))
@@ -445,7 +443,7 @@ def test_other_views_gain_where_training_views_can_spare_it(student: Splats, tmp
         recover(student, targets, config, checkpoint=checkpoint)
     resumed = recover(student, targets, config, validation=near, checkpoint=checkpoint)
     assert_same_bits(held.splats, resumed.splats)
-    assert held.report["validation"] == resumed.report["validation"]
+    assert held.report.validation == resumed.report.validation
 
 
 def test_both_engines_count_the_same_steps(student: Splats, targets: TeacherRenders) -> None:

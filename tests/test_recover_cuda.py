@@ -16,9 +16,9 @@ from scenes import around, checkered_ball
 
 from g2ard import io
 from g2ard.errors import InputError
-from g2ard.recover import RecoverConfig, gsplat_engine, recover
-from g2ard.recover.losses import l1_ssim, l1_ssim_anywhere
-from g2ard.simplify import simplify
+from g2ard.stages.recover import RecoverConfig, gsplat_engine, recover
+from g2ard.stages.recover.losses import l1_ssim, l1_ssim_anywhere
+from g2ard.stages.simplify import simplify
 from g2ard.targets import TeacherRenders
 
 BALL = checkered_ball(1200)
@@ -36,7 +36,7 @@ def ready() -> str | None:
 def test_gsplat_recovers_like_the_cpu() -> None:
     student = simplify(BALL, 300, method="paper").splats
     scores = [
-        recover(student, TARGETS, RecoverConfig(steps=60, engine=engine)).report["psnr"]
+        recover(student, TARGETS, RecoverConfig(steps=60, engine=engine)).report.psnr
         for engine in ("torch", "gsplat")
     ]
     assert scores[0]["before"] == scores[1]["before"]
@@ -71,7 +71,7 @@ def test_the_engine_hands_gsplat_what_it_documents(monkeypatch: pytest.MonkeyPat
         recover(student, TARGETS, RecoverConfig(steps=4, engine=engine, background=(0.2, 0.4, 0.1))).report
         for engine in ("torch", "gsplat")
     ]
-    assert reports[1]["loss"] == pytest.approx(reports[0]["loss"], abs=1e-4)
+    assert reports[1].loss == pytest.approx(reports[0].loss, abs=1e-4)
 
 
 def test_the_loss_in_plain_torch_is_the_fused_one() -> None:

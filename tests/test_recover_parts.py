@@ -12,8 +12,9 @@ import torch
 from scenes import around, checkered_ball
 
 from g2ard.errors import InputError
-from g2ard.recover import checkpoint
-from g2ard.recover.anchors import (
+from g2ard.splats import Splats
+from g2ard.stages.recover import checkpoint
+from g2ard.stages.recover.anchors import (
     PAPER_PRESETS,
     PRESETS,
     Anchors,
@@ -22,10 +23,9 @@ from g2ard.recover.anchors import (
     effective_rank,
     needle,
 )
-from g2ard.recover.presets import preset_for, view_consistency
-from g2ard.recover.regularize import TorchAnchors, anchor_loss, regularization, shape_loss
-from g2ard.recover.schedule import PAPER, TUNED, schedule_named
-from g2ard.splats import Splats
+from g2ard.stages.recover.presets import preset_for, view_consistency
+from g2ard.stages.recover.regularize import TorchAnchors, anchor_loss, regularization, shape_loss
+from g2ard.stages.recover.schedule import PAPER, TUNED, schedule_named
 
 
 def random_splats(n: int = 40, seed: int = 0) -> Splats:
@@ -135,9 +135,9 @@ def test_regularisers_equal_their_naive_twins() -> None:
     anchors = double_anchors(splats)
     anchor, shape = naive_losses(splats, *(t.detach().numpy() for t in (means, log_scales, quats)))
     assert anchor_loss(means, anchors).item() == pytest.approx(anchor, rel=1e-4)
-    assert shape_loss(log_scales, quats, anchors, effective_rank=True).item() == pytest.approx(
-        shape, rel=1e-4
-    )
+    assert shape_loss(
+        log_scales, quats, anchors, Regularizers(0.5, 0.25, effective_rank=True)
+    ).item() == pytest.approx(shape, rel=1e-4)
     both = regularization(means, quats, log_scales, anchors, Regularizers(0.5, 0.25, effective_rank=True))
     assert both.item() == pytest.approx(0.5 * anchor + 0.25 * shape, rel=1e-4)
 

@@ -15,10 +15,19 @@ from g2ard import _core
 from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
 from g2ard.io import read_splats, read_view_set, write_splats, write_views
-from g2ard.lift import lift
 from g2ard.poses import make_pool
-from g2ard.select import POLICIES, CoverageOptions, Surface, poses, select, surface, surfaces, visible_cells
 from g2ard.splats import Splats
+from g2ard.stages.lift import lift
+from g2ard.stages.select import (
+    POLICIES,
+    CoverageOptions,
+    Surface,
+    poses,
+    select,
+    surface,
+    surfaces,
+    visible_cells,
+)
 from g2ard.synth import city
 
 SIZE = (96, 72)
@@ -152,7 +161,15 @@ def random_problem(rng, count=12, cells=60):
 
 def run_greedy(made, seen, positions, k, lazy, **options):
     starts = np.concatenate([[0], np.cumsum([len(s) for s in seen])]).astype(np.uint64)
-    merged = {"directional": True, "kappa": 20.0, "alpha": 2.0, "lambda_": 1.0, **options}
+    merged = {
+        "directional": True,
+        "kappa": 20.0,
+        "alpha": 2.0,
+        "lambda_": 1.0,
+        "anchors": 32,
+        "epsilon": 1e-9,
+        **options,
+    }
     return _core.select_greedy(
         made.parts, starts, np.concatenate(seen).astype(np.uint32), positions, k, lazy=lazy, **merged
     )
@@ -168,6 +185,18 @@ def test_greedy_is_the_naive_greedy(directional, alpha):
         want, value = naive.greedy(6, made, seen, positions, directional=directional, alpha=alpha)
         assert order.tolist() == want
         np.testing.assert_allclose(gains, value, rtol=1e-6, atol=1e-12)
+
+
+def test_directions_and_epsilon_are_options():
+    made, seen, positions = random_problem(np.random.default_rng(5))
+    order, gains, _ = run_greedy(made, seen, positions, 6, False, anchors=48, epsilon=0.1)
+    want, value = naive.greedy(6, made, seen, positions, directional=True, directions=48, epsilon=0.1)
+    assert order.tolist() == want
+    np.testing.assert_allclose(gains, value, rtol=1e-6, atol=1e-12)
+    _, usual, _ = run_greedy(made, seen, positions, 6, False)
+    assert abs(usual[0] - gains[0]) > 1e-3 * abs(usual[0])
+    with pytest.raises(InputError, match="anchors: expected 1 to 64"):
+        run_greedy(made, seen, positions, 6, False, anchors=65)
 
 
 def test_lazy_is_plain_greedy_on_fifty_pools():
@@ -193,11 +222,11 @@ def test_auto_reaches_every_pose_and_then_represents(count):
     scene, cameras = ball(), around(count)
     coarse = surface(scene, 1000)
     depths, shares = poses.outlooks(coarse, cameras)
-    alike = poses.likeness(cameras, depths)
-    wanted = poses.demand(alike)
+    alike = poses.pose_kernel(cameras, depths)
+    wanted = poses.inverse_density(alike)
     np.testing.assert_array_equal(alike, alike.T)
     np.testing.assert_array_equal(np.diag(alike), 1.0)
-    order, gains = poses.represent(alike, wanted, np.ones(count, bool), shares)
+    order, gains = poses.facility_location(alike, wanted, np.ones(count, bool), shares)
     assert order.tolist() == naive.represent(count, alike, wanted, shares)
     assert gains.sum() == pytest.approx(1.0)
     assert gains.min() >= 0
@@ -211,7 +240,9 @@ def test_auto_reaches_first():
     far = np.array([[-4.0, 0, 0], [0, 0, 4.0]])
     chosen = select(ball(), views(np.concatenate([crowd, far])), 3)
     assert set(chosen.order.tolist()) >= {30, 31}
-    unreached = poses.represent(np.eye(5), np.full(5, 0.2), np.array([1, 1, 0, 1, 1], bool), np.ones(5))
+    unreached = poses.facility_location(
+        np.eye(5), np.full(5, 0.2), np.array([1, 1, 0, 1, 1], bool), np.ones(5)
+    )
     assert unreached[0].tolist() == [
         0,
         1,
@@ -224,7 +255,7 @@ def test_of_views_alike_the_one_that_sees_more_is_taken():
     """Five pairs of twins, of which the second sees more."""
     alike = np.kron(np.eye(5), np.ones((2, 2)))
     shares = np.tile([0.2, 0.3], 5)
-    order, _ = poses.represent(alike, np.full(10, 0.1), np.ones(10, bool), shares)
+    order, _ = poses.facility_location(alike, np.full(10, 0.1), np.ones(10, bool), shares)
     assert set(order[:5].tolist()) == {1, 3, 5, 7, 9}
 
 

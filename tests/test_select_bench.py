@@ -13,7 +13,7 @@ from scenes import checkered_ball
 
 from g2ard.bench import rows as table
 from g2ard.bench.select import ARMS, Trial, bench_select, summary
-from g2ard.bench.select_stands import Size, Stand, pool_of, stand
+from g2ard.bench.select_workspaces import Size, Workspace, pool_of, workspace_of
 from g2ard.errors import InputError
 from g2ard.io import write_splats
 
@@ -30,11 +30,11 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def ball(scene: Path) -> Stand:
-    return stand(scene, SIZE)
+def ball(scene: Path) -> Workspace:
+    return workspace_of(scene, SIZE)
 
 
-def test_no_pool_holds_what_is_scored(ball: Stand) -> None:
+def test_no_pool_holds_what_is_scored(ball: Workspace) -> None:
     for kind in ("even", "biased"):
         for seed in range(5):
             pool = pool_of(ball, kind, seed)
@@ -44,7 +44,7 @@ def test_no_pool_holds_what_is_scored(ball: Stand) -> None:
             np.testing.assert_array_equal(pool.rows, pool_of(ball, kind, seed).rows)
 
 
-def test_a_biased_pool_is_crowded(ball: Stand) -> None:
+def test_a_biased_pool_is_crowded(ball: Workspace) -> None:
     def spread(kind: str, seed: int) -> float:
         places = ball.targets.cameras.positions[pool_of(ball, kind, seed).rows]
         return float(np.median(np.linalg.norm(places - np.median(places, axis=0), axis=1)))

@@ -13,11 +13,11 @@ import pytest
 from scenes import around, checkered_ball
 
 from g2ard.cameras import Cameras, look_at
-from g2ard.distill import DistillConfig, distill
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
-from g2ard.recover.schedule import TUNED
-from g2ard.select import select
+from g2ard.pipeline import DistillConfig, distill
+from g2ard.stages.recover.schedule import TUNED
+from g2ard.stages.select import select
 from g2ard.targets import TeacherRenders
 
 CommandLine = Callable[..., tuple[int, str, str]]
@@ -51,12 +51,12 @@ class Watched(TeacherRenders):
 def test_all_views_are_drawn_by_weight_unless_told_otherwise() -> None:
     targets = TeacherRenders(PRIOR, crowded())
     done = distill(PRIOR, 200, targets, SHORT)
-    said = done.report["views"]
-    assert (said["candidates"], len(said["chosen"]), said["refused"]) == (33, 32, ["v32"])
-    assert said["weighted"]
-    assert said["left_out"] == 0
+    said = done.report.views
+    assert (said.candidates, len(said.chosen), said.refused) == (33, 32, ["v32"])
+    assert said.weighted
+    assert said.left_out == 0
     plain = distill(PRIOR, 200, targets, replace(SHORT, weighted=False))
-    assert plain.report["views"] is None
+    assert plain.report.views is None
     assert any(not np.array_equal(getattr(done.splats, a), getattr(plain.splats, a)) for a in ARRAYS)
 
 
@@ -64,24 +64,24 @@ def test_only_chosen_views_are_looked_at_and_the_rest_is_accounted_for() -> None
     targets = Watched(crowded())
     report = distill(PRIOR, 200, targets, replace(SHORT, views=8)).report
     chosen = select(PRIOR, targets.cameras, 8)
-    assert report["views"]["chosen"] == [targets.cameras.names[i] for i in chosen.order]
+    assert report.views.chosen == [targets.cameras.names[i] for i in chosen.order]
     assert targets.asked == set(chosen.order.tolist())
-    assert 0 < report["views"]["left_out"] == chosen.left_out < 1
-    assert report["seconds"]["select"] > 0
+    assert 0 < report.views.left_out == chosen.left_out < 1
+    assert report.seconds.select > 0
 
 
 def test_auto_takes_as_many_as_the_curve_asks_for() -> None:
     targets = TeacherRenders(PRIOR, crowded())
     report = distill(PRIOR, 200, targets, replace(SHORT, views="auto", policy="coverage")).report
-    assert 1 < len(report["views"]["chosen"]) < 20
-    assert report["views"]["policy"] == "coverage"
+    assert 1 < len(report.views.chosen) < 20
+    assert report.views.policy == "coverage"
 
 
 def test_given_weights_stand() -> None:
     cameras = around(12)
     targets, weights = Watched(cameras), np.r_[np.zeros(11), 1.0]
     report = distill(PRIOR, 200, targets, SHORT, weights=weights).report
-    assert report["views"] is None
+    assert report.views is None
     with pytest.raises(InputError, match="expected 12"):
         distill(PRIOR, 200, targets, SHORT, weights=[1.0])
     with pytest.raises(InputError, match="policy"):
@@ -89,7 +89,7 @@ def test_given_weights_stand() -> None:
 
 
 def test_selects_once_unless_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    import g2ard.select as stage
+    import g2ard.stages.select as stage
 
     counts: list[int] = []
     whole = stage.select
@@ -125,7 +125,7 @@ def test_a_stopped_run_goes_on_with_the_same_views(tmp_path: Path) -> None:
     again = distill(PRIOR, 600, targets, config, work=tmp_path)
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(whole.splats, name), getattr(again.splats, name))
-    assert whole.report["views"] == again.report["views"]
+    assert whole.report.views == again.report.views
     with pytest.raises(InputError, match="another scene or other options"):
         distill(PRIOR, 600, targets, replace(config, views=7), work=tmp_path)
 

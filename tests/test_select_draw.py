@@ -14,10 +14,10 @@ from scenes import around, checkered_ball
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
-from g2ard.recover import RecoverConfig, recover
-from g2ard.recover.draw import checked_weights, drawn
-from g2ard.simplify import simplify
 from g2ard.splats import Splats
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.draw import checked_weights, drawn
+from g2ard.stages.simplify import simplify
 from g2ard.targets import TeacherRenders
 
 ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
@@ -101,7 +101,7 @@ def test_a_resume_draws_on_where_it_stopped(
         recover(student, targets, config, checkpoint=checkpoint)
     resumed = recover(student, targets, config, weights=WEIGHTS, checkpoint=checkpoint)
     assert same(whole.splats, resumed.splats)
-    assert whole.report["loss"] == resumed.report["loss"]
+    assert whole.report.loss == resumed.report.loss
 
 
 def signal_interrupt() -> None:

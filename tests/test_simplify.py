@@ -11,8 +11,8 @@ from simplify_cases import ARRAYS, all_alike, assert_same, assert_sound, scene
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.simplify import METHODS, SimplifyConfig, schedule, simplify
 from g2ard.splats import Splats
+from g2ard.stages.simplify import METHODS, SimplifyConfig, schedule, simplify
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -111,7 +111,7 @@ def test_odd_scenes(method, name):
         out = simplify(prior, budget, method=method)
         assert_sound(out, len(prior), budget)
         infinite = int(np.isinf(prior.logit_opacities).sum())
-        assert out.report["infinite_logits"] == infinite
+        assert out.report.infinite_logits == infinite
 
 
 @pytest.mark.parametrize("method", ["default", "fast"])
@@ -120,7 +120,7 @@ def test_a_floater_swallows_nothing_that_shows(method):
     far = prior.means.copy()
     far[7] = [160_000, 0, 0]
     out = simplify(replace(prior, means=far), 100, method=method)
-    assert out.report["faded"] == 0
+    assert out.report.faded == 0
     assert (out.parents == out.parents[7]).sum() == 1
 
 
@@ -134,23 +134,23 @@ def test_scales_too_large_to_square(method):
 
 def test_floaters_that_fade_are_counted():
     prior = replace(scene(500), logit_opacities=np.full(500, 3, np.float32))
-    assert simplify(prior, 50).report["faded"] == 0
+    assert simplify(prior, 50).report.faded == 0
     far = prior.means.copy()
     far[:40] += 160_000 * np.random.default_rng(5).normal(size=(40, 3)).astype(np.float32)
     out = simplify(replace(prior, means=far), 12)
     faint = out.splats.opacities < 1 / 255
-    assert out.report["faded"] == np.count_nonzero(faint) > 0
+    assert out.report.faded == np.count_nonzero(faint) > 0
     assert set(np.flatnonzero(faint)) == set(out.parents[:40][faint[out.parents[:40]]])
 
 
 def test_the_paper_says_what_it_skipped():
     prior = scene(2000)
     out = simplify(prior, 1500, method="paper")
-    assert out.report["skipped"]["coverages"] == sum(r["refused"]["energy"] for r in out.report["rounds"])
+    assert out.report.skipped["coverages"] == sum(r.refused["energy"] for r in out.report.rounds)
     faint = replace(prior, logit_opacities=np.where(np.arange(2000) < 1500, 0, -9).astype(np.float32))
-    dropped = simplify(faint, 1500, method="paper").report["skipped"]
+    dropped = simplify(faint, 1500, method="paper").report.skipped
     assert (dropped["binnings"], dropped["trims"]) == (1, 1)
-    assert "binnings" not in simplify(prior, 200).report["skipped"]
+    assert "binnings" not in simplify(prior, 200).report.skipped
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -172,7 +172,7 @@ def test_non_finite_rows_are_dropped_and_counted(method):
     prior.means[5, 0], prior.scales[9, 1], prior.shN[30, 1, 2] = np.nan, np.inf, np.nan
     out = simplify(prior, 100, method=method)
     assert_sound(out, 400, 100)
-    assert out.report["nonfinite_rows"] == 3
+    assert out.report.nonfinite_rows == 3
     assert (out.parents[[5, 9, 30]] == -1).all()
 
 
@@ -204,15 +204,15 @@ def test_schedule():
 def test_the_report_adds_up(method):
     prior = scene(5000)
     out = simplify(prior, 600, method=method, visibility=None if method == "paper" else all_alike)
-    rounds = out.report["rounds"]
-    for r, before in zip(rounds, [5000, *(r["after"] for r in rounds)], strict=False):
-        assert r["before"] == before
-        assert r["after"] == r["before"] - r["dropped"] - r["merged"] - r["trimmed"]
-    assert rounds[-1]["after"] == 600
+    rounds = out.report.rounds
+    for r, before in zip(rounds, [5000, *(r.after for r in rounds)], strict=False):
+        assert r.before == before
+        assert r.after == r.before - r.dropped - r.merged - r.trimmed
+    assert rounds[-1].after == 600
     members = [np.count_nonzero(out.parents == p) for p in range(600)]
-    assert out.report["merged_members"] == sum(m for m in members if m > 1)
-    assert out.report["skipped"]["alone"] == members.count(1)
-    assert sum(r["merged"] for r in rounds) >= out.report["merged_members"] - sum(m > 1 for m in members)
+    assert out.report.merged_members == sum(m for m in members if m > 1)
+    assert out.report.skipped["alone"] == members.count(1)
+    assert sum(r.merged for r in rounds) >= out.report.merged_members - sum(m > 1 for m in members)
 
 
 @pytest.mark.parametrize("logit", [-16, -1e4, -np.inf])
@@ -254,7 +254,7 @@ def test_command_line(tmp_path, command_line):
     for arguments, want, part in (
         (("-r", "10", "-o", "small.ply"), 1, "small.ply"),  # exists
         (("-n", "5", "-o", "b.ply", "--no-views", "--views", "x"), 2, "exclude"),
-        (("-n", "1001", "-o", "b.ply"), 1, "prior.ply: the budget of 1001"),
+        (("-n", "1001", "-o", "b.ply"), 1, "prior.ply: a budget of 1,001"),
         (("-n", "0", "-o", "b.ply"), 2, "positive count"),
         (("-o", "b.ply"), 2, "either -n COUNT or -r RATIO"),
         (("-n", "5", "-o", "b.ply", "--method", "best"), 2, "method"),

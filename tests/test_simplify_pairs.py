@@ -11,8 +11,8 @@ import pytest
 from simplify_cases import ARRAYS, Views, all_alike, assert_sound, opaque_wall, scene
 
 from g2ard.errors import InputError
-from g2ard.simplify import SimplifyConfig, simplify
 from g2ard.splats import Splats
+from g2ard.stages.simplify import SimplifyConfig, simplify
 
 sys.path.insert(0, str(Path(__file__).parent))
 from reference import simplify as naive
@@ -44,7 +44,7 @@ def test_a_function_of_visibility_is_asked_again_for_the_result():
     assert_sound(out, 4000, 100)
     assert asked == [4000, 100]  # the last to fit what was merged
     assert out.protected.all()
-    assert out.report["unseen"] == 0
+    assert out.report.unseen == 0
 
 
 def test_what_no_view_sees_is_counted():
@@ -55,8 +55,8 @@ def test_what_no_view_sees_is_counted():
         return Views(np.where(splats.means[:, 0] < 0, 0.0, 1.0), np.full(len(splats), 0.01))
 
     out = simplify(prior, 100, visibility=look)
-    assert out.report["unseen"] == (unseen & (out.parents >= 0)).sum() > 0
-    assert simplify(prior, 100).report["unseen"] is None
+    assert out.report.unseen == (unseen & (out.parents >= 0)).sum() > 0
+    assert simplify(prior, 100).report.unseen is None
 
 
 @pytest.mark.parametrize("growth", [1.0, 1.5])
@@ -83,25 +83,25 @@ def test_clusters_conserve_mass_mean_and_covariance(method, growth):
 
 @pytest.mark.parametrize("method", ["default", "fast"])
 def test_an_opaque_wall_stays_opaque_and_thin(method):
-    from g2ard.render import render
-    from g2ard.visibility import looker
+    from g2ard.stages.render import render
+    from g2ard.visibility import visibility_source
 
     wall, cameras = opaque_wall()
     alpha = {}
     for growth in (1.0, 1.5):
         out = simplify(wall, 80, method=method, config=SimplifyConfig(max_growth=growth)).splats
-        alpha[growth] = render(out, cameras, 0).alpha[15:45, 20:60].mean()
+        alpha[growth] = render(out, cameras[0]).alpha[15:45, 20:60].mean()
         assert out.scales.min(axis=1).max() < 0.0025
     assert alpha[1.5] > alpha[1.0] + 0.05
-    seen = simplify(wall, 80, method=method, visibility=looker(cameras)).splats
-    assert render(seen, cameras, 0).alpha[15:45, 20:60].mean() > alpha[1.5]
+    seen = simplify(wall, 80, method=method, visibility=visibility_source(cameras)).splats
+    assert render(seen, cameras[0]).alpha[15:45, 20:60].mean() > alpha[1.5]
 
 
 def test_opacities_are_fitted_and_all_else_is_the_members():
     prior = scene(4000, dtype=np.float64)
     config = SimplifyConfig(max_growth=1)
     out = simplify(prior, 100, visibility=all_alike, config=config)
-    assert out.report["fitted"] > 50
+    assert out.report.fitted > 50
     members = np.bincount(out.parents[out.parents >= 0], minlength=100)
     floor = 0.05 * members.mean()  # every row sends 1 to the views, before and after
     factor = np.clip((members + floor) / (1 + floor), 0.5, 2) ** 0.25
@@ -134,7 +134,7 @@ def test_no_merged_cluster_is_dropped():
 @pytest.mark.parametrize("method", ["default", "fast"])
 @pytest.mark.parametrize("scale", [1.0, 2.0**-10])
 def test_what_is_seen_does_not_depend_on_the_order_of_rows(method, scale):
-    from g2ard.visibility import looker
+    from g2ard.visibility import visibility_source
 
     wall, cameras = opaque_wall()
     viewmats = cameras.viewmats.copy()
@@ -142,12 +142,12 @@ def test_what_is_seen_does_not_depend_on_the_order_of_rows(method, scale):
     cameras = replace(cameras, viewmats=viewmats)
     wall = replace(wall, means=wall.means * np.float32(scale), scales=wall.scales * np.float32(scale))
     shuffled = np.random.default_rng(8).permutation(len(wall))
-    a = simplify(wall, 80, method=method, visibility=looker(cameras))
-    b = simplify(wall.take(shuffled), 80, method=method, visibility=looker(cameras))
+    a = simplify(wall, 80, method=method, visibility=visibility_source(cameras))
+    b = simplify(wall.take(shuffled), 80, method=method, visibility=visibility_source(cameras))
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(a.splats, name), getattr(b.splats, name), err_msg=name)
     np.testing.assert_array_equal(a.parents[shuffled], b.parents)
-    assert a.report["fitted"] > 40
+    assert a.report.fitted > 40
 
 
 def test_bands_of_zeros_are_skipped_and_come_back():
@@ -157,5 +157,5 @@ def test_bands_of_zeros_are_skipped_and_come_back():
     np.testing.assert_array_equal(a.splats.shN, b.splats.shN[:, :3])
     assert b.splats.shN.shape == (60, 15, 3)
     assert not b.splats.shN[:, 3:].any()
-    assert (a.report["skipped"]["sh_bands"], b.report["skipped"]["sh_bands"]) == (0, 2)
-    assert b.report["skipped"]["alone"] == (np.bincount(b.parents[b.parents >= 0]) == 1).sum()
+    assert (a.report.skipped["sh_bands"], b.report.skipped["sh_bands"]) == (0, 2)
+    assert b.report.skipped["alone"] == (np.bincount(b.parents[b.parents >= 0]) == 1).sum()

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from simplify_cases import ARRAYS, assert_sound, scene
 
-from g2ard.simplify import SimplifyConfig, flag, schedule, simplify
 from g2ard.splats import Splats
+from g2ard.stages.simplify import SimplifyConfig, flag, schedule, simplify
 
 sys.path.insert(0, str(Path(__file__).parent))
 from reference import simplify as naive
@@ -22,7 +22,7 @@ def one_round(prior, budget, flags, **options):
 
 def test_paper_goes_by_the_schedule():
     out = simplify(scene(5000), 600, method="paper")
-    assert [r["after"] for r in out.report["rounds"]] == schedule(5000, 600)
+    assert [r.after for r in out.report.rounds] == schedule(5000, 600)
 
 
 def test_paper_merges_as_the_naive_twin_and_conserves_moments():
@@ -60,7 +60,7 @@ def test_paper_drops_the_transparent_but_never_below_the_budget():
     prior.logit_opacities[::5] = -6
     visible = int((prior.opacities >= 0.01).sum())
     out = one_round(prior, visible - 50, np.zeros(1000, bool))
-    assert out.report["rounds"][0]["dropped"] == 1000 - visible
+    assert out.report.rounds[0].dropped == 1000 - visible
     assert_sound(one_round(prior, visible + 10, np.zeros(1000, bool)), 1000, visible + 10)
 
 
@@ -100,5 +100,5 @@ def test_coverage_equals_the_naive_twin():
         for margin, refused in ((-0.06, 0), (0.06, 1)):
             least = max(0, covered + margin)
             out = one_round(prior, 1, np.zeros(n, bool), min_opacity=0, max_energy=10, min_coverage=least)
-            assert out.report["rounds"][0]["refused"] == {"energy": 0, "coverage": refused}, n
+            assert out.report.rounds[0].refused == {"energy": 0, "coverage": refused}, n
     assert partly > 3

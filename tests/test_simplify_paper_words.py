@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from simplify_cases import ARRAYS
 
-from g2ard.simplify import SimplifyConfig, flag, simplify
 from g2ard.splats import Splats
+from g2ard.stages.simplify import SimplifyConfig, flag, simplify
 
 C0 = 0.28209479177387814
 
@@ -29,28 +29,28 @@ def sheet(side, height=0.0):
 def one_group(points, colors, **options):
     """The report of a reduction to one cell, in one round."""
     config = SimplifyConfig(retention=1e-9, **options)
-    return simplify(discs(points, colors), 1, method="paper", config=config).report["rounds"][0]
+    return simplify(discs(points, colors), 1, method="paper", config=config).report.rounds[0]
 
 
 def shed(result, how):
-    return sum(r[how] for r in result.report["rounds"])
+    return sum(getattr(r, how) for r in result.report.rounds)
 
 
 # "Locality cells: adaptive voxels, |C| ≈ N_S … one cell per retained primitive" (tab:s_config).
 
 
 def test_one_cell_for_each_retained_primitive_in_every_round():
-    rounds = simplify(discs(sheet(60)), 360, method="paper").report["rounds"]
+    rounds = simplify(discs(sheet(60)), 360, method="paper").report.rounds
     assert len(rounds) == 8
     for r in rounds:
-        assert abs(r["cells"] - 360) <= 0.03 * 360, r
+        assert abs(r.cells - 360) <= 0.03 * 360, r
 
 
 def test_a_round_on_the_way_has_the_cells_of_the_final_budget():
     prior = discs(sheet(60))
     config = SimplifyConfig(retention=1e-9)
     out = simplify(prior, 2700, method="paper", final_budget=360, config=config)
-    assert abs(out.report["rounds"][0]["cells"] - 360) <= 0.03 * 360
+    assert abs(out.report.rounds[0].cells - 360) <= 0.03 * 360
 
 
 # "Third, if the count still exceeds the round budget, primitives are ranked": merging comes first, and ends
@@ -62,14 +62,14 @@ def test_flat_smooth_discs_reach_the_budget_by_merging():
     smooth = np.stack([0.3 + 0.002 * points[:, 0], 0.3 + 0.002 * points[:, 1], 0 * points[:, 0] + 0.4], 1)
     out = simplify(discs(points, smooth), 360, method="paper")
     assert shed(out, "merged") >= 0.98 * (3600 - 360)
-    assert [r["after"] for r in out.report["rounds"]][-1] == 360
+    assert [r.after for r in out.report.rounds][-1] == 360
 
 
 def test_merging_ends_at_the_round_budget():
-    first = simplify(discs(sheet(60)), 360, method="paper").report["rounds"][0]
-    assert first["after"] == 2700
-    assert first["trimmed"] <= 8  # a group that is taken back returns all of its members
-    assert first["undone_groups"] > 100
+    first = simplify(discs(sheet(60)), 360, method="paper").report.rounds[0]
+    assert first.after == 2700
+    assert first.trimmed <= 8  # a group that is taken back returns all of its members
+    assert first.undone_groups > 100
 
 
 # "A surface-coverage guard prevents merging across incompatible geometric support" (section 3.2), ">= 0.6 of
@@ -80,7 +80,7 @@ def test_merging_ends_at_the_round_budget():
 def test_two_parallel_sheets_do_not_merge(gap):
     for side in (1, 2, 4):
         pair = np.concatenate([sheet(side), sheet(side, gap)])
-        assert one_group(pair, 0.4)["refused"] == {"energy": 0, "coverage": 1}, side
+        assert one_group(pair, 0.4).refused == {"energy": 0, "coverage": 1}, side
     prior = discs(np.concatenate([sheet(30), sheet(30, gap)]))
     out = simplify(prior, 180, method="paper", config=SimplifyConfig(retention=1e-9))
     of = out.parents
@@ -105,8 +105,8 @@ def test_a_wall_does_not_merge_with_a_floor_it_stands_on():
         scales=np.concatenate([ground.scales, wall.scales]),
     )
     config = SimplifyConfig(retention=1e-9)
-    report = simplify(prior, 1, method="paper", config=config).report["rounds"][0]
-    assert report["refused"]["coverage"] == 1
+    report = simplify(prior, 1, method="paper", config=config).report.rounds[0]
+    assert report.refused["coverage"] == 1
 
 
 # "E_j = (1/|C_j|) Σ ‖c_i − ĉ_i‖²" (eq. frequency): in-sample.
@@ -119,17 +119,17 @@ def test_groups_of_one_color_bin_pass_the_energy(count, least):
     for _ in range(100):
         points = np.c_[rng.uniform(0, 2, (count, 2)), rng.uniform(0, 0.04, count)]
         report = one_group(points, rng.uniform(0.25, 0.5, (count, 3)), min_coverage=0)
-        passed += report["merged"] == count - 1
+        passed += report.merged == count - 1
     assert passed >= 100 * least
 
 
 def test_texture_of_more_than_the_threshold_is_refused_and_flagged():
     points = sheet(4)
     checks = np.where((points[:, 0] + points[:, 1]) % 2 == 0, 0.26, 0.49)[:, None]
-    assert one_group(points, checks)["refused"] == {"energy": 1, "coverage": 0}
+    assert one_group(points, checks).refused == {"energy": 1, "coverage": 0}
     assert flag(discs(points, checks), 1).all()
     ramp = 0.26 + 0.05 * points[:, :1]
-    assert one_group(points, ramp)["merged"] == 15
+    assert one_group(points, ramp).merged == 15
     assert not flag(discs(points, ramp), 1).any()
 
 
@@ -139,9 +139,9 @@ def test_texture_of_more_than_the_threshold_is_refused_and_flagged():
 def test_colors_beyond_white_are_white():
     points = sheet(4)
     bright = np.linspace(0.8, 3, 16)[:, None]
-    assert one_group(points, bright)["merged"] == 15
+    assert one_group(points, bright).merged == 15
     assert not flag(discs(points, 1 + bright), 1).any()
-    assert one_group(points, -bright)["merged"] == 15
+    assert one_group(points, -bright).merged == 15
 
 
 def test_bins_part_a_cell():

@@ -16,14 +16,14 @@ from view_files import transforms
 
 from g2ard.bench.definition import read_definition
 from g2ard.bench.recover import RecoverBench
-from g2ard.bench.select_stands import Size, pool_of, stand
-from g2ard.bench.stand import Stand
+from g2ard.bench.select_workspaces import Size, pool_of, workspace_of
+from g2ard.bench.workspace import Workspace
 from g2ard.errors import InputError
 from g2ard.images import write_png
 from g2ard.io import Points, read_points, read_view_set, write_points, write_splats, write_views
-from g2ard.lift import lift
-from g2ard.render import render
 from g2ard.splits import for_scores, for_training, not_held_out, split_mask, splits_of
+from g2ard.stages.lift import lift
+from g2ard.stages.render import render
 
 CommandLine = Callable[..., tuple[int, str, str]]
 Program = Callable[..., None]
@@ -47,7 +47,7 @@ def folder(tmp_path: Path) -> Path:
     transforms(photos / "transforms.json", list(VIEWS.viewmats), **size)
     (photos / "images").mkdir()
     for i in range(16):
-        write_png(photos / "images" / f"{i:03d}.png", render(BALL, VIEWS, i).image)
+        write_png(photos / "images" / f"{i:03d}.png", render(BALL, VIEWS[i]).image)
     split = {"train": sorted(TRAIN), "test": sorted(TEST)}
     (photos / "split.json").write_text(json.dumps(split))
     return tmp_path
@@ -79,10 +79,10 @@ class Watch:
 
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
-    import g2ard.adapt
-    import g2ard.evaluate
-    import g2ard.recover
-    import g2ard.render
+    import g2ard.stages.adapt
+    import g2ard.stages.evaluate
+    import g2ard.stages.recover
+    import g2ard.visibility
 
     seen = Watch()
 
@@ -96,10 +96,10 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
 
         monkeypatch.setattr(module, name, told)
 
-    watched(g2ard.recover, "recover", 1, seen.trained)
-    watched(g2ard.adapt, "adapt", 1, seen.trained)
-    watched(g2ard.render, "looker", 0, seen.looked)
-    watched(g2ard.evaluate, "evaluate", 1, seen.scored)
+    watched(g2ard.stages.recover, "recover", 1, seen.trained)
+    watched(g2ard.stages.adapt, "adapt", 1, seen.trained)
+    watched(g2ard.visibility, "visibility_source", 0, seen.looked)
+    watched(g2ard.stages.evaluate, "evaluate", 1, seen.scored)
     return seen
 
 
@@ -235,7 +235,7 @@ def test_training_on_test_views_is_said(command_line: CommandLine, folder: Path)
             output = f"{command}-{split}.ply"
             status, _, error = command_line(command, "small.ply", *look, output, "--split", split, cwd=folder)
             assert status == 0, error
-            said = f"--split {split}: {words} views trained on are test views"
+            said = f"split {split}: {words} views trained on are test views"
             assert (said in error) if words else ("test views" not in error)
 
 
@@ -274,17 +274,17 @@ adapt = "photos"
 
 
 def test_simplifiers_are_given_training_views_alone(folder: Path) -> None:
-    from g2ard.bench.simplify import _Stand
+    from g2ard.bench.simplify import _Workspace
 
     names = [f"{i:03d}.png" for i in range(16)]
     (folder / "photos" / "split.json").write_text(
         json.dumps({"train": names[:6], "val": names[6:9], "test": names[9:13]})
     )
-    made = _Stand(folder, folder / "ball.ply", folder / "photos", None, 0, ["pool"])
+    made = _Workspace(folder, folder / "ball.ply", folder / "photos", None, 0, ["pool"])
     assert set(made.targets["pool"].cameras.names) == set(names[9:13])
     written = read_view_set(made.views)
     assert written.splits == ("train",) * 6 + ("val",) * 3 + ("test",) * 4 + (None,) * 3
-    pool = read_view_set(_Stand(folder / "photos", folder / "ball.ply", None, None, 0, ["pool"]).views)
+    pool = read_view_set(_Workspace(folder / "photos", folder / "ball.ply", None, None, 0, ["pool"]).views)
     assert pool.splits == splits_of(None, pool.cameras.names)
 
 
@@ -292,7 +292,7 @@ def test_studies_read_the_stated_splits(folder: Path) -> None:
     for score in ("", 'score = { unseen = "photos" }\n'):
         (folder / "study.toml").write_text(STUDY + score)
         definition = read_definition(folder / "study.toml")
-        made = Stand(folder / f"work{len(score)}", definition, definition.scenes[0])
+        made = Workspace(folder / f"work{len(score)}", definition, definition.scenes[0])
         for path in (made.train, made.adapt):
             found = read_view_set(path)
             assert (set(found.cameras.names), set(found.splits)) == (TRAIN, {"train"})
@@ -320,7 +320,7 @@ def test_caliterra_s_photos_stay_apart(folder: Path, g2ard: Program, watch: Watc
 def test_the_study_of_policies_never_offers_test_photos() -> None:
     data = real("caliterra")
     test = set(json.loads((data / "split.json").read_text())["test"])
-    made = stand(data, Size(gaussians=500, pixels=64))
+    made = workspace_of(data, Size(gaussians=500, pixels=64))
     names = np.array(made.targets.cameras.names)
     assert set(names[made.tests]) <= test
     for kind in ("biased", "even"):

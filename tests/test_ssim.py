@@ -10,7 +10,7 @@ from reference import ssim as reference
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.recover.losses import l1_ssim
+from g2ard.stages.recover.losses import l1_ssim
 
 Image = NDArray[np.float32]
 SHAPES = [(48, 64, 3), (1, 1, 3), (5, 7, 3), (33, 100, 1), (130, 17, 3), (12, 11, 4)]

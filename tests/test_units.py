@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from g2ard.cameras import Cameras, look_at
-from g2ard.render import RasterSettings, render, settings_for
-from g2ard.select import select
-from g2ard.simplify import simplify
 from g2ard.splats import Splats
-from g2ard.visibility import looker, visibility
+from g2ard.stages.render import RasterSettings, render, settings_for
+from g2ard.stages.select import select
+from g2ard.stages.simplify import simplify
+from g2ard.visibility import visibility, visibility_source
 
 ARRAYS = ("means", "scales", "quats", "logit_opacities", "sh0", "shN")
 
@@ -52,9 +52,9 @@ def in_units(scene: Splats, cameras: Cameras, unit: float) -> tuple[Splats, Came
 def test_what_views_see_scales_by_powers_of_two_exactly(method, unit, dtype):
     scene, cameras = replace(ball(), means=ball().means.astype(dtype)), around()
     small, near = in_units(scene, cameras, unit)
-    here = simplify(scene, 150, method=method, visibility=looker(cameras))
-    there = simplify(small, 150, method=method, visibility=looker(near))
-    assert here.report["fitted"] > 50
+    here = simplify(scene, 150, method=method, visibility=visibility_source(cameras))
+    there = simplify(small, 150, method=method, visibility=visibility_source(near))
+    assert here.report.fitted > 50
     back = in_units(there.splats, near, 1 / unit)[0]
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(back, name), getattr(here.splats, name), err_msg=name)
@@ -64,7 +64,7 @@ def test_what_views_see_scales_by_powers_of_two_exactly(method, unit, dtype):
 def test_an_image_does_not_depend_on_the_unit():
     scene, cameras = ball(), around()
     small, near = in_units(scene, cameras, 1e-3)
-    here, there = render(scene, cameras, 0), render(small, near, 0)
+    here, there = render(scene, cameras[0]), render(small, near[0])
     assert here.alpha.max() > 0.9
     np.testing.assert_allclose(there.image, here.image, rtol=0, atol=1e-3)
     seen, same = visibility(scene, cameras), visibility(small, near)
@@ -90,7 +90,7 @@ def test_views_are_chosen_in_any_unit(policy):
 
 def test_recovery_works_in_any_unit():
     pytest.importorskip("torch")
-    from g2ard.recover import RecoverConfig, recover
+    from g2ard.stages.recover import RecoverConfig, recover
     from g2ard.targets import TeacherRenders
 
     figures = []
@@ -98,7 +98,7 @@ def test_recovery_works_in_any_unit():
         scene, cameras = in_units(ball(), around(), unit)
         student = simplify(scene, 300).splats
         done = recover(student, TeacherRenders(scene, cameras), RecoverConfig(steps=30))
-        figures.append((done.report["psnr"]["before"], done.report["psnr"]["after"]))
+        figures.append((done.report.psnr.before, done.report.psnr.after))
     (before, after), (before_small, after_small) = figures
     assert after > before + 1
     assert before_small == pytest.approx(before, abs=0.05)

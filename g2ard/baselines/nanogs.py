@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.recover.anchors import rotation_matrices
 from g2ard.splats import Splats
+from g2ard.stages.recover.anchors import rotation_matrices
 
 __all__ = ["nanogs"]
 

@@ -11,8 +11,8 @@ from g2ard import _core
 from g2ard.baselines.ranking import keep_best
 from g2ard.cameras import Cameras
 from g2ard.progress import Progress, counter, silent
-from g2ard.render import arrays_of, centred, settings_for, view_of
 from g2ard.splats import Splats
+from g2ard.stages.render import arrays_of, centred, settings_for, view_of
 
 __all__ = ["fisher", "pup", "rounds", "sensitivity"]
 
@@ -35,7 +35,7 @@ def fisher(splats: Splats, cameras: Cameras, *, progress: Progress = silent) -> 
     splats, cameras = centred(splats, cameras)
     settings = settings_for(splats.means)
     views = [view_of(cameras, i, settings) for i in range(len(cameras))]
-    upper = _core.sensitivity(arrays_of(splats), views, settings.choices, counter(progress, "sensitivity"))
+    upper = _core.sensitivity(arrays_of(splats), views, settings, counter(progress, "sensitivity"))
     out = np.zeros((len(splats), 6, 6))
     rows, columns = np.triu_indices(6)
     out[:, rows, columns] = out[:, columns, rows] = upper

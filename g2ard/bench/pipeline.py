@@ -13,11 +13,11 @@ from g2ard.baselines.pup import rounds as pup_rounds
 from g2ard.bench.definition import Definition, SceneSpec
 from g2ard.bench.methods import ROUND_STEPS, Leg, Matched, MethodSpec
 from g2ard.bench.process import Usage
-from g2ard.bench.stand import Stage, Stand, fingerprint, scene_key
-from g2ard.recover.presets import preset_for
-from g2ard.simplify import METHODS as SIMPLIFIERS
-from g2ard.simplify import schedule as paper_rounds
+from g2ard.bench.workspace import Stage, Workspace, fingerprint, scene_key
 from g2ard.splats import Splats
+from g2ard.stages.recover.presets import preset_for
+from g2ard.stages.simplify import METHODS as SIMPLIFIERS
+from g2ard.stages.simplify import schedule as paper_rounds
 
 __all__ = ["Cell", "Pipeline", "Spent"]
 
@@ -72,10 +72,10 @@ class Spent:
 class Pipeline:
     """One cell's stages, from the prior to the scene that is scored."""
 
-    def __init__(self, stand: Stand, cell: Cell) -> None:
-        self.stand, self.cell = stand, cell
-        self.source = stand.prior(cell.method.prior)
-        self.prior = cell.method.prior or stand.kinds[0]
+    def __init__(self, workspace: Workspace, cell: Cell) -> None:
+        self.workspace, self.cell = workspace, cell
+        self.source = workspace.prior(cell.method.prior)
+        self.prior = cell.method.prior or workspace.kinds[0]
         splats = io.read_splats(self.source.output)
         self.count = len(splats)
         self.budget = max(1, math.floor(self.count / cell.ratio + 0.5))
@@ -114,13 +114,13 @@ class Pipeline:
 
     def run(self) -> Stage:
         """The scene that is scored."""
-        method, stand = self.cell.method, self.stand
-        views = stand.train
+        method, workspace = self.cell.method, self.workspace
+        views = workspace.train
         if method.policy is not None:
-            chosen = stand.select(self.source, method.policy, method.k, self.cell.seed)
+            chosen = workspace.select(self.source, method.policy, method.k, self.cell.seed)
             views = chosen.output
             self.selecting.add(chosen.usage)
-        early = stand.train if method.shared_start else views
+        early = workspace.train if method.shared_start else views
         counts = self.counts()
         legs = method.legs(len(counts)) if counts else []
         state, flags = self.source, None
@@ -131,7 +131,7 @@ class Pipeline:
             for leg in (leg for leg in legs if leg.round == number):
                 state = self._recover(state, views if leg.final else early, leg, legs, built)
         if self.cell.definition.adapt_steps:
-            state = stand.readapt(state, self.sh_degree, self.cell.seed)
+            state = workspace.readapt(state, self.sh_degree, self.cell.seed)
             self.adapting.add(state.usage)
         return state
 
@@ -145,7 +145,7 @@ class Pipeline:
         job: dict[str, Any] = {"method": method.reduce, "count": count, "seed": self._seed(False)}
         if method.reduce not in baselines.METHODS:
             job |= {"budget": self.budget, "protection": method.protection}
-        done = self.stand.reduce(state, views, job, flags)
+        done = self.workspace.reduce(state, views, job, flags)
         self.reducing.add(done.usage, done.report.get("seconds"))
         return done
 
@@ -161,7 +161,7 @@ class Pipeline:
             "final": leg.final,
             "seed": self._seed(leg.final),
         }
-        done = self.stand.recover(state, views, job, None if state is built else built)
+        done = self.workspace.recover(state, views, job, None if state is built else built)
         self.recovering.add(done.usage, done.report["seconds"])
         self.steps += done.report["steps"]
         self.last = done.report

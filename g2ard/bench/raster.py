@@ -14,8 +14,9 @@ from g2ard import _core
 from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
-from g2ard.render import RasterSettings, arrays_of, view_of
 from g2ard.splats import Splats
+from g2ard.stages.recover.schedule import Rates
+from g2ard.stages.render import RasterSettings, arrays_of, view_of
 
 __all__ = ["RasterBench", "SceneFigures", "bench_raster", "built_in_view", "cpu_name", "drawn"]
 
@@ -166,17 +167,17 @@ def _measure(
     arrays, view = arrays_of(splats), view_of(local, 0, settings)
     width, height = view[2]
     rasterizer = _core.Rasterizer(isa)
-    target, _, _, _ = rasterizer.forward(arrays, view, settings.choices, [0.0, 0.0, 0.0], False)
+    target, _, _, _ = rasterizer.forward(arrays, view, settings, [0.0, 0.0, 0.0], False)
     counts = rasterizer.counts()
-    contributing = int(_core.accumulate(arrays, [view], settings.choices)["hits"].sum())
+    contributing = int(_core.accumulate(arrays, [view], settings)["hits"].sum())
     trainer = _core.Trainer(arrays, splats.scales.max(1), isa)
-    lesson = (view, settings.choices, [0.0, 0.0, 0.0], np.ascontiguousarray(target[::-1]), 0.2)
+    step_input = (view, settings, [0.0, 0.0, 0.0], np.ascontiguousarray(target[::-1]), 0.2)
     limits = _core.machine_limits()
     rehearsals, steps = [], []
     for _ in range(repeats):
-        trainer.rehearse(*lesson)
+        trainer.gradients_only(*step_input)
         rehearsals.append(trainer.passes())
-        trainer.step(*lesson, [0.0] * 6)  # rates of 0: every repeat times the same scene
+        trainer.step(*step_input, Rates(*[0.0] * 6))  # rates of 0: every repeat times the same scene
         steps.append(trainer.passes())
     memory = trainer.memory()
     again = _core.machine_limits()

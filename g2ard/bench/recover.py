@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,21 +16,22 @@ from g2ard.bench.recover_studies import STUDIES, Plan
 from g2ard.bench.simplify import machine, scene_label
 from g2ard.bench.standing import check_protocol, standing_targets
 from g2ard.cameras import Cameras
-from g2ard.distill import DistillConfig, distill
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
-from g2ard.lift import lift
+from g2ard.pipeline import DistillConfig, distill
 from g2ard.poses import make_pool
 from g2ard.progress import Progress, silent
-from g2ard.recover import RecoverConfig, recover
-from g2ard.recover.anchors import PAPER_PRESETS, Anchors, drift95, effective_rank, needle
-from g2ard.recover.presets import preset_for
-from g2ard.recover.schedule import PAPER
-from g2ard.simplify import simplify
 from g2ard.splats import Splats
 from g2ard.splits import HOLD_OUT, for_scores, for_training, not_held_out, split_mask
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.lift import lift
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.anchors import PAPER_PRESETS, Anchors, drift95, effective_rank, needle
+from g2ard.stages.recover.presets import preset_for
+from g2ard.stages.recover.report import RecoverReport
+from g2ard.stages.recover.schedule import PAPER
+from g2ard.stages.simplify import simplify
 from g2ard.targets import Photos, Targets, TeacherRenders
-from g2ard.visibility import looker
+from g2ard.visibility import visibility_source
 
 __all__ = ["STUDIES", "Look", "RecoverBench", "bench_recover"]
 
@@ -213,7 +213,7 @@ class RecoverBench:
         """What all one-shot runs of a budget start from, and the seconds it took to make."""
         if budget not in self._starts:
             began = time.monotonic()
-            look = looker(self.cameras[0], progress=progress)
+            look = visibility_source(self.cameras[0], progress=progress)
             small = simplify(self.prior, budget, visibility=look, progress=progress).splats
             if self.sh_degree is not None:
                 small = small.with_sh_degree(self.sh_degree)
@@ -314,22 +314,22 @@ class _Run:
         way = self._chain if self.plan.schedule.round_steps else self._once
         done, started, reports = way(progress)
         self._count_cpu()
-        _check_finite(done, [loss for report in reports for loss in report["loss"]])
-        spent = sum(report["seconds"] for report in reports)
-        extra = sum(report["seconds"] * report["regularizers"]["share"] for report in reports)
+        _check_finite(done, [loss for report in reports for loss in report.loss])
+        spent = sum(report.seconds for report in reports)
+        extra = sum(report.seconds * report.regularizers.share for report in reports)
         ends = [
             replace(
                 look,
                 simplify_s=self.simplify_s,
                 drift95=drift95(Anchors.of(started), done.means),
                 reg_share=extra / max(spent, 1e-9),
-                skipped=sum(report["skipped"]["non_finite"] for report in reports),
+                skipped=sum(report.skipped["non_finite"] for report in reports),
             )
-            for look in self._look(done, reports[-1]["steps"], spent, final=1)
+            for look in self._look(done, reports[-1].steps, spent, final=1)
         ]
         return [*self.found, *ends]
 
-    def _once(self, progress: Progress) -> tuple[Splats, Splats, list[dict[str, Any]]]:
+    def _once(self, progress: Progress) -> tuple[Splats, Splats, list[RecoverReport]]:
         plan, bench = self.plan, self.bench
         start, self.simplify_s = bench.start(self.budget, progress)
         assert plan.regularizers is not None
@@ -347,7 +347,7 @@ class _Run:
         done = recover(start, bench.targets[0], config, progress=progress, watch=self._watch)
         return done.splats, start, [done.report]
 
-    def _chain(self, progress: Progress) -> tuple[Splats, Splats, list[dict[str, Any]]]:
+    def _chain(self, progress: Progress) -> tuple[Splats, Splats, list[RecoverReport]]:
         plan, bench = self.plan, self.bench
         assert plan.regularizers is not None
         config = DistillConfig(
@@ -362,8 +362,8 @@ class _Run:
         done = distill(
             bench.prior, self.budget, bench.targets[0], config, progress=progress, watch=self._watch
         )
-        self.simplify_s = done.report["seconds"]["simplify"]
-        reports = [report for entry in done.report["rounds"] for report in entry["recover"]]
+        self.simplify_s = done.report.seconds.simplify
+        reports = [report for entry in done.report.rounds for report in entry.recover]
         return done.splats, done.simplified, reports
 
     def _watch(self, step: int, seconds: float, splats: Callable[[], Splats]) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from g2ard.recover.anchors import Regularizers
-from g2ard.recover.schedule import PAPER, TUNED, Schedule
+from g2ard.stages.recover.anchors import Regularizers
+from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
 
 __all__ = ["STUDIES", "Plan"]
 

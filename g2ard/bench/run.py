@@ -16,12 +16,12 @@ from g2ard.bench.pipeline import Cell, Pipeline
 from g2ard.bench.run_rows import Row, with_deltas, write_csv
 from g2ard.bench.score import Scored, pictured, save_jpeg, score
 from g2ard.bench.simplify import machine
-from g2ard.bench.stand import Stand, folder_of
+from g2ard.bench.workspace import Workspace, folder_of
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.lpips import Lpips, load_lpips
 from g2ard.progress import Progress, silent
-from g2ard.recover.anchors import needle
+from g2ard.stages.recover.anchors import needle
 
 __all__ = ["bench_run", "cells_of"]
 
@@ -65,7 +65,7 @@ def bench_run(
         for d in definitions
         if d.lpips is not None
     }
-    stand: Stand | None = None
+    workspace: Workspace | None = None
     if again:
         for definition in definitions:
             for scene in definition.scenes:
@@ -75,12 +75,12 @@ def bench_run(
         if not again and _done(folder, cell):
             continue
         try:
-            if stand is None or (stand.definition, stand.scene) != (cell.definition, cell.scene):
-                stand = Stand(folder / "work", cell.definition, cell.scene)
+            if workspace is None or (workspace.definition, workspace.scene) != (cell.definition, cell.scene):
+                workspace = Workspace(folder / "work", cell.definition, cell.scene)
             networks = weights.get((cell.definition.lpips or "", cell.definition.lpips_input), {})
-            answer = _measure(stand, cell, folder, networks)
+            answer = _measure(workspace, cell, folder, networks)
         except Exception as error:  # one cell must not end hours of others; its row and the exit status tell
-            stand = None
+            workspace = None
             answer = {"rows": [asdict(_failed(cell, error))], "views": {}}
         _write_json(folder / "cells" / f"{cell.key}.json", {**answer, "label": cell.label})
         write_csv(folder / "rows.csv", _rows(folder, cells) + _others(folder, cells))
@@ -150,8 +150,8 @@ def _failed(cell: Cell, error: BaseException) -> Row:
     return replace(_head(cell, cell.method.prior or "", ""), error=text)
 
 
-def _measure(stand: Stand, cell: Cell, folder: Path, lpips: dict[str, Lpips]) -> dict[str, Any]:
-    work = Pipeline(stand, cell)
+def _measure(workspace: Workspace, cell: Cell, folder: Path, lpips: dict[str, Lpips]) -> dict[str, Any]:
+    work = Pipeline(workspace, cell)
     result = work.run()
     splats = io.read_splats(result.output)
     if len(splats) != work.budget:
@@ -178,22 +178,22 @@ def _measure(stand: Stand, cell: Cell, folder: Path, lpips: dict[str, Lpips]) ->
         "seconds": work.selecting.wall + work.reducing.wall + work.recovering.wall,
     }
     rows, views = [], {}
-    for split, targets in stand.test.items():
-        _picture_targets(folder, stand, split)
+    for split, targets in workspace.test.items():
+        _picture_targets(folder, workspace, split)
         pictures = folder / "images" / cell.key / split
         scored = score(
             splats,
             targets,
             cell.scene.background,
             lpips=lpips,
-            settings=stand.settings,
+            settings=workspace.settings,
             eight_bit=cell.definition.eight_bit,
             pictures=pictures,
         )
         measured: dict[str, Any] = {**figures, **_means(scored)}
         rows.append(asdict(replace(_head(cell, work.prior, split), **measured)))
         views[split] = [asdict(view) for view in scored.views]
-    return {"rows": rows, "views": views, "scene_key": stand.key, "dropped": stand.dropped}
+    return {"rows": rows, "views": views, "scene_key": workspace.key, "dropped": workspace.dropped}
 
 
 def _means(scored: Scored) -> dict[str, Any]:
@@ -203,10 +203,10 @@ def _means(scored: Scored) -> dict[str, Any]:
     return {**means, **counted, "luma_drift": scored.luma_drift}
 
 
-def _picture_targets(folder: Path, stand: Stand, split: str) -> None:
-    targets = stand.test[split]
+def _picture_targets(folder: Path, workspace: Workspace, split: str) -> None:
+    targets = workspace.test[split]
     for view in pictured(len(targets.cameras)):
-        path = folder / "images" / stand.key / split / f"{view}.jpg"
+        path = folder / "images" / workspace.key / split / f"{view}.jpg"
         if not path.exists():
             save_jpeg(path, targets[view])
 

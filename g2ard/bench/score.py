@@ -12,8 +12,8 @@ from PIL import Image
 from g2ard.images import as_saved, to_bytes
 from g2ard.lpips import Lpips
 from g2ard.metrics import psnr, ssim
-from g2ard.render import RasterSettings, Renderer
 from g2ard.splats import Splats
+from g2ard.stages.render import RasterSettings, Renderer
 from g2ard.targets import Targets, mask_of
 
 __all__ = ["Scored", "ViewFigures", "luma", "pictured", "save_jpeg", "score"]
@@ -98,13 +98,13 @@ def score(
         background: RGB behind the scene.
         lpips: networks to score with as well.
         settings: the renderer's conventions; None means gsplat's.
-        eight_bit: as for `g2ard.evaluate.evaluate`.
+        eight_bit: as for `g2ard.stages.evaluate.evaluate`.
         pictures: a folder; None keeps no pictures.
     """
     renderer = Renderer(splats, background=background, settings=settings)
     views = []
     for number, name in enumerate(targets.cameras.names):
-        image, target = np.clip(renderer.image(targets.cameras, number), 0, 1), targets[number]
+        image, target = np.clip(renderer.image(targets.cameras[number]), 0, 1), targets[number]
         if eight_bit:
             image, target = as_saved(image), as_saved(target)
         mask = mask_of(targets, number)

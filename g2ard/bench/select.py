@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.bench import rows as table
-from g2ard.bench.select_stands import KINDS, Pool, Size, Stand, label, pool_of, stand
+from g2ard.bench.select_workspaces import KINDS, Pool, Size, Workspace, label, pool_of, workspace_of
 from g2ard.bench.simplify import machine
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
 from g2ard.progress import Progress, silent
-from g2ard.recover import RecoverConfig, recover
-from g2ard.select import POLICIES, CoverageOptions, Selection, select
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.select import POLICIES, CoverageOptions, Selection, select
 from g2ard.targets import Subset, Targets
 
 __all__ = ["ARMS", "Trial", "bench_select", "summary"]
@@ -148,7 +148,7 @@ def bench_select(
             continue
         own = f"{label(scene).replace('/', '_')}-{size.candidates}-{size.pixels}"
         folder = cache / own if cache else None
-        bench = _Bench(stand(scene, size, cache=folder, progress=progress), size, steps)
+        bench = _Bench(workspace_of(scene, size, cache=folder, progress=progress), size, steps)
         for key in missing:
             trial = bench.run(*key)
             table.append(csv_path, [trial])
@@ -166,25 +166,25 @@ def _plan(arms: Sequence[str], percents: Sequence[float], draws: int) -> Iterato
 
 
 class _Bench:
-    """Trials on one stand; a pool's orders are found once."""
+    """Trials in one workspace; a pool's orders are found once."""
 
-    def __init__(self, scene: Stand, size: Size, steps: int) -> None:
-        self.stand, self.size, self.steps = scene, size, steps
+    def __init__(self, scene: Workspace, size: Size, steps: int) -> None:
+        self.workspace, self.size, self.steps = scene, size, steps
         self._orders: dict[tuple[str, int, str], tuple[Selection, float]] = {}
 
     def run(self, scene: str, kind: str, arm: str, percent: float, seed: int, draw: int) -> Trial:
-        pool = pool_of(self.stand, kind, seed)
+        pool = pool_of(self.workspace, kind, seed)
         k = max(1, math.ceil(percent / 100 * len(pool.rows) - 1e-9))
         rows, weights, select_s = self._chosen(pool, kind, arm, k, seed, draw)
         began = time.process_time()
         result = recover(
-            self.stand.student,
-            Subset(self.stand.targets, pool.rows[rows]),
+            self.workspace.student,
+            Subset(self.workspace.targets, pool.rows[rows]),
             RecoverConfig(
                 steps=self.steps,
-                regularizers=self.stand.regularizers,
-                sh_degree=self.stand.sh_degree,
-                background=self.stand.background,
+                regularizers=self.workspace.regularizers,
+                sh_degree=self.workspace.sh_degree,
+                background=self.workspace.background,
                 seed=seed,
             ),
             weights=weights,
@@ -192,11 +192,14 @@ class _Bench:
         recover_s = time.process_time() - began
 
         def score(targets: Targets) -> tuple[float, float]:
-            found = evaluate(result.splats, targets, background=self.stand.background)
+            found = evaluate(result.splats, targets, background=self.workspace.background)
             return found.psnr, found.ssim
 
-        inside, outside = score(Subset(self.stand.targets, self.stand.tests)), score(self.stand.outside)
-        crowd = score(Subset(self.stand.targets, pool.crowd))[0] if len(pool.crowd) else None
+        inside, outside = (
+            score(Subset(self.workspace.targets, self.workspace.tests)),
+            score(self.workspace.outside),
+        )
+        crowd = score(Subset(self.workspace.targets, pool.crowd))[0] if len(pool.crowd) else None
         return Trial(
             scene, kind, arm, percent, seed, draw, len(pool.rows), len(rows), *inside, *outside, crowd,
             select_s, recover_s, self.steps, len(result.splats), self.size.pixels, machine(),
@@ -223,9 +226,9 @@ class _Bench:
     def _select(self, pool: Pool, k: int, policy: str, seed: int) -> tuple[Selection, float]:
         assert policy in POLICIES
         began = time.process_time()
-        cameras = self.stand.targets.cameras.take(pool.rows)
+        cameras = self.workspace.targets.cameras.take(pool.rows)
         options = CoverageOptions(cells=_CELLS)
-        chosen = select(self.stand.prior, cameras, k, policy=policy, seed=seed, options=options)
+        chosen = select(self.workspace.prior, cameras, k, policy=policy, seed=seed, options=options)
         return chosen, time.process_time() - began
 
 

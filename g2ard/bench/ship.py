@@ -16,14 +16,14 @@ from g2ard.bench import rows as table
 from g2ard.bench.simplify import scene_label
 from g2ard.bench.standing import standing_targets
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
 from g2ard.io.scene_formats import FORMATS
 from g2ard.poses import make_pool
 from g2ard.progress import Progress, silent
-from g2ard.simplify import simplify
 from g2ard.splats import Splats
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.simplify import simplify
 from g2ard.targets import TeacherRenders
-from g2ard.visibility import looker
+from g2ard.visibility import visibility_source
 
 __all__ = ["PEER", "Cell", "bench_ship"]
 
@@ -101,7 +101,7 @@ def bench_ship(
         targets = {"pool": TeacherRenders(splats, cameras.take(held), lazy=True)}
         targets |= standing_targets(splats, scene, seed)
         for ratio in ratios:
-            small = _reduced(splats, ratio, looker(cameras.take(~held)))
+            small = _reduced(splats, ratio, visibility_source(cameras.take(~held)))
             plain: dict[str, float] = {}
             for name in names:
                 cell = Cell(scene_label(scene), ratio, name, "", count=len(small))

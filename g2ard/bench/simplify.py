@@ -21,11 +21,11 @@ from g2ard.bench.process import measured
 from g2ard.bench.raster import cpu_name
 from g2ard.bench.standing import check_protocol, standing_targets
 from g2ard.errors import InputError
-from g2ard.evaluate import evaluate
 from g2ard.poses import make_pool
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
 from g2ard.splits import split_mask, splits_of
+from g2ard.stages.evaluate import evaluate
 from g2ard.targets import TeacherRenders
 
 __all__ = [
@@ -165,10 +165,10 @@ def bench_simplify(
         if not missing:
             continue
         with tempfile.TemporaryDirectory(prefix="g2ard-bench-") as folder:
-            stand = _Stand(Path(folder), scene, views, splat_transform, seed, kinds)
+            workspace = _Workspace(Path(folder), scene, views, splat_transform, seed, kinds)
             for name, some in missing.items():
                 about: dict[str, Any] = {"version": versions[name[2]], "machine": machine()}
-                cells = [replace(cell, **about) for cell in stand.measure(*name, some)]
+                cells = [replace(cell, **about) for cell in workspace.measure(*name, some)]
                 table.append(csv_path, cells)
                 done |= {cell.key: cell for cell in cells}
                 finished += len(cells)
@@ -176,7 +176,7 @@ def bench_simplify(
     return [done[key] for _, key in wanted]
 
 
-class _Stand:
+class _Workspace:
     """One scene, written out, with its views; measures methods on it."""
 
     def __init__(

@@ -13,7 +13,7 @@ from g2ard.errors import InputError
 from g2ard.poses import plan_pool
 from g2ard.poses.lattice import halton
 from g2ard.poses.orbit import plan_orbit
-from g2ard.poses.sight import Lens, Poses, look
+from g2ard.poses.sight import Lens, Poses, view_statistics
 from g2ard.poses.site import Site
 from g2ard.splats import Splats
 from g2ard.splits import for_scores
@@ -129,7 +129,7 @@ def _between(splats: Splats, seed: int) -> Cameras:
     eyes = far.eyes + ((1 - share) * met)[:, None] * far.gazes
     free = (site.grid.distance(eyes) > 2 * site.grid.cell) & (site.above_ground(eyes) > 0.01)
     poses = Poses(eyes[free], far.gazes[free])
-    poses = poses.take(look(site, poses, lens).close > 2 * site.grid.cell)
+    poses = poses.take(view_statistics(site, poses, lens).close > 2 * site.grid.cell)
     return _named(poses.take(slice(_STANDING)).cameras(site, lens))
 
 

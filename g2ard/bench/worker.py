@@ -22,8 +22,8 @@ from g2ard.cameras import Cameras
 from g2ard.errors import G2ardError
 from g2ard.images import to_bytes
 from g2ard.io.atomic import atomic_output
-from g2ard.recover.anchors import Anchors, Regularizers
-from g2ard.recover.schedule import Rates, Schedule, schedule_named
+from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.schedule import Rates, Schedule, schedule_named
 from g2ard.targets import CACHE_BYTES, Targets, against_of, mask_of
 
 __all__ = ["StoredTargets", "store_targets"]
@@ -72,8 +72,8 @@ def store_targets(targets: Targets, folder: Path) -> None:
 
 def _reduce(job: Job) -> dict[str, Any]:
     from g2ard import baselines
-    from g2ard.simplify import SimplifyConfig, simplify
-    from g2ard.visibility import looker
+    from g2ard.stages.simplify import SimplifyConfig, simplify
+    from g2ard.visibility import visibility_source
 
     splats, cameras = io.read_splats(job["scene"]), _cameras(job["views"])
     output, began = Path(job["output"]), time.monotonic()
@@ -95,7 +95,7 @@ def _reduce(job: Job) -> dict[str, Any]:
         splats,
         job["count"],
         method="default" if job["method"] == "no-views" else job["method"],
-        visibility=looker(cameras) if looks else None,
+        visibility=visibility_source(cameras) if looks else None,
         protected=flags,
         final_budget=job["budget"],
         config=config,
@@ -107,17 +107,17 @@ def _reduce(job: Job) -> dict[str, Any]:
 
 
 def _select(job: Job) -> dict[str, Any]:
-    from g2ard.select import select
+    from g2ard.stages.select import select
 
     cameras = _cameras(job["views"])
     chosen = select(io.read_splats(job["scene"]), cameras, job["k"], policy=job["policy"], seed=job["seed"])
-    kept = cameras.take(np.sort(chosen.order))  # of training views alone: the stand has taken the others out
+    kept = cameras.take(np.sort(chosen.order))  # of training views alone: the workspace holds the others out
     io.write_views(job["output"], kept, splits=["train"] * len(kept), overwrite=True)
     return {"views": len(chosen.order)}
 
 
 def _cameras(path: str) -> Cameras:
-    """All views of a file that the stand has written, with a photo or without."""
+    """All views of a file that the workspace has written, with a photo or without."""
     return io.read_view_set(path, unpictured=True).cameras
 
 
@@ -126,7 +126,7 @@ def _targets(job: Job) -> StoredTargets:
 
 
 def _recover(job: Job) -> dict[str, Any]:
-    from g2ard.recover import RecoverConfig, recover
+    from g2ard.stages.recover import RecoverConfig, recover
 
     student, targets = io.read_splats(job["scene"]), _targets(job)
     for view in range(len(targets.cameras)):  # read before the clock of a time limit starts
@@ -145,11 +145,12 @@ def _recover(job: Job) -> dict[str, Any]:
     anchors = None if built is None else Anchors.of(built, config.regularizers.in_plane)
     done = recover(student, targets, config, anchors=anchors)
     io.write_splats(job["output"], done.splats, overwrite=True)
-    return {key: done.report[key] for key in ("steps", "seconds", "psnr", "drift95", "needle", "multiplier")}
+    report = done.report.as_dict()
+    return {key: report[key] for key in ("steps", "seconds", "psnr", "drift95", "needle", "multiplier")}
 
 
 def _adapt(job: Job) -> dict[str, Any]:
-    from g2ard.adapt import AdaptConfig, adapt
+    from g2ard.stages.adapt import AdaptConfig, adapt
 
     config = AdaptConfig(
         steps=job["steps"],
@@ -160,7 +161,8 @@ def _adapt(job: Job) -> dict[str, Any]:
     )
     done = adapt(io.read_splats(job["scene"]), _targets(job), config)
     io.write_splats(job["output"], done.splats, overwrite=True)
-    return {key: done.report[key] for key in ("steps", "seconds", "psnr", "converged")}
+    report = done.report.as_dict()
+    return {key: report[key] for key in ("steps", "seconds", "psnr", "converged")}
 
 
 def _schedule(name: str, cameras: Cameras) -> Schedule:

@@ -10,6 +10,7 @@ import typer
 
 from g2ard.cli.commands import register
 from g2ard.cli.frame import app
+from g2ard.cli.pipes import outlive_readers
 from g2ard.cli.usage import usage_line
 
 __all__ = ["main"]
@@ -19,6 +20,7 @@ def main() -> None:
     """Entry point of the `g2ard` program: usage errors are one line and exit status 2, as all errors are."""
     # Kernels have threads of their own; those of numpy's BLAS only spin, for a thirtieth of a short command.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    outlive_readers()
     gc.set_threshold(50_000)  # importing makes many objects and no garbage: looking for it took a twentieth
     register(next(iter(sys.argv[1:]), None))  # the others would only take time
     try:
@@ -32,4 +34,5 @@ def main() -> None:
             print(f"{where}: {message} (see {where} --help)", file=sys.stderr)
         status = e.exit_code
     gc.freeze()  # nor is there any to look for at the end
+    sys.stdout.flush()
     sys.exit(status)

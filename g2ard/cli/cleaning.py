@@ -1,4 +1,4 @@
-"""Cleaning a scene for commands: its pool, what was found, the picture of it."""
+"""A picture of what `g2ard clean` would take out."""
 
 from __future__ import annotations
 
@@ -8,40 +8,16 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.clean import Cleaning
-    from g2ard.cli.frame import Run
     from g2ard.splats import Splats
 
-__all__ = ["found_clutter", "paint_clutter"]
+__all__ = ["paint_clutter"]
 
-_VIEWS, _SIDE = 96, 400
-_ROWS = 100_000
 _COLORS = {
     "invisible": (0.20, 0.45, 0.95),
     "giant": (0.95, 0.85, 0.10),
     "needle": (0.90, 0.15, 0.75),
     "floater": (0.95, 0.25, 0.10),
 }
-
-
-def found_clutter(run: Run, splats: Splats, kinds: tuple[str, ...]) -> tuple[Cleaning, Cameras]:
-    """What can go, by views of a pool of the scene's own; a line says how many of each kind.
-
-    Raises:
-        InputError: no pool can be planned.
-    """
-    from g2ard.clean import KINDS, find_clutter
-    from g2ard.poses import plan_pool
-    from g2ard.visibility import visibility
-
-    pool = plan_pool(splats, _VIEWS, seed=run.seed, rows=_ROWS, near=0.25, looks=True, progress=run.progress)
-    cameras = pool.cameras.resized(_SIDE)
-    seen = visibility(splats, cameras, run.progress)
-    pixels = int((cameras.widths.astype(int) * cameras.heights).sum())
-    found = find_clutter(splats, seen, pixels, kinds or KINDS)
-    parts = [f"{count:,} {name}" for name, count in found.counts.items() if name in (kinds or KINDS)]
-    gone = len(splats) - int(found.keep.sum())
-    run.say(f"{gone:,} of {len(splats):,} Gaussians can go: {', '.join(parts)}")
-    return found, cameras
 
 
 def paint_clutter(path: Path, splats: Splats, found: Cleaning, cameras: Cameras, overwrite: bool) -> None:
@@ -51,13 +27,13 @@ def paint_clutter(path: Path, splats: Splats, found: Cleaning, cameras: Cameras,
     from g2ard.clean import KINDS
     from g2ard.images import contact_sheet, write_png
     from g2ard.paint import painted
-    from g2ard.render import Renderer
+    from g2ard.stages.render import Renderer
 
     colors = np.array([*_COLORS.values(), (0.45, 0.48, 0.52)])[found.kind]
     scenes = [splats, painted(splats, colors), splats.take(found.keep)]
     chosen = np.unique(np.linspace(0, len(cameras) - 1, min(3, len(cameras))).astype(int))
     renderers = [Renderer(scene) for scene in scenes]
-    rows = [[np.clip(r.image(cameras, int(view)), 0, 1) for r in renderers] for view in chosen]
+    rows = [[np.clip(r.image(cameras[int(view)]), 0, 1) for r in renderers] for view in chosen]
     legend = ", ".join(f"{name} {word}" for name, word in zip(KINDS, _WORDS, strict=True))
     labels = [f"{len(splats):,} Gaussians", legend, f"{len(scenes[2]):,} stay"]
     write_png(path, contact_sheet(rows, labels), overwrite=overwrite)

@@ -11,14 +11,16 @@ import os
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
 
 from g2ard import __version__, interrupt
+from g2ard.cli.config import load_config, printed
 from g2ard.cli.console import Console
-from g2ard.cli.usage import typed
+from g2ard.cli.usage import in_flags, typed
 from g2ard.errors import G2ardError
 
 __all__ = ["Run", "app", "command", "group"]
@@ -26,7 +28,7 @@ __all__ = ["Run", "app", "command", "group"]
 app = typer.Typer(
     help="Distil a dense 3D Gaussian scene into a compact, standard 3DGS model at an exact budget.",
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -41,61 +43,15 @@ def _version(show: bool) -> None:
 @app.callback()
 def _root(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        bool, typer.Option("-V", "--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     pass
 
 
-def _load_config(ctx: typer.Context, path: Path | None) -> Path | None:
-    """Make a TOML file's values the defaults: its table of this command's name, else its top level."""
-    if path is None:
-        return None
-    import tomllib
-
-    try:
-        values = tomllib.loads(path.read_text())
-    except OSError as e:
-        raise typer.BadParameter(f"{path}: {e.strerror}") from None
-    except UnicodeDecodeError:
-        raise typer.BadParameter(f"{path}: not a text file") from None
-    except tomllib.TOMLDecodeError as e:
-        raise typer.BadParameter(f"{path}: {e}") from None
-    table = values.get(
-        str(ctx.info_name), {k: v for k, v in values.items() if k == "set" or not isinstance(v, dict)}
-    )
-    constants = _flat(table.pop("set", {}))
-    table = {key.replace("-", "_"): _as_typed(value) for key, value in table.items()}
-    if constants:
-        table["set"] = [f"{name}={_as_typed(value)}" for name, value in constants.items()]
-    unknown = sorted(set(table) - {p.name for p in ctx.command.params})
-    if unknown:
-        raise typer.BadParameter(f"{path}: no option of `{ctx.info_name}` is called {', '.join(unknown)}")
-    ctx.default_map = {**(ctx.default_map or {}), **table}
-    return path
-
-
-def _flat(table: Any, prefix: str = "") -> dict[str, Any]:
-    """A table of constants by their dotted names: `simplify.max_energy = 0.02` is a table within one."""
-    if not isinstance(table, dict):
-        raise typer.BadParameter("set: a table of constants, such as set = { simplify.max_energy = 0.02 }")
-    out: dict[str, Any] = {}
-    for key, value in table.items():
-        out |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return out
-
-
-def _as_typed(value: Any) -> Any:
-    """A TOML value as it would be typed: options parse text; [1, 1, 1] is 1,1,1."""
-    if isinstance(value, list):
-        return ",".join(str(item) for item in value)
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
 _RIVALS = (
-    ("count", "ratio"),
-    ("count", "fit"),
-    ("ratio", "fit"),
+    *combinations(("count", "ratio", "fit", "min_psnr"), 2),
+    *combinations(("count", "ratio", "fit", "min_ssim"), 2),
     ("steps", "time_limit"),
     ("views", "no_views"),
 )
@@ -124,11 +80,21 @@ _COMMON: dict[str, tuple[Any, Any]] = {
     "seed": (Annotated[int, typer.Option(min=0, help="Seed of everything random.")], 0),
     "threads": (Annotated[int, typer.Option(min=0, max=256, help="Threads; 0 means every core.")], 0),
     "device": (Annotated[str, typer.Option(metavar="auto|cpu|gpu|cuda", help="Where to compute.")], "auto"),
+    "print_config": (
+        Annotated[
+            bool,
+            typer.Option("--print-config", help="Print the options as a file for --config, and do nothing."),
+        ],
+        False,
+    ),
     "config": (
         Annotated[
             Path | None,
             typer.Option(
-                metavar="FILE.toml", callback=_load_config, is_eager=True, help="Defaults; flags win."
+                metavar="FILE.toml",
+                callback=load_config,
+                is_eager=True,
+                help="Defaults; flags win.",
             ),
         ],
         None,
@@ -159,6 +125,7 @@ class Run:
         self.json: str | None = common["json"]
         self.console = Console(quiet=common["quiet"])
         self.noted = False  # whether a GPU failed
+        self.kept: list[str] = []  # what a Ctrl-C leaves, in words
         given = (*options.values(), common["config"])
         paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
         self._inputs = [p for p in paths if isinstance(p, Path) and p is not options.get("output")]
@@ -284,6 +251,9 @@ def command(
             shared = {key: values.pop(key) for key in shared_options}
             if typed(ctx, "set"):  # after those of the config file, for the last counts
                 shared["set"] = [*(ctx.default_map or {}).get("set", []), *shared["set"]]
+            if shared.pop("print_config"):
+                typer.echo(printed(ctx, {**values, **shared}), nl=False)
+                return
             ours = interrupt.raises()
             try:
                 _execute(Run(name, shared, dict(values)), fn, values, cuda)
@@ -324,7 +294,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
         with run.console, _device(run):
             fn(run, **options)
     except KeyboardInterrupt:
-        run.console.error("interrupted")
+        run.console.error(f"interrupted; {'; '.join(run.kept) or 'nothing was written'}")
         raise typer.Exit(130) from None
     except (G2ardError, OSError, MemoryError) as e:
         run.console.error(_one_line(e))
@@ -367,4 +337,4 @@ def _one_line(error: BaseException) -> str:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, MemoryError):
         return f"out of memory{f': {error}' if str(error) else ''}"
-    return " ".join(str(error).split())
+    return in_flags(" ".join(str(error).split()))

@@ -7,16 +7,22 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from g2ard.report.window import Crop
 
+if TYPE_CHECKING:
+    from g2ard.cli.frame import Run
+    from g2ard.policy.budget import Budget
+    from g2ard.splats import Splats
+
 __all__ = [
     "ConventionOption",
     "Count",
     "CountOption",
+    "CountsOption",
     "CropOption",
     "FormatOption",
     "LookOption",
@@ -27,16 +33,20 @@ __all__ = [
     "PresetOption",
     "ProtocolOption",
     "RatioOption",
+    "RatiosOption",
     "SceneArgument",
     "Triple",
     "ViewsOption",
     "ViewsOrMadeOption",
-    "budget_of",
+    "can_be_made",
     "can_judge",
     "is_made",
     "one_budget",
     "parse_ratio",
+    "recovery_engine",
+    "trained_on",
     "views_count",
+    "views_or_teacher",
 ]
 
 _COUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmM%]?)")
@@ -74,6 +84,17 @@ class Count:
         """The count out of `total`; a share is rounded up and at least 1."""
         return max(1, math.ceil(self.value * total - 1e-9)) if self.is_share else int(self.value)
 
+    @property
+    def number(self) -> int | float:
+        """A whole number, or a share in (0, 1]."""
+        return float(self.value) if self.is_share else int(self.value)
+
+    def budget(self) -> Budget:
+        """As the library takes it."""
+        from g2ard.policy.budget import Budget
+
+        return Budget(share=self.value) if self.is_share else Budget(count=int(self.value))
+
     def __str__(self) -> str:
         return self.text
 
@@ -93,6 +114,44 @@ CountOption = Annotated[
     Count | None,
     typer.Option(
         "-n", "--count", parser=Count.parse, metavar="COUNT", help="Budget: 250000, 250k, 1.5M or 25%."
+    ),
+]
+
+
+class Counts(tuple[Count, ...]):
+    """Several in one argument, 10k,20k; a class, for typer reads a bare tuple as several arguments."""
+
+    @classmethod
+    def parse(cls, text: str) -> Counts:
+        return cls(Count.parse(part) for part in text.split(","))
+
+
+class Ratios(tuple[float, ...]):
+    """Several in one argument, 5,10,20."""
+
+    @classmethod
+    def parse(cls, text: str) -> Ratios:
+        return cls(parse_ratio(part) for part in text.split(","))
+
+
+CountsOption = Annotated[
+    list[Counts] | None,
+    typer.Option(
+        "-n",
+        "--count",
+        parser=Counts.parse,
+        metavar="COUNT",
+        help="Budget: 250000, 250k, 1.5M or 25%; several, 10k,20k, want {count} in the output's name.",
+    ),
+]
+RatiosOption = Annotated[
+    list[Ratios] | None,
+    typer.Option(
+        "-r",
+        "--ratio",
+        parser=Ratios.parse,
+        metavar="RATIO",
+        help="Budget as a ratio: 10 keeps a tenth; several, 5,10,20, want {ratio} in the output's name.",
     ),
 ]
 RatioOption = Annotated[
@@ -145,28 +204,15 @@ LookOption = Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Wher
 OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Where the result goes.")]
 
 
-def one_budget(count: Count | None, ratio: float | None) -> None:
+def one_budget(count: Count | None, ratio: float | None) -> Budget:
     """Usage check, before anything is read: exactly one of -n and -r."""
+    from g2ard.policy.budget import Budget
+
     if (count is None) == (ratio is None):
         raise typer.BadParameter("give the budget as either -n COUNT or -r RATIO")
-
-
-def budget_of(scene: Path, count: Count | None, ratio: float | None, total: int) -> int:
-    """The exact budget out of the scene's `total` Gaussians; N/RATIO is rounded to the nearest, at least 1.
-
-    Raises:
-        InputError: it is above `total`.
-    """
-    from g2ard.errors import InputError
-
-    if count is not None:
-        budget = count.of(total)
-    else:
-        assert ratio is not None  # one_budget has seen to it
-        budget = max(1, math.floor(total / ratio + 0.5))
-    if budget > total:
-        raise InputError(f"{scene}: the budget of {budget} is above its {total} Gaussians")
-    return budget
+    if count is None:
+        return Budget(ratio=ratio)
+    return count.budget()
 
 
 class Triple(tuple[float, float, float]):
@@ -345,3 +391,37 @@ def one_horizon(steps: int | None, time_limit: float | None, constants: Mapping[
         raise typer.BadParameter("--steps and --time-limit exclude each other")
     if steps is not None and "schedule.steps" in constants:
         raise typer.BadParameter("--steps and --set schedule.steps exclude each other")
+
+
+def recovery_engine(run: Run) -> Literal["fused", "gsplat"]:
+    """What takes recovery's steps on the device asked for.
+
+    Raises:
+        InputError: CUDA was asked for and is not to be had.
+    """
+    if run.device != "cuda":
+        return "fused"
+    from g2ard.stages.recover.gsplat_engine import check_cuda
+
+    check_cuda()
+    return "gsplat"
+
+
+def trained_on(split: str) -> str:
+    """What to call the views that a command has fitted."""
+    return "training views" if split == "train" else f"{split} views"
+
+
+def can_be_made(views: Path | None, teacher: Path | None) -> None:
+    """Usage check: where no views are given, a teacher is there to be looked at."""
+    if teacher is None and (views is None or is_made(views)):
+        raise typer.BadParameter("give --views, or a --teacher to make views of")
+
+
+def views_or_teacher(run: Run, views: Path | None, teacher: Path | None, dense: Splats | None) -> Any:
+    """The views given, else those beside the teacher, else a pool of it; see `can_be_made`."""
+    from g2ard.policy.views import views_or_pool
+
+    if dense is None:
+        return views
+    return views_or_pool(dense, views, beside=teacher, seed=run.seed, progress=run.progress, say=run.say)

@@ -7,19 +7,25 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import typer
+
 from g2ard.cli.frame import Run
 from g2ard.errors import OutputError
 
 __all__ = ["check_stopped", "left_at", "stoppable"]
 
 
-def check_stopped(run: Run, place: Path, resume: bool) -> bool:
+def check_stopped(run: Run, place: Path, resume: bool, output: Path) -> bool:
     """Before the work: whether there is something to go on from at `place`, a checkpoint or a folder of them.
 
     Raises:
         OutputError: there is, and neither --resume nor --overwrite says what is to become of it.
+        Exit: `output` is there already, and nothing is left to go on with.
     """
     left = left_at(place)
+    if resume and not left and not run.overwrite and output.exists():
+        run.say(f"{output}: finished already, nothing is left to resume (-w without --resume starts anew)")
+        raise typer.Exit
     if resume and not left:
         run.say(f"nothing to go on from ({place}): starts anew")
     if left and not (resume or run.overwrite):
@@ -36,7 +42,7 @@ def stoppable(run: Run, place: Path, resume: bool) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         if left_at(place):
-            run.say(f"stopped; the same command with --resume goes on from {place}")
+            run.kept.append(f"the same command with --resume goes on from {place}")
         raise
     else:
         _remove(place)

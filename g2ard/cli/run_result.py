@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from g2ard.cli.frame import Run
 
-__all__ = ["say_views", "told", "write_table"]
+if TYPE_CHECKING:
+    from g2ard.policy.fit import Aim
+    from g2ard.splats import Splats
+
+__all__ = ["say_views", "say_weight", "tell_quality", "told", "write_table"]
 
 _LOSS, _SSIM_LOSS = 0.05, 0.001
 """dB, and SSIM, under the simplified scene that the command speaks of."""
@@ -51,9 +56,12 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
 
 def told(report: dict[str, Any]) -> list[str]:
     """What recovery kept, where it lost, and what no view saw, a line each."""
-    from g2ard.recover.outcome import outcome
+    from g2ard.stages.recover.outcome import outcome
+    from g2ard.stages.recover.report import RecoverReport
 
-    lines = [outcome(done) for entry in report["rounds"] for done in entry.get("recover", [])]
+    lines = [
+        outcome(RecoverReport.of(done)) for entry in report["rounds"] for done in entry.get("recover", [])
+    ]
     found = [line for line in lines if line is not None]
     for kind, what in (("scores", "unseen views"), ("apart", "views of another kind")):
         if not report[kind]:
@@ -89,3 +97,28 @@ def say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:
             f"views: {len(views['chosen'])} of {views['candidates']} by {views['policy']};"
             f" those left out would have added {100 * views['left_out']:.1f} %"
         )
+
+
+def say_weight(run: Run, source: Path, output: Path, splats: Splats) -> None:
+    """A result that outweighs the file it was made from: what of it is colour by direction, and how to be rid
+    of it."""
+    if not source.is_file() or output.stat().st_size < source.stat().st_size:
+        return
+    made, given = (path.stat().st_size / 1e6 for path in (output, source))
+    sizes = f"{output}: {made:.2f} MB, {source.name} has {given:.2f} MB"
+    share = splats.shN.nbytes / splats.nbytes
+    hint = "packed formats are smaller than .ply"
+    if share:
+        hint = f"{share:.0%} of it is SH above degree 0 (--sh-degree 0 on distill and recover leaves it out)"
+    run.say(f"{sizes}: {hint}")
+
+
+def tell_quality(run: Run, aim: Aim, splats: Splats) -> None:
+    """What a result keeps of a quality that was asked for; status 3 where that is not met."""
+    judgement = aim.judge(splats)
+    if judgement is None:
+        return
+    met, line = judgement
+    if not met:
+        run.unmet(line)
+    run.say(line)

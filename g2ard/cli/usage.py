@@ -6,7 +6,31 @@ from typing import Any
 
 import typer
 
-__all__ = ["typed", "usage_line"]
+__all__ = ["in_flags", "typed", "usage_line"]
+
+_FLAGS = {
+    "overwrite=True replaces it": "give -w (--overwrite) to replace it",
+    "another checkpoint or folder of work starts anew": "-w without --resume starts anew",
+    "engine 'gsplat'": "--device cuda",
+    "count, ratio:": "-n, -r:",
+    "to take a ratio of: give a count": "to take a ratio of: give a count, -n COUNT",
+    "its photos are needed as views": "give its photos with --views",
+    "TeacherRenders of a scene can stand in": "--teacher SCENE stands in with its renders",
+    "crop ": "--crop ",
+}
+"""What the library calls by the name of a parameter → what a shell calls it."""
+
+
+def in_flags(message: str) -> str:
+    """An error of the library in the words of the command line.
+
+    >>> in_flags("a.ply: exists; overwrite=True replaces it")
+    'a.ply: exists; give -w (--overwrite) to replace it'
+    """
+    for words, flag in _FLAGS.items():
+        if words != "crop " or message.startswith(words):
+            message = message.replace(words, flag)
+    return message
 
 
 def usage_line(error: typer.TyperException) -> str:

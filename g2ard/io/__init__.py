@@ -115,7 +115,7 @@ def _named(path: str | Path, suffixes: tuple[str, ...], rule: str) -> Path:
     from g2ard.errors import OutputError
 
     path = Path(path)
-    if path.suffix not in suffixes:
+    if path.suffix.lower() not in suffixes:
         raise OutputError(f"{path}: {rule}")
     return path
 
@@ -226,7 +226,7 @@ def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -
     from g2ard.io import cloud_ply
 
     path = Path(path)
-    if path.suffix != ".ply":
+    if path.suffix.lower() != ".ply":
         raise OutputError(f"{path}: clouds are written as .ply")
     cloud_ply.write(path, points, overwrite=overwrite)
 

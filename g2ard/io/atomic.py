@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
 
@@ -26,15 +26,17 @@ def check_output(path: str | Path, overwrite: bool = False, *, folder: bool = Fa
         `path` as a Path.
 
     Raises:
-        OutputError: it exists and may not be overwritten, is of the other kind, or its folder is absent or
-            not writable.
+        OutputError: it exists and may not be overwritten, is of the other kind, or its folder is not
+            writable. A folder that is absent is made when the output is written.
     """
     path = Path(path)
     try:
         _refuse_existing(path, overwrite, folder)
-        if not path.parent.is_dir():
-            raise OutputError(f"{path}: the folder {path.parent} does not exist")
-        probe = _beside(path)
+        parent = path.absolute().parent
+        there = next(folder for folder in (parent, *parent.parents) if folder.exists())
+        if not there.is_dir():
+            raise OutputError(f"{path}: {there} is a file; a folder is needed there")
+        probe = _beside(there / path.name)
         probe.mkdir()
         probe.rmdir()
     except OutputError:
@@ -52,7 +54,7 @@ def _refuse_existing(path: Path, overwrite: bool, folder: bool) -> None:
     if folder and not path.is_dir():
         raise OutputError(f"{path}: is a file; a folder is to be written there")
     if not overwrite and (not folder or any(path.iterdir())):
-        raise OutputError(f"{path}: exists; give -w (--overwrite) to replace it")
+        raise OutputError(f"{path}: exists; overwrite=True replaces it")
 
 
 def _beside(path: Path) -> Path:
@@ -86,7 +88,7 @@ def atomic_output(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
     ['a.txt']
     """
     path = check_output(path, overwrite)
-    temporary = _beside(path)
+    temporary, made = _beside(path), _parents_made(path)
     try:
         yield temporary
         os.replace(temporary, path)
@@ -96,6 +98,7 @@ def atomic_output(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
         raise OutputError(f"{path}: cannot write: {error.strerror or error}") from error
     finally:
         temporary.unlink(missing_ok=True)
+        _drop_empty(made)
 
 
 @contextmanager
@@ -109,7 +112,7 @@ def atomic_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
         OutputError: see `check_output`; or the disk refuses while writing.
     """
     path = check_output(path, overwrite, folder=True)
-    temporary = _beside(path)
+    temporary, made = _beside(path), _parents_made(path)
     try:
         temporary.mkdir()
         yield temporary
@@ -123,6 +126,21 @@ def atomic_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
         raise OutputError(f"{path}: cannot write: {error.strerror or error}") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        _drop_empty(made)
+
+
+def _parents_made(path: Path) -> list[Path]:
+    """Make the folders above `path` that are absent; those made, innermost first."""
+    absent = [folder for folder in path.absolute().parents if not folder.exists()]
+    path.absolute().parent.mkdir(parents=True, exist_ok=True)
+    return absent
+
+
+def _drop_empty(folders: list[Path]) -> None:
+    """Nothing came of an output: the folders made for it go again."""
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
 
 
 def _move_into(source: Path, target: Path) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from g2ard.poses.gather import gather
 from g2ard.poses.lattice import halton
-from g2ard.poses.sight import Lens, Poses, look
+from g2ard.poses.sight import Lens, Poses, view_statistics
 from g2ard.poses.site import Site
 
 __all__ = ["plan_aerial"]
@@ -57,7 +57,7 @@ def plan_aerial(
 
     def judge(poses: Poses) -> Floats:
         free = (site.grid.distance(poses.eyes) > 3 * site.grid.cell) & (site.above_ground(poses.eyes) > 0)
-        seen = look(site, poses, lens, free)
+        seen = view_statistics(site, poses, lens, free)
         return np.where(seen.close > 0.3 * height, seen.covered / 0.75, 0.0)
 
     return gather(count if first is None else min(first, count), propose, judge, tell)

@@ -91,7 +91,7 @@ class Glance:
 
     def of(self, cameras: Cameras, tell: Callable[[int, int], None], reach: Floats | None = None) -> Focus:
         """Look through each camera; what is farther than `reach`, (C,), is a backdrop and does not count."""
-        from g2ard.render import RasterSettings, view_of
+        from g2ard.stages.render import RasterSettings, view_of
 
         if not len(cameras):
             return Focus(*np.zeros((3, 0)))
@@ -101,7 +101,7 @@ class Glance:
         figures = np.zeros((3, len(here)))
         for i in range(len(here)):
             sums: dict[str, Any] = _core.accumulate(
-                self._arrays, [view_of(here, i, settings)], settings.choices, None
+                self._arrays, [view_of(here, i, settings)], settings, None
             )
             weight = sums["weight"]
             depth = norms(self._means - here.positions[i])

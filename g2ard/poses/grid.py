@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.poses.matter import Matter
 from g2ard.poses.numbers import norms, turned
+from g2ard.poses.volume import OccupiedVolume
 
 __all__ = ["Grid"]
 
@@ -55,23 +55,23 @@ class Grid:
     scale: NDArray[np.float32]
 
     @classmethod
-    def of(cls, low: Floats, high: Floats, matter: Matter, axes: Floats, *, cells: int = 0) -> Grid:
+    def of(cls, low: Floats, high: Floats, volume: OccupiedVolume, axes: Floats, *, cells: int = 0) -> Grid:
         """Fill the box from `low` to `high`, along the rows of `axes`; 0 cells means by the matter's rows."""
-        if matter.stand_for > 1:
-            cells = cells or _CELLS_A_ROW * len(matter.points)
-        cells = cells or int(np.clip(len(matter.points), *_CELLS))
+        if volume.represents > 1:
+            cells = cells or _CELLS_A_ROW * len(volume.points)
+        cells = cells or int(np.clip(len(volume.points), *_CELLS))
         sides = np.maximum(high - low, np.max(high - low) / 256)
         cell = float(np.cbrt(np.prod(sides) / cells))
         shape = np.maximum(1, np.ceil(sides / cell)).astype(int)
-        points = turned(matter.points, axes)
+        points = turned(volume.points, axes)
         filled, logs = np.zeros(int(np.prod(shape))), np.zeros(int(np.prod(shape)))
-        sizes = 0.5 * np.log(np.maximum(matter.scales[:, 1] * matter.scales[:, 2], np.finfo(float).tiny))
-        faces = 2 * np.pi * matter.scales[:, 1] * matter.scales[:, 2] / cell**2
-        optical = matter.stand_for * matter.opacities * faces
-        parts = np.clip(np.ceil(1.6 * matter.scales[:, 2] / cell), 1, 9).astype(np.int8)
+        sizes = 0.5 * np.log(np.maximum(volume.scales[:, 1] * volume.scales[:, 2], np.finfo(float).tiny))
+        faces = 2 * np.pi * volume.scales[:, 1] * volume.scales[:, 2] / cell**2
+        optical = volume.represents * volume.opacities * faces
+        parts = np.clip(np.ceil(1.6 * volume.scales[:, 2] / cell), 1, 9).astype(np.int8)
         for count in np.unique(parts):
             rows, offsets = np.flatnonzero(parts == count), _lattice(int(count))
-            spans = turned(matter.spans(rows).reshape(-1, 3), axes).reshape(-1, 2, 3) if count > 1 else None
+            spans = turned(volume.spans(rows).reshape(-1, 3), axes).reshape(-1, 2, 3) if count > 1 else None
             parts_of = min(len(offsets), -(-len(offsets) * len(rows) // _BATCH))
             for some in np.array_split(offsets, parts_of):
                 at = points[rows]

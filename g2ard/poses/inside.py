@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from g2ard.poses.gather import gather
 from g2ard.poses.lattice import fibonacci, halton
-from g2ard.poses.sight import Lens, Poses, look
+from g2ard.poses.sight import Lens, Poses, view_statistics
 from g2ard.poses.site import Site
 
 __all__ = ["Inside", "find_inside", "plan_inside"]
@@ -106,7 +106,7 @@ def plan_inside(
         return Poses(places[(at * reach).astype(int)], gazes)
 
     def judge(poses: Poses) -> Floats:
-        seen = look(site, poses, lens)
+        seen = view_statistics(site, poses, lens)
         return np.minimum(seen.covered / 0.8, seen.close / (4 * site.grid.cell))
 
     return gather(count, propose, judge, tell)

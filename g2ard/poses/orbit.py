@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from g2ard.poses.gather import gather
 from g2ard.poses.lattice import halton
 from g2ard.poses.numbers import quantile, turned
-from g2ard.poses.sight import Lens, Poses, look
+from g2ard.poses.sight import Lens, Poses, view_statistics
 from g2ard.poses.site import Site
 
 __all__ = ["plan_orbit"]
@@ -55,7 +55,7 @@ def plan_orbit(
 
     def judge(poses: Poses) -> Floats:
         free = (site.grid.distance(poses.eyes) > 2 * site.grid.cell) & (site.above_ground(poses.eyes) > 0.02)
-        return (look(site, poses, lens, free).close > 4 * site.grid.cell).astype(float)
+        return (view_statistics(site, poses, lens, free).close > 4 * site.grid.cell).astype(float)
 
     return gather(count if first is None else min(first, count), propose, judge, tell)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from g2ard.cameras import Cameras
 from g2ard.poses.site import Site
 
-__all__ = ["Lens", "Poses", "Seen", "clearance", "look"]
+__all__ = ["Lens", "Poses", "ViewStatistics", "clearance", "view_statistics"]
 
 Floats = NDArray[np.float64]
 
@@ -90,7 +90,7 @@ class Poses:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class ViewStatistics:
     """Per pose (P,): the share of the frame that meets matter, and how far the view is open.
 
     Args:
@@ -106,8 +106,10 @@ class Seen:
     median: Floats
 
 
-def look(site: Site, poses: Poses, lens: Lens, wanted: NDArray[np.bool_] | None = None) -> Seen:
-    """Cast a coarse frame of rays from each pose into the site's opaque cells; nothing where not wanted."""
+def view_statistics(
+    site: Site, poses: Poses, lens: Lens, wanted: NDArray[np.bool_] | None = None
+) -> ViewStatistics:
+    """Cast a coarse frame of rays from each pose into the site's opaque cells; zeros where not wanted."""
     covered, standing, close, median = (np.zeros(len(poses)) for _ in range(4))
     asked = np.arange(len(poses)) if wanted is None else np.flatnonzero(wanted)
     for some, eyes, directions in _frames_of_rays(poses, lens, asked):
@@ -121,11 +123,11 @@ def look(site: Site, poses: Poses, lens: Lens, wanted: NDArray[np.bool_] | None 
         met = np.sort(site.grid.cast(eyes, directions, murky=True).reshape(len(some), -1), axis=1)
         halfway = np.isfinite(met).sum(axis=1) // 2
         close[some], median[some] = met[:, met.shape[1] // 10], met[np.arange(len(some)), halfway]
-    return Seen(covered, standing, close, median)
+    return ViewStatistics(covered, standing, close, median)
 
 
 def clearance(site: Site, poses: Poses, lens: Lens) -> Floats:
-    """(P,) `Seen.close` alone, for half the rays."""
+    """(P,) `ViewStatistics.close` alone, for half the rays."""
     close = np.zeros(len(poses))
     for some, eyes, directions in _frames_of_rays(poses, lens, np.arange(len(poses))):
         met = site.grid.cast(eyes, directions, murky=True).reshape(len(some), -1)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.poses.grid import Grid
-from g2ard.poses.matter import Matter, Sample
 from g2ard.poses.numbers import along, middle, moments, quantile, turned
 from g2ard.poses.terrain import Terrain
 from g2ard.poses.up import Up, estimate_up, given_up
+from g2ard.poses.volume import OccupiedVolume, Sample
 from g2ard.splats import Splats
 
 __all__ = ["Site"]
@@ -52,20 +52,20 @@ class Site:
         Raises:
             InputError: nothing visible, or an `up` that is no direction.
         """
-        matter = Matter.of(splats, rows)
-        some = matter.sample()
+        volume = OccupiedVolume.of(splats, rows)
+        some = volume.sample()
         found = estimate_up(some) if up is None else given_up(some, up)
         axes = _axes(some, found.axis)
         points = turned(some.points, axes)
         box = np.array([quantile(points[:, a], some.weights, [0.01, 0.99]) for a in range(3)]).T
-        body = 1.5 * middle(matter.scales[:, 2])  # of a scene no larger than its Gaussians
+        body = 1.5 * middle(volume.scales[:, 2])  # of a scene no larger than its Gaussians
         box += np.maximum(0, body - (box[1] - box[0]) / 2) * np.array([[-1.0], [1.0]])
         room = 0.1 * (box[1] - box[0]) + 0.02
-        grid = Grid.of(box[0] - room, box[1] + room, matter, axes)
+        grid = Grid.of(box[0] - room, box[1] + room, volume, axes)
         facing = np.abs(along(some.normals, found.axis)) > np.cos(np.radians(35))
         terrain = Terrain.of(points[facing], some.weights[facing], box) if found.grounded else None
-        origin = splats.offset + matter.origin
-        return cls(points, some.weights, box, terrain, grid, axes, origin, matter.size, found)
+        origin = splats.offset + volume.origin
+        return cls(points, some.weights, box, terrain, grid, axes, origin, volume.size, found)
 
     def ground(self, points: Floats) -> Floats:
         """(M,) heights of the ground under points; the matter's lowest where there is no ground."""

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 from g2ard.poses.lattice import fibonacci
-from g2ard.poses.matter import Sample
 from g2ard.poses.numbers import along, moments, quantile
+from g2ard.poses.volume import Sample
 
 __all__ = ["Up", "estimate_up", "given_up"]
 
@@ -38,7 +38,7 @@ class Up:
     why: str
 
 
-def given_up(matter: Sample, up: ArrayLike) -> Up:
+def given_up(sample: Sample, up: ArrayLike) -> Up:
     """The user's own answer; only whether there is a ground is looked up.
 
     Raises:
@@ -48,60 +48,60 @@ def given_up(matter: Sample, up: ArrayLike) -> Up:
     if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
         raise InputError(f"up: expected three finite numbers, not all zero, got {up!r}")
     axis = axis / np.linalg.norm(axis)
-    layer, _ = _layer(matter, axis)
-    return Up(axis, _is_flat(matter)[0] or layer > 0.1, "up as given")
+    layer, _ = _layer(sample, axis)
+    return Up(axis, _is_flat(sample)[0] or layer > 0.1, "up as given")
 
 
-def estimate_up(matter: Sample) -> Up:
+def estimate_up(sample: Sample) -> Up:
     """The axis from planes or the scene's shape, its sign from where the matter lies.
 
     In turn: a scene much flatter than wide lies on its ground; else the strongest plane at the edge of the
     matter is the ground; else (an object cut out of its surroundings) the long axis of matterthing long, or
     the axis that capture software usually calls up.
     """
-    flat, thin, long = _is_flat(matter)
+    flat, thin, long = _is_flat(sample)
     if flat:
-        axis = _mean_normal(matter, thin, np.abs(along(matter.normals, thin)) > np.cos(np.radians(35)))
-        return _signed(matter, axis, True, "the scene is flat")
-    few = matter.take(slice(_SEARCHED))
+        axis = _mean_normal(sample, thin, np.abs(along(sample.normals, thin)) > np.cos(np.radians(35)))
+        return _signed(sample, axis, True, "the scene is flat")
+    few = sample.take(slice(_SEARCHED))
     directions = np.concatenate([np.eye(3), fibonacci(600)[:300]])
     layers = [_layer(few, axis) for axis in directions]
-    axis, strength = _best_plane(matter, few, directions, layers)
+    axis, strength = _best_plane(sample, few, directions, layers)
     if strength > 0.12:
-        return _signed(matter, axis, True, "a ground plane")
-    axis, contrast = _layered(matter, directions, np.array([share for share, _ in layers]))
+        return _signed(sample, axis, True, "a ground plane")
+    axis, contrast = _layered(sample, directions, np.array([share for share, _ in layers]))
     if contrast > _LAYERED and _habit(axis) > 1:
-        return _signed(matter, axis, True, "its layers face that way")
+        return _signed(sample, axis, True, "its layers face that way")
     if long is not None:
-        return _signed(matter, _snapped(long), False, "no ground; the long axis")
-    return _signed(matter, np.array([0.0, -1.0, 0.0]), False, "no ground; a guess")
+        return _signed(sample, _snapped(long), False, "no ground; the long axis")
+    return _signed(sample, np.array([0.0, -1.0, 0.0]), False, "no ground; a guess")
 
 
-def _is_flat(matter: Sample) -> tuple[bool, Floats, Floats | None]:
+def _is_flat(sample: Sample) -> tuple[bool, Floats, Floats | None]:
     """Whether the scene is a sheet; its thinnest axis; its longest if it sticks out."""
-    w = matter.weights / matter.weights.sum()
-    centred = matter.points - (w[:, None] * matter.points).sum(axis=0)
+    w = sample.weights / sample.weights.sum()
+    centred = sample.points - (w[:, None] * sample.points).sum(axis=0)
     values, vectors = np.linalg.eigh(moments(centred, w))
     long = vectors[:, 2] if values[2] > 3 * values[1] else None
     return bool(values[0] < 0.08 * values[1]), vectors[:, 0], long
 
 
-def _layer(matter: Sample, axis: Floats) -> tuple[float, float]:
+def _layer(sample: Sample, axis: Floats) -> tuple[float, float]:
     """Share of all matter in the strongest layer that faces `axis`, and the layer's height."""
-    facing = np.abs(along(matter.normals, axis)) > _FACING
+    facing = np.abs(along(sample.normals, axis)) > _FACING
     if not facing.any():
         return 0.0, 0.0
-    heights = along(matter.points[facing], axis)
+    heights = along(sample.points[facing], axis)
     bins = np.floor(heights / _SLAB).astype(int)
     low = bins.min()
-    mass = np.bincount(bins - low, (matter.weights * matter.flatness)[facing])
+    mass = np.bincount(bins - low, (sample.weights * sample.flatness)[facing])
     pairs = mass + np.append(mass[1:], 0.0)
     best = int(np.argmax(pairs))
-    return float(pairs[best] / matter.weights.sum()), float((low + best + 1) * _SLAB)
+    return float(pairs[best] / sample.weights.sum()), float((low + best + 1) * _SLAB)
 
 
 def _best_plane(
-    matter: Sample, few: Sample, directions: Floats, layers: list[tuple[float, float]]
+    sample: Sample, few: Sample, directions: Floats, layers: list[tuple[float, float]]
 ) -> tuple[Floats, float]:
     """The direction whose strongest layer holds most and has matter on one side only, refined.
 
@@ -113,28 +113,28 @@ def _best_plane(
     ]
     axis = directions[int(np.argmax(scores))]
     for _ in range(3):
-        _, height = _layer(matter, axis)
-        inside = np.abs(along(matter.points, axis) - height) < 2 * _SLAB
-        axis = _mean_normal(matter, axis, inside & (np.abs(along(matter.normals, axis)) > _FACING))
-    return axis, _edge(matter, axis, *_layer(matter, axis))
+        _, height = _layer(sample, axis)
+        inside = np.abs(along(sample.points, axis) - height) < 2 * _SLAB
+        axis = _mean_normal(sample, axis, inside & (np.abs(along(sample.normals, axis)) > _FACING))
+    return axis, _edge(sample, axis, *_layer(sample, axis))
 
 
-def _layered(matter: Sample, directions: Floats, shares: Floats) -> tuple[Floats, float]:
+def _layered(sample: Sample, directions: Floats, shares: Floats) -> tuple[Floats, float]:
     """The direction whose strongest layer holds most, refined, and how many times what the strongest layer
     that faces away from it (by 60° or more) holds: a floor under noise, a path among reeds."""
     axis = directions[int(np.argmax(shares))]
     across = np.abs(directions @ axis) < 0.5
     contrast = shares.max() / max(shares[across].max(), np.finfo(float).tiny)
-    facing = np.abs(along(matter.normals, axis)) > _FACING
-    return _mean_normal(matter, axis, facing), float(contrast)
+    facing = np.abs(along(sample.normals, axis)) > _FACING
+    return _mean_normal(sample, axis, facing), float(contrast)
 
 
-def _edge(matter: Sample, axis: Floats, share: float, height: float) -> float:
+def _edge(sample: Sample, axis: Floats, share: float, height: float) -> float:
     """The strongest layer's share, less what lies on both its sides: ground and walls have one side."""
-    beside = along(matter.points, axis) - height
-    above = matter.weights[beside > 2 * _SLAB].sum()
-    below = matter.weights[beside < -2 * _SLAB].sum()
-    return share * (1 - 2 * min(above, below) / max(above + below, 0.05 * matter.weights.sum()))
+    beside = along(sample.points, axis) - height
+    above = sample.weights[beside > 2 * _SLAB].sum()
+    below = sample.weights[beside < -2 * _SLAB].sum()
+    return share * (1 - 2 * min(above, below) / max(above + below, 0.05 * sample.weights.sum()))
 
 
 def _habit(axis: Floats) -> float:
@@ -142,11 +142,11 @@ def _habit(axis: Floats) -> float:
     return 1.2 if np.abs(axis[1:]).max() > np.cos(np.radians(15)) else 1.0
 
 
-def _mean_normal(matter: Sample, axis: Floats, rows: NDArray[np.bool_]) -> Floats:
-    weights = (matter.weights * matter.flatness)[rows]
+def _mean_normal(sample: Sample, axis: Floats, rows: NDArray[np.bool_]) -> Floats:
+    weights = (sample.weights * sample.flatness)[rows]
     if not weights.sum() > 0:
         return axis
-    mean = np.linalg.eigh(moments(matter.normals[rows], weights))[1][:, 2]
+    mean = np.linalg.eigh(moments(sample.normals[rows], weights))[1][:, 2]
     return mean * np.copysign(1.0, mean @ axis)
 
 
@@ -156,8 +156,8 @@ def _snapped(axis: Floats) -> Floats:
     return np.eye(3)[best] if abs(axis[best]) > np.cos(np.radians(15)) else axis
 
 
-def _signed(matter: Sample, axis: Floats, grounded: bool, why: str) -> Up:
-    lean = _lean(matter, axis) if grounded else -_balance(matter, axis)
+def _signed(sample: Sample, axis: Floats, grounded: bool, why: str) -> Up:
+    lean = _lean(sample, axis) if grounded else -_balance(sample, axis)
     if abs(lean) > 0.05:
         side = "most matter lies above it" if grounded else "its heavier end is down"
         return Up(axis * np.copysign(1.0, lean), grounded, f"{why}, {side}")
@@ -166,47 +166,47 @@ def _signed(matter: Sample, axis: Floats, grounded: bool, why: str) -> Up:
     return Up(axis * sign, grounded, f"{why}, its sign by custom")
 
 
-def _lean(matter: Sample, axis: Floats) -> float:
+def _lean(sample: Sample, axis: Floats) -> float:
     """−1…1: how far the matter stands on the side of `axis`, seen from what faces it.
 
     Heights are taken from the median of the facing matter in each of 6×6 columns, so that slopes do not
     count. Between a floor and a ceiling, what is neither decides: furniture stands on floors.
     """
-    heights = along(matter.points, axis)
-    facing = np.abs(along(matter.normals, axis)) > _FACING
-    ends = _two_layers(matter, heights, facing)
+    heights = along(sample.points, axis)
+    facing = np.abs(along(sample.normals, axis)) > _FACING
+    ends = _two_layers(sample, heights, facing)
     if ends is not None:
         low, high = ends
         between = (heights > low + 2 * _SLAB) & (heights < high - 2 * _SLAB)
-        weights = matter.weights[between]
+        weights = sample.weights[between]
         if not weights.sum() > 0:
             return 0.0
         mean = (weights * heights[between]).sum() / weights.sum()
         return float(1 - 2 * (mean - low) / (high - low))
-    column = _columns(matter, axis)
+    column = _columns(sample, axis)
     above = np.zeros(len(heights))
     for cell in np.unique(column):
         rows = column == cell
         ground = rows & facing if (rows & facing).any() else rows
-        above[rows] = heights[rows] - quantile(heights[ground], matter.weights[ground], 0.5)
-    total = (matter.weights * np.abs(above)).sum()
-    return float((matter.weights * above).sum() / max(total, np.finfo(float).tiny))
+        above[rows] = heights[rows] - quantile(heights[ground], sample.weights[ground], 0.5)
+    total = (sample.weights * np.abs(above)).sum()
+    return float((sample.weights * above).sum() / max(total, np.finfo(float).tiny))
 
 
-def _columns(matter: Sample, axis: Floats) -> NDArray[Any]:
+def _columns(sample: Sample, axis: Floats) -> NDArray[Any]:
     across = np.eye(3)[int(np.argmin(np.abs(axis)))]
     first = np.cross(axis, across)
     first /= np.linalg.norm(first)
-    sides = [np.floor(3 + 3 * along(matter.points, a)) for a in (first, np.cross(axis, first))]
+    sides = [np.floor(3 + 3 * along(sample.points, a)) for a in (first, np.cross(axis, first))]
     row, column = (np.clip(side, 0, 5).astype(int) for side in sides)
     return row * 6 + column
 
 
-def _two_layers(matter: Sample, heights: Floats, facing: NDArray[np.bool_]) -> tuple[float, float] | None:
+def _two_layers(sample: Sample, heights: Floats, facing: NDArray[np.bool_]) -> tuple[float, float] | None:
     """Heights of a floor and a ceiling: both ends of what faces the axis are strong layers."""
     if not facing.any():
         return None
-    weights = (matter.weights * matter.flatness)[facing]
+    weights = (sample.weights * sample.flatness)[facing]
     low, high = quantile(heights[facing], weights, [0.05, 0.95])
     if high - low < 6 * _SLAB:
         return None
@@ -215,9 +215,9 @@ def _two_layers(matter: Sample, heights: Floats, facing: NDArray[np.bool_]) -> t
     return (float(low), float(high)) if min(shares) > 0.25 else None
 
 
-def _balance(matter: Sample, axis: Floats) -> float:
+def _balance(sample: Sample, axis: Floats) -> float:
     """−1…1: which half of its height a thing's matter leans to."""
-    heights = along(matter.points, axis)
-    low, high = quantile(heights, matter.weights, [0.01, 0.99])
-    mean = (matter.weights * heights).sum() / matter.weights.sum()
+    heights = along(sample.points, axis)
+    low, high = quantile(heights, sample.weights, [0.01, 0.99])
+    mean = (sample.weights * heights).sum() / sample.weights.sum()
     return float(2 * (mean - low) / max(high - low, np.finfo(float).tiny) - 1)

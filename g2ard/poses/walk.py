@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from g2ard.poses.gather import gather
 from g2ard.poses.lattice import fibonacci, halton
-from g2ard.poses.sight import Lens, Poses, look
+from g2ard.poses.sight import Lens, Poses, view_statistics
 from g2ard.poses.site import Site
 
 __all__ = ["enclosed", "plan_walk"]
@@ -56,7 +56,7 @@ def plan_walk(
         return Poses(places[np.arange(start, stop) % len(places)], gazes)
 
     def judge(poses: Poses) -> Floats:
-        seen = look(site, poses, lens)
+        seen = view_statistics(site, poses, lens)
         covered = seen.covered / (0.8 if indoors else 0.5)
         limits = [covered, seen.close / (2 * room), seen.median / far]
         return np.min(limits if indoors else [*limits, seen.standing / _THINGS], axis=0)

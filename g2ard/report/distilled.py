@@ -10,11 +10,11 @@ import numpy as np
 
 from g2ard.errors import InputError
 from g2ard.images import to_bytes
-from g2ard.render import Renderer
 from g2ard.report.charts import Point, chart
 from g2ard.report.page import Comparison, Page, Shown, legend
 from g2ard.report.window import Crop
 from g2ard.splats import Splats
+from g2ard.stages.render import Renderer
 from g2ard.targets import Targets
 
 __all__ = ["check_crops", "distill_report"]
@@ -98,7 +98,7 @@ def distill_report(
         windows = [crop.window for crop in crops if crop.view in (None, name)]
         shown = []
         for name, renderer in renderers:
-            image = renderer.image(targets.cameras, view)
+            image = renderer.image(targets.cameras[view])
             shown.append(Shown(name, to_bytes(image), f"{scores[name]['views'][view]['psnr']:.2f} dB"))
         page.comparison(Comparison(targets.cameras.names[view], to_bytes(targets[view]), shown, windows))
     page.write(path)
@@ -113,7 +113,7 @@ def check_crops(crops: Sequence[Crop], names: Sequence[str]) -> None:
     for crop in crops:
         if crop.view is not None and crop.view not in names:
             few = ", ".join(names[:4]) + (", …" if len(names) > 4 else "")
-            raise InputError(f"--crop {crop.view}: not among the {len(names)} views that are scored ({few})")
+            raise InputError(f"crop {crop.view}: not among the {len(names)} views that are scored ({few})")
 
 
 def _error_charts(

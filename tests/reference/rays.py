@@ -55,9 +55,9 @@ def agreement(splats, surface, cameras, seen, cells):
 
     Args:
         splats: the scene.
-        surface: `g2ard.select.surface` of it.
+        surface: `g2ard.stages.select.surface` of it.
         cameras: views in world coordinates.
-        seen: `g2ard.select.visible_cells` of both.
+        seen: `g2ard.stages.select.visible_cells` of both.
         cells: which cells to try.
     """
     agree = kept = total = 0

@@ -55,11 +55,23 @@ def anchors(count=32):
     return np.stack([across * np.cos(turn), across * np.sin(turn), z], 1)
 
 
-def objective(chosen, surface, seen, positions, *, directional, kappa=20.0, alpha=2.0, offset=1.0):
+def objective(
+    chosen,
+    surface,
+    seen,
+    positions,
+    *,
+    directional,
+    kappa=20.0,
+    alpha=2.0,
+    offset=1.0,
+    directions=32,
+    epsilon=1e-9,
+):
     """F(S) as equation 2 has it; `seen[v]` lists cells, `positions` are in the surface's coordinates."""
     m = len(surface.centers)
     if directional:
-        a = anchors()
+        a = anchors(directions)
         raw = np.exp(kappa * np.abs(surface.normals @ a.T))
         target = raw / raw.sum(1, keepdims=True)
     else:
@@ -76,7 +88,7 @@ def objective(chosen, surface, seen, positions, *, directional, kappa=20.0, alph
             incidence = (1 - confidence) + confidence * abs(d @ surface.normals[j])
             phi = np.where(a @ d - 1 > -3 / kappa, np.exp(kappa * (a @ d)), 0)
             evidence[j] += incidence * phi / phi.sum()
-    x = offset + evidence / (target + 1e-9)
+    x = offset + evidence / (target + epsilon)
     u = np.log(x) if alpha == 1 else x ** (1 - alpha) / (1 - alpha)
     return float((surface.weights[:, None] * target * u).sum())
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from g2ard import _core
-from g2ard.render import view_of
+from g2ard.stages.recover.schedule import Rates
+from g2ard.stages.render import view_of
 from stress.scenes import NAMES, Problem, random_problem
 
 __all__ = ["THREADS", "differing", "large_problem"]
@@ -50,19 +51,19 @@ def differing(problem: Problem) -> list[str]:
 def _everything(problem: Problem) -> dict[str, bytes]:
     arrays = tuple(problem.params[name] for name in NAMES)
     width, height = problem.size
-    view, choices = view_of(problem.cameras, 0, problem.settings), problem.settings.choices
+    view, settings = view_of(problem.cameras, 0, problem.settings), problem.settings
     background = [float(c) for c in problem.background]
     rng = np.random.default_rng(0)
     target = rng.random((height, width, 3)).astype(np.float32)
     gradient = rng.normal(size=(height, width, 5)).astype(np.float32)
     rasterizer = _core.Rasterizer()
-    image, alpha, depth, _ = rasterizer.forward(arrays, view, choices, background, True)
+    image, alpha, depth, _ = rasterizer.forward(arrays, view, settings, background, True)
     assert depth is not None
     planes = [np.ascontiguousarray(gradient[..., part]) for part in (slice(0, 3), 3, 4)]
     found = {"image": image, "alpha": alpha, "depth": depth}
     found |= dict(zip(NAMES, rasterizer.backward(arrays, *planes), strict=True))
     trainer = _core.Trainer(arrays)
     for _ in range(2):
-        trainer.step(view, choices, background, target, 0.2, [1e-2] * 6)
+        trainer.step(view, settings, background, target, 0.2, Rates(*[1e-2] * 6))
     found |= {f"trained {name}": array for name, array in trainer.state().items()}
     return {name: array.tobytes() for name, array in found.items()}

@@ -18,6 +18,7 @@ from g2ard.cli.options import (
     SizeOption,
     SplitOption,
     TeacherOption,
+    trained_on,
 )
 
 
@@ -44,13 +45,13 @@ def adapt(
     preset: PaperOption = None,
 ) -> None:
     """Refit colours and opacities to new images; means, rotations and scales stay as they are."""
-    from g2ard.adapt import AdaptConfig, appearance_only
-    from g2ard.adapt import adapt as refit
-    from g2ard.cli.resume import check_stopped, stoppable
-    from g2ard.cli.scenes import load_scene, load_trained, make_targets, trained_on
+    from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
-    from g2ard.recover.schedule import schedule_named
+    from g2ard.policy.inputs import load_scene, load_trained, make_targets
+    from g2ard.stages.adapt import AdaptConfig, appearance_only
+    from g2ard.stages.adapt import adapt as refit
+    from g2ard.stages.recover.schedule import schedule_named
 
     recovery = appearance_only(schedule_named(schedule))
     config = AdaptConfig(
@@ -65,20 +66,21 @@ def adapt(
     )
     config = changed(config, "adapt", run.constants(adapt=config))
     work = output.parent / f".{output.name}.work"
-    check_stopped(run, work, resume)
-    check_scene_output(output, run.overwrite)
-    splats = load_scene(run, compact)
-    dense = load_scene(run, teacher) if teacher else None
-    cameras = load_trained(run, views, split, size).cameras
-    targets = make_targets(run, cameras, dense, config.background)
+    if left_at(work) or not (resume and output.exists()):
+        check_scene_output(output, run.overwrite)
+    check_stopped(run, work, resume, output)
+    splats = load_scene(compact, run.say)
+    dense = load_scene(teacher, run.say) if teacher else None
+    cameras = load_trained(views, split, size, run.say).cameras
+    targets = make_targets(cameras, dense, config.background, progress=run.progress, say=run.say)
     with stoppable(run, work, resume):
-        work.mkdir(exist_ok=True)
+        work.mkdir(parents=True, exist_ok=True)
         result = refit(splats, targets, config, work=work, progress=run.progress)
         write_splats(output, result.splats, overwrite=run.overwrite)
-    gain, end = result.report["psnr"], "converged" if result.report["converged"] else "all steps taken"
+    gain, end = result.report.psnr, "converged" if result.report.converged else "all steps taken"
     run.say(
-        f"{output}: {len(splats):,} Gaussians, {result.report['steps']:,} steps ({end}), "
-        f"{trained_on(split)} {gain['before']:.2f} → {gain['after']:.2f} dB"
+        f"{output}: {len(splats):,} Gaussians, {result.report.steps:,} steps ({end}), "
+        f"{trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB"
     )
     constants = listed({"adapt": config}, run.config)
-    run.result({**result.report, "output": str(output), "constants": constants})
+    run.result({**result.report.as_dict(), "output": str(output), "constants": constants})

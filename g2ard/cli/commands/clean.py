@@ -34,9 +34,10 @@ def clean(
     """
     from g2ard import io
     from g2ard.clean import KINDS
-    from g2ard.cli.cleaning import found_clutter, paint_clutter
-    from g2ard.cli.scenes import load_scene
+    from g2ard.cli.cleaning import paint_clutter
     from g2ard.errors import InputError
+    from g2ard.policy.clean import clutter_seen
+    from g2ard.policy.inputs import load_scene
 
     kinds = KINDS if only is None else tuple(word.strip() for word in only.split(","))
     if wrong := [word for word in kinds if word not in KINDS]:
@@ -49,8 +50,8 @@ def clean(
         if preview.resolve() in {path.resolve() for path in (scene, output) if path}:
             raise typer.BadParameter(f"--preview: {preview} is another file already; name a .png of its own")
         io.check_output(preview, run.overwrite)
-    splats = load_scene(run, scene)
-    found, cameras = found_clutter(run, splats, kinds)
+    splats = load_scene(scene, run.say)
+    found, cameras = clutter_seen(splats, kinds, seed=run.seed, progress=run.progress, say=run.say)
     if preview is not None:
         paint_clutter(preview, splats, found, cameras, run.overwrite)
         run.say(f"picture: {preview}")

@@ -53,8 +53,8 @@ def convert(
     import numpy as np
 
     from g2ard import io
-    from g2ard.cli.scenes import load_scene
     from g2ard.io.scene_formats import check_options
+    from g2ard.policy.inputs import load_scene
     from g2ard.transform import in_box, in_sphere, merge
     from g2ard.transform import transform as moved
 
@@ -64,7 +64,7 @@ def convert(
     matrix = None if transform is None else _matrix(transform)
     check_options(output, options)
     io.check_scene_output(output, run.overwrite)
-    splats = merge([load_scene(run, path) for path in scenes])
+    splats = merge([load_scene(path, run.say) for path in scenes])
     read = len(splats)
     if corners is not None:
         splats = splats.take(in_box(splats, corners[:3], corners[3:]))

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
+import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from g2ard.cli.fit import FitOption, MinPsnrOption, MinSsimOption, asked_budget, check_budget, shrunk_to_fit
+from g2ard.cli.budget_options import FitOption, MinPsnrOption, MinSsimOption
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
     Count,
-    CountOption,
+    CountsOption,
     CropOption,
     FormatOption,
     Method,
     PolicyOption,
     PresetOption,
-    RatioOption,
+    RatiosOption,
     ResumeOption,
     ScheduleName,
     SizeOption,
@@ -31,21 +32,17 @@ from g2ard.cli.options import (
     can_judge,
     is_made,
     one_horizon,
+    recovery_engine,
     views_count,
 )
+from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.resume import check_stopped, left_at
-from g2ard.cli.run_result import say_views, told, write_table
-from g2ard.cli.run_views import views_of
-from g2ard.cli.scenes import (
-    load_scene,
-    make_targets,
-    recovery_engine,
-)
+from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Cameras
-    from g2ard.distill import Distilled
-    from g2ard.lift import LiftConfig
+    from g2ard.pipeline import Distilled
+    from g2ard.policy.distill import DistillJob
+    from g2ard.report.window import Crop
     from g2ard.splats import Splats
     from g2ard.targets import Targets
 
@@ -60,12 +57,16 @@ _KEPT = Path("simplified", "scene.ply")
 @command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True, constants=True)
 def distill(
     run: Run,
-    scene: Annotated[
-        Path, typer.Argument(metavar="SCENE|CLOUD", help="A trained scene, or a coloured cloud.")
-    ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN", help="Folder of the run.")],
-    count: CountOption = None,
-    ratio: RatioOption = None,
+    scene: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[SCENE|CLOUD]",
+            help="A trained scene, or a coloured cloud; without either, --views are photos to start from.",
+        ),
+    ] = None,
+    count: CountsOption = None,
+    ratio: RatiosOption = None,
     fit: FitOption = None,
     min_psnr: MinPsnrOption = None,
     min_ssim: MinSsimOption = None,
@@ -134,128 +135,167 @@ def distill(
 
     Views are those of --views, else the cameras that lie beside the scene, else a pool of poses of its own.
     """
-    check_budget(count, ratio, fit, min_psnr, min_ssim)
+    budgets = budgets_of(count, ratio, fit, min_psnr, min_ssim)
     can_judge(k, policy)
     if is_made(str(held_out)):
         raise typer.BadParameter("--held-out: a file of views; those that are made hold out every 8th anyway")
     given = views is not None and not is_made(views)
-    place = output / f"scene.{format}"
-    run.spare_inputs(place, output / _KEPT, *([output / "views.json"] if not given else []))
-    import shutil
-    import time
-
-    from g2ard.constants import changed, listed
-    from g2ard.distill import DistillConfig
-    from g2ard.distill import distill as pipeline
-    from g2ard.io import kind, write_views
-    from g2ard.io.atomic import check_output
-    from g2ard.lift import LiftConfig
-    from g2ard.recover.presets import preset_for
-    from g2ard.recover.schedule import schedule_named
-    from g2ard.report.distilled import check_crops, distill_report
+    if scene is None and not given:
+        raise typer.BadParameter("give a SCENE, or photos with their poses as --views")
+    if photos and is_made(views):
+        raise typer.BadParameter("--photos: views that are made have none")
+    from g2ard.io import kind
+    from g2ard.pipeline import DistillConfig
+    from g2ard.policy.distill import prepare
+    from g2ard.report.distilled import check_crops
+    from g2ard.stages.lift import LiftConfig
 
     began = time.monotonic()
     values = run.constants(recover=DistillConfig(), lift=LiftConfig())
     one_horizon(steps, time_limit, values)
     engine = recovery_engine(run)
-    lifted = kind(scene) != "splats"
-    if lifted and not given:
+    name = f"scene.{format}"
+    outputs = Outputs(run, output, budgets)
+    outputs.check(lambda folder: _check_place(run, folder / name, given, resume))
+    if scene is not None and kind(scene) != "splats" and not given:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
-    if photos and is_made(views):
-        raise typer.BadParameter("--photos: views that are made have none")
-    if not left_at(output / _WORK):
-        check_output(output, run.overwrite, folder=True)
-    check_stopped(run, output / _WORK, resume)
-    lifting = changed(LiftConfig(), "lift", values)
-    prior = _lift(run, scene, lifting) if lifted else load_scene(run, scene)
-    prior = _cleaned(run, prior) if clean else prior
-    asked = asked_budget(run, scene, prior, place.name, count, ratio, fit, min_psnr, min_ssim)
-    budget = asked.count
-    looks = views_of(run, scene, prior, views, held_out, size, up, teach=not lifted and photos is not True)
-    train, test = looks.train.cameras, looks.test
-    check_crops(crop or [], test.names)
-    pictured = all(p is not None for p in (*train.image_paths, *test.image_paths))
-    use_photos = lifted or (pictured if photos is None else photos)
-    teacher, against = (None, "photos") if use_photos else (prior, "teacher renders")
-    colour = background or (0.0, 0.0, 0.0)
-    kind_of = "paper-lift" if lifted and preset == "paper" else preset
-    regularizers, why, measured = preset_for(
-        kind_of, prior, train if use_photos else None, paper=schedule == "paper"
-    )
-    run.say(f"{len(prior):,} → {budget:,} Gaussians; {len(train)} views against {against}")
-    run.say(f"regularisers: {why}")
-    config = DistillConfig(
-        method=method,
-        schedule=schedule_named(schedule, steps),
-        steps=steps,
-        time_limit=time_limit,
-        regularizers=regularizers,
-        sh_degree=sh_degree if sh_degree is not None else (3 if lifted or schedule == "paper" else None),
-        background=colour,
-        views=k.of(len(train)) if isinstance(k, Count) else "auto" if k else None,
+    early = [folder / name for folder in outputs.paths()]
+    if early and all(_is_done(run, place, resume) for place in early):
+        for place in early:
+            _tell_resumed(run, place, resume)
+        return
+    job = prepare(
+        scene,
+        budgets,
+        format=format,
+        clean=clean,
+        views=views,
+        photos=photos,
+        held_out=held_out,
+        views_count=k.number if isinstance(k, Count) else "auto" if k else None,
         policy=policy,
         weighted=weighted,
         reselect=reselect,
+        method=method,
+        preset=preset,
+        schedule=schedule,
+        steps=steps,
+        time_limit=time_limit,
+        sh_degree=sh_degree,
+        size=size,
+        background=background or (0.0, 0.0, 0.0),
+        constants=values,
+        up=up,
         seed=run.seed,
         engine=engine,
+        progress=run.progress,
+        say=run.say,
     )
-    config = changed(config, "recover", values)
-    used: dict[str, Any] = {"recover": replace(config, simplify=config.simplify.resolved(method))}
-    used |= {"lift": lifting} if lifted else {}
-    targets = make_targets(run, train, teacher, colour, lazy=k is not None)
-    unseen = make_targets(run, test, teacher, colour)
-    validation, apart = _apart_targets(run, looks.apart, teacher, colour)
-    with _work_folder(run, output, resume) as work:
-        result = pipeline(
-            prior,
-            budget,
-            targets,
-            config,
-            weights=looks.train.weights if weighted else None,
-            validation=validation,
-            work=work,
-            progress=run.progress,
+    check_crops(crop or [], job.views.test.names)
+    outputs.check(lambda folder: _check_place(run, folder / name, given, resume), len(job.prior))
+    places = [folder / name for folder in outputs.paths(len(job.prior))]
+    for place in places:
+        _tell_resumed(run, place, resume)
+    todo = [pair for pair in zip(job.aims, places, strict=True) if not _is_done(run, pair[1], resume)]
+    if not todo:
+        return
+    job.render_targets()
+    reports = []
+    for aim, place in todo:
+        result, report = _distil(
+            run, scene or Path(str(views)), job, aim.count, place, resume, keep, crop or [], began
         )
-        result = replace(result, splats=shrunk_to_fit(run, result.splats, fit, place.name))
-        report = _score(run, prior, result, {"scores": unseen, "apart": apart}, colour)
-        report["unseen"] = looks.unseen if looks.unseen is not None else _unseen(result, len(prior))
-        report |= {"against": against, "preset": why, "prior": measured.as_dict()}
-        report |= {key: result.report[key] for key in ("rounds", "views")}
-        report["constants"] = listed(used, run.config)
-        report["seconds"] = {**result.report["seconds"], "total": time.monotonic() - began}
+        reports.append(report)
+        run.kept.append(f"{place.parent} is finished")
+        began = time.monotonic()
+    run.result(reports[0] if len(reports) == 1 else {"runs": reports})
+    tell_quality(run, aim, result.splats)
+
+
+def _check_place(run: Run, place: Path, given: bool, resume: bool) -> None:
+    """Refuse a place whose folder holds an input, another result, or a stopped run that is not asked for."""
+    from g2ard.io.atomic import check_output
+
+    folder = place.parent
+    run.spare_inputs(place, folder / _KEPT, *([folder / "views.json"] if not given else []))
+    left = left_at(folder / _WORK)
+    if not left and not (resume and _finished(place)):
+        check_output(folder, run.overwrite, folder=True)
+    if left or not resume:
+        check_stopped(run, folder / _WORK, resume, place)
+
+
+def _is_done(run: Run, place: Path, resume: bool) -> bool:
+    """Whether there is nothing left to go on with in a folder."""
+    return resume and not run.overwrite and _finished(place)
+
+
+def _tell_resumed(run: Run, place: Path, resume: bool) -> None:
+    folder = place.parent
+    if _is_done(run, place, resume):
+        run.say(f"{folder}: finished already, nothing is left to resume (-w without --resume starts anew)")
+    elif resume and not left_at(folder / _WORK):
+        run.say(f"{folder}: nothing to go on from: starts anew")
+
+
+def _finished(place: Path) -> bool:
+    """Whether a run has ended there."""
+    return place.exists() and not left_at(place.parent / _WORK)
+
+
+def _distil(
+    run: Run,
+    source: Path,
+    job: DistillJob,
+    budget: int,
+    place: Path,
+    resume: bool,
+    keep: bool,
+    crops: list[Crop],
+    began: float,
+) -> tuple[Distilled, dict[str, Any]]:
+    """One budget's run: all files of its folder, `place` the scene's; and what is said of it."""
+    from g2ard.policy.score import report_of
+    from g2ard.report.distilled import distill_report
+
+    output, colour = place.parent, job.config.background
+    with _work_folder(run, output, resume) as work:
+        result = job.run(budget, work=work)
+        report = report_of(job, result, run.config)
+        report["seconds"] = {**report["seconds"], "total": time.monotonic() - began}
         distill_report(
             output / "report.html",
-            f"{scene.name}: {len(prior):,} → {budget:,}",
+            f"{source.name}: {len(job.prior):,} → {len(result.splats):,}",
             [("simplified", result.simplified), ("recovered", result.splats)],
-            unseen,
+            job.held_out,
             report,
             colour,
             told=told(report),
-            crops=crop or [],
+            crops=crops,
         )
-        _write(run, place, result, unseen, colour, report)
+        _write(run, place, result, job.held_out, colour, report)
         _keep(output / _KEPT, result.simplified if keep else None)
-    if looks.pool is not None:
-        write_views(output / "views.json", looks.pool.cameras, splits=looks.pool.splits, overwrite=True)
+    if (pool := job.views.pool) is not None:
+        from g2ard.io import write_views
+
+        write_views(output / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
     shutil.rmtree(output / _WORK)
     write_table(run, report)
     for line in told(report):
         run.say(line)
-    say_views(run, report["views"], k is not None)
+    say_views(run, report["views"], job.config.views is not None)
+    say_weight(run, source, place, result.splats)
     run.say(
         f"scene: {place} ({place.stat().st_size / 1e6:.2f} MB)\npicture: {output / 'preview.png'}\n"
         f"report: {output / 'report.html'}, {output / 'report.json'}"
     )
-    run.result(report)
-    asked.judge(result.splats)
+    return result, report
 
 
 @contextmanager
 def _work_folder(run: Run, output: Path, resume: bool) -> Iterator[Path]:
     """Where finished rounds and checkpoints wait for --resume; an error leaves nothing behind, nor does a
     Ctrl-C before the first of them."""
-    import shutil
-
     work, made = output / _WORK, not output.exists()
     if not resume:
         shutil.rmtree(work, ignore_errors=True)
@@ -264,70 +304,12 @@ def _work_folder(run: Run, output: Path, resume: bool) -> Iterator[Path]:
         yield work
     except (Exception, KeyboardInterrupt) as error:
         if left_at(work) and (resume or isinstance(error, KeyboardInterrupt)):
-            run.say(f"stopped; the same command with --resume goes on in {output}")
+            run.kept.append(f"the same command with --resume goes on in {output}")
+            if not isinstance(error, KeyboardInterrupt):
+                run.say(run.kept[-1])
         else:
             shutil.rmtree(output if made else work, ignore_errors=True)
         raise
-
-
-def _lift(run: Run, path: Path, config: LiftConfig) -> Splats:
-    from g2ard.io import read_cloud
-    from g2ard.lift import lift
-
-    cloud = read_cloud(path)
-    for note in cloud.notes:
-        run.say(f"{path}: {note}")
-    return lift(cloud.points.positions, cloud.points.colors, **vars(config), progress=run.progress)
-
-
-def _cleaned(run: Run, prior: Splats) -> Splats:
-    from g2ard.clean import KINDS
-    from g2ard.cli.cleaning import found_clutter
-
-    return prior.take(found_clutter(run, prior, KINDS)[0].keep)
-
-
-def _apart_targets(
-    run: Run, cameras: Cameras | None, teacher: Splats | None, colour: Colour
-) -> tuple[Targets | None, Targets | None]:
-    """Every second view of another kind to validate with, the others to score; None without a teacher."""
-    if cameras is None or teacher is None or len(cameras) < 2:
-        return None, None
-    validation, scored = (
-        make_targets(run, cameras.take(range(first, len(cameras), 2)), teacher, colour) for first in (0, 1)
-    )
-    return validation, scored
-
-
-def _score(
-    run: Run, prior: Splats, result: Distilled, views: dict[str, Targets | None], colour: Colour
-) -> dict[str, Any]:
-    """Both scenes' figures in each kind of views; None for a kind without any."""
-    from g2ard.evaluate import evaluate
-
-    scenes = {"simplified": result.simplified, "recovered": result.splats}
-    scores: dict[str, Any] = {
-        kind: targets
-        and {
-            name: evaluate(
-                splats, targets, background=colour, progress=run.progress, stage=f"score {name}"
-            ).as_dict()
-            for name, splats in scenes.items()
-        }
-        for kind, targets in views.items()
-    }
-    return {
-        "input_count": len(prior),
-        "output_count": len(result.splats),
-        "bytes": {"input": prior.nbytes, "output": result.splats.nbytes},
-        **scores,
-    }
-
-
-def _unseen(result: Distilled, count: int) -> float | None:
-    """Share of the Gaussians that no view sees that simplification looked from; None for `paper`."""
-    unseen = result.report["rounds"][0]["simplify"].get("unseen")
-    return None if unseen is None else unseen / count
 
 
 def _write(

@@ -11,10 +11,12 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
     ConventionOption,
-    LookOption,
     SizeOption,
     SplitOption,
     TeacherOption,
+    ViewsOrMadeOption,
+    can_be_made,
+    views_or_teacher,
 )
 
 
@@ -22,7 +24,7 @@ from g2ard.cli.options import (
 def evaluate(
     run: Run,
     scenes: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scenes to score.")],
-    views: LookOption,
+    views: ViewsOrMadeOption = None,
     teacher: TeacherOption = None,
     photos: Annotated[
         bool,
@@ -51,24 +53,28 @@ def evaluate(
 
     3DGS's own evaluation is --convention inria --8bit --lpips-input unscaled.
     """
-    from g2ard.cli.scenes import load_scene, load_views, make_targets
     from g2ard.errors import InputError
-    from g2ard.evaluate import evaluate as score
     from g2ard.lpips import load_lpips
-    from g2ard.recover.anchors import Anchors, drift95, needle
-    from g2ard.render import RasterSettings
+    from g2ard.policy.inputs import load_scene, load_views, make_targets
+    from g2ard.stages.evaluate import evaluate as score
+    from g2ard.stages.recover.anchors import Anchors, drift95, needle
+    from g2ard.stages.render import RasterSettings
 
     if photos and teacher is None:
         raise typer.BadParameter("--photos goes with --teacher: without a teacher all targets are photos")
+    can_be_made(views, teacher)
     colour, settings = background or (0.0, 0.0, 0.0), RasterSettings(convention=convention)
-    dense = load_scene(run, teacher) if teacher else None
-    frozen = load_scene(run, anchors) if anchors else None
-    cameras = load_views(run, views, split, size, unpictured=photos)
-    targets = make_targets(run, cameras, dense, colour, photos=photos, settings=settings)
+    dense = load_scene(teacher, run.say) if teacher else None
+    frozen = load_scene(anchors, run.say) if anchors else None
+    views = views_or_teacher(run, views, teacher, dense)
+    cameras = load_views(views, split, size, run.say, unpictured=photos)
+    targets = make_targets(
+        cameras, dense, colour, photos=photos, settings=settings, progress=run.progress, say=run.say
+    )
     networks = load_lpips(lpips, scaled=lpips_input == "scaled") if lpips else None
     rows: list[dict[str, Any]] = []
     for path in scenes:
-        splats = load_scene(run, path)
+        splats = load_scene(path, run.say)
         scored = score(
             splats,
             targets,

@@ -13,25 +13,52 @@ from g2ard.cli.frame import Run, command
 @command("info", example="g2ard info scene.ply --json -")
 def info(
     run: Run,
-    path: Annotated[
-        Path | None,
-        typer.Argument(metavar="SCENE|CLOUD|VIEWS", help="A Gaussian scene, a coloured cloud or views."),
+    paths: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="SCENE|CLOUD|VIEWS|RUN...",
+            help="Gaussian scenes, coloured clouds, views, or folders that `distill` wrote.",
+        ),
     ] = None,
     devices: Annotated[
         bool, typer.Option("--devices", help="List the GPUs, and which one --device would use.")
     ] = False,
 ) -> None:
     """Show what is in a file: counts, extents, SH degree, opacities, scales, odd values."""
-    if (path is None) != devices:
+    if bool(paths) == devices:
         raise typer.BadParameter("give a file, or --devices")
-    if path is None:
+    if not paths:
         _devices(run)
         return
-    from g2ard.io.describe import describe
+    found = []
+    for path in paths:
+        figures, rows = _described(path)
+        _show(run, str(path), rows)
+        found.append(figures)
+    run.result(found[0] if len(found) == 1 else {"files": found})
 
-    figures = describe(path)
-    _show(run, str(path), _rows(figures))
-    run.result(figures)
+
+def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
+    """Figures of a file, or of a run's scene with its scores, and the rows that show them."""
+    from g2ard.io.describe import describe
+    from g2ard.io.jsonfile import read_json
+    from g2ard.io.scene_formats import FORMATS
+
+    told = path / "report.json"
+    scenes = [path / f"scene.{name}" for name in FORMATS]
+    scene = next((place for place in scenes if place.is_file()), None)
+    if scene is None or not told.is_file():
+        figures = describe(path)
+        return figures, _rows(figures)
+    figures, report = describe(scene), read_json(told)
+    scores = {name: {k: found[k] for k in ("psnr", "ssim")} for name, found in report["scores"].items()}
+    figures["run"] = {"input_count": report["input_count"], "against": report["against"], "scores": scores}
+    rows = [["made from", f"{report['input_count']:,} Gaussians"]]
+    rows += [
+        [name, f"{found['psnr']:.2f} dB, SSIM {found['ssim']:.4f} against {report['against']}"]
+        for name, found in scores.items()
+    ]
+    return figures, [*_rows(figures), *rows]
 
 
 def _devices(run: Run) -> None:

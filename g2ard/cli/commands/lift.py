@@ -27,7 +27,7 @@ def lift(
     import time
 
     from g2ard import io
-    from g2ard.lift import lift as lift_points
+    from g2ard.stages.lift import lift as lift_points
 
     io.check_scene_output(output, run.overwrite)
     began = time.perf_counter()

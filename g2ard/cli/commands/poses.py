@@ -55,13 +55,13 @@ def poses(
     up: UpOption = None,
 ) -> None:
     """Make a pool of candidate views for a scene without photos: poses in free space that see it well."""
-    from g2ard.cli.scenes import load_scene
     from g2ard.io import check_views_output, write_views
+    from g2ard.policy.inputs import load_scene
     from g2ard.poses import plan_pool
     from g2ard.splits import splits_of
 
     check_views_output(output, run.overwrite)
-    splats = load_scene(run, scene)
+    splats = load_scene(scene, run.say)
     pool = plan_pool(
         splats,
         count,

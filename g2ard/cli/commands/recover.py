@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +11,6 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
-    LookOption,
     OutputOption,
     PresetOption,
     ResumeOption,
@@ -20,12 +20,17 @@ from g2ard.cli.options import (
     SplitOption,
     TeacherOption,
     TimeLimitOption,
+    ViewsOrMadeOption,
+    can_be_made,
     one_horizon,
+    recovery_engine,
+    trained_on,
+    views_or_teacher,
 )
 
 if TYPE_CHECKING:
-    from g2ard.recover.anchors import Anchors
     from g2ard.splats import Splats
+    from g2ard.stages.recover.anchors import Anchors
 
 
 @command(
@@ -37,8 +42,8 @@ if TYPE_CHECKING:
 def recover(
     run: Run,
     student: Annotated[Path, typer.Argument(metavar="STUDENT", help="The compact scene to recover.")],
-    views: LookOption,
     output: OutputOption,
+    views: ViewsOrMadeOption = None,
     teacher: TeacherOption = None,
     anchors: Annotated[
         Path | None,
@@ -61,32 +66,34 @@ def recover(
     background: BackgroundOption = None,
 ) -> None:
     """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
-    from g2ard.cli.resume import check_stopped, stoppable
-    from g2ard.cli.scenes import (
+    from g2ard.cli.resume import check_stopped, left_at, stoppable
+    from g2ard.constants import changed, listed
+    from g2ard.io import check_scene_output, write_splats
+    from g2ard.policy.inputs import (
         load_scene,
         load_trained,
         make_targets,
-        recovery_engine,
-        trained_on,
     )
-    from g2ard.constants import changed, listed
-    from g2ard.io import check_scene_output, write_splats
-    from g2ard.recover import RecoverConfig
-    from g2ard.recover import recover as optimize
-    from g2ard.recover.outcome import outcome
-    from g2ard.recover.presets import preset_for
-    from g2ard.recover.schedule import schedule_named
+    from g2ard.stages.recover import RecoverConfig
+    from g2ard.stages.recover import recover as optimize
+    from g2ard.stages.recover.outcome import outcome
+    from g2ard.stages.recover.presets import preset_for
+    from g2ard.stages.recover.schedule import schedule_named
 
     values = run.constants(recover=RecoverConfig())
     one_horizon(steps, time_limit, values)
+    can_be_made(views, teacher)
     checkpoint = output.parent / f".{output.name}.checkpoint.npz"
-    check_stopped(run, checkpoint, resume)
-    check_scene_output(output, run.overwrite)
+    if left_at(checkpoint) or not (resume and output.exists()):
+        check_scene_output(output, run.overwrite)
+    check_stopped(run, checkpoint, resume, output)
     engine = recovery_engine(run)
     colour = background or (0.0, 0.0, 0.0)
-    splats = load_scene(run, student)
-    dense = load_scene(run, teacher) if teacher else None
-    chosen = load_trained(run, views, split, size)
+    splats = load_scene(student, run.say)
+    dense = load_scene(teacher, run.say) if teacher else None
+    views = views_or_teacher(run, views, teacher, dense)
+    chosen = load_trained(views, split, size, run.say)
+    targets = make_targets(chosen.cameras, dense, colour, progress=run.progress, say=run.say)
     weights = chosen.weights if weighted else None
     if weights is not None:
         run.say(f"{len(weights)} views, drawn by their weights")
@@ -108,7 +115,6 @@ def recover(
     )
     config = changed(config, "recover", values)
     frozen = _anchors(run, anchors, splats, config.regularizers.in_plane) if anchors else None
-    targets = make_targets(run, chosen.cameras, dense, colour)
     with stoppable(run, checkpoint, resume):
         result = optimize(
             splats,
@@ -122,13 +128,13 @@ def recover(
         write_splats(output, result.splats, overwrite=run.overwrite)
     if (told := outcome(result.report)) is not None:
         run.say(told)
-    gain = result.report["psnr"]
+    gain = result.report.psnr
     run.say(
-        f"{output}: {len(splats):,} Gaussians, "
-        f"{trained_on(split)} {gain['before']:.2f} → {gain['after']:.2f} dB"
+        f"{output}: {len(splats):,} Gaussians, {trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB"
     )
-    report = {**result.report, "preset": why, "prior": measured.as_dict()}
-    report["constants"] = listed({"recover": config}, run.config)
+    used = replace(config, schedule=replace(config.schedule, steps=config.steps or config.schedule.steps))
+    report = {**result.report.as_dict(), "preset": why, "prior": measured.as_dict()}
+    report["constants"] = listed({"recover": used}, run.config)
     run.result({**report, "output": str(output)})
 
 
@@ -138,11 +144,11 @@ def _anchors(run: Run, path: Path, student: Splats, in_plane: float) -> Anchors:
     Raises:
         InputError: there are more or fewer of them.
     """
-    from g2ard.cli.scenes import load_scene
     from g2ard.errors import InputError
-    from g2ard.recover.anchors import Anchors
+    from g2ard.policy.inputs import load_scene
+    from g2ard.stages.recover.anchors import Anchors
 
-    scene = load_scene(run, path)
+    scene = load_scene(path, run.say)
     if len(scene) != len(student):
         raise InputError(f"{path}: {len(scene)} Gaussians, the student has {len(student)}")
     return Anchors.of(scene.recentred(student.offset), in_plane)

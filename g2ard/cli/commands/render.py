@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,13 +15,13 @@ from g2ard.cli.options import (
     ConventionOption,
     Count,
     CountOption,
-    LookOption,
     Method,
     RatioOption,
     SceneArgument,
     SizeOption,
     SplitOption,
-    budget_of,
+    ViewsOrMadeOption,
+    is_made,
     one_budget,
 )
 
@@ -32,12 +34,17 @@ if TYPE_CHECKING:
 Color = Literal["scene", "flags", "cells", "parents"]
 
 
-@command("render", example="g2ard render scene.ply --views poses.json -o renders/")
+@command("render", example="g2ard render scene.ply -n 4 --sheet look.png")
 def render(
     run: Run,
     scene: SceneArgument,
-    views: LookOption,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the PNGs.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder for the PNGs.")
+    ] = None,
+    views: ViewsOrMadeOption = None,
+    sheet: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="All views on one picture, for a look.")
+    ] = None,
     depth: Annotated[bool, typer.Option("--depth", help="Also write NAME.depth.npy, scene units.")] = False,
     color: Annotated[
         Color,
@@ -58,30 +65,81 @@ def render(
     """Render a scene into every view as PNG, or what simplification makes of it painted on its surfaces."""
     import numpy as np
 
-    from g2ard.cli.scenes import load_scene, load_views
     from g2ard.images import write_png
-    from g2ard.io.atomic import atomic_folder, check_output
-    from g2ard.render import RasterSettings, Renderer
+    from g2ard.io.atomic import check_output
+    from g2ard.io.clean import plural
+    from g2ard.policy.inputs import load_scene, load_views
+    from g2ard.policy.views import views_or_pool
+    from g2ard.stages.render import RasterSettings, Renderer
 
-    _check(color, count, ratio, parents)
-    check_output(output, run.overwrite, folder=True)
-    splats, settings = load_scene(run, scene), RasterSettings(convention=convention)
+    if output is None and sheet is None:
+        raise typer.BadParameter("give -o DIR, --sheet FILE.png or both")
+    looks = count if color == "scene" and ratio is None else None
+    if looks is None:
+        _check(color, count, ratio, parents)
+    elif parents is not None or looks.is_share or (views is not None and not is_made(views)):
+        raise typer.BadParameter("-n: how many views to make, where none are given")
+    if output is not None:
+        check_output(output, run.overwrite, folder=True)
+    if sheet is not None:
+        check_output(sheet, run.overwrite)
+    splats, settings = load_scene(scene, run.say), RasterSettings(convention=convention)
     if color != "scene":
-        budget = None if parents else budget_of(scene, count, ratio, len(splats))
+        budget = None if parents else one_budget(count, ratio).of(len(splats), str(scene))
         splats = _painted(run, splats, color, budget, method, parents)
-    cameras = load_views(run, views, split, size)
+    found = views_or_pool(
+        splats,
+        "made" if looks is not None else views,
+        beside=scene,
+        count=None if looks is None else int(looks.value),
+        seed=run.seed,
+        progress=run.progress,
+        say=run.say,
+    )
+    cameras = load_views(found, split, size, run.say)
+    shown: list[NDArray[np.float32]] = []
     renderer = Renderer(splats, background=background or (0.0, 0.0, 0.0), settings=settings)
-    with atomic_folder(output, overwrite=run.overwrite) as folder:
+    with _folder(output, run.overwrite) as folder:
         for view, name in enumerate(cameras.names):
-            rendered = renderer.render(cameras, view)
-            stem = folder / Path(name).with_suffix("")
-            stem.parent.mkdir(parents=True, exist_ok=True)
-            write_png(stem.with_name(stem.name + ".png"), rendered.image)
-            if depth:
-                np.save(stem.with_name(stem.name + ".depth.npy"), rendered.depth)
+            rendered = renderer.render(cameras[view])
+            if sheet is not None:
+                shown.append(np.clip(rendered.image, 0, 1))
+            if folder is not None:
+                stem = folder / Path(name).with_suffix("")
+                stem.parent.mkdir(parents=True, exist_ok=True)
+                write_png(stem.with_name(stem.name + ".png"), rendered.image)
+                if depth:
+                    np.save(stem.with_name(stem.name + ".depth.npy"), rendered.depth)
             run.progress("render", view + 1, len(cameras))
-    run.say(f"{len(cameras)} images in {output}")
-    run.result({"images": len(cameras), "output": str(output)})
+    if sheet is not None:
+        _write_sheet(sheet, shown, cameras.names, run.overwrite)
+    run.say(f"{plural(len(cameras), 'image')} in {' and '.join(str(p) for p in (output, sheet) if p)}")
+    run.result({"images": len(cameras), "output": str(output or sheet)})
+
+
+@contextmanager
+def _folder(path: Path | None, overwrite: bool) -> Iterator[Path | None]:
+    from g2ard.io.atomic import atomic_folder
+
+    if path is None:
+        yield None
+        return
+    with atomic_folder(path, overwrite=overwrite) as folder:
+        yield folder
+
+
+def _write_sheet(
+    path: Path, images: list[NDArray[np.float32]], names: tuple[str, ...], overwrite: bool
+) -> None:
+    """A grid about as wide as high; views of several sizes stand in rows of their own."""
+    import math
+
+    from g2ard.images import contact_sheet, write_png
+
+    columns = math.ceil(math.sqrt(len(images)))
+    rows = [images[i : i + columns] for i in range(0, len(images), columns)]
+    captions = [", ".join(names[i : i + columns]) for i in range(0, len(images), columns)]
+    write_png(path, contact_sheet(rows, [""] * columns, row_labels=captions), overwrite=overwrite)
 
 
 def _check(color: Color, count: Count | None, ratio: float | None, parents: Path | None) -> None:
@@ -98,7 +156,7 @@ def _painted(
     run: Run, splats: Splats, color: Color, budget: int | None, method: Method, parents: Path | None
 ) -> Splats:
     from g2ard.paint import cell_labels, flag_colors, label_colors, painted
-    from g2ard.simplify import flag, simplify
+    from g2ard.stages.simplify import flag, simplify
 
     if color == "flags":
         assert budget is not None  # _check has seen to it

@@ -45,11 +45,11 @@ def select(
 
     Views that are not for training follow after them, with their split and no weight, to score on.
     """
-    from g2ard.cli.scenes import load_scene, load_split_views
     from g2ard.constants import changed, listed
     from g2ard.io import check_views_output
-    from g2ard.select import CoverageOptions
-    from g2ard.select import select as choose
+    from g2ard.policy.inputs import load_scene, load_split_views
+    from g2ard.stages.select import CoverageOptions
+    from g2ard.stages.select import select as choose
 
     if views is None:
         raise typer.BadParameter("--views VIEWS: the candidates to select from")
@@ -57,8 +57,8 @@ def select(
     values = run.constants(select=CoverageOptions(), over_options=True)
     options = changed(CoverageOptions(cells=cells), "select", values)
     check_views_output(output, run.overwrite)
-    splats = load_scene(run, scene)
-    pool, candidates = load_split_views(run, views, split)
+    splats = load_scene(scene, run.say)
+    pool, candidates = load_split_views(views, split, run.say)
     cameras = pool.cameras.take(candidates)
     chosen = choose(
         splats,

@@ -2,36 +2,31 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from g2ard.cli.fit import FitOption, MinPsnrOption, MinSsimOption
+from g2ard.cli.budget_options import FitOption, MinPsnrOption, MinSsimOption
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
-    CountOption,
+    CountsOption,
     Method,
     OutputOption,
     PaperOption,
-    RatioOption,
+    RatiosOption,
     SceneArgument,
     UpOption,
     ViewsOrMadeOption,
     is_made,
 )
+from g2ard.cli.outputs import Outputs, budgets_of
+from g2ard.cli.run_result import say_weight, tell_quality
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Cameras
-    from g2ard.cli.options import Triple
-    from g2ard.simplify import Simplified
-    from g2ard.splats import Splats
-
-_VIEWS, _NEAR = 96, 0.25
-"""Poses of a pool of its own, as many of them are used as the scene needs; and the most that step nearer."""
-
-_ROWS = 100_000
-"""Gaussians that those are planned on."""
+    from g2ard.io import Scene
+    from g2ard.stages.simplify import Simplified, SimplifyConfig
 
 
 @command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply", constants=True)
@@ -39,8 +34,8 @@ def simplify(
     run: Run,
     scene: SceneArgument,
     output: OutputOption,
-    count: CountOption = None,
-    ratio: RatioOption = None,
+    count: CountsOption = None,
+    ratio: RatiosOption = None,
     fit: FitOption = None,
     min_psnr: MinPsnrOption = None,
     min_ssim: MinSsimOption = None,
@@ -66,101 +61,90 @@ def simplify(
     The default method weighs errors by what is seen: from --views, else from the cameras that lie beside the
     scene, else from a pool of poses of its own. The fast one looks only at given views, the paper's at none.
     """
-    import time
-    from dataclasses import replace
-
-    from g2ard import io
-    from g2ard.cli.fit import asked_budget, check_budget, shrunk_to_fit
-    from g2ard.constants import changed, listed
-    from g2ard.simplify import SimplifyConfig
-    from g2ard.simplify import simplify as reduce
-    from g2ard.visibility import looker
-
-    check_budget(count, ratio, fit, min_psnr, min_ssim)
-    if fit is not None and parents is not None:
-        raise typer.BadParameter("--parents: the rows of a scene that --fit shrinks are not known beforehand")
+    budgets = budgets_of(count, ratio, fit, min_psnr, min_ssim)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other")
+    from g2ard import io
+    from g2ard.constants import changed
+    from g2ard.policy.fit import aim_of
+    from g2ard.policy.inputs import say_notes
+    from g2ard.policy.simplify import simplify_each
+    from g2ard.stages.simplify import SimplifyConfig
+
     values = run.constants(simplify=SimplifyConfig(), over_options=True)
     config = changed(SimplifyConfig(retention=retention), "simplify", values)
-    io.check_scene_output(output, run.overwrite)
-    if parents is not None:
-        _check_parents(run, parents, scene, views)
-    began = time.perf_counter()
+    outputs = Outputs(run, output, budgets)
+    outputs.check(lambda path: io.check_scene_output(path, run.overwrite))
+    maps = None if parents is None else Outputs(run, parents, budgets, name="--parents")
+    if maps is not None:
+        maps.check(lambda path: _check_parents(run, path, scene, views))
+    clock = [time.perf_counter()]
     found = io.read_scene(scene)
-    for note in found.notes:
-        run.say(f"{scene}: {note}")
-    read = time.perf_counter()
-    asked = asked_budget(run, scene, found.splats, output.name, count, ratio, fit, min_psnr, min_ssim)
-    budget = asked.count
-    looks = not no_views and budget < len(found.splats)
-    cameras = _cameras(run, scene, found.splats, views, method, up) if looks else None
-    small = reduce(
-        found.splats,
-        budget,
-        method=method,
-        visibility=None if cameras is None else looker(cameras, progress=run.progress),
-        config=config,
-        progress=run.progress,
-    )
-    small = replace(small, splats=shrunk_to_fit(run, small.splats, fit, output.name))
-    simplified = time.perf_counter()
-    io.write_splats(output, small.splats, overwrite=run.overwrite)
-    if parents is not None:
-        _write_parents(run, parents, small)
-    written = time.perf_counter()
-    _tell(run, small)
-    share = (small.report["unseen"] or 0) / len(found.splats)
-    if share >= 0.005:
-        run.say(f"no view sees {share:.0%} of the Gaussians: they count by their own size alone")
-    run.say(f"{output}: {len(small.splats):,} of {len(found.splats):,} Gaussians in {written - began:.1f} s")
-    run.result(
-        {
-            **small.report,
-            "method": method,
-            "constants": listed({"simplify": config.resolved(method)}),
-            "notes": {note.code: note.count for note in found.notes},
-            "seconds": {
-                "read": read - began,
-                "simplify": simplified - read,
-                "write": written - simplified,
-                "total": written - began,
-            },
-            "peak_rss_bytes": _peak_rss(),
-        }
-    )
-    asked.judge(small.splats)
-
-
-def _cameras(
-    run: Run, scene: Path, splats: Splats, views: Path | None, method: str, up: Triple | None
-) -> Cameras | None:
-    """The views given, else those beside the scene, else a few of its own where it leaves room for them."""
-    from g2ard.cli.found import as_pool, found_views
-    from g2ard.cli.scenes import load_views
-    from g2ard.errors import InputError
-
-    made = is_made(views)
-    if method == "paper" and views is not None:
-        run.say("paper uses no views")
-    if method == "paper" and made:
-        return None
-    if views is None and method == "default" and (found := found_views(run, scene, splats, ["train"])):
-        return as_pool(load_views(run, found, "train", None))
-    if views is not None and not made:
-        return load_views(run, views, "train", None)
-    if method != "default" and not made:
-        return None
-    from g2ard.poses import plan_pool
-
-    try:
-        pool = plan_pool(
-            splats, _VIEWS, up=up, seed=run.seed, rows=_ROWS, near=_NEAR, looks=True, progress=run.progress
+    say_notes(scene, found.notes, run.say)
+    total = len(found.splats)
+    outputs.check(lambda path: io.check_scene_output(path, run.overwrite), total)
+    clock.append(time.perf_counter())
+    aims = [
+        aim_of(
+            budget,
+            found.splats,
+            str(scene),
+            file=output.name,
+            seed=run.seed,
+            progress=run.progress,
+            say=run.say,
         )
-    except InputError as e:
-        run.say(f"goes on without views: {e}")
-        return None
-    return pool.cameras
+        for budget in budgets
+    ]
+    made = simplify_each(
+        found.splats,
+        [aim.count for aim in aims],
+        views=views,
+        blind=no_views,
+        method=method,
+        config=config,
+        beside=scene,
+        up=up,
+        seed=run.seed,
+        progress=run.progress,
+        say=run.say,
+    )
+    reports = []
+    places = zip(outputs.paths(total), maps.paths(total) if maps else [None] * len(aims), strict=True)
+    for reduced, aim, (place, rows) in zip(made, aims, places, strict=True):
+        small = aim.shrink_simplified(reduced, run.say)
+        clock.append(time.perf_counter())
+        io.write_splats(place, small.splats, overwrite=run.overwrite)
+        if rows is not None:
+            _write_parents(run, rows, small)
+        clock.append(time.perf_counter())
+        reports.append(_report(run, found, small, config.resolved(method), method, clock))
+        _tell(run, scene, small, place, total, clock[-1] - clock[0])
+        run.kept.append(f"{place} is written")
+        clock = [clock[-1] - (clock[1] - clock[0]), clock[-1]]  # reading is shared
+    run.result(reports[0] if len(reports) == 1 else {"runs": reports})
+    tell_quality(run, aims[0], small.splats)
+
+
+def _report(
+    run: Run, found: Scene, small: Simplified, config: SimplifyConfig, method: str, clock: list[float]
+) -> dict[str, Any]:
+    from g2ard.constants import listed
+
+    began, read, simplified, written = clock
+    return {
+        **small.report.as_dict(),
+        "method": method,
+        "constants": listed({"simplify": config}),
+        "notes": {note.code: note.count for note in found.notes},
+        "seconds": {
+            "read": read - began,
+            "simplify": simplified - read,
+            "write": written - simplified,
+            "total": written - began,
+        },
+        "peak_rss_bytes": _peak_rss(),
+    }
 
 
 def _check_parents(run: Run, parents: Path, scene: Path, views: Path | None) -> None:
@@ -181,24 +165,32 @@ def _write_parents(run: Run, path: Path, small: Simplified) -> None:
         np.save(file, small.parents)
 
 
-def _tell(run: Run, small: Simplified) -> None:
-    if not run.verbose:
-        return
+def _tell(run: Run, scene: Path, small: Simplified, output: Path, total: int, seconds: float) -> None:
+    if run.verbose:
+        _table(run, small)
+    share = (small.report.unseen or 0) / total
+    if share >= 0.005:
+        run.say(f"no view sees {share:.0%} of the Gaussians: they count by their own size alone")
+    say_weight(run, scene, output, small.splats)
+    run.say(f"{output}: {len(small.splats):,} of {total:,} Gaussians in {seconds:.1f} s")
+
+
+def _table(run: Run, small: Simplified) -> None:
     columns = ["round", "before", "dropped", "merged", "refused", "trimmed", "after"]
     rows = [
         [str(i + 1)]
         + [
             f"{v:,}"
             for v in (
-                r["before"],
-                r["dropped"],
-                r["merged"],
-                sum(r.get("refused", {}).values()),
-                r["trimmed"],
-                r["after"],
+                r.before,
+                r.dropped,
+                r.merged,
+                sum((r.refused or {}).values()),
+                r.trimmed,
+                r.after,
             )
         ]
-        for i, r in enumerate(small.report["rounds"])
+        for i, r in enumerate(small.report.rounds)
     ]
     run.console.table("Rounds", columns, rows)
 

@@ -5,12 +5,13 @@
 mod scene;
 
 use divan::{Bencher, Divan, black_box};
+use g2ard_core::random::Lcg;
 use g2ard_core::raster::{
     Accumulated, Camera, Image, ImageGradients, Params, Rasterizer, Settings,
 };
 use g2ard_core::{Control, Cpu};
 use rayon::prelude::*;
-use scene::{Random, Scene, Slopes, cameras};
+use scene::{Scene, Slopes, cameras};
 
 const COUNTS: [usize; 2] = [20_000, 200_000];
 /// Ten times fewer.
@@ -28,14 +29,14 @@ fn main() {
 
 mod spatial {
     use super::*;
-    use g2ard_core::spatial::{Frame, Tree, codes, order};
+    use g2ard_core::spatial::{RobustBounds, Tree, codes, order};
 
     const NEIGHBORS: usize = 6;
 
     #[divan::bench(args = COUNTS)]
     fn morton_order(bencher: Bencher, count: usize) {
         let points = Scene::of(count).means;
-        bencher.bench(|| order(&codes(&points, &Frame::of(&points))));
+        bencher.bench(|| order(&codes(&points, &RobustBounds::of(&points))));
     }
 
     #[divan::bench(args = COUNTS)]
@@ -60,6 +61,7 @@ mod spatial {
 
 mod simplify {
     use super::*;
+    use g2ard_core::scene::Ordered;
     use g2ard_core::simplify::{Pairwise, Paper, flags};
 
     /// Counts after each round, `retention` of the one before kept.
@@ -75,8 +77,13 @@ mod simplify {
 
     fn pairwise(bencher: Bencher, count: usize, policy: Pairwise) {
         let (scene, counts) = (Scene::of(count), schedule(count, 0.65));
-        let run = || policy.run(&scene.scene(), None, None, &counts, &Control::default());
-        bencher.bench(|| run().expect("a valid scene"));
+        bencher.bench(|| {
+            let (scene, control) = (scene.scene(), Control::default());
+            let ordered = Ordered::new(&scene).expect("a valid scene");
+            policy
+                .run(&scene, &ordered, None, None, &counts, &control)
+                .expect("a valid scene")
+        });
     }
 
     #[divan::bench(args = COUNTS)]
@@ -84,15 +91,9 @@ mod simplify {
         pairwise(bencher, count, Pairwise::default());
     }
 
-    /// Along the Morton tree's ladder all the way.
     #[divan::bench(args = COUNTS)]
     fn fast_policy(bencher: Bencher, count: usize) {
-        let policy = Pairwise {
-            ladder: 1.0,
-            ladder_steps: 3,
-            ..Pairwise::default()
-        };
-        pairwise(bencher, count, policy);
+        pairwise(bencher, count, Pairwise::fast());
     }
 
     #[divan::bench(args = COUNTS)]
@@ -107,17 +108,13 @@ mod simplify {
     fn paper_policy(bencher: Bencher, count: usize) {
         let (scene, counts) = (Scene::of(count), schedule(count, 0.75));
         let (paper, cells) = (Paper::default(), count / RATIO);
-        let run = || {
-            paper.run(
-                &scene.scene(),
-                None,
-                cells,
-                &counts,
-                &Cpu,
-                &Control::default(),
-            )
-        };
-        bencher.bench(|| run().expect("a valid scene"));
+        bencher.bench(|| {
+            let (scene, control) = (scene.scene(), Control::default());
+            let ordered = Ordered::new(&scene).expect("a valid scene");
+            paper
+                .run(&scene, &ordered, None, cells, &counts, &Cpu, &control)
+                .expect("a valid scene")
+        });
     }
 }
 
@@ -162,7 +159,7 @@ mod raster {
         let scene = Scene::of(count);
         let (params, mut rasterizer) = (scene.params(), Rasterizer::default());
         render(&mut rasterizer, &params, &view(), &mut blank());
-        let mut random = Random(1);
+        let mut random = Lcg(1);
         let rgb: Vec<f32> = (0..3 * WIDTH * HEIGHT)
             .map(|_| random.uniform() as f32 - 0.5)
             .collect();
@@ -202,7 +199,7 @@ mod ssim {
             width: WIDTH,
             channels: 3,
         };
-        let mut random = Random(1);
+        let mut random = Lcg(1);
         let [image, target] = [(); 2].map(|()| -> Vec<f32> {
             (0..shape.values())
                 .map(|_| random.uniform() as f32)
@@ -218,7 +215,7 @@ mod ssim {
 
 mod select {
     use super::*;
-    use g2ard_core::select::{Coverage, Opaque, Problem, Surface, visible};
+    use g2ard_core::select::{Coverage, Occluders, Problem, Surface, visible_cells};
 
     const VIEWS: usize = 64;
     const CHOSEN: usize = 16;
@@ -232,9 +229,9 @@ mod select {
         Surface::of(&scene.gaussians(), scene.means.len() / 4, &Cpu).expect("a valid scene")
     }
 
-    fn seen(scene: &Scene, surface: &Surface, views: &[Camera]) -> Vec<Vec<u32>> {
-        let opaque = Opaque::of(&scene.gaussians());
-        visible(&opaque, surface, views, &Control::default()).expect("never cancelled")
+    fn seen_cells(scene: &Scene, surface: &Surface, views: &[Camera]) -> Vec<Vec<u32>> {
+        let occluders = Occluders::of(&scene.gaussians());
+        visible_cells(&occluders, surface, views, &Control::default()).expect("never cancelled")
     }
 
     #[divan::bench(args = COUNTS)]
@@ -248,7 +245,7 @@ mod select {
     fn cells_seen(bencher: Bencher, count: usize) {
         let (scene, views) = (Scene::of(count), views());
         let surface = surface(&scene);
-        bencher.bench(|| seen(&scene, &surface, &views));
+        bencher.bench(|| seen_cells(&scene, &surface, &views));
     }
 
     /// 16 of the 64 views by directional coverage, lazily.
@@ -259,7 +256,7 @@ mod select {
         let positions: Vec<_> = views.iter().map(Camera::position).collect();
         let problem = Problem {
             surface: &surface,
-            visible: &seen(&scene, &surface, &views),
+            visible: &seen_cells(&scene, &surface, &views),
             positions: &positions,
         };
         let coverage = Coverage {
@@ -267,6 +264,8 @@ mod select {
             kappa: 20.0,
             alpha: 2.0,
             lambda: 1.0,
+            anchors: 32,
+            epsilon: 1e-9,
         };
         let run = || problem.greedy(CHOSEN, &coverage, true, &Control::default());
         bencher.bench(|| run().expect("a valid problem"));

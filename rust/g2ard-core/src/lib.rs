@@ -1,23 +1,30 @@
 //! Geometry kernels of g2ard, in pure Rust.
 //!
-//! Data flows one way: points → [`lift`] → [`splats`] → [`simplify`] → [`raster`] and [`ssim`]; [`quantize`] serves file formats.
+//! Data flows one way: points → [`lift`] → [`splats`] → [`scene`] → [`raster`] → [`visibility`] → [`simplify`], [`select`]
+//! and [`train`]; [`quantize`] serves file formats. [`backend`] alone knows the stages whose kernels a device may run.
 //! Results never depend on the number of threads: every reduction has a fixed order.
 
 pub mod backend;
 pub mod control;
+mod cpu;
 pub mod error;
 pub mod lift;
 pub mod linalg;
 pub mod quantize;
+#[doc(hidden)]
+pub mod random;
 pub mod raster;
+pub mod scene;
 pub mod select;
 pub mod simplify;
 pub mod spatial;
 pub mod splats;
 pub mod ssim;
 pub mod train;
+pub mod visibility;
 
-pub use backend::{Backend, Cpu};
+pub use backend::Backend;
 pub use control::Control;
+pub use cpu::Cpu;
 pub use error::{Error, Result};
 pub use splats::Splats;

@@ -9,7 +9,7 @@ use crate::{Control, Error, Result};
 /// Defaults are the paper's.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LiftConfig {
-    /// Nearest others that PCA looks at.
+    /// Nearest others that PCA takes in.
     pub neighbors: usize,
     /// Normal scale over the geometric mean of the tangential ones.
     pub normal_ratio: f64,
@@ -68,7 +68,7 @@ struct Patch {
     quat: [f64; 4],
 }
 
-/// Rows between two looks at the control.
+/// Rows between two checks of the control.
 const CHUNK: usize = 4096;
 
 /// `points`: centred near the origin, finite.
@@ -119,7 +119,7 @@ fn patch(points: &[[f64; 3]], row: u32, near: &[Neighbor<f64>], config: &LiftCon
 }
 
 /// Sizes in the order of the points. A patch without extent (its neighbours all at one place) takes the
-/// median extent of the nearest patches that have one; where none has, 1: nothing tells its size.
+/// median extent of the nearest patches that have one; where none has, 1: its size is unknown.
 fn discs(tree: &Tree, patches: &[Patch], config: &LiftConfig) -> Discs {
     let sized: Vec<usize> = (0..patches.len())
         .filter(|&at| patches[at].tangential[0] > 0.0)

@@ -1,16 +1,15 @@
-//! The device as policies see it: the twins where they serve, the CPU where they do not, and why.
+//! The device as policies see it: the twins where they work, the CPU where they do not, and the reasons.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use g2ard_core::backend::{Group, Numbered, Run};
 use g2ard_core::raster::Camera;
-use g2ard_core::select::{Gaussians, Surface};
-use g2ard_core::simplify::Merged;
-use g2ard_core::spatial::{Cells, Frame};
-use g2ard_core::{Backend, Control, Cpu, Result};
+use g2ard_core::select::{Gaussians, Surface, ViewKernels};
+use g2ard_core::simplify::{Group, GroupKernels, Merged};
+use g2ard_core::spatial::{Cells, RobustBounds};
+use g2ard_core::{Backend, Control, Cpu, Result, Splats};
 
-use crate::rows::Rows;
+use crate::rows::{Numbered, Numbers, Rows};
 use crate::runtime::{Adapter, Error, Gpu, Options, guarded};
 use crate::{groups, probe, visibility, voxels};
 
@@ -25,10 +24,10 @@ pub enum Choice {
     Auto,
 }
 
-/// Rows below which opening a device takes longer than the CPU needs.
+/// Rows below which opening a device takes longer than the CPU needs for the work.
 const WORTH_OPENING: usize = 200_000;
 
-/// A backend that runs the twins and goes on with the CPU, for good, once a device fails it.
+/// A backend that runs the twins, and only the CPU's kernels once a device has failed: a failed device is not retried.
 #[derive(Debug, Default)]
 pub struct Device {
     choice: Choice,
@@ -119,7 +118,7 @@ impl Device {
         }
     }
 
-    /// A real GPU that is faster than the CPU. Having none, or no room for one, is nothing to tell of.
+    /// A real GPU that is faster than the CPU. Having none, or too little memory for one, is not reported.
     fn worthwhile(&self) -> crate::runtime::Result<Option<Gpu>> {
         guarded(|| match Gpu::open(false, self.options) {
             Ok(gpu) => Ok(probe::pays(&gpu)?.then_some(gpu)),
@@ -167,23 +166,16 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-impl Backend for Device {
-    fn cells(&self, points: &[[f64; 3]], frame: &Frame, target: usize) -> Result<Cells> {
+impl ViewKernels for Device {
+    fn cells(&self, points: &[[f64; 3]], bounds: &RobustBounds, target: usize) -> Result<Cells> {
         self.either(
             points.len(),
-            |gpu| voxels::adaptive(gpu, points, frame, target),
-            || Backend::cells(&Cpu, points, frame, target),
+            |gpu| voxels::adaptive(gpu, points, bounds, target),
+            || ViewKernels::cells(&Cpu, points, bounds, target),
         )
     }
 
-    fn run(&self) -> Box<dyn Run + '_> {
-        Box::new(OnDevice {
-            device: self,
-            held: Mutex::default(),
-        })
-    }
-
-    fn looks(
+    fn view_statistics(
         &self,
         scene: &Gaussians<'_>,
         cameras: &[Camera],
@@ -191,12 +183,12 @@ impl Backend for Device {
     ) -> Result<Vec<[f32; 2]>> {
         self.either(
             scene.means.len(),
-            |gpu| visibility::looks(gpu, scene, cameras, control),
-            || Cpu.looks(scene, cameras, control),
+            |gpu| visibility::view_statistics(gpu, scene, cameras, control),
+            || Cpu.view_statistics(scene, cameras, control),
         )
     }
 
-    fn visible(
+    fn visible_cells(
         &self,
         scene: &Gaussians<'_>,
         surface: &Surface,
@@ -205,76 +197,96 @@ impl Backend for Device {
     ) -> Result<Vec<Vec<u32>>> {
         self.either(
             scene.means.len(),
-            |gpu| visibility::visible(gpu, scene, surface, cameras, control),
-            || Cpu.visible(scene, surface, cameras, control),
+            |gpu| visibility::visible_cells(gpu, scene, surface, cameras, control),
+            || Cpu.visible_cells(scene, surface, cameras, control),
         )
     }
 }
 
-/// One run of simplification: the rows that the device holds for it go with it.
-struct OnDevice<'a> {
-    device: &'a Device,
-    held: Mutex<Rows>,
-}
-
-impl OnDevice<'_> {
-    /// `twin` on the device, which has been sent what it lacked of the rows; else `cpu`.
-    fn either<T>(
-        &self,
-        rows: Numbered<'_>,
-        twin: impl FnOnce(&Gpu, &Rows) -> crate::runtime::Result<T>,
-        cpu: impl FnOnce() -> Result<T>,
-    ) -> Result<T> {
-        let with_rows = |gpu: &Gpu| {
-            let mut held = lock(&self.held);
-            held.follow(gpu, rows)?;
-            twin(gpu, &held)
-        };
-        let without = || {
-            if self.device.gpu().is_none() {
-                *lock(&self.held) = Rows::default(); // nobody comes back to a device that was left
-            }
-            cpu()
-        };
-        self.device.either(rows.splats.len(), with_rows, without)
+impl Backend for Device {
+    fn group_kernels(&self) -> Box<dyn GroupKernels + '_> {
+        Box::new(RunOnDevice {
+            device: self,
+            uploaded: Mutex::default(),
+            numbers: Mutex::default(),
+        })
     }
 }
 
-impl Run for OnDevice<'_> {
-    fn cells(&self, rows: Numbered<'_>, kept: &[u32], target: usize) -> Result<Cells> {
+/// One run of simplification, and the rows that the device holds for it.
+struct RunOnDevice<'a> {
+    device: &'a Device,
+    uploaded: Mutex<Rows>,
+    numbers: Mutex<Numbers>,
+}
+
+impl RunOnDevice<'_> {
+    /// `twin` on the device, after the upload of the rows that it lacks; else `cpu`.
+    fn either<T>(
+        &self,
+        splats: &Splats,
+        twin: impl FnOnce(&Gpu, &Rows, Numbered<'_>) -> crate::runtime::Result<T>,
+        cpu: impl FnOnce() -> Result<T>,
+    ) -> Result<T> {
+        let mut numbers = lock(&self.numbers);
+        let rows = Numbered {
+            splats,
+            numbers: numbers.of(splats.len()),
+        };
+        let with_rows = |gpu: &Gpu| {
+            let mut uploaded = lock(&self.uploaded);
+            uploaded.follow(gpu, rows)?;
+            twin(gpu, &uploaded, rows)
+        };
+        let without = || {
+            if self.device.gpu().is_none() {
+                *lock(&self.uploaded) = Rows::default(); // a failed device is not retried
+            }
+            cpu()
+        };
+        self.device.either(splats.len(), with_rows, without)
+    }
+}
+
+impl GroupKernels for RunOnDevice<'_> {
+    fn cells(&self, splats: &Splats, kept: &[u32], target: usize) -> Result<Cells> {
         self.either(
-            rows,
-            |gpu, held| voxels::of_rows(gpu, held, rows, kept, target),
-            || Run::cells(&Cpu, rows, kept, target),
+            splats,
+            |gpu, uploaded, rows| voxels::of_rows(gpu, uploaded, rows, kept, target),
+            || GroupKernels::cells(&Cpu, splats, kept, target),
         )
     }
 
     fn energies(
         &self,
-        rows: Numbered<'_>,
+        splats: &Splats,
         count: usize,
         group: &Group<'_>,
         control: &Control,
     ) -> Result<Vec<f64>> {
         self.either(
-            rows,
-            |gpu, held| groups::energies(gpu, held, rows, count, group, control),
-            || Cpu.energies(rows, count, group, control),
+            splats,
+            |gpu, uploaded, rows| groups::energies(gpu, uploaded, rows, count, group, control),
+            || Cpu.energies(splats, count, group, control),
         )
     }
 
     fn merges(
         &self,
-        rows: Numbered<'_>,
+        splats: &Splats,
         groups: &[&[u32]],
         support: f64,
         control: &Control,
     ) -> Result<Vec<(Merged, f64)>> {
         self.either(
-            rows,
-            |gpu, held| groups::merges(gpu, held, rows, groups, support, control),
-            || Cpu.merges(rows, groups, support, control),
+            splats,
+            |gpu, uploaded, rows| groups::merges(gpu, uploaded, rows, groups, support, control),
+            || Cpu.merges(splats, groups, support, control),
         )
+    }
+
+    fn rows_replaced(&self, copied: &[u32]) {
+        lock(&self.numbers).replace(copied);
     }
 }
 

@@ -1,7 +1,7 @@
 //! Compute-shader twins of g2ard-core's kernels, for any GPU that speaks Vulkan, Metal or DirectX 12.
 //!
-//! [`Device`] is a [`g2ard_core::Backend`]: policies call it as they call the CPU, and get the same answers. Each
-//! twin has a room of its own, WGSL beside Rust; `runtime` is the one door to wgpu.
+//! [`Device`] is a [`g2ard_core::Backend`]: policies call it as they call the CPU, and get the same results. Each
+//! twin has a folder of its own, WGSL beside Rust; only `runtime` calls wgpu.
 
 mod device;
 mod groups;

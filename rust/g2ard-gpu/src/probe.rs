@@ -1,12 +1,13 @@
-//! Whether a device computes rightly, and whether it is worth using.
+//! Whether a device computes correctly, and whether it is faster.
 
 use std::time::{Duration, Instant};
 
-use g2ard_core::backend::{Numbered, Run};
+use g2ard_core::random::Lcg;
+use g2ard_core::simplify::GroupKernels;
 use g2ard_core::{Control, Cpu, Splats};
 
 use crate::groups;
-use crate::rows::Rows;
+use crate::rows::{Numbered, Rows};
 use crate::runtime::{Error, Gpu, Result};
 
 /// Groups of a check, and of a race; rows of each.
@@ -14,7 +15,7 @@ const FEW: usize = 128;
 const MANY: usize = 1 << 15;
 const ROWS: usize = 8;
 
-/// The CPU must need this many times as long: below, what is sent to and fro outweighs what is gained.
+/// The CPU must need this many times as long: below, transfers outweigh the gain.
 const PAYS: f64 = 1.5;
 
 /// Whether the device's answers are the CPU's, bit for bit.
@@ -43,7 +44,7 @@ fn race(gpu: &Gpu, groups: usize) -> Result<(Duration, Duration)> {
         ROWS
     };
     let began = Instant::now();
-    let want = Cpu.energies(rows, groups, &group, &control)?;
+    let want = Cpu.energies(&splats, groups, &group, &control)?;
     let here = began.elapsed();
     let began = Instant::now();
     let mut held = Rows::default();
@@ -62,13 +63,8 @@ fn race(gpu: &Gpu, groups: usize) -> Result<(Duration, Duration)> {
 
 /// Rows without any pattern.
 fn sample(count: usize) -> Splats {
-    let mut state = 1u64;
-    let mut next = || {
-        state = state
-            .wrapping_mul(6364136223846793005)
-            .wrapping_add(1442695040888963407);
-        (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
-    };
+    let mut random = Lcg(1);
+    let mut next = || random.centred();
     Splats {
         means: (0..count).map(|_| [next(), next(), next()]).collect(),
         sh: (0..count)

@@ -1,6 +1,7 @@
 //! What the tests of twins share.
 
 use g2ard_core::Splats;
+use g2ard_core::random::Lcg;
 
 use crate::runtime::{Error, Gpu, Options};
 
@@ -20,28 +21,6 @@ pub fn gpu_with(what: &str, options: Options) -> Option<Gpu> {
     }
 }
 
-/// The same numbers in every run.
-pub struct Random(u64);
-
-impl Random {
-    pub fn new(seed: u64) -> Self {
-        Self(seed)
-    }
-
-    pub fn below(&mut self, count: u64) -> u64 {
-        (self.unit() * count as f64) as u64
-    }
-
-    /// In [0, 1).
-    pub fn unit(&mut self) -> f64 {
-        self.0 = self
-            .0
-            .wrapping_mul(6364136223846793005)
-            .wrapping_add(1442695040888963407);
-        (self.0 >> 11) as f64 / (1u64 << 53) as f64
-    }
-}
-
 /// Share of entries that are equal.
 pub fn share<T: PartialEq>(a: &[T], b: &[T]) -> f64 {
     assert_eq!(a.len(), b.len());
@@ -50,31 +29,31 @@ pub fn share<T: PartialEq>(a: &[T], b: &[T]) -> f64 {
 }
 
 /// Discs on two wavy sheets with noise, of a few large and many small ones.
-fn sheets(count: usize, random: &mut Random) -> Splats {
+fn sheets(count: usize, random: &mut Lcg) -> Splats {
     let mut splats = Splats {
         sh_coeffs: 4,
         ..Splats::default()
     };
     for _ in 0..count {
-        let (x, y) = (10.0 * random.unit() - 5.0, 10.0 * random.unit() - 5.0);
+        let (x, y) = (10.0 * random.uniform() - 5.0, 10.0 * random.uniform() - 5.0);
         let sheet = random.below(2) as f64;
-        let z = sheet + 0.3 * (1.7 * x).sin() * (1.1 * y).cos() + 0.01 * random.unit();
+        let z = sheet + 0.3 * (1.7 * x).sin() * (1.1 * y).cos() + 0.01 * random.uniform();
         splats.means.push([x, y, z].map(|v| f64::from(v as f32)));
         splats
             .quats
-            .push([0; 4].map(|_| (random.unit() - 0.5) as f32));
-        let size = 0.02 * (3.0 * random.unit()).exp();
+            .push([0; 4].map(|_| (random.uniform() - 0.5) as f32));
+        let size = 0.02 * (3.0 * random.uniform()).exp();
         splats
             .scales
-            .push([1.0, 0.3 + 0.7 * random.unit(), 0.02].map(|s| (s * size) as f32));
+            .push([1.0, 0.3 + 0.7 * random.uniform(), 0.02].map(|s| (s * size) as f32));
         splats
             .logit_opacities
-            .push((8.0 * random.unit() - 3.0) as f32);
+            .push((8.0 * random.uniform() - 3.0) as f32);
         for k in 0..splats.sh_coeffs {
             let smooth = if k == 0 { x.sin() + sheet } else { 0.0 };
             splats
                 .sh
-                .push([0; 3].map(|_| (smooth + 0.3 * (random.unit() - 0.5)) as f32));
+                .push([0; 3].map(|_| (smooth + 0.3 * (random.uniform() - 0.5)) as f32));
         }
     }
     splats
@@ -82,7 +61,7 @@ fn sheets(count: usize, random: &mut Random) -> Splats {
 
 /// Scenes that hurt: each kernel is held against its CPU twin on all of them.
 pub fn scenes(count: usize) -> Vec<(&'static str, Splats)> {
-    let mut random = Random::new(11);
+    let mut random = Lcg(11);
     let plain = sheets(count, &mut random);
     let with = |change: &dyn Fn(usize, &mut Splats)| {
         let mut splats = plain.clone();
@@ -129,7 +108,7 @@ pub fn scenes(count: usize) -> Vec<(&'static str, Splats)> {
     // Nothing that merging could weigh by.
     let massless = with(&|i, s| s.scales[i] = [s.scales[i][0], 0.0, 0.0]);
     let small = |n: usize| {
-        let mut random = Random::new(7);
+        let mut random = Lcg(7);
         sheets(n, &mut random)
     };
     vec![

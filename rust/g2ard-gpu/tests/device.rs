@@ -1,6 +1,8 @@
 //! The device as policies see it: the paper's policy whole, and every way in which a device fails.
 
-use g2ard_core::simplify::{Means, Outcome, Paper, PaperRound, SceneRef};
+use g2ard_core::random::Lcg;
+use g2ard_core::scene::{Means, Ordered, SceneRef};
+use g2ard_core::simplify::{Outcome, Paper, PaperRound};
 use g2ard_core::{Backend, Control, Cpu};
 use g2ard_gpu::runtime::{Error, Gpu, Options, list};
 use g2ard_gpu::{Choice, Device};
@@ -15,13 +17,8 @@ struct Scene {
 
 /// A wavy sheet at UTM offsets.
 fn scene(count: usize) -> Scene {
-    let mut state = 3u64;
-    let mut next = || {
-        state = state
-            .wrapping_mul(6364136223846793005)
-            .wrapping_add(1442695040888963407);
-        (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
-    };
+    let mut random = Lcg(3);
+    let mut next = || random.centred();
     let mut scene = Scene {
         means: Vec::new(),
         quats: Vec::new(),
@@ -62,10 +59,11 @@ fn simplify(scene: &Scene, backend: &dyn Backend) -> Outcome<PaperRound> {
     Paper::default()
         .run(
             &borrowed,
+            &Ordered::new(&borrowed).unwrap(),
             None,
             count / 5,
             &schedule,
-            backend,
+            &*backend.group_kernels(),
             &Control::default(),
         )
         .unwrap()

@@ -3,23 +3,30 @@
 use pyo3::prelude::*;
 
 mod arrays;
+mod defaults;
 mod device;
 mod error;
 mod lift;
 mod quantize;
 mod raster;
+mod scene;
 mod select;
 mod simplify;
 mod spatial;
 mod ssim;
 mod train;
+mod views;
+mod visibility;
 mod work;
 
 #[pymodule]
 fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("__version__", env!("CARGO_PKG_VERSION"))?;
     work::register(m)?;
+    defaults::register(m)?;
     device::register(m)?;
+    scene::register(m)?;
+    visibility::register(m)?;
     lift::register(m)?;
     simplify::register(m)?;
     spatial::register(m)?;

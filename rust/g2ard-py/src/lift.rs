@@ -1,4 +1,4 @@
-//! `g2ard.lift`.
+//! `g2ard.stages.lift`.
 
 use g2ard_core::lift::{LiftConfig, lift};
 use numpy::{PyArray2, PyReadonlyArray2};

@@ -3,14 +3,14 @@
 use g2ard_core::raster::limits::measure;
 use g2ard_core::raster::simd::Isa;
 use g2ard_core::raster::{
-    Accumulated, Camera, Convention, Gradients, Image, ImageGradients, Params, Passes, Rasterizer,
-    SENSITIVITY_TRIANGLE, Settings,
+    Accumulated, Gradients, Image, ImageGradients, Params, Passes, Rasterizer, SENSITIVITY_TRIANGLE,
 };
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::error::to_py;
+use crate::views::{RasterOptions, View};
 use crate::work;
 
 pub type Floats<'py> = PyReadonlyArrayDyn<'py, f32>;
@@ -51,52 +51,6 @@ impl Arrays<'_> {
         };
         params.validate().map_err(to_py)?;
         Ok(params)
-    }
-}
-
-/// `(viewmat 4×4, (fx, fy, cx, cy), (width, height), near)`.
-#[derive(FromPyObject)]
-pub struct View([[f64; 4]; 4], [f64; 4], (usize, usize), f32);
-
-impl View {
-    pub fn camera(&self) -> Camera {
-        let (v, k) = (&self.0, &self.1);
-        Camera {
-            viewmat: [v[0], v[1], v[2]],
-            fx: k[0],
-            fy: k[1],
-            cx: k[2],
-            cy: k[3],
-            width: self.2.0,
-            height: self.2.1,
-            near: self.3,
-        }
-    }
-}
-
-/// `(convention, antialiased, alpha_max)`.
-#[derive(FromPyObject)]
-pub struct Choices(String, bool, f32);
-
-impl Choices {
-    pub fn settings(&self) -> PyResult<Settings> {
-        let convention = match self.0.as_str() {
-            "gsplat" => Convention::Gsplat,
-            "inria" => Convention::Inria,
-            other => {
-                return Err(to_py(g2ard_core::Error::invalid(
-                    "convention",
-                    "gsplat or inria",
-                    other,
-                )));
-            }
-        };
-        Ok(Settings {
-            convention,
-            antialiased: self.1,
-            alpha_max: self.2,
-            ..Settings::default()
-        })
     }
 }
 
@@ -163,14 +117,14 @@ impl PyRasterizer {
     }
 
     /// (image (H, W, 3), alpha (H, W), depth (H, W) or None, median depth (H, W) or None).
-    #[pyo3(signature = (arrays, view, choices, background, depth = true, median = false))]
+    #[pyo3(signature = (arrays, view, options, background, depth = true, median = false))]
     #[allow(clippy::type_complexity)]
     fn forward<'py>(
         &mut self,
         py: Python<'py>,
         arrays: Arrays<'py>,
         view: View,
-        choices: Choices,
+        options: RasterOptions,
         background: [f32; 3],
         depth: bool,
         median: bool,
@@ -181,7 +135,7 @@ impl PyRasterizer {
         Option<Array<'py, numpy::Ix2>>,
     )> {
         let params = arrays.params()?;
-        let (camera, settings) = (view.camera(), choices.settings()?);
+        let (camera, settings) = (view.camera(), options.settings()?);
         camera.validate().map_err(to_py)?;
         let (height, width) = (camera.height, camera.width);
         let inner = &mut self.inner;
@@ -294,16 +248,16 @@ pub fn passes<'py>(py: Python<'py>, passes: &Passes) -> PyResult<Bound<'py, PyDi
 
 /// Per-Gaussian sums over all `views`: a dict of (N,) arrays.
 #[pyfunction]
-#[pyo3(signature = (arrays, views, choices, progress = None))]
+#[pyo3(signature = (arrays, views, options, progress = None))]
 fn accumulate<'py>(
     py: Python<'py>,
     arrays: Arrays<'py>,
     views: Vec<View>,
-    choices: Choices,
+    options: RasterOptions,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let params = arrays.params()?;
-    let settings = choices.settings()?;
+    let settings = options.settings()?;
     let sums = work::long(py, progress, |control| {
         let mut rasterizer = Rasterizer::default();
         let mut sums = Accumulated::new(params.len());
@@ -327,16 +281,16 @@ fn accumulate<'py>(
 
 /// (N, 21) upper triangles of Σ g gᵀ over all pixels, channels and `views`, g = ∂C/∂(mean, log scale).
 #[pyfunction]
-#[pyo3(signature = (arrays, views, choices, progress = None))]
+#[pyo3(signature = (arrays, views, options, progress = None))]
 fn sensitivity<'py>(
     py: Python<'py>,
     arrays: Arrays<'py>,
     views: Vec<View>,
-    choices: Choices,
+    options: RasterOptions,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, numpy::PyArray2<f64>>> {
     let params = arrays.params()?;
-    let settings = choices.settings()?;
+    let settings = options.settings()?;
     let sums = work::long(py, progress, |control| {
         let mut rasterizer = Rasterizer::default();
         let mut sums = vec![0.0; SENSITIVITY_TRIANGLE * params.len()];

@@ -1,7 +1,7 @@
-//! `g2ard.select`.
+//! `g2ard.stages.select`.
 
 use g2ard_core::raster::Camera;
-use g2ard_core::select::{Coverage, Gaussians, Opaque, Problem, Surface, median_depths};
+use g2ard_core::select::{Coverage, Gaussians, Occluders, Problem, Surface, median_depths};
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -9,28 +9,8 @@ use pyo3::types::PyDict;
 use crate::arrays;
 use crate::device::{backend, kernels};
 use crate::error::to_py;
+use crate::views::View;
 use crate::work::{long, quick};
-
-/// `(viewmat 4×4, (fx, fy, cx, cy), (width, height), near)`.
-#[derive(FromPyObject)]
-struct View([[f64; 4]; 4], [f64; 4], (usize, usize), f32);
-
-impl View {
-    fn camera(&self) -> Camera {
-        let [fx, fy, cx, cy] = self.1;
-        let (width, height) = self.2;
-        Camera {
-            viewmat: [self.0[0], self.0[1], self.0[2]],
-            fx,
-            fy,
-            cx,
-            cy,
-            width,
-            height,
-            near: self.3,
-        }
-    }
-}
 
 /// Centred means, quats, linear scales, opacities.
 #[derive(FromPyObject)]
@@ -81,14 +61,14 @@ fn select_depth<'py>(
     view: View,
 ) -> PyResult<Bound<'py, PyArray2<f32>>> {
     let (scene, camera) = (scene.borrow()?, view.camera());
-    let depth = quick(py, || Ok(median_depths(&Opaque::of(&scene), &camera)))?;
+    let depth = quick(py, || Ok(median_depths(&Occluders::of(&scene), &camera)))?;
     PyArray1::from_vec(py, depth).reshape([camera.height, camera.width])
 }
 
 /// (C, 2): the share of each view's pixels that show the scene, and the median of their depths.
 #[pyfunction]
 #[pyo3(signature = (scene, views, progress=None))]
-fn select_looks<'py>(
+fn select_view_statistics<'py>(
     py: Python<'py>,
     scene: Scene<'py>,
     views: Vec<View>,
@@ -98,7 +78,7 @@ fn select_looks<'py>(
     let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
     let kernels = kernels();
     let found = long(py, progress, |control| {
-        backend(&kernels).looks(&scene, &cameras, control)
+        backend(&kernels).view_statistics(&scene, &cameras, control)
     })?;
     arrays::matrix(py, found)
 }
@@ -152,7 +132,7 @@ fn select_visible<'py>(
     let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
     let kernels = kernels();
     let seen = long(py, progress, |control| {
-        backend(&kernels).visible(&scene, &surface, &cameras, control)
+        backend(&kernels).visible_cells(&scene, &surface, &cameras, control)
     })?;
     let mut starts = vec![0u64];
     for cells in &seen {
@@ -168,7 +148,7 @@ type Choice<'py> = (Bound<'py, PyArray1<u32>>, Bound<'py, PyArray1<f64>>, u64);
 
 /// (views, gains, evaluations) of greedy maximisation.
 #[pyfunction]
-#[pyo3(signature = (surface, starts, cells, positions, k, *, directional, kappa, alpha, lambda_, lazy, progress=None))]
+#[pyo3(signature = (surface, starts, cells, positions, k, *, directional, kappa, alpha, lambda_, anchors, epsilon, lazy, progress=None))]
 fn select_greedy<'py>(
     py: Python<'py>,
     surface: Surfaces<'py>,
@@ -180,6 +160,8 @@ fn select_greedy<'py>(
     kappa: f64,
     alpha: f64,
     lambda_: f64,
+    anchors: usize,
+    epsilon: f64,
     lazy: bool,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Choice<'py>> {
@@ -205,6 +187,8 @@ fn select_greedy<'py>(
         kappa,
         alpha,
         lambda: lambda_,
+        anchors,
+        epsilon,
     };
     let problem = Problem {
         surface: &surface,
@@ -224,7 +208,7 @@ fn select_greedy<'py>(
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(select_surface, m)?)?;
     m.add_function(wrap_pyfunction!(select_depth, m)?)?;
-    m.add_function(wrap_pyfunction!(select_looks, m)?)?;
+    m.add_function(wrap_pyfunction!(select_view_statistics, m)?)?;
     m.add_function(wrap_pyfunction!(select_visible, m)?)?;
     m.add_function(wrap_pyfunction!(select_greedy, m)?)
 }

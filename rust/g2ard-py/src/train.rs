@@ -1,7 +1,7 @@
 //! `_core.Trainer`: whole recovery steps in Rust.
 
 use g2ard_core::raster::Isa;
-use g2ard_core::train::{Exported, Lesson, Rates, Regularizers, Trainer};
+use g2ard_core::train::{Exported, Rates, Regularizers, StepInput, Trainer};
 use numpy::{
     IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
     PyReadonlyArray3,
@@ -9,8 +9,56 @@ use numpy::{
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::raster::{Arrays, Choices, Floats, View, isa_named, slice};
+use crate::raster::{Arrays, Floats, isa_named, slice};
+use crate::views::{RasterOptions, View};
 use crate::work;
+
+/// The attributes of a `g2ard.stages.recover.schedule.Rates` that are learning rates.
+#[derive(FromPyObject)]
+struct PyRates {
+    means: f32,
+    quats: f32,
+    log_scales: f32,
+    logit_opacities: f32,
+    sh0: f32,
+    #[pyo3(attribute("shN"))]
+    sh_n: f32,
+}
+
+impl From<PyRates> for Rates {
+    fn from(rates: PyRates) -> Self {
+        Self {
+            means: rates.means,
+            quats: rates.quats,
+            log_scales: rates.log_scales,
+            logit_opacities: rates.logit_opacities,
+            sh0: rates.sh0,
+            sh_n: rates.sh_n,
+        }
+    }
+}
+
+/// The attributes of a `g2ard.stages.recover.anchors.Regularizers` that are weights.
+#[derive(FromPyObject)]
+struct PyRegularizers {
+    anchor: f32,
+    shape: f32,
+    effective_rank: bool,
+    thickness: f32,
+    rank_offset: f32,
+}
+
+impl From<PyRegularizers> for Regularizers {
+    fn from(weights: PyRegularizers) -> Self {
+        Self {
+            anchor: weights.anchor,
+            shape: weights.shape,
+            effective_rank: weights.effective_rank,
+            thickness: weights.thickness,
+            rank_offset: weights.rank_offset,
+        }
+    }
+}
 
 #[pyclass(name = "Trainer", module = "g2ard._core")]
 struct PyTrainer {
@@ -54,67 +102,54 @@ impl PyTrainer {
             .map_err(crate::error::to_py)
     }
 
-    /// One step: (photometric loss before it, Gaussians moved). `rates`: means, quats, log_scales, logit_opacities,
-    /// sh0, shN. `regularizers`: (λ_anchor, λ_shape, effective rank too) or None. `mask`: where the loss counts.
-    /// `reach`: pixels beyond which geometry stands still.
-    #[pyo3(signature = (view, choices, background, target, ssim_weight, rates, regularizers = None, mask = None, reach = None))]
+    /// One step: (photometric loss before it, Gaussians moved). `mask`: where the loss counts. `reach`: pixels beyond
+    /// which geometry stands still.
+    #[pyo3(signature = (view, options, background, target, ssim_weight, rates, regularizers = None, mask = None, reach = None))]
     #[allow(clippy::too_many_arguments)] // all of them by name from one place in Python
     fn step(
         &mut self,
         py: Python<'_>,
         view: View,
-        choices: Choices,
+        options: RasterOptions,
         background: [f32; 3],
         target: PyReadonlyArray3<'_, f32>,
         ssim_weight: f32,
-        rates: [f32; 6],
-        regularizers: Option<(f32, f32, bool)>,
+        rates: PyRates,
+        regularizers: Option<PyRegularizers>,
         mask: Option<PyReadonlyArray2<'_, bool>>,
         reach: Option<f32>,
     ) -> PyResult<(f64, usize)> {
-        let [means, quats, log_scales, logit_opacities, sh0, sh_n] = rates;
-        let lesson = Lesson {
+        let input = StepInput {
             camera: &view.camera(),
-            settings: &choices.settings()?,
+            settings: &options.settings()?,
             background,
             target: values(&target)?,
             mask: mask.as_ref().map(covered).transpose()?,
             ssim_weight,
-            rates: Rates {
-                means,
-                quats,
-                log_scales,
-                logit_opacities,
-                sh0,
-                sh_n,
-            },
+            rates: rates.into(),
             reach,
-            regularizers: regularizers.map(|(anchor, shape, effective_rank)| Regularizers {
-                anchor,
-                shape,
-                effective_rank,
-            }),
+            regularizers: regularizers.map(Into::into),
         };
         let inner = &mut self.inner;
-        let report = work::quick(py, || inner.step(&lesson))?;
+        let report = work::quick(py, || inner.step(&input))?;
         self.seconds_loss = report.seconds_loss;
         self.skipped += report.skipped;
         Ok((report.loss, report.updated))
     }
 
     /// A step up to the gradients, which are thrown away: for timing. Returns the photometric loss.
-    fn rehearse(
+    fn gradients_only(
         &mut self,
         py: Python<'_>,
         view: View,
-        choices: Choices,
+        options: RasterOptions,
         background: [f32; 3],
         target: PyReadonlyArray3<'_, f32>,
         ssim_weight: f32,
     ) -> PyResult<f64> {
-        let lesson = Lesson {
+        let input = StepInput {
             camera: &view.camera(),
-            settings: &choices.settings()?,
+            settings: &options.settings()?,
             background,
             target: values(&target)?,
             mask: None,
@@ -124,7 +159,7 @@ impl PyTrainer {
             regularizers: None,
         };
         let inner = &mut self.inner;
-        let report = work::quick(py, || inner.rehearse(&lesson))?;
+        let report = work::quick(py, || inner.gradients_only(&input))?;
         self.seconds_loss = report.seconds_loss;
         Ok(report.loss)
     }

@@ -33,13 +33,13 @@ def raster(
     from g2ard import _core
     from g2ard.bench.raster import bench_raster
     from g2ard.cli.options import Count
-    from g2ard.cli.scenes import load_scene, load_views
+    from g2ard.policy.inputs import load_scene, load_views
 
     wanted = [Count.parse(part) for part in counts.split(",")]
-    splats = load_scene(run, scene)
+    splats = load_scene(scene, run.say)
     found = bench_raster(
         splats,
-        load_views(run, views, "all", size) if views else None,
+        load_views(views, "all", size, run.say) if views else None,
         counts=[count.of(len(splats)) for count in wanted],
         isas=_core.instruction_sets() if every_isa else None,
         repeats=repeats,

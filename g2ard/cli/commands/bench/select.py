@@ -47,7 +47,7 @@ def select(
 ) -> None:
     """What views chosen by each policy are worth: equal recovery, unseen views in and out of distribution."""
     from g2ard.bench.select import ARMS, bench_select, summary
-    from g2ard.bench.select_stands import Size
+    from g2ard.bench.select_workspaces import Size
     from g2ard.bench.simplify import machine
 
     trials = bench_select(

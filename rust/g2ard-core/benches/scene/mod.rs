@@ -1,31 +1,15 @@
 //! Seeded scenes and views, made on the spot: a bumpy ball of small discs, textured, in no order.
 
 use g2ard_core::Splats;
+use g2ard_core::random::Lcg;
 use g2ard_core::raster::{Camera, Gradients, Params};
+use g2ard_core::scene::{Means, SceneRef};
 use g2ard_core::select::Gaussians;
-use g2ard_core::simplify::{Means, SceneRef};
+
 use glam::{DQuat, DVec3};
 
 /// SH of degree 3, as trained scenes have.
 const SH_COEFFS: usize = 16;
-
-/// SplitMix64.
-pub struct Random(pub u64);
-
-impl Random {
-    /// Uniform in [0, 1).
-    pub fn uniform(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
-    }
-
-    fn between(&mut self, low: f64, high: f64) -> f64 {
-        low + (high - low) * self.uniform()
-    }
-}
 
 /// The same Gaussians in every layout that a kernel asks for.
 pub struct Scene {
@@ -43,7 +27,7 @@ pub struct Scene {
 impl Scene {
     /// `count` discs that cover the ball about as densely whatever their number.
     pub fn of(count: usize) -> Self {
-        let mut random = Random(count as u64);
+        let mut random = Lcg(count as u64);
         let spacing = (4.0 * std::f64::consts::PI / count as f64).sqrt();
         let mut scene = Self {
             means: Vec::with_capacity(count),
@@ -68,7 +52,7 @@ impl Scene {
         scene
     }
 
-    fn push(&mut self, spacing: f64, random: &mut Random) {
+    fn push(&mut self, spacing: f64, random: &mut Lcg) {
         let z = random.between(-1.0, 1.0);
         let (turn, across) = (
             random.between(0.0, std::f64::consts::TAU),

@@ -1,36 +1,27 @@
 //! How well an affine function of position predicts colour: the residual behind flags and the energy guard.
 
-use super::{Sym3, dot, outer, sub, symmetric_eigen};
+use glam::DVec3;
+
+use super::{Sym3, outer, symmetric_eigen};
 
 /// Directions flatter than this share of the widest carry no slope.
 const RANK_FLOOR: f64 = 1e-12;
 
 /// Centred least squares c ≈ a + B(x − x̄), by the principal directions of x.
 struct Fit {
-    center: [f64; 3],
-    color: [f64; 3],
+    center: DVec3,
+    color: DVec3,
     rank: usize,
-    axes: [[f64; 3]; 3],
-    slopes: [[f64; 3]; 3],
+    axes: [DVec3; 3],
+    slopes: [DVec3; 3],
 }
 
 impl Fit {
     fn new(points: &[[f64; 3]], colors: &[[f64; 3]]) -> Self {
-        let inverse_count = 1.0 / points.len() as f64;
-        let mean = |values: &[[f64; 3]]| {
-            // About the first row, so that a far-away origin costs no digits.
-            let base = values[0];
-            let mut sum = [0.0; 3];
-            for &v in values {
-                let d = sub(v, base);
-                (0..3).for_each(|k| sum[k] += d[k]);
-            }
-            [0, 1, 2].map(|k| base[k] + sum[k] * inverse_count)
-        };
         let (center, color) = (mean(points), mean(colors));
         let mut scatter: Sym3 = [0.0; 6];
         for &x in points {
-            let o = outer(sub(x, center));
+            let o = outer((DVec3::from(x) - center).into());
             (0..6).for_each(|k| scatter[k] += o[k]);
         }
         let e = symmetric_eigen(&scatter);
@@ -39,32 +30,37 @@ impl Fit {
             center,
             color,
             rank: e.values.iter().filter(|&&v| v > narrow).count(),
-            axes: e.vectors,
-            slopes: [[0.0; 3]; 3],
+            axes: e.vectors.map(DVec3::from),
+            slopes: [DVec3::ZERO; 3],
         };
         for k in 0..fit.rank {
-            let (mut zz, mut zc) = (0.0, [0.0; 3]);
+            let (mut zz, mut zc) = (0.0, DVec3::ZERO);
             for (&x, &c) in points.iter().zip(colors) {
-                let z = dot(fit.axes[k], sub(x, center));
-                let c = sub(c, color);
+                let z = fit.axes[k].dot(DVec3::from(x) - center);
                 zz += z * z;
-                (0..3).for_each(|j| zc[j] += z * c[j]);
+                zc += z * (DVec3::from(c) - color);
             }
-            fit.slopes[k] = zc.map(|v| v / zz);
+            fit.slopes[k] = zc / zz;
         }
         fit
     }
 
     /// The predicted colour at `x`.
-    fn predict(&self, x: [f64; 3]) -> [f64; 3] {
-        let d = sub(x, self.center);
+    fn predict(&self, x: [f64; 3]) -> DVec3 {
+        let d = DVec3::from(x) - self.center;
         let mut color = self.color;
-        for k in 0..self.rank {
-            let z = dot(self.axes[k], d);
-            (0..3).for_each(|j| color[j] += z * self.slopes[k][j]);
+        for (axis, slope) in self.axes.iter().zip(self.slopes).take(self.rank) {
+            color += axis.dot(d) * slope;
         }
         color
     }
+}
+
+/// About the first row, so that a far-away origin costs no digits.
+fn mean(rows: &[[f64; 3]]) -> DVec3 {
+    let base = DVec3::from(rows[0]);
+    let sum: DVec3 = rows.iter().map(|&v| DVec3::from(v) - base).sum();
+    base + sum * (1.0 / rows.len() as f64)
 }
 
 /// E_j of eq. `frequency`: mean over the first `own` points of ‖c_i − ĉ_i‖², ĉ_i predicted by the affine
@@ -79,8 +75,8 @@ pub fn affine_energy(points: &[[f64; 3]], colors: &[[f64; 3]], own: usize) -> f6
     let fit = Fit::new(points, colors);
     let energy: f64 = (0..own)
         .map(|i| {
-            let residual = sub(colors[i], fit.predict(points[i]));
-            dot(residual, residual)
+            let residual = DVec3::from(colors[i]) - fit.predict(points[i]);
+            residual.dot(residual)
         })
         .sum();
     energy / own as f64
@@ -89,15 +85,12 @@ pub fn affine_energy(points: &[[f64; 3]], colors: &[[f64; 3]], own: usize) -> f6
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::linalg::dot;
+    use crate::random::Lcg;
 
     fn cloud(n: usize, seed: u64) -> Vec<[f64; 3]> {
-        let mut state = seed;
-        let mut next = || {
-            state = state
-                .wrapping_mul(6364136223846793005)
-                .wrapping_add(1442695040888963407);
-            (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
-        };
+        let mut random = Lcg(seed);
+        let mut next = || random.centred();
         (0..n).map(|_| [next(), next(), next()]).collect()
     }
 

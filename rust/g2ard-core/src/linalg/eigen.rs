@@ -67,6 +67,7 @@ fn rotate(a: &mut [[f64; 3]; 3], v: &mut [[f64; 3]; 3], p: usize, q: usize) {
 mod tests {
     use super::*;
     use crate::linalg::{covariance, rotation_from_quat};
+    use crate::random::Lcg;
 
     fn norm(m: &Sym3) -> f64 {
         let off = m[1] * m[1] + m[2] * m[2] + m[4] * m[4];
@@ -99,13 +100,8 @@ mod tests {
 
     #[test]
     fn keeps_every_digit_where_eigenvalues_meet() {
-        let mut seed = 1u64;
-        let mut next = || {
-            seed = seed
-                .wrapping_mul(6364136223846793005)
-                .wrapping_add(1442695040888963407);
-            (seed >> 11) as f64 / (1u64 << 53) as f64 - 0.5
-        };
+        let mut random = Lcg(1);
+        let mut next = || random.centred();
         let spectra = [
             [1.0, 1.0, 1.0],
             [1.0, 1.0, 1.0 + 1e-6],

@@ -2,11 +2,13 @@
 
 use rayon::prelude::*;
 
-use super::order::Shared;
+use super::disjoint::DisjointSlice;
 use super::params::Params;
 use super::project::Splat;
-use super::simd::{Kernel, LANES, Lanes, Mask, Row};
-use super::stage::{BATCH, Place, Staged, alpha, block_coordinates, by_pair, log2_alpha};
+use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
+use super::tile_batch::{
+    BATCH, TileBatch, TileRect, alpha, block_coordinates, by_pair, log2_alpha,
+};
 use super::tiles::Pair;
 use super::{ALPHA_MIN, BLOCKS, Camera, Settings};
 
@@ -44,21 +46,21 @@ impl Accumulated {
 /// Sums that threads add to, each to rows of its own.
 #[derive(Clone, Copy)]
 pub(super) struct SharedSums {
-    weight: Shared<f64>,
-    transmittance: Shared<f64>,
-    hits: Shared<u64>,
-    dominant: Shared<u64>,
-    peak: Shared<f32>,
+    weight: DisjointSlice<f64>,
+    transmittance: DisjointSlice<f64>,
+    hits: DisjointSlice<u64>,
+    dominant: DisjointSlice<u64>,
+    peak: DisjointSlice<f32>,
 }
 
 impl SharedSums {
     pub fn new(sums: &mut Accumulated) -> Self {
         Self {
-            weight: Shared::new(&mut sums.weight),
-            transmittance: Shared::new(&mut sums.transmittance),
-            hits: Shared::new(&mut sums.hits),
-            dominant: Shared::new(&mut sums.dominant),
-            peak: Shared::new(&mut sums.peak),
+            weight: DisjointSlice::new(&mut sums.weight),
+            transmittance: DisjointSlice::new(&mut sums.transmittance),
+            hits: DisjointSlice::new(&mut sums.hits),
+            dominant: DisjointSlice::new(&mut sums.dominant),
+            peak: DisjointSlice::new(&mut sums.peak),
         }
     }
 
@@ -85,21 +87,21 @@ pub const ALL: usize = 5;
 #[derive(Clone, Copy)]
 struct Block {
     /// The light that would be left if nothing ever stopped: see the forward kernel.
-    unstopped: Row,
+    unstopped: Lanes16,
     /// The largest αT so far, and the number of its pair, −1 for none.
-    most: Row,
-    winner: Row,
+    most: Lanes16,
+    winner: Lanes16,
 }
 
 /// Blends one tile from front to back without an image: only every pair's `KINDS` sums, each in its own slot.
 pub struct Accumulate<'a, const KINDS: usize> {
     pub pairs: &'a [Pair],
     pub splats: &'a [Splat],
-    pub place: Place,
+    pub rect: TileRect,
     pub settings: &'a Settings,
-    pub staged: &'a mut Staged,
-    pub slots: Shared<[f32; KINDS]>,
-    pub written: Shared<u8>,
+    pub tile_batch: &'a mut TileBatch,
+    pub slots: DisjointSlice<[f32; KINDS]>,
+    pub written: DisjointSlice<u8>,
 }
 
 impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
@@ -111,26 +113,26 @@ impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
         let clip = F::splat(self.settings.alpha_max);
         let stop = F::splat(self.settings.transmittance_min);
         let mut blocks = [Block {
-            unstopped: Row::default(),
-            most: Row::default(),
-            winner: Row([-1.0; LANES]),
+            unstopped: Lanes16::default(),
+            most: Lanes16::default(),
+            winner: Lanes16([-1.0; LANES]),
         }; BLOCKS];
         for b in 0..BLOCKS {
-            let on_image = F::Mask::from_bits(self.place.lanes(b));
+            let on_image = F::Mask::from_bits(self.rect.lanes(b));
             F::splat(1.0).only(on_image).store(&mut blocks[b].unstopped);
         }
-        let mut words = [0; BLOCKS];
+        let mut block_masks = [0; BLOCKS];
         let mut lit = u16::MAX;
         for first in (0..self.pairs.len()).step_by(BATCH) {
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
-            self.staged
-                .load(self.pairs, first, self.splats, &self.place);
-            let s = &*self.staged;
-            s.reachable::<F>(pairs.len(), &mut words);
-            let masks = by_pair(&words);
+            self.tile_batch
+                .load(self.pairs, first, self.splats, &self.rect);
+            let s = &*self.tile_batch;
+            s.reachable::<F>(pairs.len(), &mut block_masks);
+            let masks = by_pair(&block_masks);
             for (p, pair) in pairs.iter().enumerate() {
                 let mut todo = masks[p] & lit;
-                let number = F::splat(s.near[p].number);
+                let number = F::splat(s.splats[p].number);
                 let [mut weight, mut light, mut peak] = [F::zero(); 3];
                 let mut hits = 0;
                 while todo != 0 {
@@ -138,7 +140,7 @@ impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
                     todo &= todo - 1;
                     let block = &mut blocks[b];
                     let (x, y) = block_coordinates::<F>(b);
-                    let (_, _, log2) = log2_alpha(&s.near[p], x, y);
+                    let (_, _, log2) = log2_alpha(&s.splats[p], x, y);
                     let hit = log2.ge(minimum);
                     let a = alpha(log2).min(clip).only(hit);
                     let t = F::load(&block.unstopped);
@@ -204,7 +206,7 @@ fn larger(a: f32, b: f32) -> f32 {
 /// All lanes as one value, halves first.
 #[inline(always)]
 fn folded<F: Lanes>(lanes: F, with: impl Fn(f32, f32) -> f32) -> f32 {
-    let mut row = Row::default();
+    let mut row = Lanes16::default();
     lanes.store(&mut row);
     let mut half = LANES / 2;
     while half > 0 {
@@ -246,27 +248,10 @@ impl Total {
     }
 }
 
-/// Lowers each row's pixel size to depth / focal length where the mean falls inside the image.
+/// Lowers each row's pixel size to that of this view.
 pub fn smallest_pixels(params: &Params, camera: &Camera, sizes: &mut [f32]) {
-    let focal = camera.fx.max(camera.fy);
-    let (width, height) = (camera.width as f64, camera.height as f64);
-    sizes
-        .par_iter_mut()
-        .zip(params.means.par_chunks_exact(3))
-        .for_each(|(size, mean)| {
-            let p = camera.viewmat.map(|r| {
-                r[0] * f64::from(mean[0])
-                    + r[1] * f64::from(mean[1])
-                    + r[2] * f64::from(mean[2])
-                    + r[3]
-            });
-            if p[2] < f64::from(camera.near) {
-                return;
-            }
-            let x = camera.fx * p[0] / p[2] + camera.cx;
-            let y = camera.fy * p[1] / p[2] + camera.cy;
-            if (0.0..=width).contains(&x) && (0.0..=height).contains(&y) {
-                *size = size.min((p[2] / focal) as f32);
-            }
-        });
+    let means = params.means.as_chunks::<3>().0;
+    sizes.par_iter_mut().zip(means).for_each(|(size, mean)| {
+        camera.lower_pixel_size(mean.map(f64::from), size);
+    });
 }

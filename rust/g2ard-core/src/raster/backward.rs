@@ -1,11 +1,12 @@
 //! One tile from back to front, Gaussian by Gaussian: every pair's ten sums go to its own slot.
 
-use super::order::{Shared, prefetch};
+use super::disjoint::DisjointSlice;
+use super::memory::prefetch;
 use super::project::Splat;
-use super::simd::{Kernel, Lanes, Mask, Row};
-use super::stage::{
-    BATCH, Batch, Near, Place, alpha, block_coordinates, by_pair, for_stretches, load_batch,
-    log2_alpha,
+use super::simd::{Kernel, Lanes, Lanes16, Mask};
+use super::tile_batch::{
+    BATCH, TileRect, TileSplat, TileSplats, alpha, block_coordinates, by_pair, for_stretches,
+    load_batch, log2_alpha,
 };
 use super::tiles::Pair;
 use super::{ALPHA_MIN, BLOCKS, Settings, TILE};
@@ -14,20 +15,20 @@ use super::{ALPHA_MIN, BLOCKS, Settings, TILE};
 pub const SUMS: usize = 10;
 
 /// A tile's incoming gradients and the state carried from back to front, block by block: what a block needs lies side
-/// by side, for rows 4 KiB apart would wait for each other's stores.
+/// by side: loads and stores 4 KiB apart would alias.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Incoming([Block; BLOCKS]);
 
 #[derive(Debug, Clone, Copy, Default)]
 struct Block {
     /// Gradients of R, G, B, alpha and depth.
-    given: [Row; 5],
+    given: [Lanes16; 5],
     /// Transmittance in front of the pair last done.
-    transmittance: Row,
-    /// What lies behind, seen without the light lost in front and dotted with the gradient: R·g. Carrying it,
+    transmittance: Lanes16,
+    /// The colour behind, as if unoccluded, dotted with the gradient: R·g. Carrying it,
     /// dα = T(c·g − R·g) never divides by 1 − α.
-    behind: Row,
-    last: Row,
+    behind: Lanes16,
+    last: Lanes16,
 }
 
 pub const RGB: usize = 0;
@@ -43,17 +44,17 @@ impl Incoming {
         image: &[f32],
         channels: usize,
         width: usize,
-        place: &Place,
+        rect: &TileRect,
     ) {
-        if place.columns < TILE || place.rows < TILE {
+        if rect.columns < TILE || rect.rows < TILE {
             for block in &mut self.0 {
-                block.given[from..from + channels].fill(Row::default());
+                block.given[from..from + channels].fill(Lanes16::default());
             }
         }
-        for y in 0..place.rows {
-            let first = ((place.y + y) * width + place.x) * channels;
-            let row = &image[first..first + place.columns * channels];
-            for_stretches(y, place.columns, |x, block, lane, count| {
+        for y in 0..rect.rows {
+            let first = ((rect.y + y) * width + rect.x) * channels;
+            let row = &image[first..first + rect.columns * channels];
+            for_stretches(y, rect.columns, |x, block, lane, count| {
                 let given = &mut self.0[block].given[from..from + channels];
                 if let (Some(values), [r, g, b]) =
                     (row[x * channels..].first_chunk::<12>(), &mut *given)
@@ -80,17 +81,17 @@ impl Incoming {
 pub struct Backward<'a, const WITH_DEPTH: bool> {
     pub pairs: &'a [Pair],
     pub splats: &'a [Splat],
-    pub place: Place,
+    pub rect: TileRect,
     pub settings: &'a Settings,
     pub background: [f32; 3],
-    /// What the forward pass left: one entry per batch it looked at.
-    pub words: &'a [[u64; BLOCKS]],
-    pub transmittance: &'a [Row; BLOCKS],
-    pub last: &'a [Row; BLOCKS],
+    /// From the forward pass: one entry per batch it processed.
+    pub block_masks: &'a [[u64; BLOCKS]],
+    pub transmittance: &'a [Lanes16; BLOCKS],
+    pub last: &'a [Lanes16; BLOCKS],
     pub incoming: &'a mut Incoming,
-    pub batch: &'a mut Batch,
-    pub slots: Shared<[f32; SUMS]>,
-    pub written: Shared<u8>,
+    pub batch: &'a mut TileSplats,
+    pub slots: DisjointSlice<[f32; SUMS]>,
+    pub written: DisjointSlice<u8>,
 }
 
 impl<const WITH_DEPTH: bool> Kernel for Backward<'_, WITH_DEPTH> {
@@ -110,36 +111,36 @@ impl<const WITH_DEPTH: bool> Kernel for Backward<'_, WITH_DEPTH> {
         }
         let minimum = F::splat(ALPHA_MIN.log2());
         let clip = F::splat(self.settings.alpha_max);
-        for (batch, words) in self.words.iter().enumerate().rev() {
+        for (batch, block_masks) in self.block_masks.iter().enumerate().rev() {
             let mut union = 0;
             for block in 0..BLOCKS {
-                union |= words[block];
+                union |= block_masks[block];
             }
             if union == 0 {
                 continue;
             }
             let first = batch * BATCH;
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
-            load_batch(self.batch, self.pairs, first, self.splats, &self.place);
+            load_batch(self.batch, self.pairs, first, self.splats, &self.rect);
             for pair in pairs {
-                // SAFETY: only its address is asked for.
+                // SAFETY: only the address is used.
                 unsafe { prefetch(&*self.slots.at(pair.slot as usize)) };
             }
             let s = &*self.batch;
             let mut list = [0; BATCH * BLOCKS + 1];
-            let count = list_items(words, &mut list);
-            let look = Look {
+            let count = list_items(block_masks, &mut list);
+            let evaluator = Evaluator {
                 batch: s,
                 minimum,
                 clip,
             };
             let mut sums = [F::zero(); SUMS];
-            let mut ahead = look.at(list[0], state);
+            let mut ahead = evaluator.at(list[0], state);
             for i in 0..count {
                 let (item, next) = (list[i], list[i + 1]);
                 let now = ahead;
-                // Looked at one item ahead: nothing here depends on what the other pairs of its block leave behind.
-                ahead = look.at(next, state);
+                // Evaluated one item ahead: nothing here depends on the other pairs of its block.
+                ahead = evaluator.at(next, state);
                 let (pair, block) = split(item);
                 now.blend::<WITH_DEPTH>(&s[pair], &mut state[block], &mut sums);
                 if split(next).0 != pair {
@@ -164,15 +165,15 @@ type Item = u16;
 #[inline(always)]
 fn split(item: Item) -> (usize, usize) {
     let pair = item as usize / BLOCKS;
-    // The list ends with the place for nothing; the minimum tells the compiler that no other lies past it.
+    // The list ends with the rect for nothing; the minimum tells the compiler that no other lies past it.
     (pair.min(BATCH), item as usize % BLOCKS)
 }
 
-/// The items of a batch from its last pair to its first, and one past the end that looks at nothing. Returns how many.
+/// The items of a batch from its last pair to its first, and one past the end that evaluates nothing. Returns how many.
 #[inline(always)]
-fn list_items(words: &[u64; BLOCKS], list: &mut [Item; BATCH * BLOCKS + 1]) -> usize {
+fn list_items(block_masks: &[u64; BLOCKS], list: &mut [Item; BATCH * BLOCKS + 1]) -> usize {
     const PAIRS: usize = u64::BITS as usize / BLOCKS;
-    let masks = by_pair(words);
+    let masks = by_pair(block_masks);
     let mut count = 0;
     for (quad, masks) in masks.as_chunks::<PAIRS>().0.iter().enumerate().rev() {
         let mut bits = 0;
@@ -190,16 +191,16 @@ fn list_items(words: &[u64; BLOCKS], list: &mut [Item; BATCH * BLOCKS + 1]) -> u
     count
 }
 
-/// What looking at an item needs that the items of a batch share.
-struct Look<'a, F: Lanes> {
-    batch: &'a Batch,
+/// What evaluating the items of a batch needs.
+struct Evaluator<'a, F: Lanes> {
+    batch: &'a TileSplats,
     minimum: F,
     clip: F,
 }
 
 /// An item's α and 1/(1 − α), and where α follows its arguments.
 #[derive(Clone, Copy)]
-struct Seen<F: Lanes> {
+struct Evaluated<F: Lanes> {
     u: F,
     v: F,
     a: F,
@@ -207,9 +208,9 @@ struct Seen<F: Lanes> {
     free: F::Mask,
 }
 
-impl<F: Lanes> Look<'_, F> {
+impl<F: Lanes> Evaluator<'_, F> {
     #[inline(always)]
-    fn at(&self, item: Item, state: &[Block; BLOCKS]) -> Seen<F> {
+    fn at(&self, item: Item, state: &[Block; BLOCKS]) -> Evaluated<F> {
         let (p, block) = split(item);
         let (x, y) = block_coordinates::<F>(block);
         let near = &self.batch[p];
@@ -219,7 +220,7 @@ impl<F: Lanes> Look<'_, F> {
             .and(F::load(&state[block].last).ge(F::splat(near.number)));
         let raw = alpha(log2);
         let a = raw.min(self.clip).only(hit);
-        Seen {
+        Evaluated {
             u,
             v,
             a,
@@ -229,10 +230,10 @@ impl<F: Lanes> Look<'_, F> {
     }
 }
 
-impl<F: Lanes> Seen<F> {
+impl<F: Lanes> Evaluated<F> {
     /// Steps the block's state to before the pair, and adds to the pair's sums.
     #[inline(always)]
-    fn blend<const WITH_DEPTH: bool>(self, s: &Near, g: &mut Block, sums: &mut [F; SUMS]) {
+    fn blend<const WITH_DEPTH: bool>(self, s: &TileSplat, g: &mut Block, sums: &mut [F; SUMS]) {
         let t = F::load(&g.transmittance) * self.rest;
         t.store(&mut g.transmittance);
         let w = self.a * t;

@@ -1,71 +1,71 @@
 //! Blending one tile from front to back: per batch of 64 pairs, per 4×4 block, the block's state in registers.
 
 use super::project::Splat;
-use super::simd::{Kernel, LANES, Lanes, Mask, Row};
-use super::stage::{BATCH, Place, Staged, alpha, block_coordinates, log2_alpha};
+use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
+use super::tile_batch::{BATCH, TileBatch, TileRect, alpha, block_coordinates, log2_alpha};
 use super::tiles::Pair;
 use super::{ALPHA_MIN, BLOCKS, Settings};
 
 /// One tile's pixels, a row of 16 lanes per block.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Pixels {
-    pub rgb: [[Row; BLOCKS]; 3],
-    pub depth: [Row; BLOCKS],
+    pub rgb: [[Lanes16; BLOCKS]; 3],
+    pub depth: [Lanes16; BLOCKS],
     /// Depth of the first splat behind which less than half the light is left; 0 if there is none.
-    pub median: [Row; BLOCKS],
+    pub median: [Lanes16; BLOCKS],
 }
 
-/// Blends a tile. Leaves in `words` the pairs that really contributed, block by block.
+/// Blends a tile. `block_masks` holds the pairs that contributed to each block afterwards.
 pub struct Forward<'a, const DEPTH: bool> {
     pub pairs: &'a [Pair],
     pub splats: &'a [Splat],
-    pub place: Place,
+    pub rect: TileRect,
     pub settings: &'a Settings,
-    /// 16 words for each batch.
-    pub words: &'a mut [[u64; BLOCKS]],
-    pub transmittance: &'a mut [Row; BLOCKS],
+    /// 16 block_masks for each batch.
+    pub block_masks: &'a mut [[u64; BLOCKS]],
+    pub transmittance: &'a mut [Lanes16; BLOCKS],
     /// Number within the tile of each pixel's last pair, −1 for none.
-    pub last: &'a mut [Row; BLOCKS],
+    pub last: &'a mut [Lanes16; BLOCKS],
     pub pixels: &'a mut Pixels,
-    pub staged: &'a mut Staged,
+    pub tile_batch: &'a mut TileBatch,
 }
 
 impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
-    /// Batches looked at before every pixel had stopped.
+    /// Batches processed before every pixel had stopped.
     type Output = usize;
 
     #[inline(always)]
     fn run<F: Lanes>(self) -> usize {
         *self.pixels = Pixels::default();
-        *self.transmittance = [Row([1.0; LANES]); BLOCKS];
-        *self.last = [Row([-1.0; LANES]); BLOCKS];
+        *self.transmittance = [Lanes16([1.0; LANES]); BLOCKS];
+        *self.last = [Lanes16([-1.0; LANES]); BLOCKS];
         // The light that would be left if nothing ever stopped. A stopped pixel's only falls further below the
-        // minimum, so "would it stop here" needs no memory, and the loop below waits for nothing but one product.
+        // minimum, so whether it would stop here needs no state, and the loop below depends on one product alone.
         // Pixels off the image start without light.
-        let mut unstopped = [Row::default(); BLOCKS];
+        let mut unstopped = [Lanes16::default(); BLOCKS];
         for b in 0..BLOCKS {
             F::splat(1.0)
-                .only(F::Mask::from_bits(self.place.lanes(b)))
+                .only(F::Mask::from_bits(self.rect.lanes(b)))
                 .store(&mut unstopped[b]);
         }
         let minimum = F::splat(ALPHA_MIN.log2());
         let clip = F::splat(self.settings.alpha_max);
         let stop = F::splat(self.settings.transmittance_min);
         let half = F::splat(0.5);
-        for (batch, words) in self.words.iter_mut().enumerate() {
+        for (batch, block_masks) in self.block_masks.iter_mut().enumerate() {
             let first = batch * BATCH;
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
-            self.staged
-                .load(self.pairs, first, self.splats, &self.place);
-            let s = &*self.staged;
-            s.reachable::<F>(pairs.len(), words);
+            self.tile_batch
+                .load(self.pairs, first, self.splats, &self.rect);
+            let s = &*self.tile_batch;
+            s.reachable::<F>(pairs.len(), block_masks);
             let mut any = false;
             for block in 0..BLOCKS {
-                let mut todo = words[block];
+                let mut todo = block_masks[block];
                 let mut t = F::load(&unstopped[block]);
                 if todo == 0 || !t.gt(stop).any() {
                     any |= t.gt(stop).any();
-                    words[block] = 0;
+                    block_masks[block] = 0;
                     continue;
                 }
                 let mut kept = 0u64;
@@ -84,7 +84,7 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
                 while todo != 0 && light {
                     let p = todo.trailing_zeros() as usize;
                     todo &= todo - 1;
-                    let near = &s.near[p];
+                    let near = &s.splats[p];
                     let (_, _, log2) = log2_alpha(near, x, y);
                     let hit = log2.ge(minimum);
                     let a = alpha(log2).min(clip).only(hit);
@@ -106,7 +106,7 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
                     kept |= u64::from(go.any()) << p;
                     light = going.any();
                 }
-                words[block] = kept;
+                block_masks[block] = kept;
                 any |= light;
                 t.store(&mut unstopped[block]);
                 left.store(&mut self.transmittance[block]);
@@ -123,6 +123,6 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
                 return batch + 1;
             }
         }
-        self.words.len()
+        self.block_masks.len()
     }
 }

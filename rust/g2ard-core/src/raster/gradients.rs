@@ -1,10 +1,10 @@
-//! The fixed-order sum of each Gaussian's slots, and what becomes of the gradient.
+//! The sum of each Gaussian's slots in a fixed order, and where the gradient goes.
 
 use super::backward::SUMS;
-use super::order::Shared;
+use super::disjoint::DisjointSlice;
 use super::params::{Params, Source};
 use super::project::{RowGradients, ScreenGradients, Splat, View, unproject};
-use super::simd::{Kernel, LANES, Lanes, Row};
+use super::simd::{Kernel, LANES, Lanes, Lanes16};
 use crate::{Error, Result};
 
 /// Takes sixteen Gaussians' gradients at a time; groups come in any order, each at most once.
@@ -51,12 +51,12 @@ impl Gradients<'_> {
 
     pub(crate) fn sink(&mut self, sh_coeffs: usize) -> RowMajor {
         RowMajor {
-            means: Shared::new(self.means),
-            quats: Shared::new(self.quats),
-            log_scales: Shared::new(self.log_scales),
-            logit_opacities: Shared::new(self.logit_opacities),
-            sh0: Shared::new(self.sh0),
-            sh_n: Shared::new(self.sh_n),
+            means: DisjointSlice::new(self.means),
+            quats: DisjointSlice::new(self.quats),
+            log_scales: DisjointSlice::new(self.log_scales),
+            logit_opacities: DisjointSlice::new(self.logit_opacities),
+            sh0: DisjointSlice::new(self.sh0),
+            sh_n: DisjointSlice::new(self.sh_n),
             sh_coeffs,
         }
     }
@@ -65,25 +65,25 @@ impl Gradients<'_> {
 /// Writes rows out as torch holds them.
 #[derive(Clone, Copy)]
 pub(crate) struct RowMajor {
-    means: Shared<f32>,
-    quats: Shared<f32>,
-    log_scales: Shared<f32>,
-    logit_opacities: Shared<f32>,
-    sh0: Shared<f32>,
-    sh_n: Shared<f32>,
+    means: DisjointSlice<f32>,
+    quats: DisjointSlice<f32>,
+    log_scales: DisjointSlice<f32>,
+    logit_opacities: DisjointSlice<f32>,
+    sh0: DisjointSlice<f32>,
+    sh_n: DisjointSlice<f32>,
     sh_coeffs: usize,
 }
 
 #[inline(always)]
 fn scatter<F: Lanes>(
-    out: Shared<f32>,
+    out: DisjointSlice<f32>,
     group: usize,
     touched: u16,
     stride: usize,
     offset: usize,
     value: F,
 ) {
-    let mut row = Row::default();
+    let mut row = Lanes16::default();
     value.store(&mut row);
     let mut bits = touched;
     while bits != 0 {
@@ -122,7 +122,7 @@ impl Sink for RowMajor {
     }
 }
 
-/// Throws the gradients away: for timing what leads up to them.
+/// Discards the gradients: for timing the passes before.
 #[derive(Clone, Copy)]
 pub(crate) struct Discard;
 
@@ -139,7 +139,7 @@ impl Sink for Discard {
         for k in 0..16 {
             sum = sum + g.basis[k];
         }
-        let mut row = Row::default();
+        let mut row = Lanes16::default();
         sum.store(&mut row);
         std::hint::black_box(&row);
     }
@@ -184,7 +184,7 @@ pub(crate) fn collect<F: Lanes>(
     slots: &[[f32; SUMS]],
     written: &[u8],
 ) -> (u16, ScreenGradients<F>) {
-    let mut rows = [Row::default(); SUMS];
+    let mut rows = [Lanes16::default(); SUMS];
     let mut touched = 0u16;
     while *next < splats.len() && splats[*next].row as usize / LANES == group {
         let splat = &splats[*next];

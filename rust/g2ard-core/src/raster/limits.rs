@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use rayon::prelude::*;
 
-use super::simd::{Isa, Kernel, LANES, Lanes, Row, dispatch};
+use super::simd::{Isa, Kernel, LANES, Lanes, Lanes16, dispatch};
 
 /// Fused multiply-adds of all threads together, in 10⁹ flops a second (an FMA is two), and bytes read from memory, in
 /// 10⁹ a second.
@@ -39,7 +39,7 @@ impl Kernel for Multiply {
     }
 }
 
-struct Read<'a>(&'a [Row]);
+struct Read<'a>(&'a [Lanes16]);
 
 impl Kernel for Read<'_> {
     type Output = f32;
@@ -62,7 +62,7 @@ fn total<F: Lanes>(lanes: &[F]) -> f32 {
     for l in lanes {
         sum = sum + *l;
     }
-    let mut row = Row::default();
+    let mut row = Lanes16::default();
     sum.store(&mut row);
     row.0.iter().sum()
 }
@@ -71,8 +71,8 @@ fn total<F: Lanes>(lanes: &[F]) -> f32 {
 pub fn measure(isa: Isa) -> Limits {
     let threads = rayon::current_num_threads();
     let flops = (2 * LANES * CHAINS * TURNS * threads) as f64;
-    let rows = vec![Row([1.0; LANES]); BYTES / size_of::<Row>() * threads];
-    let parts: Vec<&[Row]> = rows.chunks(BYTES / size_of::<Row>()).collect();
+    let rows = vec![Lanes16([1.0; LANES]); BYTES / size_of::<Lanes16>() * threads];
+    let parts: Vec<&[Lanes16]> = rows.chunks(BYTES / size_of::<Lanes16>()).collect();
     let (mut compute, mut memory) = (f64::INFINITY, f64::INFINITY);
     for _ in 0..REPEATS {
         let clock = Instant::now();

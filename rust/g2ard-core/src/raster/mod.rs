@@ -1,8 +1,8 @@
-//! The tiled differentiable rasteriser: one room per pass.
+//! The tiled differentiable rasteriser: one file per pass.
 //!
-//! [`project`] turns 16 Gaussians at a time into screen splats, and [`covers`] lists the 16×16 tiles that each one's
-//! ellipse at α = 1/255 really meets; [`order`] sorts them by depth once; [`tiles`] scatters them stably into their tiles;
-//! [`stage`] brings a tile's pairs to its own coordinates; [`forward`] blends each tile, 4×4 pixels to a register; [`backward`] walks the same pairs from back to front, each pair summing into its own slot; [`gradients`]
+//! [`project`] turns 16 Gaussians at a time into screen splats, and [`tile_lists`] lists the 16×16 tiles that each one's
+//! ellipse at α = 1/255 meets; [`depth_sort`] sorts them by depth once; [`tiles`] scatters them stably into their tiles;
+//! [`tile_batch`] holds a tile's pairs in the tile's coordinates; [`forward`] blends each tile, 4×4 pixels to a register; [`backward`] walks the same pairs from back to front, each pair summing into its own slot; [`gradients`]
 //! adds a Gaussian's slots in order and goes back through the projection. No atomics: the bits do not depend on threads.
 //!
 //! Conventions (gsplat's by default): pixel centres at +0.5; 0.3 px² dilation; α = min(0.99, opacity·exp(−q)); α < 1/255
@@ -10,24 +10,28 @@
 
 pub(crate) mod accumulate;
 pub(crate) mod backward;
-mod covers;
+pub(crate) mod depth_sort;
+pub(crate) mod disjoint;
 mod forward;
-pub(crate) mod frame;
+mod frustum;
 pub(crate) mod gradients;
 pub mod limits;
-pub(crate) mod order;
+pub(crate) mod memory;
 pub(crate) mod params;
 pub(crate) mod project;
+pub(crate) mod rasterizer;
 mod sensitivity;
 mod sh;
 pub mod simd;
-mod stage;
+mod tile_batch;
+mod tile_lists;
 mod tiles;
 
 pub use accumulate::Accumulated;
-pub use frame::{Counts, Image, ImageGradients, Memory, Passes, Rasterizer};
+pub(crate) use frustum::Frustum;
 pub use gradients::Gradients;
 pub use params::Params;
+pub use rasterizer::{Counts, Image, ImageGradients, Memory, Passes, Rasterizer};
 pub use sensitivity::TRIANGLE as SENSITIVITY_TRIANGLE;
 pub use simd::Isa;
 
@@ -96,12 +100,35 @@ impl Camera {
         [0, 1, 2].map(|j| -(v[0][j] * v[0][3] + v[1][j] * v[1][3] + v[2][j] * v[2][3]))
     }
 
+    /// A point of the world in the camera's axes.
+    pub(crate) fn to_camera(&self, p: [f64; 3]) -> [f64; 3] {
+        self.viewmat
+            .map(|r| r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + r[3])
+    }
+
+    /// Lowers `size` to that of a pixel at a point, depth / focal length in scene units, if the image contains the point.
+    #[inline]
+    pub(crate) fn lower_pixel_size(&self, point: [f64; 3], size: &mut f32) {
+        let p = self.to_camera(point);
+        let here = (p[2] / self.fx.max(self.fy)) as f32;
+        // Most points are already smaller in an earlier view: that is one division instead of three.
+        if !(p[2] >= f64::from(self.near) && here < *size) {
+            return;
+        }
+        let x = self.fx * p[0] / p[2] + self.cx;
+        let y = self.fy * p[1] / p[2] + self.cy;
+        let (width, height) = (self.width as f64, self.height as f64);
+        if (0.0..=width).contains(&x) && (0.0..=height).contains(&y) {
+            *size = here;
+        }
+    }
+
     pub(crate) fn tiles(&self) -> (usize, usize) {
         (self.width.div_ceil(TILE), self.height.div_ceil(TILE))
     }
 }
 
-/// Whose rasteriser to agree with where they differ.
+/// Which rasteriser to agree with where they differ.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Convention {
     #[default]

@@ -1,6 +1,6 @@
 //! Where the Gaussians' stored values come from, sixteen rows at a time.
 
-use super::simd::{LANES, Lanes, Row};
+use super::simd::{LANES, Lanes, Lanes16};
 use crate::{Error, Result};
 
 /// N Gaussians in the torch layout: row-major borrowed slices, each in its stored (not activated) space.
@@ -71,6 +71,9 @@ pub(crate) fn check_count(rows: usize) -> Result<()> {
 
 /// Sixteen Gaussians' values by attribute. Lanes past the end repeat the last row.
 pub(crate) trait Source: Copy + Sync {
+    /// Whether there are colours; without, splats are black.
+    const COLOURED: bool = true;
+
     fn len(&self) -> usize;
     fn sh_coeffs(&self) -> usize;
     fn mean<F: Lanes>(&self, group: usize, axis: usize) -> F;
@@ -84,7 +87,7 @@ pub(crate) trait Source: Copy + Sync {
 /// Every `stride`-th value from a row-major array, `offset` into the row.
 #[inline(always)]
 fn strided<F: Lanes>(values: &[f32], group: usize, stride: usize, offset: usize) -> F {
-    let mut row = Row::default();
+    let mut row = Lanes16::default();
     let first = group * LANES;
     let start = first * stride + offset;
     if values.len() >= (first + LANES) * stride {

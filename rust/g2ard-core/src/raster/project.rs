@@ -4,7 +4,7 @@ mod screen;
 mod unproject;
 
 use super::params::Source;
-use super::simd::{LANES, LOG2_E, Lanes, Mask, Row, Wide};
+use super::simd::{LANES, LOG2_E, Lanes, Lanes16, Mask, Wide};
 use super::{ALPHA_MIN, Camera, Convention, DILATION, Settings};
 
 pub use screen::Project;
@@ -17,7 +17,7 @@ const DET_MAX: f32 = 1e33;
 /// INRIA's floor under det Σ₂ / det(Σ₂ + 0.3 I).
 const INRIA_FLOOR: f32 = 2.5e-5;
 
-/// A camera's numbers in the form the kernels want.
+/// A camera's numbers in the form the kernels take.
 #[derive(Debug, Clone, Copy)]
 pub struct View {
     rotation: [[f64; 3]; 3],
@@ -285,7 +285,7 @@ fn on_image<F: Lanes>(centre: F, extent: F, size: f32) -> F::Mask {
 /// ½·log2(x), lane by lane: only antialiasing needs it.
 #[inline(always)]
 fn half_log2<F: Lanes>(x: F) -> F {
-    let mut row = Row::default();
+    let mut row = Lanes16::default();
     x.store(&mut row);
     for l in 0..LANES {
         row.0[l] = 0.5 * row.0[l].log2();
@@ -315,6 +315,8 @@ pub fn unit_quaternion<F: Lanes, S: Source>(source: &S, group: usize) -> ([F; 4]
     (q, rn * shrink)
 }
 
+/// The rotation of unit quaternions, in lanes of f32. [`crate::linalg::rotation_from_quat`] is the scalar f64 one, which
+/// normalises too: SIMD lanes cannot share its code, nor f32 its bits.
 #[inline(always)]
 pub fn rotation<F: Lanes>(q: &[F; 4]) -> [[F; 3]; 3] {
     let [w, x, y, z] = *q;

@@ -1,14 +1,16 @@
-//! How much each Gaussian's place and size matter to a view: F = Σ over pixels and channels of g gᵀ, g = ∂C/∂(mean,
-//! log scale), 6×6 a Gaussian. What pruning by sensitivity (PUP 3D-GS) ranks by.
+//! How much each Gaussian's rect and size matter to a view: F = Σ over pixels and channels of g gᵀ, g = ∂C/∂(mean,
+//! log scale), 6×6 a Gaussian. Pruning by sensitivity (PUP 3D-GS) ranks by it.
 //!
 //! Of a pixel, g is linear in φ = (u, v, u², uv, v²): g = L·(h φ) + w·d, with h = ∂C/∂(ln α), w = αT, and L (6×5) and d
 //! (by the viewing direction in SH) the same for every pixel of a view. So a pixel adds to moments of u and v only.
 
-use super::order::Shared;
+use super::disjoint::DisjointSlice;
 use super::params::Source;
 use super::project::{ScreenGradients, Splat, View, unproject};
-use super::simd::{Kernel, LANES, Lanes, Mask, Row};
-use super::stage::{BATCH, Batch, Place, alpha, block_coordinates, load_batch, log2_alpha};
+use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
+use super::tile_batch::{
+    BATCH, TileRect, TileSplats, alpha, block_coordinates, load_batch, log2_alpha,
+};
 use super::tiles::Pair;
 use super::{ALPHA_MIN, BLOCKS, Settings};
 
@@ -31,25 +33,25 @@ const PRODUCT: [[usize; 5]; 5] = [
 
 #[derive(Clone, Copy, Default)]
 struct Block {
-    transmittance: Row,
-    /// The colour behind, seen without the light lost in front.
-    behind: [Row; 3],
-    last: Row,
+    transmittance: Lanes16,
+    /// The colour behind, as if unoccluded.
+    behind: [Lanes16; 3],
+    last: Lanes16,
 }
 
 /// One tile from back to front; every pair's sums go to its own slot.
 pub struct Sensitivity<'a> {
     pub pairs: &'a [Pair],
     pub splats: &'a [Splat],
-    pub place: Place,
+    pub rect: TileRect,
     pub settings: &'a Settings,
-    /// What the forward pass left.
-    pub words: &'a [[u64; BLOCKS]],
-    pub transmittance: &'a [Row; BLOCKS],
-    pub last: &'a [Row; BLOCKS],
-    pub batch: &'a mut Batch,
-    pub slots: Shared<[f32; MOMENTS]>,
-    pub written: Shared<u8>,
+    /// From the forward pass.
+    pub block_masks: &'a [[u64; BLOCKS]],
+    pub transmittance: &'a [Lanes16; BLOCKS],
+    pub last: &'a [Lanes16; BLOCKS],
+    pub batch: &'a mut TileSplats,
+    pub slots: DisjointSlice<[f32; MOMENTS]>,
+    pub written: DisjointSlice<u8>,
 }
 
 impl Kernel for Sensitivity<'_> {
@@ -64,14 +66,14 @@ impl Kernel for Sensitivity<'_> {
         }
         let minimum = F::splat(ALPHA_MIN.log2());
         let clip = F::splat(self.settings.alpha_max);
-        for (batch, words) in self.words.iter().enumerate().rev() {
-            let mut union = words.iter().fold(0, |all, word| all | word);
+        for (batch, block_masks) in self.block_masks.iter().enumerate().rev() {
+            let mut union = block_masks.iter().fold(0, |all, word| all | word);
             if union == 0 {
                 continue;
             }
             let first = batch * BATCH;
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
-            load_batch(self.batch, self.pairs, first, self.splats, &self.place);
+            load_batch(self.batch, self.pairs, first, self.splats, &self.rect);
             while union != 0 {
                 let p = 63 - union.leading_zeros() as usize;
                 union ^= 1 << p;
@@ -79,10 +81,10 @@ impl Kernel for Sensitivity<'_> {
                 let number = F::splat(near.number);
                 let mut sums = [F::zero(); MOMENTS];
                 for (block, g) in state.iter_mut().enumerate() {
-                    if words[block] >> p & 1 == 0 {
+                    if block_masks[block] >> p & 1 == 0 {
                         continue;
                     }
-                    let on_image = F::Mask::from_bits(self.place.lanes(block));
+                    let on_image = F::Mask::from_bits(self.rect.lanes(block));
                     let (x, y) = block_coordinates::<F>(block);
                     let (u, v, log2) = log2_alpha(near, x, y);
                     let hit = log2.ge(minimum).and(F::load(&g.last).ge(number));
@@ -151,7 +153,7 @@ pub struct GatherSensitivity<'a, S: Source> {
     pub splats: &'a [Splat],
     pub slots: &'a [[f32; MOMENTS]],
     pub written: &'a [u8],
-    pub out: Shared<f64>,
+    pub out: DisjointSlice<f64>,
 }
 
 impl<S: Source> Kernel for GatherSensitivity<'_, S> {
@@ -198,8 +200,8 @@ fn total(splat: &Splat, slots: &[[f32; MOMENTS]], written: &[u8]) -> Option<[f64
 /// Sixteen Gaussians' L, column by column, then their d of each channel: where a unit of each would push the
 /// parameters. `[column][parameter]`.
 #[inline(always)]
-fn columns<F: Lanes, S: Source>(view: &View, source: &S, group: usize) -> [[Row; 6]; 8] {
-    let mut out = [[Row::default(); 6]; 8];
+fn columns<F: Lanes, S: Source>(view: &View, source: &S, group: usize) -> [[Lanes16; 6]; 8] {
+    let mut out = [[Lanes16::default(); 6]; 8];
     // Without higher bands colour does not follow the direction: the last three stay zero.
     let lively = if source.sh_coeffs() > 1 { 8 } else { 5 };
     for (k, column) in out.iter_mut().enumerate().take(lively) {
@@ -223,7 +225,7 @@ fn columns<F: Lanes, S: Source>(view: &View, source: &S, group: usize) -> [[Row;
 }
 
 /// F += L M Lᵀ + Σ_c (L k_c d_cᵀ + d_c k_cᵀ Lᵀ) + Σ w²·Σ_c d_c d_cᵀ.
-fn add(moments: &[f64; MOMENTS], columns: &[[Row; 6]; 8], lane: usize, out: &mut [f64]) {
+fn add(moments: &[f64; MOMENTS], columns: &[[Lanes16; 6]; 8], lane: usize, out: &mut [f64]) {
     let mut weights = [[0.0; 8]; 8];
     for i in 0..5 {
         for j in 0..5 {

@@ -4,13 +4,14 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::covers::{Cover, Lister, narrow};
-use super::frame::bytes;
-use super::order::{Key, Shared, prefetch};
+use super::depth_sort::Key;
+use super::disjoint::DisjointSlice;
+use super::memory::{bytes, prefetch};
+use super::tile_lists::{TileIntersector, TileList, narrow};
 
 /// How many stretches the depth order is cut into: fixed, so that the work splits alike for any number of threads.
 const STRETCHES: usize = 16;
-/// Keys a stretch reads ahead of itself: what they point at lies scattered.
+/// Keys a stretch prefetches ahead of itself: what they point at lies scattered.
 const AHEAD: usize = 16;
 /// A splat in a tile, and the slot this pair's gradient goes to.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -46,15 +47,15 @@ impl Bins {
     pub fn fill(
         &mut self,
         order: &[Key],
-        covers: &[Cover],
-        listers: &[Lister],
+        tile_lists: &[TileList],
+        intersectors: &[TileIntersector],
         chunk: usize,
         tiles: (usize, usize),
     ) {
         self.slots.clear();
         self.slots.push(0);
-        for (i, lister) in listers.iter().enumerate() {
-            self.slots.push(self.slots[i] + lister.slots);
+        for (i, intersector) in intersectors.iter().enumerate() {
+            self.slots.push(self.slots[i] + intersector.slots);
         }
         let (total_tiles, narrow) = (tiles.0 * tiles.1, narrow(tiles));
         let stretch = order.len().div_ceil(STRETCHES).max(1);
@@ -66,28 +67,28 @@ impl Bins {
         stretches.for_each(|(keys, counts)| {
             for (i, key) in keys.iter().enumerate() {
                 if let Some(ahead) = keys.get(i + AHEAD) {
-                    prefetch(&covers[ahead.splat as usize]);
+                    prefetch(&tile_lists[ahead.splat as usize]);
                 }
                 let splat = key.splat as usize;
-                let list = &listers[splat / chunk].list;
-                covers[splat].for_each(list, 0, narrow, |tile, _| counts[tile] += 1);
+                let list = &intersectors[splat / chunk].list;
+                tile_lists[splat].for_each(list, 0, narrow, |tile, _| counts[tile] += 1);
             }
         });
         let pairs = self.prefix(total_tiles);
         self.pairs.resize(pairs, Pair::default());
-        let (out, slots) = (Shared::new(&mut self.pairs), &self.slots);
+        let (out, slots) = (DisjointSlice::new(&mut self.pairs), &self.slots);
         let stretches = order
             .par_chunks(stretch)
             .zip(self.counts.par_chunks_mut(total_tiles));
         stretches.for_each(|(keys, next)| {
             for (i, key) in keys.iter().enumerate() {
                 if let Some(ahead) = keys.get(i + AHEAD) {
-                    prefetch(&covers[ahead.splat as usize]);
+                    prefetch(&tile_lists[ahead.splat as usize]);
                 }
                 let splat = key.splat as usize;
-                let list = &listers[splat / chunk].list;
+                let list = &intersectors[splat / chunk].list;
                 let first = slots[splat / chunk];
-                covers[splat].for_each(list, first, narrow, |tile, slot| {
+                tile_lists[splat].for_each(list, first, narrow, |tile, slot| {
                     let splat = key.splat;
                     // SAFETY: the prefix sums give every stretch its own places in every tile.
                     unsafe { out.write(next[tile] as usize, Pair { splat, slot }) };

@@ -9,9 +9,8 @@ use super::Surface;
 use crate::linalg::{dot, sub};
 use crate::{Control, Error, Result};
 
-const ANCHORS: usize = 32;
-/// Keeps the coverage ratio finite where a target is next to nothing.
-const EPSILON: f64 = 1e-9;
+/// Most directions a cell may be asked to be seen from.
+const MAX_ANCHORS: usize = 64;
 /// Cells summed together: the order of the sum does not depend on the number of threads.
 const CHUNK: usize = 4096;
 
@@ -26,6 +25,10 @@ pub struct Coverage {
     pub alpha: f64,
     /// g(x) = u(λ + x).
     pub lambda: f64,
+    /// Directions on the sphere that targets and observations are laid out on.
+    pub anchors: usize,
+    /// ε of C_jk / (P_jk + ε): keeps the ratio finite where a target is next to nothing.
+    pub epsilon: f64,
 }
 
 impl Coverage {
@@ -34,10 +37,15 @@ impl Coverage {
             ("kappa", self.kappa, self.kappa > 0.0),
             ("alpha", self.alpha, self.alpha >= 0.0),
             ("lambda", self.lambda, self.lambda > 0.0),
+            ("epsilon", self.epsilon, self.epsilon > 0.0),
         ] {
             if !(ok && value.is_finite()) {
                 return Err(Error::invalid(name, "a positive number", value));
             }
+        }
+        if !(1..=MAX_ANCHORS).contains(&self.anchors) {
+            let expected = format!("1 to {MAX_ANCHORS}");
+            return Err(Error::invalid("anchors", expected, self.anchors));
         }
         Ok(())
     }
@@ -78,7 +86,7 @@ impl Problem<'_> {
     /// The `k` views that greedy maximisation of F picks.
     ///
     /// F is monotone and submodular, so a gain once computed bounds all later ones: lazily, only the view
-    /// that leads by its bound is looked at again (CELF). `lazy: false` looks at all of them, each time.
+    /// that leads by its bound is evaluated again (CELF). `lazy: false` evaluates all of them, each time.
     pub fn greedy(
         &self,
         k: usize,
@@ -151,7 +159,7 @@ impl PartialOrd for Bound {
 impl<'a> State<'a> {
     fn new(problem: Problem<'a>, coverage: Coverage) -> Self {
         let anchors = if coverage.directional {
-            sphere(ANCHORS)
+            sphere(coverage.anchors)
         } else {
             vec![[0.0, 0.0, 1.0]]
         };
@@ -188,7 +196,7 @@ impl<'a> State<'a> {
         let confidence = surface.confidence[j];
         let incidence = (1.0 - confidence) + confidence * dot(d, surface.normals[j]).abs();
         let kappa = self.coverage.kappa;
-        let mut near = [(0usize, 0.0f64); ANCHORS];
+        let mut near = [(0usize, 0.0f64); MAX_ANCHORS];
         let (mut found, mut total, mut best) = (0, 0.0, (0, f64::NEG_INFINITY));
         for (k, &a) in self.anchors.iter().enumerate() {
             let away = dot(a, d) - 1.0;
@@ -219,7 +227,7 @@ impl<'a> State<'a> {
                     let mut own = 0.0;
                     self.observe(view, cell, |at, value| {
                         let p = self.targets[at];
-                        let (before, scale) = (self.evidence[at], p + EPSILON);
+                        let (before, scale) = (self.evidence[at], p + self.coverage.epsilon);
                         let g = |c: f64| self.coverage.g(c / scale);
                         own += p * (g(before + value) - g(before));
                     });

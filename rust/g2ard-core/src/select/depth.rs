@@ -1,7 +1,7 @@
-//! The scene's median depth at the pixels where it is wanted. No other pixel is worked out, so that this is far
-//! cheaper than an image and yet exactly what it would show.
+//! The scene's median depth at the pixels that are wanted. No other pixel is computed: far cheaper than an image, and
+//! exactly its values.
 
-use super::opaque::Opaque;
+use super::occluders::Occluders;
 use super::pinhole::{ALPHA_MIN, Pinhole, Splat};
 use crate::raster::Camera;
 
@@ -14,13 +14,13 @@ pub(super) struct Scratch {
     splats: Vec<Splat>,
     keys: Vec<u64>,
     spare: Vec<u64>,
-    /// What is left at each pixel: 1 at first where the depth is wanted, 0 elsewhere.
+    /// Transmittance left at each pixel: 1 at first where the depth is wanted, 0 elsewhere.
     pub light: Vec<f32>,
     pub depth: Vec<f32>,
 }
 
 impl Scratch {
-    /// Wants every pixel, or none yet.
+    /// Prepares for a view: with `light` 1 every pixel is wanted, with 0 none yet.
     pub fn clear(&mut self, view: &Pinhole, light: f32) {
         let size = view.width * view.height;
         self.light.clear();
@@ -32,7 +32,7 @@ impl Scratch {
     }
 
     /// Depth of the splat behind which less than half the light is left, 0 where there is none.
-    pub fn trace(&mut self, scene: &Opaque, view: &Pinhole) {
+    pub fn trace(&mut self, scene: &Occluders, view: &Pinhole) {
         for row in scene.rows_in(view) {
             if let Some((z, splat)) = view.project(row)
                 && self.touches(view, &splat)
@@ -50,7 +50,7 @@ impl Scratch {
         }
     }
 
-    /// Whether a splat may reach a wanted pixel; wide ones are not looked through.
+    /// Whether a splat may reach a wanted pixel; wide ones are taken untested.
     fn touches(&self, view: &Pinhole, s: &Splat) -> bool {
         let row = |j: u32| j as usize * view.width;
         (s.columns[1] - s.columns[0]) * (s.rows[1] - s.rows[0]) > 64
@@ -83,7 +83,8 @@ fn draw(s: &Splat, z: f32, view: &Pinhole, light: &mut [f32], depth: &mut [f32])
     }
 }
 
-/// Radix sort by the upper 32 bits, stable: equal depths keep the order of the rows.
+/// Radix sort by the upper 32 bits, stable: equal depths keep the order of the rows. One view is one thread's, so this
+/// sort is serial; [`crate::raster`]'s sorts one view with all threads.
 fn sort_by_high_half(keys: &mut Vec<u64>, spare: &mut Vec<u64>) {
     const BITS: u32 = 11;
     spare.resize(keys.len(), 0);
@@ -107,7 +108,7 @@ fn sort_by_high_half(keys: &mut Vec<u64>, spare: &mut Vec<u64>) {
 }
 
 /// Median depths of one camera, row by row.
-pub fn median_depths(scene: &Opaque, camera: &Camera) -> Vec<f32> {
+pub fn median_depths(scene: &Occluders, camera: &Camera) -> Vec<f32> {
     let (view, mut scratch) = (Pinhole::of(camera), Scratch::default());
     scratch.clear(&view, 1.0);
     scratch.trace(scene, &view);
@@ -117,18 +118,14 @@ pub fn median_depths(scene: &Opaque, camera: &Camera) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::random::Lcg;
     use crate::select::Gaussians;
 
     #[test]
     fn sorts_stably_by_the_high_half() {
-        let mut state = 9u64;
-        let mut keys: Vec<u64> = (0..5000u64)
-            .map(|i| {
-                state = state
-                    .wrapping_mul(6364136223846793005)
-                    .wrapping_add(1442695040888963407);
-                ((state >> 40) % 97 * 40_000_000) << 32 | i
-            })
+        let mut random = Lcg(9);
+        let mut keys: Vec<u64> = (0..5000)
+            .map(|i| (u64::from(random.integer()) % 97 * 40_000_000) << 32 | i)
             .collect();
         let mut want = keys.clone();
         want.sort_unstable();
@@ -166,7 +163,7 @@ mod tests {
             height: 47,
             near: 0.01,
         };
-        let opaque = Opaque::of(&scene);
+        let opaque = Occluders::of(&scene);
         let whole = median_depths(&opaque, &camera);
         assert!(whole.iter().filter(|&&d| d > 0.0).count() > 1000);
         let (view, mut scratch) = (Pinhole::of(&camera), Scratch::default());
@@ -184,13 +181,8 @@ mod tests {
 
     #[test]
     fn blocks_out_of_sight_leave_nothing_out() {
-        let mut state = 5u64;
-        let mut uniform = |low: f64, high: f64| {
-            state = state
-                .wrapping_mul(6364136223846793005)
-                .wrapping_add(1442695040888963407);
-            low + (high - low) * (state >> 11) as f64 / (1u64 << 53) as f64
-        };
+        let mut random = Lcg(5);
+        let mut uniform = |low, high| random.between(low, high);
         let n = 6000;
         let means: Vec<[f64; 3]> = (0..n).map(|_| [0; 3].map(|_| uniform(-9.0, 9.0))).collect();
         let scales: Vec<[f32; 3]> = (0..n)
@@ -202,8 +194,8 @@ mod tests {
             scales: &scales,
             opacities: &(0..n).map(|_| uniform(0.0, 1.0) as f32).collect::<Vec<_>>(),
         };
-        let blocks = Opaque::of(&scene);
-        let mut whole = Opaque::of(&scene);
+        let blocks = Occluders::of(&scene);
+        let mut whole = Occluders::of(&scene);
         for block in &mut whole.blocks {
             block.half = [f32::INFINITY; 3];
         }

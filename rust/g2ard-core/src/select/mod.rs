@@ -2,14 +2,16 @@
 
 mod coverage;
 mod depth;
-mod opaque;
+mod kernels;
+mod occluders;
 mod pinhole;
 mod surface;
 mod visible;
 
 pub use coverage::{Chosen, Coverage, Problem};
 pub use depth::median_depths;
-pub use opaque::{Opaque, Row};
+pub use kernels::ViewKernels;
+pub use occluders::{Occluder, Occluders};
 pub use pinhole::Pinhole;
 pub use surface::{Gaussians, Surface};
-pub use visible::{look_of, looks, visible};
+pub use visible::{statistics_of, view_statistics, visible_cells};

@@ -1,11 +1,12 @@
-//! One camera, and Gaussians as it sees them: by gsplat's conventions.
+//! One camera and the projection of one Gaussian at a time, in f32, by gsplat's conventions.
+//!
+//! [`crate::raster`] projects sixteen at a time from stored parameters, with f64 positions and exact minors; depth for
+//! selection reads covariances made once for all views, and wants no colours, so the two share constants only.
 
-use super::opaque::{Block, Row};
-use crate::raster::Camera;
+use super::occluders::{Block, Occluder};
+pub(super) use crate::raster::ALPHA_MIN;
+use crate::raster::{Camera, DILATION};
 
-/// As gsplat: splats are widened by 0.3 px², less than 1/255 is nothing.
-const DILATION: f32 = 0.3;
-pub(super) const ALPHA_MIN: f32 = 1.0 / 255.0;
 /// What float32 may lose of a coordinate on its way into the camera's frame, of its size.
 const ROUNDING: f32 = 1e-6;
 
@@ -113,7 +114,7 @@ impl Pinhole {
     }
 
     /// The splat and its depth; None where no pixel can show it.
-    pub(super) fn project(&self, row: &Row) -> Option<(f32, Splat)> {
+    pub(super) fn project(&self, row: &Occluder) -> Option<(f32, Splat)> {
         let [tx, ty, z] = self.to_camera(row.mean);
         if z <= self.near {
             return None;
@@ -127,7 +128,7 @@ impl Pinhole {
             (ty / z).clamp(self.limits[1][0], self.limits[1][1]),
         );
         let (a, b) = (self.focal[0] / z, self.focal[1] / z);
-        // Most Gaussians are out of sight: a bound on their extent is enough to tell.
+        // Most Gaussians are outside the image: a bound on their extent is enough to refuse them.
         let out = |at: f32, size: usize| at - at.clamp(0.0, size as f32);
         let far = |d: f32, scale: f32, t: f32| {
             d * d > row.reach * (row.trace * scale * scale * (1.0 + t * t) + DILATION)

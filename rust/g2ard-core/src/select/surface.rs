@@ -2,9 +2,11 @@
 
 use rayon::prelude::*;
 
+use super::ViewKernels;
+
 use crate::linalg::{Sym3, covariance, outer, rotation_from_quat, sub, symmetric_eigen};
-use crate::spatial::Frame;
-use crate::{Backend, Error, Result};
+use crate::spatial::RobustBounds;
+use crate::{Error, Result};
 
 /// A scene's geometry, borrowed; means are centred by the caller.
 #[derive(Debug, Clone, Copy)]
@@ -81,9 +83,9 @@ pub struct Surface {
 
 impl Surface {
     /// About `target` adaptive voxels of the scene.
-    pub fn of(scene: &Gaussians<'_>, target: usize, backend: &dyn Backend) -> Result<Self> {
+    pub fn of(scene: &Gaussians<'_>, target: usize, kernels: &dyn ViewKernels) -> Result<Self> {
         scene.validate()?;
-        let cells = backend.cells(scene.means, &Frame::of(scene.means), target)?;
+        let cells = kernels.cells(scene.means, &RobustBounds::of(scene.means), target)?;
         let rows: Vec<_> = (0..cells.len())
             .into_par_iter()
             .map(|c| cell(scene, cells.members_of(c)))
@@ -113,7 +115,7 @@ impl Surface {
 fn cell(scene: &Gaussians<'_>, members: &[u32]) -> ([f64; 3], [f64; 3], f64, f64) {
     let rows = || members.iter().map(|&i| i as usize);
     let area: f64 = rows().map(|i| scene.footprint(i)).sum();
-    // Members that cover nothing still have a place.
+    // Members without area still count by position.
     let mass = |i: usize| {
         if area > 0.0 {
             scene.footprint(i) / area

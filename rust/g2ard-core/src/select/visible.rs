@@ -1,16 +1,20 @@
-//! What each view sees: how far, and which surface cells.
+//! What each view sees: its depths, and which surface cells.
 
 use rayon::prelude::*;
 
 use super::Surface;
 use super::depth::Scratch;
-use super::opaque::Opaque;
+use super::occluders::Occluders;
 use super::pinhole::Pinhole;
 use crate::raster::Camera;
 use crate::{Control, Result};
 
-/// For each camera what it shows of the scene: see [`look_of`].
-pub fn looks(scene: &Opaque, cameras: &[Camera], control: &Control) -> Result<Vec<[f32; 2]>> {
+/// For each camera the share of its pixels that show the scene, and their median depth: see [`statistics_of`].
+pub fn view_statistics(
+    scene: &Occluders,
+    cameras: &[Camera],
+    control: &Control,
+) -> Result<Vec<[f32; 2]>> {
     control.begin(cameras.len() as u64);
     cameras
         .par_iter()
@@ -20,13 +24,13 @@ pub fn looks(scene: &Opaque, cameras: &[Camera], control: &Control) -> Result<Ve
             scratch.clear(&view, 1.0);
             scratch.trace(scene, &view);
             control.advance(1);
-            Ok(look_of(&scratch.depth))
+            Ok(statistics_of(&scratch.depth))
         })
         .collect()
 }
 
 /// The share of pixels that show the scene, and the median of their depths (0 without any).
-pub fn look_of(image: &[f32]) -> [f32; 2] {
+pub fn statistics_of(image: &[f32]) -> [f32; 2] {
     let mut depths: Vec<f32> = image.iter().copied().filter(|&d| d > 0.0).collect();
     if depths.is_empty() {
         return [0.0; 2];
@@ -39,8 +43,8 @@ pub fn look_of(image: &[f32]) -> [f32; 2] {
 
 /// For each camera the cells it sees, ascending: the cell's centre falls on the image and lies within
 /// max(cell size, 1 % of its depth) of the median depth in that pixel.
-pub fn visible(
-    scene: &Opaque,
+pub fn visible_cells(
+    scene: &Occluders,
     surface: &Surface,
     cameras: &[Camera],
     control: &Control,

@@ -2,8 +2,9 @@
 
 use rayon::prelude::*;
 
-use super::moments::{Gaussian, MAX_OPACITY, pool, rendered_area, sigmoid};
-use super::{GONE, Ordered, SceneRef, Step};
+use super::moments::{MAX_OPACITY, pool, rendered_area, sigmoid};
+use super::{GONE, Step};
+use crate::scene::{Gaussian, Ordered, SceneRef};
 use crate::{Control, Result, Splats};
 
 /// Which cluster each ordered row belongs to ([`GONE`] for none).
@@ -86,7 +87,7 @@ impl Partition {
 
 const CHUNK: usize = 1024;
 
-/// A cluster's Gaussian; its SH wait for the one array they all go to.
+/// A cluster's Gaussian; its SH are written later, into the one array of all.
 struct Made {
     mean: [f64; 3],
     quat: [f32; 4],

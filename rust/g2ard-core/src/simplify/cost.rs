@@ -38,8 +38,8 @@ pub struct Node {
     pub alpha: f32,
     /// Σ α·A, A with the dilation: light stopped, as rendered.
     pub mass: f32,
-    /// Σ αT over the views, or what stands for it.
-    pub seen: f32,
+    /// Σ αT over the views, or its estimate.
+    pub visibility: f32,
     /// A_d.
     pub areas: Lanes,
 }
@@ -183,7 +183,7 @@ impl Node {
             blur,
             alpha: (mass / area(&s)).min(MAX_ALPHA),
             mass,
-            seen: self.seen + other.seen,
+            visibility: self.visibility + other.visibility,
             areas: areas(&s),
         }
     }
@@ -215,7 +215,7 @@ impl Node {
         };
         let (p, q, r) = (self.alpha, other.alpha, m.alpha);
         if r < MIN_ALPHA && p.max(q) >= MIN_ALPHA {
-            return f32::MAX; // what is spread so thin that nobody draws it would be lost
+            return f32::MAX; // spread so thin that it is no longer drawn, its light would be lost
         }
         let (u, v) = (share * p, (1.0 - share) * q);
         let (mut geo, mut col) = (0.0, 0.0);
@@ -225,7 +225,7 @@ impl Node {
             col += u * u * self.areas[l] + v * v * other.areas[l] - 4.0 * u * v * ab[l];
         }
         let error = geometric * geo.max(0.0) + color * col.max(0.0);
-        let cost = error * (PI / USED) * m.seen / m.mass.max(f32::MIN_POSITIVE);
+        let cost = error * (PI / USED) * m.visibility / m.mass.max(f32::MIN_POSITIVE);
         if cost < f32::MAX { cost } else { f32::MAX }
     }
 }
@@ -253,6 +253,7 @@ pub fn color_distance(a: &[f32], b: &[f32]) -> f32 {
 mod tests {
     use super::*;
     use crate::linalg::{Sym3, covariance, dot, rotation_from_quat};
+    use crate::random::Lcg;
 
     type Flat = ([f64; 2], [f64; 3]);
 
@@ -324,18 +325,13 @@ mod tests {
             error +=
                 geometric * squared([1.0, 1.0, -1.0]) + color * squared([share, share - 1.0, 0.0]);
         }
-        error / 6.0 * f64::from(m.seen / m.mass)
+        error / 6.0 * f64::from(m.visibility / m.mass)
     }
 
     #[test]
     fn equals_the_projected_squared_error_in_f64() {
-        let mut state = 11u64;
-        let mut next = || {
-            state = state
-                .wrapping_mul(6364136223846793005)
-                .wrapping_add(1442695040888963407);
-            (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
-        };
+        let mut random = Lcg(11);
+        let mut next = || random.centred();
         let mut node = || {
             let r = rotation_from_quat([next(), next(), next(), next()]);
             let scales = [0, 1, 2].map(|_| (3.0 * next()).exp());
@@ -347,7 +343,7 @@ mod tests {
                 ..Node::default()
             }
             .weighed();
-            n.seen = 3.0 * n.mass;
+            n.visibility = 3.0 * n.mass;
             n
         };
         for _ in 0..300 {
@@ -375,7 +371,7 @@ mod tests {
             ..Node::default()
         };
         let mut a = plain.weighed();
-        a.seen = a.mass;
+        a.visibility = a.mass;
         assert!(a.cost(&a, 0.0, 1.0) < 0.2); // α adds up, shape stays
         let mut far = Node {
             mean: [1e15; 3],
@@ -383,7 +379,7 @@ mod tests {
             ..plain
         }
         .weighed();
-        far.seen = far.mass;
+        far.visibility = far.mass;
         let cost = a.cost(&far, 1.0, 0.03);
         assert!(cost.is_finite() && cost >= 0.0);
     }

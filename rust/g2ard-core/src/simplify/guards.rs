@@ -1,10 +1,13 @@
-//! Whether a merged Gaussian may stand in for its members.
+//! Whether a merged Gaussian may replace its members.
 
 use std::f64::consts::PI;
 use std::sync::OnceLock;
 
-use super::moments::{Gaussian, footprint};
-use crate::linalg::{Sym3, dot, sub};
+use glam::{DVec2, DVec3};
+
+use super::moments::footprint;
+use crate::linalg::Sym3;
+use crate::scene::Gaussian;
 
 const SAMPLES: usize = 16;
 
@@ -24,32 +27,36 @@ pub fn disc() -> &'static [[f64; 2]; SAMPLES] {
 /// A footprint cast on a plane along its normal.
 struct Shadow {
     /// Of the mean.
-    center: [f64; 2],
+    center: DVec2,
     /// L of LLᵀ, the covariance in the plane: rows (l₁₁, 0) and (l₂₁, l₂₂).
-    factor: [[f64; 2]; 2],
+    factor: [DVec2; 2],
 }
 
 impl Shadow {
     /// On the plane along the axes `x` and `y`; `offset` is the mean's from the plane's origin.
-    fn of(g: &Gaussian, offset: [f64; 3], [x, y]: [[f64; 3]; 2]) -> Self {
+    fn of(g: &Gaussian, offset: DVec3, [x, y]: [DVec3; 2]) -> Self {
         // Σ^½ times each axis: their products are the covariance in the plane.
-        let [p, q] = [x, y].map(|axis| [0, 1, 2].map(|k| g.scales[k] * dot(axis, g.axis(k))));
-        let first = dot(p, p).sqrt();
+        let axes = [0, 1, 2].map(|k| DVec3::from(g.axis(k)));
+        let root = |axis: DVec3| DVec3::from([0, 1, 2].map(|k| g.scales[k] * axis.dot(axes[k])));
+        let (p, q) = (root(x), root(y));
+        let first = p.length();
         let (mut second, mut along) = (0.0, 0.0);
         if first > 0.0 {
-            second = dot(p, q) / first;
+            second = p.dot(q) / first;
             along = second / first;
         }
-        let rest = sub(q, p.map(|v| v * along));
         Self {
-            center: [dot(x, offset), dot(y, offset)],
-            factor: [[first, 0.0], [second, dot(rest, rest).sqrt()]],
+            center: DVec2::new(x.dot(offset), y.dot(offset)),
+            factor: [
+                DVec2::new(first, 0.0),
+                DVec2::new(second, (q - p * along).length()),
+            ],
         }
     }
 
     /// As A, the product of two scales: for a disc A·|n_i·n|.
     fn area(&self) -> f64 {
-        self.factor[0][0] * self.factor[1][1]
+        self.factor[0].x * self.factor[1].y
     }
 }
 
@@ -62,7 +69,7 @@ impl Shadow {
 /// grows with the gap between two sheets.
 pub fn coverage(members: &[Gaussian], merged: &Gaussian, support: f64) -> f64 {
     let order = merged.axes_by_scale();
-    let [x, y, normal] = order.map(|k| merged.axis(k));
+    let [x, y, normal] = order.map(|k| DVec3::from(merged.axis(k)));
     let (mut total, mut within) = (0.0, [0.0; 6]);
     for g in members {
         let (area, cov) = (footprint(g.scales), g.covariance());
@@ -75,19 +82,18 @@ pub fn coverage(members: &[Gaussian], merged: &Gaussian, support: f64) -> f64 {
     let reach = support * (along(&within, normal) / total).sqrt();
     let mut covered = 0.0;
     for g in members {
-        let offset = sub(g.mean, merged.mean);
-        if dot(normal, offset).abs() > reach {
+        let offset = DVec3::from(g.mean) - DVec3::from(merged.mean);
+        if normal.dot(offset).abs() > reach {
             continue;
         }
         let shadow = Shadow::of(g, offset, [x, y]);
         // In units of the merged footprint's half axes.
-        let [(u, ux, uy), (v, vx, vy)] = [0, 1].map(|t| {
-            let scale = merged.scales[order[t]];
-            let [x, y] = shadow.factor[t].map(|l| l / scale);
-            (shadow.center[t] / (support * scale), x, y)
-        });
+        let scales = [0, 1].map(|t| merged.scales[order[t]]);
+        let center = shadow.center / (support * DVec2::from(scales));
+        let [first, second] = [0, 1].map(|t| shadow.factor[t] / scales[t]);
         let hits = disc().iter().filter(|[x, y]| {
-            let (u, v) = (u + x * ux + y * uy, v + x * vx + y * vy);
+            let u = center.x + x * first.x + y * first.y;
+            let v = center.y + x * second.x + y * second.y;
             u * u + v * v <= 1.0
         });
         covered += shadow.area() * hits.count() as f64 / SAMPLES as f64;
@@ -96,10 +102,11 @@ pub fn coverage(members: &[Gaussian], merged: &Gaussian, support: f64) -> f64 {
 }
 
 /// nᵀΣn, not below 0.
-fn along(cov: &Sym3, n: [f64; 3]) -> f64 {
+fn along(cov: &Sym3, n: DVec3) -> f64 {
     let [xx, xy, xz, yy, yz, zz] = *cov;
     let rows = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
-    dot(n, rows.map(|row| dot(row, n))).max(0.0)
+    n.dot(rows.map(|row| DVec3::from(row).dot(n)).into())
+        .max(0.0)
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Who merges with whom in one round: cheapest pairs of neighbours first, each row once.
+//! The pairs that merge in one round: cheapest neighbours first, each row once.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::GONE;
 use super::cost::{Node, color_distance};
-use crate::spatial::{Frame, Tree, codes, order};
+use crate::spatial::{RobustBounds, Tree, codes, order};
 use crate::{Control, Result};
 
 /// Clusters in Morton order, with their SH, `width` values each.
@@ -23,16 +23,16 @@ impl Nodes {
         self.geometry.len()
     }
 
-    /// The rows of `left` in Morton order on a lattice shifted by shares of the frame's radius, where each node
+    /// The rows of `left` in Morton order on a lattice shifted by shares of the bounds's radius, where each node
     /// then is ([`GONE`] if not in `left`), and the codes in that order.
     pub fn morton(&self, left: &[u32], shift: [f64; 3]) -> (Vec<u32>, Vec<u32>, Vec<u64>) {
         let means: Vec<[f64; 3]> = left
             .par_iter()
             .map(|&i| self.geometry[i as usize].mean.map(f64::from))
             .collect();
-        let mut frame = Frame::of(&means);
-        (0..3).for_each(|k| frame.origin[k] += shift[k] * frame.radius);
-        let keys = codes(&means, &frame);
+        let mut bounds = RobustBounds::of(&means);
+        (0..3).for_each(|k| bounds.origin[k] += shift[k] * bounds.radius);
+        let keys = codes(&means, &bounds);
         let sorted = order(&keys);
         let from: Vec<u32> = sorted.par_iter().map(|&at| left[at as usize]).collect();
         let mut map = vec![GONE; self.len()];
@@ -62,7 +62,7 @@ impl Nodes {
 
     #[inline(always)]
     fn cost(&self, i: usize, j: usize, geometric: f32) -> f32 {
-        let (i, j) = (i.min(j), i.max(j)); // rounding must not tell the two apart
+        let (i, j) = (i.min(j), i.max(j)); // the same rounding for (i, j) and (j, i)
         let color = color_distance(self.sh_of(i), self.sh_of(j));
         self.geometry[i].cost(&self.geometry[j], color, geometric)
     }
@@ -95,7 +95,7 @@ impl Nodes {
 /// Cost and partner.
 type Candidate = (f32, u32);
 
-const NOBODY: Candidate = (f32::INFINITY, GONE);
+const NONE: Candidate = (f32::INFINITY, GONE);
 const CHUNK: usize = 1024;
 
 /// The `k` nearest of every node, cheapest to merge with first.
@@ -108,7 +108,7 @@ pub fn candidates(
     let tree: Tree<f32> = Tree::over((0..nodes.len() as u32).collect(), |i| {
         nodes.geometry[i].mean
     });
-    let mut lists = vec![NOBODY; nodes.len() * k];
+    let mut lists = vec![NONE; nodes.len() * k];
     lists
         .par_chunks_mut(CHUNK * k)
         .enumerate()
@@ -129,8 +129,8 @@ pub fn candidates(
     Ok(lists)
 }
 
-/// Among many nodes at one place the nearest by index would be the same few for all of them, and those few
-/// merges all that a round could do: look at the next in order instead.
+/// Among many nodes at one position the nearest by index would be the same few for all of them, and a round could
+/// merge only those few: take the next in order instead.
 fn spread_duplicates(i: usize, k: usize, n: usize, near: &mut Vec<(f32, u32)>) {
     near.clear();
     let first = i.saturating_sub(k / 2).min(n.saturating_sub(k + 1));
@@ -144,8 +144,8 @@ fn spread_duplicates(i: usize, k: usize, n: usize, near: &mut Vec<(f32, u32)>) {
 
 /// Up to `merges` disjoint pairs (lower index first), cheapest first, between equals the lower index.
 ///
-/// A row whose partner is taken falls back on its next candidate. Merged rows are locked: without that the
-/// cheapest cluster would swallow its surroundings.
+/// A row whose partner is taken falls back on its next candidate. Merged rows are locked: otherwise the cheapest
+/// cluster would absorb its surroundings.
 pub fn matched(lists: &[Candidate], k: usize, merges: usize) -> Vec<(u32, u32)> {
     let n = lists.len() / k;
     // Costs are ≥ 0, so their bits sort as they do.
@@ -194,13 +194,14 @@ pub fn matched(lists: &[Candidate], k: usize, merges: usize) -> Vec<(u32, u32)> 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::random::Lcg;
 
     #[test]
     fn takes_the_cheapest_disjoint_pairs_and_falls_back() {
         // 0–1 costs 1, 1–2 costs 2, 2–3 costs 5, 3–4 costs 3.
         let lists = [
             (1.0, 1),
-            NOBODY,
+            NONE,
             (1.0, 0),
             (2.0, 2),
             (2.0, 1),
@@ -208,34 +209,29 @@ mod tests {
             (3.0, 4),
             (5.0, 2),
             (3.0, 3),
-            NOBODY,
+            NONE,
         ];
         assert_eq!(matched(&lists, 2, 9), [(0, 1), (3, 4)]);
         assert_eq!(matched(&lists, 2, 1), [(0, 1)]);
         let lists = [
             (1.0, 1),
-            NOBODY,
+            NONE,
             (1.0, 0),
             (2.0, 2),
             (2.0, 1),
             (5.0, 3),
             (5.0, 2),
-            NOBODY,
+            NONE,
         ];
         assert_eq!(matched(&lists, 2, 9), [(0, 1), (2, 3)]);
     }
 
     #[test]
     fn equals_the_naive_greedy_matching() {
-        let mut state = 3u64;
-        let mut next = || {
-            state = state
-                .wrapping_mul(6364136223846793005)
-                .wrapping_add(1442695040888963407);
-            (state >> 40) as u32
-        };
+        let mut random = Lcg(3);
+        let mut next = || random.integer();
         let (n, k) = (300, 5);
-        let mut lists = vec![NOBODY; n * k];
+        let mut lists = vec![NONE; n * k];
         for i in 0..n {
             for at in 0..k {
                 let j = next() as usize % n;

@@ -1,16 +1,17 @@
 //! Simplification: shared parts (scene order, moments, residual flags, guards, trim) and the policies over them.
 //!
-//! A scene is first put in an order of its own ([`Ordered`]); every policy works on that order, so the
-//! result depends neither on the order of the input's rows nor on the number of threads.
+//! Every policy works on a scene's own order ([`crate::scene::Ordered`]), so the result depends neither on the order of
+//! the input's rows nor on the number of threads.
 
 mod clusters;
 mod cost;
 mod guards;
-mod ladder;
-mod look;
+mod importance;
+mod kernels;
+mod leaves;
 mod matching;
 mod moments;
-mod ordered;
+mod morton_tree;
 mod outcome;
 mod pairwise;
 mod paper;
@@ -19,11 +20,10 @@ mod rows;
 mod trim;
 
 pub use guards::{coverage, disc};
-pub use look::Look;
-pub use moments::{Gaussian, MAX_OPACITY, Merged, merge, optical_mass, pool, weights};
-pub use ordered::{Means, Ordered, SceneRef};
+pub use kernels::{Group, GroupKernels, means_of};
+pub use moments::{MAX_OPACITY, Merged, merge, optical_mass, pool, weights};
 pub use outcome::Outcome;
-pub use pairwise::{Pairwise, PairwiseRound, Seen};
+pub use pairwise::{Pairwise, PairwiseRound, Visibility};
 pub use paper::{Paper, PaperRound};
 pub use residual::{Texture, color, flags};
 

@@ -1,10 +1,10 @@
 //! From the rounds of a policy back to the rows and the coordinates of the caller.
 
-use super::{GONE, Ordered, SceneRef, Step};
+use super::{GONE, Step};
 use crate::Splats;
-use crate::backend::Numbered;
+use crate::scene::{Ordered, SceneRef};
 
-/// The simplified scene in the caller's coordinates, and what became of each of its rows.
+/// The simplified scene in the caller's coordinates, and where each input row went.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outcome<R> {
     pub splats: Splats,
@@ -18,65 +18,31 @@ pub struct Outcome<R> {
     pub infinite_logits: usize,
 }
 
-/// Follows parents and copies through successive steps.
-pub struct Trail {
-    pub step: Step,
-    /// See [`Numbered`].
-    numbers: Vec<u32>,
-    /// The number that the next new row gets.
-    next: u32,
-}
-
-impl Trail {
+impl Step {
     /// Before the first round: every row is a copy of itself, and none is flagged.
     pub fn start(splats: Splats) -> Self {
         let rows: Vec<u32> = (0..splats.len() as u32).collect();
         Self {
-            numbers: rows.clone(),
-            next: rows.len() as u32,
-            step: Step {
-                parents: rows.clone(),
-                flags: vec![false; rows.len()],
-                copied: rows,
-                splats,
-            },
+            parents: rows.clone(),
+            flags: vec![false; rows.len()],
+            copied: rows,
+            splats,
         }
     }
 
-    pub fn rows(&self) -> Numbered<'_> {
-        Numbered {
-            splats: &self.step.splats,
-            numbers: &self.numbers,
-        }
-    }
-
-    pub fn then(&mut self, next: Step) {
+    /// Both steps as one: parents and copies of `next` followed back to the rows that this one began with.
+    pub fn then(self, next: Self) -> Self {
         let through = |rows: &[u32], map: &[u32]| -> Vec<u32> {
             let follow = |&p: &u32| if p == GONE { GONE } else { map[p as usize] };
             rows.iter().map(follow).collect()
         };
-        let number = |&source: &u32| {
-            if source != GONE {
-                return self.numbers[source as usize];
-            }
-            self.next += 1;
-            self.next - 1
-        };
-        self.numbers = next.copied.iter().map(number).collect();
-        self.step = Step {
-            parents: through(&self.step.parents, &next.parents),
-            copied: through(&next.copied, &self.step.copied),
+        Self {
+            parents: through(&self.parents, &next.parents),
+            copied: through(&next.copied, &self.copied),
             ..next
-        };
+        }
     }
 
-    /// Back to the caller's rows and coordinates.
-    pub fn finish<R>(self, scene: &SceneRef, ordered: &Ordered, rounds: Vec<R>) -> Outcome<R> {
-        self.step.finish(scene, ordered, rounds)
-    }
-}
-
-impl Step {
     /// Back to the caller's rows and coordinates: adds the origin, except to copied rows, whose mean is the
     /// caller's own, bit for bit.
     pub fn finish<R>(self, scene: &SceneRef, ordered: &Ordered, rounds: Vec<R>) -> Outcome<R> {
@@ -88,7 +54,7 @@ impl Step {
         } = self;
         for (mean, &source) in splats.means.iter_mut().zip(&copied) {
             *mean = if source == GONE {
-                [0, 1, 2].map(|k| mean[k] + ordered.origin[k])
+                [0, 1, 2].map(|k| mean[k] + ordered.bounds.origin[k])
             } else {
                 scene.means.get(ordered.rows[source as usize] as usize)
             };
@@ -117,7 +83,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn copies_keep_their_numbers_and_new_rows_get_new_ones() {
+    fn parents_and_copies_are_followed_through_rounds() {
         let step = |copied: Vec<u32>, parents: Vec<u32>| Step {
             splats: Splats {
                 means: vec![[0.0; 3]; copied.len()],
@@ -127,12 +93,14 @@ mod tests {
             parents,
             copied,
         };
-        let mut trail = Trail::start(step(vec![0; 4], Vec::new()).splats);
-        assert_eq!(trail.rows().numbers, [0, 1, 2, 3]);
-        trail.then(step(vec![GONE, 3, GONE], vec![0, 0, 2, 1]));
-        assert_eq!(trail.rows().numbers, [4, 3, 5]);
-        trail.then(step(vec![2, GONE], vec![1, 1, 0]));
-        assert_eq!(trail.rows().numbers, [5, 6]);
-        assert_eq!(trail.step.parents, [1, 1, 0, 1]);
+        let start = Step::start(step(vec![0; 4], Vec::new()).splats);
+        let once = start.then(step(vec![GONE, 3, GONE], vec![0, 0, 2, 1]));
+        assert_eq!(
+            (&once.parents[..], &once.copied[..]),
+            (&[0, 0, 2, 1][..], &[GONE, 3, GONE][..])
+        );
+        let twice = once.then(step(vec![1, GONE], vec![1, 0, GONE]));
+        assert_eq!(twice.parents, [1, 1, GONE, 0]);
+        assert_eq!(twice.copied, [3, GONE]);
     }
 }

@@ -1,4 +1,5 @@
-//! The default policy: pairs of neighbours, cheapest first, in rounds that lock what they merge.
+//! The pairwise policy, which users know as `default` and `fast`: runs of Morton order first, then pairs of
+//! neighbours, cheapest first, in rounds that lock what they merge.
 //!
 //! The rounds only decide *which* rows go together, in f32 and in units of the scene's typical size; what
 //! comes out is made in f64 from the raw members of each cluster ([`Partition::assemble`]).
@@ -6,57 +7,61 @@
 use rayon::prelude::*;
 
 use super::clusters::Partition;
-use super::ladder::{climb, cut};
+use super::importance::median;
+use super::leaves::Leaves;
 use super::matching::{Nodes, candidates, matched};
 use super::moments::sigmoid;
-use super::rows::{Leaves, Rows, Shuffled, median};
+use super::morton_tree::{cut, merge_costs};
+use super::rows::{Rows, Shuffled};
 use super::trim::best;
-use super::{GONE, Ordered, Outcome, SceneRef};
+use super::{GONE, Outcome};
+use crate::scene::{Ordered, SceneRef};
 use crate::{Control, Error, Result};
 
-/// Defaults are what measured best (docs/decisions.md).
+/// The constants, named as in Python, which takes its defaults from here. They are what measured best
+/// (docs/decisions.md).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pairwise {
     /// Below this α a Gaussian is dropped: no renderer draws it.
     pub min_opacity: f64,
     /// Down to this many times the budget, rows merge along Morton order alone; infinite for never.
-    pub ladder: f64,
-    /// In so many steps, each but the first halving the count on a lattice that lies elsewhere.
-    pub ladder_steps: usize,
+    pub morton_premerge_ratio: f64,
+    /// In so many steps, each on a shifted lattice; every step but the first halves the count.
+    pub morton_premerge_steps: usize,
     /// Nearest clusters that one may merge with.
     pub neighbors: usize,
-    /// Weight of the geometric error beside that of colour.
-    pub geometric: f64,
+    /// Weight of the geometric error beside that of colour; without views [`Self::BLIND`] of it.
+    pub geometric_weight: f64,
     /// Standard deviation of the blur that renderers add, in pixels.
     pub dilation: f64,
     /// Without views: size of a pixel over the median largest scale.
     pub pixel_scale: f64,
     /// How much larger than its moments say a cluster may be, in area, where α alone cannot hold its mass.
-    pub growth: f64,
+    pub max_growth: f64,
 }
 
 impl Default for Pairwise {
     fn default() -> Self {
         Self {
             min_opacity: 0.004,
-            ladder: 3.0,
-            ladder_steps: 1,
+            morton_premerge_ratio: 3.0,
+            morton_premerge_steps: 1,
             neighbors: 6,
-            geometric: 0.03,
+            geometric_weight: 0.03,
             dilation: 0.4,
-            pixel_scale: 0.5,
-            growth: 1.25,
+            pixel_scale: 0.2,
+            max_growth: 1.25,
         }
     }
 }
 
-/// What views say of each row.
+/// What views show of each input row.
 #[derive(Debug, Clone, Copy)]
-pub struct Seen<'a> {
+pub struct Visibility<'a> {
     /// Σ αT over the pixels of the views.
     pub weight: &'a [f32],
-    /// Size of a pixel at the row, scene units; infinite where no view sees it.
-    pub pixel: &'a [f32],
+    /// Size of a pixel at the row, scene units; infinite where no view shows it.
+    pub pixel_size: &'a [f32],
 }
 
 /// What one round did, in rows.
@@ -68,41 +73,61 @@ pub struct PairwiseRound {
     pub after: usize,
 }
 
+impl PairwiseRound {
+    fn merging(before: usize, after: usize) -> Self {
+        Self {
+            before,
+            merged: before - after,
+            after,
+            ..Self::default()
+        }
+    }
+}
+
 impl Pairwise {
+    /// The share of the geometric weight that is left without views: much of what it weighs is then hidden.
+    pub const BLIND: f64 = 0.5;
+
+    /// Along Morton order down to the budget, on two lattices: no graph of neighbours.
+    pub fn fast() -> Self {
+        Self {
+            morton_premerge_ratio: 1.0,
+            morton_premerge_steps: 2,
+            ..Self::default()
+        }
+    }
+
+    /// Rounds down to each count of `schedule`. `visibility` and `flags` have a row for each of the input's.
     pub fn run(
         &self,
         scene: &SceneRef,
-        seen: Option<Seen>,
+        ordered: &Ordered,
+        visibility: Option<Visibility>,
         flags: Option<&[bool]>,
         schedule: &[usize],
         control: &Control,
     ) -> Result<Outcome<PairwiseRound>> {
-        let ordered = Ordered::new(scene)?;
-        self.check(scene, seen, flags)?;
+        self.check(scene, visibility, flags)?;
         let flags = flags.map_or_else(|| vec![false; scene.len()], |f| ordered.sorted(f));
-        let blur = self.blurs(scene, &ordered, seen);
+        let blur = self.blurs(scene, ordered, visibility);
         let budget = schedule.last().copied().unwrap_or(scene.len());
         control.begin(scene.len().saturating_sub(budget) as u64);
-        let (mut partition, dropped) = self.visible(scene, &ordered, budget);
+        let (mut partition, dropped) = self.drop_transparent(scene, ordered, budget);
         let kept = (0..scene.len() as u32).filter(|&i| partition.of[i as usize] != GONE);
-        let leaves = Leaves::new(scene, &ordered, kept.collect(), &blur, seen);
+        let leaves = Leaves::new(scene, ordered, kept.collect(), &blur, visibility);
+        let geometric = self.geometric(visibility);
         let mut rounds = Vec::new();
-        let mut nodes = self.climb(leaves, &ordered.codes, &mut partition, budget, &mut rounds);
+        let mut nodes = self.premerge(leaves, geometric, &mut partition, budget, &mut rounds);
         for &target in schedule {
             while nodes.len() > target {
                 let before = nodes.len();
-                let lists = candidates(&nodes, self.neighbors, self.geometric as f32, control)?;
+                let lists = candidates(&nodes, self.neighbors, geometric, control)?;
                 let pairs = matched(&lists, self.neighbors, before - target);
                 drop(lists);
                 let map = merge(&mut nodes, &pairs);
                 let of = partition.of.par_iter_mut().filter(|c| **c != GONE);
                 of.for_each(|c| *c = map[*c as usize]);
-                rounds.push(PairwiseRound {
-                    before,
-                    merged: pairs.len(),
-                    after: nodes.len(),
-                    ..PairwiseRound::default()
-                });
+                rounds.push(PairwiseRound::merging(before, nodes.len()));
                 control.advance(pairs.len() as u64);
             }
         }
@@ -114,80 +139,69 @@ impl Pairwise {
         drop(nodes);
         let (step, clamped) = partition.assemble(
             scene,
-            &ordered,
+            ordered,
             &flags,
-            self.growth,
+            self.max_growth,
             |i| blur[i].into(),
             control,
         )?;
-        let mut outcome = step.finish(scene, &ordered, rounds);
+        let mut outcome = step.finish(scene, ordered, rounds);
         outcome.clamped_opacities = clamped;
         Ok(outcome)
     }
 
-    /// Merges runs of Morton order down to `ladder` times the budget. Each time the lattice lies
+    /// Merges runs of Morton order down to `morton_premerge_ratio` times the budget. Each time the lattice lies
     /// elsewhere, so that what one cut apart the next may join.
-    fn climb(
+    fn premerge(
         &self,
         leaves: Leaves,
-        codes: &[u64],
+        geometric: f32,
         partition: &mut Partition,
         budget: usize,
         rounds: &mut Vec<PairwiseRound>,
     ) -> Nodes {
-        let last = (self.ladder * budget as f64).min(leaves.len() as f64) as usize;
-        let mut targets = (0..self.ladder_steps)
+        let last = (self.morton_premerge_ratio * budget as f64).min(leaves.len() as f64) as usize;
+        let mut targets = (0..self.morton_premerge_steps)
             .rev()
             .map(|step| (step, last.saturating_mul(1 << step.min(32))))
             .filter(|&(_, target)| target < leaves.len());
         let Some((step, target)) = targets.next() else {
             return leaves.nodes();
         };
-        let codes: Vec<u64> = leaves.kept().iter().map(|&i| codes[i as usize]).collect();
-        let (mut rows, mut codes) = self.join(
-            &leaves,
-            &codes,
-            LATTICES[step % 3],
-            target,
+        let mut runs = RunMerging {
+            geometric,
             partition,
             rounds,
-        );
+        };
+        let (mut rows, mut codes) = runs.merge(&leaves, &leaves.codes(), target, step);
         for (step, target) in targets {
-            (rows, codes) = self.join(&rows, &codes, LATTICES[step % 3], target, partition, rounds);
+            (rows, codes) = runs.merge(&rows, &codes, target, step);
         }
         rows.settled()
     }
 
-    /// Runs of `rows` become nodes, `target` of them, in Morton order on a lattice shifted by `shift`; their
-    /// codes beside them.
-    fn join(
-        &self,
-        rows: &impl Rows,
-        codes: &[u64],
-        shift: [f64; 3],
-        target: usize,
-        partition: &mut Partition,
-        rounds: &mut Vec<PairwiseRound>,
-    ) -> (Shuffled, Vec<u64>) {
-        let runs = cut(&climb(codes, rows, self.geometric as f32), target);
-        rounds.push(PairwiseRound {
-            before: rows.len(),
-            merged: rows.len() - runs.count,
-            after: runs.count,
-            ..PairwiseRound::default()
-        });
-        let nodes = rows.merged(&runs);
-        let every: Vec<u32> = (0..nodes.len() as u32).collect();
-        let (at, map, codes) = nodes.morton(&every, shift);
-        let of = partition.of.par_iter_mut().filter(|c| **c != GONE);
-        of.for_each(|c| *c = map[runs.of[*c as usize] as usize]);
-        (Shuffled::new(nodes, at), codes)
+    /// The weight of the geometric error, in the kernels' precision.
+    fn geometric(&self, visibility: Option<Visibility>) -> f32 {
+        let share = if visibility.is_some() {
+            1.0
+        } else {
+            Self::BLIND
+        };
+        (self.geometric_weight * share) as f32
     }
 
-    fn check(&self, scene: &SceneRef, seen: Option<Seen>, flags: Option<&[bool]>) -> Result<()> {
+    fn check(
+        &self,
+        scene: &SceneRef,
+        visibility: Option<Visibility>,
+        flags: Option<&[bool]>,
+    ) -> Result<()> {
         let lengths = [
-            ("visibility.weight", seen.map(|s| s.weight.len())),
-            ("visibility.pixel_size", seen.map(|s| s.pixel.len())),
+            ("visibility.weight", visibility.map(|v| v.weight.len())),
+            (
+                "visibility.pixel_size",
+                visibility.map(|v| v.pixel_size.len()),
+            ),
             ("protected", flags.map(<[bool]>::len)),
         ];
         for (name, rows) in lengths {
@@ -198,7 +212,10 @@ impl Pairwise {
         if self.neighbors == 0 {
             return Err(Error::invalid("neighbors", "at least 1", 0));
         }
-        for (name, value) in [("ladder", self.ladder), ("max_growth", self.growth)] {
+        for (name, value) in [
+            ("morton_premerge_ratio", self.morton_premerge_ratio),
+            ("max_growth", self.max_growth),
+        ] {
             if value.is_nan() || value < 1.0 {
                 return Err(Error::invalid(name, "at least 1", value));
             }
@@ -207,8 +224,13 @@ impl Pairwise {
     }
 
     /// The variance that rendering adds to each ordered row.
-    fn blurs(&self, scene: &SceneRef, ordered: &Ordered, seen: Option<Seen>) -> Vec<f32> {
-        let pixel = seen.map_or_else(Vec::new, |s| ordered.sorted(s.pixel));
+    fn blurs(
+        &self,
+        scene: &SceneRef,
+        ordered: &Ordered,
+        visibility: Option<Visibility>,
+    ) -> Vec<f32> {
+        let pixel = visibility.map_or_else(Vec::new, |v| ordered.sorted(v.pixel_size));
         let finite = pixel.iter().copied().filter(|p| p.is_finite() && *p > 0.0);
         let usual = median(finite.collect()).unwrap_or_else(|| {
             let largest = scene
@@ -232,7 +254,12 @@ impl Pairwise {
 
     /// Every row that can be seen a cluster of its own; if those are fewer than the budget, the most opaque
     /// of the others too.
-    fn visible(&self, scene: &SceneRef, ordered: &Ordered, budget: usize) -> (Partition, usize) {
+    fn drop_transparent(
+        &self,
+        scene: &SceneRef,
+        ordered: &Ordered,
+        budget: usize,
+    ) -> (Partition, usize) {
         let opacity = |&row: &u32| sigmoid(f64::from(scene.logit(row as usize)));
         let mut scores: Vec<f64> = ordered.rows.par_iter().map(opacity).collect();
         scores
@@ -247,6 +274,35 @@ impl Pairwise {
             .for_each(|(c, &i)| of[i as usize] = c as u32);
         let count = keep.len();
         (Partition { of, count }, scores.len() - count)
+    }
+}
+
+/// Merging along Morton order, and what it does to the partition.
+struct RunMerging<'a> {
+    geometric: f32,
+    partition: &'a mut Partition,
+    rounds: &'a mut Vec<PairwiseRound>,
+}
+
+impl RunMerging<'_> {
+    /// The `target` runs of rows that are cheapest to merge become nodes. Returns them in Morton order on the lattice
+    /// of this step, and their codes.
+    fn merge(
+        &mut self,
+        rows: &impl Rows,
+        codes: &[u64],
+        target: usize,
+        step: usize,
+    ) -> (Shuffled, Vec<u64>) {
+        let runs = cut(&merge_costs(codes, rows, self.geometric), target);
+        self.rounds
+            .push(PairwiseRound::merging(rows.len(), runs.count));
+        let nodes = rows.merged(&runs);
+        let every: Vec<u32> = (0..nodes.len() as u32).collect();
+        let (at, map, codes) = nodes.morton(&every, LATTICES[step % LATTICES.len()]);
+        let of = self.partition.of.par_iter_mut().filter(|c| **c != GONE);
+        of.for_each(|c| *c = map[runs.of[*c as usize] as usize]);
+        (Shuffled::new(nodes, at), codes)
     }
 }
 

@@ -3,12 +3,11 @@
 use rayon::prelude::*;
 
 use super::moments::{Merged, optical_mass, sigmoid};
-use super::outcome::Trail;
-use super::residual::{Texture, color, flags_in};
+use super::residual::{Texture, color};
 use super::trim::best;
-use super::{GONE, Ordered, Outcome, SceneRef, Step};
-use crate::backend::{Numbered, Run};
-use crate::{Backend, Control, Error, Result, Splats};
+use super::{GONE, GroupKernels, Outcome, Step};
+use crate::scene::{Ordered, SceneRef};
+use crate::{Control, Error, Result, Splats};
 
 /// Defaults are the paper's (`tab:s_config`) but `support` and `texture.members`, which it does not state.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -83,17 +82,15 @@ impl Paper {
     pub fn run(
         &self,
         scene: &SceneRef,
+        ordered: &Ordered,
         flags: Option<&[bool]>,
         cells: usize,
         schedule: &[usize],
-        backend: &dyn Backend,
+        kernels: &dyn GroupKernels,
         control: &Control,
     ) -> Result<Outcome<PaperRound>> {
-        let ordered = Ordered::new(scene)?;
-        let run = &*backend.run();
-        let mut trail = Trail::start(ordered.splats(scene));
-        let rows = trail.rows();
-        trail.step.flags = match flags {
+        let mut step = Step::start(ordered.splats(scene));
+        step.flags = match flags {
             Some(flags) if flags.len() == ordered.rows.len() => ordered.sorted(flags),
             Some(flags) => {
                 return Err(Error::invalid(
@@ -102,28 +99,28 @@ impl Paper {
                     flags.len(),
                 ));
             }
-            None => flags_in(rows, cells, self.texture, run, control)?,
+            None => super::flags(&step.splats, cells, self.texture, kernels, control)?,
         };
         let mut rounds = Vec::new();
         let shed = |budget: usize| ordered.rows.len().saturating_sub(budget) as u64;
         control.begin(shed(schedule.last().copied().unwrap_or(usize::MAX)));
         for &budget in schedule {
-            let flags = &trail.step.flags;
             let target = Target {
                 budget,
                 cells,
                 grid: ordered.grid,
             };
-            let (step, report) = self.round(trail.rows(), flags, target, run, control)?;
+            let (next, report) = self.round(&step.splats, &step.flags, target, kernels, control)?;
             control.advance((report.before - report.after) as u64);
-            trail.then(step);
+            kernels.rows_replaced(&next.copied);
+            step = step.then(next);
             rounds.push(report);
         }
         let clamped = rounds
             .iter()
             .map(|r: &PaperRound| r.clamped_opacities)
             .sum();
-        let mut outcome = trail.finish(scene, &ordered, rounds);
+        let mut outcome = step.finish(scene, ordered, rounds);
         outcome.clamped_opacities = clamped;
         Ok(outcome)
     }
@@ -131,13 +128,13 @@ impl Paper {
     /// One round, to exactly the budget (all rows when there are no more than that).
     fn round(
         &self,
-        rows: Numbered<'_>,
+        splats: &Splats,
         flags: &[bool],
         target: Target,
-        run: &dyn Run,
+        kernels: &dyn GroupKernels,
         control: &Control,
     ) -> Result<(Step, PaperRound)> {
-        let (splats, budget) = (rows.splats, target.budget);
+        let budget = target.budget;
         let mut report = PaperRound {
             before: splats.len(),
             after: splats.len().min(budget),
@@ -146,11 +143,11 @@ impl Paper {
         let kept = self.drop_transparent(splats, flags, budget);
         report.dropped = splats.len() - kept.len();
         let groups = if kept.len() > budget {
-            self.groups(rows, &kept, target.cells, run, &mut report)?
+            self.groups(splats, &kept, target.cells, kernels, &mut report)?
         } else {
             kept.iter().map(|&i| vec![i]).collect()
         };
-        let mut merges = self.judge(rows, &groups, run, &mut report, control)?;
+        let mut merges = self.judge(splats, &groups, kernels, &mut report, control)?;
         undo_costliest(&groups, &mut merges, budget, &mut report);
         let built = build(splats, flags, &groups, merges, target.grid, &mut report);
         Ok((self.trim(built, budget, &mut report), report))
@@ -182,13 +179,13 @@ impl Paper {
     /// Rows that share a cell and a colour bin; groups in order of their first row.
     fn groups(
         &self,
-        rows: Numbered<'_>,
+        splats: &Splats,
         kept: &[u32],
         target: usize,
-        run: &dyn Run,
+        kernels: &dyn GroupKernels,
         report: &mut PaperRound,
     ) -> Result<Vec<Vec<u32>>> {
-        let cells = run.cells(rows, kept, target)?;
+        let cells = kernels.cells(splats, kept, target)?;
         report.cells = cells.len();
         let ids: Vec<usize> = (0..cells.len()).collect();
         let mut groups: Vec<Vec<u32>> = ids
@@ -199,7 +196,7 @@ impl Paper {
                     .iter()
                     .map(|&at| {
                         (
-                            self.bin(color(rows.splats, kept[at as usize] as usize)),
+                            self.bin(color(splats, kept[at as usize] as usize)),
                             kept[at as usize],
                         )
                     })
@@ -224,9 +221,9 @@ impl Paper {
     /// Each group's merged Gaussian where both guards pass: energy is asked first.
     fn judge(
         &self,
-        rows: Numbered<'_>,
+        splats: &Splats,
         groups: &[Vec<u32>],
-        run: &dyn Run,
+        kernels: &dyn GroupKernels,
         report: &mut PaperRound,
         control: &Control,
     ) -> Result<Vec<Option<Box<Candidate>>>> {
@@ -235,7 +232,7 @@ impl Paper {
             rows.extend_from_slice(&groups[several[at]]);
             rows.len()
         };
-        let energies = run.energies(rows, several.len(), &group, control)?;
+        let energies = kernels.energies(splats, several.len(), &group, control)?;
         let examined = several.len();
         let smooth: Vec<(usize, f64)> = several
             .into_iter()
@@ -244,7 +241,7 @@ impl Paper {
             .collect();
         report.refused_energy = examined - smooth.len();
         let candidates: Vec<&[u32]> = smooth.iter().map(|&(g, _)| &groups[g][..]).collect();
-        let merges = run.merges(rows, &candidates, self.support, control)?;
+        let merges = kernels.merges(splats, &candidates, self.support, control)?;
         let mut accepted: Vec<_> = groups.iter().map(|_| None).collect();
         for (&(g, energy), (merged, covered)) in smooth.iter().zip(merges) {
             if covered < self.min_coverage {

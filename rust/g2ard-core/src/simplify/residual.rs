@@ -1,12 +1,12 @@
 //! Protection flags: where an affine function of position cannot predict colour.
 
-use crate::backend::{Numbered, Run};
-use crate::{Backend, Control, Result, Splats};
+use super::GroupKernels;
+use crate::{Control, Result, Splats};
 
 /// Band-0 spherical harmonic: colour = 0.5 + SH_C0·sh0.
 const SH_C0: f64 = 0.282_094_791_773_878_14;
 
-/// The base colour as it is seen from everywhere alike: renderers clamp at 0, images at 1.
+/// The view-independent colour, clamped as renderers (at 0) and images (at 1) clamp it.
 pub fn color(splats: &Splats, i: usize) -> [f64; 3] {
     splats.sh_of(i)[0].map(|v| (0.5 + SH_C0 * f64::from(v)).clamp(0.0, 1.0))
 }
@@ -35,27 +35,11 @@ pub fn flags(
     splats: &Splats,
     cells: usize,
     texture: Texture,
-    backend: &dyn Backend,
+    kernels: &dyn GroupKernels,
     control: &Control,
 ) -> Result<Vec<bool>> {
-    let numbers: Vec<u32> = (0..splats.len() as u32).collect();
-    let rows = Numbered {
-        splats,
-        numbers: &numbers,
-    };
-    flags_in(rows, cells, texture, &*backend.run(), control)
-}
-
-/// The same within a run.
-pub(super) fn flags_in(
-    rows: Numbered<'_>,
-    cells: usize,
-    texture: Texture,
-    run: &dyn Run,
-    control: &Control,
-) -> Result<Vec<bool>> {
-    let all: Vec<u32> = (0..rows.splats.len() as u32).collect();
-    let grid = run.cells(rows, &all, cells)?;
+    let all: Vec<u32> = (0..splats.len() as u32).collect();
+    let grid = kernels.cells(splats, &all, cells)?;
     let group = |cell: usize, rows: &mut Vec<u32>| {
         let own = grid.members_of(cell);
         rows.extend_from_slice(own);
@@ -64,7 +48,7 @@ pub(super) fn flags_in(
         }
         own.len()
     };
-    let energies = run.energies(rows, grid.len(), &group, control)?;
+    let energies = kernels.energies(splats, grid.len(), &group, control)?;
     let mut out = vec![false; all.len()];
     for cell in (0..grid.len()).filter(|&c| energies[c] > texture.threshold) {
         grid.members_of(cell)

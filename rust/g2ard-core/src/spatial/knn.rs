@@ -6,7 +6,7 @@ use std::ops::{AddAssign, Mul, Sub};
 
 use rayon::prelude::*;
 
-use super::{Frame, codes, order};
+use super::{RobustBounds, codes, order};
 
 const WIDTH: usize = 8;
 type Lanes<T> = [T; WIDTH];
@@ -94,7 +94,7 @@ pub struct Tree<T = f64> {
 
 impl Tree<f64> {
     pub fn build(points: &[[f64; 3]]) -> Self {
-        let rows = order(&codes(points, &Frame::of(points)));
+        let rows = order(&codes(points, &RobustBounds::of(points)));
         Self::over(rows, |row| points[row])
     }
 }
@@ -292,6 +292,7 @@ impl<T: Real> Search<'_, T> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::random::Lcg;
 
     fn brute(points: &[[f64; 3]], i: usize, k: usize) -> Vec<Neighbor<f64>> {
         let mut all: Vec<Neighbor<f64>> = (0..points.len())
@@ -317,13 +318,8 @@ mod tests {
 
     #[test]
     fn equals_brute_force_on_easy_and_hard_clouds() {
-        let mut state = 9u64;
-        let mut next = || {
-            state = state
-                .wrapping_mul(6364136223846793005)
-                .wrapping_add(1442695040888963407);
-            (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
-        };
+        let mut random = Lcg(9);
+        let mut next = || random.centred();
         let random: Vec<[f64; 3]> = (0..700).map(|_| [next(), next(), next() * 0.01]).collect();
         check(&random, 10);
         let mut floaters = random.clone();

@@ -1,13 +1,13 @@
-//! Spatial structures: robust frame, Morton order, adaptive voxel cells, nearest neighbours, rays through cells.
+//! Spatial structures: robust bounds, Morton order, adaptive voxel cells, nearest neighbours, rays through cells.
 
-mod frame;
+mod bounds;
 mod knn;
 mod morton;
 mod rays;
 mod voxels;
 
-pub use frame::Frame;
+pub use bounds::RobustBounds;
 pub use knn::{Neighbor, Tree};
-pub use morton::{BITS, codes, order, unit};
+pub use morton::{BITS, code, codes, order, unit};
 pub use rays::Steps;
 pub use voxels::{Cells, OCTAVES, first_apart, octave_counts, search_size};

@@ -2,15 +2,15 @@
 
 use rayon::prelude::*;
 
-use super::Frame;
+use super::RobustBounds;
 
 /// Bits per axis of a code.
 pub const BITS: u32 = 21;
 const LAST: f64 = ((1u32 << BITS) - 1) as f64;
 
-/// The finest cell: the frame's cube is 2²¹ of them wide.
-pub fn unit(frame: &Frame) -> f64 {
-    2.0 * frame.radius / (1u64 << BITS) as f64
+/// The finest cell: the bounds' cube is 2²¹ of them wide.
+pub fn unit(bounds: &RobustBounds) -> f64 {
+    2.0 * bounds.radius / (1u64 << BITS) as f64
 }
 
 /// Every third bit of the result is a bit of `v`.
@@ -40,23 +40,26 @@ pub fn decode(code: u64) -> [u64; 3] {
     [gather(code), gather(code >> 1), gather(code >> 2)]
 }
 
-/// Lattice coordinates of `p`, cells of `size` counted from the lower corner of the frame's cube.
-fn cell(p: [f64; 3], frame: &Frame, size: f64) -> [f64; 3] {
-    [0, 1, 2].map(|k| ((p[k] - frame.origin[k] + frame.radius) / size).floor())
+/// Lattice coordinates of `p`, cells of `size` counted from the lower corner of the bounds' cube.
+fn cell(p: [f64; 3], bounds: &RobustBounds, size: f64) -> [f64; 3] {
+    [0, 1, 2].map(|k| ((p[k] - bounds.origin[k] + bounds.radius) / size).floor())
 }
 
 /// The code of the cell that holds `p`; None where it lies outside the lattice.
-pub fn code_inside(p: [f64; 3], frame: &Frame, size: f64) -> Option<u64> {
-    let cell = cell(p, frame, size);
+pub fn code_inside(p: [f64; 3], bounds: &RobustBounds, size: f64) -> Option<u64> {
+    let cell = cell(p, bounds, size);
     let inside = cell.iter().all(|&c| (0.0..=LAST).contains(&c));
     inside.then(|| encode(cell.map(|c| c as u64)))
 }
 
-/// 63-bit codes of the finest cells; points beyond the frame are clamped onto its faces.
-pub fn codes(points: &[[f64; 3]], frame: &Frame) -> Vec<u64> {
-    let unit = unit(frame);
-    let code = |&p: &[f64; 3]| encode(cell(p, frame, unit).map(|c| c.clamp(0.0, LAST) as u64));
-    points.par_iter().map(code).collect()
+/// The 63-bit code of a point's finest cell; points beyond the bounds are clamped onto their faces.
+pub fn code(point: [f64; 3], bounds: &RobustBounds) -> u64 {
+    encode(cell(point, bounds, unit(bounds)).map(|c| c.clamp(0.0, LAST) as u64))
+}
+
+/// The code of every point.
+pub fn codes(points: &[[f64; 3]], bounds: &RobustBounds) -> Vec<u64> {
+    points.par_iter().map(|&p| code(p, bounds)).collect()
 }
 
 /// The rows in the order of their codes, ties by row.
@@ -87,11 +90,11 @@ mod tests {
     #[test]
     fn order_is_stable_and_far_points_are_clamped() {
         let points = [[0.0; 3], [1e30; 3], [-1e30; 3], [0.0; 3]];
-        let frame = Frame {
+        let bounds = RobustBounds {
             origin: [0.0; 3],
             radius: 1.0,
         };
-        assert_eq!(order(&codes(&points, &frame)), [2, 0, 3, 1]);
-        assert_eq!(code_inside(points[1], &frame, 1e-6), None);
+        assert_eq!(order(&codes(&points, &bounds)), [2, 0, 3, 1]);
+        assert_eq!(code_inside(points[1], &bounds, 1e-6), None);
     }
 }

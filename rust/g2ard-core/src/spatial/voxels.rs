@@ -5,7 +5,7 @@ use std::convert::Infallible;
 use rayon::prelude::*;
 
 use super::morton::{BITS, code_inside, decode, encode, unit};
-use super::{Frame, codes};
+use super::{RobustBounds, codes};
 
 /// How far the count of occupied cells may be off, and how often the size is changed to get there.
 const TOLERANCE: f64 = 0.02;
@@ -28,24 +28,24 @@ impl Cells {
     ///
     /// The count at every power of two comes from one sort, by Morton prefix; what remains is a
     /// bracketed secant on log count against log size within one octave.
-    pub fn adaptive(points: &[[f64; 3]], frame: &Frame, target: usize) -> Self {
+    pub fn adaptive(points: &[[f64; 3]], bounds: &RobustBounds, target: usize) -> Self {
         let size = match points {
-            [] => frame.radius,
+            [] => bounds.radius,
             _ => {
-                let octaves = counts_by_octave(points, frame);
-                let counted = |size| Ok::<_, Infallible>(count(points, frame, size));
-                let Ok(size) = search_size(frame, &octaves, target, counted);
+                let octaves = counts_by_octave(points, bounds);
+                let counted = |size| Ok::<_, Infallible>(count(points, bounds, size));
+                let Ok(size) = search_size(bounds, &octaves, target, counted);
                 size
             }
         };
-        Self::with_size(points, frame, size)
+        Self::with_size(points, bounds, size)
     }
 
-    pub fn with_size(points: &[[f64; 3]], frame: &Frame, size: f64) -> Self {
+    pub fn with_size(points: &[[f64; 3]], bounds: &RobustBounds, size: f64) -> Self {
         let mut keyed: Vec<(u64, u32)> = points
             .par_iter()
             .enumerate()
-            .map(|(i, &p)| (code_inside(p, frame, size).unwrap_or(u64::MAX), i as u32))
+            .map(|(i, &p)| (code_inside(p, bounds, size).unwrap_or(u64::MAX), i as u32))
             .collect();
         keyed.par_sort_unstable();
         let (mut starts, mut keys) = (Vec::new(), Vec::new());
@@ -107,10 +107,10 @@ impl Cells {
 }
 
 /// Occupied cells at a size; points beyond the lattice count one each.
-fn count(points: &[[f64; 3]], frame: &Frame, size: f64) -> usize {
+fn count(points: &[[f64; 3]], bounds: &RobustBounds, size: f64) -> usize {
     let mut keys: Vec<u64> = points
         .par_iter()
-        .map(|&p| code_inside(p, frame, size).unwrap_or(u64::MAX))
+        .map(|&p| code_inside(p, bounds, size).unwrap_or(u64::MAX))
         .collect();
     keys.par_sort_unstable();
     let distinct = keys
@@ -121,8 +121,8 @@ fn count(points: &[[f64; 3]], frame: &Frame, size: f64) -> usize {
 }
 
 /// Occupied cells of size unit·2^b for every b, from one sort.
-fn counts_by_octave(points: &[[f64; 3]], frame: &Frame) -> Vec<usize> {
-    let mut sorted = codes(points, frame);
+fn counts_by_octave(points: &[[f64; 3]], bounds: &RobustBounds) -> Vec<usize> {
+    let mut sorted = codes(points, bounds);
     sorted.par_sort_unstable();
     let mut apart = [0; OCTAVES];
     for w in sorted.windows(2) {
@@ -158,12 +158,12 @@ pub fn octave_counts(apart: &[usize; OCTAVES]) -> Vec<usize> {
 /// The size at which about `target` cells are occupied, given how many are at each octave, and a way to
 /// count them at any size.
 pub fn search_size<E>(
-    frame: &Frame,
+    bounds: &RobustBounds,
     counts: &[usize],
     target: usize,
     mut count: impl FnMut(f64) -> std::result::Result<usize, E>,
 ) -> std::result::Result<f64, E> {
-    let (unit, target) = (unit(frame), target.max(1));
+    let (unit, target) = (unit(bounds), target.max(1));
     // The finest octave whose coarse end has too few cells holds the answer.
     let octave = (0..BITS as usize)
         .find(|&b| counts[b + 1] <= target)
@@ -198,16 +198,12 @@ pub fn search_size<E>(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::random::Lcg;
     use std::collections::HashSet;
 
     fn surface(n: usize) -> Vec<[f64; 3]> {
-        let mut state = 5u64;
-        let mut next = || {
-            state = state
-                .wrapping_mul(6364136223846793005)
-                .wrapping_add(1442695040888963407);
-            (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
-        };
+        let mut random = Lcg(5);
+        let mut next = || random.centred();
         (0..n)
             .map(|_| {
                 let (x, y) = (next() * 10.0, next() * 10.0);
@@ -219,19 +215,19 @@ mod tests {
     #[test]
     fn octave_counts_match_a_set() {
         let points = surface(3000);
-        let frame = Frame::of(&points);
-        let counts = counts_by_octave(&points, &frame);
+        let bounds = RobustBounds::of(&points);
+        let counts = counts_by_octave(&points, &bounds);
         for b in [0, 12, 15, 17, 18, 20] {
-            let size = unit(&frame) * (1u64 << b) as f64;
+            let size = unit(&bounds) * (1u64 << b) as f64;
             let set: HashSet<_> = points
                 .iter()
                 .map(|p| {
                     [0, 1, 2]
-                        .map(|k| ((p[k] - frame.origin[k] + frame.radius) / size).floor() as i64)
+                        .map(|k| ((p[k] - bounds.origin[k] + bounds.radius) / size).floor() as i64)
                 })
                 .collect();
             assert_eq!(counts[b], set.len(), "{b}");
-            assert_eq!(count(&points, &frame, size), set.len());
+            assert_eq!(count(&points, &bounds, size), set.len());
         }
     }
 
@@ -239,9 +235,9 @@ mod tests {
     fn finds_the_asked_count() {
         let mut points = surface(20_000);
         points.push([2e5, 2e5, -2e5]);
-        let frame = Frame::of(&points);
+        let bounds = RobustBounds::of(&points);
         for target in [1, 10, 100, 1000, 5000, 15_000] {
-            let cells = Cells::adaptive(&points, &frame, target);
+            let cells = Cells::adaptive(&points, &bounds, target);
             let off = (cells.len() as f64 / target as f64).ln().abs();
             assert!(off <= 0.0199 || target < 100, "{target}: {}", cells.len());
             assert!(
@@ -254,14 +250,15 @@ mod tests {
     #[test]
     fn partitions_the_rows_and_knows_its_neighbours() {
         let points = surface(2000);
-        let frame = Frame::of(&points);
-        let cells = Cells::adaptive(&points, &frame, 300);
+        let bounds = RobustBounds::of(&points);
+        let cells = Cells::adaptive(&points, &bounds, 300);
         let mut seen = cells.members.clone();
         seen.sort_unstable();
         assert_eq!(seen, (0..2000).collect::<Vec<u32>>());
         let at = |c: usize| {
             let p = points[cells.members_of(c)[0] as usize];
-            [0, 1, 2].map(|k| ((p[k] - frame.origin[k] + frame.radius) / cells.size).floor() as i64)
+            [0, 1, 2]
+                .map(|k| ((p[k] - bounds.origin[k] + bounds.radius) / cells.size).floor() as i64)
         };
         for c in 0..cells.len() {
             let got: HashSet<_> = cells.face_neighbors(c).collect();
@@ -275,7 +272,7 @@ mod tests {
     #[test]
     fn degenerate_scenes_end() {
         for points in [vec![], vec![[1.0; 3]], vec![[1.0; 3]; 1000]] {
-            let cells = Cells::adaptive(&points, &Frame::of(&points), 10);
+            let cells = Cells::adaptive(&points, &RobustBounds::of(&points), 10);
             assert_eq!(cells.len(), usize::from(!points.is_empty()));
         }
     }

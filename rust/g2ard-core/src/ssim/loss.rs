@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::{Shape, TAPS, window};
 use crate::Result;
-use crate::raster::frame::bytes;
+use crate::raster::memory::bytes;
 use crate::raster::simd::{Isa, LANES, dispatch};
 use bands::{Backward, Forward, span};
 
@@ -124,15 +124,11 @@ impl Loss {
 mod tests {
     use super::super::ssim;
     use super::*;
+    use crate::random::Lcg;
 
     fn noise(count: usize, seed: u32) -> Vec<f32> {
-        let mut state = seed;
-        (0..count)
-            .map(|_| {
-                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                (state >> 8) as f32 / (1 << 24) as f32
-            })
-            .collect()
+        let mut random = Lcg(u64::from(seed));
+        (0..count).map(|_| random.uniform_f32()).collect()
     }
 
     #[test]

@@ -2,12 +2,11 @@
 
 use super::Rates;
 use super::anchors::{Anchors, Regularizers};
-use super::store::{SH, Writer};
-use crate::raster::frame::ChunkSums;
+use super::store::{Block, Blocks, LOG_SCALE, LOGIT, QUAT, SH};
 use crate::raster::gradients::collect;
-use crate::raster::params::Source;
 use crate::raster::project::{RowGradients, unproject};
-use crate::raster::simd::{Kernel, LANES, Lanes, Mask, Row};
+use crate::raster::rasterizer::ChunkSums;
+use crate::raster::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
 
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
@@ -35,7 +34,7 @@ impl Biases {
 /// Adds up a chunk's slots, goes back to the parameters, and steps.
 pub struct Update<'a> {
     pub sums: &'a ChunkSums<'a>,
-    pub store: Writer,
+    pub blocks: Blocks<'a>,
     pub biases: &'a Biases,
     pub rates: &'a Rates,
     pub reach: Option<f32>,
@@ -49,7 +48,6 @@ impl Kernel for Update<'_> {
     #[inline(always)]
     fn run<F: Lanes>(self) -> (usize, usize) {
         let sums = self.sums;
-        let packed = self.store.packed;
         let (mut next, mut updated, mut skipped) = (0, 0, 0);
         for group in sums.first_group..sums.last_group {
             let (mut active, screen) =
@@ -57,13 +55,15 @@ impl Kernel for Update<'_> {
             if active == 0 && self.regularize.is_none() {
                 continue;
             }
-            let mut g = unproject(sums.view, &packed, group, &screen);
+            // SAFETY: a group belongs to one chunk, a chunk to one thread, and the last group's block is gone.
+            let mut block = unsafe { self.blocks.block(group) };
+            let mut g = unproject(sums.view, &block.parameters(), group, &screen);
             if let Some((weights, anchors)) = self.regularize {
                 let seen = F::Mask::from_bits(active);
                 zero_unseen(&mut g, seen);
-                let rows = (packed.len() - group * LANES).min(LANES);
+                let rows = (self.blocks.rows - group * LANES).min(LANES);
                 let real = ((1u32 << rows) - 1) as u16;
-                active |= anchors.add_gradients(weights, &packed, group, &mut g) & real;
+                active |= anchors.add_gradients(weights, &block.parameters(), group, &mut g) & real;
                 if active == 0 {
                     continue;
                 }
@@ -73,7 +73,7 @@ impl Kernel for Update<'_> {
             skipped += (active & !good).count_ones() as usize;
             updated += good.count_ones() as usize;
             if good != 0 {
-                self.step_group(group, good, &g);
+                self.step_group(&mut block, good, &g);
             }
         }
         (updated, skipped)
@@ -131,7 +131,6 @@ fn finite<F: Lanes>(g: &RowGradients<F>) -> F::Mask {
 
 /// What the attributes of one block share.
 struct Step<F: Lanes> {
-    group: usize,
     good: F::Mask,
     bias1: F,
     bias2: F,
@@ -139,48 +138,45 @@ struct Step<F: Lanes> {
 
 impl Update<'_> {
     #[inline(always)]
-    fn step_group<F: Lanes>(&self, group: usize, good: u16, g: &RowGradients<F>) {
-        let mut bias = [Row([1.0; LANES]); 2];
+    fn step_group<F: Lanes>(&self, block: &mut Block, good: u16, g: &RowGradients<F>) {
+        let mut bias = [Lanes16([1.0; LANES]); 2];
         for l in 0..LANES {
             if good >> l & 1 == 1 {
-                // SAFETY: the group is this thread's.
-                let steps = unsafe { &mut *self.store.steps.at(group * LANES + l) };
-                *steps += 1;
-                let pair = self.biases.0[*steps as usize];
+                block.steps[l] += 1;
+                let pair = self.biases.0[block.steps[l] as usize];
                 bias[0].0[l] = pair[0];
                 bias[1].0[l] = pair[1];
             }
         }
         let step = Step {
-            group,
             good: F::Mask::from_bits(good),
             bias1: F::load(&bias[0]),
             bias2: F::load(&bias[1]),
         };
-        // SAFETY: as above.
-        let unit = unsafe { F::load(&*self.store.units.at(group)) };
+        let unit = F::load(block.units);
         let rates = self.rates;
         let share = self.share(g.extent.largest);
         for k in 0..3 {
-            self.attribute(&step, k, g.mean[k], share * unit * F::splat(rates.means));
+            step.attribute(block, k, g.mean[k], share * unit * F::splat(rates.means));
             let own = self.share(g.extent.axes[k]);
-            self.attribute(
-                &step,
-                7 + k,
-                g.log_scale[k],
-                own * F::splat(rates.log_scales),
-            );
-            self.attribute(&step, SH + k, g.basis[0] * g.rgb[k], F::splat(rates.sh0));
+            let rate = own * F::splat(rates.log_scales);
+            step.attribute(block, LOG_SCALE + k, g.log_scale[k], rate);
+            step.attribute(block, SH + k, g.basis[0] * g.rgb[k], F::splat(rates.sh0));
         }
         for k in 0..4 {
-            self.attribute(&step, 3 + k, g.quat[k], share * F::splat(rates.quats));
+            step.attribute(block, QUAT + k, g.quat[k], share * F::splat(rates.quats));
         }
-        self.attribute(&step, 10, g.logit_opacity, F::splat(rates.logit_opacities));
+        step.attribute(
+            block,
+            LOGIT,
+            g.logit_opacity,
+            F::splat(rates.logit_opacities),
+        );
         let rate = F::splat(rates.sh_n);
-        for k in 1..self.store.packed.sh_coeffs() {
+        for k in 1..block.sh_coeffs {
             for c in 0..3 {
                 // The SH gradient has rank one: it is never written out.
-                self.attribute(&step, SH + 3 * k + c, g.basis[k] * g.rgb[c], rate);
+                step.attribute(block, SH + 3 * k + c, g.basis[k] * g.rgb[c], rate);
             }
         }
     }
@@ -199,29 +195,24 @@ impl Update<'_> {
         let fourth = square * square;
         one / fourth.fma(fourth, one)
     }
+}
 
+impl<F: Lanes> Step<F> {
+    /// Adam on one attribute of a block.
     #[inline(always)]
-    fn attribute<F: Lanes>(&self, step: &Step<F>, attribute: usize, g: F, rate: F) {
-        let packed = &self.store.packed;
-        let at = packed.index(step.group, attribute);
-        // SAFETY: the group is this thread's, and all three arrays have its rows.
-        let (first, second) = unsafe {
-            (
-                &mut *self.store.first.at(at),
-                &mut *self.store.second.at(at),
-            )
-        };
+    fn attribute(&self, block: &mut Block, attribute: usize, g: F, rate: F) {
+        let (first, second) = (&mut block.first[attribute], &mut block.second[attribute]);
         let (m, v) = (F::load(first), F::load(second));
         let m_new = (g - m).fma(F::splat((1.0 - BETA1) as f32), m);
         let v_new = v.fma(
             F::splat(BETA2 as f32),
             g * g * F::splat((1.0 - BETA2) as f32),
         );
-        let denominator = v_new.sqrt().fma(step.bias2, F::splat(EPSILON));
-        let value = packed.get::<F>(step.group, attribute);
-        let moved = (rate * step.bias1 * m_new).fnma(denominator.recip(), value);
-        packed.set(step.group, attribute, F::select(step.good, moved, value));
-        F::select(step.good, m_new, m).store(first);
-        F::select(step.good, v_new, v).store(second);
+        let denominator = v_new.sqrt().fma(self.bias2, F::splat(EPSILON));
+        let value = F::load(&block.values[attribute]);
+        let moved = (rate * self.bias1 * m_new).fnma(denominator.recip(), value);
+        F::select(self.good, moved, value).store(&mut block.values[attribute]);
+        F::select(self.good, m_new, m).store(first);
+        F::select(self.good, v_new, v).store(second);
     }
 }

@@ -1,9 +1,9 @@
 //! L_anchor and L_shape (`eq:anchor`, `eq:shape`) and their gradients, sixteen Gaussians at a time.
 
-use super::store::Packed;
+use super::store::ParameterView;
 use crate::raster::params::Source;
 use crate::raster::project::{RowGradients, quaternion_gradient, rotation, unit_quaternion};
-use crate::raster::simd::{LANES, LN_2, Lanes, Mask, Row};
+use crate::raster::simd::{LANES, LN_2, Lanes, Lanes16, Mask};
 use crate::{Error, Result};
 
 /// Weights of the two terms.
@@ -11,20 +11,23 @@ use crate::{Error, Result};
 pub struct Regularizers {
     /// λ_a of (1/N) Σ log(1 + [D² − 1]₊).
     pub anchor: f32,
-    /// λ_s of (1/N) Σ max(0, −log(r_eff − 1 + ε)) + [log s⊥ − log s̄⊥]₊.
+    /// λ_s of (1/N) Σ max(0, −log(r_eff − 1 + ε)) + β[log s⊥ − log s̄⊥]₊.
     pub shape: f32,
     /// Whether L_shape has its first term.
     pub effective_rank: bool,
+    /// β.
+    pub thickness: f32,
+    /// ε.
+    pub rank_offset: f32,
 }
 
-const EPSILON: f32 = 1e-6;
 /// Rows of a block: 3 of the mean, 9 of the frame, 1/r∥², 1/r⊥².
 const ROWS: usize = 14;
 
 /// Frozen geometry of N Gaussians in the trainer's order.
 #[derive(Debug, Clone)]
 pub struct Anchors {
-    blocks: Vec<Row>,
+    blocks: Vec<Lanes16>,
     count: f32,
 }
 
@@ -48,7 +51,7 @@ impl Anchors {
                 return Err(Error::invalid(name, format!("{expected} values"), got));
             }
         }
-        let mut blocks = vec![Row::default(); n.div_ceil(LANES) * ROWS];
+        let mut blocks = vec![Lanes16::default(); n.div_ceil(LANES) * ROWS];
         for (row, from) in order.iter().enumerate() {
             let from = *from as usize;
             let block = &mut blocks[row / LANES * ROWS..][..ROWS];
@@ -73,7 +76,7 @@ impl Anchors {
     pub(crate) fn add_gradients<F: Lanes>(
         &self,
         weights: &Regularizers,
-        packed: &Packed,
+        parameters: &ParameterView,
         group: usize,
         g: &mut RowGradients<F>,
     ) -> u16 {
@@ -83,16 +86,20 @@ impl Anchors {
             active |= anchor(
                 block,
                 F::splat(weights.anchor / self.count),
-                packed,
+                parameters,
                 group,
                 g,
             );
         }
         if weights.shape > 0.0 {
             let weight = F::splat(weights.shape / self.count);
-            active |= thickness(block, weight, packed, group, g);
+            if weights.thickness > 0.0 {
+                let weight = weight * F::splat(weights.thickness);
+                active |= thickness(block, weight, parameters, group, g);
+            }
             if weights.effective_rank {
-                active |= effective_rank(weight, packed, group, g);
+                let offset = F::splat(weights.rank_offset);
+                active |= effective_rank(weight, offset, parameters, group, g);
             }
         }
         active
@@ -102,15 +109,15 @@ impl Anchors {
 /// log(1 + [D² − 1]₊) is 2·log D outside the trust region: its slope in D² is 1/D².
 #[inline(always)]
 fn anchor<F: Lanes>(
-    block: &[Row],
+    block: &[Lanes16],
     weight: F,
-    packed: &Packed,
+    parameters: &ParameterView,
     group: usize,
     g: &mut RowGradients<F>,
 ) -> u16 {
     let mut offset = [F::zero(); 3];
     for k in 0..3 {
-        offset[k] = packed.mean::<F>(group, k) - F::load(&block[k]);
+        offset[k] = parameters.mean::<F>(group, k) - F::load(&block[k]);
     }
     let radius = [
         F::load(&block[12]),
@@ -140,13 +147,13 @@ fn anchor<F: Lanes>(
 /// [log s⊥ − log s̄⊥]₊, s⊥ = |S Rᵀ n̄|.
 #[inline(always)]
 fn thickness<F: Lanes>(
-    block: &[Row],
+    block: &[Lanes16],
     weight: F,
-    packed: &Packed,
+    parameters: &ParameterView,
     group: usize,
     g: &mut RowGradients<F>,
 ) -> u16 {
-    let (q, rq) = unit_quaternion::<F, Packed>(packed, group);
+    let (q, rq) = unit_quaternion::<F, ParameterView<'_>>(parameters, group);
     let r = rotation(&q);
     let normal = [F::load(&block[5]), F::load(&block[8]), F::load(&block[11])];
     let mut scale = [F::zero(); 3];
@@ -154,7 +161,7 @@ fn thickness<F: Lanes>(
     let mut square = F::zero();
     for k in 0..3 {
         // In units of s̄⊥, whose square may not fit f32.
-        scale[k] = packed.scale::<F>(group, k) * F::load(&block[13]);
+        scale[k] = parameters.scale::<F>(group, k) * F::load(&block[13]);
         extent[k] = (r[0][k] * normal[0] + r[1][k] * normal[1] + r[2][k] * normal[2]) * scale[k];
         square = extent[k].fma(extent[k], square);
     }
@@ -179,14 +186,15 @@ fn thickness<F: Lanes>(
 #[inline(always)]
 fn effective_rank<F: Lanes>(
     weight: F,
-    packed: &Packed,
+    offset: F,
+    parameters: &ParameterView,
     group: usize,
     g: &mut RowGradients<F>,
 ) -> u16 {
     let (zero, one) = (F::zero(), F::splat(1.0));
     let mut below = [zero; 3];
     for k in 0..3 {
-        below[k] = packed.log_scale::<F>(group, k);
+        below[k] = parameters.log_scale::<F>(group, k);
     }
     let largest = below[0].max(below[1]).max(below[2]);
     let mut share = [zero; 3];
@@ -222,8 +230,8 @@ fn effective_rank<F: Lanes>(
         series = series.fma(entropy, F::splat(c));
     }
     let rank_less_1 = series * entropy;
-    let low = F::splat(1.0 - EPSILON).gt(rank_less_1).and(one.ge(rest));
-    let slope = (weight * (rank_less_1 + one) / (rank_less_1 + F::splat(EPSILON))).only(low);
+    let low = (one - offset).gt(rank_less_1).and(one.ge(rest));
+    let slope = (weight * (rank_less_1 + one) / (rank_less_1 + offset)).only(low);
     for k in 0..3 {
         let log_share = below[k] - log_sum;
         g.log_scale[k] = (slope * share[k]).fma(log_share + entropy, g.log_scale[k]);

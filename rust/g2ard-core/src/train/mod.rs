@@ -15,8 +15,9 @@ pub use store::{Exported, Store};
 
 use std::time::Instant;
 
-use crate::raster::frame::{ChunkSums, bytes};
 use crate::raster::gradients::Discard;
+use crate::raster::memory::bytes;
+use crate::raster::rasterizer::ChunkSums;
 use crate::raster::simd::dispatch;
 use crate::raster::{
     Camera, Image, ImageGradients, Isa, Memory, Params, Passes, Rasterizer, Settings,
@@ -38,9 +39,9 @@ pub struct Rates {
     pub sh_n: f32,
 }
 
-/// One view to learn from.
+/// What one step takes in: a view, its target, and how to learn from it.
 #[derive(Debug, Clone, Copy)]
-pub struct Lesson<'a> {
+pub struct StepInput<'a> {
     pub camera: &'a Camera,
     pub settings: &'a Settings,
     pub background: [f32; 3],
@@ -58,7 +59,7 @@ pub struct Lesson<'a> {
     pub regularizers: Option<Regularizers>,
 }
 
-/// What became of a step.
+/// The outcome of a step.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Report {
     /// The photometric loss before the step.
@@ -103,12 +104,12 @@ impl Trainer {
         &self.store
     }
 
-    /// Takes up an earlier [`Store::export`]; with it training goes on bit for bit.
+    /// Restores an earlier [`Store::export`]; training then continues bit for bit.
     pub fn import(&mut self, state: &Exported) -> Result<()> {
         self.store.import(state)
     }
 
-    /// Freezes the surface that [`Lesson::regularizers`] hold the Gaussians to; rows as the caller numbers them.
+    /// Freezes the surface that [`StepInput::regularizers`] hold the Gaussians to; rows as the caller numbers them.
     pub fn anchor(
         &mut self,
         means: &[f32],
@@ -141,10 +142,10 @@ impl Trainer {
         }
     }
 
-    /// Renders the view, compares, goes back and takes one Adam step.
-    pub fn step(&mut self, lesson: &Lesson) -> Result<Report> {
-        let (loss, seconds_loss) = self.compare(lesson)?;
-        let (updated, skipped) = self.descend(lesson);
+    /// Renders the view, finds the loss and its gradients, and takes one Adam step.
+    pub fn step(&mut self, input: &StepInput) -> Result<Report> {
+        let (loss, seconds_loss) = self.photometric_loss(input)?;
+        let (updated, skipped) = self.adam_step(input);
         Ok(Report {
             loss,
             updated,
@@ -153,16 +154,17 @@ impl Trainer {
         })
     }
 
-    /// A step up to the gradients, which are thrown away: for timing.
-    pub fn rehearse(&mut self, lesson: &Lesson) -> Result<Report> {
-        let (loss, seconds_loss) = self.compare(lesson)?;
+    /// A step up to the gradients, which are discarded: for timing.
+    pub fn gradients_only(&mut self, input: &StepInput) -> Result<Report> {
+        let (loss, seconds_loss) = self.photometric_loss(input)?;
         let gradients = ImageGradients {
             rgb: &self.gradient,
             alpha: None,
             depth: None,
         };
-        let packed = self.store.packed();
-        self.rasterizer.backward_into(packed, &gradients, Discard)?;
+        let parameters = self.store.parameters();
+        self.rasterizer
+            .backward_into(parameters, &gradients, Discard)?;
         Ok(Report {
             loss,
             seconds_loss,
@@ -170,35 +172,35 @@ impl Trainer {
         })
     }
 
-    /// Renders the view and compares it with the target; returns the loss and the seconds it took.
-    fn compare(&mut self, lesson: &Lesson) -> Result<(f64, f64)> {
-        let camera = lesson.camera;
+    /// Renders the view; returns its loss against the target and the seconds that took, and leaves the gradient.
+    fn photometric_loss(&mut self, input: &StepInput) -> Result<(f64, f64)> {
+        let camera = input.camera;
         camera.validate()?;
-        lesson.settings.validate()?;
+        input.settings.validate()?;
         let shape = Shape {
             height: camera.height,
             width: camera.width,
             channels: 3,
         };
-        if lesson.target.len() != shape.values() {
+        if input.target.len() != shape.values() {
             return Err(Error::invalid(
                 "target",
                 format!("{} values", shape.values()),
-                lesson.target.len(),
+                input.target.len(),
             ));
         }
-        if let Some(reach) = lesson.reach
+        if let Some(reach) = input.reach
             && !(reach > 0.0 && reach.is_finite())
         {
             return Err(Error::invalid("reach", "pixels, more than 0", reach));
         }
-        if lesson.regularizers.is_some() && self.anchors.is_none() {
+        if input.regularizers.is_some() && self.anchors.is_none() {
             return Err(Error::invalid("regularizers", "anchors set before", "none"));
         }
         self.image.resize(shape.values(), 0.0);
         self.gradient.resize(shape.values(), 0.0);
         self.alpha.resize(camera.width * camera.height, 0.0);
-        let packed = self.store.packed();
+        let parameters = self.store.parameters();
         let mut image = Image {
             rgb: &mut self.image,
             alpha: &mut self.alpha,
@@ -206,22 +208,22 @@ impl Trainer {
             median: None,
         };
         self.rasterizer.forward_from(
-            packed,
+            parameters,
             camera,
-            lesson.settings,
-            lesson.background,
+            input.settings,
+            input.background,
             &mut image,
         );
         let clock = Instant::now();
         let pixels = camera.width * camera.height;
-        let mask = lesson.mask.map(|m| Mask::new(m, pixels)).transpose()?;
+        let mask = input.mask.map(|m| Mask::new(m, pixels)).transpose()?;
         if let Some(mask) = &mask {
-            mask.cover(&mut self.image, lesson.target);
+            mask.cover(&mut self.image, input.target);
         }
         let (image, gradient) = (&self.image, &mut self.gradient);
         let mut loss =
             self.loss
-                .l1_ssim(image, lesson.target, shape, lesson.ssim_weight, gradient)?;
+                .l1_ssim(image, input.target, shape, input.ssim_weight, gradient)?;
         if let Some(mask) = &mask {
             mask.clear(&mut self.gradient);
             loss *= f64::from(mask.share);
@@ -230,20 +232,20 @@ impl Trainer {
     }
 
     /// The backward pass and Adam; returns how many Gaussians moved and how many were skipped.
-    fn descend(&mut self, lesson: &Lesson) -> (usize, usize) {
+    fn adam_step(&mut self, input: &StepInput) -> (usize, usize) {
         self.biases.extend_to(self.store.most_steps() as usize + 1);
         let (biases, anchors, isa) = (&self.biases, self.anchors.as_ref(), self.isa);
-        let writer = self.store.writer();
+        let blocks = self.store.blocks();
         let finish = |sums: &ChunkSums| {
-            let regularize = lesson.regularizers.as_ref().zip(anchors);
+            let regularize = input.regularizers.as_ref().zip(anchors);
             dispatch(
                 isa,
                 Update {
                     sums,
-                    store: writer,
+                    blocks,
                     biases,
-                    rates: &lesson.rates,
-                    reach: lesson.reach,
+                    rates: &input.rates,
+                    reach: input.reach,
                     regularize,
                 },
             )

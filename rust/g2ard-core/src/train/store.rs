@@ -1,16 +1,16 @@
-//! Parameters and moments in blocks of sixteen, attribute after attribute.
+//! Parameters and moments in blocks of sixteen Gaussians, attribute after attribute.
 
 use crate::raster::Params;
-use crate::raster::frame::bytes;
-use crate::raster::order::Shared;
+use crate::raster::disjoint::DisjointSlice;
+use crate::raster::memory::bytes;
 use crate::raster::params::Source;
-use crate::raster::simd::{LANES, Lanes, Row};
+use crate::raster::simd::{LANES, Lanes, Lanes16};
 use crate::{Error, Result};
 
 /// Attributes before the SH: 3 means, 4 quats, 3 log-scales, 1 logit.
-const QUAT: usize = 3;
-const LOG_SCALE: usize = 7;
-const LOGIT: usize = 10;
+pub const QUAT: usize = 3;
+pub const LOG_SCALE: usize = 7;
+pub const LOGIT: usize = 10;
 pub const SH: usize = 11;
 
 /// N Gaussians' parameters, Adam's two moments of each, and how many steps each has taken.
@@ -19,11 +19,11 @@ pub struct Store {
     rows: usize,
     sh_coeffs: usize,
     /// Block g's attribute a is row `g · attributes + a`.
-    values: Vec<Row>,
-    first: Vec<Row>,
-    second: Vec<Row>,
+    values: Vec<Lanes16>,
+    first: Vec<Lanes16>,
+    second: Vec<Lanes16>,
     /// What the means' rate is multiplied by.
-    units: Vec<Row>,
+    units: Vec<Lanes16>,
     steps: Vec<u32>,
     /// An upper bound of `steps`.
     most_steps: u32,
@@ -58,14 +58,14 @@ impl Store {
         }
         let attributes = SH + 3 * params.sh_coeffs;
         let blocks = rows.div_ceil(LANES);
-        let zeros = vec![Row::default(); blocks * attributes];
+        let zeros = vec![Lanes16::default(); blocks * attributes];
         let mut store = Self {
             rows,
             sh_coeffs: params.sh_coeffs,
             values: zeros.clone(),
             first: zeros.clone(),
             second: zeros,
-            units: vec![Row([1.0; LANES]); blocks],
+            units: vec![Lanes16([1.0; LANES]); blocks],
             steps: vec![0; blocks * LANES],
             most_steps: 0,
             order: morton_order(params.means),
@@ -130,7 +130,7 @@ impl Store {
         self.unblock(&self.values, from, to)
     }
 
-    fn unblock(&self, blocks: &[Row], from: usize, to: usize) -> Vec<f32> {
+    fn unblock(&self, blocks: &[Lanes16], from: usize, to: usize) -> Vec<f32> {
         let mut out = vec![0.0; self.rows * (to - from)];
         for row in 0..self.rows {
             let at = self.order[row] as usize * (to - from);
@@ -141,7 +141,7 @@ impl Store {
         out
     }
 
-    fn block(&self, rows: &[f32], into: &mut [Row]) {
+    fn block(&self, rows: &[f32], into: &mut [Lanes16]) {
         let attributes = self.attributes();
         for row in 0..self.rows {
             let from = self.order[row] as usize * attributes;
@@ -198,7 +198,7 @@ impl Store {
         }
         self.order.clone_from(&state.order);
         let [mut values, mut first, mut second] =
-            [&self.values, &self.first, &self.second].map(|v| vec![Row::default(); v.len()]);
+            [&self.values, &self.first, &self.second].map(|v| vec![Lanes16::default(); v.len()]);
         self.block(&state.values, &mut values);
         self.block(&state.first, &mut first);
         self.block(&state.second, &mut second);
@@ -211,70 +211,119 @@ impl Store {
         Ok(())
     }
 
-    pub(crate) fn packed(&mut self) -> Packed {
-        Packed {
-            values: Shared::new(&mut self.values),
+    /// The parameters as the rasteriser reads them.
+    pub(crate) fn parameters(&self) -> ParameterView<'_> {
+        ParameterView {
+            values: &self.values,
+            first_group: 0,
             rows: self.rows,
             sh_coeffs: self.sh_coeffs,
-            attributes: SH + 3 * self.sh_coeffs,
         }
     }
 
-    pub(crate) fn writer(&mut self) -> Writer {
-        Writer {
-            packed: self.packed(),
-            first: Shared::new(&mut self.first),
-            second: Shared::new(&mut self.second),
-            units: Shared::new(&mut self.units),
-            steps: Shared::new(&mut self.steps),
+    /// The blocks as the threads of a step share them.
+    pub(crate) fn blocks(&mut self) -> Blocks<'_> {
+        Blocks {
+            values: DisjointSlice::new(&mut self.values),
+            first: DisjointSlice::new(&mut self.first),
+            second: DisjointSlice::new(&mut self.second),
+            steps: DisjointSlice::new(&mut self.steps),
+            units: &self.units,
+            rows: self.rows,
+            sh_coeffs: self.sh_coeffs,
         }
     }
 }
 
-/// A store's parameters as the rasteriser reads them. Must not outlive the store, nor be read while a block is written.
+/// Parameters of consecutive groups, borrowed.
 #[derive(Clone, Copy)]
-pub(crate) struct Packed {
-    values: Shared<Row>,
+pub(crate) struct ParameterView<'a> {
+    values: &'a [Lanes16],
+    /// The group that `values` begin with.
+    first_group: usize,
+    /// Of the whole store.
     rows: usize,
     sh_coeffs: usize,
-    attributes: usize,
 }
 
-/// The same, and all that a step changes. Each block must be one thread's.
-#[derive(Clone, Copy)]
-pub(crate) struct Writer {
-    pub packed: Packed,
-    pub first: Shared<Row>,
-    pub second: Shared<Row>,
-    pub units: Shared<Row>,
-    pub steps: Shared<u32>,
-}
-
-impl Packed {
+impl ParameterView<'_> {
     #[inline(always)]
-    pub fn index(&self, group: usize, attribute: usize) -> usize {
-        group * self.attributes + attribute
-    }
-
-    #[inline(always)]
-    pub fn get<F: Lanes>(&self, group: usize, attribute: usize) -> F {
-        // SAFETY: the store is borrowed by whoever made this, and its blocks cover all groups.
-        unsafe { F::load(&*self.values.at(self.index(group, attribute))) }
+    fn get<F: Lanes>(&self, group: usize, attribute: usize) -> F {
+        let attributes = SH + 3 * self.sh_coeffs;
+        F::load(&self.values[(group - self.first_group) * attributes + attribute])
     }
 
     #[inline(always)]
     pub fn log_scale<F: Lanes>(&self, group: usize, axis: usize) -> F {
         self.get(group, LOG_SCALE + axis)
     }
+}
 
+/// A store while threads step it, each its own blocks.
+#[derive(Clone, Copy)]
+pub(crate) struct Blocks<'a> {
+    values: DisjointSlice<Lanes16>,
+    first: DisjointSlice<Lanes16>,
+    second: DisjointSlice<Lanes16>,
+    steps: DisjointSlice<u32>,
+    units: &'a [Lanes16],
+    pub rows: usize,
+    sh_coeffs: usize,
+}
+
+/// One group's parameters, moments and counts of steps.
+pub(crate) struct Block<'a> {
+    pub group: usize,
+    /// Attribute after attribute.
+    pub values: &'a mut [Lanes16],
+    pub first: &'a mut [Lanes16],
+    pub second: &'a mut [Lanes16],
+    /// Of each lane.
+    pub steps: &'a mut [u32],
+    /// What the rate of the means is multiplied by.
+    pub units: &'a Lanes16,
+    rows: usize,
+    pub sh_coeffs: usize,
+}
+
+impl<'a> Blocks<'a> {
+    /// # Safety
+    /// `group` is one of the store's, and no other block of the group exists.
     #[inline(always)]
-    pub fn set<F: Lanes>(&self, group: usize, attribute: usize, value: F) {
-        // SAFETY: as above, and the group is this thread's.
-        unsafe { value.store(&mut *self.values.at(self.index(group, attribute))) }
+    pub unsafe fn block(&self, group: usize) -> Block<'a> {
+        let attributes = SH + 3 * self.sh_coeffs;
+        let at = group * attributes;
+        // SAFETY: the store is borrowed for 'a, its arrays hold `attributes` registers and sixteen counts of every
+        // group, and the caller promises that the group's are not borrowed elsewhere.
+        unsafe {
+            Block {
+                group,
+                values: self.values.slice(at, attributes),
+                first: self.first.slice(at, attributes),
+                second: self.second.slice(at, attributes),
+                steps: self.steps.slice(group * LANES, LANES),
+                units: &self.units[group],
+                rows: self.rows,
+                sh_coeffs: self.sh_coeffs,
+            }
+        }
     }
 }
 
-impl Source for Packed {
+impl Block<'_> {
+    /// Its parameters, to be read.
+    #[inline(always)]
+    pub fn parameters(&self) -> ParameterView<'_> {
+        ParameterView {
+            values: self.values,
+            first_group: self.group,
+            rows: self.rows,
+            sh_coeffs: self.sh_coeffs,
+        }
+    }
+}
+
+impl Source for ParameterView<'_> {
     #[inline(always)]
     fn len(&self) -> usize {
         self.rows

@@ -1,7 +1,7 @@
-//! Groups in batches that fit the device; while it computes one, the next is put together here.
+//! Groups in batches that fit the device; while it computes one, the next is assembled on the CPU.
 
 use g2ard_core::Control;
-use g2ard_core::backend::Group;
+use g2ard_core::simplify::Group;
 use rayon::prelude::*;
 
 use crate::rows::{Gather, Rows};
@@ -36,16 +36,16 @@ pub struct Found {
 /// Words that say where a group is.
 const SEGMENT: usize = 2;
 
-/// More rows than this would keep one thread busy while all others wait: such groups are rare, and the CPU's.
+/// More rows than this would keep one thread busy while all others are idle: such groups are rare and go to the CPU.
 const LARGEST: usize = 1024;
 
 /// Rounds of loops that a row takes at most, all fits without a row of leverage 1 counted.
 const ROUNDS: usize = 375;
 
-/// Rows of a batch: enough to fill a device, few enough that drivers do not lose patience.
+/// Rows of a batch: enough to fill a device, few enough that drivers do not time out.
 const ROWS: usize = 1 << 19;
 
-/// Groups that are put together between two looks at the control, and by one task.
+/// Groups that are put together between two checks of the control, and by one task.
 const CHUNK: usize = 1 << 14;
 const TASK: usize = 256;
 
@@ -83,7 +83,7 @@ pub fn run(
         answers: vec![0; count * twin.answer],
         large: Vec::new(),
     };
-    let (mut batch, mut flight) = (Batch::default(), None);
+    let (mut batch, mut submitted) = (Batch::default(), None);
     for first in (0..count).step_by(CHUNK) {
         control.check()?;
         let ids: Vec<usize> = (first..count.min(first + CHUNK)).collect();
@@ -97,15 +97,15 @@ pub fn run(
             for segment in part.groups {
                 let to = from + segment.count as usize;
                 if batch.rows.len() + to - from > most_rows || batch.groups.len() == most_groups {
-                    batch.start(gpu, twin, source, &mut flight, &mut found)?;
+                    batch.start(gpu, twin, source, &mut submitted, &mut found)?;
                 }
                 batch.push(segment.id, segment.own, &part.rows[from..to]);
                 from = to;
             }
         }
     }
-    batch.start(gpu, twin, source, &mut flight, &mut found)?;
-    land(twin, &mut flight, &mut found)?;
+    batch.start(gpu, twin, source, &mut submitted, &mut found)?;
+    finish(twin, &mut submitted, &mut found)?;
     Ok(found)
 }
 
@@ -124,8 +124,8 @@ fn part(ids: &[usize], largest: usize, group: &Group<'_>) -> (Batch, Vec<usize>)
     (batch, large)
 }
 
-/// A batch on the device, and whose answers it will leave.
-type Flight<'a> = Option<(Vec<usize>, Pending<'a>)>;
+/// A submitted batch, and the groups whose results it holds.
+type Submitted<'a> = Option<(Vec<usize>, Pending<'a>)>;
 
 impl Batch {
     fn push(&mut self, id: usize, own: u32, rows: &[u32]) {
@@ -138,13 +138,13 @@ impl Batch {
         self.rows.extend_from_slice(rows);
     }
 
-    /// Sends the batch off and takes in the one before.
+    /// Submits the batch and reads the results of the one before.
     fn start<'a>(
         &mut self,
         gpu: &'a Gpu,
         twin: &Twin,
         source: Source<'_>,
-        flight: &mut Flight<'a>,
+        submitted: &mut Submitted<'a>,
         found: &mut Found,
     ) -> Result<()> {
         let Self { rows, mut groups } = std::mem::take(self);
@@ -173,15 +173,15 @@ impl Batch {
             &buffers,
         )?;
         let pending = work.submit(&[(&answers, groups.len() * twin.answer)])?;
-        land(twin, flight, found)?;
-        *flight = Some((groups.iter().map(|g| g.id).collect(), pending));
+        finish(twin, submitted, found)?;
+        *submitted = Some((groups.iter().map(|g| g.id).collect(), pending));
         Ok(())
     }
 }
 
-/// Takes in what a batch left.
-fn land(twin: &Twin, flight: &mut Flight<'_>, found: &mut Found) -> Result<()> {
-    let Some((ids, pending)) = flight.take() else {
+/// Reads the results of a batch.
+fn finish(twin: &Twin, submitted: &mut Submitted<'_>, found: &mut Found) -> Result<()> {
+    let Some((ids, pending)) = submitted.take() else {
         return Ok(());
     };
     let words = pending.take()?;

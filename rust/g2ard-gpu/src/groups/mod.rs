@@ -2,13 +2,13 @@
 
 mod batch;
 
-use g2ard_core::backend::{Group, Numbered, Run};
 use g2ard_core::linalg::Mat3;
-use g2ard_core::simplify::{Gaussian, Merged, disc, weights};
+use g2ard_core::scene::Gaussian;
+use g2ard_core::simplify::{Group, GroupKernels, Merged, disc, weights};
 use g2ard_core::{Control, Cpu};
 use rayon::prelude::*;
 
-use crate::rows::{COLORED, Rows, WEIGHED};
+use crate::rows::{COLORED, Numbered, Rows, WEIGHED};
 use crate::runtime::{Gpu, Kernel, Result};
 use crate::soft64::{LINEAR, SOFT64};
 use batch::{Source, Twin, run};
@@ -35,7 +35,7 @@ const MERGE: Twin = Twin {
     answer: 32,
 };
 
-/// See [`Run::energies`].
+/// See [`GroupKernels::energies`].
 pub fn energies(
     gpu: &Gpu,
     held: &Rows,
@@ -54,12 +54,12 @@ pub fn energies(
     let mut energies: Vec<f64> = bytemuck::pod_collect_to_vec(&found.answers);
     let large = &found.large;
     let again = |at: usize, rows: &mut Vec<u32>| group(large[at], rows);
-    let rest = Cpu.energies(rows, large.len(), &again, control)?;
+    let rest = Cpu.energies(rows.splats, large.len(), &again, control)?;
     large.iter().zip(rest).for_each(|(&g, e)| energies[g] = e);
     Ok(energies)
 }
 
-/// See [`Run::merges`]. Opacity and SH are averaged here: to send a row's 180 bytes of SH to a device takes
+/// See [`GroupKernels::merges`]. Opacity and SH are averaged here: to send a row's 180 bytes of SH to a device takes
 /// longer than to add them up.
 pub fn merges(
     gpu: &Gpu,
@@ -97,7 +97,7 @@ pub fn merges(
         })
         .collect();
     let large: Vec<&[u32]> = found.large.iter().map(|&g| groups[g]).collect();
-    let rest = Cpu.merges(rows, &large, support, control)?;
+    let rest = Cpu.merges(rows.splats, &large, support, control)?;
     found
         .large
         .iter()
@@ -123,11 +123,15 @@ mod tests {
     use crate::runtime::Options;
     use crate::testing::{gpu, gpu_with, scenes, share};
     use g2ard_core::Splats;
-    use g2ard_core::spatial::{Cells, Frame};
+    use g2ard_core::spatial::{Cells, RobustBounds};
 
     /// Groups of a few rows and of many, with and without borrowed ones.
     fn cells_of(splats: &Splats) -> Cells {
-        Cells::adaptive(&splats.means, &Frame::of(&splats.means), splats.len() / 6)
+        Cells::adaptive(
+            &splats.means,
+            &RobustBounds::of(&splats.means),
+            splats.len() / 6,
+        )
     }
 
     fn compare(gpu: &Gpu, what: &str) {
@@ -155,7 +159,7 @@ mod tests {
             let mut held = Rows::default();
             held.follow(gpu, numbered).unwrap();
             let count = cells.len() + 9;
-            let want = Cpu.energies(numbered, count, &own, &control).unwrap();
+            let want = Cpu.energies(&splats, count, &own, &control).unwrap();
             let got = energies(gpu, &held, numbered, count, &own, &control).unwrap();
             let bits = |v: &[f64]| v.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
             let energy = share(&bits(&want), &bits(&got));
@@ -163,7 +167,7 @@ mod tests {
             let rows: Vec<u32> = (0..splats.len() as u32).collect();
             groups.extend(rows.chunks(700)); // of every size up to those that are left to the CPU
             groups.extend(rows[..splats.len().min(900)].chunks(125));
-            let want = Cpu.merges(numbered, &groups, 3.0, &control).unwrap();
+            let want = Cpu.merges(&splats, &groups, 3.0, &control).unwrap();
             let got = merges(gpu, &held, numbered, &groups, 3.0, &control).unwrap();
             let merge = share(&want, &got);
             eprintln!(

@@ -1,7 +1,7 @@
 // Members of groups, in the order of their groups: a thread takes one, and copies its row if this piece of the rows
 // holds it. `points` for cells; `colored` for energy.wgsl; `weighed` for merge.wgsl.
 
-struct Look {
+struct Attributes {
     mass: F64,
     color: array<u32, 3>, // SH of band 0; bits of f32, as the others
     scales: array<u32, 3>,
@@ -29,7 +29,7 @@ struct Piece {
 
 @group(0) @binding(0) var<uniform> piece: Piece;
 @group(0) @binding(1) var<storage, read> means: array<array<F64, 3>>;
-@group(0) @binding(2) var<storage, read> looks: array<Look>;
+@group(0) @binding(2) var<storage, read> attributes: array<Attributes>;
 @group(0) @binding(3) var<storage, read> numbers: array<u32>;
 @group(0) @binding(4) var<storage, read_write> points: array<array<F64, 3>>;
 @group(0) @binding(5) var<storage, read_write> colored: array<Colored>;
@@ -60,7 +60,7 @@ fn gather_colored(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_wor
     if at == ELSEWHERE { return; }
     colored[i].mean = means[at];
     for (var k = 0; k < 3; k++) {
-        let c = add(HALF, mul(SH_C0, widen(looks[at].color[k])));
+        let c = add(HALF, mul(SH_C0, widen(attributes[at].color[k])));
         colored[i].color[k] = select(select(c, ZERO, lt(c, ZERO)), ONE, lt(ONE, c));
     }
 }
@@ -70,6 +70,6 @@ fn gather_weighed(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_wor
     let i = thread_of(id, groups, 64u);
     let at = place(i);
     if at == ELSEWHERE { return; }
-    let l = looks[at];
+    let l = attributes[at];
     weighed[i] = Weighed(means[at], l.mass, l.quat, l.scales, 0u);
 }

@@ -1,9 +1,8 @@
-//! The rows of a run on the device. Each is sent once, when it comes into being, and found by its number ever after;
-//! groups are sent as the numbers of their members, whose rows are then brought together there.
+//! The rows of a run on the device. A row is uploaded once, when it is made, and addressed by its number from then on;
+//! groups are sent as the numbers of their members, whose rows are gathered on the device.
 
 use g2ard_core::Splats;
-use g2ard_core::backend::Numbered;
-use g2ard_core::simplify::optical_mass;
+use g2ard_core::simplify::{GONE, optical_mass};
 use rayon::prelude::*;
 
 use crate::runtime::{Buffer, Gpu, Kernel, Result, Work};
@@ -11,11 +10,11 @@ use crate::soft64::SOFT64;
 
 const SOURCES: &[&str] = &[SOFT64, include_str!("gather.wgsl")];
 
-/// A kernel that brings rows together in some form.
+/// A kernel that gathers rows in some form.
 pub struct Gather {
     kernel: Kernel,
     /// Whether it reads more than means.
-    looks: bool,
+    reads_attributes: bool,
     binding: u32,
     /// Words of a member.
     pub words: usize,
@@ -27,7 +26,7 @@ pub const POINTS: Gather = Gather {
         sources: SOURCES,
         entry: "gather_points",
     },
-    looks: false,
+    reads_attributes: false,
     binding: 4,
     words: MEAN,
 };
@@ -37,7 +36,7 @@ pub const COLORED: Gather = Gather {
         sources: SOURCES,
         entry: "gather_colored",
     },
-    looks: true,
+    reads_attributes: true,
     binding: 5,
     words: 12,
 };
@@ -47,15 +46,53 @@ pub const WEIGHED: Gather = Gather {
         sources: SOURCES,
         entry: "gather_weighed",
     },
-    looks: true,
+    reads_attributes: true,
     binding: 6,
     words: 16,
 };
 
-/// Words of a mean, and of the rest of a row.
+/// Words of a mean, and of the other attributes of a row.
 const MEAN: usize = 6;
-const LOOK: usize = 12;
+const ATTRIBUTES: usize = 12;
 const THREADS: usize = 64;
+
+/// Rows with the numbers that the device knows them by.
+#[derive(Debug, Clone, Copy)]
+pub struct Numbered<'a> {
+    pub splats: &'a Splats,
+    pub numbers: &'a [u32],
+}
+
+/// The numbers of the rows of a run: every row that is made gets the next, and a copy keeps its own.
+#[derive(Debug, Default)]
+pub struct Numbers {
+    of_row: Vec<u32>,
+    next: u32,
+}
+
+impl Numbers {
+    /// The numbers of `count` rows: 0 … count − 1 before the first round.
+    pub fn of(&mut self, count: usize) -> &[u32] {
+        if self.next == 0 {
+            self.of_row = (0..count as u32).collect();
+            self.next = count as u32;
+        }
+        debug_assert_eq!(self.of_row.len(), count, "rows changed without a word");
+        &self.of_row
+    }
+
+    /// See [`g2ard_core::simplify::GroupKernels::rows_replaced`].
+    pub fn replace(&mut self, copied: &[u32]) {
+        let number = |&source: &u32| {
+            if source != GONE {
+                return self.of_row[source as usize];
+            }
+            self.next += 1;
+            self.next - 1
+        };
+        self.of_row = copied.iter().map(number).collect();
+    }
+}
 
 /// Rows that the device has, in pieces that each fit into a buffer.
 #[derive(Debug, Default)]
@@ -69,11 +106,11 @@ struct Piece {
     first: usize,
     count: usize,
     means: Buffer,
-    looks: Buffer,
+    attributes: Buffer,
 }
 
 impl Rows {
-    /// Sends the rows that are new: those whose numbers follow on the last.
+    /// Uploads the rows that are new: those whose numbers follow on the last.
     pub fn follow(&mut self, gpu: &Gpu, rows: Numbered<'_>) -> Result<()> {
         let known = self.count as u32;
         let fresh: Vec<u32> = (0..rows.numbers.len() as u32)
@@ -88,10 +125,10 @@ impl Rows {
         );
         let mut first = self.count;
         let mut pieces = Vec::new();
-        for part in fresh.chunks((gpu.max_words() / LOOK).max(1)) {
-            let looks: Vec<_> = part
+        for part in fresh.chunks((gpu.max_words() / ATTRIBUTES).max(1)) {
+            let attributes: Vec<_> = part
                 .par_iter()
-                .map(|&i| look(rows.splats, i as usize))
+                .map(|&i| attributes(rows.splats, i as usize))
                 .collect();
             let means: Vec<_> = part
                 .iter()
@@ -101,7 +138,7 @@ impl Rows {
                 first,
                 count: part.len(),
                 means: gpu.upload("means", &means)?,
-                looks: gpu.upload("rows", &looks)?,
+                attributes: gpu.upload("rows", &attributes)?,
             });
             first += part.len();
         }
@@ -134,8 +171,8 @@ impl Rows {
                 0,
             ];
             let mut bound = vec![(1, &piece.means), (3, &order), (how.binding, &members)];
-            if how.looks {
-                bound.push((2, &piece.looks));
+            if how.reads_attributes {
+                bound.push((2, &piece.attributes));
             }
             let groups = numbers.len().div_ceil(THREADS);
             work.run_at(&how.kernel, groups, &constants, &bound)?;
@@ -144,8 +181,8 @@ impl Rows {
     }
 }
 
-/// `Look` of gather.wgsl.
-fn look(splats: &Splats, i: usize) -> [u32; LOOK] {
+/// `Attributes` of gather.wgsl.
+fn attributes(splats: &Splats, i: usize) -> [u32; ATTRIBUTES] {
     let mass = optical_mass(
         f64::from(splats.logit_opacities[i]),
         splats.scales[i].map(f64::from),
@@ -160,6 +197,16 @@ fn look(splats: &Splats, i: usize) -> [u32; LOOK] {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn copies_keep_their_numbers_and_new_rows_get_new_ones() {
+        let mut numbers = Numbers::default();
+        assert_eq!(numbers.of(4), [0, 1, 2, 3]);
+        numbers.replace(&[GONE, 3, GONE]);
+        assert_eq!(numbers.of(3), [4, 3, 5]);
+        numbers.replace(&[2, GONE]);
+        assert_eq!(numbers.of(2), [5, 6]);
+    }
     use crate::runtime::Options;
     use crate::testing::{gpu_with, scenes};
     use g2ard_core::simplify::{color, weights};
@@ -197,7 +244,7 @@ mod tests {
                 held.follow(&gpu, Numbered { splats, numbers }).unwrap();
                 (gpu.sent() - before) as usize
             };
-            let bytes = 4 * (MEAN + LOOK);
+            let bytes = 4 * (MEAN + ATTRIBUTES);
             let first: Vec<usize> = (0..700).collect();
             let numbers: Vec<u32> = (0..700).collect();
             let splats = some(&scene, &first);

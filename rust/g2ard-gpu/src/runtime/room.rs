@@ -1,5 +1,5 @@
 //! Address space that the process may still take. Where it is limited (`ulimit -v`) and runs out, drivers do not
-//! report it: they end the process. So what they need is looked for before.
+//! report it: they end the process. So the memory they need is checked before.
 
 use std::fs::read_to_string;
 use std::num::NonZero;

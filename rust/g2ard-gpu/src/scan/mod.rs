@@ -31,12 +31,13 @@ pub fn exclusive(gpu: &Gpu, work: &mut Work, values: &Buffer, count: usize) -> R
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{Random, gpu};
+    use crate::testing::gpu;
+    use g2ard_core::random::Lcg;
 
     #[test]
     fn sums_what_came_before() {
         let Some(gpu) = gpu("scan") else { return };
-        let mut random = Random::new(1);
+        let mut random = Lcg(1);
         for count in [0usize, 1, 1023, 1024, 1025, 300_000, 1_100_000] {
             let values: Vec<u32> = (0..count).map(|_| random.below(1000) as u32).collect();
             let buffer = gpu.upload("values", &values).unwrap();

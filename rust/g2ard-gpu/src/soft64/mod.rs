@@ -7,8 +7,9 @@ pub const LINEAR: &str = include_str!("linear.wgsl");
 mod tests {
     use super::*;
     use crate::runtime::{Gpu, Kernel, Work};
-    use crate::testing::{Random, gpu};
+    use crate::testing::gpu;
     use g2ard_core::linalg::symmetric_eigen;
+    use g2ard_core::random::Lcg;
 
     const OPERATIONS: &str = r"
         @group(0) @binding(1) var<storage, read> pairs: array<vec4<u32>>;
@@ -56,11 +57,11 @@ mod tests {
 
     /// Numbers whose sums cancel, whose products round both ways, and zeros of both signs.
     fn odd_numbers(count: usize) -> Vec<f64> {
-        let mut random = Random::new(3);
+        let mut random = Lcg(3);
         let mut numbers: Vec<f64> = (0..count)
             .map(|i| {
                 let wide = [0, 0, 3, 60, 400][i % 5];
-                let x = (random.unit() - 0.5)
+                let x = (random.uniform() - 0.5)
                     * 2f64.powi(random.below(2 * wide + 1) as i32 - wide as i32);
                 match i % 7 {
                     0 => f64::from_bits(x.to_bits() & !0x3fff_ffff),
@@ -134,20 +135,20 @@ mod tests {
             sources: &[SOFT64, LINEAR, EIGENS],
             entry: "each",
         };
-        let mut random = Random::new(5);
+        let mut random = Lcg(5);
         let mut matrices = vec![[0.0; 6], [1.0, 0.0, 0.0, 3.0, 0.0, 2.0], [1.0; 6]];
         for i in 0..3000 {
             let size = 2f64.powi(random.below(200) as i32 - 100);
             let flat = [1.0, 1e-4, 1e-9, 0.0][i % 4];
             let d = [
-                random.unit() - 0.5,
-                (random.unit() - 0.5) * flat,
-                (random.unit() - 0.5) * flat,
+                random.uniform() - 0.5,
+                (random.uniform() - 0.5) * flat,
+                (random.uniform() - 0.5) * flat,
             ];
             let e = [
-                random.unit() - 0.5,
-                random.unit() - 0.5,
-                (random.unit() - 0.5) * flat,
+                random.uniform() - 0.5,
+                random.uniform() - 0.5,
+                (random.uniform() - 0.5) * flat,
             ];
             let m = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)];
             matrices.push(m.map(|(i, j)| size * (d[i] * d[j] + e[i] * e[j])));

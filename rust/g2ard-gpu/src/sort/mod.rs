@@ -57,12 +57,13 @@ pub fn sort(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{Random, gpu};
+    use crate::testing::gpu;
+    use g2ard_core::random::Lcg;
 
     #[test]
     fn sorts_stably_by_the_bits_asked_for() {
         let Some(gpu) = gpu("sort") else { return };
-        let mut random = Random::new(2);
+        let mut random = Lcg(2);
         for (count, kinds, bits) in [
             (1usize, 1u64, 0..64),
             (1000, 7, 0..64),

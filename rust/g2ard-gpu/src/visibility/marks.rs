@@ -10,15 +10,15 @@ use super::{BLOCK, FAR, SPLAT};
 use crate::runtime::{Buffer, Error, Kernel, Pending, Result, Work};
 use crate::scan;
 
-pub const LOOK: &[&str] = &[include_str!("pinhole.wgsl"), include_str!("look.wgsl")];
+pub const PROJECTION: &[&str] = &[include_str!("pinhole.wgsl"), include_str!("mark.wgsl")];
 const MARK: Kernel = Kernel {
-    name: "visibility.look",
-    sources: LOOK,
-    entry: "look",
+    name: "visibility.mark",
+    sources: PROJECTION,
+    entry: "mark",
 };
 const DEPTHS: Kernel = Kernel {
     name: "visibility.depths",
-    sources: LOOK,
+    sources: PROJECTION,
     entry: "depths",
 };
 

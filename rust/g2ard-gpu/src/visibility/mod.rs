@@ -16,7 +16,7 @@ mod view;
 
 use g2ard_core::Control;
 use g2ard_core::raster::Camera;
-use g2ard_core::select::{Gaussians, Pinhole, Surface, look_of};
+use g2ard_core::select::{Gaussians, Pinhole, Surface, statistics_of};
 
 use crate::runtime::{Buffer, Gpu, Pending, Result, Work};
 use cells::Cells;
@@ -31,20 +31,20 @@ const SPLAT: usize = 9;
 /// Beyond every depth.
 const FAR: u32 = f32::INFINITY.to_bits();
 
-/// See [`g2ard_core::select::looks`].
-pub fn looks(
+/// See [`g2ard_core::select::view_statistics`].
+pub fn view_statistics(
     gpu: &Gpu,
     scene: &Gaussians<'_>,
     cameras: &[Camera],
     control: &Control,
 ) -> Result<Vec<[f32; 2]>> {
     let scene = Scene::upload(gpu, scene)?;
-    let read = |words: &[u32]| look_of(bytemuck::cast_slice(words));
+    let read = |words: &[u32]| statistics_of(bytemuck::cast_slice(words));
     each(&scene, cameras, None, control, read)
 }
 
-/// See [`g2ard_core::select::visible`].
-pub fn visible(
+/// See [`g2ard_core::select::visible_cells`].
+pub fn visible_cells(
     gpu: &Gpu,
     scene: &Gaussians<'_>,
     surface: &Surface,

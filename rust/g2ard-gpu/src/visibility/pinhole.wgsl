@@ -9,7 +9,7 @@ struct View {
     near: f32,
     count: u32, // rows or cells there are
     first: u32, // of this piece's rows among all
-    start: u32, // depths looked at, as bits: start … end − 1
+    start: u32, // range of depths, as bits: start … end − 1
     end: u32,
     cell: f32, // edge of a cell
 }

@@ -1,6 +1,6 @@
 //! Gaussians on the device, in pieces, for all views.
 
-use g2ard_core::select::{Gaussians, Opaque, Row};
+use g2ard_core::select::{Gaussians, Occluder, Occluders};
 
 use super::BLOCK;
 use crate::runtime::{Buffer, Gpu, Result};
@@ -17,12 +17,12 @@ pub struct Scene<'a> {
 
 impl<'a> Scene<'a> {
     pub fn upload(gpu: &'a Gpu, scene: &Gaussians<'_>) -> Result<Self> {
-        let opaque = Opaque::of(scene);
+        let occluders = Occluders::of(scene);
         let piece = (gpu.max_words() / ROW / BLOCK).max(1) * BLOCK;
         Ok(Self {
             gpu,
-            count: opaque.rows.len(),
-            pieces: opaque
+            count: occluders.rows.len(),
+            pieces: occluders
                 .rows
                 .chunks(piece)
                 .map(|rows| gpu.upload("rows", &rows.iter().map(words_of).collect::<Vec<_>>()))
@@ -41,7 +41,7 @@ impl<'a> Scene<'a> {
     }
 }
 
-fn words_of(row: &Row) -> [u32; ROW] {
+fn words_of(row: &Occluder) -> [u32; ROW] {
     let mut words = [0; ROW];
     let numbers = row.mean.iter().chain([&row.opacity]);
     let numbers = numbers

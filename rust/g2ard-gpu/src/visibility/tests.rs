@@ -1,9 +1,10 @@
 use super::*;
 use crate::runtime::{Error, Options};
 use crate::testing::{gpu, gpu_with, scenes};
-use g2ard_core::{Backend, Cpu};
+use g2ard_core::Cpu;
+use g2ard_core::select::ViewKernels;
 
-/// Looks from all around, from within, and from far away.
+/// Cameras all around, within, and far away.
 fn cameras(center: [f64; 3], radius: f64) -> Vec<Camera> {
     (0..6)
         .map(|i| {
@@ -53,8 +54,10 @@ fn compare(gpu: &Gpu, what: &str) {
         };
         let surface = Surface::of(&scene, 2000, &Cpu).unwrap();
         let cameras = cameras(center, radius);
-        let want = Cpu.visible(&scene, &surface, &cameras, &control).unwrap();
-        let got = visible(gpu, &scene, &surface, &cameras, &control);
+        let want = Cpu
+            .visible_cells(&scene, &surface, &cameras, &control)
+            .unwrap();
+        let got = visible_cells(gpu, &scene, &surface, &cameras, &control);
         if name == "identical" && matches!(got, Err(Error::TooMany { .. })) {
             continue; // no slab is thin enough: the CPU's
         }
@@ -73,8 +76,8 @@ fn compare(gpu: &Gpu, what: &str) {
         eprintln!("{what} {name}: {equal} of {cells} cells alike, {seen} of them seen");
         same += equal;
         all += cells;
-        let want = Cpu.looks(&scene, &cameras, &control).unwrap();
-        let got = looks(gpu, &scene, &cameras, &control).unwrap();
+        let want = Cpu.view_statistics(&scene, &cameras, &control).unwrap();
+        let got = view_statistics(gpu, &scene, &cameras, &control).unwrap();
         for (a, b) in want.iter().zip(&got) {
             let close = |k: usize| (a[k] - b[k]).abs() <= 1e-4 * a[k].abs();
             assert!(close(0) && close(1), "{name}: {a:?} {b:?}");
@@ -138,9 +141,12 @@ fn a_crowded_tile_is_drawn_to_its_end() {
         near: 0.01,
     };
     let control = Control::default();
-    let want = Cpu.looks(&scene, &[camera], &control).unwrap();
+    let want = Cpu.view_statistics(&scene, &[camera], &control).unwrap();
     assert_eq!(want, [[1.0, 2.0]]);
-    assert_eq!(looks(&gpu, &scene, &[camera], &control).unwrap(), want);
+    assert_eq!(
+        view_statistics(&gpu, &scene, &[camera], &control).unwrap(),
+        want
+    );
 }
 
 #[test]
@@ -156,6 +162,6 @@ fn the_same_twice() {
         opacities: &vec![0.4; splats.len()],
     };
     let cameras = cameras([0.0; 3], 5.0);
-    let look = || looks(&gpu, &scene, &cameras, &Control::default()).unwrap();
+    let look = || view_statistics(&gpu, &scene, &cameras, &Control::default()).unwrap();
     assert_eq!(look(), look());
 }

@@ -2,7 +2,7 @@
 
 use g2ard_core::select::Pinhole;
 
-use super::marks::{LOOK, Marks};
+use super::marks::{Marks, PROJECTION};
 use super::scene::Scene;
 use super::view::Constants;
 use super::{BLOCK, SPLAT, THREADS};
@@ -12,7 +12,7 @@ use crate::sort::{Keyed, sort};
 
 const GATHER: Kernel = Kernel {
     name: "visibility.gather",
-    sources: LOOK,
+    sources: PROJECTION,
     entry: "gather",
 };
 const TILES: &[&str] = &[include_str!("pinhole.wgsl"), include_str!("tiles.wgsl")];

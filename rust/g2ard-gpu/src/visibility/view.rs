@@ -32,7 +32,7 @@ pub struct Constants<'a> {
     pub count: usize,
     /// The first of them among all.
     pub first: usize,
-    /// Depths looked at, as bits; or pairs of splat and tile.
+    /// The range of depths, as bits; or of pairs of splat and tile.
     pub range: Range<u32>,
     /// Edge of a cell.
     pub cell: f32,

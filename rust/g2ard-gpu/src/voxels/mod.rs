@@ -1,12 +1,12 @@
 //! Twin of `g2ard_core::spatial::Cells::adaptive`: the same cells, bit for bit.
 
-use g2ard_core::backend::Numbered;
+use g2ard_core::simplify::means_of;
 use g2ard_core::spatial::{
-    BITS, Cells, Frame, OCTAVES, first_apart, octave_counts, search_size, unit,
+    BITS, Cells, OCTAVES, RobustBounds, first_apart, octave_counts, search_size, unit,
 };
 use rayon::prelude::*;
 
-use crate::rows::{POINTS, Rows};
+use crate::rows::{Numbered, POINTS, Rows};
 use crate::runtime::{Buffer, Gpu, Kernel, Result, Work};
 use crate::soft64::SOFT64;
 use crate::sort::{Keyed, sort};
@@ -46,15 +46,20 @@ const KEY: usize = 2;
 const OUTSIDE: u64 = u64::MAX;
 
 /// See [`Cells::adaptive`].
-pub fn adaptive(gpu: &Gpu, points: &[[f64; 3]], frame: &Frame, target: usize) -> Result<Cells> {
+pub fn adaptive(
+    gpu: &Gpu,
+    points: &[[f64; 3]],
+    bounds: &RobustBounds,
+    target: usize,
+) -> Result<Cells> {
     let pieces = points
         .chunks(most_points(gpu))
         .map(|piece| gpu.upload("positions", piece));
     let pieces = pieces.collect::<Result<_>>()?;
-    cells(gpu, pieces, points, frame, target)
+    cells(gpu, pieces, points, bounds, target)
 }
 
-/// See [`Run::cells`](g2ard_core::backend::Run::cells).
+/// See [`g2ard_core::simplify::GroupKernels::cells`].
 pub fn of_rows(
     gpu: &Gpu,
     held: &Rows,
@@ -62,7 +67,7 @@ pub fn of_rows(
     kept: &[u32],
     target: usize,
 ) -> Result<Cells> {
-    let points = rows.points(kept);
+    let points = means_of(rows.splats, kept);
     let numbers: Vec<u32> = kept.iter().map(|&i| rows.numbers[i as usize]).collect();
     let pieces = match held.all_means(&numbers) {
         Some(pieces) => pieces,
@@ -76,7 +81,7 @@ pub fn of_rows(
             pieces
         }
     };
-    cells(gpu, pieces, &points, &Frame::of(&points), target)
+    cells(gpu, pieces, &points, &RobustBounds::of(&points), target)
 }
 
 /// Points that one buffer may hold.
@@ -89,23 +94,23 @@ fn cells(
     gpu: &Gpu,
     pieces: Vec<Buffer>,
     points: &[[f64; 3]],
-    frame: &Frame,
+    bounds: &RobustBounds,
     target: usize,
 ) -> Result<Cells> {
     if points.is_empty() {
-        return Ok(Cells::with_size(points, frame, frame.radius));
+        return Ok(Cells::with_size(points, bounds, bounds.radius));
     }
-    let lattice = Lattice::new(gpu, pieces, points, *frame);
+    let lattice = Lattice::new(gpu, pieces, points, *bounds);
     let octaves = octave_counts(&lattice.apart()?);
-    let size = search_size(frame, &octaves, target, |size| lattice.count(size))?;
+    let size = search_size(bounds, &octaves, target, |size| lattice.count(size))?;
     lattice.cells(size)
 }
 
 /// Positions on the device: in runs of rows whose keys fit into one buffer, each run in pieces that do.
 struct Lattice<'a> {
     gpu: &'a Gpu,
-    frame: Frame,
-    /// The largest coordinate from the lattice's corner; floaters lie beyond the frame.
+    bounds: RobustBounds,
+    /// The largest coordinate from the lattice's corner; floaters lie beyond the bounds.
     reach: f64,
     runs: Vec<Run>,
 }
@@ -118,7 +123,7 @@ struct Run {
 }
 
 impl<'a> Lattice<'a> {
-    fn new(gpu: &'a Gpu, pieces: Vec<Buffer>, points: &[[f64; 3]], frame: Frame) -> Self {
+    fn new(gpu: &'a Gpu, pieces: Vec<Buffer>, points: &[[f64; 3]], bounds: RobustBounds) -> Self {
         let mut runs: Vec<Run> = Vec::new();
         let mut first = 0;
         for piece in pieces {
@@ -137,12 +142,12 @@ impl<'a> Lattice<'a> {
             first += count;
         }
         let reach = |p: &[f64; 3]| {
-            let from_corner = [0, 1, 2].map(|k| p[k] - frame.origin[k] + frame.radius);
+            let from_corner = [0, 1, 2].map(|k| p[k] - bounds.origin[k] + bounds.radius);
             from_corner.into_iter().fold(0.0, f64::max)
         };
         Self {
             gpu,
-            frame,
+            bounds,
             reach: points.par_iter().map(reach).reduce(|| 0.0, f64::max),
             runs,
         }
@@ -154,8 +159,8 @@ impl<'a> Lattice<'a> {
         let mut first = 0;
         for piece in &run.pieces {
             let rows = piece.words() / POINT;
-            let [x, y, z] = self.frame.origin;
-            let mut lattice = words(&[x, y, z, self.frame.radius, size]);
+            let [x, y, z] = self.bounds.origin;
+            let mut lattice = words(&[x, y, z, self.bounds.radius, size]);
             lattice.extend([first as u32, rows as u32, u32::from(clamped), u32::MAX]);
             let buffers = [piece, &keyed.keys, &keyed.words];
             work.run(&KEYS, rows.div_ceil(THREADS), &lattice, &buffers)?;
@@ -172,7 +177,7 @@ impl<'a> Lattice<'a> {
 
     /// How many neighbours in Morton order first fall apart at each octave.
     fn apart(&self) -> Result<[usize; OCTAVES]> {
-        let size = unit(&self.frame);
+        let size = unit(&self.bounds);
         let mut apart = [0; OCTAVES];
         if let [run] = &self.runs[..] {
             let mut work = Work::new(self.gpu);
@@ -301,10 +306,10 @@ mod tests {
     fn compare(gpu: &Gpu, what: &str) {
         for (name, splats) in scenes(12_000) {
             let points = &splats.means;
-            let frame = Frame::of(points);
+            let bounds = RobustBounds::of(points);
             for target in [1, 3000] {
-                let want = Cells::adaptive(points, &frame, target);
-                let got = adaptive(gpu, points, &frame, target).unwrap();
+                let want = Cells::adaptive(points, &bounds, target);
+                let got = adaptive(gpu, points, &bounds, target).unwrap();
                 let ids = |cells: &Cells| {
                     let mut ids = vec![0; points.len()];
                     for c in 0..cells.len() {

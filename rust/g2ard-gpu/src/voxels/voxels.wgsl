@@ -1,5 +1,5 @@
 // Cells of one size. `keys`: a thread finds the Morton code of a row's cell, in double precision throughout.
-// `octaves` and `edges` look at neighbours in sorted order; `compact` lists where each cell begins.
+// `octaves` and `edges` compare neighbours in sorted order; `compact` lists where each cell begins.
 
 struct Lattice {
     origin: array<vec4<u32>, 2>, // x, y; z, radius: as F64

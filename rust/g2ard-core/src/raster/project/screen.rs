@@ -1,13 +1,13 @@
 //! A chunk of Gaussians' splats, written out.
 
 use super::{Projected, Splat, View, colour, direction, project};
-use crate::raster::covers::{Cover, Ellipses, Lister};
 use crate::raster::params::Source;
-use crate::raster::simd::{Kernel, LANES, Lanes, Mask, Row, Wide};
+use crate::raster::simd::{Kernel, LANES, Lanes, Lanes16, Mask, Wide};
+use crate::raster::tile_lists::{Ellipses, TileIntersector, TileList};
 use crate::raster::{ALPHA_MIN, Convention, sh};
 
 /// Projects the groups `first..last`; visible splats go to the front of `out` in row order, each with
-/// its cover. Returns how many.
+/// its tile_list. Returns how many.
 pub struct Project<'a, S: Source> {
     pub view: &'a View,
     pub source: S,
@@ -15,8 +15,8 @@ pub struct Project<'a, S: Source> {
     pub last: usize,
     pub tiles: (usize, usize),
     pub out: &'a mut [Splat],
-    pub covers: &'a mut [Cover],
-    pub lister: &'a mut Lister,
+    pub tile_lists: &'a mut [TileList],
+    pub intersector: &'a mut TileIntersector,
 }
 
 impl<S: Source> Kernel for Project<'_, S> {
@@ -25,7 +25,7 @@ impl<S: Source> Kernel for Project<'_, S> {
     #[inline(always)]
     fn run<F: Lanes>(self) -> usize {
         let mut count = 0;
-        self.lister.clear();
+        self.intersector.clear();
         for group in self.first..self.last {
             let p = project::<F, S>(self.view, &self.source, group);
             let rows = (self.source.len() - group * LANES).min(LANES);
@@ -34,17 +34,20 @@ impl<S: Source> Kernel for Project<'_, S> {
                 continue;
             }
             let some = count + bits.count_ones() as usize;
-            let covers = &mut self.covers[count..some];
+            let tile_lists = &mut self.tile_lists[count..some];
             p.ellipses(self.view)
-                .covers(bits, self.tiles, self.lister, covers);
-            let (dir, _) = direction::<F, S>(self.view, &self.source, group);
-            let mut basis = [F::zero(); 16];
-            sh::basis(self.source.sh_coeffs(), dir[0], dir[1], dir[2], &mut basis);
-            let rgb = colour::<F, S>(&self.source, group, &basis);
+                .tile_lists(bits, self.tiles, self.intersector, tile_lists);
+            let mut rgb = [F::zero(); 3];
+            if S::COLOURED {
+                let (dir, _) = direction::<F, S>(self.view, &self.source, group);
+                let mut basis = [F::zero(); 16];
+                sh::basis(self.source.sh_coeffs(), dir[0], dir[1], dir[2], &mut basis);
+                rgb = colour::<F, S>(&self.source, group, &basis);
+            }
             let (mut x, mut y) = ([0.0; LANES], [0.0; LANES]);
             p.x.store(&mut x);
             p.y.store(&mut y);
-            let mut rows = [Row::default(); 8];
+            let mut rows = [Lanes16::default(); 8];
             let values = [
                 p.a,
                 p.b,
@@ -59,7 +62,7 @@ impl<S: Source> Kernel for Project<'_, S> {
                 values[k].store(&mut rows[k]);
             }
             let mut todo = bits;
-            for (splat, cover) in self.out[count..some].iter_mut().zip(covers) {
+            for (splat, tile_list) in self.out[count..some].iter_mut().zip(tile_lists) {
                 let l = todo.trailing_zeros() as usize;
                 todo &= todo - 1;
                 *splat = Splat {
@@ -72,8 +75,8 @@ impl<S: Source> Kernel for Project<'_, S> {
                     rgb: [rows[4].0[l], rows[5].0[l], rows[6].0[l]],
                     depth: rows[7].0[l],
                     row: (group * LANES + l) as u32,
-                    tiles: cover.tiles,
-                    slot: cover.slot,
+                    tiles: tile_list.tiles,
+                    slot: tile_list.slot,
                 };
             }
             count = some;

@@ -3,7 +3,7 @@
 use std::arch::x86_64::*;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use super::{LANES, Lanes, Mask, Row, TO_NEAREST, Wide, exp2_fraction};
+use super::{LANES, Lanes, Lanes16, Mask, TO_NEAREST, Wide, exp2_fraction};
 
 // SAFETY, for every `unsafe` below that gives no other reason: values of these types are only made inside kernels that
 // `dispatch` runs after it found AVX2 and FMA, so the instructions exist.
@@ -131,7 +131,7 @@ impl Lanes for Avx2 {
         unsafe { Self(_mm256_set1_ps(value), _mm256_set1_ps(value)) }
     }
     #[inline(always)]
-    fn load(row: &Row) -> Self {
+    fn load(row: &Lanes16) -> Self {
         unsafe {
             Self(
                 _mm256_load_ps(row.0.as_ptr()),
@@ -144,7 +144,7 @@ impl Lanes for Avx2 {
         unsafe { Self(_mm256_loadu_ps(at), _mm256_loadu_ps(at.add(8))) }
     }
     #[inline(always)]
-    fn store(self, row: &mut Row) {
+    fn store(self, row: &mut Lanes16) {
         unsafe {
             _mm256_store_ps(row.0.as_mut_ptr(), self.0);
             _mm256_store_ps(row.0.as_mut_ptr().add(8), self.1);
@@ -290,8 +290,8 @@ impl Lanes for Avx2 {
         }
     }
     #[inline(always)]
-    fn sums(rows: &[Self; 10]) -> Row {
-        let mut out = Row::default();
+    fn sums(rows: &[Self; 10]) -> Lanes16 {
+        let mut out = Lanes16::default();
         unsafe {
             let mut r = [_mm256_setzero_ps(); 12];
             for k in 0..10 {

@@ -3,7 +3,7 @@
 use std::arch::x86_64::*;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use super::{LANES, Lanes, Mask, Row, TO_NEAREST, Wide, exp2_fraction};
+use super::{LANES, Lanes, Lanes16, Mask, TO_NEAREST, Wide, exp2_fraction};
 
 // SAFETY, for every `unsafe` below that gives no other reason: values of these types are only made inside kernels that
 // `dispatch` runs after it found AVX-512F and DQ, so the instructions exist.
@@ -106,7 +106,7 @@ impl Lanes for Avx512 {
         Self(unsafe { _mm512_set1_ps(value) })
     }
     #[inline(always)]
-    fn load(row: &Row) -> Self {
+    fn load(row: &Lanes16) -> Self {
         Self(unsafe { _mm512_load_ps(row.0.as_ptr()) })
     }
     #[inline(always)]
@@ -114,7 +114,7 @@ impl Lanes for Avx512 {
         Self(unsafe { _mm512_loadu_ps(at) })
     }
     #[inline(always)]
-    fn store(self, row: &mut Row) {
+    fn store(self, row: &mut Lanes16) {
         unsafe { _mm512_store_ps(row.0.as_mut_ptr(), self.0) }
     }
     #[inline(always)]
@@ -203,8 +203,8 @@ impl Lanes for Avx512 {
         }
     }
     #[inline(always)]
-    fn sums(rows: &[Self; 10]) -> Row {
-        let mut out = Row::default();
+    fn sums(rows: &[Self; 10]) -> Lanes16 {
+        let mut out = Lanes16::default();
         unsafe {
             // Halve the quarters: [a₀+a₂, a₁+a₃, b₀+b₂, b₁+b₃], then [a, b, c, d], a 128-bit quarter each.
             let mut halves = [_mm512_setzero_ps(); 6];

@@ -19,7 +19,7 @@ pub const LANES: usize = 16;
 /// One value per lane in memory, aligned for the widest registers.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 #[repr(C, align(64))]
-pub struct Row(pub [f32; LANES]);
+pub struct Lanes16(pub [f32; LANES]);
 
 /// log2(e) and ln(2).
 pub const LOG2_E: f32 = std::f32::consts::LOG2_E;
@@ -61,13 +61,13 @@ pub trait Lanes:
     type Wide: Wide;
 
     fn splat(value: f32) -> Self;
-    fn load(row: &Row) -> Self;
+    fn load(row: &Lanes16) -> Self;
     /// Sixteen values from `at`, which may be unaligned.
     ///
     /// # Safety
     /// `at` must be readable for 16 values.
     unsafe fn load_at(at: *const f32) -> Self;
-    fn store(self, row: &mut Row);
+    fn store(self, row: &mut Lanes16);
     /// # Safety
     /// `at` must be writable for 16 values.
     unsafe fn store_at(self, at: *mut f32);
@@ -90,7 +90,7 @@ pub trait Lanes:
     fn widen(self) -> Self::Wide;
     fn narrow(wide: Self::Wide) -> Self;
     /// Lane `k` of the result is the sum of `rows[k]`, in one fixed order; lanes past 10 are unspecified.
-    fn sums(rows: &[Self; 10]) -> Row;
+    fn sums(rows: &[Self; 10]) -> Lanes16;
 
     #[inline(always)]
     fn zero() -> Self {
@@ -287,7 +287,7 @@ mod tests {
         fn run<F: Lanes>(self) -> Vec<f32> {
             let mut out = Vec::new();
             for chunk in self.0.chunks_exact(LANES) {
-                let mut row = Row::default();
+                let mut row = Lanes16::default();
                 row.0.copy_from_slice(chunk);
                 let x = F::load(&row);
                 let y = match self.1 {
@@ -333,12 +333,12 @@ mod tests {
         }
     }
 
-    struct Sums<'a>(&'a [Row; 10]);
+    struct Sums<'a>(&'a [Lanes16; 10]);
 
     impl Kernel for Sums<'_> {
-        type Output = (Row, u16, u16);
+        type Output = (Lanes16, u16, u16);
         #[inline(always)]
-        fn run<F: Lanes>(self) -> (Row, u16, u16) {
+        fn run<F: Lanes>(self) -> (Lanes16, u16, u16) {
             let mut rows = [F::zero(); 10];
             for k in 0..10 {
                 rows[k] = F::load(&self.0[k]);
@@ -355,7 +355,7 @@ mod tests {
 
     #[test]
     fn sums_and_masks_keep_their_places() {
-        let mut rows = [Row::default(); 10];
+        let mut rows = [Lanes16::default(); 10];
         for (k, row) in rows.iter_mut().enumerate() {
             for l in 0..LANES {
                 row.0[l] = ((k * 37 + l * 11) % 23) as f32 - 7.0;

@@ -2,7 +2,7 @@
 
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use super::{LANES, Lanes, Mask, Row, Wide};
+use super::{LANES, Lanes, Lanes16, Mask, Wide};
 
 #[derive(Clone, Copy)]
 pub struct Portable([f32; LANES]);
@@ -125,7 +125,7 @@ impl Lanes for Portable {
         Self([value; LANES])
     }
     #[inline(always)]
-    fn load(row: &Row) -> Self {
+    fn load(row: &Lanes16) -> Self {
         Self(row.0)
     }
     #[inline(always)]
@@ -134,7 +134,7 @@ impl Lanes for Portable {
         Self(unsafe { at.cast::<[f32; LANES]>().read_unaligned() })
     }
     #[inline(always)]
-    fn store(self, row: &mut Row) {
+    fn store(self, row: &mut Lanes16) {
         row.0 = self.0;
     }
     #[inline(always)]
@@ -244,8 +244,8 @@ impl Lanes for Portable {
         Self(out)
     }
     #[inline(always)]
-    fn sums(rows: &[Self; 10]) -> Row {
-        let mut out = Row::default();
+    fn sums(rows: &[Self; 10]) -> Lanes16 {
+        let mut out = Lanes16::default();
         for k in 0..10 {
             let mut half = rows[k].0;
             for width in [8, 4, 2, 1] {

@@ -1,7 +1,7 @@
 //! One band of rows of the fused loss, there and back.
 
 use super::{BACK, FORWARD};
-use crate::raster::simd::{Kernel, LANES, Lanes, Mask, Row};
+use crate::raster::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
 use crate::ssim::{C1, C2, RADIUS, Shape, TAPS};
 
 /// Values of a scratch row: zeros on both sides for the window, whole lanes in between.
@@ -37,7 +37,7 @@ fn load<F: Lanes>(row: &[f32], at: usize) -> F {
         // SAFETY: just checked.
         return unsafe { F::load_at(row.as_ptr().add(at)) };
     }
-    let mut lanes = Row::default();
+    let mut lanes = Lanes16::default();
     lanes.0[..row.len() - at].copy_from_slice(&row[at..]);
     F::load(&lanes)
 }
@@ -158,7 +158,7 @@ impl Kernel for Forward<'_> {
                 }
             }
             for k in 0..2 {
-                let mut lanes = Row::default();
+                let mut lanes = Lanes16::default();
                 sums[k].store(&mut lanes);
                 self.sums[out][k] = lanes.0.iter().map(|v| f64::from(*v)).sum();
             }
@@ -253,7 +253,7 @@ impl Kernel for Backward<'_> {
                     // SAFETY: just checked.
                     unsafe { value.store_at(out.as_mut_ptr().add(at)) };
                 } else {
-                    let mut lanes = Row::default();
+                    let mut lanes = Lanes16::default();
                     value.store(&mut lanes);
                     out[at..].copy_from_slice(&lanes.0[..row - at]);
                 }

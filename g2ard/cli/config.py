@@ -1,0 +1,125 @@
+"""Options in a TOML file: read as a command's defaults, and written as they stand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import typer
+
+__all__ = ["load_config", "printed"]
+
+_NOT_KEPT = ("config", "print_config", "overwrite", "resume")
+"""Options that belong to one call."""
+
+
+def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
+    """Make a TOML file's values the defaults: those at its top, and over them its table of this command.
+
+    Keys are the flags' long names. What the command does not know is refused; other tables are others'.
+    """
+    if path is None:
+        return None
+    values = _read(path)
+    table = _of_command(ctx, path, values)
+    constants = _flat(table.pop("set", {}))
+    params = {flag.lstrip("-").replace("-", "_"): p for p in ctx.command.params for flag in (*p.opts, p.name)}
+    table = {key.replace("-", "_"): value for key, value in table.items()}
+    unknown = sorted(set(table) - {key for key in params if len(key) > 1})
+    if unknown:
+        raise typer.BadParameter(f"{path}: no option of `{ctx.info_name}` is called {', '.join(unknown)}")
+    found: dict[str, Any] = {}
+    for key, value in table.items():
+        many = getattr(params[key], "multiple", False)
+        found[str(params[key].name)] = _several(value) if many else _as_typed(value)
+    if constants:
+        found["set"] = [f"{name}={_as_typed(value)}" for name, value in constants.items()]
+        if "set" not in params:
+            raise typer.BadParameter(f"{path}: `{ctx.info_name}` has no constants to set")
+    ctx.default_map = {**(ctx.default_map or {}), **found}
+    return path
+
+
+def _read(path: Path) -> dict[str, Any]:
+    import tomllib
+
+    try:
+        return tomllib.loads(path.read_text())
+    except OSError as e:
+        raise typer.BadParameter(f"{path}: {e.strerror}") from None
+    except UnicodeDecodeError:
+        raise typer.BadParameter(f"{path}: not a text file") from None
+    except tomllib.TOMLDecodeError as e:
+        raise typer.BadParameter(f"{path}: {e}") from None
+
+
+def _of_command(ctx: typer.Context, path: Path, values: dict[str, Any]) -> dict[str, Any]:
+    """What is at the top of the file for all commands, and over it this command's own table."""
+    from g2ard.cli.commands import COMMANDS
+
+    name = str(ctx.info_name)
+    top = {key: value for key, value in values.items() if key == "set" or not isinstance(value, dict)}
+    strange = sorted(set(values) - set(top) - {*COMMANDS, name})
+    if strange:
+        raise typer.BadParameter(f"{path}: no command is called {', '.join(strange)}")
+    own = values.get(name, {})
+    if not isinstance(own, dict):
+        raise typer.BadParameter(f"{path}: {name}: a table of options")
+    known = {flag.lstrip("-") for p in ctx.command.params for flag in (*p.opts, str(p.name))}
+    if own or len(top) < len(values):  # a file for several commands: what is not for this one is for others
+        top = {key: value for key, value in top.items() if key in known or key.replace("_", "-") in known}
+    constants = {**_flat(top.pop("set", {})), **_flat(own.get("set", {}))}
+    return {**top, **own} | ({"set": constants} if constants else {})
+
+
+def _flat(table: Any, prefix: str = "") -> dict[str, Any]:
+    """A table of constants by their dotted names: `simplify.max_energy = 0.02` is a table within one."""
+    if not isinstance(table, dict):
+        raise typer.BadParameter("set: a table of constants, such as set = { simplify.max_energy = 0.02 }")
+    out: dict[str, Any] = {}
+    for key, value in table.items():
+        out |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return out
+
+
+def _as_typed(value: Any) -> Any:
+    """A TOML value as it would be typed: options parse text; [1, 1, 1] is 1,1,1."""
+    if isinstance(value, list):
+        return ",".join(str(item) for item in value)
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _several(value: Any) -> list[str]:
+    """What an option that may be repeated is given."""
+    return [_as_typed(item) for item in value] if isinstance(value, list) else [_as_typed(value)]
+
+
+def printed(ctx: typer.Context, values: dict[str, Any]) -> str:
+    """The options of a call, defaults included, as `load_config` reads them; what is None is left out."""
+    lines = [f"[{ctx.info_name}]"]
+    constants: list[str] = []
+    for parameter in ctx.command.params:
+        name, value = str(parameter.name), values.get(str(parameter.name))
+        if name in _NOT_KEPT or parameter.param_type_name == "argument" or value in (None, [], ()):
+            continue
+        if name == "set":
+            constants = list(value)
+            continue
+        flag = max((opt for opt in parameter.opts if opt.startswith("--")), key=len, default=f"--{name}")
+        lines.append(f"{flag[2:]} = {_toml(value)}")
+    if constants:
+        lines.append(f"[{ctx.info_name}.set]")
+        pairs = (text.partition("=") for text in constants)
+        lines += [f"{name.strip()} = {_toml(value.strip())}" for name, _, value in pairs]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        return str(value)
+    if isinstance(value, list):
+        return f"[{', '.join(_toml(item) for item in value)}]"
+    text = ",".join(str(item) for item in value) if isinstance(value, tuple) else str(value)
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -1,0 +1,99 @@
+"""An exact budget out of a count, a share, a ratio, a device, bytes of a file or a quality."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+from g2ard.errors import InputError
+
+__all__ = ["DEVICES", "Budget"]
+
+DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "web": 2_000_000}
+"""Gaussians that run smoothly: what users of Quest 3 report; PlayCanvas' defaults for streamed scenes, on
+phones and in desktop browsers."""
+
+_BYTES = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmMgG])[bB]")
+_UNITS = {"k": 1e3, "m": 1e6, "g": 1e9}
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How many Gaussians are to be left, said in one of several ways.
+
+    Args:
+        count: exactly so many.
+        ratio: how many times fewer, at least 1; N/ratio is rounded to the nearest, and at least 1.
+        share: of those there are, in (0, 1]; rounded up.
+        fit: about the most whose file has these bytes, such as 5MB or 800kB; or as many as run smoothly on
+            a device of `DEVICES`.
+        min_psnr: about the fewest that keep this PSNR, dB, against the scene's own renders.
+        min_ssim: about the fewest that keep this SSIM; beside `min_psnr` both hold.
+
+    Raises:
+        InputError: not exactly one kind of them, or one out of its range.
+
+    >>> Budget(ratio=3).of(1000), Budget(count=10).of(1000), Budget(share=0.25).of(10)
+    (333, 10, 3)
+    >>> Budget(fit="1.5MB").bytes, Budget(fit="quest3").of(2_000_000)
+    (1500000, 400000)
+    """
+
+    count: int | None = None
+    ratio: float | None = None
+    share: float | None = None
+    fit: str | None = None
+    min_psnr: float | None = None
+    min_ssim: float | None = None
+
+    def __post_init__(self) -> None:
+        quality = self.min_psnr if self.min_ssim is None else self.min_ssim
+        if (self.count, self.ratio, self.share, self.fit, quality).count(None) != 4:
+            raise InputError("count, ratio, fit, min_psnr or min_ssim: expected exactly one kind of budget")
+        if self.count is not None and self.count < 1:
+            raise InputError(f"count: expected at least 1, got {self.count}")
+        if self.ratio is not None and not (math.isfinite(self.ratio) and self.ratio >= 1):
+            raise InputError(f"ratio: expected at least 1, got {self.ratio}")
+        if self.share is not None and not 0 < self.share <= 1:
+            raise InputError(f"share: expected a number in (0, 1], got {self.share}")
+        if self.min_psnr is not None and not (math.isfinite(self.min_psnr) and self.min_psnr > 0):
+            raise InputError(f"min_psnr: expected decibels above 0, got {self.min_psnr}")
+        if self.min_ssim is not None and not 0 < self.min_ssim < 1:
+            raise InputError(f"min_ssim: expected a number in (0, 1), got {self.min_ssim}")
+        if self.fit is not None and self.fit.lower() not in DEVICES and not self.bytes:
+            raise InputError(
+                f"fit: expected bytes such as 5MB or 800kB, or {', '.join(DEVICES)}, got {self.fit!r}"
+            )
+
+    @property
+    def bytes(self) -> int | None:
+        """What `fit` allows the file; None where it names a device, or something else is asked."""
+        match = _BYTES.fullmatch((self.fit or "").strip())
+        return None if match is None else round(float(match[1]) * _UNITS[match[2].lower()])
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether it takes the scene itself, not just its count, to tell (`g2ard.policy.fit`)."""
+        return self.bytes is not None or self.min_psnr is not None or self.min_ssim is not None
+
+    def of(self, total: int, name: str = "scene") -> int:
+        """The exact budget out of `total` Gaussians of the scene that errors call `name`.
+
+        Raises:
+            InputError: it is above `total`, or cannot be told without the scene.
+        """
+        if self.is_measured:
+            raise InputError("fit, min_psnr, min_ssim: only the scene itself tells how many Gaussians")
+        if self.ratio is not None:
+            return max(1, math.floor(total / self.ratio + 0.5))
+        if self.share is not None:
+            return max(1, math.ceil(self.share * total - 1e-9))
+        if self.fit is not None:
+            return min(DEVICES[self.fit.lower()], total)
+        assert self.count is not None
+        if self.count > total:
+            raise InputError(
+                f"{name}: a budget of {self.count:,} is above its {total:,} Gaussians; {total:,} at most"
+            )
+        return self.count

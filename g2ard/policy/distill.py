@@ -1,0 +1,426 @@
+"""`g2ard.distill`: what a scene, its views and a few options come to, and the pipeline on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from g2ard.errors import InputError
+from g2ard.policy.budget import Budget
+from g2ard.policy.inputs import load_scene, make_targets
+from g2ard.policy.views import RunViews, is_made, views_of
+from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.splats import Splats
+
+if TYPE_CHECKING:
+    from g2ard.cameras import Cameras
+    from g2ard.io.types import Points
+    from g2ard.pipeline import DistillConfig, Distilled
+    from g2ard.policy.fit import Aim
+    from g2ard.policy.inputs import Views
+    from g2ard.stages.lift import LiftConfig
+    from g2ard.stages.recover.presets import PriorMeasures
+    from g2ard.targets import Targets
+
+    Scene = Splats | Points | str | Path | None
+    Colour = tuple[float, float, float]
+
+__all__ = ["DistillJob", "distill", "prepare"]
+
+_DEFAULT: dict[str, Any] = {
+    "method": "default",
+    "schedule": "default",
+    "policy": "auto",
+    "views_count": None,
+    "weighted": True,
+}
+_PAPER: dict[str, Any] = {
+    "method": "paper",
+    "schedule": "paper",
+    "policy": "directional",
+    "views_count": 0.5,
+    "weighted": False,
+}
+"""What an option that is not given means, under the paper's presets and else."""
+
+
+@dataclass(frozen=True, eq=False)
+class DistillJob:
+    """A distillation, ready to run: all is decided, nothing rendered yet.
+
+    Args:
+        prior: the dense scene, or the lift of a cloud.
+        aims: what one or more budgets came to; what they share is made once.
+        views: what is looked at.
+        teacher: whose renders the targets are; None where they are photos.
+        config: of the pipeline.
+        weights: (C,) how often each view is drawn, where the views say so.
+        lifting: constants of the lift; None where nothing was lifted.
+        preset: which regularisers, and why.
+        measured: what decided it.
+        cleaned: how many Gaussians of each kind were taken out first; None where nothing was looked for.
+        progress: told of all stages.
+        say: told in lines what was noticed.
+    """
+
+    prior: Splats
+    aims: tuple[Aim, ...]
+    views: RunViews
+    teacher: Splats | None
+    config: DistillConfig
+    weights: Any
+    lifting: LiftConfig | None
+    preset: str
+    measured: PriorMeasures
+    cleaned: dict[str, int] | None = None
+    progress: Progress = silent
+    say: Say = unsaid
+
+    @property
+    def budgets(self) -> tuple[int, ...]:
+        """Counts to distil to."""
+        return tuple(aim.count for aim in self.aims)
+
+    @property
+    def against(self) -> str:
+        """What the targets are, in words."""
+        return "photos" if self.teacher is None else "teacher renders"
+
+    @cached_property
+    def targets(self) -> Targets:
+        """What recovery learns from."""
+        return self._targets(self.views.train.cameras, lazy=self.config.views is not None)
+
+    @cached_property
+    def held_out(self) -> Targets:
+        """Views of their kind to score on, never learned from."""
+        return self._targets(self.views.test)
+
+    @cached_property
+    def apart(self) -> tuple[Targets | None, Targets | None]:
+        """Views of another kind: every second one decides how much of recovery stays, the others are to score
+        on; None where there are none, or no teacher to render them."""
+        cameras = self.views.apart
+        if cameras is None or self.teacher is None or len(cameras) < 2:
+            return None, None
+        first, second = (self._targets(cameras.take(range(i, len(cameras), 2))) for i in (0, 1))
+        return first, second
+
+    def render_targets(self) -> None:
+        """Have all targets that are rendered beforehand; `run` does so where it has not been done."""
+        _ = self.targets, self.held_out, self.apart
+
+    def _targets(self, cameras: Cameras, *, lazy: bool = False) -> Targets:
+        return make_targets(
+            cameras,
+            self.teacher,
+            self.config.background,
+            lazy=lazy,
+            progress=self.progress,
+            say=self.say,
+        )
+
+    def run(self, budget: int | None = None, *, work: Path | None = None) -> Distilled:
+        """Distil to one of the budgets, the first if none is named.
+
+        Args:
+            budget: one of `budgets`.
+            work: a folder for what a stopped run leaves, see `g2ard.pipeline.distill`.
+
+        Returns:
+            As `g2ard.distill`.
+        """
+        from g2ard.pipeline import distill as pipeline
+
+        aim = next(aim for aim in self.aims if budget in (None, aim.count))
+        self.render_targets()
+        done = pipeline(
+            self.prior,
+            aim.count,
+            self.targets,
+            self.config,
+            weights=self.weights,
+            validation=self.apart[0],
+            work=work,
+            progress=self.progress,
+        )
+        return replace(done, splats=aim.shrink(done.splats, self.say)[0], held_out=self.held_out)
+
+
+def distill(
+    scene: Scene,
+    *,
+    count: int | None = None,
+    ratio: float | None = None,
+    fit: str | None = None,
+    min_psnr: float | None = None,
+    min_ssim: float | None = None,
+    format: str = "ply",
+    clean: bool = False,
+    views: Views | None = None,
+    photos: bool | None = None,
+    held_out: Views | None = None,
+    views_count: int | float | Literal["auto"] | None = None,
+    policy: str | None = None,
+    weighted: bool | None = None,
+    reselect: bool = False,
+    method: str | None = None,
+    preset: str = "auto",
+    schedule: str | None = None,
+    steps: int | None = None,
+    time_limit: float | None = None,
+    sh_degree: int | None = None,
+    size: int | None = None,
+    background: Colour = (0.0, 0.0, 0.0),
+    constants: Mapping[str, Any] | None = None,
+    beside: str | Path | None = None,
+    up: Sequence[float] | None = None,
+    seed: int = 0,
+    engine: Literal["fused", "torch", "gsplat"] = "fused",
+    work: Path | None = None,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Distilled:
+    """Distil a dense scene, or a coloured cloud with photos, as `g2ard distill` does, to the bit.
+
+    Views are chosen or made, the scene is simplified, its geometry frozen as anchors, and what is left is
+    recovered against the views' photos or the dense scene's own renders. `g2ard.pipeline.distill` is the same
+    for a caller who has targets and a `DistillConfig` of their own.
+
+    Args:
+        scene: the dense scene, a coloured cloud, or the path of either; None where `views` hold photos and
+            there is nothing else: the start is then COLMAP's sparse points, else points within the cameras'
+            sight (`g2ard.policy.photos`).
+        count: Gaussians of the result, at most as many as there are.
+        ratio: how many times fewer there are to be, at least 1.
+        fit: instead, about the most whose file has these bytes at most, such as "5MB"; or a device: quest3,
+            mobile or web.
+        min_psnr: instead, about the fewest that simplification alone keeps this PSNR with, dB, against the
+            scene in views of its own.
+        min_ssim: the same of SSIM; with `min_psnr` both hold. `say` tells what the result has.
+        format: of the file that `fit` speaks of: ply, compressed.ply, sog, spz, glb or splat.
+        clean: first take out what no picture of the scene needs (`g2ard.clean`).
+        views: cameras in world coordinates, or where they lie; None takes those beside the scene, else makes
+            a pool of poses; "made" always makes one. Their test split is held out.
+        photos: True for the views' photos as targets, False for the scene's renders; None for photos if every
+            view has one. A cloud has no renders to learn from.
+        held_out: views to score on instead.
+        views_count: how many views recovery looks at: a count, a share in (0, 1] or "auto"; None for all, or
+            for what the preset says.
+        policy: how those are chosen, see `g2ard.select`; "auto" if None.
+        weighted: draw views by weights, their own or the selection's; True if None.
+        reselect: choose views again from every round's scene.
+        method: of simplification: default, fast or paper; "default" if None.
+        preset: which regularisers hold the geometry: auto (measured), trained, lift, noisy; paper,
+            paper-trained, paper-lift and paper-noisy are the paper's, and turn all that is None here to
+            what the paper has.
+        schedule: of recovery: fast, default, best or paper; "default" if None.
+        steps: the final horizon.
+        time_limit: seconds that all recovery is fitted into; the result then depends on the machine.
+        sh_degree: of the result; None keeps the scene's, and takes 3 from a cloud or for the paper's.
+        size: pixels that the longer side of views is shrunk to.
+        background: RGB in [0, 1] behind the scene.
+        constants: by full name, as `--set` has them, such as {"rates.means": 1e-3}.
+        beside: where to look for cameras, if `scene` is no path.
+        up: (3,) away from the ground, for poses that are made; None to estimate it.
+        seed: of all that is random.
+        engine: what takes recovery's steps, see `RecoverConfig`.
+        work: a folder for finished rounds and checkpoints; the same call goes on there after a Ctrl-C.
+        progress: told of all stages.
+        say: told in lines what was noticed and decided.
+
+    Returns:
+        The compact scene, the same before recovery, a report, and the targets that were held out.
+
+    Raises:
+        InputError: not exactly one kind of budget, one that does not fit, a cloud without views,
+            files that cannot be read, or a value out of its range.
+        KeyboardInterrupt: after Ctrl-C; what is in `work` can be gone on from.
+
+    >>> import numpy as np
+    >>> ball = np.random.default_rng(0).normal(size=(900, 3))
+    >>> ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    >>> scene = Splats.create(ball, scales=np.full((900, 3), 0.05), logit_opacities=np.full(900, 4))
+    >>> small = distill(scene, ratio=10, steps=5, size=48)
+    >>> len(small.splats), len(small.simplified), len(small.report.rounds)
+    (90, 90, 1)
+    """
+    job = prepare(
+        scene,
+        [Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)],
+        format=format,
+        clean=clean,
+        views=views,
+        photos=photos,
+        held_out=held_out,
+        views_count=views_count,
+        policy=policy,
+        weighted=weighted,
+        reselect=reselect,
+        method=method,
+        preset=preset,
+        schedule=schedule,
+        steps=steps,
+        time_limit=time_limit,
+        sh_degree=sh_degree,
+        size=size,
+        background=background,
+        constants=constants,
+        beside=beside,
+        up=up,
+        seed=seed,
+        engine=engine,
+        progress=progress,
+        say=say,
+    )
+    done = job.run(work=work)
+    if judgement := job.aims[0].judge(done.splats):
+        say(judgement[1])
+    return done
+
+
+def prepare(
+    scene: Scene,
+    budgets: Sequence[Budget],
+    *,
+    format: str = "ply",
+    clean: bool = False,
+    views: Views | None = None,
+    photos: bool | None = None,
+    held_out: Views | None = None,
+    views_count: int | float | Literal["auto"] | None = None,
+    policy: str | None = None,
+    weighted: bool | None = None,
+    reselect: bool = False,
+    method: str | None = None,
+    preset: str = "auto",
+    schedule: str | None = None,
+    steps: int | None = None,
+    time_limit: float | None = None,
+    sh_degree: int | None = None,
+    size: int | None = None,
+    background: Colour = (0.0, 0.0, 0.0),
+    constants: Mapping[str, Any] | None = None,
+    beside: str | Path | None = None,
+    up: Sequence[float] | None = None,
+    seed: int = 0,
+    engine: Literal["fused", "torch", "gsplat"] = "fused",
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> DistillJob:
+    """Read and decide all that a distillation needs, at one budget or several; arguments as for `distill`.
+
+    Raises:
+        InputError: as `distill`.
+    """
+    from g2ard.constants import changed
+    from g2ard.pipeline import DistillConfig
+    from g2ard.policy.clean import clutter_seen
+    from g2ard.policy.fit import aim_of
+    from g2ard.stages.lift import LiftConfig
+    from g2ard.stages.recover.presets import preset_for
+    from g2ard.stages.recover.schedule import schedule_named
+
+    usual = _PAPER if preset.startswith("paper") else _DEFAULT
+    schedule, method = schedule or usual["schedule"], method or usual["method"]
+    weighted = usual["weighted"] if weighted is None else weighted
+    paper, values = schedule == "paper", constants or {}
+    lifting = changed(LiftConfig(), "lift", values)
+    if scene is None:
+        if views is None or is_made(views):
+            raise InputError("scene: without one, photos with poses are needed as views")
+        from g2ard.policy.photos import points_of_photos
+
+        wanted = max((budget.count for budget in budgets if budget.count is not None), default=None)
+        scene = points_of_photos(
+            views, held_out, wanted, background=background, seed=seed, progress=progress, say=say
+        )
+    prior, lifted, beside, name = _prior(scene, beside, lifting, progress, say)
+    if lifted and (views is None or is_made(views)):
+        raise InputError(f"{name}: a cloud is no teacher: its photos are needed as views")
+    cleaned = None
+    if clean:
+        found, _ = clutter_seen(prior, seed=seed, progress=progress, say=say)
+        prior, cleaned = prior.take(found.keep), found.counts
+    file = f"scene.{format}"
+    aims = tuple(
+        aim_of(budget, prior, name, file=file, seed=seed, progress=progress, say=say) for budget in budgets
+    )
+    looks = views_of(
+        prior,
+        views,
+        held_out,
+        beside=beside,
+        size=size,
+        up=up,
+        seed=seed,
+        teach=not lifted and photos is not True,
+        progress=progress,
+        say=say,
+    )
+    train = looks.train.cameras
+    pictured = all(path is not None for path in (*train.image_paths, *looks.test.image_paths))
+    use_photos = lifted or (pictured if photos is None else photos)
+    kind = "paper-lift" if lifted and preset == "paper" else preset
+    regularizers, why, measured = preset_for(kind, prior, train if use_photos else None, paper=paper)
+    counts = ", ".join(f"{aim.count:,}" for aim in aims)
+    against = "photos" if use_photos else "teacher renders"
+    say(f"{len(prior):,} → {counts} Gaussians; {len(train)} views against {against}")
+    say(f"regularisers: {why}")
+    config = DistillConfig(
+        method=method,
+        schedule=schedule_named(schedule, steps),
+        steps=steps,
+        time_limit=time_limit,
+        regularizers=regularizers,
+        sh_degree=3 if sh_degree is None and (lifted or paper or usual is _PAPER) else sh_degree,
+        background=background,
+        views=usual["views_count"] if views_count is None else views_count,
+        policy=policy or usual["policy"],
+        weighted=weighted,
+        reselect=reselect,
+        seed=seed,
+        engine=engine,
+    )
+    return DistillJob(
+        prior=prior,
+        aims=aims,
+        views=looks,
+        teacher=None if use_photos else prior,
+        config=changed(config, "recover", values),
+        weights=looks.train.weights if weighted else None,
+        lifting=lifting if lifted else None,
+        preset=why,
+        measured=measured,
+        cleaned=cleaned,
+        progress=progress,
+        say=say,
+    )
+
+
+def _prior(
+    scene: Splats | Points | str | Path,
+    beside: str | Path | None,
+    lifting: LiftConfig,
+    progress: Progress,
+    say: Say,
+) -> tuple[Splats, bool, str | Path | None, str]:
+    """The dense scene, whether it is a lift, where cameras may lie beside it, and what errors call it."""
+    from g2ard.io import kind, read_cloud
+    from g2ard.stages.lift import lift
+
+    if isinstance(scene, Splats):
+        return scene, False, beside, "scene"
+    name = "cloud"
+    if isinstance(scene, str | Path):
+        if kind(scene) == "splats":
+            return load_scene(scene, say), False, beside or scene, str(scene)
+        name, cloud = str(scene), read_cloud(scene)
+        for note in cloud.notes:
+            say(f"{scene}: {note}")
+        scene = cloud.points
+    lifted = lift(scene.positions, scene.colors, **vars(lifting), progress=progress)
+    return lifted, True, beside, name

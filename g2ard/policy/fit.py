@@ -1,0 +1,306 @@
+"""What a budget comes to for a scene: how many Gaussians fit bytes of a file, or keep a quality."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.cameras import Cameras
+from g2ard.errors import InputError
+from g2ard.metrics import psnr, ssim
+from g2ard.policy.budget import Budget
+from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.splats import Splats
+from g2ard.stages.render import Renderer
+
+if TYPE_CHECKING:
+    from g2ard.stages.simplify import Simplified
+
+__all__ = ["Aim", "Quality", "aim_of", "count_for_bytes", "count_for_quality", "file_bytes", "quality"]
+
+_VIEWS, _SIDE = 12, 400
+"""Views that a quality is measured in, and their longer side, pixels."""
+_ROWS = 100_000
+"""Gaussians that those are planned on."""
+_SAMPLE = 4096
+_MARGIN = 0.985
+"""Of the bytes asked for: merged scenes pack a little better or worse than the probe."""
+_PROBES, _CLOSE = 2, 0.05
+_STEP = 0.65
+"""Share of the Gaussians between looks at the quality."""
+_FEWEST = 64
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Mean PSNR (dB) and SSIM against the dense scene's renders."""
+
+    psnr: float
+    ssim: float
+
+    def meets(self, wanted: Quality) -> bool:
+        """Whether both are reached."""
+        return self.psnr >= wanted.psnr and self.ssim >= wanted.ssim
+
+
+Reduce = Callable[[Splats, int], Splats]
+"""A scene and a count → a scene of that count."""
+
+
+def file_bytes(splats: Splats, name: str, **options: Any) -> int:
+    """Bytes of the scene as `write_splats` writes it under `name`."""
+    from g2ard.io import write_splats
+    from g2ard.io.scene_formats import scene_format
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene" / "meta.json"
+        if scene_format(name).function == "write":
+            path = Path(folder) / f"scene{scene_format(name).suffix}"
+        write_splats(path, splats, **options)
+        return sum(file.stat().st_size for file in Path(folder).rglob("*") if file.is_file())
+
+
+def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Reduce) -> int:
+    """About the most Gaussians whose file has at most `wanted` bytes.
+
+    A sample's bytes per Gaussian give a first count, a real write of the scene reduced to it a better one; a
+    second write follows only where that is far off.
+
+    Args:
+        splats: the dense scene.
+        wanted: bytes.
+        name: of the file; its suffix is the format.
+        reduce: a fast way to reduce it, for the probe.
+
+    Raises:
+        InputError: not even a few Gaussians fit.
+    """
+    sample = splats.take(np.unique(np.linspace(0, len(splats) - 1, min(len(splats), _SAMPLE)).astype(int)))
+    before = (len(sample), file_bytes(sample, name))
+    count = _count(before, (0, 0), wanted)
+    for _ in range(_PROBES):
+        count = min(max(count, min(_FEWEST, len(splats))), len(splats))
+        probe = (count, file_bytes(reduce(splats, count) if count < len(splats) else splats, name))
+        if count == len(splats) and probe[1] <= wanted:
+            return count
+        count = _count(probe, before, wanted)
+        before = probe
+        if abs(count / probe[0] - 1) < _CLOSE:
+            break
+    if count < min(_FEWEST, len(splats)):
+        raise InputError(f"{name}: {wanted:,} bytes hold hardly a Gaussian; {probe[1]:,} hold {probe[0]:,}")
+    return min(count, len(splats))
+
+
+def _count(a: tuple[int, int], b: tuple[int, int], wanted: int) -> int:
+    """Where the line through two (count, bytes) reaches the bytes, with a margin; through one and the origin
+    where two are no line upwards."""
+    rises = (a[0] - b[0]) * (a[1] - b[1]) > 0 and not 0.8 < a[0] / max(b[0], 1) < 1.25
+    slope = (a[1] - b[1]) / (a[0] - b[0]) if rises else a[1] / a[0]
+    return int(a[0] + (wanted * _MARGIN - a[1]) / slope)
+
+
+def _images(splats: Splats, cameras: Cameras) -> list[NDArray[Any]]:
+    renderer = Renderer(splats)
+    return [np.clip(renderer.image(camera), 0, 1) for camera in cameras]
+
+
+def quality(renders: list[Any], splats: Splats, cameras: Cameras) -> Quality:
+    """Of a scene against images in [0, 1], one for each camera."""
+    pairs = list(zip(_images(splats, cameras), renders, strict=True))
+    return Quality(
+        float(np.mean([psnr(image, target) for image, target in pairs])),
+        float(np.mean([ssim(image, target) for image, target in pairs])),
+    )
+
+
+def count_for_quality(
+    splats: Splats, wanted: Quality, cameras: Cameras, reduce: Reduce
+) -> tuple[int, Quality]:
+    """About the fewest Gaussians that keep a quality in these views, and the quality there.
+
+    One scene shrinks on and on by 0.65, each step from the last, until it falls short; between the last two
+    counts PSNR is taken as linear in the logarithm of the count, which one more look checks.
+
+    Returns:
+        The count, and what the scene of the shrinking had at or just above it.
+
+    Raises:
+        InputError: the first step falls short already by more than the whole scene could gain.
+    """
+    renders = _images(splats, cameras)
+    above, scene, good = len(splats), splats, Quality(float("inf"), 1.0)
+    while above > _FEWEST:
+        below = max(int(above * _STEP), _FEWEST)
+        smaller = reduce(scene, below)
+        found = quality(renders, smaller, cameras)
+        if not found.meets(wanted):
+            return _between(scene, above, good, below, found, wanted, renders, cameras, reduce)
+        scene, above, good = smaller, below, found
+    return above, good
+
+
+def _between(
+    scene: Splats,
+    above: int,
+    good: Quality,
+    below: int,
+    bad: Quality,
+    wanted: Quality,
+    renders: list[Any],
+    cameras: Cameras,
+    reduce: Reduce,
+) -> tuple[int, Quality]:
+    """The count between one that meets the quality and one that does not."""
+    share = 1.0
+    for name in ("psnr", "ssim"):
+        low, high, need = getattr(bad, name), getattr(good, name), getattr(wanted, name)
+        if np.isfinite(high) and need > low:
+            share = min(share, (high - need) / max(high - low, 1e-12))
+        elif need > low:
+            share = min(share, 0.5)
+    count = round(above * (below / above) ** max(share, 0.0))
+    if count >= above:
+        return above, good
+    found = quality(renders, reduce(scene, count), cameras)
+    return (count, found) if found.meets(wanted) else (above, good)
+
+
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """What a budget came to for a scene.
+
+    Args:
+        count: Gaussians to reduce it to.
+        bytes: that the result's file may have at most; None if that is not asked.
+        file: a name whose suffix is the file's format.
+        wanted: quality that is to be kept; None if that is not asked.
+        dense: the scene that it is kept of.
+        cameras: where it is measured.
+    """
+
+    count: int
+    bytes: int | None = None
+    file: str = "scene.ply"
+    wanted: Quality | None = None
+    dense: Splats | None = None
+    cameras: Cameras | None = None
+
+    def shrink(self, splats: Splats, say: Say = unsaid) -> tuple[Splats, NDArray[np.int64]]:
+        """The scene, merged on as far as its file would be too large.
+
+        Returns:
+            The scene, and (N,) the row that each row went to; −1 if it was dropped.
+        """
+        from g2ard.stages.simplify import simplify
+
+        rows = np.arange(len(splats))
+        while self.bytes is not None and (size := file_bytes(splats, self.file)) > self.bytes:
+            fewer = max(1, int(len(splats) * self.bytes / size * 0.99))
+            if fewer == len(splats):
+                break
+            say(f"{size:,} bytes: merged on from {len(splats):,} to {fewer:,} Gaussians")
+            made = simplify(splats, fewer, method="fast")
+            rows = _onward(rows, made.parents)
+            splats = made.splats
+        return splats, rows
+
+    def shrink_simplified(self, small: Simplified, say: Say = unsaid) -> Simplified:
+        """The same with what is known of its rows."""
+        splats, rows = self.shrink(small.splats, say)
+        if splats is small.splats:
+            return small
+        protected = np.zeros(len(splats), bool)
+        protected[rows[small.protected & (rows >= 0)]] = True
+        parents = _onward(small.parents, rows)
+        members = np.bincount(parents[parents >= 0], minlength=len(splats))
+        report = replace(
+            small.report,
+            output_count=len(splats),
+            merged_members=int(members[members > 1].sum()),
+            protected=int(protected.sum()),
+        )
+        return replace(small, splats=splats, parents=parents, protected=protected, report=report)
+
+    def judge(self, splats: Splats) -> tuple[bool, str] | None:
+        """Whether a result keeps the quality, and a line of it; None where no quality is asked."""
+        if self.wanted is None:
+            return None
+        assert self.dense is not None
+        assert self.cameras is not None
+        got = quality(_images(self.dense, self.cameras), splats, self.cameras)
+        line = (
+            f"{len(splats):,} Gaussians: {got.psnr:.2f} dB, SSIM {got.ssim:.4f} in {len(self.cameras)} views"
+        )
+        if got.meets(self.wanted):
+            return True, line
+        return False, f"{line}, which is less than was asked; ask for a count above {len(splats):,}"
+
+
+def aim_of(
+    budget: Budget,
+    splats: Splats,
+    name: str = "scene",
+    *,
+    file: str = "scene.ply",
+    seed: int = 0,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Aim:
+    """What a budget means for a scene.
+
+    Args:
+        budget: of any kind.
+        splats: the scene.
+        name: what errors call it.
+        file: a name whose suffix is the format of the file that `Budget.fit` speaks of.
+        seed: of the views that quality is measured in.
+        progress: told of planning.
+        say: told what was found.
+
+    Raises:
+        InputError: the budget is above the scene's count, or nothing meets it.
+        OutputError: `file` names no format of scenes.
+    """
+    if budget.min_psnr is not None or budget.min_ssim is not None:
+        wanted = Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0)
+        return _by_quality(splats, wanted, seed, progress, say)
+    if budget.bytes is not None:
+        found = count_for_bytes(splats, budget.bytes, file, _fast)
+        say(f"{budget.fit}: about {found:,} Gaussians")
+        return Aim(found, bytes=budget.bytes, file=file)
+    found = budget.of(len(splats), name)
+    if budget.fit is not None:
+        say(f"{budget.fit}: {found:,} Gaussians")
+    return Aim(found)
+
+
+def _by_quality(splats: Splats, wanted: Quality, seed: int, progress: Progress, say: Say) -> Aim:
+    from g2ard.poses import plan_pool
+
+    pool = plan_pool(splats, _VIEWS, seed=seed, rows=_ROWS, looks=True, progress=progress)
+    cameras = pool.cameras.resized(_SIDE)
+    found, near = count_for_quality(splats, wanted, cameras, _fast)
+    say(f"{found:,} Gaussians should keep {near.psnr:.2f} dB, SSIM {near.ssim:.4f}")
+    return Aim(found, wanted=wanted, dense=splats, cameras=cameras)
+
+
+def _fast(splats: Splats, count: int) -> Splats:
+    from g2ard.stages.simplify import simplify
+
+    return simplify(splats, count, method="fast").splats
+
+
+def _onward(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where rows went in two reductions, one after the other.
+
+    >>> _onward(np.array([1, -1, 0, 2]), np.array([0, 1, -1])).tolist()
+    [1, -1, 0, -1]
+    """
+    return np.where(first >= 0, second[first], -1)

@@ -1,0 +1,78 @@
+"""Cameras that lie beside a scene, for runs that were given none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from g2ard.progress import Say, unsaid
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from g2ard.cameras import Cameras
+    from g2ard.splats import Splats
+
+__all__ = ["as_pool", "found_views"]
+
+_SIDE = 800
+"""Pixels of the longer side, as a pool has."""
+
+_SAMPLE = 4096
+_SEEING = 0.5
+"""Share of the cameras that must see something of the scene, or they are another's."""
+
+
+def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: Say = unsaid) -> Path | None:
+    """The views that lie beside a scene (`g2ard.io.find_views`), if they see it; says what came of it.
+
+    Args:
+        scene: the scene's path.
+        splats: the scene.
+        splits: what the run needs of them; none may be empty.
+        say: told in one line which cameras are used, or why those that are there are not.
+
+    Returns:
+        A path for `load_views` and its kin; None if there are none, or none that fit.
+    """
+    from g2ard.errors import InputError
+    from g2ard.io import find_views, read_view_set
+    from g2ard.splits import split_mask
+
+    path = find_views(scene)
+    if path is None:
+        return None
+    try:
+        views = read_view_set(path)
+        for split in splits:
+            split_mask(path, views.cameras.names, split, stated=views.splits)
+    except InputError as error:
+        say(f"views beside the scene are not used: {error}")
+        return None
+    count = len(views.cameras)
+    seeing = int(views.cameras.facing(_opaque(splats)).sum())
+    if seeing < _SEEING * count:
+        say(f"views beside the scene are not used: {path}: {seeing} of {count} cameras see it")
+        return None
+    cameras = f"{count} camera" + "s" * (count != 1)
+    say(f"views: {cameras} of {path} (found beside the scene; --views made for a pool of its own)")
+    return path
+
+
+def as_pool(cameras: Cameras) -> Cameras:
+    """Found cameras at a pool's size where they have no photos to be compared with: INRIA's file states the
+    size of the full photos, which its trainer had shrunk."""
+    return cameras if any(cameras.image_paths) else cameras.resized(_SIDE)
+
+
+def _opaque(splats: Splats) -> NDArray[np.float64]:
+    """Means in the world of some of the Gaussians that are opaque by half or more, evenly by row; of some of
+    all where there are none."""
+    import numpy as np
+
+    opaque = np.flatnonzero(splats.opacities >= 0.5)
+    rows = opaque if len(opaque) else np.arange(len(splats))
+    sample = rows[np.linspace(0, len(rows) - 1, min(_SAMPLE, len(rows))).astype(int)]
+    return splats.means[sample].astype(np.float64) + splats.offset

@@ -1,0 +1,201 @@
+"""Reading what a run is given: scenes, views and their splits, with a line for all that was noticed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from g2ard.progress import Progress, Say, silent, unsaid
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from g2ard.cameras import Cameras
+    from g2ard.io import Note, ViewSet
+    from g2ard.splats import Splats
+    from g2ard.stages.render import RasterSettings
+    from g2ard.targets import Targets
+
+    Views = Cameras | ViewSet | str | Path  # read already, or where they lie
+
+__all__ = [
+    "drop_held_out",
+    "load_for_training",
+    "load_held_out",
+    "load_scene",
+    "load_split_views",
+    "load_trained",
+    "load_view_sets",
+    "load_views",
+    "make_targets",
+    "say_notes",
+]
+
+
+def load_scene(path: str | Path, say: Say = unsaid) -> Splats:
+    """Read a scene and say what was noticed."""
+    from g2ard.io import read_scene
+
+    scene = read_scene(path)
+    say_notes(path, scene.notes, say)
+    return scene.splats
+
+
+def say_notes(path: str | Path, notes: Sequence[Note], say: Say) -> None:
+    """Say what was noticed, but for what changes nothing that is drawn: a logit past ±16 is α = 0 or 1 either
+    way, to 1e-7 (`g2ard info` tells of those too)."""
+    for note in notes:
+        if note.code not in _HARMLESS:
+            say(f"{path}: {note}")
+
+
+_HARMLESS = ("clamped_logits",)
+
+
+def load_views(
+    views: Views, split: str, size: int | None, say: Say = unsaid, *, unpictured: bool = False
+) -> Cameras:
+    """Read views, pick a split, shrink them; `unpictured` keeps views without a photo beside others.
+
+    Raises:
+        InputError: the file has no views, or the split is empty.
+    """
+    return load_view_sets(views, [split], size, say, unpictured=unpictured)[0].cameras
+
+
+def load_view_sets(
+    views: Views, splits: list[str], size: int | None, say: Say = unsaid, *, unpictured: bool = False
+) -> list[ViewSet]:
+    """Read views once and give each of several splits, shrunk, with the weights that they state.
+
+    Raises:
+        InputError: as `load_views`.
+    """
+    from g2ard.splits import split_mask
+
+    found, path = _read(views, say, unpictured=unpictured)
+    masks = [split_mask(path, found.cameras.names, split, stated=found.splits) for split in splits]
+    return [found.take(mask).resized(size) for mask in masks]
+
+
+def load_for_training(views: Views, size: int | None, say: Say = unsaid) -> ViewSet:
+    """The views to train on of a set beside which another is given to score on: its train split where it
+    states splits, else all.
+
+    Raises:
+        InputError: as `load_views`, and as `g2ard.splits.for_training`.
+    """
+    from g2ard.splits import for_training
+
+    found, path = _read(views, say)
+    return found.take(for_training(path, found.cameras.names, found.splits)).resized(size)
+
+
+def load_held_out(views: Views, size: int | None, say: Say = unsaid) -> ViewSet:
+    """The views of a set given to score on.
+
+    Raises:
+        InputError: as `load_views`, and as `g2ard.splits.for_scores`.
+    """
+    from g2ard.splits import for_scores
+
+    found, path = _read(views, say)
+    return found.take(for_scores(path, found.cameras.names, found.splits)).resized(size)
+
+
+def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewSet:
+    """The views to train on that are none of those to score on; says how many were.
+
+    Raises:
+        InputError: all of them are.
+    """
+    from g2ard.errors import InputError
+    from g2ard.splits import not_held_out
+
+    keep = not_held_out(train.cameras, held_out)
+    if not keep.any():
+        raise InputError(f"held-out views: all {len(keep)} views to train on are held out")
+    if not keep.all():
+        say(f"{len(keep) - int(keep.sum())} of {len(keep)} views are held out: not trained on")
+    return train.take(keep)
+
+
+def load_trained(views: Views, split: str, size: int | None, say: Say = unsaid) -> ViewSet:
+    """The views of a split to train on, shrunk; says so if that makes training views of held-out ones.
+
+    Raises:
+        InputError: as `load_views`.
+    """
+    pool, mask = load_split_views(views, split, say)
+    chosen = pool.take(mask)
+    held_out = chosen.splits.count("test")
+    if held_out:
+        say(f"split {split}: {held_out} of the {len(chosen.cameras)} views trained on are test views")
+    return chosen.resized(size)
+
+
+def load_split_views(views: Views, split: str, say: Say = unsaid) -> tuple[ViewSet, NDArray[np.bool_]]:
+    """All views, each with the split it belongs to, stated or by the rule; and which of them `split` means.
+
+    Raises:
+        InputError: as `load_views`.
+    """
+    from g2ard.splits import split_mask, splits_of
+
+    found, path = _read(views, say)
+    names = found.cameras.names
+    mask = split_mask(path, names, split, stated=found.splits)
+    return replace(found, splits=splits_of(path, names, found.splits)), mask
+
+
+def _read(views: Views, say: Say, *, unpictured: bool = False) -> tuple[ViewSet, Path | None]:
+    """The views, and where they lie, if they had to be read."""
+    from g2ard.io import ViewSet, read_view_set
+
+    if isinstance(views, ViewSet):
+        return views, None
+    if not isinstance(views, str | Path):
+        return ViewSet(views), None
+    found = read_view_set(views, unpictured=unpictured)
+    for note in found.notes:
+        say(f"{views}: {note}")
+    return found, Path(views)
+
+
+def make_targets(
+    cameras: Cameras,
+    teacher: Splats | None,
+    background: tuple[float, float, float],
+    *,
+    lazy: bool = False,
+    photos: bool = False,
+    settings: RasterSettings | None = None,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Targets:
+    """The teacher's renders (`lazy`: when first asked for), or the photos where no teacher is given; with
+    `photos` the photo of each view that has one, and the teacher's render of the others."""
+    from g2ard.io.exposures import find_exposures
+    from g2ard.targets import Photos, PhotosOrRenders, TeacherRenders
+
+    if teacher is not None and not photos:
+        return TeacherRenders(
+            teacher, cameras, background=background, settings=settings, lazy=lazy, progress=progress
+        )
+    exposures = find_exposures(cameras)
+    if exposures:
+        say(f"exposure.json: {len(exposures)} photos brought to the scene's own colours")
+    if teacher is None:
+        return Photos(cameras, exposures=exposures)
+    return PhotosOrRenders(
+        cameras,
+        teacher,
+        background=background,
+        exposures=exposures,
+        settings=settings,
+        lazy=lazy,
+        progress=progress,
+    )

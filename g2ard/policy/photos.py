@@ -1,0 +1,223 @@
+"""A start where there are only photos and their poses: COLMAP's sparse points, else points within sight.
+
+A point within sight lies on the ray of a random pixel, at the depth where the photos of nearby views agree
+best about its colour (a plane sweep, one ray at a time): a start to distil from, not a reconstruction.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.cameras import Cameras
+from g2ard.errors import InputError
+from g2ard.images import load_image
+from g2ard.io.types import Points
+from g2ard.policy.inputs import load_for_training, load_view_sets
+from g2ard.progress import Progress, Say, silent, unsaid
+
+if TYPE_CHECKING:
+    from g2ard.policy.inputs import Views
+
+__all__ = ["points_of_photos", "points_within_sight", "sparse_points"]
+
+_SIDE = 240
+"""Pixels of the longer side of the photos that points are looked for in."""
+_DEPTHS = 48
+_NEAREST, _FARTHEST = 0.3, 4.0
+"""Depths that are tried, evenly in 1/z, as multiples of the view's distance from what all look at."""
+_NOTHING = 2 / 255
+"""A pixel this near to the background's colour shows nothing."""
+_ALIKE = 1e-4
+"""Variance of colour, summed over channels, within which depths are as good as each other."""
+_OTHERS = 6
+"""Nearby views that are asked; at least two must hold a point."""
+_RAYS = 2048
+"""At a time."""
+
+Float = NDArray[np.float64]
+
+
+def points_of_photos(
+    views: Views,
+    held_out: Views | None,
+    count: int | None,
+    *,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    seed: int = 0,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Points:
+    """A coloured cloud to start from: the sparse points that lie with the views, and as many more within
+    their sight as are wanting to `count`.
+
+    Args:
+        views: cameras with photos, or where they lie; only those for training are looked at.
+        held_out: views to score on, if they are given apart: all of `views` are then for training.
+        count: points, at least; None where the sparse points decide.
+        background: RGB of pixels that show nothing.
+        seed: of the rays.
+        progress: told of rays.
+        say: told what was started from.
+
+    Raises:
+        InputError: a view without a photo, or no sparse points and no `count`.
+    """
+    sparse = None if not isinstance(views, str | Path) else sparse_points(Path(views))
+    found = len(sparse) if sparse is not None else 0
+    if count is None and sparse is None:
+        raise InputError(f"{views}: no sparse points to take a ratio of: give a count")
+    wanting = max(0, (count or 0) - found)
+    parts = [] if sparse is None else [sparse]
+    if wanting:
+        train = (
+            load_view_sets(views, ["train"], _SIDE)[0]
+            if held_out is None
+            else load_for_training(views, _SIDE)
+        )
+        parts.append(
+            points_within_sight(train.cameras, wanting, background=background, seed=seed, progress=progress)
+        )
+    say(f"starts from {found:,} sparse points and {wanting:,} within the cameras' sight")
+    return Points(
+        np.concatenate([part.positions for part in parts]), np.concatenate([part.colors for part in parts])
+    )
+
+
+def sparse_points(views: Path) -> Points | None:
+    """The points of a COLMAP model, or a transforms.json's `ply_file_path`; None where there are none."""
+    from g2ard.io import read_points
+    from g2ard.io.detect import file_format
+    from g2ard.io.jsonfile import read_json
+
+    found = file_format(views)
+    try:
+        if found == "colmap":
+            return read_points(views if views.is_dir() else views.parent)
+        if found == "transforms":
+            file = views / "transforms.json" if views.is_dir() else views
+            listed = read_json(file).get("ply_file_path") if file.is_file() else None
+            return read_points(file.parent / str(listed)) if listed else None
+    except InputError:
+        return None
+    return None
+
+
+def points_within_sight(
+    cameras: Cameras,
+    count: int,
+    *,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Points:
+    """Points on the rays of random pixels, each where nearby photos agree best about its colour.
+
+    z* = argmin_z Var_v[c_v(x(z))] over the views v among the nearest that hold x(z), two at least beside the
+    ray's own.
+
+    Args:
+        cameras: C ≥ 3 views with photos, in world coordinates.
+        count: points.
+        background: RGB of pixels that show nothing.
+        seed: of the rays.
+        progress: told of rays.
+
+    Returns:
+        `count` points in the world, coloured as the pixel of their ray.
+
+    Raises:
+        InputError: fewer than three views, one without a photo, or views that share no sight.
+    """
+    if len(cameras) < 3:
+        raise InputError(f"photos: expected at least 3 views, got {len(cameras)}")
+    photos = [load_image(cameras, i) for i in range(len(cameras))]
+    rng = np.random.default_rng([seed, 11])
+    middle = _looked_at(cameras)
+    reach = np.linalg.norm(cameras.positions - middle, axis=1)
+    near = [_neighbours(cameras, i) for i in range(len(cameras))]
+    positions, colors, tried = np.zeros((0, 3)), np.zeros((0, 3), np.float32), 0
+    while len(positions) < count:
+        if tried > 64 * max(count, _RAYS):
+            raise InputError("photos: the views share no sight: no point is seen by three of them")
+        view = int(rng.integers(len(cameras)))
+        rays = min(_RAYS, max(64, -(-count // len(cameras))))
+        xyz, rgb = _swept(cameras, photos, view, near[view], float(reach[view]), rays, background, rng)
+        tried += rays
+        positions, colors = np.concatenate([positions, xyz]), np.concatenate([colors, rgb])
+        progress("points", min(len(positions), count), count)
+    return Points(positions[:count], np.ascontiguousarray(colors[:count]))
+
+
+def _looked_at(cameras: Cameras) -> Float:
+    """(3,) the point nearest to all optical axes; before the median camera where they hardly cross."""
+    across = np.eye(3) - cameras.forwards[:, :, None] * cameras.forwards[:, None, :]
+    pull = across.sum(0)
+    away = cameras.extent or 1.0
+    ahead = cameras.positions.mean(0) + away * cameras.forwards.mean(0)
+    if np.linalg.cond(pull) > 1e4:
+        return ahead
+    middle = np.linalg.solve(pull, np.einsum("cij,cj->i", across, cameras.positions))
+    before = np.einsum("ci,ci->c", middle - cameras.positions, cameras.forwards) > 0
+    return middle if before.mean() > 0.5 else ahead
+
+
+def _neighbours(cameras: Cameras, view: int) -> NDArray[np.int64]:
+    """The views nearest to one, in place and direction."""
+    away = np.linalg.norm(cameras.positions - cameras.positions[view], axis=1) / (cameras.extent or 1.0)
+    turn = 1 - cameras.forwards @ cameras.forwards[view]
+    order = np.argsort(away + turn, kind="stable")
+    return order[order != view][:_OTHERS]
+
+
+def _swept(
+    cameras: Cameras,
+    photos: list[NDArray[np.float32]],
+    view: int,
+    others: NDArray[np.int64],
+    reach: float,
+    rays: int,
+    background: tuple[float, float, float],
+    rng: np.random.Generator,
+) -> tuple[Float, NDArray[np.float32]]:
+    """Points on random rays of one view that two others hold, and their colours."""
+    photo, K, pose = photos[view], cameras.Ks[view], cameras.viewmats[view]
+    columns, rows = rng.integers(photo.shape[1], size=rays), rng.integers(photo.shape[0], size=rays)
+    own = photo[rows, columns]
+    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(rays)])
+    depths = reach / np.linspace(1 / _NEAREST, 1 / _FARTHEST, _DEPTHS)
+    local = (np.linalg.inv(K) @ pixels).T[:, None, :] * depths[None, :, None]
+    world = (local - pose[:3, 3]) @ pose[:3, :3]
+    total, squares = own[:, None, :].astype(np.float64), (own[:, None, :] ** 2).astype(np.float64)
+    total, squares = (np.repeat(a, _DEPTHS, axis=1) for a in (total, squares))
+    seen = np.ones((rays, _DEPTHS))
+    for other in others:
+        color, held = _sampled(cameras, photos, int(other), world)
+        total += color
+        squares += color**2
+        seen += held
+    spread = (squares / seen[..., None] - (total / seen[..., None]) ** 2).sum(-1)
+    spread[seen < 3] = np.inf
+    alike = spread <= spread.min(1, keepdims=True) + _ALIKE
+    best = _DEPTHS - 1 - alike[:, ::-1].argmax(1)  # of equals the farthest: it hides nothing
+    kept = np.isfinite(spread.min(1)) & (np.abs(own - background).max(1) > _NOTHING)
+    return world[np.arange(rays), best][kept], own[kept].astype(np.float32)
+
+
+def _sampled(
+    cameras: Cameras, photos: list[NDArray[np.float32]], view: int, world: Float
+) -> tuple[Float, NDArray[np.bool_]]:
+    """The nearest pixel's colour of points in the world, black where the view does not hold them; and whether
+    it does."""
+    photo, pose, K = photos[view], cameras.viewmats[view], cameras.Ks[view]
+    local = world @ pose[:3, :3].T + pose[:3, 3]
+    ahead = local[..., 2] > 0
+    depth = np.where(ahead, local[..., 2], 1.0)
+    u = np.floor(K[0, 0] * local[..., 0] / depth + K[0, 2])
+    v = np.floor(K[1, 1] * local[..., 1] / depth + K[1, 2])
+    held = ahead & (u >= 0) & (v >= 0) & (u < photo.shape[1]) & (v < photo.shape[0])
+    color = photo[np.where(held, v, 0).astype(int), np.where(held, u, 0).astype(int)]
+    return np.where(held[..., None], color, 0.0), held

@@ -1,0 +1,83 @@
+"""What a distillation came to, in figures: the report that `g2ard distill` writes as report.json."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from g2ard.progress import Progress
+
+if TYPE_CHECKING:
+    from g2ard.pipeline import Distilled
+    from g2ard.policy.distill import DistillJob
+    from g2ard.splats import Splats
+    from g2ard.targets import Targets
+
+__all__ = ["report_of"]
+
+
+def report_of(job: DistillJob, done: Distilled, options: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Both scenes scored in views that recovery did not learn from, beside what the run was and did.
+
+    Args:
+        job: what was to be done.
+        done: what came of it.
+        options: names that are not listed among the constants, for they are told as options.
+
+    Returns:
+        Counts, bytes, scores in each kind of views (None where there are none of a kind), rounds, seconds by
+        stage, and every constant.
+    """
+    from g2ard.constants import listed
+
+    kinds = {"scores": job.held_out, "apart": job.apart[1]}
+    config = job.config
+    config = replace(
+        config,
+        simplify=config.simplify.resolved(config.method),
+        schedule=replace(config.schedule, steps=config.steps or config.schedule.steps),
+    )
+    used: dict[str, Any] = {"recover": config} | ({"lift": job.lifting} if job.lifting else {})
+    found = done.report.as_dict()
+    return {
+        "input_count": len(job.prior),
+        "output_count": len(done.splats),
+        "cleaned": job.cleaned,
+        "bytes": {"input": job.prior.nbytes, "output": done.splats.nbytes},
+        **{kind: _scores(job, done, targets, job.progress) for kind, targets in kinds.items()},
+        "unseen": _unseen(job, done),
+        "against": job.against,
+        "preset": job.preset,
+        "prior": job.measured.as_dict(),
+        "rounds": found["rounds"],
+        "views": found["views"],
+        "constants": listed(used, options or ()),
+        "seconds": found["seconds"],
+    }
+
+
+def _scores(
+    job: DistillJob, done: Distilled, targets: Targets | None, progress: Progress
+) -> dict[str, Any] | None:
+    """Both scenes' figures in one kind of views."""
+    from g2ard.stages.evaluate import evaluate
+
+    if targets is None:
+        return None
+    scenes: dict[str, Splats] = {"simplified": done.simplified, "recovered": done.splats}
+    return {
+        name: evaluate(
+            splats, targets, background=job.config.background, progress=progress, stage=f"score {name}"
+        ).as_dict()
+        for name, splats in scenes.items()
+    }
+
+
+def _unseen(job: DistillJob, done: Distilled) -> float | None:
+    """Share of the scene that no view sees: of its matter where a pool was made, else of the Gaussians that
+    simplification looked at; None for the paper's, which does not look."""
+    if job.views.unseen is not None:
+        return job.views.unseen
+    unseen = done.report.rounds[0].simplify.unseen
+    return None if unseen is None else unseen / len(job.prior)

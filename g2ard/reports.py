@@ -1,0 +1,63 @@
+"""Reports as dataclasses that JSON can hold: what stages tell of their work, in files and in Python alike."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields
+from typing import Any, Self, Union, get_args, get_origin, get_type_hints
+
+__all__ = ["LEFT_OUT", "Report"]
+
+LEFT_OUT = {"left_out": True}
+"""Metadata of a field that JSON leaves out where it is None."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """A dataclass of numbers, words, lists of them, and further reports.
+
+    >>> from dataclasses import field
+    >>> @dataclass(frozen=True)
+    ... class Pair(Report):
+    ...     before: float
+    ...     after: float
+    ...     note: str | None = field(default=None, metadata=LEFT_OUT)
+    >>> Pair(1.0, 2.0).as_dict(), Pair.of({"before": 1.0, "after": 2.0}) == Pair(1.0, 2.0)
+    ({'before': 1.0, 'after': 2.0}, True)
+    """
+
+    def as_dict(self) -> dict[str, Any]:
+        """The report as JSON has it: fields by name, reports within as dicts."""
+        found = ((f, getattr(self, f.name)) for f in fields(self))
+        return {f.name: _plain(value) for f, value in found if value is not None or not _left_out(f)}
+
+    @classmethod
+    def of(cls, data: Mapping[str, Any]) -> Self:
+        """The report that `as_dict` gave `data`."""
+        kinds = get_type_hints(cls)
+        names = [f.name for f in fields(cls) if f.name in data or f.default is MISSING]
+        return cls(**{name: _read(kinds[name], data[name]) for name in names})
+
+
+def _left_out(f: Any) -> bool:
+    return bool(f.metadata.get("left_out"))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Report):
+        return value.as_dict()
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _read(kind: Any, value: Any) -> Any:
+    """A value as its field's type has it."""
+    if value is None:
+        return None
+    if get_origin(kind) in (Union, types.UnionType):
+        kind = next(option for option in get_args(kind) if option is not type(None))
+    if isinstance(kind, type) and issubclass(kind, Report):
+        return kind.of(value)
+    if get_origin(kind) is tuple:
+        return tuple(_read(get_args(kind)[0], item) for item in value)
+    return value

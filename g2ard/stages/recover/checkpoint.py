@@ -1,0 +1,73 @@
+"""Saving recovery's state, and stopping between two steps rather than within one."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.io.atomic import atomic_output
+
+__all__ = ["PERIOD", "deferred_interrupt", "load", "save"]
+
+_ANEW = "another checkpoint or folder of work starts anew"
+
+PERIOD = 60.0
+"""Seconds between two checkpoints."""
+
+
+def save(path: Path, key: str, meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    """Write a checkpoint; `key` says what work it belongs to."""
+    text = json.dumps({"key": key, **meta}, default=_plain)
+    everything: dict[str, Any] = {"meta": np.array(text), **arrays}
+    with atomic_output(path, overwrite=True) as temporary:
+        np.savez(temporary, **everything)
+
+
+def load(path: Path, key: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Read a checkpoint back.
+
+    Raises:
+        InputError: it cannot be read, or belongs to other work than `key`.
+    """
+    try:
+        with np.load(path) as data:
+            arrays = dict(data)
+        meta: dict[str, Any] = json.loads(str(arrays.pop("meta")))
+        known = meta.pop("key")
+    except Exception:  # numpy and zipfile raise whatever their parsing stumbles over
+        raise InputError(f"{path}: not a checkpoint of g2ard, or a damaged one; {_ANEW}") from None
+    if known != key:
+        raise InputError(f"{path}: belongs to a run with another scene or other options; {_ANEW}")
+    return meta, arrays
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+@contextmanager
+def deferred_interrupt() -> Iterator[threading.Event]:
+    """Within it Ctrl-C sets the event instead of breaking into a step; the loop looks at it and raises."""
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        asked.set()
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield asked
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,61 @@
+"""How a recovery goes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from g2ard.errors import InputError
+from g2ard.stages.recover.anchors import PRESETS, Regularizers
+from g2ard.stages.recover.schedule import TUNED, Schedule
+
+__all__ = ["RecoverConfig"]
+
+
+@dataclass(frozen=True)
+class RecoverConfig:
+    """How recovery goes.
+
+    Args:
+        schedule: rates, horizon and decay.
+        steps: overrides the schedule's horizon.
+        time_limit: seconds; the horizon becomes what fits into them, so that the result depends on the
+            machine's speed.
+        regularizers: weights of L_anchor and L_shape (`tab:s_recovery`).
+        sh_degree: of the result; None keeps the student's.
+        ssim_weight: λ in (1−λ)·L1 + λ·(1−SSIM); 0.2 as 3DGS has it.
+        background: RGB behind the scene.
+        final: whether this is the recovery at the target count; the paper decays rounds differently.
+        seed: of the order of views.
+        engine: "fused" takes whole steps in Rust; "torch" goes through autograd and `SelectiveAdam`, with the
+            same result to rounding; "gsplat" is that on an NVIDIA GPU.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    schedule: Schedule = TUNED
+    steps: int | None = None
+    time_limit: float | None = None
+    regularizers: Regularizers = PRESETS["trained"]
+    sh_degree: int | None = None
+    ssim_weight: float = 0.2
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    final: bool = True
+    seed: int = 0
+    engine: Literal["fused", "torch", "gsplat"] = "fused"
+
+    def __post_init__(self) -> None:
+        if self.steps is not None and self.steps < 1:
+            raise InputError(f"steps: expected at least 1, got {self.steps}")
+        if self.time_limit is not None and not 0 < self.time_limit < float("inf"):
+            raise InputError(f"time_limit: expected seconds, more than 0, got {self.time_limit}")
+        if not 0 <= self.ssim_weight <= 1:
+            raise InputError(f"ssim_weight: expected a value in [0, 1], got {self.ssim_weight}")
+
+    @property
+    def horizon(self) -> int:
+        """Steps this recovery takes."""
+        if self.steps is not None:
+            return self.steps
+        return self.schedule.steps if self.final else self.schedule.round_steps

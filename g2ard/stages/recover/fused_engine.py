@@ -1,0 +1,113 @@
+"""Recovery steps whole in Rust: forward, loss, backward, regularisers and a sparse Adam in one call."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.cameras import Cameras
+from g2ard.splats import Splats
+from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.schedule import Rates
+from g2ard.stages.recover.sizes import radii
+from g2ard.stages.render import arrays_of, settings_for, view_of
+
+__all__ = ["FusedEngine"]
+
+
+class FusedEngine:
+    """Does what `TorchEngine` does, to rounding."""
+
+    def __init__(
+        self,
+        splats: Splats,
+        cameras: Cameras,
+        *,
+        anchors: Anchors,
+        regularizers: Regularizers,
+        means_in_scales: bool,
+        ssim_weight: float,
+        background: tuple[float, float, float],
+    ) -> None:
+        self._template = splats
+        self._cameras = cameras
+        self._settings = settings_for(anchors.means)
+        self._regularizers = regularizers
+        self._ssim_weight = ssim_weight
+        self._background = list(background)
+        units = radii(splats) if means_in_scales else None
+        self._trainer = _core.Trainer(arrays_of(splats), units)
+        self._anchors = (
+            anchors.means,
+            np.ascontiguousarray(anchors.frames),
+            anchors.r_parallel,
+            anchors.r_perp,
+        )
+        self._trainer.anchor(*self._anchors)
+
+    def step(
+        self,
+        view: int,
+        target: NDArray[np.float32],
+        rates: Rates,
+        *,
+        regularize: bool,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> float:
+        """One optimiser step on one view; returns its photometric loss."""
+        loss, _ = self._trainer.step(
+            view_of(self._cameras, view, self._settings),
+            self._settings,
+            self._background,
+            target,
+            self._ssim_weight,
+            rates,
+            self._regularizers if regularize else None,
+            mask,
+            self._reach(view, rates.reach),
+        )
+        return loss
+
+    def _reach(self, view: int, share: float) -> float | None:
+        """In pixels."""
+        if math.isinf(share):
+            return None
+        return share * float(max(self._cameras.widths[view], self._cameras.heights[view]))
+
+    def splats(self) -> Splats:
+        """The scene as it stands, quaternions normalised."""
+        means, quats, log_scales, logit_opacities, sh0, shN = self._trainer.arrays()
+        length = np.linalg.norm(quats, axis=1, keepdims=True)
+        quats = np.where(length > 0, quats / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
+        return Splats(
+            means=means,
+            quats=quats.astype(np.float32),
+            scales=np.exp(log_scales.astype(np.float64)).astype(np.float32),
+            logit_opacities=logit_opacities,
+            sh0=sh0,
+            shN=shN,
+            offset=self._template.offset,
+        )
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Everything a bitwise resume needs."""
+        return self._trainer.state()
+
+    def load(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take up a `state` again."""
+        self._trainer.load(state)
+        self._trainer.anchor(*self._anchors)
+
+    @property
+    def counts(self) -> NDArray[Any]:
+        """(N,) steps that each Gaussian has taken."""
+        return self._trainer.state()["steps"]
+
+    @property
+    def skipped(self) -> int:
+        """Steps of single Gaussians left out because a gradient was not finite."""
+        return self._trainer.skipped

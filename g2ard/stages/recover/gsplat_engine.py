@@ -1,0 +1,64 @@
+"""Recovery steps on an NVIDIA GPU: gsplat's rasteriser, torch's loss, Adam by rows."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from g2ard.errors import InputError
+from g2ard.stages.recover.losses import l1_ssim_anywhere
+from g2ard.stages.recover.torch_engine import TorchEngine
+
+__all__ = ["GsplatEngine", "check_cuda"]
+
+
+def check_cuda() -> None:
+    """See to it that gsplat can run.
+
+    Raises:
+        InputError: torch sees no CUDA device, or gsplat is not installed.
+    """
+    if not torch.cuda.is_available():
+        raise InputError("engine 'gsplat': torch sees no CUDA device here")
+    if find_spec("gsplat") is None:
+        raise InputError("engine 'gsplat': gsplat is not installed (pip install 'g2ard[cuda]')")
+
+
+class GsplatEngine(TorchEngine):
+    """`TorchEngine` on the GPU. gsplat adds gradients atomically: runs differ in their last bits."""
+
+    device = torch.device("cuda")
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        check_cuda()
+        super().__init__(*args, **kwargs)
+        self._viewmats = torch.from_numpy(self._cameras.viewmats).float().to(self.device)
+        self._Ks = torch.from_numpy(self._cameras.Ks).float().to(self.device)
+
+    def _render(self, means: Tensor, view: int) -> Tensor:
+        from gsplat import rasterization
+
+        p = self._parameters
+        coefficients = torch.cat([p["sh0"], p["shN"]], 1)
+        image, _, _ = rasterization(
+            means=means,
+            quats=p["quats"],
+            scales=p["log_scales"].exp(),
+            opacities=p["logit_opacities"].sigmoid(),
+            colors=coefficients,
+            viewmats=self._viewmats[view][None],
+            Ks=self._Ks[view][None],
+            width=int(self._cameras.widths[view]),
+            height=int(self._cameras.heights[view]),
+            sh_degree=round(coefficients.shape[1] ** 0.5) - 1,
+            backgrounds=torch.tensor([self._background], device=self.device),
+            near_plane=self._settings.near_of(view),
+            packed=False,
+        )
+        return image[0]
+
+    def _loss(self, image: Tensor, target: Tensor) -> Tensor:
+        return l1_ssim_anywhere(image, target, self._ssim_weight)

@@ -1,0 +1,199 @@
+"""Whether the steps do a scene good: looks on the way, ways back, and less than the whole way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard.splats import Splats
+from g2ard.stages.render import arrays_of
+
+__all__ = ["LOOKS", "Guard", "blended"]
+
+LOOKS = (0.1, 0.3, 0.5, 0.75)
+"""Shares of the horizon at which the scene is looked at."""
+
+_LOST = (5.0, 3.0, 1.0, 0.0)
+"""dB under the start at each of them from which nothing comes back: good runs dip by up to 3.6 dB under full
+rates and are level again at half of the horizon; one that went on to lose was 9 dB down at a tenth of it."""
+
+_SHARES = (0.5, 0.25)
+"""Of the way from the start to a result that is worse than it."""
+
+_DOUBTS = (2.0, 5.0, 10.0, 20.0)
+"""How many views must have touched a Gaussian for half of its change to stay."""
+_TIE = 0.1
+"""dB of the other views that are no loss yet."""
+_HALF, _HOPELESS = 0.5, 0.5
+"""At which share of the horizon other views decide whether to go on, and how many dB they must have lost."""
+
+
+_ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+_BEST = "best."
+
+
+@dataclass
+class Guard:
+    """The best scene so far, and what to do about the present one.
+
+    Args:
+        score: dB of a scene, the higher the better.
+        best: the start at first.
+        before: the start's score.
+        others: dB of a scene in views of another kind than those that are learned from; None without any.
+        active: whether anything is done about a loss; else the steps are taken as they come.
+    """
+
+    score: Callable[[Splats], float]
+    best: Splats
+    before: float
+    others: Callable[[Splats], float] | None = None
+    active: bool = True
+    looked: int = 0
+    backed_off: list[dict[str, float]] = field(default_factory=list)
+    stopped: int | None = None
+    validation: list[dict[str, float]] = field(default_factory=list)
+    best_score: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.start, self.best_score = self.best, self.before
+        if self.others is not None:
+            self.validation.append({"step": 0, "psnr": self.others(self.start)})
+
+    def due(self, share: float) -> bool:
+        """Whether the scene is to be looked at."""
+        return self.active and self.looked < len(LOOKS) and LOOKS[self.looked] <= share < 1
+
+    def look(self, scene: Splats, share: float, step: int) -> Literal["on", "back", "stop"]:
+        """What to do about the scene of a step: go on, go back to the best with smaller steps, or stop."""
+        while self.due(share):
+            self.looked += 1
+        value = self.score(scene)
+        if value > self.best_score:
+            self.best, self.best_score = scene, value
+        if not value < self.before - _LOST[self.looked - 1] and math.isfinite(value):
+            if self.others is not None:
+                self.validation.append({"step": step, "psnr": self.others(scene)})
+                if share >= _HALF and self.lost > _HOPELESS:
+                    self.stopped = step
+                    return "stop"
+            return "on"
+        if self.looked == len(LOOKS):
+            self.stopped = step
+            return "stop"
+        self.backed_off.append({"step": step, "psnr": value})
+        return "back"
+
+    @property
+    def lost(self) -> float:
+        """dB that the other views have lost against the start, as they were last looked at."""
+        return self.validation[0]["psnr"] - self.validation[-1]["psnr"] if self.validation else 0.0
+
+    def settle(self, result: Splats, views: NDArray[np.float64], step: int) -> tuple[Splats, float | None]:
+        """What of a result's changes stays, by the views of another kind; all of them where there are none.
+
+        While they gain against the start, or lose under 0.1 dB, everything stays. Else they choose: a
+        Gaussian that v views touched goes v/(v + k) of its way, or all go the same part of it, or none.
+
+        Args:
+            result: where the steps ended.
+            views: (N,) how many touched each Gaussian.
+            step: its number, for the log.
+
+        Returns:
+            The scene, and its k: 0 is all of the way, ∞ none of it, None a part of it for all alike.
+        """
+        if self.others is None:
+            return result, 0.0
+        self.validation.append({"step": step, "psnr": self.others(result)})
+        if self.lost <= _TIE:
+            return result, 0.0
+        best, most = self.start, self.validation[0]["psnr"]
+        chosen: float | None = math.inf
+        ways: list[tuple[float | None, NDArray[np.float64] | float]] = [
+            (0.0, 1.0),
+            *((k, views / (views + k)) for k in _DOUBTS),
+            *((None, share) for share in _SHARES),
+        ]
+        for k, share in ways:
+            part = blended(self.start, result, share)
+            value = self.others(part)
+            if value > most:
+                best, chosen, most = part, k, value
+        self.validation.append({"step": step, "psnr": most})
+        return best, chosen
+
+    def judge(self, result: Splats) -> tuple[Splats, float, float]:
+        """The best of the result, what was seen before it, and half or a quarter of the way where it lost.
+
+        Returns:
+            The scene, its score, and how much of the way to the result it went: 1, or 0 for the start.
+        """
+        value = self.score(result)
+        if value >= self.best_score or not self.active:
+            return result, value, 1.0
+        if self.best is not self.start:
+            return self.best, self.best_score, 1.0
+        for share in _SHARES:
+            part = blended(self.start, result, share)
+            value = self.score(part)
+            if value > self.before:
+                return part, value, share
+        return self.start, self.before, 0.0
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The best scene, as a checkpoint holds it; nothing where that is the start."""
+        if self.best is self.start:
+            return {}
+        return {f"{_BEST}{name}": getattr(self.best, name) for name in _ARRAYS}
+
+    def load(self, meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+        """Take up `meta` and `arrays` again; what is taken from `arrays` is gone from there."""
+        self.looked, self.backed_off = int(meta["looked"]), list(meta["backed_off"])
+        self.stopped, self.best_score = meta["stopped"], float(meta["best_score"])
+        self.validation = list(meta["validation"])
+        found = {name: arrays.pop(_BEST + name) for name in _ARRAYS if _BEST + name in arrays}
+        if found:
+            self.best = replace(self.start, **found)
+
+    def meta(self) -> dict[str, Any]:
+        """What a checkpoint must remember besides the best scene."""
+        return {
+            "looked": self.looked,
+            "backed_off": self.backed_off,
+            "stopped": self.stopped,
+            "best_score": self.best_score,
+            "validation": self.validation,
+        }
+
+
+def blended(start: Splats, end: Splats, share: ArrayLike) -> Splats:
+    """A scene between two of the same Gaussians, each attribute in the space it is optimised in.
+
+    Args:
+        start: where `share` is 0.
+        end: where it is 1.
+        share: of the way, one for all or (N,).
+
+    >>> a = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]])
+    >>> b = Splats.create([[2, 0, 0]], scales=[[4, 1, 1]])
+    >>> half = blended(a, b, 0.5)
+    >>> half.means.tolist(), half.scales.tolist()
+    ([[1.0, 0.0, 0.0]], [[2.0, 1.0, 1.0]])
+    """
+
+    (m0, q0, l0, o0, d0, n0), (m1, q1, l1, o1, d1, n1) = (arrays_of(scene) for scene in (start, end))
+    q0, q1 = (q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-30) for q in (q0, q1))
+    q0 = q0 * np.where((q0 * q1).sum(1, keepdims=True) < 0, -1, 1)
+    pairs = (m0, m1), (q0, q1), (l0, l1), (o0, o1), (d0, d1), (n0, n1)
+    way = np.broadcast_to(np.asarray(share, np.float32), (len(start),))
+    means, quats, log_scales, logits, sh0, shN = (
+        (a + way.reshape(-1, *[1] * (a.ndim - 1)) * (b - a)).astype(np.float32) for a, b in pairs
+    )
+    scales = np.exp(log_scales.astype(np.float64)).astype(np.float32)
+    return Splats(means, quats, scales, logits, sh0, shN, end.offset)

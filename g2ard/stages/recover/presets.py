@@ -1,0 +1,173 @@
+"""Which regularisers a prior needs: named, or chosen by measuring it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from g2ard.cameras import Cameras
+from g2ard.errors import InputError
+from g2ard.splats import Splats
+from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS, Regularizers, needle
+
+__all__ = ["PriorMeasures", "measure_prior", "preset_for", "view_consistency"]
+
+_LIFT_THICKNESS = 0.2
+_LIFT_SPREAD = 2.5
+"""Discs of one mould: the lift's normal scale is a tenth of the tangential ones, give or take its anisotropy.
+Measured, median and spread: lifts .12 and 1.2, simplified ten times .10–.14 and 1.9–2.3; trained scenes
+.17–.30 and 3.5–7.3, simplified .44–.49 and 2.2–2.7."""
+
+_MANY_NEEDLES = 0.10
+_INCONSISTENT = 0.95
+"""Trained scenes .977–.988; a tenth of their Gaussians strewn about: .81–.97."""
+
+_SAMPLE_VIEWS = 4
+_SAMPLE_PIXELS = 160
+_SAME_DEPTH = 0.05
+
+
+@dataclass(frozen=True)
+class PriorMeasures:
+    """What tells a lift, a faithful and a noisy trained scene apart.
+
+    Args:
+        needle: share of Gaussians with an effective rank below 1.1.
+        thickness: median of smallest scale over middle scale.
+        thickness_spread: its upper over its lower quartile; a lift's discs are all alike.
+        view_dependent: whether any colour depends on the view.
+        consistency: see `view_consistency`; None where there were no two views to compare.
+    """
+
+    needle: float
+    thickness: float
+    thickness_spread: float
+    view_dependent: bool
+    consistency: float | None
+
+    def as_dict(self) -> dict[str, float | bool | None]:
+        """For reports."""
+        return asdict(self)
+
+
+def measure_prior(prior: Splats, cameras: Cameras | None = None) -> PriorMeasures:
+    """Measure a scene, and its view consistency where there are views.
+
+    >>> flat = Splats.create(np.zeros((4, 3)), scales=[[1, 1, 0.1]] * 4)
+    >>> found = measure_prior(flat)
+    >>> round(found.thickness, 3), round(found.thickness_spread, 3), found.consistency
+    (0.1, 1.0, None)
+    """
+    scales = np.sort(prior.scales.astype(np.float64), axis=1)
+    tiny = np.finfo(np.float32).tiny
+    thickness = scales[:, 0] / np.maximum(scales[:, 1], tiny)
+    low, middle, high = np.quantile(thickness, [0.25, 0.5, 0.75]) if len(prior) else (1.0, 1.0, 1.0)
+    return PriorMeasures(
+        needle=needle(prior.scales),
+        thickness=float(middle),
+        thickness_spread=float(high / max(low, tiny)),
+        view_dependent=bool(prior.shN.any()),
+        consistency=view_consistency(prior, cameras) if cameras is not None else None,
+    )
+
+
+def view_consistency(scene: Splats, cameras: Cameras) -> float | None:
+    """Share of surface points seen in one view that its nearest neighbour does not see through.
+
+    The median depth of a few small views is carried into the nearest other view. A point that lies behind
+    what that view sees is hidden and says nothing; one in front of it floats. Points within 5 % in depth
+    agree.
+
+    Args:
+        scene: the prior; its offset counts, cameras are in world coordinates.
+        cameras: at least two views.
+
+    Returns:
+        Agreeing over agreeing and floating points, in [0, 1]; None if no point is in two views.
+    """
+    from g2ard import _core
+    from g2ard.stages.render import arrays_of, centred, settings_for, view_of
+
+    if len(cameras) < 2 or not len(scene):
+        return None
+    scene, small = centred(scene, cameras.resized(_SAMPLE_PIXELS))
+    arrays, settings = arrays_of(scene), settings_for(scene.means)
+    sample = np.unique(np.linspace(0, len(small) - 1, min(len(small), _SAMPLE_VIEWS)).round().astype(int))
+    agree = float_ = 0
+    for a in sample:
+        distance = np.linalg.norm(small.positions - small.positions[a], axis=1)
+        distance[a] = np.inf
+        b = int(distance.argmin())
+        depths = []
+        for view in (view_of(small, int(a), settings), view_of(small, b, settings)):
+            rasterizer = _core.Rasterizer()
+            _, _, _, median = rasterizer.forward(arrays, view, settings, [0.0] * 3, False, True)
+            assert median is not None
+            depths.append(median)
+        expected, seen = _carried(depths[0], depths[1], small, int(a), b)
+        ratio = np.where(seen > 0, seen, np.inf) / expected
+        agree += int((np.abs(ratio - 1) <= _SAME_DEPTH).sum())
+        float_ += int((ratio > 1 + _SAME_DEPTH).sum())
+    return agree / (agree + float_) if agree + float_ else None
+
+
+def _carried(
+    depth: np.ndarray, other: np.ndarray, cameras: Cameras, a: int, b: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points of view `a` that fall into view `b`: their depth there, and the depth that `b` sees."""
+    rows, columns = np.nonzero(depth > 0)
+    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
+    rays = np.linalg.inv(cameras.Ks[a]) @ pixels * depth[rows, columns]
+    b_from_a = cameras.viewmats[b] @ np.linalg.inv(cameras.viewmats[a])
+    points = b_from_a[:3, :3] @ rays + b_from_a[:3, 3:]
+    points = points[:, points[2] > 1e-6]
+    u, v, _ = np.floor(cameras.Ks[b] @ points / points[2])
+    height, width = other.shape
+    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    return points[2, inside], other[v[inside].astype(int), u[inside].astype(int)]
+
+
+def preset_for(
+    name: str, prior: Splats, cameras: Cameras | None = None, *, paper: bool = False
+) -> tuple[Regularizers, str, PriorMeasures]:
+    """The regularisers of preset `name`, a line that says which and why, and what was measured.
+
+    `auto` measures the prior: thin discs of one mould without view-dependent colour are an untrained lift;
+    more than a tenth of needles, or views that see through each other's surfaces, mean a noisy trained
+    scene; anything else is taken for a faithful one.
+
+    Args:
+        name: auto, trained, lift or noisy; paper is auto with the paper's weights, paper-trained, paper-lift
+            and paper-noisy are rows of its table.
+        prior: the scene the anchors come from, before simplification where it is at hand.
+        cameras: views to measure consistency in; None leaves that out.
+        paper: take the paper's weights, which go with its schedule.
+
+    Returns:
+        The weights, the reason and the measures.
+
+    Raises:
+        InputError: no such preset.
+    """
+    kind = {"paper": "auto"}.get(name, name.removeprefix("paper-"))
+    if kind != "auto" and kind not in PRESETS:
+        raise InputError(f"preset: expected auto, paper, {', '.join(PRESETS)}, got {name!r}")
+    paper = paper or name.startswith("paper")
+    found = measure_prior(prior, cameras)
+    kind, why = (kind, "as asked") if kind != "auto" else _judged(found)
+    said = f"the paper's for {kind}" if paper else kind
+    return (PAPER_PRESETS if paper else PRESETS)[kind], f"{said} ({why})", found
+
+
+def _judged(m: PriorMeasures) -> tuple[str, str]:
+    figures = f"{m.needle:.1%} needles, thickness {m.thickness:.2f} within ×{m.thickness_spread:.1f}"
+    if m.consistency is not None:
+        figures += f", {m.consistency:.0%} of the surface seen alike by neighbouring views"
+    if not m.view_dependent and m.thickness <= _LIFT_THICKNESS and m.thickness_spread <= _LIFT_SPREAD:
+        return "lift", f"thin discs of one mould: nothing was trained; {figures}"
+    if m.needle > _MANY_NEEDLES:
+        return "noisy", f"over {_MANY_NEEDLES:.0%} needles; {figures}"
+    if m.consistency is not None and m.consistency < _INCONSISTENT:
+        return "noisy", f"views see through each other's surfaces; {figures}"
+    return "trained", figures

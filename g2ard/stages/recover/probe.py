@@ -1,0 +1,134 @@
+"""How fast a scene wants to learn: PSNR of a few views, and the rate multiplier that short trials choose."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from g2ard.metrics import psnr
+from g2ard.splats import Splats
+from g2ard.targets import Targets, mask_of
+
+if TYPE_CHECKING:
+    from g2ard.stages.render import Renderer
+
+__all__ = ["MULTIPLIERS", "Probe", "calm", "search_multiplier", "trial_steps"]
+
+MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
+"""Of all rates; trained scenes want 1 or less, lifts more."""
+
+_TIE = 0.04
+"""Gains that differ from the best by less than this share of it are nearly the same."""
+_CALMEST = 0.01
+"""Smaller ones change nothing that 8 bits show."""
+_VIEWS = 8
+_SHARE = 0.01
+"""Of the time that looking at the views may take while somebody watches the progress."""
+_FIRST_SHARE = 0.1
+"""The same of the first look, where short runs would end before the second."""
+_FEWEST, _MOST, _PART = 10, 60, 50
+_SHORTEST_HORIZON = 100
+
+
+def trial_steps(horizon: int) -> int:
+    """Steps of one trial: a fiftieth of the horizon, 10 to 60; 0 where trials would not pay.
+
+    >>> trial_steps(50), trial_steps(300), trial_steps(1000), trial_steps(6000)
+    (0, 10, 20, 60)
+    """
+    return 0 if horizon < _SHORTEST_HORIZON else min(_MOST, max(_FEWEST, horizon // _PART))
+
+
+def search_multiplier(
+    score: Callable[[float], float], guess: float, start: float
+) -> tuple[float, dict[float, float]]:
+    """The best of `MULTIPLIERS`, walking both ways from the one nearest to `guess`, and all scores seen.
+
+    Of those whose gain is within 4 % of the best the largest is taken: a long run decays in the end, a trial
+    is too short for what the larger would reach.
+
+    Args:
+        score: PSNR that a trial with a multiplier ends at.
+        guess: where to begin.
+        start: PSNR before.
+
+    >>> search_multiplier(lambda m: -abs(m - 1), 0.2, start=0)[0]
+    1.0
+    >>> round(search_multiplier(lambda m: {1 / 3: 32.0, 3**-0.5: 31.95}.get(m, 30.0), 1 / 3, start=30)[0], 3)
+    0.577
+    """
+    seen: dict[int, float] = {}
+
+    def good(i: int) -> bool:
+        best = max(seen.values())
+        return seen[i] >= best - _TIE * max(best - start, 0.0)
+
+    at = min(range(len(MULTIPLIERS)), key=lambda i: abs(math.log(MULTIPLIERS[i] / guess)))
+    for way in (range(at, -1, -1), range(at + 1, len(MULTIPLIERS))):
+        for i in way:
+            value = score(MULTIPLIERS[i])
+            seen[i] = value if math.isfinite(value) else -math.inf
+            if not good(i):
+                break
+    best = max(seen, key=lambda i: (seen[i], -i))
+    chosen = max(filter(good, seen)) if seen[best] > start else best
+    return MULTIPLIERS[chosen], {MULTIPLIERS[i]: value for i, value in sorted(seen.items())}
+
+
+def calm(
+    score: Callable[[float], float], best: float, seen: dict[float, float], start: float
+) -> tuple[float, dict[float, float]]:
+    """A third of the multiplier, again and again, while the best only makes the start worse.
+
+    >>> calm(lambda m: 50 - 9 * m, 1 / 3, {1 / 3: 47.0}, start=49.5)[0] < 0.06
+    True
+    """
+    seen = dict(seen)
+    while seen[best] < start and best > _CALMEST:
+        seen[best / 3] = score(best / 3)
+        if seen[best / 3] <= seen[best]:
+            break
+        best /= 3
+    return best, seen
+
+
+class Probe:
+    """PSNR of a few evenly spaced training views."""
+
+    def __init__(self, targets: Targets, background: tuple[float, float, float]) -> None:
+        count = len(targets.cameras)
+        sample = np.linspace(0, count - 1, min(count, _VIEWS)).round().astype(int)
+        self._views = [int(view) for view in np.unique(sample)]
+        self._targets, self._background = targets, background
+        self._next = 0.0
+        self._latest = (float("nan"), 0)
+
+    def all_of(self, splats: Splats) -> float:
+        """Mean over all of the views."""
+        from g2ard.stages.render import Renderer
+
+        renderer = Renderer(splats, background=self._background)
+        return float(np.mean([self._score(renderer, view) for view in self._views]))
+
+    def latest(self, splats: Callable[[], Splats], step: int, seconds: float) -> tuple[float, int]:
+        """The mean, and the step it is of: an earlier one where looking has had its share of the time.
+
+        Args:
+            splats: gives the scene as it stands.
+            step: how many have been taken.
+            seconds: since recovery began.
+        """
+        if seconds >= self._next:
+            began = time.monotonic()
+            self._latest = self.all_of(splats()), step
+            first = self._next == 0.0  # half a minute of an old figure tells nobody anything
+            self._next = seconds + (time.monotonic() - began) / (_FIRST_SHARE if first else _SHARE)
+        return self._latest
+
+    def _score(self, renderer: Renderer, view: int) -> float:
+        image = renderer.image(self._targets.cameras[view])
+        return psnr(np.clip(image, 0, 1), self._targets[view], mask_of(self._targets, view))

@@ -1,0 +1,127 @@
+"""The rasteriser as a differentiable torch function: any loss and any optimiser on top."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from g2ard import _core
+from g2ard.cameras import Cameras
+from g2ard.errors import InputError
+from g2ard.stages.render import RasterSettings, View, view_of
+
+__all__ = ["rasterize"]
+
+_NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
+
+_idle: list[_core.Rasterizer] = []
+"""Rasterizers whose forward pass nobody will go back through any more: their buffers are used again."""
+
+
+class _Lease:
+    """A Rasterizer for as long as an autograd node may need what its forward pass left."""
+
+    def __init__(self) -> None:
+        try:
+            self.rasterizer = _idle.pop()
+        except IndexError:
+            self.rasterizer = _core.Rasterizer()
+
+    def __del__(self) -> None:
+        if len(_idle) < 4:  # more than this would only hold memory
+            _idle.append(self.rasterizer)
+
+
+def _numpy(tensor: Tensor) -> np.ndarray[Any, Any]:
+    return tensor.detach().contiguous().numpy()
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, view: View, settings: RasterSettings, background: list[float], *params: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        ctx.lease = _Lease()
+        ctx.save_for_backward(*params)
+        ctx.set_materialize_grads(False)
+        arrays = tuple(_numpy(p) for p in params)
+        image, alpha, depth, _ = ctx.lease.rasterizer.forward(arrays, view, settings, background, True, False)
+        return torch.from_numpy(image), torch.from_numpy(alpha), torch.from_numpy(depth)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        image, alpha, depth = (None if g is None else _numpy(g.float()) for g in grads)
+        params = ctx.saved_tensors
+        if image is None:
+            like = depth if alpha is None else alpha
+            if like is None:
+                return (None,) * (3 + len(params))
+            image = np.zeros((*like.shape, 3), np.float32)
+        arrays = tuple(_numpy(p) for p in params)
+        out = ctx.lease.rasterizer.backward(arrays, image, alpha, depth)
+        return (None, None, None, *(torch.from_numpy(g) for g in out))
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    logit_opacities: Tensor,
+    sh0: Tensor,
+    shN: Tensor,
+    cameras: Cameras,
+    index: int,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    settings: RasterSettings | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Render view `index` on the CPU, differentiably in all six parameter tensors.
+
+    Calls are independent: several views may be rendered before one backward pass. Bit for bit the same for
+    any number of threads.
+
+    Args:
+        means: (N, 3) float32, in the coordinates of `cameras`.
+        quats: (N, 4) float32 wxyz, any length; zero means no rotation.
+        log_scales: (N, 3) float32, natural logarithms.
+        logit_opacities: (N,) float32.
+        sh0: (N, 1, 3) float32.
+        shN: (N, K−1, 3) float32, SH degree 0–3.
+        cameras: the views.
+        index: which of them.
+        background: RGB behind the scene; not differentiated.
+        settings: conventions; None means gsplat's.
+
+    Returns:
+        image (H, W, 3), alpha (H, W) and depth (H, W) = Σ αT·z (not divided by alpha), float32.
+
+    Raises:
+        InputError: a tensor that is not float32 on the CPU, shapes that do not fit, an index out of range.
+
+    >>> import torch
+    >>> from g2ard.cameras import Cameras, look_at
+    >>> views = Cameras.from_lists(
+    ...     [look_at([0, -2, 0], [0, 0, 0])], [[[50, 0, 16], [0, 50, 12], [0, 0, 1]]], [(32, 24)], ["front"])
+    >>> means = torch.zeros(1, 3, requires_grad=True)
+    >>> image, alpha, depth = rasterize(
+    ...     means, torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), -2.0), torch.zeros(1),
+    ...     torch.ones(1, 1, 3), torch.zeros(1, 0, 3), views, 0)
+    >>> image[:, :16].sum().backward()  # to light the left half up, move left
+    >>> bool(means.grad[0, 0] < 0)
+    True
+    """
+    settings = settings or RasterSettings()
+    if not 0 <= index < len(cameras):
+        raise InputError(f"view {index}: there are {len(cameras)} views")
+    params = (means, quats, log_scales, logit_opacities, sh0, shN)
+    for name, tensor in zip(_NAMES, params, strict=True):
+        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+            raise InputError(f"{name}: expected float32 on the CPU, got {tensor.dtype} on {tensor.device}")
+    colour = [float(c) for c in background]
+    out: tuple[Tensor, Tensor, Tensor] = _Rasterize.apply(
+        view_of(cameras, index, settings), settings, colour, *params
+    )
+    return out

@@ -1,0 +1,86 @@
+"""Adam that leaves Gaussians alone that a view did not touch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = ["SelectiveAdam"]
+
+_LARGEST = 1e18
+"""Beyond this the square of a gradient leaves float32."""
+
+
+class SelectiveAdam(torch.optim.Optimizer):
+    """`torch.optim.Adam` row by row, as the fused engine has it: rows are Gaussians, in all parameters alike.
+
+    A row whose gradients are all zero keeps its values and its moments, and each row has a count of steps t
+    of its own: p ← p − lr · m/(1 − β₁ᵗ) / (√(v/(1 − β₂ᵗ)) + ε), with the bias terms in float64. A row with a
+    gradient that is not finite, or over 1e18, is left alone too, and counted. A group's "share", if there is
+    one, multiplies its lr row by row or value by value.
+
+    Args:
+        parameters: by name, (N, …) each; parameter groups are in this order, with the name and lr 0.
+        betas: β₁ and β₂.
+        eps: ε.
+
+    >>> p = torch.zeros(3, 2, requires_grad=True)
+    >>> adam = SelectiveAdam({"p": p})
+    >>> adam.param_groups[0]["lr"] = 0.1
+    >>> p.grad = torch.tensor([[1.0, -1.0], [0.0, 0.0], [torch.nan, 1.0]])
+    >>> adam.step()
+    >>> [[round(v, 6) + 0.0 for v in row] for row in p.tolist()], adam.skipped
+    ([[-0.1, 0.1], [0.0, 0.0], [0.0, 0.0]], 1)
+    """
+
+    skipped = 0
+    """Steps of single rows left out because a gradient was not finite; not part of `state_dict`."""
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Tensor],
+        *,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-15,
+    ) -> None:
+        groups = [{"params": [p], "name": name} for name, p in parameters.items()]
+        super().__init__(groups, {"lr": 0.0, "betas": betas, "eps": eps})
+        rows = len(next(iter(parameters.values())))
+        for p in parameters.values():
+            count = torch.zeros(rows, dtype=torch.int64, device=p.device)
+            self.state[p] = {"m": torch.zeros_like(p), "v": torch.zeros_like(p), "count": count}
+
+    @torch.no_grad()
+    def step(self, closure: Any = None) -> None:  # type: ignore[override]
+        """One step of every row that has a gradient."""
+        if closure is not None:
+            raise ValueError("SelectiveAdam takes no closure")
+        groups = [group for group in self.param_groups if group["params"][0].grad is not None]
+        grads = [
+            group["params"][0].grad.flatten(1)
+            if group["params"][0].ndim > 1
+            else group["params"][0].grad[:, None]
+            for group in groups
+        ]
+        touched = torch.stack([(grad != 0).any(1) for grad in grads]).any(0)
+        sound = torch.stack([(grad.abs() <= _LARGEST).all(1) for grad in grads]).all(0)
+        self.skipped += int((touched & ~sound).sum())
+        rows = (touched & sound).nonzero()[:, 0]
+        for group in groups:
+            self._step_rows(group, rows)
+
+    def _step_rows(self, group: dict[str, Any], rows: Tensor) -> None:
+        (p,), (beta1, beta2) = group["params"], group["betas"]
+        grad, (m, v, count) = p.grad[rows], (self.state[p][key] for key in ("m", "v", "count"))
+        count[rows] += 1
+        steps = count[rows].double().reshape(-1, *[1] * (grad.ndim - 1))
+        bias1, bias2 = ((1 / (1 - beta**steps)).to(p.dtype) for beta in (beta1, beta2))
+        m[rows] = m[rows].lerp_(grad, 1 - beta1)
+        v[rows] = v[rows].mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
+        step = (m[rows] * bias1) / ((v[rows] * bias2).sqrt_() + group["eps"])
+        if group.get("share") is not None:
+            step *= group["share"][rows]
+        p[rows] -= group["lr"] * step

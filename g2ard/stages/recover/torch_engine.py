@@ -1,0 +1,182 @@
+"""Recovery steps in torch: autograd over the Rust rasteriser and loss, Adam by rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from g2ard.cameras import Cameras
+from g2ard.splats import Splats
+from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.extent import extents, share_of_rate
+from g2ard.stages.recover.losses import l1_ssim
+from g2ard.stages.recover.rasterize import rasterize
+from g2ard.stages.recover.regularize import TorchAnchors, regularization
+from g2ard.stages.recover.schedule import Rates
+from g2ard.stages.recover.selective_adam import SelectiveAdam
+from g2ard.stages.recover.sizes import radii
+from g2ard.stages.render import settings_for
+
+__all__ = ["TorchEngine"]
+
+_NAMES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
+
+
+class TorchEngine:
+    """Holds the parameters and `SelectiveAdam`'s moments; one `step` a view.
+
+    With `means_in_scales` the means are optimised as multiples of each Gaussian's initial radius (`radii`):
+    Adam is indifferent to the scale of a gradient, so a rate of 0.05 moves a Gaussian by 5 % of its own size.
+    Rendering, loss and device are what subclasses change.
+    """
+
+    device = torch.device("cpu")
+
+    def __init__(
+        self,
+        splats: Splats,
+        cameras: Cameras,
+        *,
+        anchors: Anchors,
+        regularizers: Regularizers,
+        means_in_scales: bool,
+        ssim_weight: float,
+        background: tuple[float, float, float],
+    ) -> None:
+        self._template = splats
+        self._cameras = cameras
+        self._anchors = TorchAnchors(anchors).to(self.device)
+        self._settings = settings_for(anchors.means)
+        self._regularizers = regularizers
+        self._ssim_weight = ssim_weight
+        self._background = background
+        self._base = torch.from_numpy(splats.means.astype(np.float32)).to(self.device)
+        unit = radii(splats) if means_in_scales else np.ones(len(splats), np.float32)
+        self._unit = torch.from_numpy(unit[:, None]).to(self.device)
+        start = {
+            "means": np.zeros((len(splats), 3), np.float32),
+            "log_scales": splats.log_scales,
+            "quats": splats.quats,
+            "logit_opacities": splats.logit_opacities,
+            "sh0": splats.sh0,
+            "shN": splats.shN,
+        }
+        self._parameters = {
+            name: torch.from_numpy(start[name].copy()).to(self.device).requires_grad_() for name in _NAMES
+        }
+        self._adam = SelectiveAdam({name: p for name, p in self._parameters.items() if p.numel()})
+
+    def step(
+        self,
+        view: int,
+        target: NDArray[np.float32],
+        rates: Rates,
+        *,
+        regularize: bool,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> float:
+        """One optimiser step on one view; returns its photometric loss."""
+        p = self._parameters
+        means = self._base + self._unit * p["means"]
+        image = self._render(means, view)
+        wanted, share = torch.from_numpy(target).to(self.device), 1.0
+        if mask is not None:  # nothing differs where nothing counts
+            image = torch.where(torch.from_numpy(mask).to(self.device)[..., None], image, wanted)
+            share = mask.size / max(1, int(mask.sum()))
+        loss = share * self._loss(image, wanted)
+        total = loss
+        if regularize and self._regularizers.active:
+            total = loss + regularization(
+                means, p["quats"], p["log_scales"], self._anchors, self._regularizers
+            )
+        self._adam.zero_grad(set_to_none=True)
+        torch.autograd.backward(total)
+        shares = self._shares(means.detach(), view, rates.reach)
+        for group in self._adam.param_groups:
+            group["lr"], group["share"] = getattr(rates, group["name"]), shares.get(group["name"])
+        self._adam.step()
+        return float(loss.detach())
+
+    def _shares(self, means: Tensor, view: int, reach: float) -> dict[str, Tensor]:
+        """What is left of each rate, by row or by value, for the size of things in this view."""
+        if math.isinf(reach):
+            return {}
+        p, near = self._parameters, self._settings.near_of(view)
+        largest, axes = extents(means, p["quats"], p["log_scales"], self._cameras, view, near)
+        pixels = reach * float(max(self._cameras.widths[view], self._cameras.heights[view]))
+        whole = share_of_rate(largest, pixels)[:, None]
+        return {"means": whole, "quats": whole, "log_scales": share_of_rate(axes, pixels)}
+
+    def _render(self, means: Tensor, view: int) -> Tensor:
+        """(H, W, 3) of one view, differentiable."""
+        p = self._parameters
+        image, _, _ = rasterize(
+            means,
+            p["quats"],
+            p["log_scales"],
+            p["logit_opacities"],
+            p["sh0"],
+            p["shN"],
+            self._cameras,
+            view,
+            background=self._background,
+            settings=self._settings,
+        )
+        return image
+
+    def _loss(self, image: Tensor, target: Tensor) -> Tensor:
+        return l1_ssim(image, target, self._ssim_weight)
+
+    def splats(self) -> Splats:
+        """The scene as it stands, quaternions normalised."""
+        p = {name: value.detach().cpu() for name, value in self._parameters.items()}
+        return Splats(
+            means=(self._base.cpu() + self._unit.cpu() * p["means"]).numpy().copy(),
+            quats=torch.nn.functional.normalize(p["quats"], dim=1).numpy().copy(),
+            scales=p["log_scales"].double().exp().float().numpy(),
+            logit_opacities=p["logit_opacities"].numpy().copy(),
+            sh0=p["sh0"].numpy().copy(),
+            shN=p["shN"].numpy().copy(),
+            offset=self._template.offset,
+        )
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Everything a bitwise resume needs."""
+        arrays = {f"p.{name}": value.detach().cpu().numpy() for name, value in self._parameters.items()}
+        arrays["base"], arrays["unit"] = self._base.cpu().numpy(), self._unit.cpu().numpy()
+        arrays["skipped"] = np.array(self._adam.skipped)
+        for name, key, moment in self._moments():
+            arrays[f"{key}.{name}"] = moment.cpu().numpy()
+        return arrays
+
+    def load(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take up a `state` again."""
+        with torch.no_grad():
+            for name, parameter in self._parameters.items():
+                parameter.copy_(torch.from_numpy(state[f"p.{name}"]))
+        self._base = torch.from_numpy(state["base"]).to(self.device)
+        self._unit = torch.from_numpy(state["unit"]).to(self.device)
+        self._adam.skipped = int(state["skipped"])
+        for name, key, moment in self._moments():
+            moment.copy_(torch.from_numpy(state[f"{key}.{name}"]))
+
+    def _moments(self) -> Iterator[tuple[str, str, Tensor]]:
+        for group in self._adam.param_groups:
+            for key, moment in self._adam.state[group["params"][0]].items():
+                yield group["name"], key, moment
+
+    @property
+    def counts(self) -> NDArray[Any]:
+        """(N,) steps that each Gaussian has taken."""
+        return self._adam.state[self._parameters["means"]]["count"].cpu().numpy()
+
+    @property
+    def skipped(self) -> int:
+        """Steps of single Gaussians left out because a gradient was not finite."""
+        return self._adam.skipped

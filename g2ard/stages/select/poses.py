@@ -1,0 +1,203 @@
+"""Views as poses: a kernel between them, which of them represent the others, and how often to draw each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.cameras import Cameras
+from g2ard.progress import Progress, counter
+from g2ard.splats import Splats
+from g2ard.stages.select.surfaces import Surface, core_scene, core_views
+
+__all__ = [
+    "draw_weights",
+    "facility_location",
+    "farthest",
+    "gains_of",
+    "inside_geometry",
+    "inverse_density",
+    "outlooks",
+    "pose_kernel",
+]
+
+Float = NDArray[np.float64]
+Order = NDArray[np.int64]
+
+_BANDWIDTH = 0.35
+"""Of the kernel exp(−(d/0.35)²) between poses: neighbours 20° apart on an orbit are half alike."""
+_REACH = 2.0
+"""Bandwidths within which a chosen view represents a pose: beyond, the kernel is below 2 %."""
+_WORTH = 0.25
+"""Power of its share of the scene by which a view's gain is weighed."""
+_GRID = 48, 36
+_BEHIND = 1.15
+"""Times the nearest depth of its place in the grid: what lies farther is hidden."""
+_ROWS = 200_000
+"""Gaussians by which a pose inside geometry is found: of more, a fair sample, each as much larger."""
+_SIDE = 48
+"""Pixels along the longer side of the images that decide it."""
+_INSIDE = 0.02
+"""A pose whose image is mostly nearer than this share of the median pose's depth is inside geometry."""
+
+
+def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
+    """What each view sees of a coarse surface.
+
+    Returns:
+        (C,) its median depth of the cells within its image, 0 where there is none, and (C,) the share of all
+        cells that lie in front there: not much behind the nearest of theirs in a grid of 48 × 36.
+    """
+    local = cameras.recentred(cells.origin)
+    depths, shares = np.zeros(len(local)), np.zeros(len(local))
+    columns, rows = _GRID
+    for i in range(len(local)):
+        x, y, z = local.viewmats[i, :3, :3] @ cells.centers.T + local.viewmats[i, :3, 3:]
+        ahead = z > 0
+        z = np.where(ahead, z, 1.0)
+        K = local.Ks[i]
+        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        inside = ahead & (u >= 0) & (u < local.widths[i]) & (v >= 0) & (v < local.heights[i])
+        if inside.any():
+            u, v, z = u[inside], v[inside], z[inside]
+            row, column = (
+                (v * rows / local.heights[i]).astype(int),
+                (u * columns / local.widths[i]).astype(int),
+            )
+            place = row * columns + column
+            nearest = np.full(columns * rows, np.inf)
+            np.minimum.at(nearest, place, z)
+            depths[i] = np.median(z)
+            shares[i] = np.count_nonzero(z < _BEHIND * nearest[place]) / len(cells.centers)
+    return depths, shares
+
+
+def inside_geometry(splats: Splats, cameras: Cameras, depths: Float, progress: Progress) -> NDArray[np.bool_]:
+    """(C,) whether a pose stands inside geometry: what fills its image is next to its lens.
+
+    A photo's pose is never refused: there was a camera.
+
+    Args:
+        splats: the scene.
+        cameras: C views.
+        depths: (C,) see `outlooks`.
+        progress: told of the views done.
+    """
+    made = np.array([path is None for path in cameras.image_paths])
+    if not (made.any() and (depths > 0).any()):
+        return np.zeros(len(cameras), bool)
+    step = -(-len(splats) // _ROWS)
+    sample = splats.take(np.arange(0, len(splats), step))
+    sample = replace(sample, scales=sample.scales * np.float32(np.sqrt(step)))
+    scene, origin = core_scene(sample)
+    small = core_views(cameras.resized(_SIDE), origin, scene)
+    share, near = _core.select_view_statistics(scene, small, progress=counter(progress, "poses")).T
+    typical = np.median(np.where(near > 0, near, depths)[depths > 0])
+    inside: NDArray[np.bool_] = made & (share > 0.5) & (near < _INSIDE * typical)
+    return inside
+
+
+def pose_kernel(cameras: Cameras, depths: Float) -> Float:
+    """(C, C) exp(−(d/0.35)²): d² = |Δposition|²/(depth·depth) + |Δdirection|²: parallax and turn."""
+    seen = depths[depths > 0]
+    scale = np.where(depths > 0, depths, np.median(seen) if len(seen) else 1.0)
+    positions = cameras.positions - np.median(cameras.positions, axis=0)  # whatever one of them is
+    with np.errstate(over="ignore", invalid="ignore"):  # 1e300 away is as far as can be
+        away = np.nan_to_num(_squares(positions), nan=np.inf) / (scale[:, None] * scale)
+    return np.exp(-(away + _squares(cameras.forwards)) / _BANDWIDTH**2)
+
+
+def _squares(rows: Float) -> Float:
+    """(n, n) squared distances; exactly 0 between equal rows."""
+    out = np.zeros((len(rows), len(rows)))
+    for column in rows.T:
+        out += (column[:, None] - column) ** 2
+    return out
+
+
+def inverse_density(alike: Float) -> Float:
+    """(C,) weights of the poses, one over the kernel density there; they sum to 1."""
+    weights = 1 / alike.sum(1)
+    return weights / weights.sum()
+
+
+def facility_location(
+    alike: Float, wanted: Float, usable: NDArray[np.bool_], shares: Float
+) -> tuple[Order, Float]:
+    """Views that represent all candidates: first within reach of every pose, then by facility location.
+
+    From the weighted medoid of the poses on, the farthest comes next while any is more than two bandwidths
+    from all chosen: there the kernel is flat. Then greedy facility location. Each view counts times the
+    fourth root of its share of the scene, so that of like views the one that sees more is taken.
+
+    Args:
+        alike: (C, C) see `pose_kernel`.
+        wanted: (C,) see `inverse_density`.
+        usable: (C,) which may be chosen; the others weigh nothing.
+        shares: (C,) see `outlooks`.
+
+    Returns:
+        The usable views in order, and what each adds to Σ_u w_u max_{v∈S} alike_uv.
+    """
+    wanted, away, worth = np.where(usable, wanted, 0.0), _bandwidths_apart(alike), shares**_WORTH
+    best, left = np.zeros(len(alike)), usable.copy()
+    nearest = np.where(usable, np.inf, -np.inf)
+    order: list[int] = []
+    gains: list[float] = []
+    for _ in range(int(usable.sum())):
+        if not order:
+            view = int(np.argmax(np.where(left, worth / np.maximum(wanted @ away, 1e-12), -1.0)))
+        elif nearest.max() > _REACH:
+            view = int(np.argmax(worth * np.where(nearest > _REACH, nearest, 0.0)))
+        else:
+            added = wanted @ np.maximum(alike - best[:, None], 0.0)
+            view = int(np.argmax(np.where(left, worth * added, -1.0)))
+        order.append(view)
+        gains.append(float(wanted @ np.maximum(alike[:, view] - best, 0.0)))
+        best = np.maximum(best, alike[:, view])
+        nearest = np.minimum(nearest, away[view])
+        left[view] = False
+    return np.array(order, np.int64), np.array(gains)
+
+
+def _bandwidths_apart(alike: Float) -> Float:
+    """(C, C) distances in bandwidths of the kernel."""
+    return np.asarray(np.sqrt(-np.log(np.maximum(alike, np.finfo(np.float64).tiny))))
+
+
+def gains_of(order: Order, alike: Float, wanted: Float) -> Float:
+    """What each view of a given order adds to the facility location."""
+    best, gains = np.zeros(len(alike)), []
+    for view in order:
+        gains.append(float(wanted @ np.maximum(alike[:, view] - best, 0.0)))
+        best = np.maximum(best, alike[:, view])
+    return np.array(gains)
+
+
+def farthest(alike: Float, usable: NDArray[np.bool_]) -> tuple[Order, Float]:
+    """Farthest pose next, from the one most like all others; gains are distances to the nearest chosen."""
+    if not usable.any():
+        return np.zeros(0, np.int64), np.zeros(0)
+    away = _bandwidths_apart(alike)
+    first = int(np.argmax(np.where(usable, alike[:, usable].sum(1), -1.0)))
+    order, gains = [first], [float(away[usable, first].max())]
+    nearest = np.where(usable, away[first], -1.0)
+    nearest[first] = -1.0
+    for _ in range(int(usable.sum()) - 1):
+        view = int(np.argmax(nearest))
+        order.append(view)
+        gains.append(float(nearest[view]))
+        nearest = np.where(nearest >= 0, np.minimum(nearest, away[view]), -1.0)
+        nearest[view] = -1.0
+    return np.array(order, np.int64), np.array(gains)
+
+
+def draw_weights(order: Order, alike: Float, wanted: Float) -> Float:
+    """(K,) the summed weights of the poses that each chosen view is nearest to, mean 1."""
+    nearest = order[np.argmax(alike[:, order], axis=1)]
+    nearest[order] = order  # each is nearest to itself, equals included
+    weights = np.bincount(nearest, wanted, len(alike))[order]
+    return weights / weights.mean()

@@ -1,0 +1,204 @@
+"""The scene as cells of surface, what each view sees of them, and the greedy order of views by that."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.cameras import Cameras
+from g2ard.errors import InputError, require
+from g2ard.progress import Progress, counter, silent
+from g2ard.splats import Splats
+from g2ard.stages.render import settings_for
+
+__all__ = [
+    "CoverageOptions",
+    "Surface",
+    "Visible",
+    "core_scene",
+    "core_views",
+    "greedy",
+    "surface",
+    "visible_cells",
+]
+
+Float = NDArray[np.float64]
+Order = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class CoverageOptions:
+    """Of the policies that look at surfaces (main text, eq. 2; `tab:s_avs`).
+
+    Args:
+        cells: surface cells M; adaptive voxels.
+        kappa: sharpness of the observation kernel and of the targets.
+        alpha: exponent of the fair utility u(x) = x^(1−α)/(1−α).
+        offset: g(x) = u(offset + x); the paper's λ.
+        anchors: directions on the sphere, at most 64, that targets and observations are laid out on.
+        epsilon: ε of the coverage ratio C_jk / (P_jk + ε).
+        lazy: look again only at the view that leads (CELF): the same views, fewer evaluations.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    cells: int = 300_000
+    kappa: float = 20.0
+    alpha: float = 2.0
+    offset: float = 1.0
+    anchors: int = 32
+    epsilon: float = 1e-9
+    lazy: bool = True
+
+    def __post_init__(self) -> None:
+        require("cells", self.cells, self.cells >= 1, "at least 1")
+        for name in ("kappa", "offset", "epsilon"):
+            value = getattr(self, name)
+            require(name, value, 0 < value < float("inf"), "more than 0")
+        require("anchors", self.anchors, 1 <= self.anchors <= 64, "1 to 64")
+        require("alpha", self.alpha, 0 <= self.alpha < float("inf"), "at least 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """M cells of surface, in coordinates about `origin`.
+
+    Args:
+        centers: (M, 3) float64.
+        normals: (M, 3) float64 unit, unoriented.
+        confidence: (M,) float64 in [0, 1], planarity (λ₂ − λ₃)/λ₁.
+        weights: (M,) float64, footprint areas capped at their 99th percentile, summing to 1.
+        size: edge of a cell, scene units.
+        origin: (3,) float64 world coordinates.
+    """
+
+    centers: Float
+    normals: Float
+    confidence: Float
+    weights: Float
+    size: float
+    origin: Float
+
+    @property
+    def parts(self) -> tuple[Float, Float, Float, Float, float]:
+        """As `_core` takes them."""
+        return self.centers, self.normals, self.confidence, self.weights, self.size
+
+
+@dataclass(frozen=True, eq=False)
+class Visible:
+    """Which cells each of C views sees: view v's are cells[starts[v]:starts[v + 1]], ascending."""
+
+    starts: NDArray[np.uint64]
+    cells: NDArray[np.uint32]
+
+    def of(self, view: int) -> NDArray[np.uint32]:
+        return self.cells[int(self.starts[view]) : int(self.starts[view + 1])]
+
+
+def surface(splats: Splats, cells: int = 300_000) -> Surface:
+    """Partition a prior into about `cells` cells of surface.
+
+    Raises:
+        InputError: the scene is empty or not finite.
+    """
+    if cells < 1:
+        raise InputError(f"cells: expected at least 1, got {cells}")
+    scene, origin = core_scene(splats)
+    found = _core.select_surface(scene, cells)
+    return Surface(
+        found["centers"], found["normals"], found["confidence"], found["weights"], found["size"], origin
+    )
+
+
+def visible_cells(
+    splats: Splats, cells: Surface, cameras: Cameras, *, progress: Progress = silent
+) -> Visible:
+    """Rasterise the prior's median depth into every view and compare: ν_jv.
+
+    A cell is visible where its centre falls on the image within max(cell size, 1 % of depth) of the median
+    depth (by gsplat's conventions) in that pixel. Pixels without a cell are not worked out.
+
+    Args:
+        splats: the prior that `cells` came from.
+        cells: see `surface`.
+        cameras: C views in world coordinates.
+        progress: told of the views done.
+
+    Returns:
+        A `Visible`.
+    """
+    scene, origin = core_scene(splats)
+    starts, seen = _core.select_visible(
+        scene, cells.parts, core_views(cameras, origin, scene), progress=counter(progress, "visibility")
+    )
+    return Visible(starts, seen)
+
+
+def core_scene(splats: Splats) -> tuple[tuple[Any, ...], Float]:
+    """What `_core` takes, and the world point it is centred about."""
+    if not len(splats):
+        raise InputError("the scene is empty")
+    means = splats.means.astype(np.float64)
+    middle = np.median(means, axis=0)
+    arrays = (means - middle, splats.quats, splats.scales, splats.opacities)
+    return tuple(np.ascontiguousarray(a) for a in arrays), middle + splats.offset
+
+
+def core_views(cameras: Cameras, origin: Float, scene: tuple[Any, ...]) -> list[tuple[Any, ...]]:
+    """The cameras as `_core` takes them, about the origin of a `core_scene`."""
+    near = settings_for(scene[0]).near_of(0)
+    local = cameras.recentred(origin)
+    return [
+        (
+            local.viewmats[i].tolist(),
+            [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
+            (int(local.widths[i]), int(local.heights[i])),
+            near,
+        )
+        for i, K in enumerate(local.Ks)
+    ]
+
+
+def greedy(
+    splats: Splats,
+    cameras: Cameras,
+    policy: str,
+    options: CoverageOptions | None,
+    progress: Progress,
+    seconds: dict[str, float],
+) -> tuple[Order, Float, int]:
+    """The pool in the greedy's order without views that see no cell, what each adds, and evaluations."""
+    options = options or CoverageOptions()
+    began = time.perf_counter()
+    cells = surface(splats, options.cells)
+    seconds["surface"] = time.perf_counter() - began
+    began = time.perf_counter()
+    seen = visible_cells(splats, cells, cameras, progress=progress)
+    seconds["visibility"] = time.perf_counter() - began
+    usable = np.diff(seen.starts.astype(np.int64)) > 0
+    began = time.perf_counter()
+    order, gains, evaluations = _core.select_greedy(
+        cells.parts,
+        seen.starts,
+        seen.cells,
+        np.ascontiguousarray(cameras.recentred(cells.origin).positions),
+        len(cameras),
+        directional=policy == "directional",
+        kappa=options.kappa,
+        alpha=options.alpha,
+        lambda_=options.offset,
+        anchors=options.anchors,
+        epsilon=options.epsilon,
+        lazy=options.lazy,
+        progress=counter(progress, "select"),
+    )
+    seconds["greedy"] = time.perf_counter() - began
+    keep = usable[order]
+    return order.astype(np.int64)[keep], gains[keep], evaluations

@@ -1,0 +1,281 @@
+"""Fewer Gaussians at an exact budget: rounds of drop, merge and trim (section 3.2 of the paper)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.errors import InputError
+from g2ard.prepared import PreparedScene, finite_rows_of, with_some_opacity
+from g2ard.progress import Progress, counter, silent
+from g2ard.splats import DRAWN_LOGIT, Splats
+from g2ard.stages.simplify.config import METHODS, SimplifyConfig, schedule
+from g2ard.stages.simplify.pairs import (
+    Visibility,
+    VisibilitySource,
+    merge,
+    merge_and_fit,
+    rows_of,
+    splats_of,
+)
+from g2ard.stages.simplify.report import SimplifyReport, SimplifyRound
+
+__all__ = [
+    "METHODS",
+    "Simplified",
+    "SimplifyConfig",
+    "SimplifyReport",
+    "Visibility",
+    "VisibilitySource",
+    "flag",
+    "schedule",
+    "simplify",
+]
+
+_DEFAULTS = SimplifyConfig()
+
+
+@dataclass(frozen=True, eq=False)
+class Simplified:
+    """What simplification made.
+
+    Args:
+        splats: exactly the budget of Gaussians, in an order that only the scene's content decides. Their
+            geometry is what recovery takes as anchors.
+        parents: (N,) int64, the output row each input row went to; −1 if it was dropped or trimmed.
+        protected: (M,) bool, flags inherited by OR from everything merged into the row.
+        report: what was done, in numbers.
+    """
+
+    splats: Splats
+    parents: NDArray[np.int64]
+    protected: NDArray[np.bool_]
+    report: SimplifyReport
+
+
+def flag(
+    splats: Splats, budget: int, *, config: SimplifyConfig = _DEFAULTS, progress: Progress = silent
+) -> NDArray[np.bool_]:
+    """Protection flags of a raw prior: p_i = 1[E_c(i) > ε_h] (eq. `frequency`).
+
+    E_j is the mean squared residual of an affine predictor of colour, clamped to [0, 1], within cell j, over
+    about `budget` cells; a cell of few members borrows those of its face neighbours for the fit.
+
+    Args:
+        splats: the raw prior, never a recovered scene: fitting hides the residual.
+        budget: the final count N_S, which sets the cell size.
+        config: `flag_threshold` and `flag_members` are read.
+        progress: told when done.
+
+    Returns:
+        (N,) bool; False for rows that are not finite.
+
+    Raises:
+        InputError: no finite row, or a budget below 1.
+
+    >>> plane = np.stack(np.meshgrid(range(20), range(20), [0]), -1).reshape(-1, 3)
+    >>> noise = np.random.default_rng(0).normal(size=(400, 1, 3)) * (plane[:, :1, None] > 9)
+    >>> scene = Splats.create(plane, scales=np.ones((400, 3)), sh0=noise)
+    >>> flags = flag(scene, 40)
+    >>> float(flags[plane[:, 0] < 8].mean()), float(flags[plane[:, 0] > 12].mean())
+    (0.0, 1.0)
+    """
+    _check_budget(budget, None)
+    scene, finite = finite_rows_of(splats)
+    found = _core.simplify_flags(
+        scene.core,
+        budget,
+        threshold=config.flag_threshold,
+        members=config.flag_members,
+        progress=counter(progress, "flag"),
+    )
+    flags = np.zeros(len(splats), bool)
+    flags[finite] = found
+    return flags
+
+
+def simplify(
+    splats: Splats,
+    budget: int,
+    *,
+    method: str = "default",
+    visibility: Visibility | VisibilitySource | None = None,
+    protected: NDArray[np.bool_] | None = None,
+    final_budget: int | None = None,
+    config: SimplifyConfig = _DEFAULTS,
+    progress: Progress = silent,
+) -> Simplified:
+    """Reduce a scene to exactly `budget` Gaussians.
+
+    `default` aims at the error in the image. Down to three times the budget it merges along Morton order,
+    wherever that costs least; then, in rounds that lock what they merge, the cheapest pairs of neighbours
+    become one. Mean, covariance and SH are averaged by mass, and mass m = α·A *as rendered* is conserved,
+    with A = √tr adj(Σ + e²I) and e the blur of a renderer. A merge costs the squared error of its projections
+    times how much of it the views see. Without `visibility` it needs no cameras at all; with a function
+    of it the rows' opacities are fitted last to what the views see of them.
+
+    `fast` merges along Morton order all the way, on two lattices in turn: no graph of neighbours.
+
+    `paper`: rounds of 75 %; each drops α < 0.01, merges cell × colour-bin groups by moment matching where the
+    affine-energy and surface-coverage guards pass, at most down to the round's count, and trims what is left
+    by π = −log(1 − α)·A·(1 + λ_h·p) (eq. `importance`). There is about one cell for each Gaussian of the
+    final budget, in every round (`docs/paper.md` holds how the paper is read).
+
+    Rows below the methods' α are dropped first, unless the budget needs them, or there are no others.
+
+    The result does not depend on the order of the rows, the unit, or the number of threads.
+
+    Args:
+        splats: the scene. Infinite logits mean α = 0 or 1, scales over e⁴³ count as that; rows with other
+            non-finite values are dropped and counted.
+        budget: Gaussians to keep, at most as many as there are.
+        method: the policy.
+        visibility: for `default` and `fast`: what views see of each Gaussian (`g2ard.visibility`), or
+            a function that finds it for a scene, asked again for the result, whose opacities it fits.
+        protected: (N,) bool flags to inherit. With None, `paper` computes them (see `flag`), the others,
+            which have no use for them, go without.
+        final_budget: for `paper`: N_S, where this call is one round on the way to a smaller count; it sets
+            the size of all cells. None means `budget`.
+        config: the constants.
+        progress: told of Gaussians shed, round by round.
+
+    Returns:
+        The scene, where each row went, the inherited flags and a report.
+
+    Raises:
+        InputError: a budget below 1 or above the count of finite rows, arrays of another length, or an
+            unknown method.
+
+    >>> rng = np.random.default_rng(0)
+    >>> scene = Splats.create(rng.normal(size=(1000, 3)), scales=np.full((1000, 3), 0.1))
+    >>> small = simplify(scene, 100)
+    >>> len(small.splats), small.parents.shape, int(small.parents.max())
+    (100, (1000,), 99)
+    """
+    if method not in METHODS:
+        raise InputError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+    scene, finite = finite_rows_of(splats)
+    _check_budget(budget, len(scene))
+    flags = _check_flags(protected, len(splats))
+    if flags is not None:
+        flags = np.ascontiguousarray(flags[finite])
+    if not (scene.opacities >= config.min_opacity_of(method)).any():
+        scene, config = with_some_opacity(scene), replace(config, min_opacity=0.0)
+    if method == "paper":
+        out = _paper(scene, budget, flags, final_budget or budget, config, progress)
+    else:
+        out = _pairs(scene, budget, method, visibility, len(splats), finite, flags, config, progress)
+    return _simplified(splats, finite, out)
+
+
+def _pairs(
+    scene: PreparedScene,
+    budget: int,
+    method: str,
+    visibility: Visibility | VisibilitySource | None,
+    count: int,
+    finite: NDArray[np.bool_] | slice,
+    flags: NDArray[np.bool_] | None,
+    config: SimplifyConfig,
+    progress: Progress,
+) -> dict[str, Any]:
+    if callable(visibility):
+        return merge_and_fit(scene, budget, method, visibility, flags, config, progress)
+    of_rows = None if visibility is None else rows_of(visibility, count, finite)
+    return merge(scene, budget, method, of_rows, flags, config, counter(progress, "simplify"))
+
+
+def _paper(
+    scene: PreparedScene,
+    budget: int,
+    flags: NDArray[np.bool_] | None,
+    cells: int,
+    config: SimplifyConfig,
+    progress: Progress,
+) -> dict[str, Any]:
+    return _core.simplify_paper(
+        scene.core,
+        schedule(len(scene), budget, config.retention_of("paper"), config.fold),
+        cells,
+        protected=flags,
+        min_opacity=config.min_opacity_of("paper"),
+        color_bin=config.color_bin,
+        max_energy=config.max_energy,
+        min_coverage=config.min_coverage,
+        support=config.support,
+        flag_threshold=config.flag_threshold,
+        flag_members=config.flag_members,
+        protection=config.protection,
+        progress=counter(progress, "simplify"),
+    )
+
+
+def _check_budget(budget: int, count: int | None) -> None:
+    if budget < 1:
+        raise InputError(f"budget: expected at least 1, got {budget}")
+    if count is not None and budget > count:
+        raise InputError(f"budget: expected at most the {count} Gaussians there are, got {budget}")
+
+
+def _check_flags(protected: NDArray[np.bool_] | None, count: int) -> NDArray[np.bool_] | None:
+    if protected is None:
+        return None
+    flags = np.asarray(protected)
+    if flags.dtype != np.bool_ or flags.shape != (count,):
+        raise InputError(f"protected: expected bool of shape ({count},), got {flags.dtype} {flags.shape}")
+    return flags
+
+
+def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str, Any]) -> Simplified:
+    parents = np.full(len(splats), -1, np.int64)
+    parents[finite] = out["parents"]
+    small = splats_of(splats, out).with_sh_degree(splats.sh_degree)
+    kept = int(np.count_nonzero(parents >= 0))
+    alone = int(np.count_nonzero(np.bincount(parents[parents >= 0], minlength=len(small)) == 1))
+    protected: NDArray[np.bool_] = out["protected"]
+    report = SimplifyReport(
+        input_count=len(splats),
+        output_count=len(small),
+        merged_members=kept - alone,
+        rounds=tuple(SimplifyRound.of(r) for r in out["rounds"]),
+        protected=int(np.count_nonzero(protected)),
+        nonfinite_rows=0 if isinstance(finite, slice) else len(splats) - int(np.count_nonzero(finite)),
+        infinite_logits=out["infinite_logits"],
+        clamped_opacities=out["clamped_opacities"],
+        fitted=out.get("fitted", 0),
+        unseen=out.get("unseen"),
+        faded=_faded(splats, small, parents),
+        skipped={
+            "alone": alone,
+            "sh_bands": splats.sh_degree - math.isqrt(out["sh"].shape[1]) + 1,
+            **_spared(out["rounds"]),
+        },
+    )
+    return Simplified(small, parents, protected, report)
+
+
+def _faded(splats: Splats, small: Splats, parents: NDArray[np.int64]) -> int:
+    """Merged rows that no renderer draws, though it drew a member: floaters so far apart that their mass,
+    which is conserved, stops no light any more."""
+    faint = small.logit_opacities < DRAWN_LOGIT
+    if not faint.any():
+        return 0
+    drawn = np.zeros(len(small), bool)
+    drawn[parents[(parents >= 0) & (splats.logit_opacities >= DRAWN_LOGIT)]] = True
+    return int(np.count_nonzero(faint & drawn))
+
+
+def _spared(rounds: list[dict[str, Any]]) -> dict[str, int]:
+    """What the paper's rounds need not have done."""
+    if not rounds or "cells" not in rounds[0]:
+        return {}
+    return {
+        "coverages": sum(r["refused"]["energy"] for r in rounds),
+        "binnings": sum(r["cells"] == 0 for r in rounds),
+        "trims": sum(r["trimmed"] == 0 for r in rounds),
+    }

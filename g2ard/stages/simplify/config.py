@@ -1,0 +1,158 @@
+"""What the policies of simplification share: their constants and the counts of their rounds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from g2ard import _core
+from g2ard.errors import InputError
+
+__all__ = ["METHODS", "SimplifyConfig", "schedule"]
+
+METHODS = ("default", "fast", "paper")
+"""The policies."""
+
+_RETENTION = {"default": 0.65, "fast": 0.65, "paper": 0.75}
+
+_CORE = _core.defaults()
+"""The core's constants by method: the one place of the defaults below."""
+
+_PAIRWISE, _PAPER = _CORE["default"], _CORE["paper"]
+
+
+_OF_METHOD = ("min_opacity", "morton_premerge_ratio", "morton_premerge_steps")
+"""Constants whose default is the method's own."""
+
+
+@dataclass(frozen=True)
+class SimplifyConfig:
+    """The constants of simplification: those of `paper` are the paper's (`tab:s_config`) where it states
+    them, the others are measured (`docs/paper.md`, `docs/decisions.md`).
+
+    Args:
+        retention: share of the Gaussians that a round keeps; None means the method's own, 0.75 in the paper,
+            0.65 for the others (fewer rounds, as good).
+        fold: a last cut by less than this share is folded into the round before, in 0–1; not in the paper. A
+            cut of a few Gaussians would cost a whole recovery.
+        min_opacity: below this α a Gaussian is dropped; None means the method's own, 0.01 in the paper, 0.004
+            (what no renderer draws) for the others.
+        morton_premerge_ratio: of `default` and `fast`: down to this many times the budget rows merge along
+            Morton order alone, before pairs of neighbours do; at least 1, infinite for never. None means the
+            method's own, 3 for `default`, 1 for `fast`.
+        morton_premerge_steps: of `default` and `fast`: in how many steps, each on a shifted lattice. None
+            means the method's own, 1 for `default`, 2 for `fast`.
+        neighbors: `default`: nearest clusters that one may merge with. More lets far ones in: 16 is worse.
+        geometric_weight: of `default` and `fast`: weight of the error of coverage beside that of colour; half
+            of it without views, for much of what it would then weigh lies hidden.
+        dilation: of `default` and `fast`: standard deviation of the blur that renderers add, in pixels
+            (√0.3 would be all of it; 0.4 measured best).
+        pixel_scale: of `default` and `fast` without views: the size of a pixel over the median of the largest
+            scales.
+        max_growth: of `default` and `fast`: how many times the area that its moments say a cluster may take,
+            along its two longer axes, where α ≤ 0.99 alone cannot hold its mass. At 1 opaque surfaces show
+            gaps.
+        color_bin: `paper`: edge of the colour bins that part [0, 1] within a cell, in colour units
+            (`tab:s_config`).
+        max_energy: `paper`: largest affine energy of a merged group, summed over channels, colour units
+            squared (`tab:s_config`; E_j of eq. `frequency`).
+        min_coverage: `paper`: least share of the members' footprint area that the merged footprint covers
+            (`tab:s_config`).
+        support: `paper`: where a footprint ends for that, in standard deviations; not in the paper. 3 is
+            where 3DGS's renderer ends it.
+        flag_threshold: ε_h, the affine residual of a cell above which its Gaussians are protected, colour
+            units squared (eq. `frequency`, `tab:s_config`).
+        flag_members: a cell with fewer Gaussians borrows those of its face neighbours for the fit behind its
+            residual; not in the paper. 8 are two for each of the four affine coefficients; 1 borrows nothing.
+        protection: `paper`: λ_h, what a protected Gaussian's priority π is raised by (eq. `importance`,
+            `tab:s_config`).
+    """
+
+    retention: float | None = None
+    fold: float = 0.05
+    min_opacity: float | None = None
+    morton_premerge_ratio: float | None = None
+    morton_premerge_steps: int | None = None
+    neighbors: int = _PAIRWISE["neighbors"]
+    geometric_weight: float = _PAIRWISE["geometric_weight"]
+    dilation: float = _PAIRWISE["dilation"]
+    pixel_scale: float = _PAIRWISE["pixel_scale"]
+    max_growth: float = _PAIRWISE["max_growth"]
+    color_bin: float = _PAPER["color_bin"]
+    max_energy: float = _PAPER["max_energy"]
+    min_coverage: float = _PAPER["min_coverage"]
+    support: float = _PAPER["support"]
+    flag_threshold: float = _PAPER["flag_threshold"]
+    flag_members: int = _PAPER["flag_members"]
+    protection: float = _PAPER["protection"]
+
+    def __post_init__(self) -> None:
+        if self.retention is not None and not 0 < self.retention < 1:
+            raise InputError(f"retention: expected a number between 0 and 1, got {self.retention}")
+        if not 0 <= self.fold < 1:
+            raise InputError(f"fold: expected a number in [0, 1), got {self.fold}")
+        if not self.max_growth >= 1:
+            raise InputError(f"max_growth: expected at least 1, got {self.max_growth}")
+        if self.morton_premerge_ratio is not None and not self.morton_premerge_ratio >= 1:
+            raise InputError(f"morton_premerge_ratio: expected at least 1, got {self.morton_premerge_ratio}")
+        if self.morton_premerge_steps is not None and self.morton_premerge_steps < 1:
+            raise InputError(f"morton_premerge_steps: expected at least 1, got {self.morton_premerge_steps}")
+        if self.neighbors < 1:
+            raise InputError(f"neighbors: expected at least 1, got {self.neighbors}")
+        for name in ("color_bin", "pixel_scale", "support"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise InputError(f"{name}: expected a positive number, got {value}")
+        for name in (
+            "min_opacity",
+            "geometric_weight",
+            "dilation",
+            "max_energy",
+            "min_coverage",
+            "flag_threshold",
+            "flag_members",
+            "protection",
+        ):
+            value = getattr(self, name)
+            if value is not None and not value >= 0:
+                raise InputError(f"{name}: expected a number ≥ 0, got {value}")
+        if self.min_opacity is not None and self.min_opacity > 1:
+            raise InputError(f"min_opacity: expected a number in [0, 1], got {self.min_opacity}")
+
+    def resolved(self, method: str) -> SimplifyConfig:
+        """The same with the method's own constants where None stands for them.
+
+        >>> SimplifyConfig().resolved("paper").retention
+        0.75
+        """
+        own = {
+            name: value
+            for name, value in _CORE[method].items()
+            if name in _OF_METHOD and getattr(self, name) is None
+        }
+        return replace(self, retention=self.retention_of(method), **own)
+
+    def retention_of(self, method: str) -> float:
+        """The share a round of `method` keeps."""
+        return _RETENTION[method] if self.retention is None else self.retention
+
+    def min_opacity_of(self, method: str) -> float:
+        """The α below which `method` drops."""
+        return self.resolved(method).min_opacity or 0.0
+
+
+def schedule(count: int, budget: int, retention: float = 0.75, fold: float = 0.05) -> list[int]:
+    """Counts after each round: N_r = max(N_S, ⌈retention·N_{r−1}⌉), a last cut by less than `fold` folded in.
+
+    >>> schedule(500_000, 50_000)
+    [375000, 281250, 210938, 158204, 118653, 88990, 66743, 50000]
+    >>> schedule(10, 10)
+    []
+    """
+    rounds: list[int] = []
+    while count > budget:
+        count = max(budget, min(count - 1, math.ceil(retention * count)))
+        if budget > (1 - fold) * count:
+            count = budget
+        rounds.append(count)
+    return rounds

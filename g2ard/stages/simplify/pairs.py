@@ -1,0 +1,165 @@
+"""The methods `default` and `fast`, which the core calls pairwise: merging weighed by what views see, then
+opacities fitted to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.errors import InputError
+from g2ard.prepared import PreparedScene
+from g2ard.progress import Progress, counter
+from g2ard.splats import DRAWN_LOGIT, Splats
+from g2ard.stages.simplify.config import SimplifyConfig, schedule
+
+__all__ = ["Visibility", "VisibilitySource", "merge", "merge_and_fit", "rows_of", "splats_of"]
+
+_FIT = 1 / 4
+"""Exponent of the ratio of what views saw to what they see: ½ fits the views looked from by up to 0.1 dB
+better, and others by up to 0.4 dB worse (`docs/decisions.md`)."""
+
+MAX_OPACITY = 0.99
+"""α never exceeds it: renderers clip there."""
+
+DRAWN_OPACITY = float(1 / (1 + np.exp(-DRAWN_LOGIT)))
+"""Renderers draw nothing fainter."""
+
+
+class Visibility(Protocol):
+    """What views see of N Gaussians, such as `g2ard.visibility.visibility` returns."""
+
+    @property
+    def weight(self) -> NDArray[Any]:
+        """(N,) Σ αT over the pixels of the views."""
+
+    @property
+    def pixel_size(self) -> NDArray[Any]:
+        """(N,) the size of a pixel there, scene units; ∞ where no view contains it."""
+
+
+VisibilitySource = Callable[[Splats], Visibility]
+"""Finds what views see of a scene, such as `g2ard.visibility.visibility_source` returns."""
+
+
+@dataclass(frozen=True, eq=False)
+class _RowVisibility:
+    weight: NDArray[np.float32]
+    pixel_size: NDArray[np.float32]
+
+
+def rows_of(visibility: Visibility, count: int, finite: NDArray[np.bool_] | slice) -> _RowVisibility:
+    """The finite rows of a visibility, contiguous."""
+    for name in ("weight", "pixel_size"):
+        shape = getattr(visibility, name).shape
+        if shape != (count,):
+            raise InputError(f"visibility.{name}: expected shape ({count},), got {shape}")
+    weight, pixel = (np.asarray(a, np.float32)[finite] for a in (visibility.weight, visibility.pixel_size))
+    return _RowVisibility(np.ascontiguousarray(weight), np.ascontiguousarray(pixel))
+
+
+def merge(
+    scene: PreparedScene,
+    budget: int,
+    method: str,
+    visibility: Visibility | None,
+    flags: NDArray[np.bool_] | None,
+    config: SimplifyConfig,
+    tell: Callable[[int, int], None],
+) -> dict[str, Any]:
+    """`default` or `fast`; `visibility` has a row for each of the scene's."""
+    config = config.resolved(method)
+    return _core.simplify_pairwise(
+        scene.core,
+        schedule(len(scene), budget, config.retention_of(method), config.fold),
+        protected=flags,
+        weight=None if visibility is None else visibility.weight,
+        pixel_size=None if visibility is None else visibility.pixel_size,
+        min_opacity=config.min_opacity_of(method),
+        morton_premerge_ratio=config.morton_premerge_ratio,
+        morton_premerge_steps=config.morton_premerge_steps,
+        neighbors=config.neighbors,
+        geometric_weight=config.geometric_weight,
+        dilation=config.dilation,
+        pixel_scale=config.pixel_scale,
+        max_growth=config.max_growth,
+        progress=tell,
+    )
+
+
+def merge_and_fit(
+    scene: PreparedScene,
+    budget: int,
+    method: str,
+    source: VisibilitySource,
+    flags: NDArray[np.bool_] | None,
+    config: SimplifyConfig,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Merge by what views see of the scene, then fit each row's opacity to what they see of the result."""
+    visibility = rows_of(source(scene), len(scene), slice(None))
+    out = merge(scene, budget, method, visibility, flags, config, counter(progress, "simplify"))
+    merged, parents = splats_of(scene, out), out["parents"]
+    order = scene.core.order  # sums round alike whatever the order of the rows
+    fitted = _fitted(merged, parents[order], visibility.weight[order], source(merged).weight)
+    changed = fitted.logit_opacities != merged.logit_opacities
+    changed |= (fitted.scales != merged.scales).any(axis=1)
+    return {
+        **out,
+        "scales": fitted.scales,
+        "logit_opacities": fitted.logit_opacities,
+        "fitted": int(np.count_nonzero(changed)),
+        "unseen": int(np.count_nonzero((visibility.weight == 0) & (parents >= 0))),
+    }
+
+
+def _fitted(scene: Splats, parents: NDArray[np.int64], wanted: NDArray[Any], now: NDArray[Any]) -> Splats:
+    """The scene with opacities by which the views see of each row about what they saw of its members.
+
+    α is multiplied by the fourth root of the ratio, within 0.84–1.19: neighbours share what is missing, and
+    other views than these want less of it. What α ≤ 0.99 cannot hold goes to the area of the two longer axes.
+    A floor of 5 % of the mean keeps what is hardly seen as it is.
+
+    Args:
+        scene: M merged Gaussians.
+        parents: (N,) the row each of N Gaussians went to, or −1.
+        wanted: (N,) Σ αT of the N.
+        now: (M,) Σ αT of the M.
+    """
+    kept = parents >= 0
+    members = np.bincount(parents[kept], minlength=len(scene))
+    target = np.bincount(parents[kept], wanted[kept], len(scene))
+    floor = 0.05 * target.mean()
+    factor = np.clip((target + floor) / np.maximum(now + floor, np.finfo(float).tiny), 0.5, 2.0) ** _FIT
+    alone = (members < 2) | ~np.isfinite(factor)
+    alpha = scene.opacities.astype(np.float64)
+    held = np.minimum(alpha * factor, np.maximum(alpha, MAX_OPACITY))
+    faint = (held < DRAWN_OPACITY) & (alpha >= DRAWN_OPACITY)  # what was drawn still is
+    held = np.where(faint | (alpha <= 0) | alone, alpha, held)
+    area = np.where(alone | faint | (held <= 0), 1.0, alpha * factor / np.maximum(held, 1e-30))
+    changed = held != alpha
+    logits = np.log(np.maximum(held, 1e-30)) - np.log1p(-np.minimum(held, 1 - 1e-9))
+    shortest = np.arange(3) == np.argmin(scene.scales, axis=1)[:, None]
+    grown = (area > 1)[:, None] & ~shortest
+    return replace(
+        scene,
+        logit_opacities=np.where(changed, logits, scene.logit_opacities).astype(np.float32),
+        scales=np.where(grown, scene.scales * np.sqrt(area)[:, None], scene.scales).astype(np.float32),
+    )
+
+
+def splats_of(like: Splats, out: dict[str, Any]) -> Splats:
+    sh: NDArray[np.float32] = out["sh"]
+    return Splats(
+        means=out["means"].astype(like.means.dtype, copy=False),
+        quats=out["quats"],
+        scales=out["scales"],
+        logit_opacities=out["logit_opacities"],
+        sh0=np.ascontiguousarray(sh[:, :1]),
+        shN=np.ascontiguousarray(sh[:, 1:]),
+        offset=like.offset,
+    )

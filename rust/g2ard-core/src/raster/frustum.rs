@@ -1,0 +1,61 @@
+//! Which boxes can touch an image: a conservative test over groups of rows, in f64.
+//!
+//! [`crate::select::Pinhole`] has its own, in f32 with the slack that takes: it bounds Gaussians by their own traces
+//! and reaches, as its projection does, where this one knows only the largest scale.
+
+use super::{Camera, DILATION};
+
+/// Standard deviations at which an opacity of 1 falls to α = 1/255, and a little more.
+const REACH: f64 = 3.4;
+
+/// One camera's test: it may keep a box that touches nothing, but never refuses one that does.
+pub struct Frustum<'a> {
+    camera: &'a Camera,
+    near: f64,
+    focal: f64,
+    /// ‖J‖ / focal · z at most, by the clamped rays of the projection's Jacobian.
+    spread: f64,
+}
+
+impl<'a> Frustum<'a> {
+    pub fn of(camera: &'a Camera) -> Self {
+        let widest = |size: usize, c: f64, f: f64| {
+            let size = size as f64;
+            c.abs().max((size - c).abs()) / f + 0.15 * size / f
+        };
+        let x = widest(camera.width, camera.cx, camera.fx);
+        let y = widest(camera.height, camera.cy, camera.fy);
+        Self {
+            camera,
+            near: 0.999 * f64::from(camera.near),
+            focal: camera.fx.max(camera.fy),
+            spread: (1.0 + x * x + y * y).sqrt(),
+        }
+    }
+
+    /// Whether Gaussians with means in a box, given by its centre and half its sides, and no larger scale than `scale`
+    /// can touch the image.
+    pub fn meets(&self, centre: [f32; 3], half: [f32; 3], scale: f32) -> bool {
+        let c = self.camera;
+        let middle = c.to_camera(centre.map(f64::from));
+        let reach = [0, 1, 2].map(|r: usize| {
+            let row = &c.viewmat[r];
+            let side = |k: usize| row[k].abs() * f64::from(half[k]);
+            side(0) + side(1) + side(2) + 1e-5 * middle[r].abs()
+        });
+        let far = middle[2] + reach[2];
+        if far < self.near {
+            return false;
+        }
+        let near = (middle[2] - reach[2]).max(self.near);
+        let sigma = self.focal / near * self.spread * f64::from(scale);
+        let radius = REACH * (sigma * sigma + f64::from(DILATION)).sqrt() + 2.0;
+        let touches = |axis: usize, focal: f64, centre: f64, size: usize| {
+            let (low, high) = (middle[axis] - reach[axis], middle[axis] + reach[axis]);
+            let low = focal * low / if low < 0.0 { near } else { far };
+            let high = focal * high / if high > 0.0 { near } else { far };
+            high + centre + radius >= 0.0 && low + centre - radius <= size as f64
+        };
+        touches(0, c.fx, c.cx, c.width) && touches(1, c.fy, c.cy, c.height)
+    }
+}

@@ -1,0 +1,428 @@
+//! The passes in order, and the buffers they share: those of one view, reused from call to call.
+
+mod sensitive;
+mod tiled;
+mod views;
+
+use std::time::Instant;
+
+use rayon::prelude::*;
+
+use super::accumulate::{ALL, Accumulated, SharedSums, Total, smallest_pixels};
+use super::backward::SUMS;
+use super::depth_sort::{self, Key};
+use super::disjoint::DisjointSlice;
+use super::gradients::{Gather, Gradients, Sink};
+use super::memory::bytes;
+use super::params::{Params, Source};
+use super::project::{Project, Splat, View};
+use super::simd::{Isa, LANES, Lanes16, dispatch};
+use super::tile_batch::BATCH;
+use super::tile_lists::{TileIntersector, TileList};
+use super::tiles::Bins;
+use super::{BLOCKS, Camera, Settings};
+use crate::{Error, Result};
+
+pub use views::{Counts, Image, ImageGradients, Memory, Passes};
+
+use views::lap;
+
+/// Groups of sixteen rows projected as one piece of work.
+const CHUNK: usize = 64;
+
+/// One chunk of rows after the backward pass: its visible splats and where their sums lie.
+pub(crate) struct ChunkSums<'a> {
+    pub view: &'a View,
+    pub first_group: usize,
+    pub last_group: usize,
+    pub splats: &'a [Splat],
+    pub slots: &'a [[f32; SUMS]],
+    pub written: &'a [u8],
+}
+
+struct ForwardState {
+    camera: Camera,
+    settings: Settings,
+    view: View,
+    background: [f32; 3],
+    rows: usize,
+}
+
+/// Renders one view and remembers what its backward pass needs; every buffer is reused by the next view.
+pub struct Rasterizer {
+    isa: Isa,
+    state: Option<ForwardState>,
+    splats: Vec<Splat>,
+    tile_lists: Vec<TileList>,
+    intersectors: Vec<TileIntersector>,
+    /// (first splat, number visible) of each chunk of rows.
+    chunks: Vec<(usize, usize)>,
+    order: Vec<Key>,
+    spare: Vec<Key>,
+    bins: Bins,
+    /// First batch of each tile, and how many the forward pass processed.
+    batches: Vec<(usize, usize)>,
+    block_masks: Vec<[u64; BLOCKS]>,
+    transmittance: Vec<[Lanes16; BLOCKS]>,
+    last: Vec<[Lanes16; BLOCKS]>,
+    slots: Vec<[f32; SUMS]>,
+    /// The sums of visibility, one pair's after another's.
+    shares: Vec<f32>,
+    written: Vec<u8>,
+    passes: Passes,
+}
+
+impl Default for Rasterizer {
+    fn default() -> Self {
+        Self::new(Isa::detect())
+    }
+}
+
+impl Rasterizer {
+    pub fn new(isa: Isa) -> Self {
+        Self {
+            isa,
+            state: None,
+            splats: Vec::new(),
+            tile_lists: Vec::new(),
+            intersectors: Vec::new(),
+            chunks: Vec::new(),
+            order: Vec::new(),
+            spare: Vec::new(),
+            bins: Bins::default(),
+            batches: Vec::new(),
+            block_masks: Vec::new(),
+            transmittance: Vec::new(),
+            last: Vec::new(),
+            slots: Vec::new(),
+            shares: Vec::new(),
+            written: Vec::new(),
+            passes: Passes::default(),
+        }
+    }
+
+    pub fn isa(&self) -> Isa {
+        self.isa
+    }
+
+    /// Renders a view.
+    pub fn forward(
+        &mut self,
+        params: &Params,
+        camera: &Camera,
+        settings: &Settings,
+        background: [f32; 3],
+        image: &mut Image,
+    ) -> Result<()> {
+        params.validate()?;
+        camera.validate()?;
+        settings.validate()?;
+        image.validate(camera)?;
+        self.prepare(*params, camera, settings, background);
+        let mut clock = Instant::now();
+        if image.depth.is_some() || image.median.is_some() {
+            self.forward_tiles::<true>(image);
+        } else {
+            self.forward_tiles::<false>(image);
+        }
+        self.passes.forward = lap(&mut clock);
+        Ok(())
+    }
+
+    /// Gradients of the last forward pass; `params` must be the ones it rendered.
+    pub fn backward(
+        &mut self,
+        params: &Params,
+        image: &ImageGradients,
+        out: &mut Gradients,
+    ) -> Result<()> {
+        params.validate()?;
+        out.validate(params)?;
+        let sink = out.sink(params.sh_coeffs);
+        self.backward_into(*params, image, sink)
+    }
+
+    pub(crate) fn backward_into<S: Source, K: Sink>(
+        &mut self,
+        source: S,
+        image: &ImageGradients,
+        sink: K,
+    ) -> Result<()> {
+        let Some(state) = &self.state else {
+            return Err(Error::invalid(
+                "backward",
+                "a forward pass before it",
+                "none",
+            ));
+        };
+        if source.len() != state.rows {
+            return Err(Error::invalid("rows", state.rows.to_string(), source.len()));
+        }
+        image.validate(&state.camera)?;
+        let mut clock = Instant::now();
+        if image.depth.is_some() {
+            self.backward_tiles::<true>(image);
+        } else {
+            self.backward_tiles::<false>(image);
+        }
+        self.passes.backward = lap(&mut clock);
+        let Some(state) = &self.state else {
+            return Ok(());
+        };
+        let chunks = self.chunks.par_iter().enumerate();
+        chunks.for_each(|(chunk, &(first, count))| {
+            let slots = self.bins.slots_of(chunk);
+            let gather = Gather {
+                view: &state.view,
+                source,
+                sink,
+                splats: &self.splats[first..first + count],
+                slots: &self.slots[slots.clone()],
+                written: &self.written[slots],
+            };
+            dispatch(self.isa, gather);
+        });
+        self.passes.gather = lap(&mut clock);
+        Ok(())
+    }
+
+    /// Renders any source, image only.
+    pub(crate) fn forward_from<S: Source>(
+        &mut self,
+        source: S,
+        camera: &Camera,
+        settings: &Settings,
+        background: [f32; 3],
+        image: &mut Image,
+    ) {
+        self.prepare(source, camera, settings, background);
+        let mut clock = Instant::now();
+        self.forward_tiles::<false>(image);
+        self.passes.forward = lap(&mut clock);
+    }
+
+    /// Fills the slots, then calls `finish(chunk, slots of the chunk's splats)` for every chunk of rows, in parallel,
+    /// and returns what the calls do, in order.
+    pub(crate) fn backward_by_chunk<T: Send>(
+        &mut self,
+        image: &ImageGradients,
+        finish: impl Fn(&ChunkSums) -> T + Sync,
+    ) -> Vec<T> {
+        let mut clock = Instant::now();
+        self.backward_tiles::<false>(image);
+        self.passes.backward = lap(&mut clock);
+        let Some(state) = &self.state else {
+            return Vec::new();
+        };
+        let groups = state.rows.div_ceil(LANES);
+        let finish = |(chunk, &(first, count)): (usize, &(usize, usize))| {
+            let slots = self.bins.slots_of(chunk);
+            finish(&ChunkSums {
+                view: &state.view,
+                first_group: chunk * CHUNK,
+                last_group: groups.min((chunk + 1) * CHUNK),
+                splats: &self.splats[first..first + count],
+                slots: &self.slots[slots.clone()],
+                written: &self.written[slots],
+            })
+        };
+        let results = self.chunks.par_iter().enumerate().map(finish).collect();
+        self.passes.gather = lap(&mut clock);
+        results
+    }
+
+    /// Renders a view without an image and adds what every Gaussian contributes to it.
+    pub fn accumulate(
+        &mut self,
+        params: &Params,
+        camera: &Camera,
+        settings: &Settings,
+        sums: &mut Accumulated,
+    ) -> Result<()> {
+        params.validate()?;
+        camera.validate()?;
+        settings.validate()?;
+        if sums.weight.len() != params.len() {
+            return Err(Error::invalid(
+                "accumulate",
+                format!("sums of {} rows", params.len()),
+                sums.weight.len(),
+            ));
+        }
+        let colourless = Params {
+            sh_n: &[],
+            sh_coeffs: 1,
+            ..*params
+        };
+        let rows = SharedSums::new(sums);
+        self.accumulate_from::<ALL, _>(colourless, camera, settings, |row, total| {
+            // SAFETY: the call comes once for every row.
+            unsafe { rows.add(row, &total) };
+        });
+        smallest_pixels(params, camera, &mut sums.pixel_size);
+        Ok(())
+    }
+
+    /// Calls `visit(row, its sums)` once for every row that may touch the view's image, in parallel.
+    pub(crate) fn accumulate_from<const KINDS: usize, S: Source>(
+        &mut self,
+        source: S,
+        camera: &Camera,
+        settings: &Settings,
+        visit: impl Fn(usize, Total) + Sync,
+    ) {
+        self.prepare(source, camera, settings, [0.0; 3]);
+        self.accumulate_tiles::<KINDS>();
+        let shares = self.shares.as_chunks::<KINDS>().0;
+        let chunks = self.chunks.par_iter().enumerate();
+        chunks.for_each(|(chunk, &(first, count))| {
+            let slots = self.bins.slots_of(chunk);
+            let (shares, written) = (&shares[slots.clone()], &self.written[slots]);
+            for splat in &self.splats[first..first + count] {
+                visit(splat.row as usize, Total::of(splat, shares, written));
+            }
+        });
+        self.state = None; // no state that a backward pass could use
+    }
+
+    /// What the buffers hold now.
+    pub fn memory(&self) -> Memory {
+        let Bins { pairs, starts, .. } = &self.bins;
+        Memory {
+            gaussians: bytes(&self.splats)
+                + bytes(&self.tile_lists)
+                + self
+                    .intersectors
+                    .iter()
+                    .map(TileIntersector::bytes)
+                    .sum::<usize>()
+                + bytes(&self.order)
+                + bytes(&self.spare)
+                + bytes(pairs)
+                + bytes(&self.block_masks)
+                + bytes(&self.slots)
+                + bytes(&self.shares)
+                + bytes(&self.written),
+            images: bytes(starts)
+                + bytes(&self.transmittance)
+                + bytes(&self.last)
+                + self.bins.count_bytes(),
+        }
+    }
+
+    /// How long the last calls' passes took.
+    pub fn passes(&self) -> Passes {
+        self.passes
+    }
+
+    pub fn counts(&self) -> Counts {
+        let block_masks = self
+            .batches
+            .iter()
+            .flat_map(|&(first, done)| &self.block_masks[first..first + done]);
+        let blocks: u64 = block_masks
+            .flatten()
+            .map(|w| u64::from(w.count_ones()))
+            .sum();
+        Counts {
+            visible: self.order.len(),
+            pairs: self.bins.pairs.len(),
+            evaluated: blocks * LANES as u64,
+        }
+    }
+
+    /// Projects, sorts and bins.
+    pub(crate) fn prepare<S: Source>(
+        &mut self,
+        source: S,
+        camera: &Camera,
+        settings: &Settings,
+        background: [f32; 3],
+    ) {
+        let view = View::new(camera, settings);
+        self.state = Some(ForwardState {
+            camera: *camera,
+            settings: *settings,
+            view,
+            background,
+            rows: source.len(),
+        });
+        let mut clock = Instant::now();
+        self.project(&view, source, camera.tiles());
+        self.passes.project = lap(&mut clock);
+        self.collect_keys();
+        depth_sort::sort(&mut self.order, &mut self.spare);
+        self.passes.sort = lap(&mut clock);
+        self.bins.fill(
+            &self.order,
+            &self.tile_lists,
+            &self.intersectors,
+            CHUNK * LANES,
+            camera.tiles(),
+        );
+        self.passes.bin = lap(&mut clock);
+        self.batches.clear();
+        let mut first = 0;
+        for tile in self.bins.starts.windows(2) {
+            self.batches.push((first, 0));
+            first += ((tile[1] - tile[0]) as usize).div_ceil(BATCH);
+        }
+        self.block_masks.resize(first, [0; BLOCKS]);
+    }
+
+    fn project<S: Source>(&mut self, view: &View, source: S, tiles: (usize, usize)) {
+        let groups = source.len().div_ceil(LANES);
+        let isa = self.isa;
+        self.splats.resize(groups * LANES, Splat::default());
+        self.tile_lists.resize(groups * LANES, TileList::default());
+        self.intersectors
+            .resize_with(groups.div_ceil(CHUNK), TileIntersector::default);
+        let parts = self
+            .splats
+            .par_chunks_mut(CHUNK * LANES)
+            .zip(self.tile_lists.par_chunks_mut(CHUNK * LANES))
+            .zip(&mut self.intersectors);
+        let project =
+            |(chunk, ((out, tile_lists), intersector)): (usize, ((&mut _, &mut _), &mut _))| {
+                let first = chunk * CHUNK;
+                let project = Project {
+                    view,
+                    source,
+                    first,
+                    last: groups.min(first + CHUNK),
+                    tiles,
+                    out,
+                    tile_lists,
+                    intersector,
+                };
+                (first * LANES, dispatch(isa, project))
+            };
+        parts
+            .enumerate()
+            .map(project)
+            .collect_into_vec(&mut self.chunks);
+    }
+
+    /// The visible splats' keys, in row order.
+    fn collect_keys(&mut self) {
+        let mut first = 0;
+        let starts = self.chunks.iter().map(|&(_, count)| {
+            first += count;
+            first - count
+        });
+        let starts: Vec<usize> = starts.collect();
+        self.order.resize(first, Key::default());
+        let order = DisjointSlice::new(&mut self.order);
+        let chunks = self.chunks.par_iter().zip(starts);
+        chunks.for_each(|(&(first, count), start)| {
+            // SAFETY: the chunks' stretches of keys do not overlap.
+            let keys = unsafe { order.slice(start, count) };
+            for (i, (key, splat)) in keys.iter_mut().zip(&self.splats[first..]).enumerate() {
+                *key = Key {
+                    depth: splat.depth.to_bits(),
+                    splat: (first + i) as u32,
+                };
+            }
+        });
+    }
+}

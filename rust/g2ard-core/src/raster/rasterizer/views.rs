@@ -1,0 +1,93 @@
+//! Inputs and outputs of the passes.
+
+use std::time::Instant;
+
+use crate::raster::Camera;
+use crate::{Error, Result};
+
+/// Where the forward pass writes: row-major, `height × width` (× 3 interleaved).
+#[derive(Debug)]
+pub struct Image<'a> {
+    pub rgb: &'a mut [f32],
+    /// 1 − the light left.
+    pub alpha: &'a mut [f32],
+    /// Σ αT·z: *not* divided by alpha.
+    pub depth: Option<&'a mut [f32]>,
+    /// Depth of the first splat behind which less than half the light is left; 0 where there is none.
+    pub median: Option<&'a mut [f32]>,
+}
+
+/// dL/d(image), dL/d(alpha), dL/d(depth), in the layouts of [`Image`].
+#[derive(Debug, Clone, Copy)]
+pub struct ImageGradients<'a> {
+    pub rgb: &'a [f32],
+    pub alpha: Option<&'a [f32]>,
+    pub depth: Option<&'a [f32]>,
+}
+
+/// How much work the last forward pass was.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Counts {
+    pub visible: usize,
+    pub pairs: usize,
+    /// (pair, 4×4 block) evaluations that contributed to a pixel, in pixels (16 a block).
+    pub evaluated: u64,
+}
+
+/// Seconds the passes of the last calls took.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Passes {
+    pub project: f64,
+    pub sort: f64,
+    pub bin: f64,
+    pub forward: f64,
+    /// Tiles, from the image's gradient to the slots.
+    pub backward: f64,
+    /// From the slots to the parameters, and what the caller does with their gradient.
+    pub gather: f64,
+}
+
+/// Seconds since `from`, which becomes now.
+pub fn lap(from: &mut Instant) -> f64 {
+    let now = Instant::now();
+    let seconds = now.duration_since(*from).as_secs_f64();
+    *from = now;
+    seconds
+}
+
+/// Bytes held: by buffers that grow with the Gaussians and their pairs, and by those that grow with the image.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Memory {
+    pub gaussians: usize,
+    pub images: usize,
+}
+
+fn check(name: &'static str, got: usize, expected: usize) -> Result<()> {
+    if got == expected {
+        return Ok(());
+    }
+    Err(Error::invalid(name, format!("{expected} values"), got))
+}
+
+impl Image<'_> {
+    /// Every plane has the camera's size.
+    pub(crate) fn validate(&self, camera: &Camera) -> Result<()> {
+        let pixels = camera.width * camera.height;
+        let length = |plane: &Option<&mut [f32]>| plane.as_ref().map_or(pixels, |p| p.len());
+        check("image", self.rgb.len(), 3 * pixels)?;
+        check("alpha", self.alpha.len(), pixels)?;
+        check("depth", length(&self.depth), pixels)?;
+        check("median", length(&self.median), pixels)
+    }
+}
+
+impl ImageGradients<'_> {
+    /// As for [`Image`].
+    pub(crate) fn validate(&self, camera: &Camera) -> Result<()> {
+        let pixels = camera.width * camera.height;
+        let length = |plane: Option<&[f32]>| plane.map_or(pixels, <[f32]>::len);
+        check("image gradient", self.rgb.len(), 3 * pixels)?;
+        check("alpha gradient", length(self.alpha), pixels)?;
+        check("depth gradient", length(self.depth), pixels)
+    }
+}

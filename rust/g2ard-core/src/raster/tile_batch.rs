@@ -1,0 +1,365 @@
+//! Sixty-four of a tile's pairs in the tile's own coordinates, and the 4×4-pixel blocks each of them reaches.
+
+use super::memory::prefetch;
+use super::project::Splat;
+use super::simd::{LANES, Lanes, Lanes16, Mask};
+use super::tiles::Pair;
+use super::{ALPHA_MIN, BLOCKS, TILE};
+
+/// Pairs processed together: a bit each in a block's mask.
+pub const BATCH: usize = 64;
+
+/// A tile's splats lie scattered in memory: each is prefetched this many pairs before it is needed.
+const AHEAD: usize = 24;
+
+/// A pair's splat relative to the tile's first pixel centre: what the pixels' loops read, in one cache line.
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+pub struct TileSplat {
+    pub u: f32,
+    pub v: f32,
+    pub a: f32,
+    pub b: f32,
+    pub c: f32,
+    pub log2_opacity: f32,
+    pub rgb: [f32; 3],
+    pub depth: f32,
+    /// The pair's number within the tile.
+    pub number: f32,
+}
+
+/// A splat that reaches nothing.
+const NOTHING: TileSplat = TileSplat {
+    u: 0.0,
+    v: 0.0,
+    a: 0.0,
+    b: 0.0,
+    c: 0.0,
+    log2_opacity: f32::MIN,
+    rgb: [0.0; 3],
+    depth: 0.0,
+    number: 0.0,
+};
+
+impl TileSplat {
+    #[inline(always)]
+    pub fn new(s: &Splat, rect: &TileRect, number: usize) -> Self {
+        // In f64: far from the centre of a needle u is a small difference of large numbers.
+        let (dx, dy) = (rect.x as f64 + 0.5 - s.x, rect.y as f64 + 0.5 - s.y);
+        Self {
+            u: (f64::from(s.a) * dx + f64::from(s.b) * dy) as f32,
+            v: (f64::from(s.c) * dy) as f32,
+            a: s.a,
+            b: s.b,
+            c: s.c,
+            log2_opacity: s.log2_opacity,
+            rgb: s.rgb,
+            depth: s.depth,
+            number: number as f32,
+        }
+    }
+}
+
+/// A batch's splats, and one more that reaches nothing.
+pub type TileSplats = [TileSplat; BATCH + 1];
+
+/// A batch, and its splats' ellipses one field after another.
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+pub struct TileBatch {
+    pub splats: TileSplats,
+    a: [f32; BATCH],
+    b: [f32; BATCH],
+    c: [f32; BATCH],
+    log2_opacity: [f32; BATCH],
+    centre_x: [f32; BATCH],
+    centre_y: [f32; BATCH],
+}
+
+impl Default for TileBatch {
+    fn default() -> Self {
+        let zero = [0.0; BATCH];
+        Self {
+            splats: [NOTHING; BATCH + 1],
+            a: zero,
+            b: zero,
+            c: zero,
+            log2_opacity: zero,
+            centre_x: zero,
+            centre_y: zero,
+        }
+    }
+}
+
+/// A tile's rect in the image.
+#[derive(Debug, Clone, Copy)]
+pub struct TileRect {
+    /// Its first pixel.
+    pub x: usize,
+    pub y: usize,
+    /// How many of its 16 columns and rows are on the image.
+    pub columns: usize,
+    pub rows: usize,
+}
+
+impl TileRect {
+    pub fn of(tile: usize, tiles_x: usize, width: usize, height: usize) -> Self {
+        let (x, y) = (tile % tiles_x * TILE, tile / tiles_x * TILE);
+        Self {
+            x,
+            y,
+            columns: (width - x).min(TILE),
+            rows: (height - y).min(TILE),
+        }
+    }
+
+    /// The lanes of a block that are on the image.
+    pub fn lanes(&self, block: usize) -> u16 {
+        let mut bits = 0;
+        for l in 0..LANES {
+            let (x, y) = block_pixel(block, l);
+            bits |= u16::from(x < self.columns && y < self.rows) << l;
+        }
+        bits
+    }
+}
+
+/// The pixel of a block's lane, relative to the tile.
+#[inline(always)]
+pub fn block_pixel(block: usize, lane: usize) -> (usize, usize) {
+    (block % 4 * 4 + lane % 4, block / 4 * 4 + lane / 4)
+}
+
+/// The pixels' coordinates within the tile, block by block.
+static COORDINATES: [[Lanes16; 2]; BLOCKS] = {
+    let mut rows = [[Lanes16([0.0; LANES]); 2]; BLOCKS];
+    let mut block = 0;
+    while block < BLOCKS {
+        let mut l = 0;
+        while l < LANES {
+            rows[block][0].0[l] = (block % 4 * 4 + l % 4) as f32;
+            rows[block][1].0[l] = (block / 4 * 4 + l / 4) as f32;
+            l += 1;
+        }
+        block += 1;
+    }
+    rows
+};
+
+/// Calls `visit(pixel, block, lane, how many)` for each stretch of a tile's row that lies in one block: 4 pixels, but
+/// perhaps the last.
+#[inline(always)]
+pub fn for_stretches(y: usize, columns: usize, mut visit: impl FnMut(usize, usize, usize, usize)) {
+    for x in (0..columns).step_by(4) {
+        visit(x, y / 4 * 4 + x / 4, y % 4 * 4, (columns - x).min(4));
+    }
+}
+
+/// The lanes' pixel coordinates within the tile.
+#[inline(always)]
+pub fn block_coordinates<F: Lanes>(block: usize) -> (F, F) {
+    let [x, y] = &COORDINATES[block];
+    (F::load(x), F::load(y))
+}
+
+/// Loads a tile's pairs from the `first` on, 64 at most.
+#[inline(always)]
+pub fn load_batch(
+    batch: &mut TileSplats,
+    pairs: &[Pair],
+    first: usize,
+    splats: &[Splat],
+    rect: &TileRect,
+) {
+    let places = batch.iter_mut().take(BATCH);
+    for (i, (near, pair)) in (first..).zip(places.zip(&pairs[first..])) {
+        if let Some(ahead) = pairs.get(i + AHEAD) {
+            prefetch(&splats[ahead.splat as usize]);
+        }
+        *near = TileSplat::new(&splats[pair.splat as usize], rect, i);
+    }
+}
+
+impl TileBatch {
+    /// Loads a tile's pairs from the `first` on, 64 at most.
+    #[inline(always)]
+    pub fn load(&mut self, pairs: &[Pair], first: usize, splats: &[Splat], rect: &TileRect) {
+        let (x0, y0) = (rect.x as f64 + 0.5, rect.y as f64 + 0.5);
+        for (i, pair) in pairs[first..].iter().take(BATCH).enumerate() {
+            if let Some(ahead) = pairs.get(first + i + AHEAD) {
+                prefetch(&splats[ahead.splat as usize]);
+            }
+            let s = &splats[pair.splat as usize];
+            self.splats[i] = TileSplat::new(s, rect, first + i);
+            self.a[i] = s.a;
+            self.b[i] = s.b;
+            self.c[i] = s.c;
+            self.log2_opacity[i] = s.log2_opacity;
+            self.centre_x[i] = (s.x - x0) as f32;
+            self.centre_y[i] = (s.y - y0) as f32;
+        }
+    }
+
+    /// Bit p of mask b: whether pair p reaches α = 1/255 anywhere in block b's rectangle of pixel centres. The minimum
+    /// of the quadratic over a rectangle lies on one of the two sides nearest to the centre (or is the centre).
+    #[inline(always)]
+    pub fn reachable<F: Lanes>(&self, count: usize, block_masks: &mut [u64; BLOCKS]) {
+        *block_masks = [0; BLOCKS];
+        for first in (0..count).step_by(LANES) {
+            // SAFETY: `first` is at most 48 and each array holds 64.
+            let [a, b, c, cx, cy, log2_opacity] = unsafe {
+                [
+                    F::load_at(self.a.as_ptr().add(first)),
+                    F::load_at(self.b.as_ptr().add(first)),
+                    F::load_at(self.c.as_ptr().add(first)),
+                    F::load_at(self.centre_x.as_ptr().add(first)),
+                    F::load_at(self.centre_y.as_ptr().add(first)),
+                    F::load_at(self.log2_opacity.as_ptr().add(first)),
+                ]
+            };
+            // What an earlier batch left past the end reaches nothing.
+            let real = F::Mask::from_bits(((1u32 << (count - first).min(LANES)) - 1) as u16);
+            // Slack for the rounding of what follows: too much costs time, never correctness.
+            let size = a.fma(cx.abs(), (b.abs() + c) * cy.abs());
+            let level = log2_opacity - F::splat(ALPHA_MIN.log2() - 0.01);
+            let level = F::select(real, size.fma(F::splat(2e-6), level), F::splat(-1.0));
+            // For fixed dx the best dy is dx·down; for fixed dy the best dx is dy·across.
+            let down = -(a * b) / b.fma(b, c * c);
+            let across = -b / a;
+            for row in 0..4 {
+                let top = F::splat((4 * row) as f32) - cy;
+                let bottom = top + F::splat(3.0);
+                let near_y = top.max(F::zero().min(bottom));
+                for column in 0..4 {
+                    let left = F::splat((4 * column) as f32) - cx;
+                    let right = left + F::splat(3.0);
+                    let near_x = left.max(F::zero().min(right));
+                    let dy = (near_x * down).max(top).min(bottom);
+                    let dx = (near_y * across).max(left).min(right);
+                    let (u1, v1) = (a.fma(near_x, b * dy), c * dy);
+                    let (u2, v2) = (a.fma(dx, b * near_y), c * near_y);
+                    let least = u1.fma(u1, v1 * v1).min(u2.fma(u2, v2 * v2));
+                    let hit = level.ge(least).bits();
+                    block_masks[row * 4 + column] |= u64::from(hit) << first;
+                }
+            }
+        }
+    }
+}
+
+/// The blocks that each pair reaches, from the pairs that reach each block: four 16×16 bit matrices, transposed by
+/// swapping halves, quarters, …
+#[inline(always)]
+pub fn by_pair(block_masks: &[u64; BLOCKS]) -> [u16; BATCH] {
+    let mut masks = [0; BATCH];
+    for (part, masks) in masks.as_chunks_mut::<BLOCKS>().0.iter_mut().enumerate() {
+        for block in 0..BLOCKS {
+            masks[block] = (block_masks[block] >> (16 * part)) as u16;
+        }
+        swap::<8>(masks, 0x00ff);
+        swap::<4>(masks, 0x0f0f);
+        swap::<2>(masks, 0x3333);
+        swap::<1>(masks, 0x5555);
+    }
+    masks
+}
+
+#[inline(always)]
+fn swap<const BY: usize>(m: &mut [u16; 16], low: u16) {
+    for i in 0..16 {
+        if i & BY == 0 {
+            let t = (m[i] >> BY ^ m[i + BY]) & low;
+            m[i + BY] ^= t;
+            m[i] ^= t << BY;
+        }
+    }
+}
+
+/// log2 α before clipping, for the pixels (x, y) of a block.
+#[inline(always)]
+pub fn log2_alpha<F: Lanes>(s: &TileSplat, x: F, y: F) -> (F, F, F) {
+    let u = F::splat(s.a).fma(x, F::splat(s.b).fma(y, F::splat(s.u)));
+    let v = F::splat(s.c).fma(y, F::splat(s.v));
+    (u, v, u.fnma(u, v.fnma(v, F::splat(s.log2_opacity))))
+}
+
+/// α before clipping, where its log2 is above the minimum; elsewhere anything, even NaN: to be masked.
+#[inline(always)]
+pub fn alpha<F: Lanes>(log2: F) -> F {
+    log2.exp2()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::simd::{Isa, Kernel, dispatch};
+    use super::*;
+    use crate::random::Lcg;
+
+    struct Reachable<'a>(&'a TileBatch, usize);
+
+    impl Kernel for Reachable<'_> {
+        type Output = [u64; BLOCKS];
+        #[inline(always)]
+        fn run<F: Lanes>(self) -> [u64; BLOCKS] {
+            let mut block_masks = [0; BLOCKS];
+            self.0.reachable::<F>(self.1, &mut block_masks);
+            block_masks
+        }
+    }
+
+    #[test]
+    fn block_masks_miss_no_pixel_and_little_else() {
+        let mut source = Lcg(3);
+        let mut random = || source.uniform_f32();
+        let rect = TileRect {
+            x: 32,
+            y: 16,
+            columns: 16,
+            rows: 16,
+        };
+        let (mut hit, mut extra) = (0, 0);
+        for _ in 0..100 {
+            let splats: Vec<Splat> = (0..50)
+                .map(|_| {
+                    let a = 0.05 * 30f32.powf(random());
+                    Splat {
+                        x: f64::from(random() * 40.0 + 20.0),
+                        y: f64::from(random() * 40.0 + 4.0),
+                        a,
+                        b: a * (random() - 0.5) * 4.0,
+                        c: 0.05 * 30f32.powf(random()),
+                        log2_opacity: -random() * 7.0,
+                        ..Splat::default()
+                    }
+                })
+                .collect();
+            let pairs: Vec<Pair> = (0..50).map(|splat| Pair { splat, slot: 0 }).collect();
+            let mut tile_batch = TileBatch::default();
+            tile_batch.load(&pairs, 0, &splats, &rect);
+            let block_masks = dispatch(Isa::detect(), Reachable(&tile_batch, pairs.len()));
+            for (p, s) in splats.iter().enumerate() {
+                for (block, word) in block_masks.iter().enumerate() {
+                    // Twenty points to a pixel: the rectangle of pixel centres, not only the centres.
+                    let touched = (0..=60).any(|i| {
+                        (0..=60).any(|j| {
+                            let x = 32.5 + (block % 4 * 4) as f64 + 0.05 * f64::from(i);
+                            let y = 16.5 + (block / 4 * 4) as f64 + 0.05 * f64::from(j);
+                            let u = f64::from(s.a) * (x - s.x) + f64::from(s.b) * (y - s.y);
+                            let v = f64::from(s.c) * (y - s.y);
+                            f64::from(s.log2_opacity) - u * u - v * v >= f64::from(ALPHA_MIN.log2())
+                        })
+                    });
+                    let got = word >> p & 1 == 1;
+                    assert!(got || !touched, "{s:?} block {block}");
+                    hit += usize::from(touched);
+                    extra += usize::from(got && !touched);
+                }
+            }
+            assert!(block_masks.iter().all(|w| w >> 50 == 0));
+        }
+        assert!(
+            hit > 5_000 && extra * 50 < hit,
+            "{extra} blocks too many of {hit}"
+        );
+    }
+}

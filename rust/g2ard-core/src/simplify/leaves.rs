@@ -1,0 +1,161 @@
+//! The scene's rows as leaves of merging: Gaussians made nodes as they are read.
+
+use rayon::prelude::*;
+
+use super::cost::{MAX_ALPHA, Node};
+use super::importance::{Importance, median};
+use super::matching::Nodes;
+use super::moments::sigmoid;
+use super::pairwise::Visibility;
+use super::rows::Rows;
+use crate::scene::{Ordered, SceneRef};
+
+/// What a few views do not see counts as this share of its mass: other views will see some of it.
+const UNSEEN: f32 = 0.2;
+
+/// Largest scale and coordinate in typical sizes: beyond, f32 products of four of them would overflow.
+const MAX_SCALE: f64 = 1e6;
+const MAX_COORDINATE: f64 = 1e15;
+
+/// Rows of the scene. At 13 million their nodes would take more than the scene itself.
+pub struct Leaves<'a> {
+    scene: &'a SceneRef<'a>,
+    ordered: &'a Ordered,
+    /// The ordered rows that are kept, ascending.
+    kept: Vec<u32>,
+    /// The variance that rendering adds to each ordered row.
+    blur: &'a [f32],
+    visibility: Option<Visibility<'a>>,
+    /// What the scene's lengths are divided by.
+    unit: f64,
+    /// Σ αT that a unit of mass counts for though no view sees it.
+    floor: f32,
+    /// Estimates Σ αT without views.
+    importance: Importance,
+}
+
+impl<'a> Leaves<'a> {
+    pub fn new(
+        scene: &'a SceneRef<'a>,
+        ordered: &'a Ordered,
+        kept: Vec<u32>,
+        blur: &'a [f32],
+        visibility: Option<Visibility<'a>>,
+    ) -> Self {
+        let unit = typical_size(scene);
+        let mut leaves = Self {
+            scene,
+            ordered,
+            kept,
+            blur,
+            visibility,
+            unit,
+            floor: 0.0,
+            importance: Importance::default(),
+        };
+        if let Some(visibility) = visibility {
+            let masses: Vec<f32> = (0..leaves.len())
+                .into_par_iter()
+                .map(|i| leaves.node(i).mass)
+                .collect();
+            let mass: f64 = masses.iter().map(|&m| f64::from(m)).sum();
+            let rows = leaves.kept.iter();
+            let total: f64 = rows.map(|&i| f64::from(leaves.weight(visibility, i))).sum();
+            leaves.floor = UNSEEN
+                * if total > 0.0 {
+                    (total / mass) as f32
+                } else {
+                    1.0
+                };
+        } else {
+            let nodes: Vec<Node> = (0..leaves.len())
+                .into_par_iter()
+                .map(|i| leaves.node(i))
+                .collect();
+            leaves.importance = Importance::of_scene(&nodes);
+        }
+        leaves
+    }
+
+    /// Their Morton codes, ascending.
+    pub fn codes(&self) -> Vec<u64> {
+        let codes = self.ordered.codes(self.scene);
+        self.kept.iter().map(|&i| codes[i as usize]).collect()
+    }
+
+    /// Every row as a node of its own.
+    pub fn nodes(&self) -> Nodes {
+        let width = self.width();
+        let mut sh = vec![0.0; self.len() * width];
+        let rows = sh.par_chunks_mut(width).enumerate();
+        rows.for_each(|(i, out)| self.read_sh(i, out));
+        Nodes {
+            geometry: (0..self.len())
+                .into_par_iter()
+                .map(|i| self.node(i))
+                .collect(),
+            sh,
+            width,
+        }
+    }
+
+    fn weight(&self, visibility: Visibility, ordered: u32) -> f32 {
+        visibility.weight[self.ordered.rows[ordered as usize] as usize].max(0.0)
+    }
+}
+
+impl Rows for Leaves<'_> {
+    fn len(&self) -> usize {
+        self.kept.len()
+    }
+
+    fn width(&self) -> usize {
+        3 * (self.scene.rest + 1)
+    }
+
+    fn node(&self, i: usize) -> Node {
+        let at = self.kept[i] as usize;
+        let row = self.ordered.rows[at] as usize;
+        let mut g = self.ordered.gaussian(self.scene, row);
+        g.scales = g.scales.map(|s| (s / self.unit).min(MAX_SCALE));
+        let coordinate = |v: f64| (v / self.unit).clamp(-MAX_COORDINATE, MAX_COORDINATE) as f32;
+        let mut node = Node {
+            mean: g.mean.map(coordinate),
+            cov: g.covariance().map(|v| v as f32),
+            blur: (f64::from(self.blur[at]) / (self.unit * self.unit)) as f32,
+            alpha: (sigmoid(f64::from(self.scene.logit(row))) as f32).min(MAX_ALPHA),
+            ..Node::default()
+        }
+        .weighed();
+        node.visibility = match self.visibility {
+            Some(visibility) => self.weight(visibility, at as u32) + self.floor * node.mass,
+            None => self.importance.of(&node),
+        };
+        node
+    }
+
+    fn color(&self, i: usize) -> [f32; 3] {
+        self.scene.sh0[self.ordered.rows[self.kept[i] as usize] as usize]
+    }
+
+    fn read_sh(&self, i: usize, out: &mut [f32]) {
+        let (dc, rest) = self
+            .scene
+            .sh_of(self.ordered.rows[self.kept[i] as usize] as usize);
+        out[..3].copy_from_slice(&dc);
+        out[3..].copy_from_slice(rest.as_flattened());
+    }
+}
+
+/// A power of two near the median of the middle scale, so that dividing by it rounds nothing.
+fn typical_size(scene: &SceneRef) -> f64 {
+    let middle = |s: &[f32; 3]| s[0].max(s[1]).min(s[2]).max(s[0].min(s[1]));
+    let positive = scene
+        .scales
+        .iter()
+        .map(middle)
+        .filter(|s| *s > 0.0)
+        .collect();
+    let size = f64::from(median(positive).unwrap_or(1.0));
+    f64::from_bits(size.to_bits() & (0x7ff << 52))
+}

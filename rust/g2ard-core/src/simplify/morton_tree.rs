@@ -1,0 +1,187 @@
+//! The binary tree of Morton codes, and what merging each of its subtrees into one node costs.
+//!
+//! Rows sorted by Morton code are the leaves of a binary tree whose inner nodes are common prefixes. An inner
+//! node is named by the gap between two neighbouring rows at which it splits, so one number per gap says what
+//! merging everything below it costs. That number never falls towards the root: cutting at any threshold
+//! leaves whole subtrees, which are contiguous runs of rows.
+
+use super::clusters::Partition;
+use super::cost::{Node, color_distance};
+use super::rows::Rows;
+
+/// Rows below which a subtree is not worth another task.
+const GRAIN: usize = 4096;
+
+/// A subtree merged into one node, its colour, and the sum of its merges' costs.
+struct Subtree {
+    node: Node,
+    color: [f32; 3],
+    cost: f32,
+}
+
+struct MortonTree<'a, R> {
+    codes: &'a [u64],
+    rows: &'a R,
+    geometric: f32,
+}
+
+/// For every gap between neighbouring rows, the cost of merging all rows that its tree node spans.
+///
+/// `codes` ascend; `rows` are in the same order.
+pub fn merge_costs(codes: &[u64], rows: &impl Rows, geometric: f32) -> Vec<f32> {
+    let mut costs = vec![0.0; rows.len().saturating_sub(1)];
+    if !costs.is_empty() {
+        let tree = MortonTree {
+            codes,
+            rows,
+            geometric,
+        };
+        tree.merge(0, rows.len(), &mut costs);
+    }
+    costs
+}
+
+impl<R: Rows> MortonTree<'_, R> {
+    /// Merges rows `from..to`; `costs` has an element for each gap between them.
+    fn merge(&self, from: usize, to: usize, costs: &mut [f32]) -> Subtree {
+        if to - from == 1 {
+            return Subtree {
+                node: self.rows.node(from),
+                color: self.rows.color(from),
+                cost: 0.0,
+            };
+        }
+        let split = self.split(from, to);
+        let (left, rest) = costs.split_at_mut(split - from - 1);
+        let (gap, right) = rest.split_at_mut(1);
+        let (a, b) = if to - from > GRAIN {
+            rayon::join(
+                || self.merge(from, split, left),
+                || self.merge(split, to, right),
+            )
+        } else {
+            (self.merge(from, split, left), self.merge(split, to, right))
+        };
+        let subtree = self.join(&a, &b);
+        gap[0] = subtree.cost;
+        subtree
+    }
+
+    /// The first row whose code has the highest bit in which the range's codes differ; the middle of equals.
+    fn split(&self, from: usize, to: usize) -> usize {
+        let (first, last) = (self.codes[from], self.codes[to - 1]);
+        if first == last {
+            return from + (to - from) / 2;
+        }
+        let bit = 63 - (first ^ last).leading_zeros();
+        let prefix = last >> bit << bit;
+        from + self.codes[from..to].partition_point(|&c| c < prefix)
+    }
+
+    fn join(&self, a: &Subtree, b: &Subtree) -> Subtree {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe { join_avx2(a, b, self.geometric) };
+        }
+        join(a, b, self.geometric)
+    }
+}
+
+/// The same code with wider registers; no fused operations, so the same bits.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn join_avx2(a: &Subtree, b: &Subtree, geometric: f32) -> Subtree {
+    join(a, b, geometric)
+}
+
+#[inline(always)]
+fn join(a: &Subtree, b: &Subtree, geometric: f32) -> Subtree {
+    let share = a.node.share(&b.node);
+    let node = a.node.merged(&b.node);
+    let color = color_distance(&a.color, &b.color);
+    let cost = a.node.cost_as(&b.node, &node, color, geometric);
+    Subtree {
+        node,
+        color: [0, 1, 2].map(|k| a.color[k] + share * (b.color[k] - a.color[k])),
+        cost: (a.cost + b.cost + cost).min(f32::MAX),
+    }
+}
+
+/// The partition into `count` runs that closes the cheapest gaps, between equals the earlier.
+pub fn cut(costs: &[f32], count: usize) -> Partition {
+    let rows = costs.len() + 1;
+    let close = rows.saturating_sub(count.max(1));
+    let mut keys: Vec<(u32, u32)> = costs
+        .iter()
+        .enumerate()
+        .map(|(g, s)| (s.to_bits(), g as u32))
+        .collect();
+    let mut closed = vec![false; costs.len()];
+    if close > 0 {
+        keys.select_nth_unstable(close - 1);
+        keys[..close]
+            .iter()
+            .for_each(|k| closed[k.1 as usize] = true);
+    }
+    let mut of = Vec::with_capacity(rows);
+    of.push(0);
+    let mut run = 0;
+    for closed in closed {
+        run += u32::from(!closed);
+        of.push(run);
+    }
+    Partition {
+        of,
+        count: run as usize + 1,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simplify::matching::Nodes;
+
+    fn nodes(n: usize) -> Nodes {
+        let geometry = (0..n)
+            .map(|i| {
+                let mut node = Node {
+                    mean: [i as f32 + (i / 8 * 20) as f32, 0.0, 0.0],
+                    cov: [1.0, 0.0, 0.0, 1.0, 0.0, 0.01],
+                    blur: 0.1,
+                    alpha: 0.5,
+                    ..Node::default()
+                }
+                .weighed();
+                node.visibility = node.mass;
+                node
+            })
+            .collect();
+        Nodes {
+            geometry,
+            sh: vec![0.0; 3 * n],
+            width: 3,
+        }
+    }
+
+    #[test]
+    fn any_cut_leaves_whole_subtrees_and_the_exact_count() {
+        let codes: Vec<u64> = (0..64).map(|i| i * 3).collect();
+        let costs = merge_costs(&codes, &nodes(64), 0.03);
+        for count in 1..=64 {
+            let p = cut(&costs, count);
+            assert_eq!((p.count, p.of.len()), (count, 64));
+            assert!(p.of.windows(2).all(|w| w[1] - w[0] <= 1));
+        }
+        // Groups of eight lie far apart: the cheapest eight clusters are those groups.
+        let codes: Vec<u64> = (0..64).collect();
+        let p = cut(&merge_costs(&codes, &nodes(64), 0.03), 8);
+        assert!((0..64).all(|i| p.of[i] == i as u32 / 8), "{:?}", p.of);
+    }
+
+    #[test]
+    fn one_place_and_one_row() {
+        assert_eq!(cut(&merge_costs(&[5; 9], &nodes(9), 0.03), 4).count, 4);
+        assert_eq!(cut(&merge_costs(&[5], &nodes(1), 0.03), 1).count, 1);
+    }
+}

@@ -1,0 +1,108 @@
+//! The scene in groups of sixteen rows, and those of them that a view can see.
+
+use crate::raster::Frustum;
+use crate::raster::params::Source;
+use crate::raster::simd::{LANES, Lanes, Lanes16};
+use crate::scene::{SceneRef, limits};
+
+/// Sixteen rows, and what bounds them.
+pub struct Group {
+    /// Mean, quaternion, scales (linear, so that a unit twice as long rounds alike), logit; the last row again in lanes past the end.
+    values: [Lanes16; 11],
+    centre: [f32; 3],
+    /// Half the sides of the means' box.
+    half: [f32; 3],
+    /// The largest scale.
+    scale: f32,
+}
+
+impl Group {
+    pub fn of(scene: &SceneRef, rows: &[u32], shift: [f64; 3]) -> Self {
+        let mut values = [Lanes16::default(); 11];
+        let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
+        let mut scale = 0f32;
+        for l in 0..LANES {
+            let row = rows[l.min(rows.len() - 1)] as usize;
+            let mean = scene.means.get(row);
+            for k in 0..3 {
+                let m = (mean[k] - shift[k]) as f32;
+                values[k].0[l] = m;
+                (low[k], high[k]) = (low[k].min(m), high[k].max(m));
+                let s = scene.scales[row][k].clamp(limits::DRAWN_SCALES.0, limits::DRAWN_SCALES.1);
+                values[7 + k].0[l] = s;
+                scale = scale.max(s);
+            }
+            for k in 0..4 {
+                values[3 + k].0[l] = scene.quats[row][k];
+            }
+            values[10].0[l] =
+                scene.logit_opacities[row].clamp(limits::DRAWN_LOGITS.0, limits::DRAWN_LOGITS.1);
+        }
+        let centre = [0, 1, 2].map(|k| 0.5 * low[k] + 0.5 * high[k]);
+        Self {
+            values,
+            centre,
+            half: [0, 1, 2].map(|k| (high[k] - centre[k]).max(centre[k] - low[k])),
+            scale,
+        }
+    }
+
+    /// The mean of a row.
+    pub fn mean(&self, lane: usize) -> [f64; 3] {
+        [0, 1, 2].map(|k| f64::from(self.values[k].0[lane]))
+    }
+
+    /// Whether any row can touch the camera's image.
+    pub fn meets(&self, frustum: &Frustum) -> bool {
+        frustum.meets(self.centre, self.half, self.scale)
+    }
+}
+
+/// The groups a view can see, one after another.
+#[derive(Clone, Copy)]
+pub struct CulledGroups<'a> {
+    pub groups: &'a [Group],
+    /// Numbers of the groups that the view can see, ascending.
+    pub live: &'a [u32],
+    pub rows: usize,
+}
+
+impl CulledGroups<'_> {
+    #[inline(always)]
+    fn value<F: Lanes>(&self, group: usize, value: usize) -> F {
+        F::load(&self.groups[self.live[group] as usize].values[value])
+    }
+}
+
+impl Source for CulledGroups<'_> {
+    const COLOURED: bool = false;
+
+    #[inline(always)]
+    fn len(&self) -> usize {
+        self.rows
+    }
+    #[inline(always)]
+    fn sh_coeffs(&self) -> usize {
+        1
+    }
+    #[inline(always)]
+    fn mean<F: Lanes>(&self, group: usize, axis: usize) -> F {
+        self.value(group, axis)
+    }
+    #[inline(always)]
+    fn quat<F: Lanes>(&self, group: usize, part: usize) -> F {
+        self.value(group, 3 + part)
+    }
+    #[inline(always)]
+    fn scale<F: Lanes>(&self, group: usize, axis: usize) -> F {
+        self.value(group, 7 + axis)
+    }
+    #[inline(always)]
+    fn logit_opacity<F: Lanes>(&self, group: usize) -> F {
+        self.value(group, 10)
+    }
+    #[inline(always)]
+    fn sh<F: Lanes>(&self, _group: usize, _k: usize, _c: usize) -> F {
+        F::zero()
+    }
+}

@@ -1,0 +1,264 @@
+//! What views see of a whole scene, in little memory: each view projects only the groups of rows about its frustum.
+
+mod groups;
+
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use crate::Result;
+use crate::raster::accumulate::WEIGHT;
+use crate::raster::disjoint::DisjointSlice;
+use crate::raster::params::check_count;
+use crate::raster::simd::LANES;
+use crate::raster::{Camera, Frustum, Rasterizer, Settings};
+use crate::scene::{Means, Ordered, SceneRef};
+use groups::{CulledGroups, Group};
+
+/// Σ αT and the smallest pixel of each of N Gaussians over the views added so far. The result depends neither on the
+/// order of the rows nor on the number of threads: equal depths are drawn in the order of the scene's content.
+pub struct VisibilityAccumulator {
+    groups: Vec<Group>,
+    ordered: Arc<Ordered>,
+    /// What f64 means are taken relative to; f32 means stay as they are.
+    shift: [f64; 3],
+    weight: Vec<f64>,
+    pixel_size: Vec<f32>,
+    rasterizer: Rasterizer,
+}
+
+impl VisibilityAccumulator {
+    pub fn new(scene: &SceneRef, ordered: Arc<Ordered>) -> Result<Self> {
+        check_count(scene.len())?;
+        let shift = match scene.means {
+            Means::F32(_) => [0.0; 3],
+            Means::F64(_) => ordered.bounds.origin,
+        };
+        let rows = ordered.rows.par_chunks(LANES);
+        let groups = rows.map(|r| Group::of(scene, r, shift)).collect();
+        Ok(Self {
+            groups,
+            weight: vec![0.0; scene.len()],
+            pixel_size: vec![f32::INFINITY; scene.len()],
+            ordered,
+            shift,
+            rasterizer: Rasterizer::default(),
+        })
+    }
+
+    /// Adds a view in the scene's coordinates.
+    pub fn add(&mut self, camera: &Camera, settings: &Settings) -> Result<()> {
+        camera.validate()?;
+        settings.validate()?;
+        let mut camera = *camera;
+        for r in &mut camera.viewmat {
+            r[3] += r[0] * self.shift[0] + r[1] * self.shift[1] + r[2] * self.shift[2];
+        }
+        let frustum = Frustum::of(&camera);
+        let numbers = 0..self.groups.len() as u32;
+        let live: Vec<u32> = numbers
+            .into_par_iter()
+            .filter(|&g| self.groups[g as usize].meets(&frustum))
+            .collect();
+        self.find_pixels(&camera, &live);
+        let past_end = match live.last() {
+            Some(&g) => (LANES * (g as usize + 1)).saturating_sub(self.weight.len()),
+            None => return Ok(()),
+        };
+        let source = CulledGroups {
+            groups: &self.groups,
+            live: &live,
+            rows: live.len() * LANES - past_end,
+        };
+        let weight = DisjointSlice::new(&mut self.weight);
+        self.rasterizer
+            .accumulate_from::<WEIGHT, _>(source, &camera, settings, |row, total| {
+                let row = live[row / LANES] as usize * LANES + row % LANES;
+                // SAFETY: the call comes once for every row of a view.
+                unsafe { *weight.at(row) += total.weight };
+            });
+        Ok(())
+    }
+
+    /// Rows that some view saw.
+    pub fn seen(&self) -> usize {
+        self.weight.par_iter().filter(|w| **w > 0.0).count()
+    }
+
+    /// Σ αT and the size of a pixel, scene units, ∞ where no view has the mean in its image; by input row.
+    pub fn by_row(&self) -> (Vec<f32>, Vec<f32>) {
+        let mut weight = vec![0.0; self.weight.len()];
+        let mut pixel_size = vec![0.0; self.weight.len()];
+        for (i, &row) in self.ordered.rows.iter().enumerate() {
+            weight[row as usize] = self.weight[i] as f32;
+            pixel_size[row as usize] = self.pixel_size[i];
+        }
+        (weight, pixel_size)
+    }
+
+    /// Lowers each live row's pixel size to that of this view.
+    fn find_pixels(&mut self, camera: &Camera, live: &[u32]) {
+        let count = self.pixel_size.len();
+        let pixel_size = DisjointSlice::new(&mut self.pixel_size);
+        live.par_iter().for_each(|&g| {
+            let first = g as usize * LANES;
+            // SAFETY: no two groups share rows.
+            let sizes = unsafe { pixel_size.slice(first, LANES.min(count - first)) };
+            for (lane, size) in sizes.iter_mut().enumerate() {
+                camera.lower_pixel_size(self.groups[g as usize].mean(lane), size);
+            }
+        });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::Lcg;
+    use crate::raster::{Accumulated, Params};
+
+    type Arrays = (Vec<[f32; 3]>, Vec<[f32; 4]>, Vec<[f32; 3]>, Vec<f32>);
+
+    /// 1,003 Gaussians of very different sizes around the origin: means, quaternions, scales, logits.
+    fn scene() -> Arrays {
+        let mut source = Lcg(7);
+        let mut random = || source.uniform_f32();
+        let n = 1003;
+        let mut triple = |a: f32, b: f32| [0; 3].map(|_| a + (b - a) * random());
+        let means = (0..n).map(|_| triple(-3.0, 3.0)).collect();
+        let scales = (0..n).map(|_| triple(-6.0, -0.5).map(f32::exp)).collect();
+        let quats = (0..n).map(|_| triple(-1.0, 1.0));
+        let quats = quats.map(|q| [0.5, q[0], q[1], q[2]]).collect();
+        let logits = (0..n).map(|_| triple(-5.0, 5.0)[0]).collect();
+        (means, quats, scales, logits)
+    }
+
+    /// A scene of those arrays, but for its means and scales.
+    fn made<'a>(means: Means<'a>, scales: &'a [[f32; 3]], rows: &'a Arrays) -> SceneRef<'a> {
+        SceneRef {
+            means,
+            quats: &rows.1,
+            scales,
+            logit_opacities: &rows.3,
+            sh0: &rows.0,
+            sh_rest: &[],
+            rest: 0,
+        }
+    }
+
+    fn accumulator(scene: &SceneRef) -> VisibilityAccumulator {
+        VisibilityAccumulator::new(scene, Arc::new(Ordered::new(scene).unwrap())).unwrap()
+    }
+
+    fn cameras() -> Vec<Camera> {
+        let turned = |angle: f64, z: f64| {
+            let (s, c) = angle.sin_cos();
+            Camera {
+                viewmat: [[c, 0.0, s, 0.1], [0.0, 1.0, 0.0, -0.2], [-s, 0.0, c, z]],
+                fx: 90.0,
+                fy: 80.0,
+                cx: 40.0,
+                cy: 33.0,
+                width: 85,
+                height: 64,
+                near: 0.05,
+            }
+        };
+        (0..12)
+            .map(|i| turned(0.5 * f64::from(i), f64::from(i % 4)))
+            .collect()
+    }
+
+    #[test]
+    fn sees_what_the_whole_raster_sees() {
+        let rows = scene();
+        let (means, quats, scales, logits) = &rows;
+        let log_scales: Vec<f32> = scales.as_flattened().iter().map(|s| s.ln()).collect();
+        let params = Params {
+            means: means.as_flattened(),
+            quats: quats.as_flattened(),
+            log_scales: &log_scales,
+            logit_opacities: logits,
+            sh0: means.as_flattened(),
+            sh_n: &[],
+            sh_coeffs: 1,
+        };
+        let scene = made(Means::F32(means), scales, &rows);
+        let (mut views, mut whole) = (accumulator(&scene), Accumulated::new(means.len()));
+        let (mut rasterizer, mut met) = (Rasterizer::default(), 0);
+        for camera in cameras() {
+            let settings = Settings::default();
+            views.add(&camera, &settings).unwrap();
+            rasterizer
+                .accumulate(&params, &camera, &settings, &mut whole)
+                .unwrap();
+            let frustum = Frustum::of(&camera);
+            met += views.groups.iter().filter(|g| g.meets(&frustum)).count();
+        }
+        let (weight, pixel_size) = views.by_row();
+        assert_eq!(pixel_size, whole.pixel_size);
+        for (i, (&got, &want)) in weight.iter().zip(&whole.weight).enumerate() {
+            let want = want as f32; // of log scales, which round
+            assert!(
+                (got - want).abs() <= 1e-3 + 1e-4 * want,
+                "{i}: {got} {want}"
+            );
+        }
+        assert!(met < 12 * views.groups.len() * 9 / 10, "{met} groups met");
+        assert_eq!(
+            views.seen(),
+            whole.weight.iter().filter(|w| **w > 0.0).count()
+        );
+    }
+
+    #[test]
+    fn a_unit_that_is_a_power_of_two_changes_no_bit() {
+        let rows = scene();
+        let by_row = |unit: f32| {
+            let times = |rows: &[[f32; 3]]| rows.iter().map(|r| r.map(|x| unit * x)).collect();
+            let (means, scales): (Vec<_>, Vec<_>) = (times(&rows.0), times(&rows.2));
+            let mut views = accumulator(&made(Means::F32(&means), &scales, &rows));
+            for mut camera in cameras() {
+                for r in &mut camera.viewmat {
+                    r[3] *= f64::from(unit);
+                }
+                camera.near *= unit;
+                views.add(&camera, &Settings::default()).unwrap();
+            }
+            let (weight, pixel_size) = views.by_row();
+            (
+                weight,
+                pixel_size.into_iter().map(|p| p / unit).collect::<Vec<_>>(),
+            )
+        };
+        let here = by_row(1.0);
+        for exponent in [-10, -1, 1, 3, 10] {
+            assert_eq!(by_row(2f32.powi(exponent)), here, "2^{exponent}");
+        }
+    }
+
+    #[test]
+    fn map_coordinates_are_as_good_as_any() {
+        let rows = scene();
+        let offset = [400_000.0, 4_000_000.0, 100.0];
+        let here: Vec<[f64; 3]> = rows.0.iter().map(|m| m.map(f64::from)).collect();
+        let moved: Vec<[f64; 3]> = here
+            .iter()
+            .map(|m| [0, 1, 2].map(|k| m[k] + offset[k]))
+            .collect();
+        let by_row = |means: &[[f64; 3]], shift: [f64; 3]| {
+            let mut views = accumulator(&made(Means::F64(means), &rows.2, &rows));
+            for mut camera in cameras() {
+                for r in &mut camera.viewmat {
+                    r[3] -= r[0] * shift[0] + r[1] * shift[1] + r[2] * shift[2];
+                }
+                views.add(&camera, &Settings::default()).unwrap();
+            }
+            views.by_row().0
+        };
+        let (a, b) = (by_row(&here, [0.0; 3]), by_row(&moved, offset));
+        let total: f32 = a.iter().sum();
+        let apart: f32 = a.iter().zip(&b).map(|(a, b)| (a - b).abs()).sum();
+        assert!(apart < 1e-3 * total, "{apart} of {total}");
+    }
+}

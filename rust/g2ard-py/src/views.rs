@@ -1,0 +1,58 @@
+//! Cameras and the rasteriser's options, as Python holds them.
+
+use g2ard_core::Error;
+use g2ard_core::raster::{Camera, Convention, Settings};
+use pyo3::prelude::*;
+
+use crate::error::to_py;
+
+/// `(viewmat 4×4, (fx, fy, cx, cy), (width, height), near)`.
+#[derive(FromPyObject)]
+pub struct View([[f64; 4]; 4], [f64; 4], (usize, usize), f32);
+
+impl View {
+    pub fn camera(&self) -> Camera {
+        let [fx, fy, cx, cy] = self.1;
+        let (width, height) = self.2;
+        Camera {
+            viewmat: [self.0[0], self.0[1], self.0[2]],
+            fx,
+            fy,
+            cx,
+            cy,
+            width,
+            height,
+            near: self.3,
+        }
+    }
+}
+
+/// The attributes of a `g2ard.stages.render.RasterSettings` that do not depend on the view.
+#[derive(FromPyObject)]
+pub struct RasterOptions {
+    convention: String,
+    antialiased: bool,
+    alpha_max: f32,
+}
+
+impl RasterOptions {
+    pub fn settings(&self) -> PyResult<Settings> {
+        let convention = match self.convention.as_str() {
+            "gsplat" => Convention::Gsplat,
+            "inria" => Convention::Inria,
+            other => {
+                return Err(to_py(Error::invalid(
+                    "convention",
+                    "gsplat or inria",
+                    other,
+                )));
+            }
+        };
+        Ok(Settings {
+            convention,
+            antialiased: self.antialiased,
+            alpha_max: self.alpha_max,
+            ..Settings::default()
+        })
+    }
+}

@@ -1,0 +1,161 @@
+"""`import g2ard`: what it gives, that it loads nothing, and that it does what the shell does, to the bit."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import checkered_ball
+
+import g2ard
+from g2ard.io import Points
+from g2ard.reports import Report
+from g2ard.splats import Splats
+
+CommandLine = Callable[..., tuple[int, str, str]]
+BALL = checkered_ball(1500)
+ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    g2ard.save(tmp_path / "ball.ply", BALL)
+    return tmp_path
+
+
+def assert_same_bits(ours: Splats, theirs: Splats, path: Path) -> None:
+    """Compared as files: a file holds logarithms of scales."""
+    g2ard.save(path, ours)
+    written = g2ard.load(path)
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(written, name), getattr(theirs, name))
+
+
+def test_every_name_is_there_and_functions_are_no_modules() -> None:
+    for name in g2ard.__all__:
+        found = getattr(g2ard, name)
+        assert not inspect.ismodule(found), name
+        assert name == "__version__" or found.__doc__, name
+    import_module("g2ard.stages.simplify")  # the stage's import leaves the function alone
+    assert callable(g2ard.simplify)
+    assert set(dir(g2ard)) == set(g2ard.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'simplfy'"):
+        g2ard.simplfy  # type: ignore[attr-defined]
+
+
+def test_importing_loads_neither_numpy_nor_torch() -> None:
+    code = (
+        "import g2ard, sys; print([m for m in ('numpy', 'torch', 'PIL', 'g2ard._core') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("typed", "given"),
+    [
+        (["-n", 200], {"count": 200}),
+        (["-r", 6, "--method", "fast", "--views", "made"], {"ratio": 6, "method": "fast", "views": "made"}),
+        (["-r", 5, "--no-views"], {"ratio": 5, "blind": True}),
+        (["-r", 7, "--preset", "paper"], {"ratio": 7, "method": "paper"}),
+        (["--fit", "20kB"], {"fit": "20kB"}),
+        (["--min-psnr", 24, "--min-ssim", 0.5], {"min_psnr": 24, "min_ssim": 0.5}),
+    ],
+)
+def test_simplify_does_what_the_shell_does(
+    typed: list[object], given: dict[str, object], command_line: CommandLine, folder: Path
+) -> None:
+    status, _, error = command_line("simplify", "ball.ply", "-o", "small.ply", *typed, cwd=folder)
+    assert status == 0, error
+    theirs = g2ard.load(folder / "small.ply")
+    ours = g2ard.simplify(folder / "ball.ply", **given)  # type: ignore[arg-type]
+    assert_same_bits(ours.splats, theirs, folder / "ours.ply")
+    again = g2ard.simplify(g2ard.load(folder / "ball.ply"), **given)  # type: ignore[arg-type]
+    assert_same_bits(again.splats, theirs, folder / "again.ply")
+
+
+@pytest.mark.parametrize(
+    ("typed", "given"),
+    [
+        (["-n", 150, "--steps", 25], {"count": 150, "steps": 25}),
+        (["--fit", "30kB", "--clean", "--steps", 10], {"fit": "30kB", "clean": True, "steps": 10}),
+        (
+            ["-r", 10, "--preset", "paper", "--steps", 30, "--set", "schedule.round_steps=4"],
+            {"ratio": 10, "preset": "paper", "steps": 30, "constants": {"schedule.round_steps": 4}},
+        ),
+    ],
+)
+def test_distill_does_what_the_shell_does(
+    typed: list[object], given: dict[str, object], command_line: CommandLine, folder: Path
+) -> None:
+    status, _, error = command_line(
+        "distill", "ball.ply", "-o", "run", "--size", 64, "--seed", 3, *typed, cwd=folder
+    )
+    assert status == 0, error
+    ours = g2ard.distill(folder / "ball.ply", size=64, seed=3, **given)  # type: ignore[arg-type]
+    assert_same_bits(ours.splats, g2ard.load(folder / "run" / "scene.ply"), folder / "ours.ply")
+    told = json.loads((folder / "run" / "report.json").read_text())
+    rounds = ours.report.as_dict()["rounds"]
+    assert [r["recover"][-1]["loss"] for r in rounds] == [r["recover"][-1]["loss"] for r in told["rounds"]]
+    assert ours.held_out is not None
+    score = g2ard.evaluate(ours.splats, ours.held_out)
+    assert score.psnr == pytest.approx(told["scores"]["recovered"]["psnr"], abs=1e-9)
+
+
+def test_errors_speak_of_parameters(folder: Path) -> None:
+    for wrong, words in (
+        ({}, "expected exactly one kind of budget"),
+        ({"count": 5, "ratio": 2}, "expected exactly one kind of budget"),
+        ({"count": 1501}, "1,501 is above its 1,500"),
+        ({"ratio": 0.5}, "ratio: expected at least 1"),
+        ({"ratio": 2, "method": "magic"}, "method: expected one of default, fast, paper"),
+    ):
+        for function in (g2ard.simplify, g2ard.distill):
+            with pytest.raises(g2ard.InputError, match=words) as caught:
+                function(BALL, **wrong)
+            assert "--" not in str(caught.value)
+    with pytest.raises(g2ard.InputError, match="a cloud is no teacher"):
+        g2ard.distill(Points(np.zeros((9, 3)), np.zeros((9, 3), "f4")), count=5)
+
+
+def test_reports_are_dataclasses_that_json_gives_back() -> None:
+    small = g2ard.simplify(BALL, ratio=10)
+    report = small.report
+    assert isinstance(report, Report)
+    assert (report.input_count, report.output_count, report.rounds[-1].after) == (1500, 150, 150)
+    assert type(report).of(json.loads(json.dumps(report.as_dict()))) == report
+    targets = g2ard.TeacherRenders(BALL, g2ard.make_pool(BALL, 8).resized(48))
+    done = g2ard.recover(small.splats, targets, g2ard.RecoverConfig(steps=10)).report
+    assert done.psnr.after > done.psnr.before
+    assert type(done).of(json.loads(json.dumps(done.as_dict()))) == done
+
+
+def test_one_camera_is_a_view_of_many() -> None:
+    pool = g2ard.make_pool(BALL, 8)
+    together = g2ard.Cameras.of(pool)
+    np.testing.assert_array_equal(together.viewmats, pool.viewmats)
+    np.testing.assert_array_equal(together.Ks, pool.Ks)
+    assert (together.names, pool[-1].name, len(list(pool))) == (pool.names, pool.names[-1], 8)
+    with pytest.raises(IndexError):
+        pool[8]
+    assert g2ard.render(BALL, pool[2]).image.shape == (600, 800, 3)
+
+
+def test_what_measures_others_is_never_imported() -> None:
+    code = """
+import sys, numpy as np, g2ard
+ball = np.random.default_rng(0).normal(size=(900, 3))
+scene = g2ard.Splats.create(ball / np.linalg.norm(ball, axis=1)[:, None], scales=np.full((900, 3), 0.05))
+g2ard.distill(scene, ratio=10, steps=3, size=32)
+apart = ("g2ard.bench", "g2ard.synth", "g2ard.baselines", "g2ard.cli", "torch")
+print([m for m in sys.modules if m.startswith(apart)])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

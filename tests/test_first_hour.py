@@ -1,0 +1,277 @@
+"""What a newcomer meets in the first hour: outputs, names, pipes, signals, what is said and what is not."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scenes import around, checkered_ball
+from view_files import transforms
+
+import g2ard
+from g2ard.images import write_png
+from g2ard.io import Points, write_points, write_views
+from g2ard.policy.photos import points_within_sight
+from g2ard.splats import SH_C0
+
+CommandLine = Callable[..., tuple[int, str, str]]
+BALL = checkered_ball(1200)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    g2ard.save(tmp_path / "ball.ply", BALL)
+    write_views(tmp_path / "views.json", around(16, (48, 36)))
+    return tmp_path
+
+
+def test_folders_are_made_and_suffixes_are_of_any_case(command_line: CommandLine, folder: Path) -> None:
+    g2ard.save(folder / "a" / "b" / "ball.PLY", BALL)
+    assert len(g2ard.load(folder / "a" / "b" / "ball.PLY")) == 1200
+    status, _, error = command_line(
+        "simplify", "a/b/ball.PLY", "-r", 4, "-o", "c/d/small.Ply", "--json", "e/f.json", cwd=folder
+    )
+    assert status == 0, error
+    assert json.loads((folder / "e" / "f.json").read_text())["output_count"] == 300
+    assert len(g2ard.load(folder / "c" / "d" / "small.Ply")) == 300
+
+
+def test_several_budgets_are_what_single_runs_give(command_line: CommandLine, folder: Path) -> None:
+    several = ("simplify", "ball.ply", "-r", "4,6", "-r", 10, "-o", "s_{ratio}x_{count}.ply", "--json", "-")
+    status, out, error = command_line(*several, cwd=folder)
+    assert status == 0, error
+    assert [run["output_count"] for run in json.loads(out)["runs"]] == [300, 200, 120]
+    for ratio, count in ((4, 300), (6, 200), (10, 120)):
+        command_line("simplify", "ball.ply", "-r", ratio, "-o", f"one_{ratio}.ply", cwd=folder)
+        one = (folder / f"one_{ratio}.ply").read_bytes()
+        assert (folder / f"s_{ratio}x_{count}.ply").read_bytes() == one
+    ask = ("distill", "ball.ply", "--steps", 8, "--size", 48)
+    status, _, error = command_line(*ask, "-n", "200,100", "-o", "runs/{count}", cwd=folder)
+    assert status == 0, error
+    command_line(*ask, "-n", "100", "-o", "alone", cwd=folder)
+    assert (folder / "runs/100/scene.ply").read_bytes() == (folder / "alone/scene.ply").read_bytes()
+    assert (folder / "runs/200/report.html").exists()
+
+
+def test_resuming_a_finished_run_says_so(command_line: CommandLine, folder: Path) -> None:
+    ask = ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 5, "--size", 48)
+    assert command_line(*ask, cwd=folder)[0] == 0
+    before = (folder / "run" / "scene.ply").stat().st_mtime_ns
+    status, _, error = command_line(*ask, "--resume", cwd=folder)
+    assert (status, error.count("\n")) == (0, 1), error
+    assert "run: finished already" in error
+    assert (folder / "run" / "scene.ply").stat().st_mtime_ns == before
+    ask = (
+        "recover",
+        "ball.ply",
+        "--views",
+        "views.json",
+        "--teacher",
+        "ball.ply",
+        "--steps",
+        3,
+        "-o",
+        "b.ply",
+    )
+    assert command_line(*ask, cwd=folder)[0] == 0
+    status, _, error = command_line(*ask, "--resume", cwd=folder)
+    assert status == 0
+    assert "b.ply: finished already" in error
+
+
+def program(*arguments: object, folder: Path, **pipes: int) -> subprocess.Popen[bytes]:
+    root = Path(__file__).resolve().parents[1]
+    path = os.pathsep.join(filter(None, [str(root), os.environ.get("PYTHONPATH")]))
+    return subprocess.Popen(
+        [sys.executable, "-m", "g2ard", *map(str, arguments)],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": path},
+        **pipes,  # type: ignore[arg-type]
+    )
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_a_closed_pipe_loses_no_result(stream: str, folder: Path) -> None:
+    """As under `| head -0`: the reader is gone before anything is said."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, stream: writer}
+    running = program(
+        "simplify", "ball.ply", "-r", 5, "-o", "s.ply", "--json", "-", "-v", folder=folder, **quiet
+    )
+    os.close(writer)
+    _, error = running.communicate(timeout=120)
+    assert running.returncode == 0, error
+    assert b"roken" not in (error or b"")
+    assert len(g2ard.load(folder / "s.ply")) == 240
+
+
+def test_an_interrupt_says_what_was_kept(folder: Path) -> None:
+    ask = ("distill", "ball.ply", "-r", 4, "-o", "run", "--size", 48, "--steps", 100_000)
+    running = program(*ask, folder=folder, stderr=subprocess.PIPE)
+    work = folder / "run" / ".unfinished"
+    until = time.monotonic() + 120
+    while not (work.is_dir() and any(work.iterdir())) and time.monotonic() < until:
+        time.sleep(0.05)
+    running.send_signal(signal.SIGINT)
+    _, error = running.communicate(timeout=120)
+    assert running.returncode == 130
+    assert b"g2ard: interrupted; the same command with --resume goes on in run" in error
+
+
+def test_version_has_a_letter(command_line: CommandLine, folder: Path) -> None:
+    assert command_line("-V", cwd=folder) == command_line("--version", cwd=folder)
+    assert "--install-completion" in command_line("--help", cwd=folder)[1]
+
+
+def photos_of(folder: Path, points: bool = False) -> None:
+    """Photos of the ball with a transforms.json, and COLMAP-like points beside them if asked for."""
+    views = around(24)
+    (folder / "images").mkdir(parents=True)
+    K = views.Ks[0]
+    size = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": 64, "h": 48}
+    transforms(folder / "transforms.json", list(views.viewmats), **size)
+    for i in range(24):
+        write_png(folder / "images" / f"{i:03d}.png", g2ard.render(BALL, views[i]).image)
+    if points:
+        colors = np.clip(0.5 + SH_C0 * BALL.sh0[:, 0], 0, 1).astype(np.float32)
+        write_points(folder / "sparse.ply", Points(BALL.means.astype(np.float64), colors))
+        listed = json.loads((folder / "transforms.json").read_text())
+        (folder / "transforms.json").write_text(json.dumps({**listed, "ply_file_path": "sparse.ply"}))
+
+
+@pytest.mark.parametrize("points", [False, True])
+def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_path: Path) -> None:
+    photos_of(tmp_path / "photos", points)
+    ask = ("distill", "--views", "photos", "-o", "run", "--json", "-")
+    status, out, error = command_line(*ask, "-n", 500, "--steps", 150, cwd=tmp_path)
+    assert status == 0, error
+    found = json.loads(out)
+    assert (found["output_count"], found["against"]) == (500, "photos")
+    assert found["scores"]["recovered"]["psnr"] > max(17, found["scores"]["simplified"]["psnr"] + 1)
+    said = "starts from 1,200 sparse points and 0 within" if points else "starts from 0 sparse points and 500"
+    assert said in error
+    ours = g2ard.distill(None, views=tmp_path / "photos", count=500, steps=150).splats
+    g2ard.save(tmp_path / "ours.ply", ours)
+    assert (tmp_path / "ours.ply").read_bytes() == (tmp_path / "run" / "scene.ply").read_bytes()
+    status, _, error = command_line(*ask, "-r", 4, "--steps", 5, "-w", cwd=tmp_path)
+    assert status == (0 if points else 1)
+    assert points or "give a count, -n COUNT" in error
+    status, _, error = command_line("distill", "-n", 500, "-o", "run", cwd=tmp_path)
+    assert (status, "give a SCENE, or photos" in error) == (2, True)
+
+
+def test_points_within_sight_lie_on_what_is_seen(tmp_path: Path) -> None:
+    photos_of(tmp_path / "photos")
+    cameras = g2ard.load_views(tmp_path / "photos")
+    found = points_within_sight(cameras, 600)
+    assert found.positions.shape == (600, 3)
+    bright = found.colors.max(1) > 0.1  # the background is black everywhere, and everywhere agrees
+    away = np.abs(np.linalg.norm(found.positions[bright], axis=1) - 1)
+    assert np.median(away) < 0.15
+    np.testing.assert_array_equal(found.positions, points_within_sight(cameras, 600).positions)
+
+
+def test_a_result_that_outweighs_its_input_says_so(command_line: CommandLine, tmp_path: Path) -> None:
+    photos_of(tmp_path / "photos", points=True)
+    ask = ("distill", "photos/sparse.ply", "--views", "photos", "-n", 1000, "--steps", 3)
+    error = command_line(*ask, "-o", "run", cwd=tmp_path)[2]
+    assert (
+        "run/scene.ply: 0.24 MB, sparse.ply has 0.03 MB: 76% of it is SH above degree 0 (--sh-degree" in error
+    )
+    g2ard.save(tmp_path / "ball.ply", BALL)
+    assert "MB" not in command_line("simplify", "ball.ply", "-r", 2, "-o", "s.ply", cwd=tmp_path)[2]
+
+
+def test_views_are_made_where_none_are_given(command_line: CommandLine, folder: Path) -> None:
+    ask = ("render", "ball.ply", "--size", 64)
+    status, _, error = command_line(*ask, "-n", 4, "--sheet", "a/look.png", cwd=folder)
+    assert status == 0, error
+    assert "4 images in a/look.png" in error
+    with Image.open(folder / "a" / "look.png") as picture:
+        assert picture.width > 128
+    assert not (folder / "renders").exists()
+    status, _, error = command_line("render", "ball.ply", "-n", 1, "-o", "renders", "--size", 32, cwd=folder)
+    assert (status, "1 image in renders" in error) == (0, True), error
+    assert len(list((folder / "renders").iterdir())) == 1
+    command_line("simplify", "ball.ply", "-r", 5, "-o", "small.ply", cwd=folder)
+    given = ("--teacher", "ball.ply", "--size", 48)
+    status, out, error = command_line("evaluate", "small.ply", *given, "--json", "-", cwd=folder)
+    assert status == 0, error
+    before = json.loads(out)["scenes"][0]
+    ask = ("recover", "small.ply", *given, "--steps", 60, "-o", "better.ply")
+    status, _, error = command_line(*ask, cwd=folder)
+    assert status == 0, error
+    out = command_line("evaluate", "better.ply", *given, "--json", "-", cwd=folder)[1]
+    after = json.loads(out)["scenes"][0]
+    assert len(before["views"]) >= 20
+    assert after["psnr"] > before["psnr"] + 1
+    for command in (("evaluate", "small.ply"), ("recover", "small.ply", "-o", "x.ply")):
+        status, _, error = command_line(*command, cwd=folder)
+        assert (status, "--views, or a --teacher" in error) == (2, True)
+
+
+def test_a_config_file_is_written_and_read_by_flags_names(command_line: CommandLine, folder: Path) -> None:
+    ask = ("distill", "ball.ply", "-r", "5,10", "-o", "r{ratio}", "--views-count", "50%", "--steps", 4)
+    ask = (*ask, "--size", 48, "--background", "0.5,0,1", "--set", "rates.means=1e-4")
+    status, out, error = command_line(*ask, "--print-config", cwd=folder)
+    assert status == 0, error
+    assert not (folder / "r5").exists()
+    for line in ('ratio = ["5.0,10.0"]', 'views-count = "50%"', "steps = 4", 'background = "0.5,0.0,1.0"'):
+        assert line in out
+    (folder / "c.toml").write_text(out)
+    again = command_line("distill", "ball.ply", "--config", "c.toml", "--print-config", cwd=folder)
+    assert again == (0, out, "")
+    status, _, error = command_line("distill", "ball.ply", "--config", "c.toml", cwd=folder)
+    assert status == 0, error
+    assert "views: 70 of 140" in error or "views: " in error
+    assert (folder / "r10" / "scene.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[simplfy]\nratio = 10", "no command is called simplfy"),
+        ("[simplify]\nrato = 10", "no option of `simplify` is called rato"),
+        ("rato = 10", "no option of `simplify` is called rato"),
+        ("simplify = 10", "simplify"),
+        ("[simplify]\nratio = 0.5", "0.5"),
+    ],
+)
+def test_a_config_file_is_never_ignored(
+    text: str, words: str, command_line: CommandLine, folder: Path
+) -> None:
+    (folder / "c.toml").write_text(text)
+    ask = ("simplify", "ball.ply", "-o", "s.ply", "--config", "c.toml")
+    status, _, error = command_line(*ask, cwd=folder)
+    assert (status, words in error, error.count("\n")) == (2, True, 1), error
+
+
+def test_tables_and_what_stands_above_them(command_line: CommandLine, folder: Path) -> None:
+    (folder / "c.toml").write_text("seed = 5\nsize = 64\n[simplify]\nratio = [10]\n[render]\nsplit = 'test'")
+    status, out, error = command_line(
+        "simplify", "ball.ply", "-o", "s.ply", "--config", "c.toml", "--json", "-", cwd=folder
+    )
+    assert status == 0, error
+    found = json.loads(out)
+    assert (found["output_count"], found["config"]["seed"]) == (120, 5)
+
+
+def test_info_of_several_files_and_of_a_run(command_line: CommandLine, folder: Path) -> None:
+    command_line("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 4, "--size", 48, cwd=folder)
+    status, out, error = command_line("info", "ball.ply", "views.json", "run", "--json", "-", cwd=folder)
+    assert status == 0, error
+    scene, views, made = json.loads(out)["files"]
+    assert (scene["kind"], views["kind"], made["count"]) == ("splats", "views", 120)
+    assert made["run"]["input_count"] == 1200
+    assert made["run"]["scores"]["recovered"]["psnr"] > 10
+    assert "made from" in command_line("info", "run", cwd=folder)[1]
