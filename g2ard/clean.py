@@ -2,7 +2,7 @@
 
 | kind | what it is |
 |---|---|
-| invisible | no pixel changes by half an 8-bit step without it, nor their mean without all of them |
+| invisible | within reach of a view, no pixel changes by half an 8-bit step without it, nor their mean |
 | giant | larger than the scene, which lies within its 3σ: fog over everything |
 | needle | ten times as long as wide, with both ends beyond the 3σ of every neighbour |
 | floater | with all it touches less than a thousandth of the scene, in number and in light |
@@ -17,10 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
+from g2ard.cameras import Cameras
 from g2ard.errors import InputError
+from g2ard.progress import Progress, silent
 from g2ard.splats import DRAWN_LOGIT, Splats
+from g2ard.stages.render import Renderer
 
-__all__ = ["KINDS", "Cleaning", "find_clutter"]
+__all__ = ["KINDS", "Cleaning", "find_clutter", "within_reach"]
 
 KINDS = ("invisible", "giant", "needle", "floater")
 
@@ -31,6 +34,8 @@ _LONG = 10.0
 _SMALL = 1e-3
 """Share of the scene's Gaussians, and of its light, below which a group of its own is a floater."""
 _NEIGHBORS = 16
+_BEHIND = 0.01
+"""Share of the depth that a Gaussian may lie behind what a view sees and count as looked at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +59,16 @@ class Cleaning:
         return {name: int(np.count_nonzero(self.kind == i)) for i, name in enumerate(KINDS)}
 
 
-def find_clutter(splats: Splats, seen: Any, pixels: int, kinds: tuple[str, ...] = KINDS) -> Cleaning:
+def find_clutter(
+    splats: Splats, seen: Any, looked: NDArray[np.bool_], pixels: int, kinds: tuple[str, ...] = KINDS
+) -> Cleaning:
     """Find what can go. A Gaussian of several kinds counts as the first of them in the order of `KINDS`.
 
     Args:
         splats: N Gaussians, finite.
-        seen: what views see of them (`g2ard.visibility.visibility`): `weight`, `peak` and `pixel_size` are
-            read. What no view looks at is never called invisible, unless its α is below 1/255.
+        seen: what views see of them (`g2ard.visibility.visibility`): `weight` and `peak` are read.
+        looked: (N,) those that the views could see (`within_reach`): no other is called invisible, unless
+            its α is below 1/255.
         pixels: of all those views together.
         kinds: the kinds looked for.
 
@@ -68,19 +76,20 @@ def find_clutter(splats: Splats, seen: Any, pixels: int, kinds: tuple[str, ...] 
         A kind for each.
 
     Raises:
-        InputError: an unknown kind, or `seen` of another length.
+        InputError: an unknown kind, or `seen` or `looked` of another length.
     """
     if unknown := sorted(set(kinds) - set(KINDS)):
         raise InputError(f"kinds: expected some of {', '.join(KINDS)}, got {unknown[0]!r}")
-    if len(seen.weight) != len(splats):
-        raise InputError(f"seen: expected {len(splats)} rows, got {len(seen.weight)}")
+    for name, rows in (("seen", seen.weight), ("looked", looked)):
+        if len(rows) != len(splats):
+            raise InputError(f"{name}: expected {len(splats)} rows, got {len(rows)}")
     kind = np.full(len(splats), -1, np.int8)
-    hidden = _invisible(splats, seen, pixels)
+    hidden = _invisible(splats, seen, looked, pixels)
     finders = {
         "invisible": lambda rest: hidden,
         "giant": lambda rest: _giants(splats),
         "needle": lambda rest: _needles(splats, rest),
-        "floater": lambda rest: _floaters(splats, rest, seen.weight),
+        "floater": lambda rest: _floaters(splats, rest, seen.weight, looked),
     }
     for number, name in enumerate(KINDS):
         if name in kinds:
@@ -90,16 +99,44 @@ def find_clutter(splats: Splats, seen: Any, pixels: int, kinds: tuple[str, ...] 
     return Cleaning(kind)
 
 
-def _invisible(splats: Splats, seen: Any, pixels: int) -> NDArray[np.bool_]:
+def _invisible(splats: Splats, seen: Any, looked: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
     """What no renderer draws; and, least light first, what changes no pixel by half a step, until all
     together would change the mean pixel by as much."""
     faint = splats.logit_opacities < DRAWN_LOGIT
-    looked = np.isfinite(seen.pixel_size)
     small = np.flatnonzero(looked & ~faint & (seen.peak < _HALF_STEP))
     order = small[np.argsort(seen.weight[small], kind="stable")]
     total = np.cumsum(seen.weight[order], dtype=np.float64)
     out: NDArray[np.bool_] = faint.copy()
     out[order[total <= _HALF_STEP * pixels]] = True
+    return out
+
+
+def within_reach(splats: Splats, cameras: Cameras, progress: Progress = silent) -> NDArray[np.bool_]:
+    """(N,) whose mean lies in the image of some view, before its matter or 1 % of the depth behind.
+
+    Matter is where half of a pixel's light is hidden. What lies deeper in all views, behind a wall or in a
+    corner that none of them looks into, may show from elsewhere.
+
+    Args:
+        splats: the scene.
+        cameras: in world coordinates.
+        progress: told after each view.
+    """
+    renderer = Renderer(splats)
+    means = splats.means.astype(np.float64) + splats.offset
+    out = np.zeros(len(splats), bool)
+    for done, camera in enumerate(cameras, 1):
+        depths = renderer.render(camera, median=True).median
+        assert depths is not None
+        x, y, z = camera.viewmat[:3, :3] @ means.T + camera.viewmat[:3, 3:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.floor(camera.K[0, 0] * x / z + camera.K[0, 2])
+            v = np.floor(camera.K[1, 1] * y / z + camera.K[1, 2])
+        framed = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        rows = np.flatnonzero(framed)
+        there = depths[v[rows].astype(int), u[rows].astype(int)]
+        out[rows[(there == 0) | (z[rows] < (1 + _BEHIND) * there)]] = True
+        progress("reach", done, len(cameras), {})
     return out
 
 
@@ -148,8 +185,11 @@ def _needles(splats: Splats, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return out
 
 
-def _floaters(splats: Splats, rest: NDArray[np.bool_], weight: NDArray[Any]) -> NDArray[np.bool_]:
-    """Groups of `rest` that touch (spheres of 3σ of the largest scale meet), small in number and light."""
+def _floaters(
+    splats: Splats, rest: NDArray[np.bool_], weight: NDArray[Any], looked: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Groups of `rest` that touch (spheres of 3σ of the largest scale meet), small in number and light, some
+    of them within reach of a view."""
     out = np.zeros(len(splats), bool)
     rows = np.flatnonzero(rest)
     if len(rows) <= _NEIGHBORS:
@@ -163,6 +203,7 @@ def _floaters(splats: Splats, rest: NDArray[np.bool_], weight: NDArray[Any]) -> 
     count = np.bincount(group, minlength=len(rows))
     light = np.bincount(group, weight[rows], minlength=len(rows))
     small = (count <= _SMALL * len(rows)) & (light <= _SMALL * light.sum())
+    small &= np.bincount(group, looked[rows], minlength=len(rows)) > 0
     out[rows[small[group]]] = True
     return out
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scenes import around, checkered_ball
 
-from g2ard.clean import KINDS, find_clutter
+from g2ard.cameras import Cameras, look_at
+from g2ard.clean import KINDS, find_clutter, within_reach
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.metrics import psnr
@@ -44,9 +45,10 @@ def junk() -> tuple[Splats, np.ndarray]:
 
 
 def find(splats: Splats, **options: object):
+    """What is found if views could see all of it."""
     views = around(24)
     pixels = int((views.widths * views.heights).sum())
-    return find_clutter(splats, visibility(splats, views), pixels, **options)
+    return find_clutter(splats, visibility(splats, views), np.ones(len(splats), bool), pixels, **options)
 
 
 def test_every_kind_is_found_and_the_ball_stays() -> None:
@@ -73,8 +75,30 @@ def test_what_no_view_looks_at_stays() -> None:
     splats, _ = junk()
     view = around(24).take([0])
     behind = replace(splats, means=splats.means + (100 * view.positions[0]).astype(np.float32))
-    found = find_clutter(behind, visibility(behind, view), 64 * 48, ("invisible",))
+    reached = within_reach(behind, view)
+    assert not reached.any()
+    found = find_clutter(behind, visibility(behind, view), reached, 64 * 48, ("invisible",))
     np.testing.assert_array_equal(found.kind >= 0, splats.logit_opacities < -5.54)
+
+
+def test_what_lies_behind_a_wall_stays() -> None:
+    """A view sees a wall alone: what stands behind it is in its frame, and no other view tells more."""
+    x, z = np.meshgrid(np.linspace(-3, 3, 61), np.linspace(-3, 3, 61))
+    means = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], 1)
+    wall = Splats.create(means, scales=np.full((x.size, 3), 0.1), logit_opacities=np.full(x.size, 9.0))
+    beyond = replace(checkered_ball(500), logit_opacities=np.full(500, 5, np.float32))
+    beyond = replace(beyond, means=beyond.means + np.float32([0, 3, 0]))
+    before = replace(wall.take([0]), means=np.float32([[0, -1, 0]]), logit_opacities=np.float32([-5.4]))
+    scene = merge([wall, beyond, before])
+    K = [[60, 0, 32], [0, 60, 24], [0, 0, 1]]
+    view = Cameras.from_lists([look_at([0, -4, 0], [0, 0, 0])], [K], [(64, 48)], ["front"])
+    reached = within_reach(scene, view)
+    assert not reached[x.size : -1].any()
+    assert reached[-1]
+    hidden = visibility(scene, view).weight[x.size : -1]
+    assert hidden.max() < 1e-3  # it would be called invisible by what shows alone
+    kinds = find_clutter(scene, visibility(scene, view), reached, 64 * 48, ("invisible",)).kind
+    assert (kinds[x.size : -1] < 0).all()
 
 
 def test_a_chain_of_thin_ones_is_no_needle() -> None:

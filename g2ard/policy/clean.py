@@ -41,7 +41,7 @@ def clutter_seen(
     Raises:
         InputError: an unknown kind, or a scene with no room for poses.
     """
-    from g2ard.clean import KINDS, find_clutter
+    from g2ard.clean import KINDS, find_clutter, within_reach
     from g2ard.poses import plan_pool
     from g2ard.visibility import visibility
 
@@ -50,7 +50,7 @@ def clutter_seen(
     cameras = pool.cameras.resized(_SIDE)
     seen = visibility(splats, cameras, progress)
     pixels = int((cameras.widths.astype(int) * cameras.heights).sum())
-    found = find_clutter(splats, seen, pixels, kinds)
+    found = find_clutter(splats, seen, within_reach(splats, cameras, progress), pixels, kinds)
     parts = [f"{count:,} {name}" for name, count in found.counts.items() if name in kinds]
     gone = len(splats) - int(found.keep.sum())
     say(f"{gone:,} of {len(splats):,} Gaussians can go: {', '.join(parts)}")

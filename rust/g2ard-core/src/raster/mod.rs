@@ -101,7 +101,7 @@ impl Camera {
     }
 
     /// A point of the world in the camera's axes.
-    pub(crate) fn to_camera(self, p: [f64; 3]) -> [f64; 3] {
+    pub(crate) fn to_camera(&self, p: [f64; 3]) -> [f64; 3] {
         self.viewmat
             .map(|r| r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + r[3])
     }
