@@ -136,7 +136,7 @@ def _rendered(scene: Splats, views: Cameras) -> Arrays:
         renderer = Renderer(scene, settings=settings)
         name = f"{settings.convention}{' antialiased' * settings.antialiased}"
         for view in (0, 7):
-            out = renderer.render(views, view, median=True)
+            out = renderer.render(views[view], median=True)
             for part in ("image", "alpha", "depth", "median"):
                 yield f"{name} {view} {part}", getattr(out, part)
     here, settings = views.recentred(scene.offset), RasterSettings()
