@@ -121,6 +121,10 @@ def distill(
     size: SizeOption = None,
     background: BackgroundOption = None,
     up: UpOption = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Tell about how long it will take, and what memory; write nothing."),
+    ] = False,
 ) -> None:
     """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget.
 
@@ -182,6 +186,9 @@ def distill(
     check_crops(crop or [], job.views.test.names)
     outputs.check(lambda folder: _check_folder(run, folder, given, resume), len(job.prior))
     places = list(zip(job.budgets, outputs.paths(len(job.prior)), strict=True))
+    if dry_run:
+        run.result({"runs": [_tell_estimate(run, job, budget, folder) for budget, folder in places]})
+        return
     for _, folder in places:
         _tell_resumed(run, folder, resume)
     todo = [(budget, folder) for budget, folder in places if not _is_done(run, folder, resume)]
@@ -196,6 +203,21 @@ def distill(
         run.kept.append(f"{folder} is finished")
         began = time.monotonic()
     run.result(reports[0] if len(reports) == 1 else {"runs": reports})
+
+
+def _tell_estimate(run: Run, job: DistillJob, budget: int, folder: Path) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    from g2ard.policy.estimate import estimate
+
+    found = estimate(job, budget)
+    parts = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in found.seconds.items())
+    run.say(
+        f"{folder}: {budget:,} Gaussians, {found.views} views of {found.pixels:,} pixels, "
+        f"{found.steps:,} steps: about {found.total:.0f} s ({parts}) "
+        f"and {found.bytes / 1e6:,.0f} MB; nothing is written"
+    )
+    return {"output": str(folder), "count": budget, **asdict(found), "total_seconds": found.total}
 
 
 def _check_folder(run: Run, folder: Path, given: bool, resume: bool) -> None:
