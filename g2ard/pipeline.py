@@ -27,6 +27,7 @@ from g2ard.stages.simplify.report import SimplifyReport
 from g2ard.targets import Photos, Subset, Targets, fingerprint_of
 
 if TYPE_CHECKING:
+    from g2ard.cameras import Cameras
     from g2ard.stages.recover.optimize import Watch
 
 __all__ = ["DistillConfig", "DistillReport", "Distilled", "distill"]
@@ -202,6 +203,25 @@ def distill(
     return Distilled(rounds.state, rounds.simplified, report)
 
 
+def final_steps(config: DistillConfig, scene: Splats, cameras: Cameras, *, photos: bool) -> int:
+    """Steps of the last recovery: as asked for, the schedule's, or by need where a teacher renders targets.
+
+    Args:
+        config: of the pipeline.
+        scene: what is to be recovered.
+        cameras: the views it learns from.
+        photos: whether those are photos.
+    """
+    from g2ard.stages.recover.need import steps_for
+
+    schedule = config.schedule
+    if config.steps is not None:
+        return config.steps
+    if not schedule.means_in_scales or photos:
+        return schedule.steps
+    return steps_for(scene, cameras, schedule.steps)
+
+
 @dataclass(frozen=True, eq=False)
 class _Supervision:
     """What recovery looks at, how often, and why."""
@@ -364,14 +384,10 @@ class _Rounds:
                 checkpoint.unlink(missing_ok=True)
         self.seconds["recover"] += entry["recover"][-1]["seconds"]
 
-    def _steps(self) -> int | None:
-        """The final horizon: as asked for, the schedule's, or by need where a teacher renders the targets."""
-        from g2ard.stages.recover.need import steps_for
-
-        schedule = self.config.schedule
-        if self.config.steps is not None or not schedule.means_in_scales or isinstance(self.targets, Photos):
-            return self.config.steps
-        return steps_for(self.state, self.supervision.targets.cameras, schedule.steps)
+    def _steps(self) -> int:
+        """The final horizon."""
+        photos = isinstance(self.targets, Photos)
+        return final_steps(self.config, self.state, self.supervision.targets.cameras, photos=photos)
 
     def _seconds(self, final: bool) -> float | None:
         """This recovery's part of the time limit."""

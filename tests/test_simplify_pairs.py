@@ -5,14 +5,18 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scenes import around, checkered_ball
 from simplify_cases import ARRAYS, Views, all_alike, assert_sound, opaque_wall, scene
 
+from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.splats import Splats
 from g2ard.stages.simplify import SimplifyConfig, simplify
+from g2ard.visibility import visibility_source
 
 sys.path.insert(0, str(Path(__file__).parent))
 from reference import simplify as naive
@@ -159,3 +163,41 @@ def test_bands_of_zeros_are_skipped_and_come_back():
     assert not b.splats.shN[:, 3:].any()
     assert (a.report.skipped["sh_bands"], b.report.skipped["sh_bands"]) == (0, 2)
     assert b.report.skipped["alone"] == (np.bincount(b.parents[b.parents >= 0]) == 1).sum()
+
+
+def test_the_constants_are_the_core_s() -> None:
+    default, fast = (SimplifyConfig().resolved(method) for method in ("default", "fast"))
+    assert (default.morton_premerge_ratio, default.morton_premerge_steps) == (3.0, 1)
+    assert (fast.morton_premerge_ratio, fast.morton_premerge_steps) == (1.0, 2)
+    core = _core.defaults()["default"]
+    assert {name: getattr(default, name) for name in core} == core
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"morton_premerge_ratio": 0.5}, {"morton_premerge_ratio": np.nan}, {"morton_premerge_steps": 0}],
+)
+def test_a_premerge_that_is_none_is_refused(values: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=next(iter(values))):
+        SimplifyConfig(**values)
+
+
+def test_without_a_premerge_pairs_alone_merge() -> None:
+    scene = checkered_ball(600)
+    never = simplify(scene, 60, config=SimplifyConfig(morton_premerge_ratio=np.inf))
+    always = simplify(scene, 60, config=SimplifyConfig(morton_premerge_ratio=1.0))
+    assert len(always.report.rounds) == 1 < len(never.report.rounds)
+    assert all(r.merged <= r.before // 2 for r in never.report.rounds)  # a pair becomes one
+
+
+def test_a_scene_is_put_in_order_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+
+    def counted(splats: Splats) -> Any:
+        made.append(len(splats))
+        return core_scene(splats)
+
+    core_scene = _core.Scene
+    monkeypatch.setattr(_core, "Scene", counted)
+    simplify(checkered_ball(600), 60, visibility=visibility_source(around(4)))
+    assert made == [600, 60]  # the input, then the result whose opacities are fitted

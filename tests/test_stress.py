@@ -7,8 +7,11 @@ from collections.abc import Iterator
 import pytest
 import torch
 from stress.gradients import Tally, check_problem
+from stress.results import lines, random_scene
 from stress.run import Outcome, stress
 from stress.scenes import NAMES, Problem
+
+from g2ard import _core
 
 
 @pytest.fixture(autouse=True)
@@ -47,3 +50,18 @@ def test_an_image_off_by_a_little_fails() -> None:
     outcome = Outcome()
     outcome.close([np.full(1000, 3e-6)])
     assert outcome.failures == ["image: 99.9th percentile 3.00e-06"]
+
+
+def test_the_record_of_results_is_the_same_at_any_number_of_threads() -> None:
+    before, found = _core.num_threads(), []
+    try:
+        for threads in (1, 3):
+            _core.set_num_threads(threads)
+            found.append(list(lines("discs", random_scene(4, 1_500))))
+    finally:
+        _core.set_num_threads(before)
+    assert found[0] == found[1]
+    stages = {line.split("/")[1] for line in found[0]}
+    assert stages == {"simplify", "select", "recover", "render", "visibility"}
+    different = list(lines("discs", random_scene(5, 1_500)))
+    assert len(set(found[0]) & set(different)) < len(different) / 4  # what is the same: offsets, refusals

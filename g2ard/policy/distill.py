@@ -113,6 +113,10 @@ class DistillJob:
         """Have all targets that are rendered beforehand; `run` does so where it has not been done."""
         _ = self.targets, self.held_out, self.apart
 
+    def tried(self, cameras: Cameras) -> Targets:
+        """Targets of a few views, none of them kept."""
+        return self._targets(cameras, lazy=True)
+
     def _targets(self, cameras: Cameras, *, lazy: bool = False) -> Targets:
         return make_targets(
             cameras,

@@ -25,13 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scenes import around, checkered_ball
 
-from g2ard import _core, io, simplify, visibility
+from g2ard import _core, io, visibility
 from g2ard.cameras import Cameras
 from g2ard.splats import Splats
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import PRESETS
 from g2ard.stages.render import RasterSettings, Renderer, arrays_of, view_of
 from g2ard.stages.select import CoverageOptions, select
+from g2ard.stages.simplify import METHODS, flag, simplify
 from g2ard.targets import TeacherRenders
 
 __all__ = ["lines", "random_scene"]
@@ -99,14 +100,14 @@ def _simplified(scene: Splats, views: Cameras) -> Arrays:
     budget = len(scene) // 10
     rng = np.random.default_rng(3)
     protected = rng.random(len(scene)) < 0.1
-    yield "flags", simplify.flag(scene, budget)
-    for method in simplify.METHODS:
-        out = simplify.simplify(scene, budget, method=method, protected=protected)
+    yield "flags", flag(scene, budget)
+    for method in METHODS:
+        out = simplify(scene, budget, method=method, protected=protected)
         yield from _named(method, out.splats, parents=out.parents, protected=out.protected)
         if method == "paper":
             continue
         seen = visibility.visibility_source(views, longest=80)
-        out = simplify.simplify(scene, budget, method=method, visibility=seen)
+        out = simplify(scene, budget, method=method, visibility=seen)
         yield from _named(f"{method} with views", out.splats, parents=out.parents)
 
 
@@ -118,7 +119,7 @@ def _selected(scene: Splats, views: Cameras) -> Arrays:
 
 
 def _recovered(scene: Splats, views: Cameras) -> Arrays:
-    small = simplify.simplify(scene, len(scene) // 5).splats
+    small = simplify(scene, len(scene) // 5).splats
     targets = TeacherRenders(scene, views)
     regularizers = replace(PRESETS["noisy"], period=2)
     for engine in ("fused", "torch"):
@@ -135,7 +136,7 @@ def _rendered(scene: Splats, views: Cameras) -> Arrays:
         renderer = Renderer(scene, settings=settings)
         name = f"{settings.convention}{' antialiased' * settings.antialiased}"
         for view in (0, 7):
-            out = renderer.render(views, view, median=True)
+            out = renderer.render(views[view], median=True)
             for part in ("image", "alpha", "depth", "median"):
                 yield f"{name} {view} {part}", getattr(out, part)
     here, settings = views.recentred(scene.offset), RasterSettings()

@@ -130,6 +130,10 @@ def distill(
     size: SizeOption = None,
     background: BackgroundOption = None,
     up: UpOption = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Tell about how long it will take, and what memory; write nothing."),
+    ] = False,
 ) -> None:
     """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget.
 
@@ -194,6 +198,13 @@ def distill(
     check_crops(crop or [], job.views.test.names)
     outputs.check(lambda folder: _check_place(run, folder / name, given, resume), len(job.prior))
     places = [folder / name for folder in outputs.paths(len(job.prior))]
+    if dry_run:
+        estimates = [
+            _tell_estimate(run, job, aim.count, place.parent)
+            for aim, place in zip(job.aims, places, strict=True)
+        ]
+        run.result({"runs": estimates})
+        return
     for place in places:
         _tell_resumed(run, place, resume)
     todo = [pair for pair in zip(job.aims, places, strict=True) if not _is_done(run, pair[1], resume)]
@@ -210,6 +221,21 @@ def distill(
         began = time.monotonic()
     run.result(reports[0] if len(reports) == 1 else {"runs": reports})
     tell_quality(run, aim, result.splats)
+
+
+def _tell_estimate(run: Run, job: DistillJob, budget: int, folder: Path) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    from g2ard.policy.estimate import estimate
+
+    found = estimate(job, budget)
+    parts = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in found.seconds.items())
+    run.say(
+        f"{folder}: {budget:,} Gaussians, {found.views} views of {found.pixels:,} pixels, "
+        f"{found.steps:,} steps: about {found.total:.0f} s ({parts}) "
+        f"and {found.bytes / 1e6:,.0f} MB; nothing is written"
+    )
+    return {"output": str(folder), "count": budget, **asdict(found), "total_seconds": found.total}
 
 
 def _check_place(run: Run, place: Path, given: bool, resume: bool) -> None:

@@ -37,7 +37,7 @@ impl<'a> Frustum<'a> {
     /// can touch the image.
     pub fn meets(&self, centre: [f32; 3], half: [f32; 3], scale: f32) -> bool {
         let c = self.camera;
-        let middle = c.to_camera(centre.map(f64::from));
+        let middle = c.in_camera(centre.map(f64::from));
         let reach = [0, 1, 2].map(|r: usize| {
             let row = &c.viewmat[r];
             let side = |k: usize| row[k].abs() * f64::from(half[k]);

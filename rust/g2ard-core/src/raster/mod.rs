@@ -101,7 +101,7 @@ impl Camera {
     }
 
     /// A point of the world in the camera's axes.
-    pub(crate) fn to_camera(&self, p: [f64; 3]) -> [f64; 3] {
+    pub(crate) fn in_camera(&self, p: [f64; 3]) -> [f64; 3] {
         self.viewmat
             .map(|r| r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + r[3])
     }
@@ -109,7 +109,7 @@ impl Camera {
     /// Lowers `size` to that of a pixel at a point, depth / focal length in scene units, if the image contains the point.
     #[inline]
     pub(crate) fn lower_pixel_size(&self, point: [f64; 3], size: &mut f32) {
-        let p = self.to_camera(point);
+        let p = self.in_camera(point);
         let here = (p[2] / self.fx.max(self.fy)) as f32;
         // Most points are already smaller in an earlier view: that is one division instead of three.
         if !(p[2] >= f64::from(self.near) && here < *size) {
