@@ -1,4 +1,4 @@
-"""Sphinx: the site that `make docs` builds. Sources are the Markdown files as GitHub shows them, from the repository's root."""
+"""Sphinx: the site that `make docs` builds from the Markdown files of the repository, its root the source."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ version = release = g2ard.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "docs/index"
-include_patterns = ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**", "benches/record/**"]
-exclude_patterns = ["docs/_build", "docs/conf.py"]
+include_patterns = ["*.md", "docs/**", "benches/record/**"]
+exclude_patterns = ["docs/conf.py"]
 
 html_theme = "furo"
 html_title = "g2ard"
@@ -33,10 +33,10 @@ napoleon_use_ivar = True
 def as_rst(app, what, name, obj, options, lines) -> None:
     """Docstrings are plain text with `code`: what reStructuredText would read as markup is escaped."""
     for i, line in enumerate(lines):
-        pieces = re.split(r"(`[^`]+`)", line)
-        plain = [re.sub(r"(?<!\*)([*|])", r"\\\1", p) if k % 2 == 0 else f"`{p}`" for k, p in enumerate(pieces)]
         if not line.lstrip().startswith((">>>", "...")):
-            lines[i] = "".join(plain)
+            parts = re.split(r"(`[^`]+`)", line)  # every second one is code
+            parts[::2] = [re.sub(r"([*|])", r"\\\1", part) for part in parts[::2]]
+            lines[i] = "".join(parts)
 
 
 def setup(app) -> None:
