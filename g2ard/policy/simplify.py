@@ -1,4 +1,4 @@
-"""`g2ard.simplify`: the looks that the stage weighs errors by, then the stage."""
+"""`g2ard.simplify`: the views that the stage weighs errors by, then the stage."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def simplify(
         scene: the dense scene, or its path.
         count: Gaussians to keep, at most as many as there are.
         ratio: how many times fewer to keep, at least 1; the result has N/ratio, rounded to the nearest.
-        views: cameras in world coordinates, or where they lie, of which the training split is looked from;
+        views: cameras in world coordinates, or where they lie, of which the training split is used;
             "made" makes a pool even if cameras lie beside the scene.
         blind: use no cameras at all.
         method: default, fast or paper; `g2ard.stages.simplify.simplify` says what they do.
@@ -51,8 +51,8 @@ def simplify(
         beside: where to look for cameras, if `scene` is no path; its folder and its trainer's are looked in.
         up: (3,) away from the ground, for poses that are made; None to estimate it.
         seed: of poses that are made.
-        progress: told of planning, looks and Gaussians shed.
-        say: told in lines what was noticed and what is looked from.
+        progress: told of planning, visibility and Gaussians shed.
+        say: told in lines what was noticed and which views are used.
 
     Returns:
         The scene, where each row went, protection flags and a report.
@@ -100,7 +100,7 @@ def simplify_each(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Iterator[Simplified]:
-    """The same scene at several budgets, each as `simplify` gives it; poses and looks are shared.
+    """The same scene at several budgets, each as `simplify` gives it; poses and visibility are shared.
 
     Raises:
         InputError: as `simplify`.

@@ -125,7 +125,7 @@ class Probe:
         if seconds >= self._next:
             began = time.monotonic()
             self._latest = self.all_of(splats()), step
-            first = self._next == 0.0  # half a minute of an old figure tells nobody anything
+            first = self._next == 0.0  # the starting score is outdated soon
             self._next = seconds + (time.monotonic() - began) / (_FIRST_SHARE if first else _SHARE)
         return self._latest
 
