@@ -1,4 +1,4 @@
-"""How fast a scene wants to learn: PSNR of a few views, and the rate multiplier that short trials choose."""
+"""PSNR of a few views on the way, and the rate multiplier that short trials choose."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _CALMEST = 0.01
 """Smaller ones change nothing that 8 bits show."""
 _VIEWS = 8
 _SHARE = 0.01
-"""Of the time that looking at the views may take while somebody watches the progress."""
+"""Share of the time that scoring the views may take while progress is shown."""
 _FIRST_SHARE = 0.1
 """The same of the first look, where short runs would end before the second."""
 _FEWEST, _MOST, _PART = 10, 60, 50
