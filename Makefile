@@ -43,7 +43,7 @@ $(VENV)/.docs: pyproject.toml
 	touch $@
 
 docs: setup $(VENV)/.docs
-	$(BIN)/python -m sphinx -q -W --keep-going -c docs -b html . site
+	$(BIN)/python -m sphinx -q -E -a -W --keep-going -c docs -b html . site
 	@echo site/docs/index.html
 
 # Needs a scene: SCENE=path, or real data. Every study runs once, small: one scene, two ratios, few steps.
