@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 RUST := $(shell find rust -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml) Cargo.toml Cargo.lock
 
-.PHONY: demo test lint stress bench bench-kernels wheel setup clean
+.PHONY: demo test lint docs stress bench bench-kernels wheel setup clean
 
 setup: $(VENV)/.built
 
@@ -36,6 +36,16 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# The site, in site/docs/index.html. A broken link or reference is an error.
+EXTRA_DOCS := import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"])
+$(VENV)/.docs: pyproject.toml
+	$(BIN)/pip install --quiet $$($(BIN)/python -c '$(EXTRA_DOCS)')
+	touch $@
+
+docs: setup $(VENV)/.docs
+	$(BIN)/python -m sphinx -q -E -a -W --keep-going -c docs -b html . site
+	@echo site/docs/index.html
+
 # Needs a scene: SCENE=path, or real data. Every study runs once, small: one scene, two ratios, few steps.
 # What bench/ and bench.csv hold is not measured again; `make clean` removes them.
 QUICK := --only city,guitar --ratios 10,30 --seeds 0 --size 240 --steps 150 --seconds 8 --adapt-steps 500
@@ -53,4 +63,4 @@ wheel: setup
 	$(BIN)/maturin build --release --out dist
 
 clean:
-	rm -rf $(VENV) target dist demo bench bench.csv
+	rm -rf $(VENV) target dist demo site bench bench.csv

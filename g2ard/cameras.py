@@ -295,6 +295,17 @@ class Cameras:
 def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
     """(4, 4) camera_from_world of a camera at `position` facing `target`, image top towards `up`.
 
+    Args:
+        position: (3,) the camera's centre, world coordinates.
+        target: (3,) a point it faces.
+        up: (3,) a direction, of any length but 0; where the camera faces along it, some right axis is taken.
+
+    Returns:
+        (4, 4) float64, rigid; OpenCV axes: x right, y down, z forward.
+
+    Raises:
+        InputError: position and target coincide.
+
     >>> look_at([0, 0, -2], [0, 0, 0], up=[0, -1, 0]).tolist()[2]
     [0.0, 0.0, 1.0, 2.0]
     """

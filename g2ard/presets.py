@@ -54,6 +54,9 @@ def preset(name: str = "paper", prior: str = "trained") -> Preset:
         prior: the row of `tab:s_recovery`: trained, lift (an untrained cloud's), or noisy (trained and less
             regular). `g2ard.stages.recover.presets.preset_for("paper", …)` measures which.
 
+    Returns:
+        A `Preset`: the configurations of simplify, select, recover, distill and adapt.
+
     Raises:
         InputError: no such preset, or prior.
 

@@ -55,7 +55,7 @@ def against_of(targets: Targets, view: int) -> str | None:
 
 
 def fingerprint_of(targets: Targets) -> str:
-    """What a checkpoint remembers of its targets: the views, and where their images come from."""
+    """What a checkpoint stores of its targets: the views, and where their images come from."""
     cameras = targets.cameras
     digest = hashlib.sha256(str(getattr(targets, "source", type(targets).__name__)).encode())
     for array in (cameras.viewmats, cameras.Ks, cameras.widths, cameras.heights):
@@ -197,8 +197,20 @@ def _inverse(name: str, exposure: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 class TeacherRenders(_Cached):
-    """The dense scene rendered into each view, in [0, 1] and float32, by gsplat's conventions or `settings`;
-    `lazy`, when first asked for."""
+    """The dense scene rendered into each view: (H, W, 3) float32, clipped to [0, 1], never rounded to 8 bits.
+
+    Args:
+        teacher: the dense scene.
+        cameras: the views, world coordinates.
+        background: RGB in [0, 1] behind the scene.
+        settings: the renderer's conventions; None means gsplat's.
+        limit: bytes of renders kept in memory; what is over it is rendered again when asked for.
+        lazy: render a view when it is first asked for, not all at once.
+        progress: told of views rendered.
+
+    Raises:
+        InputError: a camera or a background that cannot be rendered.
+    """
 
     def __init__(
         self,

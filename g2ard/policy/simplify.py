@@ -1,4 +1,4 @@
-"""`g2ard.simplify`: the looks that the stage weighs errors by, then the stage."""
+"""`g2ard.simplify`: the views that the stage weighs errors by, then the stage."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def simplify(
         min_psnr: instead, about the fewest that keep this PSNR, dB, against the scene in views of its own.
         min_ssim: the same of SSIM; with `min_psnr` both hold. `say` tells what the result has.
         format: of the file that `fit` speaks of: ply, compressed.ply, sog, spz, glb or splat.
-        views: cameras in world coordinates, or where they lie, of which the training split is looked from;
+        views: cameras in world coordinates, or where they lie, of which the training split is used;
             "made" makes a pool even if cameras lie beside the scene.
         blind: use no cameras at all.
         method: default, fast or paper; `g2ard.stages.simplify.simplify` says what they do.
@@ -60,8 +60,8 @@ def simplify(
         beside: where to look for cameras, if `scene` is no path; its folder and its trainer's are looked in.
         up: (3,) away from the ground, for poses that are made; None to estimate it.
         seed: of poses that are made.
-        progress: told of planning, looks and Gaussians shed.
-        say: told in lines what was noticed and what is looked from.
+        progress: told of planning, visibility and Gaussians shed.
+        say: told in lines what was noticed and which views are used.
 
     Returns:
         The scene, where each row went, protection flags and a report.
@@ -115,7 +115,7 @@ def simplify_each(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Iterator[Simplified]:
-    """The same scene at several budgets, each as `simplify` gives it; poses and looks are shared.
+    """The same scene at several budgets, each as `simplify` gives it; poses and visibility are shared.
 
     Raises:
         InputError: as `simplify`.

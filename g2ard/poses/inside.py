@@ -32,8 +32,8 @@ _SHARP = 0.05
 .013–.026; in the hollow of an object .13 and more."""
 
 _SOME_INSIDE, _ALL_INSIDE = 0.005, 0.025
-"""Share of the box that lies within rooms: below the first nobody stands inside, from the second on everybody
-does. Measured: showroom .026–.079, objects and open scenes 0.000."""
+"""Share of the box that lies within rooms: below the first no pose stands inside, from the second on all do.
+Measured: showroom .026–.079, objects and open scenes 0.000."""
 
 _SHELL = 0.5
 """At most so much of a pool stands within what has no ground."""

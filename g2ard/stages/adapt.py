@@ -167,11 +167,11 @@ def adapt(
 ) -> Adapted:
     """Refit spherical harmonics and opacities to targets; means, rotations and scales stay.
 
-    First one affine map of all colours (`g2ard.appearance.colour_change`), where the images ask for it: what
-    changed everywhere is then right where no image looks. From there each Gaussian's own appearance, under
-    L = (1−λ)·L1 + λ·(1−SSIM) as in recovery, whose anchors have nothing to hold here. At last a blend of the
-    two, by how well the images see each Gaussian. What the result shows on other trajectories is a direct
-    reading of the geometry's worth.
+    First one affine map c ↦ M·(c, 1) of all colours, M (3, 4) by least squares
+    (`g2ard.appearance.colour_change`), where it gains enough on the images: a change of light is then right
+    in unseen places too. From there each Gaussian's own appearance, under L = (1−λ)·L1 + λ·(1−SSIM) as in
+    recovery, without regularisers. Last a blend: a Gaussian seen by v images goes v/(v + prior_views) of the
+    way to its fit. PSNR on other trajectories then measures the geometry (`tab:geobase`).
 
     Args:
         compact: the scene; its offset counts, cameras are in world coordinates.

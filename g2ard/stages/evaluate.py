@@ -23,8 +23,8 @@ __all__ = ["Evaluation", "ViewScore", "evaluate"]
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One view's figures; LPIPS by network, empty without weights; `against` "photo" or "teacher" where the
-    targets say so."""
+    """One view's figures: PSNR in dB, SSIM in [−1, 1], LPIPS by network, empty without weights; `against` is
+    "photo" or "teacher" where the targets say so."""
 
     name: str
     psnr: float
@@ -91,13 +91,14 @@ def evaluate(
 ) -> Evaluation:
     """Render every view of `targets` and score it.
 
-    Renders are clamped to [0, 1] without 8-bit rounding, unless asked for; SSIM has an 11×11 Gaussian window,
-    σ 1.5, zero-padded. Where a photo has a mask, only its pixels count.
+    PSNR = −10·log₁₀ of the mean squared difference over pixels and channels, in dB, at most 100; SSIM (Wang
+    et al. 2004) has an 11×11 Gaussian window, σ 1.5, zero-padded, values in 0–1. Renders are clamped to
+    [0, 1] without 8-bit rounding, unless asked for. Where a photo has a mask, only its pixels count.
 
     Args:
         splats: the scene; its offset counts, cameras are in world coordinates.
         targets: photos or teacher renders; photo-relative and teacher-relative figures never mix.
-        background: RGB behind the scene.
+        background: RGB in [0, 1] behind the scene.
         lpips: networks to score with as well, as `g2ard.lpips.load_lpips` finds them.
         settings: the renderer's conventions; None means gsplat's. A teacher's renders have their own, see
             `g2ard.targets.TeacherRenders`.
@@ -106,7 +107,7 @@ def evaluate(
         stage: the name progress is reported under.
 
     Returns:
-        An `Evaluation`.
+        An `Evaluation`: one `ViewScore` a view, and their means.
 
     Raises:
         InputError: a photo cannot be read.

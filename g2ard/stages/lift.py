@@ -43,10 +43,10 @@ def lift(
 ) -> Splats:
     """One flat disc for each coloured point (supplement, "Dense Prior Construction").
 
-    The frame is a PCA of the point and its nearest others: two tangents, then the normal. The tangential
-    scales are a fixed share of the neighbourhood's standard deviations √λ₁ ≥ √λ₂ along them, the second
-    raised to at least the first over `max_anisotropy`; the normal scale is `normal_ratio` times their
-    geometric mean. A point whose neighbours all coincide takes the median size around it.
+    The frame is a PCA of the point and its nearest others: two tangents, then the normal. With the
+    neighbourhood's variances λ₁ ≥ λ₂ along the tangents, s₁ = 0.94·√λ₁, s₂ = max(0.94·√λ₂, s₁/max_anisotropy)
+    and the normal scale s₃ = normal_ratio·√(s₁s₂), in the points' unit. A point whose
+    neighbours all coincide takes the median size around it.
 
     Args:
         points: (N, 3), any unit and origin; float64 keeps map coordinates exact.

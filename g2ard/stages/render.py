@@ -140,9 +140,10 @@ class Rendered:
     Args:
         image: (H, W, 3) float32, linear in the SH colours, ≥ 0, not clipped at 1.
         alpha: (H, W) float32 in [0, 1], how much of the background is hidden.
-        depth: (H, W) float32, Σ αT·z: the expected depth *times* alpha; divide by alpha for a distance.
-        median: (H, W) float32, depth of the splat behind which less than half the light is left, 0 if
-            there is none; None unless asked for.
+        depth: (H, W) float32, scene units, Σ αT·z: the expected depth times alpha; divide by alpha for a
+            distance.
+        median: (H, W) float32, scene units, depth of the splat behind which less than half the light is
+            left, 0 if there is none; None unless asked for.
     """
 
     image: _Floats
@@ -156,7 +157,7 @@ class Renderer:
 
     Args:
         splats: the scene, SH degree 0–3.
-        background: RGB seen where the scene lets light through.
+        background: RGB in [0, 1] behind the scene.
         settings: conventions; None means gsplat's.
 
     Raises:
@@ -232,10 +233,23 @@ def render(
     settings: RasterSettings | None = None,
     median: bool = False,
 ) -> Rendered:
-    """Render one view of a scene once; see `Renderer`, which many views of one scene want.
+    """Render one view of a scene; for many views of one scene `Renderer` is faster.
+
+    C = Σᵢ cᵢαᵢTᵢ + T·background from front to back, αᵢ = min(0.99, oᵢ·exp(−½dᵀΣ₂⁻¹d)), Tᵢ = Πⱼ(1 − αⱼ) over
+    the splats in front; Σ₂ is the projected covariance with a dilation of 0.3 px² (3DGS, Kerbl et al. 2023).
+
+    Args:
+        splats: the scene, SH degree 0–3.
+        camera: the view, world coordinates.
+        background: RGB in [0, 1] behind the scene.
+        settings: conventions; None means gsplat's.
+        median: whether the median depth is wanted too.
+
+    Returns:
+        A `Rendered`: image (H, W, 3), alpha (H, W) and depth (H, W), all float32; depth in scene units.
 
     Raises:
-        InputError: a camera that makes no sense, a background that is not three numbers.
+        InputError: a camera whose values are out of range, a background that is not three numbers.
 
     >>> from g2ard.cameras import Camera
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])

@@ -1,4 +1,4 @@
-"""In what order recovery looks at its views: each in its turn, or as often as its weight says."""
+"""The order in which recovery draws its views: each in turn, or as often as its weight says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the steps do a scene good: looks on the way, ways back, and less than the whole way."""
+"""Whether the steps improve a scene: scores on the way, steps back, and blends of start and result."""
 
 from __future__ import annotations
 

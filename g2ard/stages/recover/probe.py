@@ -1,4 +1,4 @@
-"""How fast a scene wants to learn: PSNR of a few views, and the rate multiplier that short trials choose."""
+"""PSNR of a few views on the way, and the rate multiplier that short trials choose."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _CALMEST = 0.01
 """Smaller ones change nothing that 8 bits show."""
 _VIEWS = 8
 _SHARE = 0.01
-"""Of the time that looking at the views may take while somebody watches the progress."""
+"""Share of the time that scoring the views may take while progress is shown."""
 _FIRST_SHARE = 0.1
 """The same of the first look, where short runs would end before the second."""
 _FEWEST, _MOST, _PART = 10, 60, 50
@@ -125,7 +125,7 @@ class Probe:
         if seconds >= self._next:
             began = time.monotonic()
             self._latest = self.all_of(splats()), step
-            first = self._next == 0.0  # half a minute of an old figure tells nobody anything
+            first = self._next == 0.0  # the starting score is outdated soon
             self._next = seconds + (time.monotonic() - began) / (_FIRST_SHARE if first else _SHARE)
         return self._latest
 

@@ -19,7 +19,7 @@ __all__ = ["rasterize"]
 _NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
 _idle: list[_core.Rasterizer] = []
-"""Rasterizers whose forward pass nobody will go back through any more: their buffers are used again."""
+"""Rasterizers whose forward pass no backward pass needs any more: their buffers are used again."""
 
 
 class _Lease:

@@ -10,7 +10,7 @@ from g2ard.errors import InputError, require
 __all__ = ["PAPER", "SCHEDULES", "TUNED", "Rates", "Schedule", "schedule_named"]
 
 _REACH = 0.01
-"""What is larger than a hundredth of the image stands still, unless that is what the scene is made of."""
+"""Gaussians larger than a hundredth of the image hardly move, unless that is the scene's typical size."""
 
 _UNTRAINED_RMSE = 0.1
 """A start further from its targets must yet become surfaces: large Gaussians have to move."""
@@ -20,7 +20,7 @@ _UNTRAINED_RMSE = 0.1
 class Rates:
     """Adam's learning rate of each attribute, in the space it is optimised in.
 
-    What is large in the view a step looks at stands still: a Gaussian whose largest standard deviation there
+    What is large in a step's view hardly moves: a Gaussian whose largest standard deviation there
     is σ, as a share of the image's longer side, takes steps of 1/(1 + (σ/reach)¹⁶) times the rate in means
     and rotations, and each of its scales by the σ of that axis alone (`recover.extent`). Many layers
     that move together, as those of a sky do, move the image by the sum of their steps.

@@ -34,7 +34,7 @@ def typical_share(splats: Splats, cameras: Cameras) -> float:
 
     Args:
         splats: the scene; its offset counts, cameras are in world coordinates.
-        cameras: evenly spaced ones of them are looked from; who stands in front of whom does not matter.
+        cameras: evenly spaced ones of them are used; occlusion does not matter.
 
     >>> from g2ard.cameras import look_at
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1, 0.2, 0.01]])

@@ -57,7 +57,7 @@ class SimplifyReport(Report):
         skipped: `alone`: rows passed on as they were; `sh_bands`: of zeros, left out of all sums; of the
             paper's, `coverages`: groups that the cheaper guard had refused; rounds without `binnings`, or
             `trims`: few rows were left already.
-        seconds: in the pipeline, what the stage took, looks included.
+        seconds: in the pipeline, what the stage took, visibility included.
     """
 
     input_count: int

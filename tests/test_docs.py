@@ -1,0 +1,172 @@
+"""What the documentation says against what there is: links, commands, options, names, records, plots."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import re
+import shlex
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import g2ard
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted(
+    page for pattern in ("*.md", "docs/**/*.md", "benches/record/*.md") for page in ROOT.glob(pattern)
+)
+NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
+
+
+def without_code(text: str) -> str:
+    text = re.sub(r"(?ms)^ *```.*?^ *```", "", text)
+    return re.sub(r"`[^`\n]*`", "code", text)
+
+
+def anchors(page: Path) -> set[str]:
+    """The fragments that a page's headings make, as GitHub does."""
+    titles = re.findall(
+        r"(?m)^#{1,6} (.+)$", re.sub(r"(?ms)^```.*?^```", "", page.read_text(encoding="utf-8"))
+    )
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_relative_links_lead_somewhere(name: str) -> None:
+    page = ROOT / name
+    for target in re.findall(r"\]\(([^)\s]+)\)", without_code(page.read_text(encoding="utf-8"))):
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, fragment = target.partition("#")
+        there = (page.parent / path) if path else page
+        assert there.is_file(), f"{name}: {target}"
+        if fragment:
+            assert fragment in anchors(there), f"{name}: {target}"
+
+
+@cache
+def command_options() -> dict[str, set[str]]:
+    """Each command, as "bench raster", and the options that it takes."""
+    from typer.main import get_command
+
+    from g2ard.cli.commands import register
+    from g2ard.cli.frame import app
+
+    register()
+    found: dict[str, set[str]] = {}
+
+    def walk(command: Any, path: str) -> None:
+        options = {o for p in command.params for o in (*p.opts, *p.secondary_opts) if o.startswith("-")}
+        found[path] = options | {"-h", "--help"}
+        for name, inner in getattr(command, "commands", {}).items():
+            walk(inner, f"{path} {name}".strip())
+
+    walk(get_command(app), "")
+    return found
+
+
+def shell_lines(text: str) -> list[str]:
+    """The lines of a page's shell blocks, and what it quotes of calls in running text."""
+    blocks = re.findall(r"(?ms)^```sh\n(.*?)^```", text)
+    quoted = re.findall(r"`(g2ard [^`\n]+)`", re.sub(r"(?ms)^```.*?^```", "", text))
+    return [line for block in blocks for line in block.splitlines()] + quoted
+
+
+def calls_in(text: str) -> list[list[str]]:
+    """The arguments of every `g2ard …` in a page."""
+    parts = [part for line in shell_lines(text) for part in re.split(r"&&|\|", line)]
+    calls = [part.replace("…", "") for part in parts if re.match(r"\s*g2ard\s", part)]
+    return [shlex.split(call, comments=True)[1:] for call in calls]
+
+
+def unknown_in(arguments: list[str]) -> str:
+    """The first command or option that there is not; "" if all are known."""
+    commands = command_options()
+    path = ""
+    while arguments and f"{path} {arguments[0]}".strip() in commands:
+        path = f"{path} {arguments[0]}".strip()
+        arguments = arguments[1:]
+    if not path and arguments and not arguments[0].startswith("-") and arguments[0] != "COMMAND":
+        return arguments[0]
+    known = commands[path] if path else set().union(*commands.values())
+    for argument in arguments:
+        option = argument.split("=")[0]
+        if re.match(r"--?[a-zA-Z]", option) and option not in known:
+            return f"{path} {option}"
+    return ""
+
+
+CURRENT = [n for n in NAMES if not n.startswith(("benches/record", "docs/decisions/", "CHANGELOG"))]
+
+
+@pytest.mark.parametrize("name", CURRENT)
+def test_commands_and_options_named_exist(name: str) -> None:
+    for arguments in calls_in((ROOT / name).read_text(encoding="utf-8")):
+        assert not unknown_in(list(arguments)), f"{name}: g2ard {shlex.join(arguments)}"
+
+
+def test_a_wrong_option_would_be_found() -> None:
+    (good,) = calls_in("```sh\ng2ard simplify a.ply -r 10 -o b.ply   # --nothing\n```")
+    (bad,) = calls_in("```sh\ng2ard simplify a.ply --ratioo 10\n```")
+    assert unknown_in(good) == ""
+    assert unknown_in(bad) == "simplify --ratioo"
+    assert unknown_in(["simplfy", "a.ply"]) == "simplfy"
+    assert len(calls_in((ROOT / "README.md").read_text(encoding="utf-8"))) > 5
+
+
+def test_make_targets_named_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = set(re.findall(r"(?m)^([a-z-]+):", makefile))
+    for name in CURRENT:
+        for target in re.findall(r"(?m)(?:`|^)make ([a-z-]+)", (ROOT / name).read_text(encoding="utf-8")):
+            assert target in targets, f"{name}: make {target}"
+
+
+@pytest.mark.parametrize("name", CURRENT)
+def test_python_examples_parse_and_their_names_exist(name: str) -> None:
+    for block in re.findall(r"(?ms)^```python\n(.*?)^```", (ROOT / name).read_text(encoding="utf-8")):
+        for node in ast.walk(ast.parse(block)):
+            if (
+                isinstance(node, ast.Attribute)
+                and isinstance(node.value, ast.Name)
+                and node.value.id == "g2ard"
+            ):
+                assert node.attr in g2ard.__all__, f"{name}: g2ard.{node.attr}"
+
+
+def test_the_api_page_has_every_public_name_once() -> None:
+    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    listed = re.findall(r"\.\. auto\w+:: (\w+)", text)
+    assert sorted(listed) == sorted(set(g2ard.__all__) - {"__version__"})
+
+
+@pytest.mark.parametrize(
+    ("index", "folder"),
+    [
+        ("docs/decisions.md", "docs/decisions"),
+        ("docs/methods/index.md", "docs/methods"),
+        ("benches/record/README.md", "benches/record"),
+    ],
+)
+def test_an_index_lists_every_page_of_its_folder(index: str, folder: str) -> None:
+    text = (ROOT / index).read_text(encoding="utf-8")
+    for page in (ROOT / folder).glob("*.md"):
+        if page != ROOT / index:
+            assert f"{page.name})" in text, f"{index} does not list {page.name}"
+
+
+def test_plots_are_what_the_recorded_rows_give() -> None:
+    path = ROOT / "benches" / "plots.py"
+    spec = importlib.util.spec_from_file_location("plots", path)
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    drawn = module.plots()
+    folder = ROOT / "docs" / "plots"
+    assert sorted(drawn) == sorted(p.name for p in folder.glob("*.svg"))
+    for name, svg in drawn.items():
+        assert svg == (folder / name).read_text(encoding="utf-8"), f"{name}: run python benches/plots.py"
