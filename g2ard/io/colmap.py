@@ -85,7 +85,7 @@ def parsing(path: Path) -> Iterator[None]:
         raise
     except struct.error as error:
         raise InputError(f"{path}: truncated") from error
-    except (ValueError, IndexError, KeyError) as error:
+    except (ValueError, IndexError, KeyError, OverflowError) as error:
         raise InputError(f"{path}: malformed ({error})") from error
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from error

@@ -72,7 +72,7 @@ def _frame(
         viewmat = transforms.opencv_view(rigid(where, np.array(entry["transform"], np.float64)))
     except KeyError as error:
         raise InputError(f"{where}: lacks {error}") from error
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{where}: malformed ({error})") from error

@@ -80,7 +80,7 @@ def _listed(index: Path) -> list[Path]:
             if "0" in node.get("lods", {}):
                 used.add(int(node["lods"]["0"]["file"]))
         chunks = [files[i] for i in sorted(used)]
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise InputError(f"{index}: not a valid lod-meta.json ({error!r})") from error
     for chunk in chunks:
         if not (chunk / "meta.json").is_file():

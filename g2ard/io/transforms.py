@@ -106,7 +106,7 @@ def _frame(path: Path, index: int, content: dict[str, Any], frame: Any, images: 
         )
     except KeyError as error:
         raise InputError(f"{where}: lacks {error}") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{where}: malformed ({error})") from error
