@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 RUST := $(shell find rust -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml) Cargo.toml Cargo.lock
 
-.PHONY: demo test lint docs stress bench bench-kernels wheel setup clean
+.PHONY: demo test lint docs stress fuzz bench bench-kernels wheel setup clean
 
 setup: $(VENV)/.built
 
@@ -28,6 +28,12 @@ test: setup
 # Over 10,000 random gradient cases; a slice of them is in `make test`.
 stress: setup
 	$(BIN)/python tests/stress/run.py
+
+# Mutated files for every reader, FUZZ_RUNS of each of the corpus; a slice of them is in `make test`.
+FUZZ_RUNS ?= 2000
+FUZZ_SEED ?= 1
+fuzz: setup
+	$(BIN)/python tests/fuzz_readers.py --runs $(FUZZ_RUNS) --seed $(FUZZ_SEED)
 
 lint: setup
 	cargo fmt --all --check

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
+from g2ard.io.limits import check_image
 
 __all__ = ["Camera", "Cameras", "look_at"]
 
@@ -102,9 +103,11 @@ class Cameras:
         mask_paths: C paths of masks, None where all of a photo counts.
         distortions: (C, 5) float64, OpenCV k1 k2 p1 p2 k3 of the *photo*; `g2ard.images` undistorts on
             loading, to these very Ks. Zero for a pinhole photo.
+        source: the file or folder that lists the views, for messages; None for views made in memory.
 
     Raises:
-        InputError: shapes that do not fit, a non-finite pose, or an empty image.
+        InputError: shapes that do not fit, a non-finite pose, an empty image, or one of more than
+            160 million pixels.
     """
 
     viewmats: NDArray[np.float64]
@@ -115,6 +118,7 @@ class Cameras:
     image_paths: tuple[Path | None, ...] = ()
     distortions: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 5)))
     mask_paths: tuple[Path | None, ...] = ()
+    source: Path | None = None
 
     def __post_init__(self) -> None:
         n = len(self.viewmats)
@@ -144,6 +148,7 @@ class Cameras:
                 raise InputError(
                     f"view {i} ({self.names[i]}): empty image {self.widths[i]}×{self.heights[i]}"
                 )
+            check_image(f"view {i} ({self.names[i]})", int(self.widths[i]), int(self.heights[i]))
             if self.Ks[i, 0, 0] <= 0 or self.Ks[i, 1, 1] <= 0:
                 raise InputError(f"view {i} ({self.names[i]}): focal length must be positive")
 
@@ -280,6 +285,8 @@ class Cameras:
     ) -> Cameras:
         """Stack per-view lists; `sizes` holds (width, height)."""
         n = len(viewmats)
+        for name, size in zip(names, sizes, strict=True):  # before they must fit an int64
+            check_image(f"view {name}", *map(int, size))
         return cls(
             viewmats=np.asarray(viewmats, np.float64).reshape(n, 4, 4),
             Ks=np.asarray(Ks, np.float64).reshape(n, 3, 3),

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image, ImageDraw, ImageFont, UnidentifiedImageError
+from PIL import Image, ImageDraw, ImageFont
 
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
+from g2ard.io.limits import opened_image
 from g2ard.progress import Progress, silent
 
 __all__ = ["as_saved", "contact_sheet", "load_image", "load_images", "load_mask", "to_bytes", "write_png"]
@@ -46,12 +47,14 @@ def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
     path, name = cameras.image_paths[index], cameras.names[index]
     if path is None:
         raise InputError(f"view {index} ({name}) has no photo")
-    image = _open(path)
+    listed_in = "" if cameras.source is None else f"{cameras.source}: view {name!r}: "
+    image = _open(f"{listed_in}{path}", path)
     height, width = image.shape[:2]
     target = int(cameras.widths[index]), int(cameras.heights[index])
     if abs(width * target[1] - height * target[0]) > _ASPECT_SLACK * height * target[0]:
         raise InputError(
-            f"{path}: the photo is {width}×{height}, its view {target[0]}×{target[1]}: the aspects differ"
+            f"{listed_in}{path}: the photo is {width}×{height}, its view {target[0]}×{target[1]}: "
+            "the aspects differ"
         )
     distortion = cameras.distortions[index]
     if distortion.any():
@@ -100,9 +103,9 @@ def load_images(cameras: Cameras, progress: Progress = silent) -> list[NDArray[n
     return images
 
 
-def _open(path: Path) -> NDArray[np.float32]:
+def _open(where: str, path: Path) -> NDArray[np.float32]:
     try:
-        with Image.open(path) as image:
+        with opened_image(where, path) as image:
             if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey, whatever PIL calls it
                 values = np.asarray(image, np.float32)
                 top = 1.0 if image.mode == "F" else 65535.0
@@ -112,9 +115,7 @@ def _open(path: Path) -> NDArray[np.float32]:
                 return rgba[..., :3] * rgba[..., 3:]
             return np.asarray(image.convert("RGB"), np.float32) / np.float32(255)
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such photo") from error
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
-        raise InputError(f"{path}: not a whole image ({error})") from error
+        raise InputError(f"{where}: no such photo") from error
 
 
 def _undistorted(

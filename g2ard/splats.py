@@ -11,13 +11,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 
-__all__ = ["DRAWN_LOGIT", "SH_C0", "Splats"]
+__all__ = ["DRAWN_LOGIT", "SH_C0", "Splats", "unit_quats"]
 
 SH_C0 = 0.28209479177387814
 """Band-0 spherical harmonic: colour = 0.5 + SH_C0 · sh0."""
 
 DRAWN_LOGIT = -5.54
 """Below it α < 1/255, which no renderer draws."""
+
+_UNIT_SLACK = 1e-6
+"""How far from 1 the length of a quaternion may be that counts as rounded: some ulps of float32."""
 
 _DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
 
@@ -28,7 +31,7 @@ class Splats:
 
     Args:
         means: (N, 3) float32 or float64, scene units, relative to `offset`.
-        quats: (N, 4) float32 wxyz; need not be normalised.
+        quats: (N, 4) float32 wxyz of any length but 0; what g2ard returns and writes has length 1.
         scales: (N, 3) float32, linear standard deviations along the rotated axes.
         logit_opacities: (N,) float32; opacity = sigmoid(logit).
         sh0: (N, 1, 3) float32, band-0 coefficients; colour = 0.5 + SH_C0·sh0 + higher bands.
@@ -181,3 +184,26 @@ class Splats:
         for name in ("quats", "scales", "sh0", "shN"):
             ok &= np.isfinite(getattr(self, name)).reshape(len(self), -1).all(1)
         return ok
+
+
+def unit_quats(quats: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The same rotations by quaternions of length 1: q / |q|.
+
+    Args:
+        quats: (N, 4) float32 wxyz.
+
+    Returns:
+        (N, 4) float32. Rows within 1e-6 of length 1 keep every bit, so that writing and reading change
+        nothing; zeros become the identity; rows that are not finite stay, for the writers to name.
+
+    >>> unit_quats(np.float32([[-2, 0, 0, 0], [0, 3e30, 4e30, 0], [0, 0, 0, 0]])).round(6).tolist()
+    [[-1.0, 0.0, 0.0, 0.0], [0.0, 0.6000000238418579, 0.800000011920929, 0.0], [1.0, 0.0, 0.0, 0.0]]
+    """
+    lengths = np.linalg.norm(quats.astype(np.float64), axis=1)
+    off = np.isfinite(lengths) & (np.abs(lengths - 1) > _UNIT_SLACK)
+    if not off.any():
+        return quats
+    unit = quats.copy()
+    unit[off] = quats[off] / np.where(lengths[off] > 0, lengths[off], 1.0)[:, None]
+    unit[off & (lengths == 0)] = (1, 0, 0, 0)
+    return unit

@@ -28,7 +28,7 @@ def ascii_cloud(path: Path) -> Path:
 
 
 def bundle(path: Path) -> Path:
-    with zipfile.ZipFile(path, "w") as archive:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in parts().items():
             archive.writestr(name, content)
     return path
@@ -128,3 +128,12 @@ def test_damage_is_an_input_error_at_worst(tmp_path: Path, what: str) -> None:
         refused += line is not None
         assert line is None or ("\n" not in line and str(tmp_path) in line)
     assert refused > 20
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("what", MAKERS)
+def test_readers_keep_their_word_on_mutated_files(tmp_path: Path, what: str) -> None:
+    from fuzz_readers import fuzz
+
+    tally = fuzz(what, MAKERS[what], tmp_path, runs=40, seed=0)
+    assert set(tally) <= {"read", "refused"}, tally

@@ -21,9 +21,10 @@ FIELDS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 def scene(count: int = 20, degree: int = 3, seed: int = 0, offset: tuple[float, ...] = (0, 0, 0)) -> Splats:
     rng = np.random.default_rng(seed)
     rest = (degree + 1) ** 2 - 1
+    means, quats = rng.normal(size=(count, 3)), rng.normal(size=(count, 4))
     return Splats.create(
-        rng.normal(size=(count, 3)),
-        quats=rng.normal(size=(count, 4)),
+        means,
+        quats=quats / np.linalg.norm(quats, axis=1, keepdims=True),
         scales=np.exp(rng.normal(-3, 1, (count, 3))),
         logit_opacities=rng.normal(0, 3, count),
         sh0=rng.normal(size=(count, 1, 3)),

@@ -188,7 +188,7 @@ def edit(files: dict[str, bytes], **changes: Any) -> dict[str, bytes]:
     ("change", "message"),
     [
         (lambda f: {k: v for k, v in f.items() if k != "scales.webp"}, "scales.webp is missing"),
-        (lambda f: f | {"quats.webp": f["quats.webp"][:40]}, "quats.webp is not a whole image"),
+        (lambda f: f | {"quats.webp": f["quats.webp"][:40]}, "quats.webp: not a whole image"),
         (lambda f: edit(f, version=3), "version 3"),
         (lambda f: edit(f, count=17), "16 pixels for 17 Gaussians"),
         (lambda f: edit(f, count="ten"), "malformed"),

@@ -283,7 +283,10 @@ def read_view_set(
         raise InputError(f"{path}: views are needed (a COLMAP folder, transforms.json, g2ard's .json)")
     if images is not None and not Path(images).is_dir():
         raise InputError(f"{images}: no such folder of photos")
-    views = import_module(f"g2ard.io.{found}").read(path, Path(images) if images else None)
+    try:
+        views = import_module(f"g2ard.io.{found}").read(path, Path(images) if images else None)
+    except OSError as error:  # a photo's name that no file system takes, a folder that may not be read
+        raise InputError(f"{path}: {error.strerror or error}") from error
     views = views if unpictured else pictured(views)
     return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
 

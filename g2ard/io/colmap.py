@@ -85,7 +85,7 @@ def parsing(path: Path) -> Iterator[None]:
         raise
     except struct.error as error:
         raise InputError(f"{path}: truncated") from error
-    except (ValueError, IndexError, KeyError) as error:
+    except (ValueError, IndexError, KeyError, OverflowError) as error:
         raise InputError(f"{path}: malformed ({error})") from error
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from error
@@ -138,7 +138,7 @@ def frames(path: Path, images: Path | None = None) -> tuple[Path, list[Frame]]:
         photo = photos / image.name if photos else None
         if images is not None and photo is not None and photo.is_file():
             if image.camera not in sizes:  # one lens, one size
-                sizes[image.camera] = photo_size(photo)
+                sizes[image.camera] = photo_size(str(tables[1]), photo)
             camera = camera.at(sizes[image.camera])
         listed.append(
             Frame(image.name, _viewmat(tables[1], image), camera.K, camera.size, photo, camera.distortion)

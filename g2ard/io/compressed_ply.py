@@ -32,11 +32,13 @@ def read(path: Path) -> Scene:
     chunk_properties = header.properties.get("chunk", [])
     bounds = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
     bounds += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
+    if "min_r" in chunk_properties:
+        bounds += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
     missing = [name for name in bounds if name not in chunk_properties]
     if missing:
         raise InputError(f"{path}: its 'chunk' element lacks {', '.join(map(repr, missing))}")
     rest = [p for p in header.properties.get("sh", []) if re.fullmatch(r"f_rest_\d+", p)]
-    if len(rest) not in (0, 9, 24, 45):
+    if len(rest) not in (0, 9, 24, 45) or set(rest) != {f"f_rest_{k}" for k in range(len(rest))}:
         raise InputError(f"{path}: its 'sh' element has {len(rest)} coefficients; expected 9, 24 or 45")
 
     names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")

@@ -26,7 +26,7 @@ def read(path: Path) -> dict[str, NDArray[np.float64]]:
     for name, rows in read_json(path).items():
         try:
             matrix = np.array(rows, np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             matrix = np.zeros(0)
         if matrix.shape != (3, 4) or not np.isfinite(matrix).all():
             raise InputError(f"{path}: {name!r} is not a finite 3×4 matrix")

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from g2ard.errors import InputError
 from g2ard.io import colmap
 from g2ard.io.photos import view_set
@@ -54,8 +52,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     photos = images or (smaller if smaller.is_dir() else None)
     model, frames = colmap.frames(data, photos)
     every = _whole(file, "test_every", settings.word("test_every") or "8")
-    test = np.arange(len(frames)) % every == 0
-    words = np.where(test, "test", "train").tolist()
+    words = ["train" if i % every else "test" for i in range(len(frames))]
     found = view_set(model, [f._replace(split=word) for f, word in zip(frames, words, strict=True)])
     if settings.word("pose_opt") != "true":
         return found

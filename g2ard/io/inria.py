@@ -76,7 +76,7 @@ def _frame(path: Path, index: int, camera: Any, images: Path | None) -> Frame:
         )
     except KeyError as error:
         raise InputError(f"{where}: lacks {error}") from error
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{where}: malformed ({error})") from error

@@ -8,7 +8,7 @@ from typing import Any
 
 from g2ard.errors import InputError
 
-__all__ = ["read_any_json", "read_json", "read_json_list"]
+__all__ = ["parse_json", "read_any_json", "read_json", "read_json_list"]
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -42,10 +42,25 @@ def read_any_json(path: Path) -> Any:
         InputError: the file is absent or is not JSON.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
+        data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from error
+    return parse_json(str(path), data)
+
+
+def parse_json(where: str, data: bytes) -> Any:
+    """Whatever some JSON text holds; `where` names it in errors.
+
+    Raises:
+        InputError: it is not JSON, or nested deeper than Python follows.
+    """
+    try:
+        return json.loads(data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file") from error
+        raise InputError(f"{where}: not a text file") from error
     except json.JSONDecodeError as error:
-        raise InputError(f"{path}: not JSON: {error.msg} (line {error.lineno})") from error
+        raise InputError(f"{where}: not JSON: {error.msg} (line {error.lineno})") from error
+    except RecursionError as error:
+        raise InputError(f"{where}: JSON nested too deeply") from error
+    except ValueError as error:  # an integer of thousands of digits
+        raise InputError(f"{where}: not JSON: {error}") from error

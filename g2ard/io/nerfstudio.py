@@ -52,7 +52,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
         scale = float(content["scale"])
     except KeyError as error:
         raise InputError(f"{file}: lacks {error}") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{file}: malformed ({error})") from error
@@ -131,7 +131,7 @@ def _saved(
             raise InputError(f"{data}: the run's split of it is malformed ({error})") from error
     try:
         applied_scale = float(content.get("applied_scale", 1.0))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         applied_scale = math.nan
     if not (math.isfinite(applied_scale) and applied_scale > 0):
         raise InputError(f"{file}: 'applied_scale' is {content['applied_scale']!r}, not a number > 0")
@@ -144,7 +144,10 @@ def _split(frames: Sequence[Frame], options: Settings) -> list[Frame]:
     order = sorted(range(count), key=lambda i: frames[i].photo or Path(frames[i].name))
     rank = np.argsort(order)
     if mode == "fraction":
-        many = math.ceil(count * float(options.word("train_split_fraction") or 0.9))
+        fraction = float(options.word("train_split_fraction") or 0.9)
+        if not 0 <= fraction <= 1:
+            raise ValueError(f"train_split_fraction {fraction}")
+        many = math.ceil(count * fraction)
         train = np.isin(rank, np.linspace(0, count - 1, many, dtype=int))
     elif mode == "interval":
         interval = int(options.word("eval_interval") or 8)
@@ -179,7 +182,7 @@ def _affine(path: Path, key: str, rows: Any) -> NDArray[np.float64]:
     """(4, 4) of a 3×4 or 4×4 list."""
     try:
         matrix = np.array(rows, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
         raise InputError(f"{path}: {key!r} is not a finite 3×4 matrix")

@@ -72,7 +72,7 @@ def _frame(
         viewmat = transforms.opencv_view(rigid(where, np.array(entry["transform"], np.float64)))
     except KeyError as error:
         raise InputError(f"{where}: lacks {error}") from error
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{where}: malformed ({error})") from error
@@ -80,7 +80,7 @@ def _frame(
     ups = (below(path, up) for up in file_path.parents[:3] if up.parts)
     lens = _lens(where, file_path, there or next(filter(None, ups), None), lenses)
     photo = images / file_path.name if images else there
-    if photo is not None and photo.is_file() and (size := photo_size(photo)) != lens.size:
+    if photo is not None and photo.is_file() and (size := photo_size(where, photo)) != lens.size:
         zoom = np.diag([size[0] / lens.size[0], size[1] / lens.size[1], 1.0])
         lens = lens._replace(K=zoom @ lens.K, size=size)
     return Frame(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.io.clean import plural
+from g2ard.io.limits import opened_image
 from g2ard.io.types import Note, ViewSet
 
 __all__ = [
@@ -53,19 +54,18 @@ def find_photo(path: Path) -> Path:
     return next((p for p in tried if p.is_file()), path)
 
 
-def photo_size(path: Path) -> tuple[int, int]:
+def photo_size(where: str, path: Path) -> tuple[int, int]:
     """Width and height of a photo, from its header.
 
-    Raises:
-        InputError: it is not an image.
-    """
-    from PIL import Image, UnidentifiedImageError
+    Args:
+        where: names the file that lists the photo, in errors.
+        path: the photo.
 
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, UnidentifiedImageError) as error:
-        raise InputError(f"{path}: not a whole image ({error})") from error
+    Raises:
+        InputError: it is not an image, or past `LARGEST_IMAGE`.
+    """
+    with opened_image(f"{where}: {path}", path) as image:
+        return image.size
 
 
 def pixels(where: str, values: Mapping[str, Any], key: str) -> int:
@@ -163,7 +163,7 @@ def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
             Note("no_photos", len(listed), f"none of {plural(len(listed), 'photo')} found: poses only")
         )
         frames = [frame._replace(photo=None) for frame in frames]
-    cameras = _cameras(path, frames)
+    cameras = replace(_cameras(path, frames), source=path)
     masked = sum(mask is not None for mask in cameras.mask_paths)
     if masked:
         notes.append(

@@ -15,7 +15,7 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.clean import BLOCK, LOG_SCALE_LIMIT, Raw, cleaned, plural
 from g2ard.io.plyfiles import offset_of, read_element, read_header, require
 from g2ard.io.types import Note, Scene
-from g2ard.splats import Splats
+from g2ard.splats import Splats, unit_quats
 
 __all__ = ["read", "write"]
 
@@ -155,7 +155,7 @@ def _blocks(path: Path, splats: Splats, names: list[str], normals: bool) -> Iter
             part.shN.transpose(0, 2, 1).reshape(n, -1),
             part.logit_opacities[:, None],
             logs,
-            part.quats,
+            unit_quats(part.quats),
         ]
         block = np.concatenate(columns, axis=1, dtype="<f4", casting="same_kind")
         finite = np.isfinite(block)

@@ -19,6 +19,8 @@ _OFFSET = re.compile(r"g2ard offset (\S+) (\S+) (\S+)$")
 _HEADER_LIMIT = 1 << 20
 """No sane header is longer; a file without `end_header` by then is not a PLY."""
 
+_END = re.compile(rb"^end_header[ \t]*[\r\n]", re.MULTILINE)
+
 
 @dataclass
 class PlyHeader:
@@ -45,15 +47,17 @@ def read_header(path: Path) -> PlyHeader:
         raise InputError(f"{path}: the file is empty")
     if head[:3] != b"ply" or head[3:4] not in b"\r\n":
         raise InputError(f"{path}: not a PLY file (begins with {head[:8]!r}, expected 'ply')")
-    end = head.find(b"end_header")
-    if end < 0:
+    end = _END.search(head)  # a line of its own: comments may hold the word
+    if end is None:
         raise InputError(f"{path}: broken PLY: its header has no end_header line")
     header = PlyHeader()
-    for number, line in enumerate(head[:end].decode("latin-1").splitlines(), 1):
+    for number, line in enumerate(re.split(r"\r\n|\r|\n", head[: end.start()].decode("latin-1")), 1):
+        if not line.isascii():  # PLY is ASCII, and plyfile insists
+            raise InputError(f"{path}: PLY header, line {number}: a character that is not ASCII")
         try:
             _header_line(header, line.split())
         except (IndexError, ValueError, KeyError) as error:
-            raise InputError(f"{path}: broken PLY header, line {number}: {line.strip()!r}") from error
+            raise InputError(f"{path}: broken PLY header, line {number}: {line.strip()[:80]!r}") from error
     return header
 
 
@@ -97,6 +101,13 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
     """
     from plyfile import PlyData, PlyElementParseError, PlyParseError
 
+    size = path.stat().st_size
+    for name, count in header.counts.items():  # before room is made for them: a row takes a byte at least
+        if count > size:
+            raise InputError(
+                f"{path}: truncated: the header promises {count:,} rows of {name!r}, "
+                f"the file has {size:,} bytes"
+            )
     triangles = {name: dict.fromkeys(lists, 3) for name, lists in header.lists.items() if lists}
     try:
         try:
@@ -107,7 +118,7 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
             ply = PlyData.read(path, mmap="r")  # a mesh of polygons: slow, but its vertices are wanted
     except PlyElementParseError as error:
         raise InputError(_parse_failure(path, header, error)) from error
-    except (PlyParseError, ValueError, OSError) as error:
+    except (PlyParseError, ValueError, OSError, OverflowError, MemoryError) as error:
         raise InputError(f"{path}: cannot be read as a PLY: {error}") from error
     return [ply[name].data for name in names]
 

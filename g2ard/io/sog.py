@@ -7,9 +7,10 @@ detail are alternatives, not parts: only the finest is read.
 from __future__ import annotations
 
 import io
-import json
 import re
+import struct
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,7 @@ from g2ard.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+    from PIL.Image import Image
 
     from g2ard.io.clean import Raw
     from g2ard.io.types import Note, Scene
@@ -78,7 +80,7 @@ def _listed(index: Path) -> list[Path]:
             if "0" in node.get("lods", {}):
                 used.add(int(node["lods"]["0"]["file"]))
         chunks = [files[i] for i in sorted(used)]
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise InputError(f"{index}: not a valid lod-meta.json ({error!r})") from error
     for chunk in chunks:
         if not (chunk / "meta.json").is_file():
@@ -135,7 +137,7 @@ def _left_out(path: Path, read_count: int) -> list[Note]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[list[_Chunk]]:
-    from g2ard.io.jsonfile import read_json
+    from g2ard.io.jsonfile import parse_json, read_json
 
     if path.suffix.lower() != ".sog":
         yield [_Chunk(str(f), read_json(f / "meta.json"), _folder_loader(f)) for f in chunks_of(path)]
@@ -146,10 +148,28 @@ def _opened(path: Path) -> Iterator[list[_Chunk]]:
             if not inside:
                 raise InputError(f"{path}: no meta.json in it")
             prefix = min(inside, key=len).removesuffix("meta.json")
-            meta = json.loads(bundle.read(prefix + "meta.json"))
-            yield [_Chunk(str(path), meta, lambda name: bundle.read(prefix + name))]
-    except (zipfile.BadZipFile, json.JSONDecodeError, EOFError) as error:
+            load = _bundle_loader(path, bundle, prefix)
+            meta = parse_json(f"{path}: meta.json", load("meta.json"))
+            yield [_Chunk(str(path), meta, load)]
+    except InputError:
+        raise
+    except (zipfile.BadZipFile, EOFError, OSError, ValueError, struct.error, OverflowError) as error:
         raise InputError(f"{path}: not a whole .sog archive ({error})") from error
+
+
+def _bundle_loader(path: Path, bundle: zipfile.ZipFile, prefix: str) -> Callable[[str], bytes]:
+    """Reads a file of the archive: whole, and of a size within `check_unpacked`."""
+    from g2ard.io.limits import check_unpacked
+
+    def load(name: str) -> bytes:
+        info = bundle.getinfo(prefix + name)
+        check_unpacked(f"{path}: {name}", info.compress_size, info.file_size)
+        try:
+            return bundle.read(info)
+        except (zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError, zlib.error) as error:
+            raise InputError(f"{path}: {name}: not whole in the .sog archive ({error})") from error
+
+    return load
 
 
 def _folder_loader(folder: Path) -> Callable[[str], bytes]:
@@ -161,7 +181,7 @@ def _meta_errors(chunk: _Chunk) -> Iterator[None]:
     """Turn what a malformed meta.json causes into one line that names it."""
     try:
         yield
-    except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{chunk.name}: malformed meta.json ({error!r})") from error
@@ -175,7 +195,12 @@ def _count(chunk: _Chunk) -> int:
         count = chunk.meta["count"] if version == 2 else chunk.meta["means"]["shape"][0]
         if not isinstance(count, int) or count < 0:
             raise InputError(f"{chunk.name}: malformed meta.json (count is {count!r})")
-        return count
+        first = chunk.meta["means"]["files"][0]
+    with _opened_image(chunk, first) as image:  # before room is made for them
+        if image.width * image.height < count:
+            pixels = image.width * image.height
+            raise InputError(f"{chunk.name}: {first} has {pixels:,} pixels for {count:,} Gaussians")
+    return count
 
 
 def _rest_coefficients(chunk: _Chunk) -> int:
@@ -195,22 +220,31 @@ def _sh_files(chunk: _Chunk) -> tuple[str, str]:
     return centroids, next((f for f in files if f != centroids), files[1])
 
 
-def _image(chunk: _Chunk, name: str) -> NDArray[np.uint8]:
-    """(height, width, 4) bytes."""
-    import numpy as np
+@contextmanager
+def _opened_image(chunk: _Chunk, name: str) -> Iterator[Image]:
     from PIL import (
-        Image,
-        UnidentifiedImageError,
         WebPImagePlugin,  # noqa: F401  (Pillow would load all its formats to find this one)
     )
 
+    from g2ard.io.limits import opened_image
+
+    where = f"{chunk.name}: {name}"
     try:
-        with Image.open(io.BytesIO(chunk.load(name))) as image:
-            return np.asarray(image.convert("RGBA"))
+        data = chunk.load(name)
     except (KeyError, FileNotFoundError) as error:
-        raise InputError(f"{chunk.name}: {name} is missing") from error
-    except (UnidentifiedImageError, OSError, ValueError) as error:
-        raise InputError(f"{chunk.name}: {name} is not a whole image ({error})") from error
+        raise InputError(f"{where} is missing") from error
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise InputError(f"{where} cannot be read ({error})") from error
+    with opened_image(where, io.BytesIO(data)) as image:
+        yield image
+
+
+def _image(chunk: _Chunk, name: str) -> NDArray[np.uint8]:
+    """(height, width, 4) bytes."""
+    import numpy as np
+
+    with _opened_image(chunk, name) as image:
+        return np.asarray(image.convert("RGBA"))
 
 
 def _rows(chunk: _Chunk, name: str, count: int) -> NDArray[np.uint8]:

@@ -13,7 +13,7 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.clean import Raw, cleaned
 from g2ard.io.packing import world_means, writable
 from g2ard.io.types import Scene
-from g2ard.splats import SH_C0, Splats
+from g2ard.splats import SH_C0, Splats, unit_quats
 
 __all__ = ["read", "write"]
 
@@ -56,10 +56,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
     rows["scale"] = splats.scales
     rows["rgba"][:, :3] = _bytes(splats.colors * 255)
     rows["rgba"][:, 3] = _bytes(splats.opacities * 255)
-    quats = splats.quats / np.maximum(np.abs(splats.quats).max(1, keepdims=True), np.float32(1e-38))
-    norms = np.linalg.norm(quats, axis=1, keepdims=True)
-    quats = np.where(norms > 0, quats / np.maximum(norms, 1e-6), np.array([1, 0, 0, 0], np.float32))
-    rows["quat"] = _bytes(quats * 128 + 128)
+    rows["quat"] = _bytes(unit_quats(splats.quats) * 128 + 128)
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(rows.tobytes())
 

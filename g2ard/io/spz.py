@@ -18,11 +18,15 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError, MissingDependencyError
 from g2ard.io.clean import Raw, cleaned
+from g2ard.io.limits import check_unpacked
 from g2ard.io.types import Note, Scene
 
 __all__ = ["COLOR_SCALE", "FLIPS", "MAGIC", "read", "zstandard"]
 
 MAGIC = b"NGSP"
+_HEADER = 16
+"""Bytes."""
+
 _COEFFICIENTS = (0, 3, 8, 15, 24)
 _HAS_EXTENSIONS = 0x2
 COLOR_SCALE = 0.15
@@ -42,15 +46,11 @@ def read(path: Path) -> Scene:
     data = path.read_bytes()
     if data[:2] == b"\x1f\x8b":
         data = _gunzip(path, data)
-    if data[:4] != MAGIC or len(data) < 16:
+    if data[:4] != MAGIC or len(data) < _HEADER:
         raise InputError(f"{path}: not an SPZ file (begins with {data[:4]!r})")
+    sizes = _sizes(path, data)
     version, count, degree, fraction_bits, flags, stream_count = struct.unpack_from("<IIBBBB", data, 4)
-    if version not in (2, 3, 4):
-        raise InputError(f"{path}: SPZ version {version} is not known (2, 3 and 4 are)")
-    if degree >= len(_COEFFICIENTS):
-        raise InputError(f"{path}: SH degree {degree} is not known (0 to 4 are)")
     stored = _COEFFICIENTS[degree]
-    sizes = [9 * count, count, 3 * count, 3 * count, (3 if version == 2 else 4) * count, 3 * stored * count]
     streams = _zstd_streams(path, data, stream_count, sizes) if version == 4 else _slices(path, data, sizes)
     positions, alphas, colors, scales, rotations, sh = (np.frombuffer(s, np.uint8) for s in streams)
 
@@ -73,10 +73,31 @@ def read(path: Path) -> Scene:
 
 
 def _gunzip(path: Path, data: bytes) -> bytes:
+    """The header and what it promises: no byte past that is unpacked."""
+    stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
-        return zlib.decompress(data, 16 + zlib.MAX_WBITS)
+        head = stream.decompress(data, _HEADER)
+        if len(head) < _HEADER:
+            return head
+        promised = sum(_sizes(path, head))
+        check_unpacked(str(path), len(data), promised)
+        body = stream.decompress(stream.unconsumed_tail, promised) if promised else b""
     except zlib.error as error:
         raise InputError(f"{path}: truncated or broken gzip stream ({error})") from error
+    return head + body
+
+
+def _sizes(path: Path, head: bytes) -> list[int]:
+    """Bytes of the positions, alphas, colours, scales, rotations and harmonics that a header promises."""
+    version, count, degree = struct.unpack_from("<IIB", head, 4)
+    if head[:4] != MAGIC:
+        raise InputError(f"{path}: not an SPZ file (begins with {head[:4]!r})")
+    if version not in (2, 3, 4):
+        raise InputError(f"{path}: SPZ version {version} is not known (2, 3 and 4 are)")
+    if degree >= len(_COEFFICIENTS):
+        raise InputError(f"{path}: SH degree {degree} is not known (0 to 4 are)")
+    rotation = 3 if version == 2 else 4
+    return [9 * count, count, 3 * count, 3 * count, rotation * count, 3 * _COEFFICIENTS[degree] * count]
 
 
 def _slices(path: Path, data: bytes, sizes: list[int]) -> list[bytes]:
@@ -90,6 +111,7 @@ def _slices(path: Path, data: bytes, sizes: list[int]) -> list[bytes]:
 def _zstd_streams(path: Path, data: bytes, stream_count: int, sizes: list[int]) -> list[bytes]:
     """Version 4: a table of (packed, unpacked) sizes where the header says, then one frame a stream."""
     decompress = _zstd(path)
+    check_unpacked(str(path), len(data), sum(sizes))
     try:
         (table,) = struct.unpack_from("<I", data, 16)
         entries = [struct.unpack_from("<QQ", data, table + 16 * i) for i in range(stream_count)]
@@ -102,7 +124,7 @@ def _zstd_streams(path: Path, data: bytes, stream_count: int, sizes: list[int]) 
             raise InputError(f"{path}: stream {i} holds {unpacked:,} bytes, expected {size:,}")
         if start + packed > len(data):
             raise InputError(f"{path}: truncated in stream {i}")
-        streams.append(decompress(data[start : start + packed]) if size else b"")
+        streams.append(decompress(data[start : start + packed], size) if size else b"")
         start += packed
     for i, (stream, size) in enumerate(zip(streams, sizes, strict=True)):
         if len(stream) != size:
@@ -110,12 +132,8 @@ def _zstd_streams(path: Path, data: bytes, stream_count: int, sizes: list[int]) 
     return streams
 
 
-def zstandard(path: Path) -> Any:
-    """The module that packs and unpacks Zstandard frames.
-
-    Raises:
-        MissingDependencyError: there is none.
-    """
+def _zstd(path: Path) -> Callable[[bytes, int], bytes]:
+    """What unpacks a frame of a size: no more than one byte past it."""
     try:
         if sys.version_info >= (3, 14):
             from compression import zstd
@@ -129,9 +147,9 @@ def zstandard(path: Path) -> Any:
 def _zstd(path: Path) -> Callable[[bytes], bytes]:
     zstd = zstandard(path)
 
-    def decompress(frame: bytes) -> bytes:
+    def decompress(frame: bytes, size: int) -> bytes:
         try:
-            return bytes(zstd.decompress(frame))
+            return bytes(zstd.ZstdDecompressor().decompress(frame, max_length=size + 1))
         except zstd.ZstdError as error:
             raise InputError(f"{path}: broken Zstandard stream ({error})") from error
 

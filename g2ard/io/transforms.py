@@ -18,6 +18,9 @@ __all__ = ["files_of", "frames", "opencv_view", "read"]
 
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
+_LEAST_ANGLE = 1e-6
+"""Radians from 0 and π: past them a focal length is no number of pixels that means something."""
+
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL camera axes (y up, looking along −z) to OpenCV's (y down, looking along z)."""
 
@@ -103,7 +106,7 @@ def _frame(path: Path, index: int, content: dict[str, Any], frame: Any, images: 
         )
     except KeyError as error:
         raise InputError(f"{where}: lacks {error}") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{where}: malformed ({error})") from error
@@ -154,12 +157,16 @@ def _focal(values: dict[str, Any], axis: str, pixels: int) -> float | None:
     if axis == "y" and "fl_x" in values:
         return None  # square pixels, rather than an angle of another camera
     angle = values.get(f"camera_angle_{axis}")
-    return None if angle is None else 0.5 * pixels / math.tan(0.5 * float(angle))
+    if angle is None:
+        return None
+    if not _LEAST_ANGLE < float(angle) < math.pi - _LEAST_ANGLE:
+        raise ValueError(f"camera_angle_{axis} is {angle!r}, expected radians between 0 and π")
+    return 0.5 * pixels / math.tan(0.5 * float(angle))
 
 
 def _size(where: str, values: dict[str, Any], photo: Path) -> tuple[int, int]:
     if "w" in values and "h" in values:
         return pixels(where, values, "w"), pixels(where, values, "h")
     if photo.is_file():
-        return photo_size(photo)
+        return photo_size(where, photo)
     raise InputError(f"{where}: neither w and h nor its photo is there to tell the size")

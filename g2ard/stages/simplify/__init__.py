@@ -13,7 +13,7 @@ from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.prepared import PreparedScene, finite_rows_of, with_some_opacity
 from g2ard.progress import Progress, counter, silent
-from g2ard.splats import DRAWN_LOGIT, Splats
+from g2ard.splats import DRAWN_LOGIT, Splats, unit_quats
 from g2ard.stages.simplify.config import METHODS, SimplifyConfig, schedule
 from g2ard.stages.simplify.pairs import (
     Visibility,
@@ -235,6 +235,7 @@ def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str
     parents = np.full(len(splats), -1, np.int64)
     parents[finite] = out["parents"]
     small = splats_of(splats, out).with_sh_degree(splats.sh_degree)
+    small = replace(small, quats=unit_quats(small.quats))  # rows that stayed alone have them as they came
     kept = int(np.count_nonzero(parents >= 0))
     alone = int(np.count_nonzero(np.bincount(parents[parents >= 0], minlength=len(small)) == 1))
     protected: NDArray[np.bool_] = out["protected"]

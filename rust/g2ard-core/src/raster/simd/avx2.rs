@@ -5,8 +5,14 @@ use std::ops::{Add, Div, Mul, Neg, Sub};
 
 use super::{LANES, Lanes, Lanes16, Mask, TO_NEAREST, Wide, exp2_fraction};
 
-// SAFETY, for every `unsafe` below that gives no other reason: values of these types are only made inside kernels that
-// `dispatch` runs after it found AVX2 and FMA, so the instructions exist.
+/// Intrinsics that touch no memory.
+macro_rules! avx2 {
+    ($value:expr) => {
+        // SAFETY: values of these types are only made inside kernels that `dispatch` runs after it found AVX2 and FMA,
+        // so the instructions exist.
+        unsafe { $value }
+    };
+}
 
 #[derive(Clone, Copy)]
 pub struct Avx2(__m256, __m256);
@@ -23,7 +29,7 @@ macro_rules! operators {
             type Output = Self;
             #[inline(always)]
             fn $name(self, other: Self) -> Self {
-                unsafe { Self($single(self.0, other.0), $single(self.1, other.1)) }
+                avx2!(Self($single(self.0, other.0), $single(self.1, other.1)))
             }
         }
         impl $trait for Avx2Wide {
@@ -31,7 +37,7 @@ macro_rules! operators {
             #[inline(always)]
             fn $name(mut self, other: Self) -> Self {
                 for k in 0..4 {
-                    self.0[k] = unsafe { $double(self.0[k], other.0[k]) };
+                    self.0[k] = avx2!($double(self.0[k], other.0[k]));
                 }
                 self
             }
@@ -50,43 +56,42 @@ impl Neg for Avx2 {
     type Output = Self;
     #[inline(always)]
     fn neg(self) -> Self {
-        unsafe {
+        avx2!({
             let sign = _mm256_set1_ps(-0.0);
             Self(_mm256_xor_ps(self.0, sign), _mm256_xor_ps(self.1, sign))
-        }
+        })
     }
 }
 
 impl Mask for Avx2Mask {
     #[inline(always)]
     fn and(self, other: Self) -> Self {
-        unsafe {
-            Self(
-                _mm256_and_ps(self.0, other.0),
-                _mm256_and_ps(self.1, other.1),
-            )
-        }
+        avx2!(Self(
+            _mm256_and_ps(self.0, other.0),
+            _mm256_and_ps(self.1, other.1),
+        ))
     }
     #[inline(always)]
     fn or(self, other: Self) -> Self {
-        unsafe { Self(_mm256_or_ps(self.0, other.0), _mm256_or_ps(self.1, other.1)) }
+        avx2!(Self(
+            _mm256_or_ps(self.0, other.0),
+            _mm256_or_ps(self.1, other.1)
+        ))
     }
     #[inline(always)]
     fn and_not(self, other: Self) -> Self {
-        unsafe {
-            Self(
-                _mm256_andnot_ps(other.0, self.0),
-                _mm256_andnot_ps(other.1, self.1),
-            )
-        }
+        avx2!(Self(
+            _mm256_andnot_ps(other.0, self.0),
+            _mm256_andnot_ps(other.1, self.1),
+        ))
     }
     #[inline(always)]
     fn bits(self) -> u16 {
-        unsafe { (_mm256_movemask_ps(self.0) | _mm256_movemask_ps(self.1) << 8) as u16 }
+        avx2!((_mm256_movemask_ps(self.0) | _mm256_movemask_ps(self.1) << 8) as u16)
     }
     #[inline(always)]
     fn from_bits(bits: u16) -> Self {
-        unsafe {
+        avx2!({
             let all = _mm256_set1_epi32(i32::from(bits));
             let low = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
             let high = _mm256_slli_epi32::<8>(low);
@@ -94,29 +99,30 @@ impl Mask for Avx2Mask {
                 _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(all, low), low)),
                 _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(all, high), high)),
             )
-        }
+        })
     }
     #[inline(always)]
     fn any(self) -> bool {
-        unsafe { _mm256_movemask_ps(_mm256_or_ps(self.0, self.1)) != 0 }
+        avx2!(_mm256_movemask_ps(_mm256_or_ps(self.0, self.1)) != 0)
     }
 }
 
 impl Wide for Avx2Wide {
     #[inline(always)]
     fn splat(value: f64) -> Self {
-        Self([unsafe { _mm256_set1_pd(value) }; 4])
+        Self([avx2!(_mm256_set1_pd(value)); 4])
     }
     #[inline(always)]
     fn fma(mut self, factor: Self, addend: Self) -> Self {
         for k in 0..4 {
-            self.0[k] = unsafe { _mm256_fmadd_pd(self.0[k], factor.0[k], addend.0[k]) };
+            self.0[k] = avx2!(_mm256_fmadd_pd(self.0[k], factor.0[k], addend.0[k]));
         }
         self
     }
     #[inline(always)]
     fn store(self, out: &mut [f64; LANES]) {
         for k in 0..4 {
+            // SAFETY: `out` holds 16 values; the instructions exist (`avx2!`).
             unsafe { _mm256_storeu_pd(out.as_mut_ptr().add(4 * k), self.0[k]) };
         }
     }
@@ -128,10 +134,11 @@ impl Lanes for Avx2 {
 
     #[inline(always)]
     fn splat(value: f32) -> Self {
-        unsafe { Self(_mm256_set1_ps(value), _mm256_set1_ps(value)) }
+        avx2!(Self(_mm256_set1_ps(value), _mm256_set1_ps(value)))
     }
     #[inline(always)]
     fn load(row: &Lanes16) -> Self {
+        // SAFETY: a row holds 16 values, aligned to 64 bytes; the instructions exist (`avx2!`).
         unsafe {
             Self(
                 _mm256_load_ps(row.0.as_ptr()),
@@ -141,10 +148,12 @@ impl Lanes for Avx2 {
     }
     #[inline(always)]
     unsafe fn load_at(at: *const f32) -> Self {
+        // SAFETY: the caller vouches for 16 readable values; the instructions exist (`avx2!`).
         unsafe { Self(_mm256_loadu_ps(at), _mm256_loadu_ps(at.add(8))) }
     }
     #[inline(always)]
     fn store(self, row: &mut Lanes16) {
+        // SAFETY: a row holds 16 values, aligned to 64 bytes; the instructions exist (`avx2!`).
         unsafe {
             _mm256_store_ps(row.0.as_mut_ptr(), self.0);
             _mm256_store_ps(row.0.as_mut_ptr().add(8), self.1);
@@ -152,6 +161,7 @@ impl Lanes for Avx2 {
     }
     #[inline(always)]
     unsafe fn store_at(self, at: *mut f32) {
+        // SAFETY: the caller vouches for 16 writable values; the instructions exist (`avx2!`).
         unsafe {
             _mm256_storeu_ps(at, self.0);
             _mm256_storeu_ps(at.add(8), self.1);
@@ -159,51 +169,43 @@ impl Lanes for Avx2 {
     }
     #[inline(always)]
     fn fma(self, factor: Self, addend: Self) -> Self {
-        unsafe {
-            Self(
-                _mm256_fmadd_ps(self.0, factor.0, addend.0),
-                _mm256_fmadd_ps(self.1, factor.1, addend.1),
-            )
-        }
+        avx2!(Self(
+            _mm256_fmadd_ps(self.0, factor.0, addend.0),
+            _mm256_fmadd_ps(self.1, factor.1, addend.1),
+        ))
     }
     #[inline(always)]
     fn fnma(self, factor: Self, addend: Self) -> Self {
-        unsafe {
-            Self(
-                _mm256_fnmadd_ps(self.0, factor.0, addend.0),
-                _mm256_fnmadd_ps(self.1, factor.1, addend.1),
-            )
-        }
+        avx2!(Self(
+            _mm256_fnmadd_ps(self.0, factor.0, addend.0),
+            _mm256_fnmadd_ps(self.1, factor.1, addend.1),
+        ))
     }
     #[inline(always)]
     fn min(self, other: Self) -> Self {
-        unsafe {
-            Self(
-                _mm256_min_ps(self.0, other.0),
-                _mm256_min_ps(self.1, other.1),
-            )
-        }
+        avx2!(Self(
+            _mm256_min_ps(self.0, other.0),
+            _mm256_min_ps(self.1, other.1),
+        ))
     }
     #[inline(always)]
     fn max(self, other: Self) -> Self {
-        unsafe {
-            Self(
-                _mm256_max_ps(self.0, other.0),
-                _mm256_max_ps(self.1, other.1),
-            )
-        }
+        avx2!(Self(
+            _mm256_max_ps(self.0, other.0),
+            _mm256_max_ps(self.1, other.1),
+        ))
     }
     #[inline(always)]
     fn sqrt(self) -> Self {
-        unsafe { Self(_mm256_sqrt_ps(self.0), _mm256_sqrt_ps(self.1)) }
+        avx2!(Self(_mm256_sqrt_ps(self.0), _mm256_sqrt_ps(self.1)))
     }
     #[inline(always)]
     fn floor(self) -> Self {
-        unsafe { Self(_mm256_floor_ps(self.0), _mm256_floor_ps(self.1)) }
+        avx2!(Self(_mm256_floor_ps(self.0), _mm256_floor_ps(self.1)))
     }
     #[inline(always)]
     fn ldexp(self, n: Self) -> Self {
-        unsafe {
+        avx2!({
             let one = _mm256_set1_epi32(127);
             let low = _mm256_slli_epi32::<23>(_mm256_add_epi32(_mm256_cvttps_epi32(n.0), one));
             let high = _mm256_slli_epi32::<23>(_mm256_add_epi32(_mm256_cvttps_epi32(n.1), one));
@@ -211,64 +213,59 @@ impl Lanes for Avx2 {
                 _mm256_mul_ps(self.0, _mm256_castsi256_ps(low)),
                 _mm256_mul_ps(self.1, _mm256_castsi256_ps(high)),
             )
-        }
+        })
     }
     #[inline(always)]
     fn ge(self, other: Self) -> Avx2Mask {
-        unsafe {
-            Avx2Mask(
-                _mm256_cmp_ps::<_CMP_GE_OQ>(self.0, other.0),
-                _mm256_cmp_ps::<_CMP_GE_OQ>(self.1, other.1),
-            )
-        }
+        avx2!(Avx2Mask(
+            _mm256_cmp_ps::<_CMP_GE_OQ>(self.0, other.0),
+            _mm256_cmp_ps::<_CMP_GE_OQ>(self.1, other.1),
+        ))
     }
     #[inline(always)]
     fn gt(self, other: Self) -> Avx2Mask {
-        unsafe {
-            Avx2Mask(
-                _mm256_cmp_ps::<_CMP_GT_OQ>(self.0, other.0),
-                _mm256_cmp_ps::<_CMP_GT_OQ>(self.1, other.1),
-            )
-        }
+        avx2!(Avx2Mask(
+            _mm256_cmp_ps::<_CMP_GT_OQ>(self.0, other.0),
+            _mm256_cmp_ps::<_CMP_GT_OQ>(self.1, other.1),
+        ))
     }
     #[inline(always)]
     fn select(mask: Avx2Mask, yes: Self, no: Self) -> Self {
-        unsafe {
-            Self(
-                _mm256_blendv_ps(no.0, yes.0, mask.0),
-                _mm256_blendv_ps(no.1, yes.1, mask.1),
-            )
-        }
+        avx2!(Self(
+            _mm256_blendv_ps(no.0, yes.0, mask.0),
+            _mm256_blendv_ps(no.1, yes.1, mask.1),
+        ))
     }
     #[inline(always)]
     fn only(self, mask: Avx2Mask) -> Self {
-        unsafe { Self(_mm256_and_ps(self.0, mask.0), _mm256_and_ps(self.1, mask.1)) }
+        avx2!(Self(
+            _mm256_and_ps(self.0, mask.0),
+            _mm256_and_ps(self.1, mask.1)
+        ))
     }
     #[inline(always)]
     fn widen(self) -> Avx2Wide {
-        unsafe {
-            Avx2Wide([
-                _mm256_cvtps_pd(_mm256_castps256_ps128(self.0)),
-                _mm256_cvtps_pd(_mm256_extractf128_ps::<1>(self.0)),
-                _mm256_cvtps_pd(_mm256_castps256_ps128(self.1)),
-                _mm256_cvtps_pd(_mm256_extractf128_ps::<1>(self.1)),
-            ])
-        }
+        avx2!(Avx2Wide([
+            _mm256_cvtps_pd(_mm256_castps256_ps128(self.0)),
+            _mm256_cvtps_pd(_mm256_extractf128_ps::<1>(self.0)),
+            _mm256_cvtps_pd(_mm256_castps256_ps128(self.1)),
+            _mm256_cvtps_pd(_mm256_extractf128_ps::<1>(self.1)),
+        ]))
     }
     #[inline(always)]
     fn narrow(wide: Avx2Wide) -> Self {
-        unsafe {
+        avx2!({
             let [a, b, c, d] = wide.0;
             Self(
                 _mm256_set_m128(_mm256_cvtpd_ps(b), _mm256_cvtpd_ps(a)),
                 _mm256_set_m128(_mm256_cvtpd_ps(d), _mm256_cvtpd_ps(c)),
             )
-        }
+        })
     }
     #[inline(always)]
     fn recip(self) -> Self {
         // 12 bits, then Newton twice: y + y·(1 − x·y).
-        let mut y = unsafe { Self(_mm256_rcp_ps(self.0), _mm256_rcp_ps(self.1)) };
+        let mut y = avx2!(Self(_mm256_rcp_ps(self.0), _mm256_rcp_ps(self.1)));
         for _ in 0..2 {
             y = y.fma(self.fnma(y, Self::splat(1.0)), y);
         }
@@ -280,18 +277,19 @@ impl Lanes for Avx2 {
         let n = self + magic;
         let p = exp2_fraction(self - (n - magic));
         // The fraction's power is normal: its exponent can be raised as an integer.
-        unsafe {
+        avx2!({
             let low = _mm256_slli_epi32::<23>(_mm256_castps_si256(n.0));
             let high = _mm256_slli_epi32::<23>(_mm256_castps_si256(n.1));
             Self(
                 _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p.0), low)),
                 _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p.1), high)),
             )
-        }
+        })
     }
     #[inline(always)]
     fn sums(rows: &[Self; 10]) -> Lanes16 {
         let mut out = Lanes16::default();
+        // SAFETY: `out` holds 16 values, aligned to 64 bytes; the instructions exist (`avx2!`).
         unsafe {
             let mut r = [_mm256_setzero_ps(); 12];
             for k in 0..10 {

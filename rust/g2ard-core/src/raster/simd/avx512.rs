@@ -5,8 +5,14 @@ use std::ops::{Add, Div, Mul, Neg, Sub};
 
 use super::{LANES, Lanes, Lanes16, Mask, TO_NEAREST, Wide, exp2_fraction};
 
-// SAFETY, for every `unsafe` below that gives no other reason: values of these types are only made inside kernels that
-// `dispatch` runs after it found AVX-512F and DQ, so the instructions exist.
+/// Intrinsics that touch no memory.
+macro_rules! avx512 {
+    ($value:expr) => {
+        // SAFETY: values of these types are only made inside kernels that `dispatch` runs after it found AVX-512F and DQ,
+        // so the instructions exist.
+        unsafe { $value }
+    };
+}
 
 #[derive(Clone, Copy)]
 pub struct Avx512(__m512);
@@ -23,14 +29,14 @@ macro_rules! operators {
             type Output = Self;
             #[inline(always)]
             fn $name(self, other: Self) -> Self {
-                Self(unsafe { $single(self.0, other.0) })
+                Self(avx512!($single(self.0, other.0)))
             }
         }
         impl $trait for Avx512Wide {
             type Output = Self;
             #[inline(always)]
             fn $name(self, other: Self) -> Self {
-                unsafe { Self($double(self.0, other.0), $double(self.1, other.1)) }
+                avx512!(Self($double(self.0, other.0), $double(self.1, other.1)))
             }
         }
     )*};
@@ -47,7 +53,7 @@ impl Neg for Avx512 {
     type Output = Self;
     #[inline(always)]
     fn neg(self) -> Self {
-        Self(unsafe { _mm512_xor_ps(self.0, _mm512_set1_ps(-0.0)) })
+        Self(avx512!(_mm512_xor_ps(self.0, _mm512_set1_ps(-0.0))))
     }
 }
 
@@ -77,19 +83,18 @@ impl Mask for Avx512Mask {
 impl Wide for Avx512Wide {
     #[inline(always)]
     fn splat(value: f64) -> Self {
-        unsafe { Self(_mm512_set1_pd(value), _mm512_set1_pd(value)) }
+        avx512!(Self(_mm512_set1_pd(value), _mm512_set1_pd(value)))
     }
     #[inline(always)]
     fn fma(self, factor: Self, addend: Self) -> Self {
-        unsafe {
-            Self(
-                _mm512_fmadd_pd(self.0, factor.0, addend.0),
-                _mm512_fmadd_pd(self.1, factor.1, addend.1),
-            )
-        }
+        avx512!(Self(
+            _mm512_fmadd_pd(self.0, factor.0, addend.0),
+            _mm512_fmadd_pd(self.1, factor.1, addend.1),
+        ))
     }
     #[inline(always)]
     fn store(self, out: &mut [f64; LANES]) {
+        // SAFETY: `out` holds 16 values; the instructions exist (`avx512!`).
         unsafe {
             _mm512_storeu_pd(out.as_mut_ptr(), self.0);
             _mm512_storeu_pd(out.as_mut_ptr().add(8), self.1);
@@ -103,89 +108,93 @@ impl Lanes for Avx512 {
 
     #[inline(always)]
     fn splat(value: f32) -> Self {
-        Self(unsafe { _mm512_set1_ps(value) })
+        Self(avx512!(_mm512_set1_ps(value)))
     }
     #[inline(always)]
     fn load(row: &Lanes16) -> Self {
+        // SAFETY: a row holds 16 values, aligned to 64 bytes; the instructions exist (`avx512!`).
         Self(unsafe { _mm512_load_ps(row.0.as_ptr()) })
     }
     #[inline(always)]
     unsafe fn load_at(at: *const f32) -> Self {
+        // SAFETY: the caller vouches for 16 readable values; the instructions exist (`avx512!`).
         Self(unsafe { _mm512_loadu_ps(at) })
     }
     #[inline(always)]
     fn store(self, row: &mut Lanes16) {
+        // SAFETY: a row holds 16 values, aligned to 64 bytes; the instructions exist (`avx512!`).
         unsafe { _mm512_store_ps(row.0.as_mut_ptr(), self.0) }
     }
     #[inline(always)]
     unsafe fn store_at(self, at: *mut f32) {
+        // SAFETY: the caller vouches for 16 writable values; the instructions exist (`avx512!`).
         unsafe { _mm512_storeu_ps(at, self.0) }
     }
     #[inline(always)]
     fn fma(self, factor: Self, addend: Self) -> Self {
-        Self(unsafe { _mm512_fmadd_ps(self.0, factor.0, addend.0) })
+        Self(avx512!(_mm512_fmadd_ps(self.0, factor.0, addend.0)))
     }
     #[inline(always)]
     fn fnma(self, factor: Self, addend: Self) -> Self {
-        Self(unsafe { _mm512_fnmadd_ps(self.0, factor.0, addend.0) })
+        Self(avx512!(_mm512_fnmadd_ps(self.0, factor.0, addend.0)))
     }
     #[inline(always)]
     fn min(self, other: Self) -> Self {
-        Self(unsafe { _mm512_min_ps(self.0, other.0) })
+        Self(avx512!(_mm512_min_ps(self.0, other.0)))
     }
     #[inline(always)]
     fn max(self, other: Self) -> Self {
-        Self(unsafe { _mm512_max_ps(self.0, other.0) })
+        Self(avx512!(_mm512_max_ps(self.0, other.0)))
     }
     #[inline(always)]
     fn sqrt(self) -> Self {
-        Self(unsafe { _mm512_sqrt_ps(self.0) })
+        Self(avx512!(_mm512_sqrt_ps(self.0)))
     }
     #[inline(always)]
     fn floor(self) -> Self {
-        Self(unsafe { _mm512_roundscale_ps::<TO_FLOOR>(self.0) })
+        Self(avx512!(_mm512_roundscale_ps::<TO_FLOOR>(self.0)))
     }
     #[inline(always)]
     fn ldexp(self, n: Self) -> Self {
-        Self(unsafe { _mm512_scalef_ps(self.0, n.0) })
+        Self(avx512!(_mm512_scalef_ps(self.0, n.0)))
     }
     #[inline(always)]
     fn ge(self, other: Self) -> Avx512Mask {
-        Avx512Mask(unsafe { _mm512_cmp_ps_mask::<_CMP_GE_OQ>(self.0, other.0) })
+        Avx512Mask(avx512!(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(self.0, other.0)))
     }
     #[inline(always)]
     fn gt(self, other: Self) -> Avx512Mask {
-        Avx512Mask(unsafe { _mm512_cmp_ps_mask::<_CMP_GT_OQ>(self.0, other.0) })
+        Avx512Mask(avx512!(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(self.0, other.0)))
     }
     #[inline(always)]
     fn select(mask: Avx512Mask, yes: Self, no: Self) -> Self {
-        Self(unsafe { _mm512_mask_blend_ps(mask.0, no.0, yes.0) })
+        Self(avx512!(_mm512_mask_blend_ps(mask.0, no.0, yes.0)))
     }
     #[inline(always)]
     fn only(self, mask: Avx512Mask) -> Self {
-        Self(unsafe { _mm512_maskz_mov_ps(mask.0, self.0) })
+        Self(avx512!(_mm512_maskz_mov_ps(mask.0, self.0)))
     }
     #[inline(always)]
     fn widen(self) -> Avx512Wide {
-        unsafe {
+        avx512!({
             let high = _mm512_extractf32x8_ps::<1>(self.0);
             Avx512Wide(
                 _mm512_cvtps_pd(_mm512_castps512_ps256(self.0)),
                 _mm512_cvtps_pd(high),
             )
-        }
+        })
     }
     #[inline(always)]
     fn narrow(wide: Avx512Wide) -> Self {
-        unsafe {
+        avx512!({
             let low = _mm512_castps256_ps512(_mm512_cvtpd_ps(wide.0));
             Self(_mm512_insertf32x8::<1>(low, _mm512_cvtpd_ps(wide.1)))
-        }
+        })
     }
     #[inline(always)]
     fn recip(self) -> Self {
         // 14 bits, then Newton: y + y·(1 − x·y).
-        let y = Self(unsafe { _mm512_rcp14_ps(self.0) });
+        let y = Self(avx512!(_mm512_rcp14_ps(self.0)));
         y.fma(self.fnma(y, Self::splat(1.0)), y)
     }
     #[inline(always)]
@@ -194,17 +203,18 @@ impl Lanes for Avx512 {
         let n = self + magic;
         let p = exp2_fraction(self - (n - magic));
         // The fraction's power is normal: its exponent can be raised as an integer, on other ports than vscalefps.
-        unsafe {
+        avx512!({
             let raise = _mm512_slli_epi32::<23>(_mm512_castps_si512(n.0));
             Self(_mm512_castsi512_ps(_mm512_add_epi32(
                 _mm512_castps_si512(p.0),
                 raise,
             )))
-        }
+        })
     }
     #[inline(always)]
     fn sums(rows: &[Self; 10]) -> Lanes16 {
         let mut out = Lanes16::default();
+        // SAFETY: `out` holds 16 values, aligned to 64 bytes; the instructions exist (`avx512!`).
         unsafe {
             // Halve the quarters: [a₀+a₂, a₁+a₃, b₀+b₂, b₁+b₃], then [a, b, c, d], a 128-bit quarter each.
             let mut halves = [_mm512_setzero_ps(); 6];

@@ -10,6 +10,8 @@ use std::ops::{Add, Div, Mul, Neg, Sub};
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 mod portable;
 
 pub use portable::Portable;
@@ -190,18 +192,19 @@ const EXP2: [f32; 6] = [
 /// 1.5·2²³: added to a small number it leaves the nearest integer in the low bits, without a rounding instruction.
 pub const TO_NEAREST: f32 = 12_582_912.0;
 
-/// Which instruction set the kernels run on. On aarch64 the portable lanes compile to NEON.
+/// Which instruction set the kernels run on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Isa {
     Avx512,
     Avx2,
+    Neon,
     Portable,
 }
 
 impl Isa {
     /// Those this machine can run, the fastest first.
     pub fn available() -> Vec<Self> {
-        let all = [Self::Avx512, Self::Avx2, Self::Portable];
+        let all = [Self::Avx512, Self::Avx2, Self::Neon, Self::Portable];
         all.into_iter().filter(|isa| isa.runs_here()).collect()
     }
 
@@ -214,6 +217,7 @@ impl Isa {
         match self {
             Self::Avx512 => "avx512",
             Self::Avx2 => "avx2",
+            Self::Neon => "neon",
             Self::Portable => "portable",
         }
     }
@@ -226,13 +230,14 @@ impl Isa {
                 avx2 && is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq")
             }
             Self::Avx2 => avx2,
+            Self::Neon => false,
             Self::Portable => true,
         }
     }
 
     #[cfg(not(target_arch = "x86_64"))]
     fn runs_here(self) -> bool {
-        self == Self::Portable
+        self == Self::Portable || (self == Self::Neon && cfg!(target_arch = "aarch64"))
     }
 }
 
@@ -258,6 +263,8 @@ pub fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
             // SAFETY: as above.
             unsafe { on_avx2(kernel) }
         }
+        #[cfg(target_arch = "aarch64")]
+        Isa::Neon => kernel.run::<neon::Neon>(),
         _ => kernel.run::<Portable>(),
     }
 }
@@ -275,107 +282,4 @@ fn on_avx2<K: Kernel>(kernel: K) -> K::Output {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Runs one lane function over many rows of inputs.
-    struct Over<'a>(&'a [f32], &'static str);
-
-    impl Kernel for Over<'_> {
-        type Output = Vec<f32>;
-        #[inline(always)]
-        fn run<F: Lanes>(self) -> Vec<f32> {
-            let mut out = Vec::new();
-            for chunk in self.0.chunks_exact(LANES) {
-                let mut row = Lanes16::default();
-                row.0.copy_from_slice(chunk);
-                let x = F::load(&row);
-                let y = match self.1 {
-                    "exp2" => x.exp2(),
-                    "exp" => x.exp(),
-                    "log2_1p" => x.log2_1p(),
-                    "recip" => x.recip(),
-                    "floor" => x.floor(),
-                    _ => F::narrow(x.widen() * F::Wide::splat(2.0)),
-                };
-                y.store(&mut row);
-                out.extend(row.0);
-            }
-            out
-        }
-    }
-
-    fn worst(isa: Isa, name: &'static str, from: f64, to: f64, exact: impl Fn(f64) -> f64) -> f64 {
-        let x: Vec<f32> = (0..160_000)
-            .map(|i| (from + (to - from) * f64::from(i) / 160_000.0) as f32)
-            .collect();
-        let y = dispatch(isa, Over(&x, name));
-        let error = |(x, y): (&f32, &f32)| {
-            let e = exact(f64::from(*x));
-            (f64::from(*y) - e).abs() / e.abs().max(1e-30)
-        };
-        x.iter().zip(&y).map(error).fold(0.0, f64::max)
-    }
-
-    #[test]
-    fn functions_are_accurate() {
-        for isa in Isa::available() {
-            assert!(worst(isa, "exp2", -40.0, 20.0, f64::exp2) < 2.3e-7);
-            assert!(worst(isa, "exp", -80.0, 80.0, f64::exp) < 3e-7);
-            assert!(
-                worst(isa, "log2_1p", 1e-6, 1.0, |x| x.ln_1p()
-                    / std::f64::consts::LN_2)
-                    < 3e-7
-            );
-            assert!(worst(isa, "recip", 0.001, 2.0, |x| 1.0 / x) < 1.5e-7);
-            assert!(worst(isa, "floor", -30.0, 30.0, f64::floor) == 0.0);
-            assert!(worst(isa, "double", -30.0, 30.0, |x| 2.0 * x) == 0.0);
-        }
-    }
-
-    struct Sums<'a>(&'a [Lanes16; 10]);
-
-    impl Kernel for Sums<'_> {
-        type Output = (Lanes16, u16, u16);
-        #[inline(always)]
-        fn run<F: Lanes>(self) -> (Lanes16, u16, u16) {
-            let mut rows = [F::zero(); 10];
-            for k in 0..10 {
-                rows[k] = F::load(&self.0[k]);
-            }
-            let above = rows[1].gt(rows[0]);
-            let odd = F::Mask::from_bits(0b1010_1010_1010_1010);
-            (
-                F::sums(&rows),
-                above.and(odd).bits(),
-                above.and_not(odd).bits(),
-            )
-        }
-    }
-
-    #[test]
-    fn sums_and_masks_keep_their_places() {
-        let mut rows = [Lanes16::default(); 10];
-        for (k, row) in rows.iter_mut().enumerate() {
-            for l in 0..LANES {
-                row.0[l] = ((k * 37 + l * 11) % 23) as f32 - 7.0;
-            }
-        }
-        for isa in Isa::available() {
-            let (sums, odd, even) = dispatch(isa, Sums(&rows));
-            for k in 0..10 {
-                assert_eq!(
-                    sums.0[k],
-                    rows[k].0.iter().sum::<f32>(),
-                    "{} row {k}",
-                    isa.name()
-                );
-            }
-            for l in 0..LANES {
-                let above = rows[1].0[l] > rows[0].0[l];
-                assert_eq!(odd >> l & 1 == 1, above && l % 2 == 1);
-                assert_eq!(even >> l & 1 == 1, above && l % 2 == 0);
-            }
-        }
-    }
-}
+mod tests;

@@ -1,0 +1,85 @@
+"""How much a file may unpack to, checked before room is made: a few bytes can ask for gigabytes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import IO, TYPE_CHECKING
+
+from g2ard.errors import InputError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from PIL.Image import Image
+
+__all__ = ["LARGEST_IMAGE", "check_image", "check_unpacked", "opened_image"]
+
+LARGEST_IMAGE = 160_000_000
+"""Pixels of an image, as a file stores it or as a view asks for it: 12 bytes each once decoded."""
+
+_LARGEST_RATIO = 100
+_ALWAYS_UNPACKED = 64 << 20
+"""Bytes: what any file may unpack to; past that, `_LARGEST_RATIO` times its own size."""
+
+
+def check_unpacked(where: str, packed: int, unpacked: int) -> None:
+    """Refuse what would unpack to more than 64 MiB and to more than 100 times its size.
+
+    Args:
+        where: names the file in the error.
+        packed: bytes as stored.
+        unpacked: bytes it says it holds.
+
+    Raises:
+        InputError: it is past the limit.
+
+    >>> check_unpacked("a.spz", 1 << 20, 100 << 20)
+    >>> check_unpacked("b.spz", 1 << 10, 100 << 20)
+    Traceback (most recent call last):
+    ...
+    g2ard.errors.InputError: b.spz: 1,024 bytes would unpack to 104,857,600; at most 67,108,864 are taken
+    """
+    most = max(_ALWAYS_UNPACKED, _LARGEST_RATIO * packed)
+    if unpacked > most:
+        raise InputError(
+            f"{where}: {packed:,} bytes would unpack to {unpacked:,}; at most {most:,} are taken"
+        )
+
+
+def check_image(where: str, width: int, height: int) -> None:
+    """Refuse an image of more than `LARGEST_IMAGE` pixels.
+
+    Raises:
+        InputError: it is larger.
+    """
+    if width * height > LARGEST_IMAGE:
+        raise InputError(
+            f"{where}: an image of {width:,}×{height:,} pixels; at most {LARGEST_IMAGE:,} are taken"
+        )
+
+
+@contextmanager
+def opened_image(where: str, file: Path | IO[bytes]) -> Iterator[Image]:
+    """A Pillow image, its size checked before its pixels are decoded.
+
+    Whatever goes wrong in the block is told as a broken image.
+
+    Raises:
+        InputError: it is no image, not whole, or past `LARGEST_IMAGE`; the message begins with `where`.
+        FileNotFoundError: there is no such file.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(file) as image:
+            check_image(where, *image.size)
+            yield image
+    except (InputError, FileNotFoundError):
+        raise
+    except Image.DecompressionBombError as error:
+        raise InputError(f"{where}: an image of more than {LARGEST_IMAGE:,} pixels") from error
+    except UnidentifiedImageError as error:
+        raise InputError(f"{where}: not an image") from error
+    except Exception as error:  # on damage Pillow's decoders raise whatever they stumble over
+        raise InputError(f"{where}: not a whole image ({str(error) or type(error).__name__})") from error

@@ -1,0 +1,298 @@
+//! Four NEON registers.
+//!
+//! All but `exp2`, `floor` of −0 and the fused `Wide::fma` give the very bits of [`super::Portable`] on the same machine.
+
+use std::arch::aarch64::*;
+use std::ops::{Add, Div, Mul, Neg, Sub};
+
+use super::{LANES, Lanes, Lanes16, Mask, TO_NEAREST, Wide, exp2_fraction};
+
+/// Intrinsics that touch no memory.
+macro_rules! neon {
+    ($value:expr) => {
+        // SAFETY: NEON is part of every aarch64 target that Rust builds std for, so the instructions exist.
+        unsafe { $value }
+    };
+}
+
+#[derive(Clone, Copy)]
+pub struct Neon([float32x4_t; 4]);
+
+#[derive(Clone, Copy)]
+pub struct NeonMask([uint32x4_t; 4]);
+
+#[derive(Clone, Copy)]
+pub struct NeonWide([float64x2_t; 8]);
+
+macro_rules! operators {
+    ($type:ident: $($trait:ident $name:ident $intrinsic:ident),*) => {$(
+        impl $trait for $type {
+            type Output = Self;
+            #[inline(always)]
+            fn $name(mut self, other: Self) -> Self {
+                for k in 0..self.0.len() {
+                    self.0[k] = neon!($intrinsic(self.0[k], other.0[k]));
+                }
+                self
+            }
+        }
+    )*};
+}
+
+operators!(Neon: Add add vaddq_f32, Sub sub vsubq_f32, Mul mul vmulq_f32, Div div vdivq_f32);
+operators!(NeonWide: Add add vaddq_f64, Mul mul vmulq_f64, Div div vdivq_f64);
+
+impl Neg for Neon {
+    type Output = Self;
+    #[inline(always)]
+    fn neg(mut self) -> Self {
+        for k in 0..4 {
+            self.0[k] = neon!(vnegq_f32(self.0[k]));
+        }
+        self
+    }
+}
+
+impl Mask for NeonMask {
+    #[inline(always)]
+    fn and(mut self, other: Self) -> Self {
+        for k in 0..4 {
+            self.0[k] = neon!(vandq_u32(self.0[k], other.0[k]));
+        }
+        self
+    }
+    #[inline(always)]
+    fn or(mut self, other: Self) -> Self {
+        for k in 0..4 {
+            self.0[k] = neon!(vorrq_u32(self.0[k], other.0[k]));
+        }
+        self
+    }
+    #[inline(always)]
+    fn and_not(mut self, other: Self) -> Self {
+        for k in 0..4 {
+            self.0[k] = neon!(vbicq_u32(self.0[k], other.0[k]));
+        }
+        self
+    }
+    #[inline(always)]
+    fn bits(self) -> u16 {
+        // A byte per lane, each keeping the bit of its place in its half.
+        let [a, b, c, d] = self.0;
+        let low = neon!(vmovn_u16(vcombine_u16(vmovn_u32(a), vmovn_u32(b))));
+        let high = neon!(vmovn_u16(vcombine_u16(vmovn_u32(c), vmovn_u32(d))));
+        let places = neon!(vcreate_u8(0x8040_2010_0804_0201));
+        let low = neon!(vaddv_u8(vand_u8(low, places)));
+        let high = neon!(vaddv_u8(vand_u8(high, places)));
+        u16::from(low) | u16::from(high) << 8
+    }
+    #[inline(always)]
+    fn from_bits(bits: u16) -> Self {
+        let all = neon!(vdupq_n_u32(u32::from(bits)));
+        let first = neon!(vcombine_u32(
+            vcreate_u32(1 | 2 << 32),
+            vcreate_u32(4 | 8 << 32)
+        ));
+        Self([
+            neon!(vtstq_u32(all, first)),
+            neon!(vtstq_u32(all, vshlq_n_u32::<4>(first))),
+            neon!(vtstq_u32(all, vshlq_n_u32::<8>(first))),
+            neon!(vtstq_u32(all, vshlq_n_u32::<12>(first))),
+        ])
+    }
+    #[inline(always)]
+    fn any(self) -> bool {
+        let [a, b, c, d] = self.0;
+        neon!(vmaxvq_u32(vorrq_u32(vorrq_u32(a, b), vorrq_u32(c, d)))) != 0
+    }
+}
+
+impl Wide for NeonWide {
+    #[inline(always)]
+    fn splat(value: f64) -> Self {
+        Self([neon!(vdupq_n_f64(value)); 8])
+    }
+    #[inline(always)]
+    fn fma(mut self, factor: Self, addend: Self) -> Self {
+        for k in 0..8 {
+            self.0[k] = neon!(vfmaq_f64(addend.0[k], self.0[k], factor.0[k]));
+        }
+        self
+    }
+    #[inline(always)]
+    fn store(self, out: &mut [f64; LANES]) {
+        for k in 0..8 {
+            // SAFETY: 2k + 1 < 16, the length of `out`.
+            unsafe { vst1q_f64(out.as_mut_ptr().add(2 * k), self.0[k]) };
+        }
+    }
+}
+
+impl Lanes for Neon {
+    type Mask = NeonMask;
+    type Wide = NeonWide;
+
+    #[inline(always)]
+    fn splat(value: f32) -> Self {
+        Self([neon!(vdupq_n_f32(value)); 4])
+    }
+    #[inline(always)]
+    fn load(row: &Lanes16) -> Self {
+        // SAFETY: a row holds 16 values.
+        unsafe { Self::load_at(row.0.as_ptr()) }
+    }
+    #[inline(always)]
+    unsafe fn load_at(at: *const f32) -> Self {
+        let mut out = Self::zero();
+        for k in 0..4 {
+            // SAFETY: the caller vouches for 16 readable values, and 4k + 3 < 16.
+            out.0[k] = unsafe { vld1q_f32(at.add(4 * k)) };
+        }
+        out
+    }
+    #[inline(always)]
+    fn store(self, row: &mut Lanes16) {
+        // SAFETY: a row holds 16 values.
+        unsafe { self.store_at(row.0.as_mut_ptr()) }
+    }
+    #[inline(always)]
+    unsafe fn store_at(self, at: *mut f32) {
+        for k in 0..4 {
+            // SAFETY: the caller vouches for 16 writable values, and 4k + 3 < 16.
+            unsafe { vst1q_f32(at.add(4 * k), self.0[k]) };
+        }
+    }
+    #[inline(always)]
+    fn fma(mut self, factor: Self, addend: Self) -> Self {
+        for k in 0..4 {
+            self.0[k] = neon!(vfmaq_f32(addend.0[k], self.0[k], factor.0[k]));
+        }
+        self
+    }
+    #[inline(always)]
+    fn fnma(mut self, factor: Self, addend: Self) -> Self {
+        for k in 0..4 {
+            self.0[k] = neon!(vfmsq_f32(addend.0[k], self.0[k], factor.0[k]));
+        }
+        self
+    }
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        // Not `vminq_f32`, which keeps a NaN of `self`.
+        Self::select(other.gt(self), self, other)
+    }
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        Self::select(self.gt(other), self, other)
+    }
+    #[inline(always)]
+    fn sqrt(mut self) -> Self {
+        for k in 0..4 {
+            self.0[k] = neon!(vsqrtq_f32(self.0[k]));
+        }
+        self
+    }
+    #[inline(always)]
+    fn floor(mut self) -> Self {
+        for k in 0..4 {
+            self.0[k] = neon!(vrndmq_f32(self.0[k]));
+        }
+        self
+    }
+    #[inline(always)]
+    fn ldexp(mut self, n: Self) -> Self {
+        for k in 0..4 {
+            let exponent = neon!(vaddq_s32(vcvtq_s32_f32(n.0[k]), vdupq_n_s32(127)));
+            let power = neon!(vreinterpretq_f32_s32(vshlq_n_s32::<23>(exponent)));
+            self.0[k] = neon!(vmulq_f32(self.0[k], power));
+        }
+        self
+    }
+    #[inline(always)]
+    fn ge(self, other: Self) -> NeonMask {
+        let mut mask = [neon!(vdupq_n_u32(0)); 4];
+        for k in 0..4 {
+            mask[k] = neon!(vcgeq_f32(self.0[k], other.0[k]));
+        }
+        NeonMask(mask)
+    }
+    #[inline(always)]
+    fn gt(self, other: Self) -> NeonMask {
+        let mut mask = [neon!(vdupq_n_u32(0)); 4];
+        for k in 0..4 {
+            mask[k] = neon!(vcgtq_f32(self.0[k], other.0[k]));
+        }
+        NeonMask(mask)
+    }
+    #[inline(always)]
+    fn select(mask: NeonMask, yes: Self, mut no: Self) -> Self {
+        for k in 0..4 {
+            no.0[k] = neon!(vbslq_f32(mask.0[k], yes.0[k], no.0[k]));
+        }
+        no
+    }
+    #[inline(always)]
+    fn only(mut self, mask: NeonMask) -> Self {
+        for k in 0..4 {
+            let kept = neon!(vandq_u32(vreinterpretq_u32_f32(self.0[k]), mask.0[k]));
+            self.0[k] = neon!(vreinterpretq_f32_u32(kept));
+        }
+        self
+    }
+    #[inline(always)]
+    fn widen(self) -> NeonWide {
+        let mut wide = NeonWide::splat(0.0);
+        for k in 0..4 {
+            wide.0[2 * k] = neon!(vcvt_f64_f32(vget_low_f32(self.0[k])));
+            wide.0[2 * k + 1] = neon!(vcvt_high_f64_f32(self.0[k]));
+        }
+        wide
+    }
+    #[inline(always)]
+    fn narrow(wide: NeonWide) -> Self {
+        let mut out = Self::zero();
+        for k in 0..4 {
+            out.0[k] = neon!(vcvt_high_f32_f64(
+                vcvt_f32_f64(wide.0[2 * k]),
+                wide.0[2 * k + 1]
+            ));
+        }
+        out
+    }
+    #[inline(always)]
+    fn exp2(self) -> Self {
+        let magic = Self::splat(TO_NEAREST);
+        let n = self + magic;
+        let mut p = exp2_fraction(self - (n - magic));
+        // The fraction's power is normal: its exponent can be raised as an integer.
+        for k in 0..4 {
+            let raise = neon!(vshlq_n_s32::<23>(vreinterpretq_s32_f32(n.0[k])));
+            p.0[k] = neon!(vreinterpretq_f32_s32(vaddq_s32(
+                vreinterpretq_s32_f32(p.0[k]),
+                raise
+            )));
+        }
+        p
+    }
+    #[inline(always)]
+    fn sums(rows: &[Self; 10]) -> Lanes16 {
+        // Lanes l and l + 8, then l + 4, l + 2 and l + 1 are added: the order of the portable lanes.
+        let mut quads = [neon!(vdupq_n_f32(0.0)); 12];
+        for k in 0..10 {
+            let [a, b, c, d] = rows[k].0;
+            quads[k] = neon!(vaddq_f32(vaddq_f32(a, c), vaddq_f32(b, d)));
+        }
+        let mut pairs = [neon!(vdupq_n_f32(0.0)); 6]; // two sums of each of two rows
+        for k in 0..6 {
+            let (a, b) = (quads[2 * k], quads[2 * k + 1]);
+            let low = neon!(vcombine_f32(vget_low_f32(a), vget_low_f32(b)));
+            let high = neon!(vcombine_f32(vget_high_f32(a), vget_high_f32(b)));
+            pairs[k] = neon!(vaddq_f32(low, high));
+        }
+        let zero = neon!(vdupq_n_f32(0.0));
+        let [a, b, c] = [0, 2, 4].map(|k| neon!(vpaddq_f32(pairs[k], pairs[k + 1])));
+        let mut out = Lanes16::default();
+        Self([a, b, c, zero]).store(&mut out);
+        out
+    }
+}

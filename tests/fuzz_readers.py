@@ -1,0 +1,179 @@
+"""Mutates small valid files and holds every reader to its word: data that make sense, or one InputError line.
+
+    python tests/fuzz_readers.py --runs 2000 --seed 1
+
+A mutation changes, cuts or doubles stretches of bytes, writes extreme integers and floats over them, or
+changes numbers and words in text. Packed files are unpacked, mutated and packed again, so that the decoders
+behind zlib and zip see damage too. The first file of each kind that a reader answers otherwise is kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import io
+import re
+import struct
+import sys
+import tempfile
+import traceback
+import warnings
+import zipfile
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from test_io_fuzz import MAKERS, READ
+
+from g2ard.errors import InputError
+from g2ard.io import kind, read_cloud, read_scene, read_view_set
+from g2ard.io.limits import LARGEST_IMAGE
+
+EXTREMES = [
+    struct.pack(form, value)
+    for form, values in {
+        "<B": (0, 127, 128, 255),
+        "<H": (0, 0x7FFF, 0xFFFF),
+        "<I": (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF),
+        "<Q": (0, 1 << 31, 1 << 40, (1 << 63) - 1, 1 << 63, (1 << 64) - 1),
+        "<f": (0.0, -0.0, np.inf, -np.inf, np.nan, 3e38, 1e-45),
+        "<d": (np.inf, np.nan, 1e308, -1e308, 5e-324),
+    }.items()
+    for value in values
+]
+WORDS = [
+    *(b"0", b"-1", b"1e308", b"1e999", b"NaN", b"-Infinity", b"4000000000", b"99999999999999999999"),
+    *(b"null", b"true", b"[]", b"{}", b'""', b'"x"', b"[[]]", b'"\\u0000"', b"1" + b"0" * 400),
+]
+NUMBER = re.compile(rb"-?\d+(\.\d+)?([eE][-+]?\d+)?|\"[^\"]*\"|\bnull\b")
+
+
+def mutated(content: bytes, rng: np.random.Generator) -> bytes:
+    """One to three changes; the front half, where headers are, more often."""
+    data = bytearray(content)
+    for _ in range(rng.integers(1, 4)):
+        at = int(len(data) * rng.random() ** 2)
+        length = int(rng.integers(1, 40))
+        match rng.integers(6):
+            case 0:
+                data[at : at + 1] = bytes([rng.integers(256)])
+            case 1:
+                del data[at : at + length]
+            case 2:
+                data[at:at] = data[at : at + length]
+            case 3:
+                value = EXTREMES[rng.integers(len(EXTREMES))]
+                data[at : at + len(value)] = value
+            case 4:
+                places = list(NUMBER.finditer(data, at, at + 4096))
+                if places:
+                    place = places[rng.integers(len(places))]
+                    data[place.start() : place.end()] = WORDS[rng.integers(len(WORDS))]
+            case _:
+                if rng.random() < 0.3:
+                    del data[at:]
+    return bytes(data)
+
+
+def repacked(content: bytes, rng: np.random.Generator) -> bytes:
+    """As `mutated`, behind the packing where there is one, mostly."""
+    if rng.random() < 0.3:
+        return mutated(content, rng)
+    if content[:2] == b"\x1f\x8b":
+        return gzip.compress(mutated(gzip.decompress(content), rng), 1)
+    if content[:4] == b"PK\x03\x04":
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            files = {name: archive.read(name) for name in archive.namelist()}
+        chosen = "meta.json" if rng.random() < 0.5 else sorted(files)[rng.integers(len(files))]
+        files[chosen] = mutated(files[chosen], rng)
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w", (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)[rng.integers(2)]) as out:
+            for name, part in files.items():
+                out.writestr(name, part)
+        return buffer.getvalue()
+    return mutated(content, rng)
+
+
+def read_checked(path: Path) -> str | None:
+    """Read a file; the error line, if there is one. What is read must make sense."""
+    try:
+        match kind(path):
+            case "splats":
+                scene = read_scene(path).splats
+                assert len(scene)
+                assert scene.finite_rows().all()
+                assert (scene.scales > 0).all()
+                assert scene.quats.any(1).all()
+            case "points":
+                points = read_cloud(path).points
+                assert len(points)
+                assert np.isfinite(points.positions).all()
+                assert ((points.colors >= 0) & (points.colors <= 1)).all()
+            case "views":
+                cameras = read_view_set(path).cameras
+                assert len(cameras)
+                assert np.isfinite(cameras.viewmats).all()
+                assert np.isfinite(cameras.Ks).all()
+                assert (cameras.widths * cameras.heights <= LARGEST_IMAGE).all()
+    except InputError as error:
+        return str(error)
+    return None
+
+
+def fuzz(what: str, make: Callable[[Path], Path], folder: Path, runs: int, seed: int) -> Counter[str]:
+    """Mutate one case `runs` times: how many files were read, how many refused, and what else came of any.
+
+    What was answered otherwise than with data or one line is a key of its own; its first file is kept.
+    """
+    path = make(folder)
+    content = path.read_bytes()
+    asked = folder / READ[what] if what in READ else path
+    rng = np.random.default_rng([seed, *what.encode()])
+    tally: Counter[str] = Counter()
+    for _ in range(runs):
+        data = repacked(content, rng)
+        path.write_bytes(data)
+        try:
+            line = read_checked(asked)
+            found = "read" if line is None else "refused"
+            if line is not None and ("\n" in line or str(folder) not in line):
+                found = f"not one line that names the file: {line!r}"
+        except Exception as error:
+            at = traceback.extract_tb(error.__traceback__)[-1]
+            found = f"{type(error).__name__} in {Path(at.filename).name}:{at.lineno}: {str(error)[:120]}"
+        if found not in ("read", "refused", *tally):
+            kept = folder / f"broken_{len(tally)}_{path.name}"
+            kept.write_bytes(data)
+        tally[found] += 1
+    return tally
+
+
+def main() -> None:
+    """Fuzz every case of the corpus; exit 1 where a reader broke."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=2000, help="mutations of each case")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default="", help="cases whose name holds this")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    total, broken = 0, 0
+    for what, make in MAKERS.items():
+        if options.only not in what:
+            continue
+        folder = Path(tempfile.mkdtemp(prefix="g2ard-fuzz-"))
+        tally = fuzz(what, make, folder, options.runs, options.seed)
+        read, refused = tally.pop("read", 0), tally.pop("refused", 0)
+        print(f"{what:28} read {read:7,}  refused {refused:7,}", flush=True)
+        for found, times in tally.items():
+            print(f"    {times} × {found}  (kept in {folder})", flush=True)
+        total, broken = total + read + refused + tally.total(), broken + tally.total()
+    print(f"{total:,} files; {broken} answered with anything but data or one line")
+    raise SystemExit(broken > 0)
+
+
+if __name__ == "__main__":
+    main()
