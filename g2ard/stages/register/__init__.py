@@ -16,7 +16,7 @@ from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
 from g2ard.stages.register.align import Aligned, Level, align, level_of
 from g2ard.stages.register.config import RegisterConfig
-from g2ard.stages.register.grey import grey_of, local_zncc
+from g2ard.stages.register.grey import band_passed, grey_of, local_zncc
 from g2ard.stages.register.outcome import (
     PhotoReport,
     PoseError,
@@ -24,7 +24,7 @@ from g2ard.stages.register.outcome import (
     RegisterReport,
     Status,
 )
-from g2ard.stages.register.pool import PoolRenders
+from g2ard.stages.register.pool import PoolRenders, small_render, turned
 from g2ard.stages.register.pose import pose_error
 from g2ard.stages.render import Renderer
 
@@ -53,9 +53,12 @@ class _Photo:
 
 @dataclass(frozen=True)
 class _Start:
+    """A pose to start from; `turned`, where it is not None, is what alignment begins with."""
+
     pose: Float
     name: str
     rank: int | None = None
+    turned: Float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +82,11 @@ def register(
 ) -> Registered:
     """Find the poses of photos by direct alignment with renders of the scene.
 
-    A photo starts from its own pose in `starts`; without one, from the `candidates` poses of `pool` whose
-    renders at `pool_size` pixels are most like it. From each start it is aligned, coarse to fine
-    (`g2ard.stages.register.align`); the result with the highest median local ZNCC is kept, and that decides what it is worth.
+    A photo starts from its own pose in `starts`, and where that ends in doubt once more from there, turned
+    to where a small render lies best on the photo. Without a pose it starts from the `candidates` poses of
+    `pool` whose renders at `pool_size` pixels, turned alike, are most like it. From each start it is aligned,
+    coarse to fine (`g2ard.stages.register.align`); the result with the highest median local ZNCC is kept, and
+    that decides what it is worth.
     A photo that cannot be read is refused like any other: the rest goes on.
 
     Args:
@@ -174,13 +179,20 @@ def _one(
         assert pool is not None
         order, renders = pool.ranked(*photo.small)
         best = enumerate(order[: config.candidates], 1)
-        starts = [_Start(pool.pool.viewmats[at], pool.pool.names[at], rank) for rank, at in best]
-    candidates = []
-    for start in starts:
-        found = align(renderer, start.pose, photo.pyramid, config)
-        if found is not None:
-            renders += found.steps + 1
-            candidates.append(_Candidate(start, found, _likeness(renderer, found, photo, config)))
+        starts = [
+            _Start(pool.pool.viewmats[at], pool.pool.names[at], rank, there.viewmat)
+            for rank, (at, there) in best
+        ]
+    candidates = [found for start in starts if (found := _tried(renderer, start, photo, config))]
+    if given is not None and not any(c.zncc >= config.accept for c in candidates):
+        camera, grey = photo.small
+        render = small_render(renderer, replace(camera, viewmat=given.pose), config)
+        there = turned(given.pose, render, band_passed(grey), camera.K)
+        again = replace(given, turned=there.viewmat)
+        renders += 1
+        if there.pixels and (found := _tried(renderer, again, photo, config)):
+            candidates.append(found)
+    renders += sum(c.found.steps + 1 for c in candidates)
     if not candidates:
         return replace(refused, reason="the scene is out of the starting pose's sight", renders=renders), None
     best_one = max(candidates, key=lambda c: c.zncc)
@@ -211,6 +223,13 @@ def _loaded(photos: Cameras, index: int, config: RegisterConfig) -> _Photo:
     small = shrunk(config.pool_size)
     pyramid = [(camera, level_of(grey, counts)) for camera, grey, counts in levels]
     return _Photo(pyramid, small[:2], levels[-1][1])
+
+
+def _tried(renderer: Renderer, start: _Start, photo: _Photo, config: RegisterConfig) -> _Candidate | None:
+    """Align from one start; None where the scene is out of its sight."""
+    pose = start.pose if start.turned is None else start.turned
+    found = align(renderer, pose, photo.pyramid, config)
+    return None if found is None else _Candidate(start, found, _likeness(renderer, found, photo, config))
 
 
 def _likeness(renderer: Renderer, found: Aligned, photo: _Photo, config: RegisterConfig) -> float:

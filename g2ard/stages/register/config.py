@@ -28,14 +28,15 @@ class RegisterConfig:
         window: pixels of the side of ZNCC's windows.
         candidates: the best poses of a pool, by renders of `pool_size` pixels, that are aligned.
         pool_size: pixels of the longer side of those renders.
-        correlated: pixels of a residual that are worth one independent one: what variances are multiplied by.
+        correlated: what variances are multiplied by, for neighbouring residuals err alike: measured at size
+            500, so that errors on caliterra's held-out photos are as large as their σ says.
 
     Raises:
         InputError: a value out of its range.
     """
 
     size: int = 500
-    coarsest: int = 64
+    coarsest: int = 32
     iterations: int = 12
     still: float = 0.01
     accept: float = 0.6
@@ -48,7 +49,7 @@ class RegisterConfig:
     window: int = 15
     candidates: int = 5
     pool_size: int = 64
-    correlated: float = 25.0
+    correlated: float = 300.0
 
     def __post_init__(self) -> None:
         require("size", self.size, self.size >= 32, "at least 32 pixels")
@@ -68,8 +69,8 @@ class RegisterConfig:
     def levels(self) -> list[int]:
         """Longer sides in pixels, coarse to fine: halves of `size` down to `coarsest`.
 
-        >>> RegisterConfig(size=500).levels(), RegisterConfig(size=40).levels()
-        ([62, 125, 250, 500], [40])
+        >>> RegisterConfig().levels(), RegisterConfig(size=40).levels()
+        ([31, 62, 125, 250, 500], [40])
         """
         out = [self.size]
         while out[0] > 1.5 * self.coarsest:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["band_passed", "blurred", "box_mean", "gradient", "grey_of", "local_zncc", "zncc"]
+__all__ = ["band_passed", "blurred", "box_mean", "gradient", "grey_of", "local_zncc", "shift_between", "zncc"]
 
 Float = NDArray[np.float64]
 
@@ -59,6 +59,32 @@ def zncc(a: Float, b: Float, mask: NDArray[np.bool_]) -> float:
     x, y = x - x.mean(), y - y.mean()
     scale = np.sqrt((x * x).sum() * (y * y).sum())
     return float((x * y).sum() / scale) if scale > 1e-12 else 0.0
+
+
+def shift_between(a: Float, b: Float) -> tuple[int, int, float]:
+    """By how many pixels `a` is best moved, right and down, to lie on `b`; and how alike they are then.
+
+    The likeness is Σ a(x − s)·b(x) / √(Σa²·Σb²): what is moved out of sight counts 0. Moves are at most half
+    an image; of equals the first in order of rows wins.
+
+    Args:
+        a: (H, W), of mean 0 about, 0 where it does not count.
+        b: (H, W), likewise.
+
+    >>> a = np.zeros((8, 8)); a[2, 3] = 1
+    >>> shift_between(a, np.roll(a, (1, -2), (0, 1)))[:2]
+    (-2, 1)
+    """
+    height, width = a.shape
+    scale = np.sqrt((a * a).sum() * (b * b).sum())
+    if not scale > 1e-12:
+        return 0, 0, 0.0
+    shape = (2 * height, 2 * width)
+    product = np.fft.irfft2(np.fft.rfft2(b, shape) * np.conj(np.fft.rfft2(a, shape)), shape)
+    down, right = np.arange(-(height // 2), height // 2 + 1), np.arange(-(width // 2), width // 2 + 1)
+    near = product[np.ix_(down, right)]
+    at = np.unravel_index(int(np.argmax(near)), near.shape)
+    return int(right[at[1]]), int(down[at[0]]), float(near[at] / scale)
 
 
 def local_zncc(a: Float, b: Float, mask: NDArray[np.bool_], side: int) -> float:
