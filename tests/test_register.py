@@ -183,7 +183,7 @@ def test_the_command_writes_views_and_says_how_good_they_are(
         "--json",
         "-",
     )
-    common = (*common, "--set", "register.coarsest=32", "-o", "poses.json")
+    common = (*common, "--report", "page.html", "--set", "register.coarsest=32", "-o", "poses.json")
     scored = ("--truth", site / "truth.json", "--metres-per-unit", "1")
     arguments = ("register", site / "scene.ply", *common, "--poses", site / "coarse.txt", *scored)
     status, out, err = command_line(*arguments, cwd=tmp_path)
@@ -194,6 +194,9 @@ def test_the_command_writes_views_and_says_how_good_they_are(
     assert result["summary"]["found"]["recalls"][0]["share"] == 1
     assert len(result["photos"][0]["covariance"]) == 6
     assert "4 of 4 photos" in err
+    page = (tmp_path / "page.html").read_text()
+    assert page.count('<section class="view">') == 4
+    assert "found: median" in page
     found = read_views(tmp_path / "poses.json")
     truth = read_poses(site / "truth.json")
     for view in found:
@@ -216,6 +219,7 @@ def test_the_command_writes_views_and_says_how_good_they_are(
         ("--photos views.json --focal 100", 1, "these views state their intrinsics"),
         ("--photos views.json --metres-per-unit 2", 2, "goes with --truth"),
         ("--photos views.json --keep all", 2, "keep"),
+        ("--photos views.json --report scene.ply -w", 2, "would be written over"),
         ("--photos views.json --pool absent.json", 1, "absent.json"),
         ("--photos views.json --poses away.txt", 1, "none of 4 photos was registered"),
     ],

@@ -17,7 +17,7 @@ from g2ard.io.photos import photo_size
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.splats import Splats
 
-__all__ = ["matched", "photos_of", "pool_of", "read_poses"]
+__all__ = ["matched", "photos_of", "pool_of", "poses_for", "read_poses"]
 
 Poses = dict[str, NDArray[np.float64]]
 Found = TypeVar("Found")
@@ -156,6 +156,18 @@ def read_poses(path: Path) -> Poses:
         return ace.read(path)
     cameras = read_view_set(path, unpictured=True).cameras
     return dict(zip(cameras.names, cameras.viewmats, strict=True))
+
+
+def poses_for(path: Path, names: Sequence[str]) -> Poses:
+    """The poses of `read_poses` that belong to some photos, by the photos' names; see `matched`.
+
+    Raises:
+        InputError: as `read_poses`, or none of them belongs to any.
+    """
+    found = matched(read_poses(path), names)
+    if not found:
+        raise InputError(f"{path}: names none of the photos, of which the first is {names[0]}")
+    return found
 
 
 def matched(found: Mapping[str, Found], names: Sequence[str]) -> dict[str, Found]:

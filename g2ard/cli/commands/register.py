@@ -67,6 +67,9 @@ def register(
         typer.Option("--metres-per-unit", min=1e-9, help="With --truth: errors in cm, and recalls."),
     ] = None,
     split: Annotated[str, typer.Option(metavar="train|test|all", help="Of --photos VIEWS.")] = "all",
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="Also write a page of renders laid on photos.")
+    ] = None,
     background: BackgroundOption = None,
 ) -> None:
     """Find where photos were taken, by aligning renders of a scene with them.
@@ -78,7 +81,7 @@ def register(
     from g2ard.io import write_views
     from g2ard.io.atomic import check_output
     from g2ard.policy.inputs import load_scene
-    from g2ard.policy.register import matched, photos_of, pool_of, read_poses
+    from g2ard.policy.register import photos_of, pool_of, poses_for
     from g2ard.stages.register import RegisterConfig
     from g2ard.stages.register import register as find
     from g2ard.stages.register.score import summarize
@@ -90,22 +93,20 @@ def register(
     config = RegisterConfig(size=size, accept=accept)
     config = changed(config, "register", run.constants(register=config))
     check_output(output, run.overwrite)
+    if report is not None:
+        if report.resolve() in {p.resolve() for p in (output, scene, poses, truth, intrinsics, photos) if p}:
+            raise typer.BadParameter(f"--report {report} would be written over; name another output")
+        check_output(report, run.overwrite)
     taken = photos_of(photos, split=split, intrinsics=intrinsics, focal=focal, say=run.say)
     folder = photos.is_dir() and (intrinsics is not None or focal is not None)
     if poses is None and pool is None and folder:
         raise InputError(f"{photos}: photos have no pose to start from; give --poses or --pool")
     starts = {}
     if poses is not None:
-        starts = matched(read_poses(poses), taken.names)
-        if not starts:
-            raise InputError(f"{poses}: names none of the photos, of which the first is {taken.names[0]}")
+        starts = poses_for(poses, taken.names)
     elif pool is None:
         starts = dict(zip(taken.names, taken.viewmats, strict=True))
-    true = {}
-    if truth is not None:
-        true = matched(read_poses(truth), taken.names)
-        if not true:
-            raise InputError(f"{truth}: names none of the photos, of which the first is {taken.names[0]}")
+    true = {} if truth is None else poses_for(truth, taken.names)
     splats = load_scene(scene, run.say)
     places = pool_of(splats, pool, run.seed, run.progress) if pool is not None else None
     found = find(
@@ -123,7 +124,16 @@ def register(
     summary = summarize(rows, keep=keep, true=len(true), metres_per_unit=metres_per_unit)
     if len(found.cameras):
         write_views(output, found.cameras, overwrite=run.overwrite)
-    _tell(run, summary)
+    lines = _told(summary)
+    for line in lines:
+        run.say(line)
+    if report is not None:
+        from g2ard.report.registered import registration_report
+
+        colour = background or (0.0, 0.0, 0.0)
+        registration_report(
+            report, f"Photos in {scene.name}", splats, taken, rows, starts, told=lines, background=colour
+        )
     constants = listed({"register": config}, run.config)
     written = str(output) if len(found.cameras) else None
     run.result(
@@ -135,14 +145,13 @@ def register(
     run.say(f"{output}: {len(found.cameras)} of {len(rows)} photos")
 
 
-def _tell(run: Run, summary: Summary) -> None:
-    run.say(
-        f"{summary.photos} photos: {summary.registered} registered, {summary.uncertain} uncertain, "
-        f"{summary.refused} refused"
-    )
-    for words, accuracy in (("started from", summary.start), ("found", summary.found)):
-        if accuracy is not None:
-            run.say(f"{words}: {_said(accuracy, summary)}")
+def _told(summary: Summary) -> list[str]:
+    counts = f"{summary.registered} registered, {summary.uncertain} uncertain, {summary.refused} refused"
+    scored = (("started from", summary.start), ("found", summary.found))
+    return [
+        f"{summary.photos} photos: {counts}",
+        *(f"{words}: {_said(accuracy, summary)}" for words, accuracy in scored if accuracy is not None),
+    ]
 
 
 def _said(accuracy: Accuracy, summary: Summary) -> str:

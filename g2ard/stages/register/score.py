@@ -100,7 +100,7 @@ def summarize(
     if true:
         start = _accuracy([p.start_error for p in photos], true, metres_per_unit)
         found = _accuracy([p.error for p in photos if p.status in kept], true, metres_per_unit)
-    return Summary(len(photos), *counts, true, metres_per_unit, start, found)
+    return Summary(len(photos), counts[0], counts[1], counts[2], true, metres_per_unit, start, found)
 
 
 def _accuracy(errors: Sequence[PoseError | None], true: int, metres: float | None) -> Accuracy:
