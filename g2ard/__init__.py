@@ -10,6 +10,7 @@
 | `make_pool`, `select` | views for a scene that has none; the views worth having |
 | `recover` | a fixed set of Gaussians against photos or a teacher's renders |
 | `adapt` | new appearance on frozen geometry |
+| `register` | poses of photos, by aligning renders with them |
 | `render`, `Renderer`, `evaluate` | images, depths; PSNR, SSIM |
 
 They pass on `Splats`, a `Camera` or many `Cameras`, and targets: `Photos` or `TeacherRenders`. Configurations
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from g2ard.stages.lift import lift
     from g2ard.stages.recover import RecoverConfig, Recovered, recover
     from g2ard.stages.recover.anchors import Regularizers
+    from g2ard.stages.register import RegisterConfig, Registered, register
     from g2ard.stages.render import RasterSettings, Rendered, Renderer, render
     from g2ard.stages.select import CoverageOptions, Selection, select
     from g2ard.stages.simplify import Simplified, SimplifyConfig
@@ -77,6 +79,8 @@ __all__ = [
     "RasterSettings",
     "RecoverConfig",
     "Recovered",
+    "RegisterConfig",
+    "Registered",
     "Regularizers",
     "Rendered",
     "Renderer",
@@ -97,6 +101,7 @@ __all__ = [
     "make_pool",
     "preset",
     "recover",
+    "register",
     "render",
     "save",
     "save_views",
@@ -118,6 +123,7 @@ _HOMES = {
     "stages.lift": ("lift",),
     "stages.recover": ("RecoverConfig", "Recovered", "recover"),
     "stages.recover.anchors": ("Regularizers",),
+    "stages.register": ("RegisterConfig", "Registered", "register"),
     "stages.render": ("RasterSettings", "Rendered", "Renderer", "render"),
     "stages.select": ("CoverageOptions", "Selection", "select"),
     "stages.simplify": ("Simplified", "SimplifyConfig"),

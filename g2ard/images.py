@@ -18,7 +18,16 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import opened_image
 from g2ard.progress import Progress, silent
 
-__all__ = ["as_saved", "contact_sheet", "load_image", "load_images", "load_mask", "to_bytes", "write_png"]
+__all__ = [
+    "as_saved",
+    "contact_sheet",
+    "load_image",
+    "load_images",
+    "load_mask",
+    "resized",
+    "to_bytes",
+    "write_png",
+]
 
 _ASPECT_SLACK = 0.02
 """Relative difference of aspect ratio that rounding a resized photo may cause; more is another photo."""
@@ -60,7 +69,7 @@ def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
     if distortion.any():
         K = cameras.Ks[index] * np.array([[width / target[0]], [height / target[1]], [1.0]])
         image = _undistorted(image, K, distortion)
-    return _resized(image, target)
+    return resized(image, target)
 
 
 def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
@@ -160,8 +169,13 @@ def _lookup(width: int, height: int, K: tuple[float, ...], distortion: tuple[flo
     return above, left, *fractions
 
 
-def _resized(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """Each pixel the mean of the area it covers; bilinear along an axis that grows."""
+def resized(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """An image (H, W, 3) float32 at another (width, height): each pixel the mean of the area it covers;
+    bilinear along an axis that grows.
+
+    >>> resized(np.full((4, 8, 3), 0.5, np.float32), (2, 1)).tolist()
+    [[[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]]
+    """
     for axis, length in ((0, size[1]), (1, size[0])):
         if length < image.shape[axis]:
             image = _averaged(image, length, axis)

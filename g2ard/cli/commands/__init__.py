@@ -9,6 +9,7 @@ COMMANDS = (
     "simplify",
     "recover",
     "adapt",
+    "register",
     "lift",
     "convert",
     "clean",

@@ -1,0 +1,167 @@
+"""`g2ard register`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from g2ard.cli.frame import Run, command
+from g2ard.cli.options import BackgroundOption, OutputOption, SceneArgument
+
+if TYPE_CHECKING:
+    from g2ard.stages.register.score import Accuracy, Summary
+
+
+@command(
+    "register",
+    example="g2ard register small.ply --photos new/ --focal 1200 --poses coarse.txt -o poses.json",
+    constants=True,
+)
+def register(
+    run: Run,
+    scene: SceneArgument,
+    photos: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR|VIEWS",
+            help="Photos to register: a folder, or views that name them and state their lenses. "
+            "Without --poses and --pool, the views' own poses are the start.",
+        ),
+    ],
+    output: OutputOption,
+    poses: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Poses to start from: views in any format, or ACE's text."),
+    ] = None,
+    pool: Annotated[
+        str | None,
+        typer.Option(
+            metavar="VIEWS|N",
+            help="For photos without a pose: start from the likest of these views, or of N planned ones.",
+        ),
+    ] = None,
+    intrinsics: Annotated[
+        Path | None,
+        typer.Option(metavar="VIEWS", help="Lenses of a folder's photos: by name, or one for all."),
+    ] = None,
+    focal: Annotated[
+        float | None, typer.Option(metavar="PX", min=1, help="Focal length of a folder's photos, pixels.")
+    ] = None,
+    size: Annotated[
+        int, typer.Option(min=32, metavar="PIXELS", help="Shrink photos to this longer side.")
+    ] = 500,
+    accept: Annotated[
+        float, typer.Option(min=0.01, max=1, help="ZNCC from which a photo counts as registered.")
+    ] = 0.6,
+    keep: Annotated[
+        Literal["registered", "uncertain"], typer.Option(help="Write those that are uncertain as well.")
+    ] = "registered",
+    truth: Annotated[
+        Path | None,
+        typer.Option(metavar="VIEWS", help="True poses, to score with: as --poses. They decide nothing."),
+    ] = None,
+    metres_per_unit: Annotated[
+        float | None,
+        typer.Option("--metres-per-unit", min=1e-9, help="With --truth: errors in cm, and recalls."),
+    ] = None,
+    split: Annotated[str, typer.Option(metavar="train|test|all", help="Of --photos VIEWS.")] = "all",
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="Also write a page of renders laid on photos.")
+    ] = None,
+    background: BackgroundOption = None,
+) -> None:
+    """Find where photos were taken, by aligning renders of a scene with them.
+
+    Each photo is registered, uncertain or refused; OUT holds the registered ones as views.
+    """
+    from g2ard.constants import changed, listed
+    from g2ard.errors import InputError
+    from g2ard.io import write_views
+    from g2ard.io.atomic import check_output
+    from g2ard.policy.inputs import load_scene
+    from g2ard.policy.register import photos_of, pool_of, poses_for
+    from g2ard.stages.register import RegisterConfig
+    from g2ard.stages.register import register as find
+    from g2ard.stages.register.score import summarize
+
+    if metres_per_unit is not None and truth is None:
+        raise typer.BadParameter("--metres-per-unit goes with --truth")
+    if intrinsics is not None and focal is not None:
+        raise typer.BadParameter("--intrinsics and --focal exclude each other")
+    config = RegisterConfig(size=size, accept=accept)
+    config = changed(config, "register", run.constants(register=config))
+    check_output(output, run.overwrite)
+    if report is not None:
+        if report.resolve() in {p.resolve() for p in (output, scene, poses, truth, intrinsics, photos) if p}:
+            raise typer.BadParameter(f"--report {report} would be written over; name another output")
+        check_output(report, run.overwrite)
+    taken = photos_of(photos, split=split, intrinsics=intrinsics, focal=focal, say=run.say)
+    folder = photos.is_dir() and (intrinsics is not None or focal is not None)
+    if poses is None and pool is None and folder:
+        raise InputError(f"{photos}: photos have no pose to start from; give --poses or --pool")
+    starts = {}
+    if poses is not None:
+        starts = poses_for(poses, taken.names)
+    elif pool is None:
+        starts = dict(zip(taken.names, taken.viewmats, strict=True))
+    true = {} if truth is None else poses_for(truth, taken.names)
+    splats = load_scene(scene, run.say)
+    places = pool_of(splats, pool, run.seed, run.progress) if pool is not None else None
+    found = find(
+        splats,
+        taken,
+        starts=starts,
+        pool=places,
+        truth=true,
+        config=config,
+        keep=keep,
+        background=background or (0.0, 0.0, 0.0),
+        progress=run.progress,
+    )
+    rows = found.report.photos
+    summary = summarize(rows, keep=keep, true=len(true), metres_per_unit=metres_per_unit)
+    if len(found.cameras):
+        write_views(output, found.cameras, overwrite=run.overwrite)
+    lines = _told(summary)
+    for line in lines:
+        run.say(line)
+    if report is not None:
+        from g2ard.report.registered import registration_report
+
+        colour = background or (0.0, 0.0, 0.0)
+        registration_report(
+            report, f"Photos in {scene.name}", splats, taken, rows, starts, told=lines, background=colour
+        )
+    constants = listed({"register": config}, run.config)
+    written = str(output) if len(found.cameras) else None
+    run.result(
+        {**found.report.as_dict(), "summary": summary.as_dict(), "output": written, "constants": constants}
+    )
+    if not len(found.cameras):
+        first = next(row for row in rows if row.status != "registered")
+        raise InputError(f"none of {len(rows)} photos was registered; {first.name}: {first.reason}")
+    run.say(f"{output}: {len(found.cameras)} of {len(rows)} photos")
+
+
+def _told(summary: Summary) -> list[str]:
+    counts = f"{summary.registered} registered, {summary.uncertain} uncertain, {summary.refused} refused"
+    scored = (("started from", summary.start), ("found", summary.found))
+    return [
+        f"{summary.photos} photos: {counts}",
+        *(f"{words}: {_said(accuracy, summary)}" for words, accuracy in scored if accuracy is not None),
+    ]
+
+
+def _said(accuracy: Accuracy, summary: Summary) -> str:
+    if accuracy.median is None:
+        return f"no pose of {summary.true} to score"
+    scale, unit = (1.0, "units")
+    if summary.metres_per_unit is not None:
+        scale, unit = 100 * summary.metres_per_unit, "cm"
+    shares = "".join(f", {r.share:.1%} ≤ {100 * r.metres:g} cm/{r.degrees:g}°" for r in accuracy.recalls)
+    return (
+        f"median {accuracy.median.position * scale:.3g} {unit} / {accuracy.median.rotation:.3g}° "
+        f"over {accuracy.photos} of {summary.true}{shares}"
+    )

@@ -1,0 +1,50 @@
+"""Poses as text, one photo a line, as ACE and its successors write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.io.photos import rotation
+
+__all__ = ["read"]
+
+
+def read(path: Path) -> dict[str, NDArray[np.float64]]:
+    """Read `NAME qw qx qy qz tx ty tz …`: a photo and its camera_from_world, whatever follows.
+
+    Empty lines and those that begin with # are passed over.
+
+    Returns:
+        Name → (4, 4) camera_from_world, in the file's order.
+
+    Raises:
+        InputError: the file is absent, a line is no pose, a name comes twice, or there is no pose.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file") from error
+    out: dict[str, NDArray[np.float64]] = {}
+    for number, line in enumerate(lines, 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            pose = np.array(words[1:8], np.float64)
+        except ValueError:
+            pose = np.zeros(0)
+        if len(pose) != 7 or not np.isfinite(pose).all() or not np.linalg.norm(pose[:4]) > 0:
+            raise InputError(f"{path}: line {number}: expected a name, a quaternion wxyz and a translation")
+        if words[0] in out:
+            raise InputError(f"{path}: line {number}: {words[0]} comes twice")
+        out[words[0]] = np.eye(4)
+        out[words[0]][:3, :3], out[words[0]][:3, 3] = rotation(pose[:4].tolist()), pose[4:]
+    if not out:
+        raise InputError(f"{path}: no poses found")
+    return out

@@ -1,0 +1,201 @@
+"""What registration is given: photos and their lenses, poses to start from, and the true ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.cameras import Camera, Cameras
+from g2ard.errors import InputError
+from g2ard.io import read_view_set
+from g2ard.io.photos import photo_size
+from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.splats import Splats
+
+__all__ = ["matched", "photos_of", "pool_of", "poses_for", "read_poses"]
+
+Poses = dict[str, NDArray[np.float64]]
+Found = TypeVar("Found")
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+_ROWS = 200_000
+"""Gaussians that poses are planned on."""
+
+
+def photos_of(
+    path: Path,
+    *,
+    split: str = "all",
+    intrinsics: Path | None = None,
+    focal: float | None = None,
+    say: Say = unsaid,
+) -> Cameras:
+    """Photos with their lenses.
+
+    Args:
+        path: views with photos, or a folder of photos.
+        split: of views, see `g2ard.splits`; a folder has none but "all".
+        intrinsics: for a folder: views that hold the lens of each photo by name, or one lens for all.
+        focal: for a folder: pixels of the photo as stored, principal point in the middle, no distortion.
+        say: told what readers noticed.
+
+    Returns:
+        C cameras; those of a folder have no pose (the identity).
+
+    Raises:
+        InputError: no photos, no lens or two, several lenses of which none is named, or all photos of
+            another aspect than their lens.
+    """
+    files = _photos_in(path)
+    if not files:
+        found = read_view_set(path, split=split)
+        for note in found.notes:
+            say(f"{path}: {note}")
+        missing = next((v.name for v in found.cameras if v.image_path is None), None)
+        if missing is not None:
+            raise InputError(f"{path}: view {missing} has no photo")
+        if intrinsics is not None or focal is not None:
+            raise InputError(f"{path}: these views state their intrinsics; others would contradict them")
+        return found.cameras
+    if split != "all":
+        raise InputError(f"{path}: a folder of photos has no split {split!r}")
+    if (intrinsics is None) == (focal is None):
+        raise InputError(
+            f"{path}: photos without views need their intrinsics: either views, or a focal length"
+        )
+    names = [file.relative_to(path).as_posix() for file in files]
+    sizes = _sizes(files)
+    if focal is not None:
+        views = [_centred(focal, size) for size in sizes]
+    else:
+        assert intrinsics is not None
+        views = _lenses(intrinsics, names)
+        _check_aspects(files, sizes, views)
+    return Cameras.of(
+        replace(view, name=name, image_path=file, mask_path=None, viewmat=np.eye(4))
+        for view, name, file in zip(views, names, files, strict=True)
+    )
+
+
+def _photos_in(path: Path) -> list[Path]:
+    """The photos of a folder that holds no views; [] for anything else."""
+    from g2ard.io.detect import file_format
+
+    if not path.is_dir():
+        return []
+    try:
+        file_format(path)
+    except InputError:
+        return sorted(f for f in path.rglob("*") if f.suffix.lower() in _SUFFIXES and f.is_file())
+    return []
+
+
+def _sizes(files: list[Path]) -> list[tuple[int, int]]:
+    """Width and height of each; a broken photo, which registration will refuse, takes another's."""
+    found: list[tuple[int, int] | None] = []
+    for file in files:
+        try:
+            found.append(photo_size(file))
+        except InputError:
+            found.append(None)
+    usual = next((size for size in found if size), None)
+    if usual is None:
+        raise InputError(f"{files[0]}: not a whole image, and none of {len(files)} is")
+    return [size or usual for size in found]
+
+
+def _centred(focal: float, size: tuple[int, int]) -> Camera:
+    K = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
+    return Camera(np.eye(4), K, *size)
+
+
+def _lenses(path: Path, names: list[str]) -> list[Camera]:
+    """The view of each name, else the one lens that all views share."""
+    views = read_view_set(path, unpictured=True).cameras
+    by_name = matched({view.name: view for view in views}, names)
+    one = views[0]
+    shared = all(_same_lens(view, one) for view in views)
+    missing = next((name for name in names if name not in by_name), None)
+    if missing is not None and not shared:
+        raise InputError(f"{path}: no intrinsics for {missing}, and its views are of several lenses")
+    return [by_name.get(name, one) for name in names]
+
+
+def _same_lens(a: Camera, b: Camera) -> bool:
+    same = np.array_equal(a.K, b.K) and np.array_equal(a.distortion, b.distortion)
+    return same and (a.width, a.height) == (b.width, b.height)
+
+
+def _check_aspects(files: list[Path], sizes: list[tuple[int, int]], views: list[Camera]) -> None:
+    """Single photos of another aspect are refused later; where none fits, the intrinsics are another's."""
+    off = [
+        abs(w * v.height - h * v.width) > 0.02 * h * v.width for (w, h), v in zip(sizes, views, strict=True)
+    ]
+    if all(off):
+        (w, h), view = sizes[0], views[0]
+        raise InputError(
+            f"{files[0]}: the photo is {w}×{h}, its intrinsics are for {view.width}×{view.height}: "
+            "the aspects differ"
+        )
+
+
+def read_poses(path: Path) -> Poses:
+    """Name → (4, 4) camera_from_world: of views in any format, or of ACE's text (`g2ard.io.ace`).
+
+    Raises:
+        InputError: it cannot be read, or names a view twice.
+    """
+    if path.suffix.lower() == ".txt" and path.is_file():
+        from g2ard.io import ace
+
+        return ace.read(path)
+    cameras = read_view_set(path, unpictured=True).cameras
+    return dict(zip(cameras.names, cameras.viewmats, strict=True))
+
+
+def poses_for(path: Path, names: Sequence[str]) -> Poses:
+    """The poses of `read_poses` that belong to some photos, by the photos' names; see `matched`.
+
+    Raises:
+        InputError: as `read_poses`, or none of them belongs to any.
+    """
+    found = matched(read_poses(path), names)
+    if not found:
+        raise InputError(f"{path}: names none of the photos, of which the first is {names[0]}")
+    return found
+
+
+def matched(found: Mapping[str, Found], names: Sequence[str]) -> dict[str, Found]:
+    """What belongs to each of `names`: by the whole name, else by a stem that is unique on both sides.
+
+    >>> matched({"seq/a.png": 1, "b": 2}, ["a.jpg", "c.jpg"])
+    {'a.jpg': 1}
+    """
+    out = {name: found[name] for name in names if name in found}
+    stems = [PurePosixPath(name).stem for name in found]
+    ours = [PurePosixPath(name).stem for name in names]
+    by_stem = {
+        stem: value for stem, value in zip(stems, found.values(), strict=True) if stems.count(stem) == 1
+    }
+    for name, stem in zip(names, ours, strict=True):
+        if name not in out and stem in by_stem and ours.count(stem) == 1:
+            out[name] = by_stem[stem]
+    return out
+
+
+def pool_of(scene: Splats, pool: str, seed: int, progress: Progress = silent) -> Cameras:
+    """Poses to look for photos in: of a file of views, or as many as a number says, planned for the scene.
+
+    Raises:
+        InputError: neither, or a scene with no room for poses.
+    """
+    if not pool.strip().isdigit():
+        return read_view_set(Path(pool), unpictured=True).cameras
+    from g2ard.poses import plan_pool
+
+    return plan_pool(scene, int(pool), seed=seed, rows=_ROWS, progress=progress).cameras

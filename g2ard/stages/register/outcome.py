@@ -1,0 +1,86 @@
+"""What came of registration, photo by photo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from g2ard.cameras import Cameras
+from g2ard.reports import Report
+
+__all__ = ["PhotoReport", "PoseError", "RegisterReport", "Registered", "Status"]
+
+Status = Literal["registered", "uncertain", "refused"]
+
+
+@dataclass(frozen=True)
+class PoseError(Report):
+    """Distance of the camera's centre from the true one, scene units, and of the rotation, degrees."""
+
+    position: float
+    rotation: float
+
+
+@dataclass(frozen=True)
+class PhotoReport(Report):
+    """One photo.
+
+    Args:
+        name: of the photo.
+        status: "registered", "uncertain" or "refused".
+        reason: why it is no better than that; None where it is registered.
+        start: the name of the pose that was started from; None where there was none.
+        rank: of that pose in the pool, from 1; None where a pose was given.
+        zncc: median local ZNCC of render and photo at the result, in [−1, 1].
+        gain: photo's grey = gain·render + bias.
+        bias: see `gain`.
+        overlap: share of the pixels that are compared.
+        covariance: (6, 6) of (v, ω) in the camera's axes: scene units, radians.
+        sigma: root of the trace of the covariance of position, scene units, and of rotation, degrees.
+        renders: of the scene, for this photo.
+        seconds: for this photo.
+        camera_from_world: (4, 4) found; None where nothing was.
+        start_error: of the pose started from; None without a truth, or where there was no pose.
+        error: of the pose found; None likewise.
+    """
+
+    name: str
+    status: Status
+    reason: str | None = None
+    start: str | None = None
+    rank: int | None = None
+    zncc: float | None = None
+    gain: float | None = None
+    bias: float | None = None
+    overlap: float | None = None
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    sigma: PoseError | None = None
+    renders: int = 0
+    seconds: float = 0.0
+    camera_from_world: tuple[tuple[float, ...], ...] | None = None
+    start_error: PoseError | None = None
+    error: PoseError | None = None
+
+
+@dataclass(frozen=True)
+class RegisterReport(Report):
+    """All photos, in their order."""
+
+    photos: tuple[PhotoReport, ...]
+
+    def count(self, status: Status) -> int:
+        """Photos of a status."""
+        return sum(photo.status == status for photo in self.photos)
+
+
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """The outcome of `register`.
+
+    Args:
+        cameras: the photos that are kept, with the poses found.
+        report: about every photo, kept or not.
+    """
+
+    cameras: Cameras
+    report: RegisterReport

@@ -1,0 +1,92 @@
+"""Starts for photos without a pose: the poses of a pool whose small renders look most like the photo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.cameras import Camera, Cameras
+from g2ard.stages.register.config import RegisterConfig
+from g2ard.stages.register.grey import band_passed, grey_of, shift_between
+from g2ard.stages.register.pose import rotation_of
+from g2ard.stages.render import Renderer
+
+__all__ = ["PoolRenders", "Turned", "turned"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Turned:
+    """A pose turned so that its render lies on a photo, as far as moving the image tells.
+
+    Args:
+        viewmat: (4, 4) camera_from_world; the centre has stayed.
+        likeness: of the moved render and the photo, see `shift_between`.
+        pixels: by how many pixels it was moved.
+    """
+
+    viewmat: Float
+    likeness: float
+    pixels: float
+
+
+def small_render(renderer: Renderer, camera: Camera, config: RegisterConfig) -> Float:
+    """(H, W) band-passed grey, 0 where too little is opaque."""
+    out = renderer.render(camera)
+    grey = band_passed(grey_of(np.clip(out.image, 0, 1)))
+    return np.where(out.alpha >= config.min_alpha, grey, 0.0)
+
+
+def turned(viewmat: Float, render: Float, photo: Float, K: Float) -> Turned:
+    """Turn a pose by what moves its render onto the photo: ω = (−s_v/f_y, s_u/f_x, 0).
+
+    Args:
+        viewmat: (4, 4) of the render.
+        render: (H, W) of `small_render`.
+        photo: (H, W) band-passed grey.
+        K: (3, 3) of both.
+    """
+    right, down, likeness = shift_between(render, photo)
+    turn = np.eye(4)
+    turn[:3, :3] = rotation_of([-down / K[1, 1], right / K[0, 0], 0])
+    return Turned(turn @ viewmat, likeness, float(np.hypot(right, down)))
+
+
+class PoolRenders:
+    """Renders of a pool's poses through the lens of a photo, kept for photos of the same lens.
+
+    Args:
+        renderer: of the scene.
+        pool: C poses; their own K and size do not count.
+        config: `min_alpha` of `RegisterConfig`.
+    """
+
+    def __init__(self, renderer: Renderer, pool: Cameras, config: RegisterConfig) -> None:
+        self._renderer, self.pool, self._config = renderer, pool, config
+        self._kept: dict[bytes, list[Float]] = {}
+
+    def ranked(self, camera: Camera, grey: Float) -> tuple[list[tuple[int, Turned]], int]:
+        """Poses from the likest on, each turned onto the photo; and how many renders that took.
+
+        Args:
+            camera: the photo's, at `pool_size`.
+            grey: (H, W) of the photo at that size.
+
+        Ties go by index.
+        """
+        key = camera.K.tobytes() + bytes(str((camera.width, camera.height)), "ascii")
+        renders = 0
+        if key not in self._kept:
+            views = [replace(camera, viewmat=view) for view in self.pool.viewmats]
+            self._kept[key] = [small_render(self._renderer, view, self._config) for view in views]
+            renders = len(self.pool)
+        photo = band_passed(grey)
+        found = [
+            turned(view, render, photo, camera.K)
+            for view, render in zip(self.pool.viewmats, self._kept[key], strict=True)
+        ]
+        order = np.argsort([-each.likeness for each in found], kind="stable").tolist()
+        return [(at, found[at]) for at in order], renders

@@ -1,0 +1,70 @@
+"""Rigid motions: their exponential, and how far two poses are from each other."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["moved", "pose_error", "rotation_of"]
+
+Float = NDArray[np.float64]
+
+
+def rotation_of(omega: ArrayLike) -> Float:
+    """(3, 3) rotation by |ω| radians about ω (Rodrigues): I + sin θ/θ [ω]ₓ + (1 − cos θ)/θ² [ω]ₓ².
+
+    >>> np.round(rotation_of([0, 0, np.pi / 2]) @ [1, 0, 0], 12).tolist()
+    [0.0, 1.0, 0.0]
+    """
+    cross, sine, cosine = _parts(omega)
+    return np.eye(3) + sine * cross + cosine * (cross @ cross)
+
+
+def moved(viewmat: Float, xi: ArrayLike) -> Float:
+    """exp(ξ)·T of a (4, 4) camera_from_world T and ξ = (v, ω), (6,), in the camera's axes.
+
+    The translation of exp(ξ) is V·v with V = I + (1 − cos θ)/θ² [ω]ₓ + (θ − sin θ)/θ³ [ω]ₓ². The rotation is
+    made orthogonal again, so that many small motions do not add up their rounding.
+    """
+    v, omega = np.asarray(xi, np.float64)[:3], np.asarray(xi, np.float64)[3:]
+    cross, sine, cosine = _parts(omega)
+    angle2 = float(omega @ omega)
+    third = (1 - sine) / angle2 if angle2 > 1e-8 else 1 / 6
+    square = cross @ cross
+    turn = np.eye(3) + sine * cross + cosine * square
+    out = np.eye(4)
+    U, _, Vt = np.linalg.svd(turn @ viewmat[:3, :3])
+    out[:3, :3] = U @ Vt
+    out[:3, 3] = turn @ viewmat[:3, 3] + (np.eye(3) + cosine * cross + third * square) @ v
+    return out
+
+
+def pose_error(found: Float, true: Float) -> tuple[float, float]:
+    """Distance of the camera centres, scene units, and angle between the rotations, degrees.
+
+    The angle is atan2(|axis|, trace − 1): the arc cosine of the trace alone loses small angles to rounding.
+
+    Args:
+        found: (4, 4) camera_from_world.
+        true: the same of the same photo.
+
+    >>> T = np.eye(4)
+    >>> [round(e, 9) for e in pose_error(moved(T, [0, 0.3, 0, 0, 0, 0]), T)]
+    [0.3, 0.0]
+    """
+    centres = [-T[:3, :3].T @ T[:3, 3] for T in (found, true)]
+    R = found[:3, :3] @ true[:3, :3].T
+    axis = [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]
+    angle = np.degrees(np.arctan2(np.linalg.norm(axis), np.trace(R) - 1))
+    return float(np.linalg.norm(centres[0] - centres[1])), float(angle)
+
+
+def _parts(omega: ArrayLike) -> tuple[Float, float, float]:
+    """[ω]ₓ, sin θ/θ and (1 − cos θ)/θ², by their series where θ is small."""
+    x, y, z = np.asarray(omega, np.float64)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle2 = x * x + y * y + z * z
+    if angle2 < 1e-8:
+        return cross, 1 - angle2 / 6, 0.5 - angle2 / 24
+    angle = np.sqrt(angle2)
+    return cross, float(np.sin(angle) / angle), float((1 - np.cos(angle)) / angle2)
