@@ -151,7 +151,7 @@ def test_steps_by_need_are_for_teachers() -> None:
     assert horizon(teacher, config) > 1.5 * TUNED.steps
     assert horizon(TeacherRenders(PRIOR, around(12), lazy=True), config) < 1.2 * TUNED.steps
     assert horizon(teacher, replace(config, steps=7)) == 7
-    assert horizon(teacher, replace(config, schedule=PAPER)) is None
+    assert horizon(teacher, replace(config, schedule=PAPER)) == PAPER.steps
 
 
 def cloud_with_photos(folder: Path) -> None:

@@ -132,8 +132,12 @@ def _zstd_streams(path: Path, data: bytes, stream_count: int, sizes: list[int]) 
     return streams
 
 
-def _zstd(path: Path) -> Callable[[bytes, int], bytes]:
-    """What unpacks a frame of a size: no more than one byte past it."""
+def zstandard(path: Path) -> Any:
+    """The module that packs and unpacks Zstandard frames.
+
+    Raises:
+        MissingDependencyError: there is none.
+    """
     try:
         if sys.version_info >= (3, 14):
             from compression import zstd
@@ -144,7 +148,8 @@ def _zstd(path: Path) -> Callable[[bytes, int], bytes]:
     return zstd
 
 
-def _zstd(path: Path) -> Callable[[bytes], bytes]:
+def _zstd(path: Path) -> Callable[[bytes, int], bytes]:
+    """What unpacks a frame of a size: no more than one byte past it."""
     zstd = zstandard(path)
 
     def decompress(frame: bytes, size: int) -> bytes:
