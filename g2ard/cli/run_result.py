@@ -102,7 +102,11 @@ def say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:
 def say_weight(run: Run, source: Path, output: Path, splats: Splats) -> None:
     """A result that outweighs the file it was made from: what of it is colour by direction, and how to be rid
     of it."""
-    if not source.is_file() or output.stat().st_size < source.stat().st_size:
+    if (
+        source.suffix.lower() == ".json"
+        or not source.is_file()
+        or output.stat().st_size < source.stat().st_size
+    ):
         return
     made, given = (path.stat().st_size / 1e6 for path in (output, source))
     sizes = f"{output}: {made:.2f} MB, {source.name} has {given:.2f} MB"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -165,8 +165,7 @@ def distill(
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
     early = [folder / name for folder in outputs.paths()]
     if early and all(_is_done(run, place, resume) for place in early):
-        for place in early:
-            _tell_resumed(run, place, resume)
+        _tell_finished(run, early)
         return
     job = prepare(
         scene,
@@ -205,14 +204,14 @@ def distill(
         ]
         run.result({"runs": estimates})
         return
-    for place in places:
-        _tell_resumed(run, place, resume)
     todo = [pair for pair in zip(job.aims, places, strict=True) if not _is_done(run, pair[1], resume)]
     if not todo:
+        _tell_finished(run, places)
         return
     job.render_targets()
     reports = []
     for aim, place in todo:
+        _tell_anew(run, place.parent, resume)
         result, report = _distil(
             run, scene or Path(str(views)), job, aim.count, place, resume, keep, crop or [], began
         )
@@ -256,11 +255,39 @@ def _is_done(run: Run, place: Path, resume: bool) -> bool:
     return resume and not run.overwrite and _finished(place)
 
 
-def _tell_resumed(run: Run, place: Path, resume: bool) -> None:
-    folder = place.parent
-    if _is_done(run, place, resume):
-        run.say(f"{folder}: finished already, nothing is left to resume (-w without --resume starts anew)")
-    elif resume and not left_at(folder / _WORK):
+_OF_THE_CALL = ("output", "resume", "keep", "crop", "dry_run", "threads")
+"""Options that another call may have other values of, and yet go on with a run."""
+
+
+def _tell_finished(run: Run, places: Sequence[Path]) -> None:
+    """Say that there is nothing left to do, and give the reports that are there.
+
+    Raises:
+        OutputError: what is there was made with other options.
+    """
+    import json
+
+    from g2ard.errors import OutputError
+
+    reports = []
+    for place in places:
+        report = json.loads((place.parent / "report.json").read_text())
+        asked = json.loads(json.dumps(run.config, default=str))
+        before = report["config"]
+        shared = [key for key in asked if key in before and key not in _OF_THE_CALL]
+        if other := [key.replace("_", "-") for key in shared if asked[key] != before[key]]:
+            raise OutputError(
+                f"{place.parent}: finished with another {', '.join(other)}; -w without --resume starts anew"
+            )
+        run.say(
+            f"{place.parent}: finished already, nothing is left to resume (-w without --resume starts anew)"
+        )
+        reports.append(report)
+    run.result(reports[0] if len(reports) == 1 else {"runs": reports})
+
+
+def _tell_anew(run: Run, folder: Path, resume: bool) -> None:
+    if resume and not left_at(folder / _WORK):
         run.say(f"{folder}: nothing to go on from: starts anew")
 
 

@@ -54,6 +54,7 @@ def evaluate(
     3DGS's own evaluation is --convention inria --8bit --lpips-input unscaled.
     """
     from g2ard.errors import InputError
+    from g2ard.io.clean import plural
     from g2ard.lpips import load_lpips
     from g2ard.policy.inputs import load_scene, load_views, make_targets
     from g2ard.stages.evaluate import evaluate as score
@@ -93,7 +94,7 @@ def evaluate(
             row["drift95"] = drift95(Anchors.of(frozen), splats.means)
         rows.append(row)
     against = _against(rows[0]["views"])
-    said = f"{len(cameras)} views, against {_named(against)}; {_protocol(convention, eight_bit)}"
+    said = f"{plural(len(cameras), 'view')}, against {_named(against)}; {_protocol(convention, eight_bit)}"
     _table(run, said, rows)
     protocol = {"convention": convention, "8bit": eight_bit, "lpips_input": lpips_input if lpips else None}
     single = {"photo": "photos", "teacher": "teacher"}

@@ -56,6 +56,7 @@ def poses(
 ) -> None:
     """Make a pool of candidate views for a scene without photos: poses in free space that see it well."""
     from g2ard.io import check_views_output, write_views
+    from g2ard.io.clean import plural
     from g2ard.policy.inputs import load_scene
     from g2ard.poses import plan_pool
     from g2ard.splits import splits_of
@@ -75,7 +76,7 @@ def poses(
     splits = splits_of(None, pool.cameras.names)
     write_views(output, pool.cameras, splits=splits, overwrite=run.overwrite)
     direction = ", ".join(f"{v:.2f}" for v in pool.up)
-    run.say(f"{output}: {count} poses, {pool.kind} ({pool.why}; up is {direction})")
+    run.say(f"{output}: {plural(count, 'pose')}, {pool.kind} ({pool.why}; up is {direction})")
     run.say(f"no pose sees {pool.unseen:.0%} of the scene's matter; {pool.coarse:.0%} only under a pixel")
     run.result(
         {

@@ -169,7 +169,7 @@ def _tell(run: Run, scene: Path, small: Simplified, output: Path, total: int, se
     if run.verbose:
         _table(run, small)
     share = (small.report.unseen or 0) / total
-    if share >= 0.005:
+    if share >= 0.02:
         run.say(f"no view sees {share:.0%} of the Gaussians: they count by their own size alone")
     say_weight(run, scene, output, small.splats)
     run.say(f"{output}: {len(small.splats):,} of {total:,} Gaussians in {seconds:.1f} s")
