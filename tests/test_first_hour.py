@@ -256,6 +256,21 @@ def test_a_config_file_is_never_ignored(
     assert (status, words in error, error.count("\n")) == (2, True, 1), error
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("ratio = 5\nstepz = 7\n[recover]\nsteps = 9", "no command it is for has an option stepz"),
+        ("ratio = 5\n[distill]\nnonsense = 1", "no option of `distill` is called nonsense"),
+    ],
+)
+def test_other_commands_tables_are_checked_too(
+    text: str, words: str, command_line: CommandLine, folder: Path
+) -> None:
+    (folder / "c.toml").write_text(text)
+    status, _, error = command_line("simplify", "ball.ply", "-o", "s.ply", "--config", "c.toml", cwd=folder)
+    assert (status, words in error, error.count("\n")) == (2, True, 1), error
+
+
 def test_tables_and_what_stands_above_them(command_line: CommandLine, folder: Path) -> None:
     (folder / "c.toml").write_text("seed = 5\nsize = 64\n[simplify]\nratio = [10]\n[render]\nsplit = 'test'")
     status, out, error = command_line(

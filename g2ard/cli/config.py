@@ -65,11 +65,44 @@ def _of_command(ctx: typer.Context, path: Path, values: dict[str, Any]) -> dict[
     own = values.get(name, {})
     if not isinstance(own, dict):
         raise typer.BadParameter(f"{path}: {name}: a table of options")
-    known = {flag.lstrip("-") for p in ctx.command.params for flag in (*p.opts, str(p.name))}
+    known = _options(ctx.command)
     if own or len(top) < len(values):  # a file for several commands: what is not for this one is for others
-        top = {key: value for key, value in top.items() if key in known or key.replace("_", "-") in known}
+        of_others = _check_others(path, {key: values[key] for key in values if key not in {*top, name}})
+        strange = [key for key in top if _dashed(key) not in known | of_others and key != "set"]
+        if strange:
+            raise typer.BadParameter(f"{path}: no command it is for has an option {', '.join(strange)}")
+        top = {key: value for key, value in top.items() if _dashed(key) in known or key == "set"}
     constants = {**_flat(top.pop("set", {})), **_flat(own.get("set", {}))}
     return {**top, **own} | ({"set": constants} if constants else {})
+
+
+def _check_others(path: Path, tables: dict[str, Any]) -> set[str]:
+    """The options of the other commands that a file has tables of; a table's keys are among its command's."""
+    from g2ard.cli.commands import register
+    from g2ard.cli.frame import app
+
+    for name in tables:
+        register(name)
+    commands: dict[str, Any] = getattr(typer.main.get_command(app), "commands", {})
+    found: set[str] = set()
+    for name, table in tables.items():
+        command = commands.get(name)
+        if command is None or not isinstance(table, dict) or hasattr(command, "commands"):
+            continue  # a group's tables are of tables
+        options = _options(command)
+        if strange := [key for key in table if key != "set" and _dashed(key) not in options]:
+            raise typer.BadParameter(f"{path}: no option of `{name}` is called {', '.join(strange)}")
+        found |= options
+    return found
+
+
+def _options(command: Any) -> set[str]:
+    """Names of a command's options, with dashes."""
+    return {_dashed(flag.lstrip("-")) for p in command.params for flag in (*p.opts, str(p.name))}
+
+
+def _dashed(key: str) -> str:
+    return key.replace("_", "-")
 
 
 def _flat(table: Any, prefix: str = "") -> dict[str, Any]:
