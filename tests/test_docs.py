@@ -52,10 +52,9 @@ def command_options() -> dict[str, set[str]]:
     """Each command, as "bench raster", and the options that it takes."""
     from typer.main import get_command
 
-    from g2ard.cli.commands import register
     from g2ard.cli.frame import app
 
-    register()
+    register_commands()
     found: dict[str, set[str]] = {}
 
     def walk(command: Any, path: str) -> None:

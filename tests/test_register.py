@@ -113,7 +113,7 @@ def test_a_broken_photo_is_one_refused_row(site: Path, tmp_path: Path) -> None:
     assert good.error is not None
     assert good.error.position < 0.002 < (good.start_error or good.error).position
     assert bad.status == "refused"
-    assert "not a whole image" in (bad.reason or "")
+    assert "not an image" in (bad.reason or "")
     assert found.cameras.names == (views.names[0],)
     assert pose_error(found.cameras.viewmats[0], views.viewmats[0])[1] < 0.1
 

@@ -56,11 +56,11 @@ def folder(tmp_path: Path) -> Path:
 @pytest.fixture
 def g2ard(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Program:
     """The program in this process and in the folder, so that stages can be watched."""
-    from g2ard.cli.commands import register
+    from g2ard.cli.commands import register_commands
     from g2ard.cli.frame import app
 
     monkeypatch.chdir(folder)
-    register(None)
+    register_commands(None)
 
     def run(*arguments: object) -> None:
         app([str(a) for a in (*arguments, "-q")], prog_name="g2ard", standalone_mode=False)

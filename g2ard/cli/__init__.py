@@ -8,7 +8,7 @@ import sys
 
 import typer
 
-from g2ard.cli.commands import register
+from g2ard.cli.commands import register_commands
 from g2ard.cli.frame import app
 from g2ard.cli.pipes import outlive_readers
 from g2ard.cli.usage import usage_line
@@ -22,7 +22,7 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     outlive_readers()
     gc.set_threshold(50_000)  # importing makes many objects and no garbage: looking for it took a twentieth
-    register(next(iter(sys.argv[1:]), None))  # the others would only take time
+    register_commands(next(iter(sys.argv[1:]), None))  # the others would only take time
     try:
         status = app(prog_name="g2ard", standalone_mode=False)
     except typer.Abort:

@@ -78,11 +78,11 @@ def _of_command(ctx: typer.Context, path: Path, values: dict[str, Any]) -> dict[
 
 def _check_others(path: Path, tables: dict[str, Any]) -> set[str]:
     """The options of the other commands that a file has tables of; a table's keys are among its command's."""
-    from g2ard.cli.commands import register
+    from g2ard.cli.commands import register_commands
     from g2ard.cli.frame import app
 
     for name in tables:
-        register(name)
+        register_commands(name)
     commands: dict[str, Any] = getattr(typer.main.get_command(app), "commands", {})
     found: set[str] = set()
     for name, table in tables.items():

@@ -2,7 +2,7 @@
 
 from importlib import import_module
 
-__all__ = ["COMMANDS", "register"]
+__all__ = ["COMMANDS", "register_commands"]
 
 COMMANDS = (
     "distill",
@@ -23,7 +23,7 @@ COMMANDS = (
 )
 
 
-def register(asked: str | None = None) -> None:
+def register_commands(asked: str | None = None) -> None:
     """Put the command `asked` on the app; all of them if it is none."""
     for name in (asked,) if asked in COMMANDS else COMMANDS:
         import_module(f"{__name__}.{name}")
