@@ -52,6 +52,7 @@ def command_options() -> dict[str, set[str]]:
     """Each command, as "bench raster", and the options that it takes."""
     from typer.main import get_command
 
+    from g2ard.cli.commands import register_commands
     from g2ard.cli.frame import app
 
     register_commands()
