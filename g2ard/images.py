@@ -55,7 +55,7 @@ def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
     """
     path, name = cameras.image_paths[index], cameras.names[index]
     if path is None:
-        raise InputError(f"view {index} ({name}) has no photo, and no scene is there to render it from")
+        raise InputError(f"view {index} ({name}) has no photo: its views name no image for it")
     listed_in = "" if cameras.source is None else f"{cameras.source}: view {name!r}: "
     image = _open(f"{listed_in}{path}", path)
     height, width = image.shape[:2]
