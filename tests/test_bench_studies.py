@@ -209,6 +209,26 @@ def test_adaptation_takes_all_views_in_the_papers_schedule(tmp_path: Path) -> No
     assert json.loads(report.read_text())["steps"] == 7
 
 
+def test_the_last_training_views_may_be_the_new_trajectory(tmp_path: Path) -> None:
+    text = HEAD.replace("12", "4") + 'adapt_steps = 3\nmethods = ["random"]\n'
+    _, (row,), out = run(tmp_path, text + SCENE + "adapt_last = 5\n")
+    (adapt,), (train,) = out.glob("work/*/adapt.json"), out.glob("work/*/train.json")
+    adapted, trained = io.read_views(adapt).names, io.read_views(train).names
+    assert len(adapted) == 5
+    assert min(adapted) > max(trained)
+    assert len(adapted) + len(trained) + row.views == len(io.read_views(tmp_path / "views.json"))
+    none_left = study(tmp_path / "more", text + SCENE + "adapt_last = 14\n")
+    (failed,) = bench_run([read_definition(none_left)], tmp_path / "none")
+    assert "adapt_last: 14 of 14 views leave none to train on" in failed.error
+    for line, message in (
+        ("adapt_last = -1", "expected a number"),
+        ('adapt_last = 2\nadapt = "a"', "without `adapt`"),
+    ):
+        none_left.write_text(text + SCENE + line)
+        with pytest.raises(InputError, match=f"adapt_last.*{message}"):
+            read_definition(none_left)
+
+
 def test_a_study_may_score_by_inrias_conventions_in_8_bit(tmp_path: Path) -> None:
     text = HEAD.replace("12", "4") + 'methods = ["random"]\n' + SCENE
     _, (plain,), _ = run(tmp_path, text)

@@ -33,6 +33,8 @@ class SceneSpec:
             or of the pool.
         adapt: views of new appearance, for studies that adapt; every third is scored if they state no split,
             unless the study adapts on all.
+        adapt_last: for a scene without `adapt`: so many training views, the last by name, are a trajectory of
+            their own, adapted on and not trained on.
         targets: "teacher", the prior's renders, "photos", or "either": of each view its photo where it has
             one, else the prior's render.
         background: behind the scene.
@@ -46,6 +48,7 @@ class SceneSpec:
     train: str | None = None
     score: Mapping[str, str] = field(default_factory=dict)
     adapt: str | None = None
+    adapt_last: int = 0
     targets: str = "teacher"
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     indoor: bool = False
@@ -249,6 +252,12 @@ def _scene(values: dict[str, Any]) -> SceneSpec:
     made = SceneSpec(**_checked(SceneSpec, values, set()))
     if made.targets not in _TARGETS:
         raise InputError(f"scene {made.name}: targets: {', '.join(_TARGETS)}, not {made.targets!r}")
+    if not isinstance(made.adapt_last, int) or made.adapt_last < 0:
+        raise InputError(
+            f"scene {made.name}: adapt_last: expected a number of views, got {made.adapt_last!r}"
+        )
+    if made.adapt_last and (made.adapt is not None or made.train is None):
+        raise InputError(f"scene {made.name}: adapt_last is for a scene with `train` and without `adapt`")
     return made
 
 

@@ -162,6 +162,7 @@ class Workspace:
                 whole = self.place / self.scene.train
                 apart = bool(self.scene.score)
                 cameras = self._apart(whole, for_training) if apart else self._views(whole, "train")
+                cameras = cameras.take(~self._last(cameras))
             cameras = self._not_scored(cameras, "train")
             io.write_views(path, cameras, splits=["train"] * len(cameras))
         return path
@@ -185,11 +186,28 @@ class Workspace:
         path.write_text(json.dumps({**counts, what: int(np.count_nonzero(~keep))}))
         return cameras.take(keep)
 
+    def _last(self, cameras: Cameras) -> NDArray[np.bool_]:
+        """Those of the scene's `adapt_last`: the last by name."""
+        last, given = self.scene.adapt_last, len(cameras)
+        if last >= given:
+            raise InputError(
+                f"scene {self.scene.name}: adapt_last: {last} of {given} views leave none to train on"
+            )
+        rank = np.argsort(np.argsort(cameras.names, kind="stable"), kind="stable")
+        return rank >= given - last
+
     def adaptation(self, split: str) -> Cameras | None:
         """Views of new appearance: "train" to adapt on and "test", as they state; where they state no split
         every third, by name, is "test", for they are few, or None where the study adapts on all."""
+        if self.scene.adapt_last and self.scene.train is not None:
+            if split == "test":
+                return None
+            cameras = self._views(self.place / self.scene.train, "train")
+            return cameras.take(self._last(cameras))
         if self.scene.adapt is None:
-            raise InputError(f"scene {self.scene.name}: the study adapts, and it has no `adapt` views")
+            raise InputError(
+                f"scene {self.scene.name}: the study adapts, and it has no `adapt` views and no `adapt_last`"
+            )
         path = self.place / self.scene.adapt
         found = self._read(path)
         if states_splits(path, found.splits):
