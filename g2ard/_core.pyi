@@ -186,6 +186,8 @@ def select_visible(
     scene: _Gaussians,
     surface: _Surface,
     views: list[tuple[Any, ...]],
+    *,
+    tolerance: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[NDArray[np.uint64], NDArray[np.uint32]]: ...
 def select_greedy(

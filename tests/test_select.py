@@ -99,11 +99,12 @@ def smooth_depth(scene, cameras, i):
     return depth, smooth
 
 
-def test_visibility_is_the_oracles():
+@pytest.mark.parametrize("tolerance", [0.01, 0.2])
+def test_visibility_is_the_oracles(tolerance: float) -> None:
     """99.5 % of the pairs of a cell and a view agree where the depth is smooth around the cell."""
     scene, cameras = ball(2500), around(3)
     cells = surface(scene, 1200)
-    seen = visible_cells(scene, cells, cameras)
+    seen = visible_cells(scene, cells, cameras, depth_tolerance=tolerance)
     agree = kept = total = 0
     for i in range(len(cameras)):
         depth, smooth = smooth_depth(scene, cameras, i)
@@ -113,12 +114,20 @@ def test_visibility_is_the_oracles():
         inside = (u >= 0) & (u < SIZE[0]) & (v >= 0) & (v < SIZE[1])
         row, column = np.floor(v[inside]).astype(int), np.floor(u[inside]).astype(int)
         there, z = depth[row, column], camera[inside, 2]
-        want = (there > 0) & (np.abs(z - there) <= np.maximum(cells.size, 0.01 * z))
+        want = (there > 0) & (np.abs(z - there) <= np.maximum(cells.size, tolerance * z))
         use = smooth[row, column]
         got = np.isin(np.flatnonzero(inside), seen.of(i))
         agree, kept, total = agree + int((want == got)[use].sum()), kept + int(use.sum()), total + len(use)
     assert kept > 0.2 * total
     assert agree / kept >= 0.995
+
+
+def test_a_wider_tolerance_sees_more():
+    scene, cameras = ball(2500), around(3)
+    cells = surface(scene, 1200)
+    counts = [len(visible_cells(scene, cells, cameras, depth_tolerance=t).cells) for t in (0, 0.01, 0.2, 1)]
+    assert counts == sorted(counts)
+    assert counts[-1] > 1.1 * counts[1]
 
 
 @pytest.mark.parametrize(

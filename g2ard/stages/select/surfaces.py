@@ -42,6 +42,8 @@ class CoverageOptions:
         offset: g(x) = u(offset + x); the paper's λ.
         anchors: directions on the sphere, at most 64, that targets and observations are laid out on.
         epsilon: ε of the coverage ratio C_jk / (P_jk + ε).
+        depth_tolerance: a cell is seen within this share of its depth of the depth in its pixel, or within
+            a cell's size if that is more.
         lazy: look again only at the view that leads (CELF): the same views, fewer evaluations.
 
     Raises:
@@ -54,6 +56,7 @@ class CoverageOptions:
     offset: float = 1.0
     anchors: int = 32
     epsilon: float = 1e-9
+    depth_tolerance: float = 0.01
     lazy: bool = True
 
     def __post_init__(self) -> None:
@@ -61,6 +64,9 @@ class CoverageOptions:
         for name in ("kappa", "offset", "epsilon"):
             value = getattr(self, name)
             require(name, value, 0 < value < float("inf"), "more than 0")
+        require(
+            "depth_tolerance", self.depth_tolerance, 0 <= self.depth_tolerance < float("inf"), "at least 0"
+        )
         require("anchors", self.anchors, 1 <= self.anchors <= 64, "1 to 64")
         require("alpha", self.alpha, 0 <= self.alpha < float("inf"), "at least 0")
 
@@ -118,17 +124,23 @@ def surface(splats: Splats, cells: int = 300_000) -> Surface:
 
 
 def visible_cells(
-    splats: Splats, cells: Surface, cameras: Cameras, *, progress: Progress = silent
+    splats: Splats,
+    cells: Surface,
+    cameras: Cameras,
+    *,
+    depth_tolerance: float = CoverageOptions.depth_tolerance,
+    progress: Progress = silent,
 ) -> Visible:
     """Rasterise the prior's median depth into every view and compare: ν_jv.
 
-    A cell is visible where its centre falls on the image within max(cell size, 1 % of depth) of the median
-    depth (by gsplat's conventions) in that pixel. Pixels without a cell are not worked out.
+    A cell is visible where its centre falls on the image within max(cell size, depth_tolerance · depth) of
+    the median depth (by gsplat's conventions) in that pixel. Pixels without a cell are not worked out.
 
     Args:
         splats: the prior that `cells` came from.
         cells: see `surface`.
         cameras: C views in world coordinates.
+        depth_tolerance: see `CoverageOptions`.
         progress: told of the views done.
 
     Returns:
@@ -136,7 +148,11 @@ def visible_cells(
     """
     scene, origin = core_scene(splats)
     starts, seen = _core.select_visible(
-        scene, cells.parts, core_views(cameras, origin, scene), progress=counter(progress, "visibility")
+        scene,
+        cells.parts,
+        core_views(cameras, origin, scene),
+        tolerance=depth_tolerance,
+        progress=counter(progress, "visibility"),
     )
     return Visible(starts, seen)
 
@@ -180,7 +196,7 @@ def greedy(
     cells = surface(splats, options.cells)
     seconds["surface"] = time.perf_counter() - began
     began = time.perf_counter()
-    seen = visible_cells(splats, cells, cameras, progress=progress)
+    seen = visible_cells(splats, cells, cameras, depth_tolerance=options.depth_tolerance, progress=progress)
     seconds["visibility"] = time.perf_counter() - began
     usable = np.diff(seen.starts.astype(np.int64)) > 0
     began = time.perf_counter()

@@ -231,7 +231,8 @@ mod select {
 
     fn seen_cells(scene: &Scene, surface: &Surface, views: &[Camera]) -> Vec<Vec<u32>> {
         let occluders = Occluders::of(&scene.gaussians());
-        visible_cells(&occluders, surface, views, &Control::default()).expect("never cancelled")
+        visible_cells(&occluders, surface, 0.01, views, &Control::default())
+            .expect("never cancelled")
     }
 
     #[divan::bench(args = COUNTS)]

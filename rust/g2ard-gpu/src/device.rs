@@ -192,13 +192,14 @@ impl ViewKernels for Device {
         &self,
         scene: &Gaussians<'_>,
         surface: &Surface,
+        tolerance: f32,
         cameras: &[Camera],
         control: &Control,
     ) -> Result<Vec<Vec<u32>>> {
         self.either(
             scene.means.len(),
-            |gpu| visibility::visible_cells(gpu, scene, surface, cameras, control),
-            || Cpu.visible_cells(scene, surface, cameras, control),
+            |gpu| visibility::visible_cells(gpu, scene, surface, tolerance, cameras, control),
+            || Cpu.visible_cells(scene, surface, tolerance, cameras, control),
         )
     }
 }

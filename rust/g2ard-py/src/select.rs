@@ -120,19 +120,20 @@ type Lists<'py> = (Bound<'py, PyArray1<u64>>, Bound<'py, PyArray1<u32>>);
 
 /// (starts (C + 1,), cells): view v sees cells[starts[v]..starts[v + 1]].
 #[pyfunction]
-#[pyo3(signature = (scene, surface, views, progress=None))]
+#[pyo3(signature = (scene, surface, views, *, tolerance, progress=None))]
 fn select_visible<'py>(
     py: Python<'py>,
     scene: Scene<'py>,
     surface: Surfaces<'py>,
     views: Vec<View>,
+    tolerance: f32,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Lists<'py>> {
     let (scene, surface) = (scene.borrow()?, surface_of(&surface)?);
     let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
     let kernels = kernels();
     let seen = long(py, progress, |control| {
-        backend(&kernels).visible_cells(&scene, &surface, &cameras, control)
+        backend(&kernels).visible_cells(&scene, &surface, tolerance, &cameras, control)
     })?;
     let mut starts = vec![0u64];
     for cells in &seen {

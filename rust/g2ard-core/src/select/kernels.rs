@@ -23,6 +23,7 @@ pub trait ViewKernels: Sync {
         &self,
         scene: &Gaussians<'_>,
         surface: &Surface,
+        tolerance: f32,
         cameras: &[Camera],
         control: &Control,
     ) -> Result<Vec<Vec<u32>>>;
@@ -46,9 +47,10 @@ impl ViewKernels for Cpu {
         &self,
         scene: &Gaussians<'_>,
         surface: &Surface,
+        tolerance: f32,
         cameras: &[Camera],
         control: &Control,
     ) -> Result<Vec<Vec<u32>>> {
-        visible_cells(&Occluders::of(scene), surface, cameras, control)
+        visible_cells(&Occluders::of(scene), surface, tolerance, cameras, control)
     }
 }

@@ -42,10 +42,11 @@ pub fn statistics_of(image: &[f32]) -> [f32; 2] {
 }
 
 /// For each camera the cells it sees, ascending: the cell's centre falls on the image and lies within
-/// max(cell size, 1 % of its depth) of the median depth in that pixel.
+/// max(cell size, `tolerance` · its depth) of the median depth in that pixel.
 pub fn visible_cells(
     scene: &Occluders,
     surface: &Surface,
+    tolerance: f32,
     cameras: &[Camera],
     control: &Control,
 ) -> Result<Vec<Vec<u32>>> {
@@ -72,7 +73,7 @@ pub fn visible_cells(
             control.advance(1);
             let near = |&(_, pixel, z): &(u32, u32, f32)| {
                 let median = scratch.depth[pixel as usize];
-                median > 0.0 && (z - median).abs() <= (surface.size as f32).max(0.01 * z)
+                median > 0.0 && (z - median).abs() <= (surface.size as f32).max(tolerance * z)
             };
             Ok(cells.iter().filter(|c| near(c)).map(|c| c.0).collect())
         })

@@ -26,10 +26,11 @@ pub struct Cells {
     count: usize,
     pieces: Vec<Buffer>,
     size: f32,
+    tolerance: f32,
 }
 
 impl Cells {
-    pub fn upload(gpu: &Gpu, surface: &Surface) -> Result<Self> {
+    pub fn upload(gpu: &Gpu, surface: &Surface, tolerance: f32) -> Result<Self> {
         let centers: Vec<[f32; 3]> = surface
             .centers
             .iter()
@@ -42,6 +43,7 @@ impl Cells {
                 .map(|piece| gpu.upload("cells", piece))
                 .collect::<Result<_>>()?,
             size: surface.size as f32,
+            tolerance,
         })
     }
 
@@ -75,6 +77,7 @@ impl Cells {
             let count = piece.words() / CENTER;
             let constants = Constants {
                 cell: self.size,
+                tolerance: self.tolerance,
                 ..Constants::new(view, count)
             };
             let bits = gpu.buffer("seen", count.div_ceil(32))?;

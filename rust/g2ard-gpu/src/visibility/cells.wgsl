@@ -28,7 +28,7 @@ fn seen(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) g
         let pixel = pixel_of(t);
         if pixel == NOWHERE { continue; }
         let median = depth[pixel];
-        let near = median > 0.0 && abs(t.z - median) <= max(view.cell, 0.01 * t.z);
+        let near = median > 0.0 && abs(t.z - median) <= max(view.cell, view.tolerance * t.z);
         found |= u32(near) << bit;
     }
     bits[word] = found;

@@ -48,11 +48,12 @@ pub fn visible_cells(
     gpu: &Gpu,
     scene: &Gaussians<'_>,
     surface: &Surface,
+    tolerance: f32,
     cameras: &[Camera],
     control: &Control,
 ) -> Result<Vec<Vec<u32>>> {
     let scene = Scene::upload(gpu, scene)?;
-    let cells = Cells::upload(gpu, surface)?;
+    let cells = Cells::upload(gpu, surface, tolerance)?;
     each(&scene, cameras, Some(&cells), control, |bits| {
         cells.set(bits)
     })

@@ -12,6 +12,7 @@ struct View {
     start: u32, // range of depths, as bits: start … end − 1
     end: u32,
     cell: f32, // edge of a cell
+    tolerance: f32, // share of its depth that a cell may lie off the depths
 }
 
 @group(0) @binding(0) var<uniform> view: View;

@@ -55,9 +55,9 @@ fn compare(gpu: &Gpu, what: &str) {
         let surface = Surface::of(&scene, 2000, &Cpu).unwrap();
         let cameras = cameras(center, radius);
         let want = Cpu
-            .visible_cells(&scene, &surface, &cameras, &control)
+            .visible_cells(&scene, &surface, 0.02, &cameras, &control)
             .unwrap();
-        let got = visible_cells(gpu, &scene, &surface, &cameras, &control);
+        let got = visible_cells(gpu, &scene, &surface, 0.02, &cameras, &control);
         if name == "identical" && matches!(got, Err(Error::TooMany { .. })) {
             continue; // no slab is thin enough: the CPU's
         }

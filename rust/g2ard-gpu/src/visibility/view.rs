@@ -36,6 +36,8 @@ pub struct Constants<'a> {
     pub range: Range<u32>,
     /// Edge of a cell.
     pub cell: f32,
+    /// Share of its depth that a cell may lie off the depths.
+    pub tolerance: f32,
 }
 
 impl<'a> Constants<'a> {
@@ -46,12 +48,13 @@ impl<'a> Constants<'a> {
             first: 0,
             range: 0..FAR,
             cell: 0.0,
+            tolerance: 0.0,
         }
     }
 
     pub fn words(&self) -> Vec<u32> {
         let v = self.view;
-        let mut numbers = Vec::with_capacity(28);
+        let mut numbers = Vec::with_capacity(32);
         for (row, shift) in v.rotation.iter().zip(v.translation) {
             numbers.extend(row);
             numbers.push(shift);
@@ -63,6 +66,7 @@ impl<'a> Constants<'a> {
         words.extend([v.width as u32, v.height as u32, v.near.to_bits()]);
         words.extend([self.count as u32, self.first as u32]);
         words.extend([self.range.start, self.range.end, self.cell.to_bits()]);
+        words.extend([self.tolerance.to_bits(), 0, 0, 0]); // a uniform's size is a multiple of four words
         words
     }
 }
