@@ -21,7 +21,7 @@ __all__ = ["Visibility", "VisibilitySource", "merge", "merge_and_fit", "rows_of"
 
 _FIT = 1 / 4
 """Exponent of the ratio of what views saw to what they see: ½ fits the views looked from by up to 0.1 dB
-better, and others by up to 0.4 dB worse (`docs/decisions.md`)."""
+better, and others by up to 0.7 dB worse (`docs/decisions.md`)."""
 
 MAX_OPACITY = 0.99
 """α never exceeds it: renderers clip there."""
