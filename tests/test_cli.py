@@ -25,9 +25,26 @@ def test_import_and_help_load_nothing_heavy() -> None:
     assert imported_by("import g2ard", "torch", "numpy", "typer", "rich") == []
     help_ = "import contextlib, io\nfrom g2ard.cli import main\nsys.argv = ['g2ard', '--help']\n"
     help_ += "with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit): main()\n"
-    code = f"import sys\n{help_}print([m for m in ('torch', 'numpy', 'PIL') if m in sys.modules])"
+    heavy = ("torch", "numpy", "PIL", "markdown_it", "pygments")
+    code = f"import sys\n{help_}print([m for m in {heavy} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert eval(out.stdout) == []
+
+
+def test_what_help_defers_of_rich_loads_when_it_is_used() -> None:
+    code = """
+from g2ard.cli.lazy_rich import defer_rich
+defer_rich()
+from rich.markdown import Markdown
+from rich.traceback import Traceback
+import rich.traceback
+assert Markdown("*a*").markup == "*a*"
+assert Traceback.extract(ValueError, ValueError("a"), None).stacks[0].exc_value == "a"
+assert rich.traceback.PathHighlighter.__module__ == "rich.traceback"
+from rich.traceback import Traceback as real
+assert isinstance(Traceback.extract(ValueError, ValueError("a"), None).stacks, list) and real is not Traceback
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_the_package_hands_out_what_its_docstring_names() -> None:

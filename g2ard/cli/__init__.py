@@ -10,6 +10,7 @@ import typer
 
 from g2ard.cli.commands import register_commands
 from g2ard.cli.frame import app
+from g2ard.cli.lazy_rich import defer_rich
 from g2ard.cli.pipes import outlive_readers
 from g2ard.cli.usage import usage_line
 
@@ -21,6 +22,7 @@ def main() -> None:
     # Kernels have threads of their own; those of numpy's BLAS only spin, for a thirtieth of a short command.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     outlive_readers()
+    defer_rich()
     gc.set_threshold(50_000)  # importing makes many objects and no garbage: looking for it took a twentieth
     register_commands(next(iter(sys.argv[1:]), None))  # the others would only take time
     try:
