@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scenes import around, checkered_ball
 
-from g2ard.cli.commands.distill import _work_folder
 from g2ard.cli.frame import Run
 from g2ard.cli.resume import stoppable
+from g2ard.cli.run_folder import work_folder
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
 from g2ard.stages.recover import checkpoint
@@ -118,7 +118,7 @@ def test_distill_stopped_before_its_first_checkpoint_leaves_nothing(
 ) -> None:
     common = ("overwrite", "seed", "threads", "device", "verbose", "json", "quiet", "config")
     run, output = Run("distill", dict.fromkeys(common), {}), tmp_path / "run"
-    with pytest.raises(KeyboardInterrupt), _work_folder(run, output, resume=False):
+    with pytest.raises(KeyboardInterrupt), work_folder(run, output, resume=False):
         raise KeyboardInterrupt
     assert capsys.readouterr().err == ""
     assert not output.exists()
@@ -128,7 +128,7 @@ def test_distill_stopped_before_its_first_checkpoint_leaves_nothing(
         saved.touch()
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt), _work_folder(run, output, resume=False):
+    with pytest.raises(KeyboardInterrupt), work_folder(run, output, resume=False):
         stopped_later()
     assert run.kept == [f"the same command with --resume goes on in {output}"]
     assert saved.exists()

@@ -88,6 +88,83 @@ def test_resuming_a_finished_run_says_so(command_line: CommandLine, folder: Path
     assert "b.ply: finished already" in error
 
 
+SHORT = ("distill", "ball.ply", "--steps", 5, "--size", 48)
+
+
+def test_a_finished_run_is_not_taken_for_another(command_line: CommandLine, folder: Path) -> None:
+    begin = (*SHORT, "-o", "run")
+    ask = (*begin, "-r", 10)
+    status, out, error = command_line(*ask, "--json", "-", cwd=folder)
+    assert status == 0, error
+    (folder / "ball.ply").rename(folder / "away.ply")  # what is refused is refused before the scene is read
+    status, again, error = command_line(*ask, "--resume", "--json", "-", cwd=folder)
+    assert status == 0, error
+    ran, told = json.loads(out), json.loads(again)
+    assert told["scores"] == ran["scores"]
+    others = (
+        ((*ask, "--seed", 3), "seed"),
+        ((*ask, "--sh-degree", 0), "sh-degree"),
+        ((*begin, "-r", 5), "budget"),
+    )
+    for other, words in others:
+        status, _, error = command_line(*other, "--resume", cwd=folder)
+        assert status == 1, error
+        assert f"run: finished with another {words}; -w without --resume starts anew" in error
+    (folder / "away.ply").rename(folder / "ball.ply")
+    assert command_line(*SHORT, "-o", "run", "-n", 120, "--resume", cwd=folder)[0] == 0
+    (folder / "run" / "report.json").unlink()
+    status, _, error = command_line(*ask, "--resume", cwd=folder)
+    assert (status, error) == (1, "g2ard: run: exists; give -w (--overwrite) to replace it\n")
+
+
+def test_finished_folders_among_several_budgets_are_told_and_checked(
+    command_line: CommandLine, folder: Path
+) -> None:
+    status, _, error = command_line(*SHORT, "-r", 10, "-o", "{ratio}x", cwd=folder)
+    assert status == 0, error
+    before = (folder / "10x" / "scene.ply").stat().st_mtime_ns
+    ask = (*SHORT, "-r", "5,10", "-o", "{ratio}x", "--resume")
+    status, _, error = command_line(*ask, "--seed", 1, cwd=folder)
+    assert (status, "10x: finished with another seed" in error, (folder / "5x").exists()) == (1, True, False)
+    status, out, error = command_line(*ask, "--json", "-", cwd=folder)
+    assert status == 0, error
+    assert "10x: finished already" in error
+    assert "5x: nothing to go on from" in error
+    assert [run["output_count"] for run in json.loads(out)["runs"]] == [240, 120]
+    assert (folder / "10x" / "scene.ply").stat().st_mtime_ns == before
+
+
+def test_a_stopped_run_refuses_other_options_before_any_promise(
+    command_line: CommandLine, folder: Path
+) -> None:
+    ask = ("distill", "ball.ply", "-r", 4, "-o", "run", "--size", 48)
+    running = program(*ask, "--steps", 100_000, folder=folder, stderr=subprocess.PIPE)
+    work = interrupt_at_checkpoint(running, folder)
+    running.communicate(timeout=120)
+    assert running.returncode == 130
+    (folder / "ball.ply").rename(folder / "away.ply")
+    for other, words in ((("--steps", 7), "steps"), (("-n", 77, "--steps", 100_000), "budget")):
+        asked = ask if words == "steps" else (*ask[:2], *ask[4:])
+        status, _, error = command_line(*asked, *other, "--resume", cwd=folder)
+        assert (status, error.count("\n")) == (1, 1), error
+        assert f"run: begun with another {words}; -w without --resume starts anew" in error
+    g2ard.save(folder / "ball.ply", checkered_ball(1300))
+    status, _, error = command_line(*ask, "--steps", 100_000, "--resume", cwd=folder)
+    assert status == 1
+    assert "goes on in" not in error
+    assert list(work.glob("*.npz"))
+
+
+def test_a_folder_has_one_scene(command_line: CommandLine, folder: Path) -> None:
+    assert command_line(*SHORT, "-r", 10, "-o", "run", cwd=folder)[0] == 0
+    status, _, error = command_line(*SHORT, "-r", 10, "-o", "run", "-w", "--format", "sog", cwd=folder)
+    assert status == 0, error
+    assert [path.name for path in (folder / "run").glob("scene*")] == ["scene.sog"]
+    again = ("distill", "run/scene.sog", "-r", 2, "-o", "run", "-w", "--steps", 3)
+    status, _, error = command_line(*again, cwd=folder)
+    assert (status, "run/scene.sog would be written over, and is an input" in error) == (2, True), error
+
+
 def program(*arguments: object, folder: Path, **pipes: int) -> subprocess.Popen[bytes]:
     root = Path(__file__).resolve().parents[1]
     path = os.pathsep.join(filter(None, [str(root), os.environ.get("PYTHONPATH")]))
@@ -97,6 +174,16 @@ def program(*arguments: object, folder: Path, **pipes: int) -> subprocess.Popen[
         env={**os.environ, "PYTHONPATH": path},
         **pipes,  # type: ignore[arg-type]
     )
+
+
+def interrupt_at_checkpoint(running: subprocess.Popen[bytes], folder: Path) -> Path:
+    """Ctrl-C as soon as a run in `folder`/run has kept something; where that lies."""
+    work = folder / "run" / ".unfinished"
+    until = time.monotonic() + 120
+    while not list(work.glob("[!.]*.npz")) and time.monotonic() < until:
+        time.sleep(0.05)
+    running.send_signal(signal.SIGINT)
+    return work
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
@@ -118,11 +205,7 @@ def test_a_closed_pipe_loses_no_result(stream: str, folder: Path) -> None:
 def test_an_interrupt_says_what_was_kept(folder: Path) -> None:
     ask = ("distill", "ball.ply", "-r", 4, "-o", "run", "--size", 48, "--steps", 100_000)
     running = program(*ask, folder=folder, stderr=subprocess.PIPE)
-    work = folder / "run" / ".unfinished"
-    until = time.monotonic() + 120
-    while not (work.is_dir() and any(work.iterdir())) and time.monotonic() < until:
-        time.sleep(0.05)
-    running.send_signal(signal.SIGINT)
+    interrupt_at_checkpoint(running, folder)
     _, error = running.communicate(timeout=120)
     assert running.returncode == 130
     assert b"g2ard: interrupted; the same command with --resume goes on in run" in error

@@ -74,11 +74,11 @@ class Outputs:
             raise typer.BadParameter(f"{self._pattern}: two budgets would be written to the same place")
         return found
 
-    def check(self, check: Callable[[Path], object], total: int | None = None) -> None:
+    def check(self, check: Callable[[Path, Budget], object], total: int | None = None) -> None:
         """Refuse places that cannot be written, each once, as soon as their names are known."""
-        for path in self.paths(total):
+        for path, budget in zip(self.paths(total), self._budgets, strict=False):
             if path not in self._checked:
-                check(path)
+                check(path, budget)
                 self._checked.add(path)
 
     def _unknown(self) -> bool:

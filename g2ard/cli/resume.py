@@ -12,7 +12,10 @@ import typer
 from g2ard.cli.frame import Run
 from g2ard.errors import OutputError
 
-__all__ = ["check_stopped", "left_at", "stoppable"]
+__all__ = ["OPTIONS", "check_stopped", "left_at", "stoppable"]
+
+OPTIONS = "options.json"
+"""In a folder of checkpoints: what they belong to. Alone it is nothing to go on from."""
 
 
 def check_stopped(run: Run, place: Path, resume: bool, output: Path) -> bool:
@@ -53,7 +56,7 @@ def stoppable(run: Run, place: Path, resume: bool) -> Iterator[None]:
 
 def left_at(place: Path) -> bool:
     """Whether there is a checkpoint, or a folder that holds some."""
-    return any(place.iterdir()) if place.is_dir() else place.exists()
+    return any(item.name != OPTIONS for item in place.iterdir()) if place.is_dir() else place.exists()
 
 
 def _remove(place: Path) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -36,22 +34,28 @@ from g2ard.cli.options import (
     views_count,
 )
 from g2ard.cli.outputs import Outputs, budgets_of
-from g2ard.cli.resume import check_stopped, left_at
+from g2ard.cli.run_folder import (
+    KEPT,
+    REPORT,
+    WORK,
+    check_place,
+    drop_older,
+    is_done,
+    tell_anew,
+    tell_finished,
+    work_folder,
+)
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
 
 if TYPE_CHECKING:
     from g2ard.pipeline import Distilled
+    from g2ard.policy.budget import Budget
     from g2ard.policy.distill import DistillJob
     from g2ard.report.window import Crop
     from g2ard.splats import Splats
     from g2ard.targets import Targets
 
     Colour = tuple[float, float, float]
-
-_WORK = ".unfinished"
-"""In the folder of the run: finished rounds and checkpoints. Nobody else has a folder of this name."""
-_KEPT = Path("simplified", "scene.ply")
-"""In the folder of the run, with --keep: the anchors of the last recovery, for `evaluate --anchors`."""
 
 
 @command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True, constants=True)
@@ -160,13 +164,17 @@ def distill(
     engine = recovery_engine(run)
     name = f"scene.{format}"
     outputs = Outputs(run, output, budgets)
-    outputs.check(lambda folder: _check_place(run, folder / name, given, resume))
+
+    def check(folder: Path, budget: Budget) -> None:
+        check_place(run, folder / name, budget, given, resume)
+
+    outputs.check(check)
+    early = [folder / name for folder in outputs.paths()]
+    if early and all(is_done(run, place, resume) for place in early):
+        _tell_all(run, [tell_finished(run, place) for place in early])
+        return
     if scene is not None and kind(scene) != "splats" and not given:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
-    early = [folder / name for folder in outputs.paths()]
-    if early and all(_is_done(run, place, resume) for place in early):
-        _tell_finished(run, early)
-        return
     job = prepare(
         scene,
         budgets,
@@ -195,7 +203,7 @@ def distill(
         say=run.say,
     )
     check_crops(crop or [], job.views.test.names)
-    outputs.check(lambda folder: _check_place(run, folder / name, given, resume), len(job.prior))
+    outputs.check(check, len(job.prior))
     places = [folder / name for folder in outputs.paths(len(job.prior))]
     if dry_run:
         estimates = [
@@ -204,22 +212,28 @@ def distill(
         ]
         run.result({"runs": estimates})
         return
-    todo = [pair for pair in zip(job.aims, places, strict=True) if not _is_done(run, pair[1], resume)]
-    if not todo:
-        _tell_finished(run, places)
-        return
-    job.render_targets()
+    finished = {place: tell_finished(run, place) for place in places if is_done(run, place, resume)}
+    if len(finished) < len(places):
+        job.render_targets()
     reports = []
-    for aim, place in todo:
-        _tell_anew(run, place.parent, resume)
+    for aim, place in zip(job.aims, places, strict=True):
+        if place in finished:
+            reports.append(finished[place])
+            continue
+        tell_anew(run, place.parent, resume)
         result, report = _distil(
             run, scene or Path(str(views)), job, aim.count, place, resume, keep, crop or [], began
         )
         reports.append(report)
         run.kept.append(f"{place.parent} is finished")
         began = time.monotonic()
+    _tell_all(run, reports)
+    if len(finished) < len(places):
+        tell_quality(run, aim, result.splats)
+
+
+def _tell_all(run: Run, reports: list[dict[str, Any]]) -> None:
     run.result(reports[0] if len(reports) == 1 else {"runs": reports})
-    tell_quality(run, aim, result.splats)
 
 
 def _tell_estimate(run: Run, job: DistillJob, budget: int, folder: Path) -> dict[str, Any]:
@@ -235,65 +249,6 @@ def _tell_estimate(run: Run, job: DistillJob, budget: int, folder: Path) -> dict
         f"and {found.bytes / 1e6:,.0f} MB; nothing is written"
     )
     return {"output": str(folder), "count": budget, **asdict(found), "total_seconds": found.total}
-
-
-def _check_place(run: Run, place: Path, given: bool, resume: bool) -> None:
-    """Refuse a place whose folder holds an input, another result, or a stopped run that is not asked for."""
-    from g2ard.io.atomic import check_output
-
-    folder = place.parent
-    run.spare_inputs(place, folder / _KEPT, *([folder / "views.json"] if not given else []))
-    left = left_at(folder / _WORK)
-    if not left and not (resume and _finished(place)):
-        check_output(folder, run.overwrite, folder=True)
-    if left or not resume:
-        check_stopped(run, folder / _WORK, resume, place)
-
-
-def _is_done(run: Run, place: Path, resume: bool) -> bool:
-    """Whether there is nothing left to go on with in a folder."""
-    return resume and not run.overwrite and _finished(place)
-
-
-_OF_THE_CALL = ("output", "resume", "keep", "crop", "dry_run", "threads")
-"""Options that another call may have other values of, and yet go on with a run."""
-
-
-def _tell_finished(run: Run, places: Sequence[Path]) -> None:
-    """Say that there is nothing left to do, and give the reports that are there.
-
-    Raises:
-        OutputError: what is there was made with other options.
-    """
-    import json
-
-    from g2ard.errors import OutputError
-
-    reports = []
-    for place in places:
-        report = json.loads((place.parent / "report.json").read_text())
-        asked = json.loads(json.dumps(run.config, default=str))
-        before = report["config"]
-        shared = [key for key in asked if key in before and key not in _OF_THE_CALL]
-        if other := [key.replace("_", "-") for key in shared if asked[key] != before[key]]:
-            raise OutputError(
-                f"{place.parent}: finished with another {', '.join(other)}; -w without --resume starts anew"
-            )
-        run.say(
-            f"{place.parent}: finished already, nothing is left to resume (-w without --resume starts anew)"
-        )
-        reports.append(report)
-    run.result(reports[0] if len(reports) == 1 else {"runs": reports})
-
-
-def _tell_anew(run: Run, folder: Path, resume: bool) -> None:
-    if resume and not left_at(folder / _WORK):
-        run.say(f"{folder}: nothing to go on from: starts anew")
-
-
-def _finished(place: Path) -> bool:
-    """Whether a run has ended there."""
-    return place.exists() and not left_at(place.parent / _WORK)
 
 
 def _distil(
@@ -312,7 +267,7 @@ def _distil(
     from g2ard.report.distilled import distill_report
 
     output, colour = place.parent, job.config.background
-    with _work_folder(run, output, resume) as work:
+    with work_folder(run, output, resume, (len(job.prior), budget)) as work:
         result = job.run(budget, work=work)
         report = report_of(job, result, run.config)
         report["seconds"] = {**report["seconds"], "total": time.monotonic() - began}
@@ -327,12 +282,12 @@ def _distil(
             crops=crops,
         )
         _write(run, place, result, job.held_out, colour, report)
-        _keep(output / _KEPT, result.simplified if keep else None)
+        _keep(output / KEPT, result.simplified if keep else None)
     if (pool := job.views.pool) is not None:
         from g2ard.io import write_views
 
         write_views(output / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
-    shutil.rmtree(output / _WORK)
+    shutil.rmtree(output / WORK)
     write_table(run, report)
     for line in told(report):
         run.say(line)
@@ -343,26 +298,6 @@ def _distil(
         f"report: {output / 'report.html'}, {output / 'report.json'}"
     )
     return result, report
-
-
-@contextmanager
-def _work_folder(run: Run, output: Path, resume: bool) -> Iterator[Path]:
-    """Where finished rounds and checkpoints wait for --resume; an error leaves nothing behind, nor does a
-    Ctrl-C before the first of them."""
-    work, made = output / _WORK, not output.exists()
-    if not resume:
-        shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True, exist_ok=True)
-    try:
-        yield work
-    except (Exception, KeyboardInterrupt) as error:
-        if left_at(work) and (resume or isinstance(error, KeyboardInterrupt)):
-            run.kept.append(f"the same command with --resume goes on in {output}")
-            if not isinstance(error, KeyboardInterrupt):
-                run.say(run.kept[-1])
-        else:
-            shutil.rmtree(output if made else work, ignore_errors=True)
-        raise
 
 
 def _write(
@@ -378,8 +313,9 @@ def _write(
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
     preview(place.parent / "preview.png", unseen, scenes, colour)
     write_splats(place, result.splats, overwrite=True)
+    drop_older(place)
     report["bytes"]["file"] = place.stat().st_size
-    with atomic_output(place.parent / "report.json", overwrite=True) as temporary:
+    with atomic_output(place.parent / REPORT, overwrite=True) as temporary:
         temporary.write_text(json.dumps({**report, "config": run.config}, indent=2, default=str) + "\n")
 
 

@@ -74,15 +74,15 @@ def simplify(
     values = run.constants(simplify=SimplifyConfig(), over_options=True)
     config = changed(SimplifyConfig(retention=retention), "simplify", values)
     outputs = Outputs(run, output, budgets)
-    outputs.check(lambda path: io.check_scene_output(path, run.overwrite))
+    outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite))
     maps = None if parents is None else Outputs(run, parents, budgets, name="--parents")
     if maps is not None:
-        maps.check(lambda path: _check_parents(run, path, scene, views))
+        maps.check(lambda path, _: _check_parents(run, path, scene, views))
     clock = [time.perf_counter()]
     found = io.read_scene(scene)
     say_notes(scene, found.notes, run.say)
     total = len(found.splats)
-    outputs.check(lambda path: io.check_scene_output(path, run.overwrite), total)
+    outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite), total)
     clock.append(time.perf_counter())
     aims = [
         aim_of(

@@ -1,0 +1,177 @@
+"""The folder of a `distill` run: what an earlier run left there, and with which options."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from g2ard.cli.frame import Run
+from g2ard.cli.resume import OPTIONS, check_stopped, left_at
+
+if TYPE_CHECKING:
+    from g2ard.policy.budget import Budget
+
+__all__ = [
+    "KEPT",
+    "REPORT",
+    "WORK",
+    "check_place",
+    "drop_older",
+    "is_done",
+    "tell_anew",
+    "tell_finished",
+    "work_folder",
+]
+
+WORK = ".unfinished"
+"""In the folder of the run: finished rounds and checkpoints. Nobody else has a folder of this name."""
+KEPT = Path("simplified", "scene.ply")
+"""In the folder of the run, with --keep: the anchors of the last recovery, for `evaluate --anchors`."""
+REPORT = "report.json"
+"""In the folder of the run, written last."""
+
+_OF_THE_CALL = ("output", "resume", "keep", "crop", "dry_run", "threads", "device")
+"""Options that another call may have other values of, and yet go on with a run; of devices all but CUDA."""
+_OF_THE_BUDGET = ("count", "ratio")
+"""Several are one budget for each folder."""
+
+
+def check_place(run: Run, place: Path, budget: Budget, given: bool, resume: bool) -> None:
+    """Refuse a place whose folder holds an input, another result, or an earlier run that is not asked for.
+
+    Args:
+        run: the command.
+        place: of the scene's file.
+        budget: of this folder.
+        given: whether the views are given; else they are written beside the scene.
+        resume: --resume.
+
+    Raises:
+        OutputError: the folder may not be written to, or was begun with other options.
+    """
+    from g2ard.io.atomic import check_output
+
+    folder = place.parent
+    views = [] if given else [folder / "views.json"]
+    run.spare_inputs(place, *_other_scenes(place), folder / KEPT, *views)
+    left = left_at(folder / WORK)
+    if not left and not (resume and _is_finished(place)):
+        check_output(folder, run.overwrite, folder=True)
+    if left or not resume:
+        check_stopped(run, folder / WORK, resume, place)
+    if resume and left:
+        _check_same(run, folder, folder / WORK / OPTIONS, budget, "begun")
+    elif is_done(run, place, resume):
+        _check_same(run, folder, folder / REPORT, budget, "finished")
+
+
+def is_done(run: Run, place: Path, resume: bool) -> bool:
+    """Whether there is nothing left to go on with in a folder."""
+    return resume and not run.overwrite and _is_finished(place)
+
+
+def tell_finished(run: Run, place: Path) -> dict[str, Any]:
+    """Say that there is nothing left to do; the report that is there."""
+    from g2ard.io.jsonfile import read_json
+
+    run.say(f"{place.parent}: finished already, nothing is left to resume (-w without --resume starts anew)")
+    return read_json(place.parent / REPORT)
+
+
+def tell_anew(run: Run, folder: Path, resume: bool) -> None:
+    """Say so where --resume finds nothing."""
+    if resume and not left_at(folder / WORK):
+        run.say(f"{folder}: nothing to go on from: starts anew")
+
+
+@contextmanager
+def work_folder(run: Run, output: Path, resume: bool, counts: tuple[int, int] = (0, 0)) -> Iterator[Path]:
+    """Where finished rounds and checkpoints wait for --resume; an error leaves nothing behind, nor does a
+    Ctrl-C before the first of them.
+
+    Args:
+        run: the command.
+        output: the folder of the run.
+        resume: --resume.
+        counts: Gaussians of the dense scene and of the result.
+    """
+    from g2ard.errors import InputError
+
+    work, made = output / WORK, not output.exists()
+    if not resume:
+        shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True, exist_ok=True)
+    begun = {"input_count": counts[0], "output_count": counts[1], "config": run.config}
+    if not left_at(work):
+        (work / OPTIONS).write_text(json.dumps(begun, default=str))
+    try:
+        yield work
+    except (Exception, KeyboardInterrupt) as error:
+        if left_at(work) and (resume or isinstance(error, KeyboardInterrupt)):
+            run.kept.append(f"the same command with --resume goes on in {output}")
+            if not isinstance(error, KeyboardInterrupt | InputError):
+                run.say(run.kept[-1])
+        else:
+            shutil.rmtree(output if made else work, ignore_errors=True)
+        raise
+
+
+def drop_older(place: Path) -> None:
+    """Remove the scenes of an earlier run in other formats: one folder, one scene."""
+    for other in _other_scenes(place):
+        other.unlink(missing_ok=True)
+
+
+def _other_scenes(place: Path) -> list[Path]:
+    """The files that a run writes its scene to in other formats."""
+    from g2ard.io.scene_formats import FORMATS
+
+    return [path for name in FORMATS if (path := place.with_name(f"scene.{name}")) != place]
+
+
+def _is_finished(place: Path) -> bool:
+    """Whether a run has ended there."""
+    return place.exists() and (place.parent / REPORT).exists() and not left_at(place.parent / WORK)
+
+
+def _check_same(run: Run, folder: Path, told: Path, budget: Budget, how: str) -> None:
+    """Refuse to go on from a run with other options, as far as what it wrote of them tells.
+
+    Raises:
+        OutputError: it had others.
+    """
+    from g2ard.errors import OutputError
+    from g2ard.io.jsonfile import read_json
+
+    if not told.exists():
+        return
+    before = read_json(told)
+    if other := _others(run, before, budget):
+        raise OutputError(f"{folder}: {how} with another {', '.join(other)}; -w without --resume starts anew")
+
+
+def _others(run: Run, before: Mapping[str, Any], budget: Budget) -> list[str]:
+    """Names of the options whose values differ."""
+    then = before.get("config", {})
+    now = json.loads(json.dumps(run.config, default=str))
+    names = [name for name in now if name in then and name not in (*_OF_THE_CALL, *_OF_THE_BUDGET)]
+    found = [name.replace("_", "-") for name in names if now[name] != then[name]]
+    if "cuda" in (now["device"], then.get("device")) and now["device"] != then.get("device"):
+        found.append("device")
+    return found if _is_budget(budget, before) else ["budget", *found]
+
+
+def _is_budget(budget: Budget, before: Mapping[str, Any]) -> bool:
+    """Whether a run came to what a budget means; those that measure the scene are told by their options."""
+    from g2ard.errors import InputError
+
+    if budget.is_measured or "output_count" not in before:
+        return True
+    try:
+        return budget.of(before["input_count"]) == before["output_count"]
+    except InputError:
+        return False
