@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
+from test_first_hour import photos_of
 
 import g2ard
+from g2ard.memory import peak_rss
 from g2ard.policy.budget import Budget
 from g2ard.policy.distill import prepare
-from g2ard.policy.estimate import estimate
+from g2ard.policy.estimate import estimate, total
 
 CommandLine = Callable[..., tuple[int, str, str]]
 
@@ -30,6 +36,7 @@ def test_a_dry_run_counts_what_the_run_takes_and_writes_nothing(
     status, out, error = command_line(*ask, "--dry-run", cwd=tmp_path)
     assert status == 0, error
     assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]
+    assert "nothing is written" in error
     (told,) = json.loads(out)["runs"]
     status, out, error = command_line(*ask, cwd=tmp_path)
     assert status == 0, error
@@ -42,9 +49,64 @@ def test_a_dry_run_counts_what_the_run_takes_and_writes_nothing(
     assert told["pixels"] == 48 * 36
 
 
-def test_memory_grows_by_views_and_gaussians_and_a_time_limit_is_kept() -> None:
+def test_several_budgets_have_a_total(tmp_path: Path, command_line: CommandLine) -> None:
+    g2ard.save(tmp_path / "ball.ply", ball())
+    ask = ("distill", "ball.ply", "-r", "5,10", "-o", "{ratio}", "--steps", "4", "--size", "48", "--dry-run")
+    status, _, error = command_line(*ask, cwd=tmp_path)
+    assert status == 0, error
+    assert "all 2, which share their targets: about" in error
+
+
+def test_memory_grows_by_views_and_gaussians_and_a_time_limit_is_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     job = prepare(ball(), [Budget(90, None)], steps=3, size=48, time_limit=7.0)
+    monkeypatch.setattr("g2ard.policy.estimate.peak_rss", lambda: 10**9)
     few, many = estimate(job, 90), estimate(job, 450)
-    assert many.bytes - few.bytes == 983 * 360
-    assert few.bytes > 12 * few.views * few.pixels
+    assert few.bytes > 10**9 + 12 * few.views * few.pixels
     assert few.seconds["recover"] == 7.0
+    seconds, size = total([few, many])
+    assert size == many.bytes > few.bytes
+    assert seconds == pytest.approx(few.total + many.total - many.seconds["targets"])
+    monkeypatch.setattr("g2ard.policy.estimate.peak_rss", lambda: None)  # a system that does not tell
+    few, many = estimate(job, 90), estimate(job, 900)
+    assert many.bytes - few.bytes >= (983 - 192) * 900
+
+
+@pytest.mark.skipif(peak_rss() is None, reason="the system tells no memory")
+@pytest.mark.parametrize("source", ["scene", "photos"])
+def test_memory_is_about_what_the_run_takes(source: str, tmp_path: Path) -> None:
+    """The program itself included, which is most of it where the scene is small."""
+    if source == "scene":
+        g2ard.save(tmp_path / "ball.ply", ball(20_000))
+        ask = ["distill", "ball.ply", "-r", "4", "--steps", "12", "--size", "320"]
+    else:
+        photos_of(tmp_path / "photos")
+        ask = ["distill", "--views", "photos", "-n", "500", "--steps", "12"]
+    peak_of([*ask, "-o", "run", "--dry-run", "--json", "told.json"], tmp_path)
+    taken = peak_of([*ask, "-o", "run"], tmp_path)
+    said = json.loads((tmp_path / "told.json").read_text())["total"]["bytes"]
+    assert 0.75 * taken < said < 1.25 * taken, (said, taken)
+
+
+def peak_of(ask: list[str], folder: Path) -> int:
+    """The most bytes that were resident, of a run as a program."""
+    program = [sys.executable, "-m", "g2ard", *ask, "-q"]
+    root = str(Path(__file__).resolve().parents[1])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
+    code = (
+        "import resource, subprocess, sys; status = subprocess.run(sys.argv[1:]).returncode;"
+        "print(status, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *program],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=True,
+    )
+    status, peak = map(int, done.stdout.split())
+    assert status == 0, done.stderr
+    return peak if sys.platform == "darwin" else 1024 * peak

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from g2ard.memory import peak_rss
 from g2ard.targets import CACHE_BYTES, Targets
+from g2ard.visibility import visibility
 
 if TYPE_CHECKING:
     from g2ard.policy.distill import DistillJob
     from g2ard.splats import Splats
 
-__all__ = ["Estimate", "estimate"]
+__all__ = ["Estimate", "estimate", "total"]
 
 _TRIED = 2
 """Views that are rendered, and learned from, to tell how long all will take."""
@@ -24,8 +27,10 @@ _MERGING = 8.0
 guitar 13.7, playbot 8.0, a park 6.8, an open scene 6.0."""
 _TRAINER_BYTES = 983
 """Of a Gaussian in recovery: parameters, Adam's moments, buffers (`docs/benchmarks.md`)."""
-_RASTER_BYTES = 128
-"""Of a Gaussian of the dense scene while it is rendered."""
+_RASTER_BYTES = 192
+"""Of a Gaussian of the dense scene while it is rendered, at most; 123 where most lie outside the views."""
+_PROGRAM_BYTES = 150_000_000
+"""Of the interpreter and what it loads."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +42,8 @@ class Estimate:
         pixels: of one view.
         steps: of recovery, all rounds together.
         seconds: by stage: targets, simplify, recover, score.
-        bytes: of memory at the peak: the dense scene, targets, recovery.
+        bytes: of memory at the peak: what this process has taken at most, the trial included, and what comes
+            on top of it, the targets above all.
     """
 
     views: int
@@ -69,6 +75,8 @@ def estimate(job: DistillJob, budget: int) -> Estimate:
     for view in range(len(few)):
         targets[view]
     per_view = (time.monotonic() - began) / len(few)
+    if job.config.method == "default":
+        visibility(job.prior, few)  # for its memory
     merged, merging = _merged(job, budget)
     per_step = _step_seconds(job, merged, targets)
     steps = _steps(job, merged)
@@ -87,11 +95,29 @@ def estimate(job: DistillJob, budget: int) -> Estimate:
             "recover": limit if limit is not None else per_step * steps,
             "score": 2 * scored * small,
         },
-        bytes=job.prior.nbytes
-        + (_RASTER_BYTES * len(job.prior) if job.teacher is not None else 0)
-        + min(CACHE_BYTES, views * pixels * (12 if job.teacher is not None else 3))
-        + _TRAINER_BYTES * budget,
+        bytes=_trial_bytes(job, budget)
+        + 2 * merged.nbytes  # the recovered scene, and its rows on their way to the file
+        + min(CACHE_BYTES, views * pixels * _pixel_bytes(job)),
     )
+
+
+def total(estimates: Sequence[Estimate]) -> tuple[float, int]:
+    """Seconds and bytes of one run at several budgets: targets are made once, budgets one by one."""
+    apart = sum(found.total - found.seconds["targets"] for found in estimates)
+    return estimates[0].seconds["targets"] + apart, max(found.bytes for found in estimates)
+
+
+def _pixel_bytes(job: DistillJob) -> int:
+    """Of a target: RGB in float32 where it was rendered, in 8 bits where it is a photo."""
+    return 12 if job.teacher is not None else 3
+
+
+def _trial_bytes(job: DistillJob, budget: int) -> int:
+    """What this process took at most, the trial included; where the system does not tell, what it should."""
+    if (peak := peak_rss()) is not None:
+        return peak
+    rendering = _RASTER_BYTES * len(job.prior) if job.teacher is not None else 0
+    return _PROGRAM_BYTES + job.prior.nbytes + max(rendering, _TRAINER_BYTES * budget)
 
 
 def _merged(job: DistillJob, budget: int) -> tuple[Splats, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -206,11 +207,7 @@ def distill(
     outputs.check(check, len(job.prior))
     places = [folder / name for folder in outputs.paths(len(job.prior))]
     if dry_run:
-        estimates = [
-            _tell_estimate(run, job, aim.count, place.parent)
-            for aim, place in zip(job.aims, places, strict=True)
-        ]
-        run.result({"runs": estimates})
+        _tell_estimates(run, job, [place.parent for place in places])
         return
     finished = {place: tell_finished(run, place) for place in places if is_done(run, place, resume)}
     if len(finished) < len(places):
@@ -236,19 +233,29 @@ def _tell_all(run: Run, reports: list[dict[str, Any]]) -> None:
     run.result(reports[0] if len(reports) == 1 else {"runs": reports})
 
 
-def _tell_estimate(run: Run, job: DistillJob, budget: int, folder: Path) -> dict[str, Any]:
+def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[Path]) -> None:
+    """About how long each budget takes, and what memory; of several, all together too."""
     from dataclasses import asdict
 
-    from g2ard.policy.estimate import estimate
+    from g2ard.policy.estimate import estimate, total
 
-    found = estimate(job, budget)
-    parts = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in found.seconds.items())
-    run.say(
-        f"{folder}: {budget:,} Gaussians, {found.views} views of {found.pixels:,} pixels, "
-        f"{found.steps:,} steps: about {found.total:.0f} s ({parts}) "
-        f"and {found.bytes / 1e6:,.0f} MB; nothing is written"
-    )
-    return {"output": str(folder), "count": budget, **asdict(found), "total_seconds": found.total}
+    found, told = [], []
+    for folder, budget in zip(folders, job.budgets, strict=True):
+        one = estimate(job, budget)
+        parts = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in one.seconds.items())
+        run.say(
+            f"{folder}: {budget:,} Gaussians, {one.views} views of {one.pixels:,} pixels, "
+            f"{one.steps:,} steps: about {one.total:.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
+        )
+        found.append(one)
+        told.append({"output": str(folder), "count": budget, **asdict(one), "total_seconds": one.total})
+    seconds, size = total(found)
+    if len(found) > 1:
+        run.say(
+            f"all {len(found)}, which share their targets: about {seconds:.0f} s and {size / 1e6:,.0f} MB"
+        )
+    run.say("nothing is written")
+    run.result({"runs": told, "total": {"seconds": seconds, "bytes": size}})
 
 
 def _distil(

@@ -130,6 +130,7 @@ def _report(
     run: Run, found: Scene, small: Simplified, config: SimplifyConfig, method: str, clock: list[float]
 ) -> dict[str, Any]:
     from g2ard.constants import listed
+    from g2ard.memory import peak_rss
 
     began, read, simplified, written = clock
     return {
@@ -143,7 +144,7 @@ def _report(
             "write": written - simplified,
             "total": written - began,
         },
-        "peak_rss_bytes": _peak_rss(),
+        "peak_rss_bytes": peak_rss(),
     }
 
 
@@ -193,15 +194,3 @@ def _table(run: Run, small: Simplified) -> None:
         for i, r in enumerate(small.report.rounds)
     ]
     run.console.table("Rounds", columns, rows)
-
-
-def _peak_rss() -> int | None:
-    """Bytes; None where the system does not tell."""
-    import sys
-
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else 1024 * peak
