@@ -59,7 +59,8 @@ def split_mask(
     if which not in masks:
         raise InputError(f"{views}: no split {which!r} (there are {', '.join(sorted(masks))})")
     if not masks[which].any():
-        raise InputError(f"{views}: none of the {len(names)} views is in split {which!r}")
+        of = "its only view is not" if len(names) == 1 else f"none of its {len(names)} views is"
+        raise InputError(f"{views}: {of} in split {which!r}")
     return masks[which]
 
 

@@ -170,3 +170,16 @@ def test_plots_are_what_the_recorded_rows_give() -> None:
     assert sorted(drawn) == sorted(p.name for p in folder.glob("*.svg"))
     for name, svg in drawn.items():
         assert svg == (folder / name).read_text(encoding="utf-8"), f"{name}: run python benches/plots.py"
+
+
+def test_the_readme_names_every_command_and_scene_format() -> None:
+    from g2ard.cli.commands import COMMANDS
+    from g2ard.io.detect import KINDS
+
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    table = "\n".join(line for line in text.splitlines() if line.startswith("| `"))
+    assert [name for name in COMMANDS if f"`{name}`" not in table] == []
+    (scenes,) = re.findall(r"Scenes: ([^:]*)\. Clouds:", text)
+    names = {"sog": "SOG", "compressed_ply": ".compressed.ply"}
+    kinds = [name for name, kind in KINDS.items() if kind == "splats"]
+    assert [name for name in kinds if names.get(name, f".{name}") not in scenes] == []

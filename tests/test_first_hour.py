@@ -18,6 +18,7 @@ from scenes import around, checkered_ball
 from view_files import transforms
 
 import g2ard
+from g2ard.cli.options import Counts
 from g2ard.images import write_png
 from g2ard.io import Points, write_points, write_views
 from g2ard.policy.photos import points_within_sight
@@ -149,6 +150,11 @@ def test_a_stopped_run_refuses_other_options_before_any_promise(
         assert (status, error.count("\n")) == (1, 1), error
         assert f"run: begun with another {words}; -w without --resume starts anew" in error
     g2ard.save(folder / "ball.ply", checkered_ball(1300))
+    status, out, error = command_line("info", "run", cwd=folder)
+    assert status == 0, error
+    for words in ("stopped run", "simplified-1", "1,200 → 300", "ball.ply", "with --resume (-o run)"):
+        assert words in out
+    assert json.loads(command_line("info", "run", "--json", "-", cwd=folder)[1])["kept"]
     status, _, error = command_line(*ask, "--steps", 100_000, "--resume", cwd=folder)
     assert status == 1
     assert "goes on in" not in error
@@ -373,3 +379,34 @@ def test_info_of_several_files_and_of_a_run(command_line: CommandLine, folder: P
     assert made["run"]["input_count"] == 1200
     assert made["run"]["scores"]["recovered"]["psnr"] > 10
     assert "made from" in command_line("info", "run", cwd=folder)[1]
+
+
+@pytest.mark.parametrize(
+    ("text", "counts"),
+    [("1,000", [1000]), ("1_100", [1100]), ("300", [300]), ("0.2k,10%", [200, 120]), ("200,100", [200, 100])],
+)
+def test_counts_take_separators(text: str, counts: list[int]) -> None:
+    assert [count.of(1200) for count in Counts.parse(text)] == counts
+
+
+def test_several_counts_are_named_by_count(command_line: CommandLine, folder: Path) -> None:
+    status, _, error = command_line("simplify", "ball.ply", "-n", "200,100", "-o", "s.ply", cwd=folder)
+    assert (status, "such as s_{count}.ply; one number has no commas, or reads 10_000" in error) == (2, True)
+    status, _, error = command_line("simplify", "ball.ply", "-n", "1,000", "-o", "s.ply", cwd=folder)
+    assert (status, "1,000 of 1,200 Gaussians" in error) == (0, True), error
+
+
+def test_a_lift_that_outweighs_its_cloud_says_so(command_line: CommandLine, folder: Path) -> None:
+    colors = np.full((1200, 3), 0.5, np.float32)
+    write_points(folder / "cloud.ply", Points(BALL.means.astype(np.float64), colors))
+    status, _, error = command_line("lift", "cloud.ply", "-o", "lift.ply", cwd=folder)
+    assert (status, "lift.ply: 0.07 MB, cloud.ply has 0.03 MB: packed formats" in error) == (0, True), error
+
+
+def test_a_short_run_has_no_needless_notes(command_line: CommandLine, folder: Path) -> None:
+    status, _, error = command_line(*SHORT, "-r", 10, "-o", "run", cwd=folder)
+    assert status == 0, error
+    assert "poses: 160, orbit; which way is up is a guess\n" in error
+    for needless in ("never acted", "of its box", "times as high"):
+        assert needless not in error
+    assert "never acted" in command_line(*SHORT, "-r", 10, "-o", "run", "-wv", cwd=folder)[2]

@@ -15,6 +15,7 @@ from scenes import around, checkered_ball
 from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
 from g2ard.io import read_view_set, write_splats, write_views
+from g2ard.io.clean import plural
 from g2ard.splats import Splats
 from g2ard.stages.select import POLICIES, CoverageOptions, select
 
@@ -175,7 +176,7 @@ def test_the_command_on_pools_of_all_shapes(command_line: CommandLine, folder: P
         said = json.loads(out)
         assert len(said["views"]) == count == len(read_view_set(folder / "out.json").cameras)
         assert len(said["refused"]) == refused
-        assert (f"{refused} views refused" in error) == bool(refused)
+        assert (f"{plural(refused, 'view')} refused" in error) == bool(refused)
         assert len(said["curve"]) == len(poses) - refused
     write_views(folder / "pool.json", cameras([away]), overwrite=True)
     status, _, error = ask(command_line, folder, 1, "-w", "--split", "all")

@@ -30,7 +30,7 @@ def test_split_file_wins(tmp_path: Path) -> None:
     assert split_names(tmp_path, ["left/b.jpg", "b.jpg"], "train") == ["b.jpg"]  # stems alone would confuse
     with pytest.raises(InputError, match=r"no split 'val' \(there are ood, test, train\)"):
         split_names(tmp_path, names, "val")
-    with pytest.raises(InputError, match="none of the 1 views is in split 'test'"):
+    with pytest.raises(InputError, match="its only view is not in split 'test'"):
         split_names(tmp_path, ["b.jpg"], "test")
 
 

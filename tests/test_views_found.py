@@ -121,7 +121,7 @@ def test_too_few_cameras_are_left(command_line: CommandLine, folder: Path) -> No
     inria(folder / "model" / "cameras.json", EYES[:1])
     status, _, error = command_line(*SIMPLIFY, "-o", "out.ply", cwd=folder)
     assert status == 0, error
-    assert "not used: model/cameras.json: none of the 1 views is in split 'train'" in error
+    assert "not used: model/cameras.json: its only view is not in split 'train'" in error
 
 
 def test_facing() -> None:

@@ -50,6 +50,7 @@ __all__ = [
 ]
 
 _COUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmM%]?)")
+_GROUPED = re.compile(r"\d{1,3}(?:,\d{3})+|\d{1,3}(?:_\d{3})+")
 
 
 @dataclass(frozen=True)
@@ -62,12 +63,17 @@ class Count:
 
     @classmethod
     def parse(cls, text: str) -> Count:
-        """Read 250000, 250k, 1.5M or 25%.
+        """Read 250000, 250,000, 250_000, 250k, 1.5M or 25%.
 
         >>> Count.parse("250k").of(10**6), Count.parse("25%").of(10), Count.parse("1.5M").of(10**7)
         (250000, 3, 1500000)
+        >>> Count.parse("1,234,567").of(10**7), Count.parse("250_000").of(10**7)
+        (1234567, 250000)
         """
-        match = _COUNT.fullmatch(text.strip())
+        plain = text.strip()
+        if _GROUPED.fullmatch(plain):
+            plain = re.sub("[,_]", "", plain)
+        match = _COUNT.fullmatch(plain)
         if match is None or not float(match[1]) > 0:
             raise typer.BadParameter(f"a positive count such as 250000, 250k, 1.5M or 25%, not {text!r}")
         number, unit = float(match[1]), match[2].lower()
@@ -123,6 +129,14 @@ class Counts(tuple[Count, ...]):
 
     @classmethod
     def parse(cls, text: str) -> Counts:
+        """Counts between commas; a comma before a group that begins with 0, as in 1,000, is of one number.
+
+        >>> [count.of(10**6) for count in Counts.parse("10k,20k")], len(Counts.parse("250,000"))
+        ([10000, 20000], 1)
+        """
+        groups = text.strip().split(",")
+        if _GROUPED.fullmatch(text.strip()) and any(group.startswith("0") for group in groups[1:]):
+            return cls([Count.parse(text)])
         return cls(Count.parse(part) for part in text.split(","))
 
 

@@ -59,10 +59,12 @@ class Outputs:
         named = any(word in self._pattern for word in ("{ratio}", "{count}"))
         if named and any(budget.is_measured for budget in budgets):
             raise typer.BadParameter(f"{name}: {{ratio}} and {{count}} stand for budgets of -r and -n")
+        by_count = budgets[0].ratio is None
         if len(budgets) > 1 and not named:
             raise typer.BadParameter(
                 f"{name}: {len(budgets)} budgets want {{ratio}} or {{count}} in its name, such as "
-                f"{_suggested(pattern)}"
+                f"{_suggested(pattern, by_count=by_count)}"
+                + ("; one number has no commas, or reads 10_000" if by_count else "")
             )
 
     def paths(self, total: int | None = None) -> list[Path]:
@@ -98,5 +100,6 @@ class Outputs:
         return name
 
 
-def _suggested(pattern: Path) -> str:
-    return str(pattern.with_name(f"{pattern.stem}_{{ratio}}x{pattern.suffix}"))
+def _suggested(pattern: Path, *, by_count: bool) -> str:
+    word = "{count}" if by_count else "{ratio}x"
+    return str(pattern.with_name(f"{pattern.stem}_{word}{pattern.suffix}"))

@@ -22,6 +22,7 @@ __all__ = [
     "check_place",
     "drop_older",
     "is_done",
+    "stopped_run",
     "tell_anew",
     "tell_finished",
     "work_folder",
@@ -118,6 +119,19 @@ def work_folder(run: Run, output: Path, resume: bool, counts: tuple[int, int] = 
         else:
             shutil.rmtree(output if made else work, ignore_errors=True)
         raise
+
+
+def stopped_run(folder: Path) -> dict[str, Any] | None:
+    """What a stopped run left in its folder: what is kept, counts and options as far as they are told; None
+    where nothing is to be gone on from."""
+    from g2ard.io.jsonfile import read_json
+
+    work = folder / WORK
+    if not left_at(work):
+        return None
+    told = read_json(work / OPTIONS) if (work / OPTIONS).exists() else {}
+    kept = sorted(path.name.removesuffix(".npz") for path in work.glob("[!.]*.npz"))
+    return {"path": str(folder), "kind": "stopped run", "kept": kept, **told}
 
 
 def drop_older(place: Path) -> None:

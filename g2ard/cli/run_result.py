@@ -54,14 +54,14 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
     )
 
 
-def told(report: dict[str, Any]) -> list[str]:
-    """What recovery kept, where it lost, and what no view saw, a line each."""
-    from g2ard.stages.recover.outcome import outcome
+def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
+    """What recovery kept, where it lost, and what no view saw, a line each; if `verbose`, regularisers that
+    never acted too."""
+    from g2ard.stages.recover.outcome import outcome, unregularized
     from g2ard.stages.recover.report import RecoverReport
 
-    lines = [
-        outcome(RecoverReport.of(done)) for entry in report["rounds"] for done in entry.get("recover", [])
-    ]
+    done = [RecoverReport.of(done) for entry in report["rounds"] for done in entry.get("recover", [])]
+    lines = [outcome(one) for one in done] + ([unregularized(one) for one in done] if verbose else [])
     found = [line for line in lines if line is not None]
     for kind, what in (("scores", "unseen views"), ("apart", "views of another kind")):
         if not report[kind]:
@@ -88,10 +88,13 @@ def told(report: dict[str, Any]) -> list[str]:
 
 def say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:
     """What was made of the candidates, where it is not simply all of them."""
+    from g2ard.io.clean import plural
+
     if views is None:
         return
     if views["refused"]:
-        run.say(f"{len(views['refused'])} views not used: they see nothing of the scene, or stand within it")
+        count = plural(len(views["refused"]), "view")
+        run.say(f"{count} not used: nothing of the scene in sight, or within its matter")
     if chosen:
         run.say(
             f"views: {len(views['chosen'])} of {views['candidates']} by {views['policy']};"

@@ -321,6 +321,7 @@ def prepare(
         InputError: as `distill`.
     """
     from g2ard.constants import changed
+    from g2ard.io.clean import plural
     from g2ard.pipeline import DistillConfig
     from g2ard.policy.clean import clutter_seen
     from g2ard.policy.fit import aim_of
@@ -372,7 +373,7 @@ def prepare(
     regularizers, why, measured = preset_for(kind, prior, train if use_photos else None, paper=paper)
     counts = ", ".join(f"{aim.count:,}" for aim in aims)
     against = "photos" if use_photos else "teacher renders"
-    say(f"{len(prior):,} → {counts} Gaussians; {len(train)} views against {against}")
+    say(f"{len(prior):,} → {counts} Gaussians; {plural(len(train), 'view')} against {against}")
     say(f"regularisers: {why}")
     config = DistillConfig(
         method=method,

@@ -39,6 +39,7 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
     """
     from g2ard.errors import InputError
     from g2ard.io import find_views, read_view_set
+    from g2ard.io.clean import plural
     from g2ard.splits import split_mask
 
     path = find_views(scene)
@@ -56,7 +57,7 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
     if seeing < _SEEING * count:
         say(f"views beside the scene are not used: {path}: {seeing} of {count} cameras see it")
         return None
-    cameras = f"{count} camera" + "s" * (count != 1)
+    cameras = plural(count, "camera")
     say(f"views: {cameras} of {path} (found beside the scene; --views made for a pool of its own)")
     return path
 

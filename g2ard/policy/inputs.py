@@ -119,7 +119,7 @@ def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewS
     if not keep.any():
         raise InputError(f"held-out views: all {len(keep)} views to train on are held out")
     if not keep.all():
-        say(f"{len(keep) - int(keep.sum())} of {len(keep)} views are held out: not trained on")
+        say(f"held out, so not trained on: {len(keep) - int(keep.sum())} of {len(keep)} views")
     return train.take(keep)
 
 
@@ -178,6 +178,7 @@ def make_targets(
 ) -> Targets:
     """The teacher's renders (`lazy`: when first asked for), or the photos where no teacher is given; with
     `photos` the photo of each view that has one, and the teacher's render of the others."""
+    from g2ard.io.clean import plural
     from g2ard.io.exposures import find_exposures
     from g2ard.targets import Photos, PhotosOrRenders, TeacherRenders
 
@@ -187,7 +188,7 @@ def make_targets(
         )
     exposures = find_exposures(cameras)
     if exposures:
-        say(f"exposure.json: {len(exposures)} photos brought to the scene's own colours")
+        say(f"exposure.json: {plural(len(exposures), 'photo')} brought to the scene's own colours")
     if teacher is None:
         return Photos(cameras, exposures=exposures)
     return PhotosOrRenders(

@@ -111,7 +111,7 @@ def views_of(
     planned = _planned(prior, _POOL, up, seed, progress, _GROW)
     apart = planned.apart and planned.apart.resized(size)
     names = planned.cameras.names
-    say(f"poses: {planned.kind} ({planned.why})")
+    say(f"poses: {_of(planned)}")
     if held is not None:
         pool = ViewSet(planned.cameras, splits=("train",) * len(names))
         train = drop_held_out(pool.resized(size), held.cameras, say)
@@ -161,8 +161,14 @@ def views_or_pool(
         planned = _planned(scene, _POOL, up, seed, progress, _GROW)
     else:
         planned = plan_pool(scene, count, up=up, seed=seed, rows=_ROWS, progress=progress)
-    say(f"poses: {len(planned.cameras)}, {planned.kind} ({planned.why})")
+    say(f"poses: {_of(planned)}")
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
+
+
+def _of(pool: Pool) -> str:
+    """A pool in a few words; `g2ard poses` tells why it is of that kind."""
+    guess = "; which way is up is a guess" if "guess" in pool.why else ""
+    return f"{len(pool.cameras)}, {pool.kind}{guess}"
 
 
 def cameras_for_looks(

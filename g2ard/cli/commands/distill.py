@@ -296,7 +296,7 @@ def _distil(
         write_views(output / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
     shutil.rmtree(output / WORK)
     write_table(run, report)
-    for line in told(report):
+    for line in told(report, verbose=run.verbose):
         run.say(line)
     say_views(run, report["views"], job.config.views is not None)
     say_weight(run, source, place, result.splats)

@@ -40,10 +40,13 @@ def info(
 
 def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
     """Figures of a file, or of a run's scene with its scores, and the rows that show them."""
+    from g2ard.cli.run_folder import stopped_run
     from g2ard.io.describe import describe
     from g2ard.io.jsonfile import read_json
     from g2ard.io.scene_formats import FORMATS
 
+    if (stopped := stopped_run(path)) is not None:
+        return stopped, _rows_of_stopped(path, stopped)
     told = path / "report.json"
     scenes = [path / f"scene.{name}" for name in FORMATS]
     scene = next((place for place in scenes if place.is_file()), None)
@@ -59,6 +62,16 @@ def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
         for name, found in scores.items()
     ]
     return figures, [*_rows(figures), *rows]
+
+
+def _rows_of_stopped(path: Path, stopped: dict[str, Any]) -> list[list[str]]:
+    rows = [["stopped run", ", ".join(stopped["kept"]) + " kept"]]
+    if "config" in stopped:
+        rows.append(["Gaussians", f"{stopped['input_count']:,} → {stopped['output_count']:,}"])
+        scene, views = (stopped["config"].get(name) for name in ("scene", "views"))
+        rows.append(["of", str(scene or views)])
+    rows.append(["to go on", f"the command that began it, with --resume (-o {path})"])
+    return rows
 
 
 def _devices(run: Run) -> None:

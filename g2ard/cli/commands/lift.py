@@ -9,6 +9,7 @@ import typer
 
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import OutputOption
+from g2ard.cli.run_result import say_weight
 
 
 @command("lift", example="g2ard lift stadium.laz -o prior.ply")
@@ -47,6 +48,7 @@ def lift(
     lifted = time.perf_counter()
     io.write_splats(output, splats, overwrite=run.overwrite)
     written = time.perf_counter()
+    say_weight(run, cloud, output, splats)
     run.say(f"{output}: {len(splats):,} discs from {len(found.points):,} points in {written - began:.1f} s")
     run.result(
         {

@@ -76,7 +76,7 @@ def recover(
     )
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover import recover as optimize
-    from g2ard.stages.recover.outcome import outcome
+    from g2ard.stages.recover.outcome import outcome, unregularized
     from g2ard.stages.recover.presets import preset_for
     from g2ard.stages.recover.schedule import schedule_named
 
@@ -96,7 +96,7 @@ def recover(
     targets = make_targets(chosen.cameras, dense, colour, progress=run.progress, say=run.say)
     weights = chosen.weights if weighted else None
     if weights is not None:
-        run.say(f"{len(weights)} views, drawn by their weights")
+        run.say(f"views are drawn by their weights ({len(weights)})")
     regularizers, why, measured = preset_for(
         preset, dense or splats, None if dense else chosen.cameras, paper=schedule == "paper"
     )
@@ -127,6 +127,8 @@ def recover(
         )
         write_splats(output, result.splats, overwrite=run.overwrite)
     if (told := outcome(result.report)) is not None:
+        run.say(told)
+    if run.verbose and (told := unregularized(result.report)) is not None:
         run.say(told)
     gain = result.report.psnr
     run.say(

@@ -47,6 +47,7 @@ def select(
     """
     from g2ard.constants import changed, listed
     from g2ard.io import check_views_output
+    from g2ard.io.clean import plural
     from g2ard.policy.inputs import load_scene, load_split_views
     from g2ard.stages.select import CoverageOptions
     from g2ard.stages.select import select as choose
@@ -72,7 +73,8 @@ def select(
     kept = cameras.take(chosen.order)
     _write(run, output, pool, candidates.nonzero()[0][chosen.order], chosen.weights)
     if len(chosen.refused):
-        run.say(f"{len(chosen.refused)} views refused: they see nothing of the scene, or stand within it")
+        count = plural(len(chosen.refused), "view")
+        run.say(f"{count} refused: nothing of the scene in sight, or within its matter")
     run.say(
         f"{output}: {len(kept)} of {len(cameras)} views by {policy};"
         f" those left out would add {100 * chosen.left_out:.1f} %"
@@ -101,6 +103,7 @@ def _write(run: Run, output: Path, pool: ViewSet, chosen: Any, weights: Any) -> 
     import numpy as np
 
     from g2ard.io import write_views
+    from g2ard.io.clean import plural
 
     kept = np.isin(np.arange(len(pool.splits)), chosen)
     held_out = [i for i, word in enumerate(pool.splits) if word not in ("train", None) and not kept[i]]
@@ -114,9 +117,7 @@ def _write(run: Run, output: Path, pool: ViewSet, chosen: Any, weights: Any) -> 
     )
     tests = sum(pool.splits[i] not in ("train", None) for i in chosen)
     if tests:
-        run.say(
-            f"{tests} of the chosen views are held out: they keep their split, and recovery leaves them out"
-        )
+        run.say(f"held out among the chosen ones: {plural(tests, 'view')}, which recovery leaves out")
     if held_out:
         words = ", ".join(sorted({str(pool.splits[i]) for i in held_out}))
-        run.say(f"{len(held_out)} views held out ({words}) follow the chosen ones")
+        run.say(f"held out after the chosen ones: {plural(len(held_out), 'view')} ({words})")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from g2ard.stages.recover.report import RecoverReport
 
-__all__ = ["outcome"]
+__all__ = ["outcome", "unregularized"]
 
 
 def outcome(report: RecoverReport) -> str | None:
@@ -16,27 +16,9 @@ def outcome(report: RecoverReport) -> str | None:
     >>> well = RecoverReport(90, 1.0, [], Gain(32.9, 33.4), 1.0, None, 0.0, (), 0.0, 0.0, *rest)
     >>> outcome(well) is None
     True
-    >>> outcome(replace(well, regularizers=Regularized(0, 0.0, 100)))
-    'the regularisers never acted: they do every 100 steps, and there were 90 (--set regularizers.period=…)'
     >>> outcome(replace(well, backed_off=(Look(30, 23.35),)))
     'recovery fell to 23.35 dB (start 32.90) at step 30: it went on from the best with a third of the rates'
     """
-    told = [line for line in (_outcome(report), _unregularized(report)) if line]
-    return "; ".join(told) or None
-
-
-def _unregularized(report: RecoverReport) -> str | None:
-    """Weights that never acted: fewer steps than one period."""
-    held = report.regularizers
-    if report.kept_start or held.steps or not held.period or not report.steps:
-        return None
-    return (
-        f"the regularisers never acted: they do every {held.period} steps, and there were {report.steps} "
-        "(--set regularizers.period=…)"
-    )
-
-
-def _outcome(report: RecoverReport) -> str | None:
     start = f"(start {report.psnr.before:.2f})"
     lines = [f"{found.psnr:.2f} dB {start} at step {found.step}" for found in report.backed_off]
     if report.kept_start:
@@ -58,3 +40,14 @@ def _outcome(report: RecoverReport) -> str | None:
             f" {report.way:.0%} of the way to where it ended, which is above both"
         )
     return None
+
+
+def unregularized(report: RecoverReport) -> str | None:
+    """One line about weights that never acted, for there were fewer steps than one period; else None."""
+    held = report.regularizers
+    if report.kept_start or held.steps or not held.period or not report.steps:
+        return None
+    return (
+        f"the regularisers never acted: they do every {held.period} steps, and there were {report.steps} "
+        "(--set regularizers.period=…)"
+    )
