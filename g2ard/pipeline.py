@@ -13,24 +13,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from g2ard.errors import require
+from g2ard.pipeline_report import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.progress import Progress, silent
-from g2ard.reports import Report
 from g2ard.splats import Splats
 from g2ard.stages.recover import checkpoint as checkpoints
 from g2ard.stages.recover.anchors import PRESETS, Anchors, Regularizers
 from g2ard.stages.recover.draw import checked_weights
-from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.recover.schedule import TUNED, Schedule
 from g2ard.stages.select.surfaces import CoverageOptions
 from g2ard.stages.simplify.config import SimplifyConfig
-from g2ard.stages.simplify.report import SimplifyReport
 from g2ard.targets import Photos, Subset, Targets, fingerprint_of
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.stages.recover.optimize import Watch
 
-__all__ = ["DistillConfig", "DistillReport", "Distilled", "distill"]
+__all__ = ["DistillConfig", "Distilled", "distill"]
 
 _ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 
@@ -83,55 +81,6 @@ class DistillConfig:
     def __post_init__(self) -> None:
         share = not isinstance(self.views, float) or 0 < self.views <= 1
         require("views", self.views, share, "a count, auto, none, or a share in (0, 1]")
-
-
-@dataclass(frozen=True)
-class ViewsReport(Report):
-    """What was made of the candidate views.
-
-    Args:
-        policy: how they were chosen.
-        candidates: how many there were.
-        chosen: names, best first.
-        weighted: whether they were drawn by weight.
-        refused: names of those that see nothing of the scene, or stand within it.
-        left_out: what the views not chosen would have added to the policy's objective, as a share of the
-            whole pool's.
-    """
-
-    policy: str
-    candidates: int
-    chosen: list[str]
-    weighted: bool
-    refused: list[str]
-    left_out: float
-
-
-@dataclass(frozen=True)
-class RoundReport(Report):
-    """A round, recovered once where the schedule asks for it, and once more if it is the last."""
-
-    count: int
-    simplify: SimplifyReport
-    recover: tuple[RecoverReport, ...] = ()
-
-
-@dataclass(frozen=True)
-class StageSeconds(Report):
-    """Wall seconds of each stage."""
-
-    select: float
-    simplify: float
-    recover: float
-
-
-@dataclass(frozen=True)
-class DistillReport(Report):
-    """A distillation in numbers; `views` is None where nothing was selected."""
-
-    rounds: tuple[RoundReport, ...]
-    seconds: StageSeconds
-    views: ViewsReport | None
 
 
 @dataclass(frozen=True, eq=False)

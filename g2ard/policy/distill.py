@@ -3,32 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from g2ard.errors import InputError
 from g2ard.policy.budget import Budget
-from g2ard.policy.inputs import load_scene, make_targets
-from g2ard.policy.views import RunViews, is_made, views_of
+from g2ard.policy.inputs import load_scene
+from g2ard.policy.job import DistillJob
+from g2ard.policy.views import is_made, views_of
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.splats import Splats
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Cameras
     from g2ard.io.types import Points
-    from g2ard.pipeline import DistillConfig, Distilled
-    from g2ard.policy.fit import Aim
+    from g2ard.pipeline import Distilled
     from g2ard.policy.inputs import Views
     from g2ard.stages.lift import LiftConfig
-    from g2ard.stages.recover.presets import PriorMeasures
-    from g2ard.targets import Targets
 
     Scene = Splats | Points | str | Path | None
     Colour = tuple[float, float, float]
 
-__all__ = ["DistillJob", "distill", "prepare"]
+__all__ = ["distill", "prepare"]
 
 _DEFAULT: dict[str, Any] = {
     "method": "default",
@@ -45,113 +40,6 @@ _PAPER: dict[str, Any] = {
     "weighted": False,
 }
 """What an option that is not given means, under the paper's presets and else."""
-
-
-@dataclass(frozen=True, eq=False)
-class DistillJob:
-    """A distillation, ready to run: all is decided, nothing rendered yet.
-
-    Args:
-        prior: the dense scene, or the lift of a cloud.
-        aims: what one or more budgets came to; what they share is made once.
-        views: what is looked at.
-        teacher: whose renders the targets are; None where they are photos.
-        config: of the pipeline.
-        weights: (C,) how often each view is drawn, where the views say so.
-        lifting: constants of the lift; None where nothing was lifted.
-        preset: which regularisers, and why.
-        measured: what decided it.
-        cleaned: how many Gaussians of each kind were taken out first; None where nothing was looked for.
-        progress: told of all stages.
-        say: told in lines what was noticed.
-    """
-
-    prior: Splats
-    aims: tuple[Aim, ...]
-    views: RunViews
-    teacher: Splats | None
-    config: DistillConfig
-    weights: Any
-    lifting: LiftConfig | None
-    preset: str
-    measured: PriorMeasures
-    cleaned: dict[str, int] | None = None
-    progress: Progress = silent
-    say: Say = unsaid
-
-    @property
-    def budgets(self) -> tuple[int, ...]:
-        """Counts to distil to."""
-        return tuple(aim.count for aim in self.aims)
-
-    @property
-    def against(self) -> str:
-        """What the targets are, in words."""
-        return "photos" if self.teacher is None else "teacher renders"
-
-    @cached_property
-    def targets(self) -> Targets:
-        """What recovery learns from."""
-        return self._targets(self.views.train.cameras, lazy=self.config.views is not None)
-
-    @cached_property
-    def held_out(self) -> Targets:
-        """Views of their kind to score on, never learned from."""
-        return self._targets(self.views.test)
-
-    @cached_property
-    def apart(self) -> tuple[Targets | None, Targets | None]:
-        """Views of another kind: every second one decides how much of recovery stays, the others are to score
-        on; None where there are none, or no teacher to render them."""
-        cameras = self.views.apart
-        if cameras is None or self.teacher is None or len(cameras) < 2:
-            return None, None
-        first, second = (self._targets(cameras.take(range(i, len(cameras), 2))) for i in (0, 1))
-        return first, second
-
-    def render_targets(self) -> None:
-        """Have all targets that are rendered beforehand; `run` does so where it has not been done."""
-        _ = self.targets, self.held_out, self.apart
-
-    def tried(self, cameras: Cameras) -> Targets:
-        """Targets of a few views, none of them kept."""
-        return self._targets(cameras, lazy=True)
-
-    def _targets(self, cameras: Cameras, *, lazy: bool = False) -> Targets:
-        return make_targets(
-            cameras,
-            self.teacher,
-            self.config.background,
-            lazy=lazy,
-            progress=self.progress,
-            say=self.say,
-        )
-
-    def run(self, budget: int | None = None, *, work: Path | None = None) -> Distilled:
-        """Distil to one of the budgets, the first if none is named.
-
-        Args:
-            budget: one of `budgets`.
-            work: a folder for what a stopped run leaves, see `g2ard.pipeline.distill`.
-
-        Returns:
-            As `g2ard.distill`.
-        """
-        from g2ard.pipeline import distill as pipeline
-
-        aim = next(aim for aim in self.aims if budget in (None, aim.count))
-        self.render_targets()
-        done = pipeline(
-            self.prior,
-            aim.count,
-            self.targets,
-            self.config,
-            weights=self.weights,
-            validation=self.apart[0],
-            work=work,
-            progress=self.progress,
-        )
-        return replace(done, splats=aim.shrink(done.splats, self.say)[0], held_out=self.held_out)
 
 
 def distill(

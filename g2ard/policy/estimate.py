@@ -14,7 +14,7 @@ from g2ard.targets import CACHE_BYTES, Targets
 from g2ard.visibility import visibility
 
 if TYPE_CHECKING:
-    from g2ard.policy.distill import DistillJob
+    from g2ard.policy.job import DistillJob
     from g2ard.splats import Splats
 
 __all__ = ["Estimate", "estimate", "total"]

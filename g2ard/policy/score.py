@@ -10,7 +10,7 @@ from g2ard.progress import Progress
 
 if TYPE_CHECKING:
     from g2ard.pipeline import Distilled
-    from g2ard.policy.distill import DistillJob
+    from g2ard.policy.job import DistillJob
     from g2ard.splats import Splats
     from g2ard.targets import Targets
 

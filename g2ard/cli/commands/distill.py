@@ -51,7 +51,7 @@ from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, writ
 if TYPE_CHECKING:
     from g2ard.pipeline import Distilled
     from g2ard.policy.budget import Budget
-    from g2ard.policy.distill import DistillJob
+    from g2ard.policy.job import DistillJob
     from g2ard.report.window import Crop
     from g2ard.splats import Splats
     from g2ard.targets import Targets
