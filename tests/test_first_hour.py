@@ -18,7 +18,7 @@ from scenes import around, checkered_ball
 from view_files import transforms
 
 import g2ard
-from g2ard.cli.options import Counts
+from g2ard.cli.budget_options import Counts
 from g2ard.images import write_png
 from g2ard.io import Points, write_points, write_views
 from g2ard.policy.photos import points_within_sight

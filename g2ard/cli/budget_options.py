@@ -1,13 +1,157 @@
-"""Budgets by what people have: --fit 5MB, --fit quest3, --min-psnr 38."""
+"""Budgets as people have them: -n 250k, -r 10, --fit 5MB, --fit quest3, --min-psnr 38."""
 
 from __future__ import annotations
 
-from typing import Annotated
+import math
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-__all__ = ["FitOption", "MinPsnrOption", "MinSsimOption"]
+if TYPE_CHECKING:
+    from g2ard.policy.budget import Budget
 
+__all__ = [
+    "Count",
+    "CountOption",
+    "Counts",
+    "CountsOption",
+    "FitOption",
+    "MinPsnrOption",
+    "MinSsimOption",
+    "RatioOption",
+    "Ratios",
+    "RatiosOption",
+    "one_budget",
+    "parse_ratio",
+]
+
+_COUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmM%]?)")
+_GROUPED = re.compile(r"\d{1,3}(?:,\d{3})+|\d{1,3}(?:_\d{3})+")
+
+
+@dataclass(frozen=True)
+class Count:
+    """A count as typed: absolute, or a share of what there is."""
+
+    value: float
+    is_share: bool
+    text: str
+
+    @classmethod
+    def parse(cls, text: str) -> Count:
+        """Read 250000, 250,000, 250_000, 250k, 1.5M or 25%.
+
+        >>> Count.parse("250k").of(10**6), Count.parse("25%").of(10), Count.parse("1.5M").of(10**7)
+        (250000, 3, 1500000)
+        >>> Count.parse("1,234,567").of(10**7), Count.parse("250_000").of(10**7)
+        (1234567, 250000)
+        """
+        plain = text.strip()
+        if _GROUPED.fullmatch(plain):
+            plain = re.sub("[,_]", "", plain)
+        match = _COUNT.fullmatch(plain)
+        if match is None or not float(match[1]) > 0:
+            raise typer.BadParameter(f"a positive count such as 250000, 250k, 1.5M or 25%, not {text!r}")
+        number, unit = float(match[1]), match[2].lower()
+        if unit == "%":
+            if number > 100:
+                raise typer.BadParameter(f"a share is at most 100%, not {text!r}")
+            return cls(number / 100, True, text)
+        number *= {"": 1, "k": 1_000, "m": 1_000_000}[unit]
+        if number != round(number):
+            raise typer.BadParameter(f"a whole number, not {text!r}")
+        return cls(round(number), False, text)
+
+    def of(self, total: int) -> int:
+        """The count out of `total`; a share is rounded up and at least 1."""
+        return max(1, math.ceil(self.value * total - 1e-9)) if self.is_share else int(self.value)
+
+    @property
+    def number(self) -> int | float:
+        """A whole number, or a share in (0, 1]."""
+        return float(self.value) if self.is_share else int(self.value)
+
+    def budget(self) -> Budget:
+        """As the library takes it."""
+        from g2ard.policy.budget import Budget
+
+        return Budget(share=self.value) if self.is_share else Budget(count=int(self.value))
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def parse_ratio(text: str) -> float:
+    """Read 10 or 10x."""
+    try:
+        value = float(text.strip().rstrip("xX×"))
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value >= 1):
+        raise typer.BadParameter(f"a ratio of at least 1, such as 10, not {text!r}")
+    return value
+
+
+CountOption = Annotated[
+    Count | None,
+    typer.Option(
+        "-n", "--count", parser=Count.parse, metavar="COUNT", help="Budget: 250000, 250k, 1.5M or 25%."
+    ),
+]
+
+
+class Counts(tuple[Count, ...]):
+    """Several in one argument, 10k,20k; a class, for typer reads a bare tuple as several arguments."""
+
+    @classmethod
+    def parse(cls, text: str) -> Counts:
+        """Counts between commas; a comma before a group that begins with 0, as in 1,000, is of one number.
+
+        >>> [count.of(10**6) for count in Counts.parse("10k,20k")], len(Counts.parse("250,000"))
+        ([10000, 20000], 1)
+        """
+        groups = text.strip().split(",")
+        if _GROUPED.fullmatch(text.strip()) and any(group.startswith("0") for group in groups[1:]):
+            return cls([Count.parse(text)])
+        return cls(Count.parse(part) for part in text.split(","))
+
+
+class Ratios(tuple[float, ...]):
+    """Several in one argument, 5,10,20."""
+
+    @classmethod
+    def parse(cls, text: str) -> Ratios:
+        return cls(parse_ratio(part) for part in text.split(","))
+
+
+CountsOption = Annotated[
+    list[Counts] | None,
+    typer.Option(
+        "-n",
+        "--count",
+        parser=Counts.parse,
+        metavar="COUNT",
+        help="Budget: 250000, 250k, 1.5M or 25%; several, 10k,20k, want {count} in the output's name.",
+    ),
+]
+RatiosOption = Annotated[
+    list[Ratios] | None,
+    typer.Option(
+        "-r",
+        "--ratio",
+        parser=Ratios.parse,
+        metavar="RATIO",
+        help="Budget as a ratio: 10 keeps a tenth; several, 5,10,20, want {ratio} in the output's name.",
+    ),
+]
+RatioOption = Annotated[
+    float | None,
+    typer.Option(
+        "-r", "--ratio", parser=parse_ratio, metavar="RATIO", help="Budget as a ratio: 10 keeps a tenth."
+    ),
+]
 FitOption = Annotated[
     str | None,
     typer.Option("--fit", metavar="5MB|quest3|mobile|web", help="Budget: bytes of the file, or a device."),
@@ -19,3 +163,14 @@ MinPsnrOption = Annotated[
 MinSsimOption = Annotated[
     float | None, typer.Option(min=0.01, max=0.9999, help="Budget: the fewest that keep this SSIM.")
 ]
+
+
+def one_budget(count: Count | None, ratio: float | None) -> Budget:
+    """Usage check, before anything is read: exactly one of -n and -r."""
+    from g2ard.policy.budget import Budget
+
+    if (count is None) == (ratio is None):
+        raise typer.BadParameter("give the budget as either -n COUNT or -r RATIO")
+    if count is None:
+        return Budget(ratio=ratio)
+    return count.budget()

@@ -11,7 +11,7 @@ import typer
 from g2ard.cli.frame import Run
 
 if TYPE_CHECKING:
-    from g2ard.cli.options import Counts, Ratios
+    from g2ard.cli.budget_options import Counts, Ratios
     from g2ard.policy.budget import Budget
 
 __all__ = ["Outputs", "budgets_of"]

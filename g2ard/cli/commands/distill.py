@@ -10,18 +10,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from g2ard.cli.budget_options import FitOption, MinPsnrOption, MinSsimOption
+from g2ard.cli.budget_options import (
+    Count,
+    CountsOption,
+    FitOption,
+    MinPsnrOption,
+    MinSsimOption,
+    RatiosOption,
+)
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
-    Count,
-    CountsOption,
     CropOption,
     FormatOption,
     Method,
     PolicyOption,
     PresetOption,
-    RatiosOption,
     ResumeOption,
     ScheduleName,
     SizeOption,

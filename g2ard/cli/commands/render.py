@@ -9,20 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from g2ard.cli.budget_options import Count, CountOption, RatioOption, one_budget
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
     ConventionOption,
-    Count,
-    CountOption,
     Method,
-    RatioOption,
     SceneArgument,
     SizeOption,
     SplitOption,
     ViewsOrMadeOption,
     is_made,
-    one_budget,
 )
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
-    Count,
     OutputOption,
     PaperOption,
     PolicyOption,

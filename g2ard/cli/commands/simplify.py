@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from g2ard.cli.budget_options import FitOption, MinPsnrOption, MinSsimOption
+from g2ard.cli.budget_options import CountsOption, FitOption, MinPsnrOption, MinSsimOption, RatiosOption
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
-    CountsOption,
     Method,
     OutputOption,
     PaperOption,
-    RatiosOption,
     SceneArgument,
     UpOption,
     ViewsOrMadeOption,

@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
+from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command, group
-from g2ard.cli.options import BackgroundOption, Count, Triple
+from g2ard.cli.options import BackgroundOption, Triple
 
 synth = group("synth", "Make data where none is at hand.\n\nExample: g2ard synth city -o city/")
 

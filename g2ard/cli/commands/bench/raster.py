@@ -32,7 +32,7 @@ def raster(
     """Milliseconds of a recovery step, pass by pass, and the share of the machine's measured limit."""
     from g2ard import _core
     from g2ard.bench.raster import bench_raster
-    from g2ard.cli.options import Count
+    from g2ard.cli.budget_options import Count
     from g2ard.policy.inputs import load_scene, load_views
 
     wanted = [Count.parse(part) for part in counts.split(",")]

@@ -8,16 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from g2ard.cli.budget_options import parse_ratio
 from g2ard.cli.commands.bench.group import bench
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import (
-    BackgroundOption,
-    ProtocolOption,
-    SizeOption,
-    TimeLimitOption,
-    ViewsOption,
-    parse_ratio,
-)
+from g2ard.cli.options import BackgroundOption, ProtocolOption, SizeOption, TimeLimitOption, ViewsOption
 
 if TYPE_CHECKING:
     from g2ard.bench.recover import Look

@@ -9,14 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.cli.budget_options import parse_ratio
 from g2ard.cli.commands.bench.group import bench
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import (
-    PaperOption,
-    SizeOption,
-    ViewsOption,
-    parse_ratio,
-)
+from g2ard.cli.options import PaperOption, SizeOption, ViewsOption
 
 if TYPE_CHECKING:
     from g2ard.bench.definition import Definition, MethodSpec

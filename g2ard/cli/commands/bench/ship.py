@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
+from g2ard.cli.budget_options import parse_ratio
 from g2ard.cli.commands.bench.group import bench
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import parse_ratio
 
 
 @command("ship", parent=bench, example="g2ard bench ship scene.ply --ratios 1,10 --formats sog,spz")
