@@ -60,7 +60,7 @@ def split_mask(
         raise InputError(f"{views}: no split {which!r} (there are {', '.join(sorted(masks))})")
     if not masks[which].any():
         of = "its only view is not" if len(names) == 1 else f"none of its {len(names)} views is"
-        raise InputError(f"{views}: {of} in split {which!r}")
+        raise InputError(f"{views}: {of} in split {which!r}; a split.json beside them can say which are")
     return masks[which]
 
 
@@ -138,7 +138,10 @@ def for_scores(
         return np.ones(len(names), bool)
     mask = np.array([split != "train" for split in splits_of(views, names, stated)], bool)
     if not mask.any():
-        raise InputError(f"{views}: all of its {len(names)} views are for training; none is left to score on")
+        raise InputError(
+            f"{views}: all of its {len(names)} views are for training, none is left to score on; name views "
+            "with a test split"
+        )
     return mask
 
 

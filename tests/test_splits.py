@@ -30,7 +30,9 @@ def test_split_file_wins(tmp_path: Path) -> None:
     assert split_names(tmp_path, ["left/b.jpg", "b.jpg"], "train") == ["b.jpg"]  # stems alone would confuse
     with pytest.raises(InputError, match=r"no split 'val' \(there are ood, test, train\)"):
         split_names(tmp_path, names, "val")
-    with pytest.raises(InputError, match="its only view is not in split 'test'"):
+    with pytest.raises(
+        InputError, match=r"its only view is not in split 'test'; a split\.json beside them can say"
+    ):
         split_names(tmp_path, ["b.jpg"], "test")
 
 

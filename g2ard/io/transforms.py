@@ -137,7 +137,9 @@ def _intrinsics(where: str, values: dict[str, Any], photo: Path) -> dict[str, An
     model = str(values.get("camera_model", "OPENCV"))
     if model not in _MODELS or values.get("is_fisheye"):
         known = ", ".join(_MODELS)
-        raise InputError(f"{where}: a {model} lens, or a fisheye, is not supported ({known} are)")
+        raise InputError(
+            f"{where}: a {model} lens, or a fisheye, is not supported ({known} are); undistort the photos"
+        )
     width, height = _size(where, values, photo)
     fx = _focal(values, "x", width)
     fy = _focal(values, "y", height) or fx

@@ -117,7 +117,10 @@ def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewS
 
     keep = not_held_out(train.cameras, held_out)
     if not keep.any():
-        raise InputError(f"held-out views: all {len(keep)} views to train on are held out")
+        raise InputError(
+            f"held-out views: all {len(keep)} views to train on are among them; hold out fewer, or "
+            "train on others"
+        )
     if not keep.all():
         say(f"held out, so not trained on: {len(keep) - int(keep.sum())} of {len(keep)} views")
     return train.take(keep)

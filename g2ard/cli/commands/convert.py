@@ -88,7 +88,9 @@ def _check_left(splats: Splats, read: int) -> None:
     from g2ard.errors import InputError
 
     if not len(splats):
-        raise InputError(f"nothing is left: none of {read:,} Gaussians lies in --box and --sphere")
+        raise InputError(
+            f"nothing is left: none of {read:,} Gaussians lies in --box and --sphere; see `g2ard info`"
+        )
 
 
 def _size(output: Path) -> int:

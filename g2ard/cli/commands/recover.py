@@ -152,5 +152,8 @@ def _anchors(run: Run, path: Path, student: Splats, in_plane: float) -> Anchors:
 
     scene = load_scene(path, run.say)
     if len(scene) != len(student):
-        raise InputError(f"{path}: {len(scene)} Gaussians, the student has {len(student)}")
+        raise InputError(
+            f"{path}: {len(scene)} Gaussians, the student has {len(student)}; anchors are the student "
+            "as it was simplified, before any recovery"
+        )
     return Anchors.of(scene.recentred(student.offset), in_plane)
