@@ -247,7 +247,11 @@ def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_pa
     found = json.loads(out)
     assert (found["output_count"], found["against"]) == (500, "photos")
     assert found["scores"]["recovered"]["psnr"] > max(17, found["scores"]["simplified"]["psnr"] + 1)
-    said = "starts from 1,200 sparse points and 0 within" if points else "starts from 0 sparse points and 500"
+    said = (
+        "starts from 1,200 sparse points\n"
+        if points
+        else "starts from 500 points within the cameras' sight\n"
+    )
     assert said in error
     ours = g2ard.distill(None, views=tmp_path / "photos", count=500, steps=150).splats
     g2ard.save(tmp_path / "ours.ply", ours)
@@ -410,3 +414,23 @@ def test_a_short_run_has_no_needless_notes(command_line: CommandLine, folder: Pa
     for needless in ("never acted", "of its box", "times as high"):
         assert needless not in error
     assert "never acted" in command_line(*SHORT, "-r", 10, "-o", "run", "-wv", cwd=folder)[2]
+
+
+def test_a_run_killed_before_it_kept_anything_is_in_nobodys_way(
+    command_line: CommandLine, folder: Path
+) -> None:
+    work = folder / "run" / ".unfinished"
+    work.mkdir(parents=True)
+    (work / "options.json").write_text("{}")
+    status, _, error = command_line(*SHORT, "-r", 10, "-o", "run", "--resume", cwd=folder)
+    assert (status, "nothing to go on from: starts anew" in error) == (0, True), error
+
+
+def test_the_wrong_kind_of_input_is_told_what_takes_it(command_line: CommandLine, folder: Path) -> None:
+    photos_of(folder / "photos", points=True)
+    for ask, words in (
+        (("distill", "photos", "-n", 100, "-o", "x"), "photos holds views, no scene: give it as --views"),
+        (("simplify", "photos/sparse.ply", "-r", 2, "-o", "x.ply"), "`g2ard lift` makes a scene of it"),
+    ):
+        status, _, error = command_line(*ask, cwd=folder)
+        assert (status != 0, words in error, error.count("\n")) == (True, True, 1), error

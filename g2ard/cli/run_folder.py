@@ -60,7 +60,7 @@ def check_place(run: Run, place: Path, budget: Budget, given: bool, resume: bool
     views = [] if given else [folder / "views.json"]
     run.spare_inputs(place, *_other_scenes(place), folder / KEPT, *views)
     left = left_at(folder / WORK)
-    if not left and not (resume and _is_finished(place)):
+    if not left and not (resume and _is_finished(place)) and not _is_bare(folder):
         check_output(folder, run.overwrite, folder=True)
     if left or not resume:
         check_stopped(run, folder / WORK, resume, place)
@@ -150,6 +150,11 @@ def _other_scenes(place: Path) -> list[Path]:
 def _is_finished(place: Path) -> bool:
     """Whether a run has ended there."""
     return place.exists() and (place.parent / REPORT).exists() and not left_at(place.parent / WORK)
+
+
+def _is_bare(folder: Path) -> bool:
+    """Whether all that is there is what a run leaves that was killed before it kept anything."""
+    return folder.is_dir() and [path.name for path in folder.iterdir()] == [WORK]
 
 
 def _check_same(run: Run, folder: Path, told: Path, budget: Budget, how: str) -> None:

@@ -106,7 +106,8 @@ def read_scene(path: str | Path) -> Scene:
     path, found = Path(path), file_format(path)
     if found not in ("ply", "compressed_ply", "sog", "spz", "glb", "splat"):
         what = {"cloud_ply": "a point cloud (no f_dc, scale, rot)", "las": "a point cloud"}.get(found, found)
-        raise InputError(f"{path}: a Gaussian scene is needed, this is {what}")
+        hint = "; `g2ard lift` makes a scene of it" if kind(path) == "points" else ""
+        raise InputError(f"{path}: a Gaussian scene is needed, this is {what}{hint}")
     return import_module(f"g2ard.io.{found}").read(path)
 
 

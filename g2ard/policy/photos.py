@@ -66,6 +66,8 @@ def points_of_photos(
     Raises:
         InputError: a view without a photo, or no sparse points and no `count`.
     """
+    from g2ard.io.clean import plural
+
     sparse = None if not isinstance(views, str | Path) else sparse_points(Path(views))
     found = len(sparse) if sparse is not None else 0
     if count is None and sparse is None:
@@ -81,7 +83,15 @@ def points_of_photos(
         parts.append(
             points_within_sight(train.cameras, wanting, background=background, seed=seed, progress=progress)
         )
-    say(f"starts from {found:,} sparse points and {wanting:,} within the cameras' sight")
+    starts = [
+        words
+        for count, words in (
+            (found, plural(found, "sparse point")),
+            (wanting, f"{plural(wanting, 'point')} within the cameras' sight"),
+        )
+        if count
+    ]
+    say(f"starts from {' and '.join(starts)}")
     return Points(
         np.concatenate([part.positions for part in parts]), np.concatenate([part.colors for part in parts])
     )

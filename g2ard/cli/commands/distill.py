@@ -178,6 +178,10 @@ def distill(
     if early and all(is_done(run, place, resume) for place in early):
         _tell_all(run, [tell_finished(run, place) for place in early])
         return
+    if scene is not None and kind(scene) == "views":
+        raise typer.BadParameter(
+            f"{scene} holds views, no scene: give it as --views, with -n COUNT to start from photos"
+        )
     if scene is not None and kind(scene) != "splats" and not given:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
     job = prepare(
