@@ -13,6 +13,7 @@ use super::backward::SUMS;
 use super::depth_sort::{self, Key};
 use super::disjoint::DisjointSlice;
 use super::gradients::{Gather, Gradients, Sink};
+use super::grid::TileGrid;
 use super::memory::bytes;
 use super::params::{Params, Source};
 use super::project::{Project, Splat, View};
@@ -43,6 +44,7 @@ pub(crate) struct ChunkSums<'a> {
 struct ForwardState {
     camera: Camera,
     settings: Settings,
+    grid: TileGrid,
     view: View,
     background: [f32; 3],
     rows: usize,
@@ -118,7 +120,7 @@ impl Rasterizer {
         camera.validate()?;
         settings.validate()?;
         image.validate(camera)?;
-        self.prepare(*params, camera, settings, background);
+        self.prepare(*params, camera, settings, background, TileGrid::of(camera));
         let mut clock = Instant::now();
         if image.depth.is_some() || image.median.is_some() {
             self.forward_tiles::<true>(image);
@@ -195,7 +197,7 @@ impl Rasterizer {
         background: [f32; 3],
         image: &mut Image,
     ) {
-        self.prepare(source, camera, settings, background);
+        self.prepare(source, camera, settings, background, TileGrid::of(camera));
         let mut clock = Instant::now();
         self.forward_tiles::<false>(image);
         self.passes.forward = lap(&mut clock);
@@ -255,7 +257,7 @@ impl Rasterizer {
             ..*params
         };
         let rows = SharedSums::new(sums);
-        self.accumulate_from::<ALL, _>(colourless, camera, settings, |row, total| {
+        self.accumulate_from::<ALL, _>(colourless, camera, settings, TileGrid::of(camera), |row, total| {
             // SAFETY: the call comes once for every row.
             unsafe { rows.add(row, &total) };
         });
@@ -263,15 +265,16 @@ impl Rasterizer {
         Ok(())
     }
 
-    /// Calls `visit(row, its sums)` once for every row that may touch the view's image, in parallel.
+    /// Calls `visit(row, its sums)` once for every row that may touch the grid's part of the view's image, in parallel.
     pub(crate) fn accumulate_from<const KINDS: usize, S: Source>(
         &mut self,
         source: S,
         camera: &Camera,
         settings: &Settings,
+        grid: TileGrid,
         visit: impl Fn(usize, Total) + Sync,
     ) {
-        self.prepare(source, camera, settings, [0.0; 3]);
+        self.prepare(source, camera, settings, [0.0; 3], grid);
         self.accumulate_tiles::<KINDS>();
         let shares = self.shares.as_chunks::<KINDS>().0;
         let chunks = self.chunks.par_iter().enumerate();
@@ -338,17 +341,19 @@ impl Rasterizer {
         camera: &Camera,
         settings: &Settings,
         background: [f32; 3],
+        grid: TileGrid,
     ) {
         let view = View::new(camera, settings);
         self.state = Some(ForwardState {
             camera: *camera,
             settings: *settings,
+            grid,
             view,
             background,
             rows: source.len(),
         });
         let mut clock = Instant::now();
-        self.project(&view, source, camera.tiles());
+        self.project(&view, source, grid);
         self.passes.project = lap(&mut clock);
         self.collect_keys();
         depth_sort::sort(&mut self.order, &mut self.spare);
@@ -358,7 +363,7 @@ impl Rasterizer {
             &self.tile_lists,
             &self.intersectors,
             CHUNK * LANES,
-            camera.tiles(),
+            grid,
         );
         self.passes.bin = lap(&mut clock);
         self.batches.clear();
@@ -370,7 +375,7 @@ impl Rasterizer {
         self.block_masks.resize(first, [0; BLOCKS]);
     }
 
-    fn project<S: Source>(&mut self, view: &View, source: S, tiles: (usize, usize)) {
+    fn project<S: Source>(&mut self, view: &View, source: S, grid: TileGrid) {
         let groups = source.len().div_ceil(LANES);
         let isa = self.isa;
         self.splats.resize(groups * LANES, Splat::default());
@@ -390,7 +395,7 @@ impl Rasterizer {
                     source,
                     first,
                     last: groups.min(first + CHUNK),
-                    tiles,
+                    grid,
                     out,
                     tile_lists,
                     intersector,

@@ -7,7 +7,7 @@ use crate::raster::disjoint::DisjointSlice;
 use crate::raster::params::Params;
 use crate::raster::sensitivity::{GatherSensitivity, MOMENTS, Sensitivity, TRIANGLE};
 use crate::raster::simd::dispatch;
-use crate::raster::tile_batch::{TileBatch, TileRect};
+use crate::raster::tile_batch::TileBatch;
 use crate::raster::{Camera, Settings};
 use crate::{Error, Result};
 
@@ -64,7 +64,7 @@ impl Rasterizer {
             return sums;
         };
         let camera = &state.camera;
-        let tiles_x = camera.tiles().0;
+        let grid = state.grid;
         let slots = DisjointSlice::new(&mut sums);
         let written = DisjointSlice::new(&mut self.written);
         let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
@@ -79,7 +79,7 @@ impl Rasterizer {
                 let sensitivity = Sensitivity {
                     pairs: &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize],
                     splats,
-                    rect: TileRect::of(tile, tiles_x, camera.width, camera.height),
+                    rect: grid.rect(tile, camera),
                     settings: &state.settings,
                     block_masks: &self.block_masks[batch.0..batch.0 + batch.1],
                     transmittance,
