@@ -30,8 +30,8 @@ mod tiles;
 
 pub use accumulate::Accumulated;
 pub(crate) use frustum::Frustum;
-pub(crate) use grid::TileGrid;
 pub use gradients::Gradients;
+pub(crate) use grid::TileGrid;
 pub use params::Params;
 pub use rasterizer::{Counts, Image, ImageGradients, Memory, Passes, Rasterizer};
 pub use sensitivity::TRIANGLE as SENSITIVITY_TRIANGLE;

@@ -6,8 +6,8 @@ use rayon::prelude::*;
 
 use super::depth_sort::Key;
 use super::disjoint::DisjointSlice;
-use super::memory::{bytes, prefetch};
 use super::grid::TileGrid;
+use super::memory::{bytes, prefetch};
 use super::tile_lists::{TileIntersector, TileList};
 
 /// How many stretches the depth order is cut into: fixed, so that the work splits alike for any number of threads.
@@ -36,6 +36,11 @@ impl Bins {
     /// Bytes of the counts.
     pub fn count_bytes(&self) -> usize {
         bytes(&self.counts)
+    }
+
+    /// A tile's pairs, nearest first.
+    pub fn pairs_of(&self, tile: usize) -> &[Pair] {
+        &self.pairs[self.starts[tile] as usize..self.starts[tile + 1] as usize]
     }
 
     /// The slots of a chunk's splats.

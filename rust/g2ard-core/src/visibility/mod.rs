@@ -26,6 +26,8 @@ pub struct VisibilityAccumulator {
     weight: Vec<f64>,
     pixel_size: Vec<f32>,
     rasterizer: Rasterizer,
+    /// Groups that a band of the image may meet.
+    band: usize,
 }
 
 impl VisibilityAccumulator {
@@ -44,6 +46,7 @@ impl VisibilityAccumulator {
             ordered,
             shift,
             rasterizer: Rasterizer::default(),
+            band: BAND,
         })
     }
 
@@ -66,7 +69,7 @@ impl VisibilityAccumulator {
             .collect();
         self.find_pixels(&camera, &live);
         let grid = TileGrid::of(&camera);
-        for rows in bands(&live, grid.rows) {
+        for rows in bands(&live, grid.rows, self.band) {
             let [first, last] = [rows.start as u16, rows.end as u16 - 1];
             let here = live.iter();
             let here = here.filter(|g| g.tile_rows[0] <= last && g.tile_rows[1] >= first);
@@ -130,8 +133,9 @@ impl VisibilityAccumulator {
 /// about 130 bytes a row while they are.
 const BAND: usize = 1 << 14;
 
-/// The image's rows of tiles in bands, each as high as [`BAND`] allows. A group that meets two is projected for both.
-fn bands(live: &[LiveGroup], rows: usize) -> Vec<Range<usize>> {
+/// The image's rows of tiles in bands, each as high as it can be and meet no more than `most` groups, but one row at
+/// least. A group that meets two bands is projected for both.
+fn bands(live: &[LiveGroup], rows: usize, most: usize) -> Vec<Range<usize>> {
     let (mut starts, mut ends) = (vec![0; rows], vec![0; rows]);
     for group in live {
         starts[usize::from(group.tile_rows[0])] += 1;
@@ -142,7 +146,7 @@ fn bands(live: &[LiveGroup], rows: usize) -> Vec<Range<usize>> {
     for row in 0..rows {
         inside += starts[row];
         met += starts[row];
-        if row > first && met > BAND {
+        if row > first && met > most {
             bands.push(first..row);
             (first, met) = (row, inside);
         }
@@ -251,6 +255,51 @@ mod tests {
             views.seen(),
             whole.weight.iter().filter(|w| **w > 0.0).count()
         );
+    }
+
+    #[test]
+    fn bands_cover_every_row_of_tiles_once_and_meet_few_groups() {
+        let mut random = Lcg(3);
+        let live: Vec<LiveGroup> = (0..1000)
+            .map(|number| {
+                let first = random.integer() as u16 % 30;
+                let last = (first + random.integer() as u16 % 3).min(29);
+                LiveGroup {
+                    number,
+                    tile_rows: [first, last],
+                }
+            })
+            .collect();
+        for most in [1, 80, 150, 400, 5000] {
+            let bands = bands(&live, 30, most);
+            let ends = bands.iter().map(|b| b.end);
+            assert!(
+                bands
+                    .iter()
+                    .map(|b| b.start)
+                    .eq([0].into_iter().chain(ends).take(bands.len()))
+            );
+            assert_eq!(bands.last().unwrap().end, 30);
+            for band in &bands {
+                let [first, last] = [band.start as u16, band.end as u16 - 1];
+                let meets = |g: &&LiveGroup| g.tile_rows[0] <= last && g.tile_rows[1] >= first;
+                let met = live.iter().filter(meets).count();
+                assert!(met <= most || band.len() == 1, "{met} in {band:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn bands_show_what_the_whole_image_does() {
+        let rows = scene();
+        let scene = made(Means::F32(&rows.0), &rows.2, &rows);
+        let (mut whole, mut split) = (accumulator(&scene), accumulator(&scene));
+        split.band = 10;
+        for camera in cameras() {
+            whole.add(&camera, &Settings::default()).unwrap();
+            split.add(&camera, &Settings::default()).unwrap();
+        }
+        assert_eq!(whole.by_row(), split.by_row());
     }
 
     #[test]

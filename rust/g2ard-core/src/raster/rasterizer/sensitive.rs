@@ -40,13 +40,11 @@ impl Rasterizer {
             return Ok(());
         };
         let out = DisjointSlice::new(sums);
-        let chunks = self.chunks.par_iter().enumerate();
-        chunks.for_each(|(chunk, &(first, count))| {
-            let slots = self.bins.slots_of(chunk);
+        self.visible().for_each(|(splats, slots)| {
             let gather = GatherSensitivity {
                 view: &state.view,
                 source: *params,
-                splats: &self.splats[first..first + count],
+                splats,
                 slots: &sensitive[slots.clone()],
                 written: &self.written[slots],
                 out,
@@ -77,7 +75,7 @@ impl Rasterizer {
             TileBatch::default,
             |tile_batch, (tile, ((batch, transmittance), last))| {
                 let sensitivity = Sensitivity {
-                    pairs: &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize],
+                    pairs: bins.pairs_of(tile),
                     splats,
                     rect: grid.rect(tile, camera),
                     settings: &state.settings,

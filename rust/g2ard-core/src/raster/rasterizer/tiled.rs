@@ -4,7 +4,6 @@ use rayon::prelude::*;
 
 use super::{Image, ImageGradients, Rasterizer};
 use crate::raster::BLOCKS;
-use crate::raster::accumulate::Accumulate;
 use crate::raster::backward::{self, Backward, Incoming, SUMS};
 use crate::raster::disjoint::DisjointSlice;
 use crate::raster::forward::{Forward, Pixels};
@@ -42,7 +41,7 @@ impl Rasterizer {
         tile_states.enumerate().for_each_init(
             Scratch::default,
             |scratch, (tile, ((batch, transmittance), last))| {
-                let pairs = &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize];
+                let pairs = bins.pairs_of(tile);
                 let rect = grid.rect(tile, &camera);
                 // SAFETY: every tile has its own batches, and the pixels written below are its own.
                 let block_masks =
@@ -115,7 +114,7 @@ impl Rasterizer {
         states.enumerate().for_each_init(
             Scratch::default,
             |scratch, (tile, ((batch, transmittance), last))| {
-                let pairs = &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize];
+                let pairs = bins.pairs_of(tile);
                 if pairs.is_empty() {
                     return;
                 }
@@ -143,34 +142,6 @@ impl Rasterizer {
                     written,
                 };
                 dispatch(isa, backward);
-            },
-        );
-    }
-
-    pub(super) fn accumulate_tiles<const KINDS: usize>(&mut self) {
-        let pairs = self.bins.pairs.len();
-        self.shares.resize(pairs * KINDS, 0.0);
-        self.written.clear();
-        self.written.resize(pairs, 0);
-        let Some(state) = &self.state else { return };
-        let camera = &state.camera;
-        let grid = state.grid;
-        let slots = DisjointSlice::new(self.shares.as_chunks_mut::<KINDS>().0);
-        let written = DisjointSlice::new(&mut self.written);
-        let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
-        (0..self.batches.len()).into_par_iter().for_each_init(
-            TileBatch::default,
-            |tile_batch, tile| {
-                let accumulate = Accumulate {
-                    pairs: &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize],
-                    splats,
-                    rect: grid.rect(tile, camera),
-                    settings: &state.settings,
-                    tile_batch,
-                    slots,
-                    written,
-                };
-                dispatch(isa, accumulate);
             },
         );
     }
