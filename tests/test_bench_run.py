@@ -135,9 +135,7 @@ def test_the_page_works_in_a_browser(tmp_path: Path) -> None:
 
 
 def test_stages_survive_an_interruption_and_failures_are_rows(tmp_path: Path) -> None:
-    text = STUDY.replace('"pup", "rounds", "nanogs"', '"splat-transform", "random"').replace(
-        "[4]\n", "[4]\n", 1
-    )
+    text = STUDY.replace('"pup", "rounds", "nanogs"', '"splat-transform", "random"')
     text = text.replace("seconds = [3]", "")
     definition = read_definition(study(tmp_path, text))
     out = tmp_path / "out"

@@ -203,18 +203,20 @@ def test_degenerate_scenes(name: str, variant: str) -> None:
     if name == "vast":  # past what float32 can hold, such splats are left out
         assert not alpha.any()
         return
-    want, tensors = oracle(p, cameras, settings, (1, 0, 0.5), grad=True)
-    sure = ~want.doubtful
-    assert (image - want.image).abs()[sure].quantile(0.99) < 1e-4 if sure.any() else True
-    if want.doubtful.any():
-        return
-    (want.image.sum() + want.alpha.sum() + want.depth.square().sum()).backward()
-    for key, a, b in zip(NAMES, mine, tensors, strict=True):
+    want, theirs = oracle(p, cameras, settings, (1, 0, 0.5), grad=True)
+    sure = ~want.doubtful  # a flipped skip or stop is no gradient's fault
+    assert sure.double().mean() > 0.99
+    assert (image - want.image).abs()[sure].quantile(0.99) < 1e-5
+    ours = tensors_of(p)
+    again = rasterize(*ours, cameras, 0, background=(1, 0, 0.5), settings=settings)
+    for planes in (again, (want.image, want.alpha, want.depth)):
+        torch.stack([plane[sure].square().sum() for plane in planes]).sum().backward()
+    for key, a, b in zip(NAMES, ours, theirs, strict=True):
         assert a.grad is not None
         assert b.grad is not None
-        if torch.isfinite(b.grad).all():
-            scale = b.grad.norm() + 1e-3 * len(p["means"])
-            assert (a.grad - b.grad).norm() <= 2e-3 * scale, key
+        assert torch.isfinite(b.grad).all(), key
+        scale = b.grad.norm() + 0.05 * len(p["means"])
+        assert (a.grad - b.grad).norm() <= (5e-3 if name == "needles" else 1e-5) * scale, key
 
 
 def test_nothing_to_see() -> None:

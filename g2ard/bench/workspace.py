@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from g2ard import __version__, io
 from g2ard.bench.definition import Definition, SceneSpec
 from g2ard.bench.process import Usage, measured
+from g2ard.bench.stage import Stage, fingerprint, folder_of, scene_key
 from g2ard.bench.worker import StoredTargets, store_targets
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
@@ -40,41 +40,6 @@ __all__ = ["Stage", "Workspace", "fingerprint", "folder_of", "scene_key"]
 
 _POOL = 128
 _MAX_LOGIT = 20.0
-
-
-def fingerprint(value: Any) -> str:
-    """A short hash of anything that JSON can hold."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:16]
-
-
-def scene_key(definition: Definition, scene: SceneSpec) -> str:
-    """Changes with the scene, its files and the size of its views."""
-    stated = {**asdict(scene), "size": definition.size, "version": __version__}
-    files = () if scene.synth is not None else (scene.prior, scene.train, scene.adapt, *scene.score.values())
-    stamps = [_stamp(definition.folder / file) for file in files if file is not None]
-    return fingerprint({**stated, "files": stamps})
-
-
-def folder_of(work: Path, definition: Definition, scene: SceneSpec) -> Path:
-    """Where a scene's stages lie."""
-    return work / f"{scene.name.replace('/', '_')}-{scene_key(definition, scene)}"
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A stage that has run.
-
-    Args:
-        key: of all that went into it.
-        output: its scene or views.
-        usage: of its process.
-        report: what it reported.
-    """
-
-    key: str
-    output: Path
-    usage: Usage
-    report: dict[str, Any]
 
 
 class Workspace:
@@ -390,14 +355,6 @@ class Workspace:
             Usage(**json.loads(usage.read_text())),
             json.loads(report.read_text()) if report.exists() else {},
         )
-
-
-def _stamp(path: Path) -> Any:
-    """What tells one version of a file or folder from another, without reading it."""
-    if not path.exists():
-        return None
-    files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    return [(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in files if f.is_file()]
 
 
 def _readable(path: Path) -> Splats:

@@ -117,9 +117,8 @@ impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
             most: Lanes16::default(),
             winner: Lanes16([-1.0; LANES]),
         }; BLOCKS];
-        for b in 0..BLOCKS {
-            let on_image = F::Mask::from_bits(self.rect.lanes(b));
-            F::splat(1.0).only(on_image).store(&mut blocks[b].unstopped);
+        for (block, light) in blocks.iter_mut().zip(self.rect.light::<F>()) {
+            block.unstopped = light;
         }
         let mut block_masks = [0; BLOCKS];
         let mut lit = u16::MAX;
@@ -165,13 +164,7 @@ impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
                     }
                 }
                 if hits > 0 {
-                    let mut share = [folded(weight, add); KINDS];
-                    if KINDS == ALL {
-                        share[1] = folded(light, add);
-                        share[2] = hits as f32;
-                        share[3] = 0.0;
-                        share[4] = folded(peak, larger);
-                    }
+                    let share = share(weight, light, hits, peak);
                     // SAFETY: a slot belongs to one pair, and a pair to one tile.
                     unsafe {
                         self.slots.write(pair.slot as usize, share);
@@ -191,6 +184,19 @@ impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
             }
         }
     }
+}
+
+/// A pair's sums; those of `dominant` come last.
+#[inline(always)]
+fn share<const KINDS: usize, F: Lanes>(weight: F, light: F, hits: u32, peak: F) -> [f32; KINDS] {
+    let mut share = [folded(weight, add); KINDS];
+    if KINDS == ALL {
+        share[1] = folded(light, add);
+        share[2] = hits as f32;
+        share[3] = 0.0;
+        share[4] = folded(peak, larger);
+    }
+    share
 }
 
 #[inline(always)]

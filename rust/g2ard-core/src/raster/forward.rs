@@ -41,17 +41,10 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
         *self.last = [Lanes16([-1.0; LANES]); BLOCKS];
         // The light that would be left if nothing ever stopped. A stopped pixel's only falls further below the
         // minimum, so whether it would stop here needs no state, and the loop below depends on one product alone.
-        // Pixels off the image start without light.
-        let mut unstopped = [Lanes16::default(); BLOCKS];
-        for b in 0..BLOCKS {
-            F::splat(1.0)
-                .only(F::Mask::from_bits(self.rect.lanes(b)))
-                .store(&mut unstopped[b]);
-        }
+        let mut unstopped = self.rect.light::<F>();
         let minimum = F::splat(ALPHA_MIN.log2());
-        let clip = F::splat(self.settings.alpha_max);
         let stop = F::splat(self.settings.transmittance_min);
-        let half = F::splat(0.5);
+        let (clip, half) = (F::splat(self.settings.alpha_max), F::splat(0.5));
         for (batch, block_masks) in self.block_masks.iter_mut().enumerate() {
             let first = batch * BATCH;
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
@@ -73,11 +66,8 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
                 let mut left = F::load(&self.transmittance[block]);
                 let mut last = F::load(&self.last[block]);
                 let px = &mut *self.pixels;
-                let mut rgb = [
-                    F::load(&px.rgb[0][block]),
-                    F::load(&px.rgb[1][block]),
-                    F::load(&px.rgb[2][block]),
-                ];
+                let [r, g, b] = &px.rgb;
+                let mut rgb = [F::load(&r[block]), F::load(&g[block]), F::load(&b[block])];
                 let mut depth = F::load(&px.depth[block]);
                 let mut median = F::load(&px.median[block]);
                 let mut light = true;

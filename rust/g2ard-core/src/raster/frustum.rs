@@ -3,7 +3,7 @@
 //! [`crate::select::Pinhole`] has its own, in f32 with the slack that takes: it bounds Gaussians by their own traces
 //! and reaches, as its projection does, where this one knows only the largest scale.
 
-use super::{Camera, DILATION};
+use super::{Camera, DILATION, TILE};
 
 /// Standard deviations at which an opacity of 1 falls to α = 1/255, and a little more.
 const REACH: f64 = 3.4;
@@ -34,8 +34,8 @@ impl<'a> Frustum<'a> {
     }
 
     /// Whether Gaussians with means in a box, given by its centre and half its sides, and no larger scale than `scale`
-    /// can touch the image.
-    pub fn meets(&self, centre: [f32; 3], half: [f32; 3], scale: f32) -> bool {
+    /// can touch the image: the first and the last row of tiles that they can.
+    pub fn tile_rows(&self, centre: [f32; 3], half: [f32; 3], scale: f32) -> Option<[u16; 2]> {
         let c = self.camera;
         let middle = c.in_camera(centre.map(f64::from));
         let reach = [0, 1, 2].map(|r: usize| {
@@ -45,17 +45,21 @@ impl<'a> Frustum<'a> {
         });
         let far = middle[2] + reach[2];
         if far < self.near {
-            return false;
+            return None;
         }
         let near = (middle[2] - reach[2]).max(self.near);
         let sigma = self.focal / near * self.spread * f64::from(scale);
         let radius = REACH * (sigma * sigma + f64::from(DILATION)).sqrt() + 2.0;
-        let touches = |axis: usize, focal: f64, centre: f64, size: usize| {
+        let touched = |axis: usize, focal: f64, centre: f64, size: usize| {
             let (low, high) = (middle[axis] - reach[axis], middle[axis] + reach[axis]);
             let low = focal * low / if low < 0.0 { near } else { far };
             let high = focal * high / if high > 0.0 { near } else { far };
-            high + centre + radius >= 0.0 && low + centre - radius <= size as f64
+            let (low, high) = (low + centre - radius, high + centre + radius);
+            (high >= 0.0 && low <= size as f64).then_some([low, high])
         };
-        touches(0, c.fx, c.cx, c.width) && touches(1, c.fy, c.cy, c.height)
+        touched(0, c.fx, c.cx, c.width)?;
+        let last = ((c.height - 1) / TILE) as f64;
+        let rows = touched(1, c.fy, c.cy, c.height)?;
+        Some(rows.map(|y| (y / TILE as f64).clamp(0.0, last) as u16))
     }
 }

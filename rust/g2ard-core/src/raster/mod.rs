@@ -15,6 +15,7 @@ pub(crate) mod disjoint;
 mod forward;
 mod frustum;
 pub(crate) mod gradients;
+pub(crate) mod grid;
 pub mod limits;
 pub(crate) mod memory;
 pub(crate) mod params;
@@ -30,6 +31,7 @@ mod tiles;
 pub use accumulate::Accumulated;
 pub(crate) use frustum::Frustum;
 pub use gradients::Gradients;
+pub(crate) use grid::TileGrid;
 pub use params::Params;
 pub use rasterizer::{Counts, Image, ImageGradients, Memory, Passes, Rasterizer};
 pub use sensitivity::TRIANGLE as SENSITIVITY_TRIANGLE;
@@ -121,10 +123,6 @@ impl Camera {
         if (0.0..=width).contains(&x) && (0.0..=height).contains(&y) {
             *size = here;
         }
-    }
-
-    pub(crate) fn tiles(&self) -> (usize, usize) {
-        (self.width.div_ceil(TILE), self.height.div_ceil(TILE))
     }
 }
 

@@ -1,11 +1,14 @@
 //! Gaussians → screen splats, sixteen at a time (EWA: Σ₂ = J W R S Sᵀ Rᵀ Wᵀ Jᵀ + 0.3 I).
 
+mod jacobian;
 mod screen;
 mod unproject;
 
 use super::params::Source;
 use super::simd::{LANES, LOG2_E, Lanes, Lanes16, Mask, Wide};
 use super::{ALPHA_MIN, Camera, Convention, DILATION, Settings};
+
+use jacobian::{Jacobian, axes_on_screen, in_camera, scales};
 
 pub use screen::Project;
 pub use unproject::{RowGradients, ScreenGradients, quaternion_gradient, unproject};
@@ -139,14 +142,7 @@ fn logistic<F: Lanes>(x: F) -> (F, F) {
 #[inline(always)]
 pub fn project<F: Lanes, S: Source>(view: &View, source: &S, group: usize) -> Projected<F> {
     let one = F::splat(1.0);
-    let mut p = [F::Wide::splat(0.0); 3];
-    for i in 0..3 {
-        p[i] = F::Wide::splat(view.translation[i]);
-        for k in 0..3 {
-            let mean = source.mean::<F>(group, k).widen();
-            p[i] = mean.fma(F::Wide::splat(view.rotation[i][k]), p[i]);
-        }
-    }
+    let p = in_camera::<F, S>(view, source, group);
     let depth = F::narrow(p[2]);
     let near = F::splat(view.near);
     let mut visible = match view.convention {
@@ -164,46 +160,12 @@ pub fn project<F: Lanes, S: Source>(view: &View, source: &S, group: usize) -> Pr
     let ray = [F::narrow(ray_x), F::narrow(ray_y)];
     let rz = F::narrow(rz_wide);
 
-    let mut t = ray;
-    let mut inside = [visible; 2];
-    for (i, lim) in [view.lim_x, view.lim_y].iter().enumerate() {
-        let (low, high) = (F::splat(lim[0]), F::splat(lim[1]));
-        t[i] = ray[i].max(low).min(high);
-        inside[i] = ray[i].ge(low).and(high.ge(ray[i]));
-    }
-    let mut w = [[F::zero(); 3]; 3];
-    for i in 0..3 {
-        for k in 0..3 {
-            w[i][k] = F::splat(view.rotation[i][k] as f32);
-        }
-    }
-    let (jx, jy) = (rz * F::splat(view.fx as f32), rz * F::splat(view.fy as f32));
-    let mut jw = [[F::zero(); 3]; 2];
-    for k in 0..3 {
-        jw[0][k] = jx * t[0].fnma(w[2][k], w[0][k]);
-        jw[1][k] = jy * t[1].fnma(w[2][k], w[1][k]);
-    }
-
+    let Jacobian { t, inside, w, jw } = Jacobian::of(view, ray, rz);
     let (q, rq) = unit_quaternion::<F, S>(source, group);
     let r = rotation(&q);
-    let mut s = [F::zero(); 3];
-    for k in 0..3 {
-        s[k] = source.scale(group, k);
-    }
-    let mut m = [[F::zero(); 3]; 2];
-    for i in 0..2 {
-        for k in 0..3 {
-            let mut sum = jw[i][0] * r[0][k];
-            sum = jw[i][1].fma(r[1][k], sum);
-            sum = jw[i][2].fma(r[2][k], sum);
-            m[i][k] = sum * s[k];
-        }
-    }
-    let mut minors = [F::zero(); 3];
-    for k in 0..3 {
-        let (i, j) = ((k + 1) % 3, (k + 2) % 3);
-        minors[k] = m[0][i] * m[1][j] - m[0][j] * m[1][i];
-    }
+    let s = scales(source, group);
+    let m = axes_on_screen(&jw, &r, &s);
+    let minors = cross(&m[0], &m[1]);
     let blur = F::splat(DILATION);
     let (xx, xy, yy) = (dot(&m[0], &m[0]), dot(&m[0], &m[1]), dot(&m[1], &m[1]));
     // Cauchy–Binet: det(MMᵀ) is the sum of squared minors. xx·yy − xy² would lose every digit on a needle.
@@ -213,14 +175,7 @@ pub fn project<F: Lanes, S: Source>(view: &View, source: &S, group: usize) -> Pr
     visible = visible.and(F::splat(DET_MAX).ge(det));
 
     let (log2_sigma, rest_opacity) = logistic(source.logit_opacity::<F>(group));
-    let mut log2_opacity = log2_sigma;
-    if view.antialiased {
-        let mut ratio = det0 / det;
-        if view.convention == Convention::Inria {
-            ratio = ratio.max(F::splat(INRIA_FLOOR));
-        }
-        log2_opacity = log2_opacity + half_log2(ratio);
-    }
+    let log2_opacity = antialiased(view, log2_sigma, det0, det);
     let reach = log2_opacity - F::splat(ALPHA_MIN.log2());
     visible = visible.and(reach.ge(F::zero()));
 
@@ -230,10 +185,7 @@ pub fn project<F: Lanes, S: Source>(view: &View, source: &S, group: usize) -> Pr
     let b = -(xy / yy * a);
     let mut radius = F::splat(f32::INFINITY);
     if view.convention == Convention::Inria {
-        let mid = F::splat(0.5) * (xx + yy);
-        let lambda = mid + (mid.fma(mid, -det)).max(F::splat(0.1)).sqrt();
-        let r3 = F::splat(3.0) * lambda.sqrt();
-        radius = -((-r3).floor());
+        radius = inria_radius(xx + yy, det);
     }
     let out_x = (xx * reach.max(F::zero()) / k2).sqrt();
     let out_y = (yy * reach.max(F::zero()) / k2).sqrt();
@@ -270,6 +222,24 @@ pub fn project<F: Lanes, S: Source>(view: &View, source: &S, group: usize) -> Pr
 }
 
 #[inline(always)]
+fn cross<F: Lanes>(a: &[F; 3], b: &[F; 3]) -> [F; 3] {
+    [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]
+}
+
+/// Half the side of the square that INRIA's kernel draws within: three standard deviations, rounded up.
+#[inline(always)]
+fn inria_radius<F: Lanes>(trace: F, det: F) -> F {
+    let mid = F::splat(0.5) * trace;
+    let lambda = mid + (mid.fma(mid, -det)).max(F::splat(0.1)).sqrt();
+    let r3 = F::splat(3.0) * lambda.sqrt();
+    -((-r3).floor())
+}
+
+#[inline(always)]
 fn dot<F: Lanes>(a: &[F; 3], b: &[F; 3]) -> F {
     a[2].fma(b[2], a[1].fma(b[1], a[0] * b[0]))
 }
@@ -280,6 +250,19 @@ fn on_image<F: Lanes>(centre: F, extent: F, size: f32) -> F::Mask {
     let extent = extent.fma(F::splat(1.0001), F::splat(0.01));
     let after = (centre + extent).ge(F::splat(0.5));
     after.and(F::splat(size - 0.5).ge(centre - extent))
+}
+
+/// The logarithm of an opacity, where asked for times √(det0 / det).
+#[inline(always)]
+fn antialiased<F: Lanes>(view: &View, log2_opacity: F, det0: F, det: F) -> F {
+    if !view.antialiased {
+        return log2_opacity;
+    }
+    let mut ratio = det0 / det;
+    if view.convention == Convention::Inria {
+        ratio = ratio.max(F::splat(INRIA_FLOOR));
+    }
+    log2_opacity + half_log2(ratio)
 }
 
 /// ½·log2(x), lane by lane: only antialiasing needs it.

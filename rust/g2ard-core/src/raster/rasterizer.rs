@@ -1,18 +1,20 @@
 //! The passes in order, and the buffers they share: those of one view, reused from call to call.
 
+mod accumulated;
 mod sensitive;
 mod tiled;
 mod views;
 
+use std::ops::Range;
 use std::time::Instant;
 
 use rayon::prelude::*;
 
-use super::accumulate::{ALL, Accumulated, SharedSums, Total, smallest_pixels};
 use super::backward::SUMS;
 use super::depth_sort::{self, Key};
 use super::disjoint::DisjointSlice;
 use super::gradients::{Gather, Gradients, Sink};
+use super::grid::TileGrid;
 use super::memory::bytes;
 use super::params::{Params, Source};
 use super::project::{Project, Splat, View};
@@ -43,6 +45,7 @@ pub(crate) struct ChunkSums<'a> {
 struct ForwardState {
     camera: Camera,
     settings: Settings,
+    grid: TileGrid,
     view: View,
     background: [f32; 3],
     rows: usize,
@@ -118,7 +121,7 @@ impl Rasterizer {
         camera.validate()?;
         settings.validate()?;
         image.validate(camera)?;
-        self.prepare(*params, camera, settings, background);
+        self.prepare(*params, camera, settings, background, TileGrid::of(camera));
         let mut clock = Instant::now();
         if image.depth.is_some() || image.median.is_some() {
             self.forward_tiles::<true>(image);
@@ -169,14 +172,12 @@ impl Rasterizer {
         let Some(state) = &self.state else {
             return Ok(());
         };
-        let chunks = self.chunks.par_iter().enumerate();
-        chunks.for_each(|(chunk, &(first, count))| {
-            let slots = self.bins.slots_of(chunk);
+        self.visible().for_each(|(splats, slots)| {
             let gather = Gather {
                 view: &state.view,
                 source,
                 sink,
-                splats: &self.splats[first..first + count],
+                splats,
                 slots: &self.slots[slots.clone()],
                 written: &self.written[slots],
             };
@@ -195,7 +196,7 @@ impl Rasterizer {
         background: [f32; 3],
         image: &mut Image,
     ) {
-        self.prepare(source, camera, settings, background);
+        self.prepare(source, camera, settings, background, TileGrid::of(camera));
         let mut clock = Instant::now();
         self.forward_tiles::<false>(image);
         self.passes.forward = lap(&mut clock);
@@ -215,74 +216,28 @@ impl Rasterizer {
             return Vec::new();
         };
         let groups = state.rows.div_ceil(LANES);
-        let finish = |(chunk, &(first, count)): (usize, &(usize, usize))| {
-            let slots = self.bins.slots_of(chunk);
+        let finish = |(chunk, (splats, slots)): (usize, (&[Splat], Range<usize>))| {
             finish(&ChunkSums {
                 view: &state.view,
                 first_group: chunk * CHUNK,
                 last_group: groups.min((chunk + 1) * CHUNK),
-                splats: &self.splats[first..first + count],
+                splats,
                 slots: &self.slots[slots.clone()],
                 written: &self.written[slots],
             })
         };
-        let results = self.chunks.par_iter().enumerate().map(finish).collect();
+        let results = self.visible().enumerate().map(finish).collect();
         self.passes.gather = lap(&mut clock);
         results
     }
 
-    /// Renders a view without an image and adds what every Gaussian contributes to it.
-    pub fn accumulate(
-        &mut self,
-        params: &Params,
-        camera: &Camera,
-        settings: &Settings,
-        sums: &mut Accumulated,
-    ) -> Result<()> {
-        params.validate()?;
-        camera.validate()?;
-        settings.validate()?;
-        if sums.weight.len() != params.len() {
-            return Err(Error::invalid(
-                "accumulate",
-                format!("sums of {} rows", params.len()),
-                sums.weight.len(),
-            ));
-        }
-        let colourless = Params {
-            sh_n: &[],
-            sh_coeffs: 1,
-            ..*params
-        };
-        let rows = SharedSums::new(sums);
-        self.accumulate_from::<ALL, _>(colourless, camera, settings, |row, total| {
-            // SAFETY: the call comes once for every row.
-            unsafe { rows.add(row, &total) };
-        });
-        smallest_pixels(params, camera, &mut sums.pixel_size);
-        Ok(())
-    }
-
-    /// Calls `visit(row, its sums)` once for every row that may touch the view's image, in parallel.
-    pub(crate) fn accumulate_from<const KINDS: usize, S: Source>(
-        &mut self,
-        source: S,
-        camera: &Camera,
-        settings: &Settings,
-        visit: impl Fn(usize, Total) + Sync,
-    ) {
-        self.prepare(source, camera, settings, [0.0; 3]);
-        self.accumulate_tiles::<KINDS>();
-        let shares = self.shares.as_chunks::<KINDS>().0;
+    /// The visible splats of every chunk of rows, and their slots.
+    fn visible(&self) -> impl IndexedParallelIterator<Item = (&[Splat], Range<usize>)> {
         let chunks = self.chunks.par_iter().enumerate();
-        chunks.for_each(|(chunk, &(first, count))| {
-            let slots = self.bins.slots_of(chunk);
-            let (shares, written) = (&shares[slots.clone()], &self.written[slots]);
-            for splat in &self.splats[first..first + count] {
-                visit(splat.row as usize, Total::of(splat, shares, written));
-            }
-        });
-        self.state = None; // no state that a backward pass could use
+        chunks.map(|(chunk, &(first, count))| {
+            let splats = &self.splats[first..first + count];
+            (splats, self.bins.slots_of(chunk))
+        })
     }
 
     /// What the buffers hold now.
@@ -338,17 +293,19 @@ impl Rasterizer {
         camera: &Camera,
         settings: &Settings,
         background: [f32; 3],
+        grid: TileGrid,
     ) {
         let view = View::new(camera, settings);
         self.state = Some(ForwardState {
             camera: *camera,
             settings: *settings,
+            grid,
             view,
             background,
             rows: source.len(),
         });
         let mut clock = Instant::now();
-        self.project(&view, source, camera.tiles());
+        self.project(&view, source, grid);
         self.passes.project = lap(&mut clock);
         self.collect_keys();
         depth_sort::sort(&mut self.order, &mut self.spare);
@@ -358,7 +315,7 @@ impl Rasterizer {
             &self.tile_lists,
             &self.intersectors,
             CHUNK * LANES,
-            camera.tiles(),
+            grid,
         );
         self.passes.bin = lap(&mut clock);
         self.batches.clear();
@@ -370,7 +327,7 @@ impl Rasterizer {
         self.block_masks.resize(first, [0; BLOCKS]);
     }
 
-    fn project<S: Source>(&mut self, view: &View, source: S, tiles: (usize, usize)) {
+    fn project<S: Source>(&mut self, view: &View, source: S, grid: TileGrid) {
         let groups = source.len().div_ceil(LANES);
         let isa = self.isa;
         self.splats.resize(groups * LANES, Splat::default());
@@ -390,7 +347,7 @@ impl Rasterizer {
                     source,
                     first,
                     last: groups.min(first + CHUNK),
-                    tiles,
+                    grid,
                     out,
                     tile_lists,
                     intersector,

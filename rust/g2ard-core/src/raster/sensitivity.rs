@@ -110,24 +110,8 @@ impl Kernel for Sensitivity<'_> {
                             sums[at] = hw.fma(*value, sums[at]);
                         }
                     }
-                    let (su, sv) = (square * u, square * v);
-                    let (suu, svv) = (su * u, sv * v);
-                    let products = [
-                        suu,
-                        su * v,
-                        svv,
-                        suu * u,
-                        suu * v,
-                        svv * u,
-                        svv * v,
-                        suu * uu,
-                        suu * uv,
-                        suu * vv,
-                        svv * uv,
-                        svv * vv,
-                    ];
-                    for (sum, product) in sums.iter_mut().zip(products) {
-                        *sum = *sum + product;
+                    for (sum, moment) in sums.iter_mut().zip(moments(square, u, v)) {
+                        *sum = *sum + moment;
                     }
                     sums[WEIGHT] = w.fma(w, sums[WEIGHT]);
                 }
@@ -143,6 +127,27 @@ impl Kernel for Sensitivity<'_> {
             }
         }
     }
+}
+
+/// h²·uⁱvʲ, in the order that [`PRODUCT`] names.
+#[inline(always)]
+fn moments<F: Lanes>(square: F, u: F, v: F) -> [F; BY_CHANNEL] {
+    let (uu, uv, vv) = (u * u, u * v, v * v);
+    let (suu, svv) = (square * u * u, square * v * v);
+    [
+        suu,
+        square * u * v,
+        svv,
+        suu * u,
+        suu * v,
+        svv * u,
+        svv * v,
+        suu * uu,
+        suu * uv,
+        suu * vv,
+        svv * uv,
+        svv * vv,
+    ]
 }
 
 /// Adds up the slots of one chunk's splats and adds every row's F to `out`, 21 values a row.

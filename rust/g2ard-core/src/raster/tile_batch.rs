@@ -113,6 +113,17 @@ impl TileRect {
         }
     }
 
+    /// The light of every block's pixels before the first splat: 1, but 0 off the image.
+    #[inline(always)]
+    pub fn light<F: Lanes>(&self) -> [Lanes16; BLOCKS] {
+        let mut light = [Lanes16::default(); BLOCKS];
+        for (block, light) in light.iter_mut().enumerate() {
+            let on_image = F::Mask::from_bits(self.lanes(block));
+            F::splat(1.0).only(on_image).store(light);
+        }
+        light
+    }
+
     /// The lanes of a block that are on the image.
     pub fn lanes(&self, block: usize) -> u16 {
         let mut bits = 0;

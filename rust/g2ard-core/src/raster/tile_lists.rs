@@ -3,6 +3,7 @@
 use std::ops::Range;
 
 use super::TILE;
+use super::grid::TileGrid;
 use super::memory::bytes;
 use super::simd::{LANES, Lanes, Lanes16};
 
@@ -72,11 +73,6 @@ impl TileList {
     }
 }
 
-/// Whether every tile's number fits a u16.
-pub fn narrow(tiles: (usize, usize)) -> bool {
-    tiles.0 * tiles.1 <= 1 << 16
-}
-
 /// Sixteen splats' ellipses at α = 1/255: |U·d|² ≤ level, U = (a b; 0 c).
 pub struct Ellipses<F: Lanes> {
     pub x: F,
@@ -106,18 +102,18 @@ fn span<F: Lanes>(low: F, high: F, bounds: [F; 2]) -> [F; 2] {
 
 /// The tiles INRIA's kernel gives a splat of this radius: those its square touches.
 #[inline(always)]
-fn square_span<F: Lanes>(centre: F, radius: Option<F>, tiles: usize) -> [F; 2] {
-    let tiles = F::splat(tiles as f32);
+fn square_span<F: Lanes>(centre: F, radius: Option<F>, tiles: Range<usize>) -> [F; 2] {
+    let (first, last) = (F::splat(tiles.start as f32), F::splat(tiles.end as f32));
     let Some(radius) = radius else {
-        return [F::zero(), tiles];
+        return [first, last];
     };
     // Its pixel coordinates have centres at whole numbers.
     let (per_pixel, centre) = (F::splat(1.0 / TILE as f32), centre - F::splat(0.5));
     let from = (centre - radius) * per_pixel;
     let to = (centre + radius + F::splat(TILE as f32 - 1.0)) * per_pixel;
     [
-        from.max(F::zero()).floor().min(tiles),
-        to.max(F::zero()).floor().min(tiles),
+        from.max(first).floor().min(last),
+        to.max(first).floor().min(last),
     ]
 }
 
@@ -158,7 +154,7 @@ impl<F: Lanes> Ellipses<F> {
     pub fn tile_lists(
         &self,
         bits: u32,
-        tiles: (usize, usize),
+        grid: TileGrid,
         intersector: &mut TileIntersector,
         out: &mut [TileList],
     ) {
@@ -166,8 +162,9 @@ impl<F: Lanes> Ellipses<F> {
         let slack_x = self.half[0].min(most).fma(thousandth, hundredth);
         let slack_y = self.half[1].min(most).fma(thousandth, hundredth);
         let (half_x, half_y) = (self.half[0] + slack_x, self.half[1] + slack_y);
-        let columns = square_span(self.x, self.radius, tiles.0);
-        let rows = square_span(self.y, self.radius, tiles.1);
+        let columns = square_span(self.x, self.radius, 0..grid.columns);
+        let rows = grid.first_row..grid.first_row + grid.rows;
+        let rows = square_span(self.y, self.radius, rows);
         let columns = span(self.x - half_x, self.x + half_x, columns);
         let [first, last] = span(self.y - half_y, self.y + half_y, rows);
         let (mut from, mut to) = (Lanes16::default(), Lanes16::default());
@@ -197,7 +194,7 @@ impl<F: Lanes> Ellipses<F> {
         }
         let mut counts = Lanes16::default();
         count.store(&mut counts);
-        let narrow = narrow(tiles);
+        let narrow = grid.narrow();
         let mut todo = bits;
         for tile_list in out {
             let l = todo.trailing_zeros() as usize;
@@ -205,7 +202,7 @@ impl<F: Lanes> Ellipses<F> {
             let rows = (whole(from.0[l])..whole(to.0[l]))
                 .zip(&*ends)
                 .map(|(row, e)| {
-                    let first = (row * tiles.0) as u32;
+                    let first = ((row - grid.first_row) * grid.columns) as u32;
                     first + whole(e[0].0[l]) as u32..first + whole(e[1].0[l]) as u32
                 });
             tile_list.set(*slots, whole(counts.0[l]) as u32, narrow, rows, list);
@@ -248,7 +245,7 @@ mod tests {
     /// One splat's tile_list, in lane 0.
     struct Covers<'a> {
         splat: &'a Splat,
-        tiles: (usize, usize),
+        grid: TileGrid,
         intersector: &'a mut TileIntersector,
         out: &'a mut [TileList],
     }
@@ -269,7 +266,7 @@ mod tests {
                 half: [F::splat(half[0]), F::splat(half[1])],
                 radius: None,
             };
-            ellipses.tile_lists(1, self.tiles, self.intersector, self.out);
+            ellipses.tile_lists(1, self.grid, self.intersector, self.out);
         }
     }
 
@@ -300,6 +297,11 @@ mod tests {
         let mut source = Lcg(7);
         let mut random = || source.uniform_f32();
         let tiles = (6, 5);
+        let grid = TileGrid {
+            columns: 6,
+            first_row: 0,
+            rows: 5,
+        };
         let (mut met, mut extra) = (0, 0);
         for _ in 0..200 {
             let a = 0.02 * 60f32.powf(random());
@@ -316,13 +318,13 @@ mod tests {
             let mut intersector = TileIntersector::default();
             let tile_list = Covers {
                 splat: &splat,
-                tiles,
+                grid,
                 intersector: &mut intersector,
                 out: &mut out,
             };
             dispatch(Isa::detect(), tile_list);
             let mut got = Vec::new();
-            out[0].for_each(&intersector.list, 0, narrow(tiles), |t, _| got.push(t));
+            out[0].for_each(&intersector.list, 0, grid.narrow(), |t, _| got.push(t));
             let expected = brute(&splat, tiles);
             assert!(
                 expected.iter().all(|t| got.contains(t)),

@@ -6,8 +6,9 @@ use rayon::prelude::*;
 
 use super::depth_sort::Key;
 use super::disjoint::DisjointSlice;
+use super::grid::TileGrid;
 use super::memory::{bytes, prefetch};
-use super::tile_lists::{TileIntersector, TileList, narrow};
+use super::tile_lists::{TileIntersector, TileList};
 
 /// How many stretches the depth order is cut into: fixed, so that the work splits alike for any number of threads.
 const STRETCHES: usize = 16;
@@ -37,6 +38,11 @@ impl Bins {
         bytes(&self.counts)
     }
 
+    /// A tile's pairs, nearest first.
+    pub fn pairs_of(&self, tile: usize) -> &[Pair] {
+        &self.pairs[self.starts[tile] as usize..self.starts[tile + 1] as usize]
+    }
+
     /// The slots of a chunk's splats.
     pub fn slots_of(&self, chunk: usize) -> Range<usize> {
         self.slots[chunk] as usize..self.slots[chunk + 1] as usize
@@ -50,14 +56,14 @@ impl Bins {
         tile_lists: &[TileList],
         intersectors: &[TileIntersector],
         chunk: usize,
-        tiles: (usize, usize),
+        grid: TileGrid,
     ) {
         self.slots.clear();
         self.slots.push(0);
         for (i, intersector) in intersectors.iter().enumerate() {
             self.slots.push(self.slots[i] + intersector.slots);
         }
-        let (total_tiles, narrow) = (tiles.0 * tiles.1, narrow(tiles));
+        let (total_tiles, narrow) = (grid.tiles(), grid.narrow());
         let stretch = order.len().div_ceil(STRETCHES).max(1);
         self.counts.clear();
         self.counts.resize(STRETCHES * total_tiles, 0);

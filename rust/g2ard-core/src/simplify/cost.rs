@@ -1,5 +1,5 @@
 //! What merging two Gaussians costs in the image: the squared error of their projections, averaged over
-//! directions, in f32 and in lanes.
+//! directions, for one pair or for sixteen.
 //!
 //! Six axes of an icosahedron stand for all directions. Along a unit axis d a Gaussian of covariance S
 //! projects to one of area A_d = √(dᵀ adj(S) d), and two of them overlap by
@@ -7,14 +7,14 @@
 
 use std::f32::consts::PI;
 
-/// Six axes in eight lanes; the last two repeat and weigh nothing.
-const LANES: usize = 8;
-pub type Lanes = [f32; LANES];
+use super::real::{Real, exp_negative};
 
-const USED: f32 = 6.0;
+/// Six axes in eight places, which fill a register; the last two repeat and weigh nothing.
+const PLACES: usize = 8;
+const USED: usize = 6;
 
 /// Unit vectors through the vertices of an icosahedron, one of each opposite pair, by coordinate.
-const AXES: [Lanes; 3] = {
+const AXES: [[f32; PLACES]; 3] = {
     const A: f32 = 0.525_731_1; // 1 / √(1 + φ²)
     const B: f32 = 0.850_650_8; // φ / √(1 + φ²)
     [
@@ -25,23 +25,23 @@ const AXES: [Lanes; 3] = {
 };
 
 /// A symmetric 3×3 matrix: xx, xy, xz, yy, yz, zz.
-pub type Sym = [f32; 6];
+pub type Sym<T = f32> = [T; 6];
 
-/// One cluster, in units of the scene's typical size.
+/// One cluster, in units of the scene's typical size; with lanes for `T`, sixteen of them.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Node {
-    pub mean: [f32; 3],
+pub struct Node<T = f32> {
+    pub mean: [T; 3],
     /// Without the dilation.
-    pub cov: Sym,
+    pub cov: Sym<T>,
     /// e²: the variance a renderer adds, (0.4 pixel)².
-    pub blur: f32,
-    pub alpha: f32,
+    pub blur: T,
+    pub alpha: T,
     /// Σ α·A, A with the dilation: light stopped, as rendered.
-    pub mass: f32,
+    pub mass: T,
     /// Σ αT over the views, or its estimate.
-    pub visibility: f32,
+    pub visibility: T,
     /// A_d.
-    pub areas: Lanes,
+    pub areas: [T; PLACES],
 }
 
 /// α never exceeds it: renderers clip there.
@@ -51,7 +51,7 @@ pub const MAX_ALPHA: f32 = 0.99;
 const MIN_ALPHA: f32 = 1.0 / 255.0;
 
 #[inline(always)]
-fn adjugate(s: &Sym) -> Sym {
+fn adjugate<T: Real>(s: &Sym<T>) -> Sym<T> {
     let [xx, xy, xz, yy, yz, zz] = *s;
     [
         yy * zz - yz * yz,
@@ -63,87 +63,77 @@ fn adjugate(s: &Sym) -> Sym {
     ]
 }
 
-/// vᵀ S v in every lane.
+/// vᵀ S v.
 #[inline(always)]
-fn quadratic(s: &Sym, v: &[Lanes; 3]) -> Lanes {
-    let mut out = [0.0; LANES];
-    for l in 0..LANES {
-        let (x, y, z) = (v[0][l], v[1][l], v[2][l]);
-        out[l] = x * (s[0] * x + 2.0 * (s[1] * y + s[2] * z))
-            + y * (s[3] * y + 2.0 * s[4] * z)
-            + s[5] * z * z;
-    }
-    out
+fn quadratic<T: Real>(s: &Sym<T>, [x, y, z]: [T; 3]) -> T {
+    let two = T::splat(2.0);
+    x * (s[0] * x + two * (s[1] * y + s[2] * z)) + y * (s[3] * y + two * s[4] * z) + s[5] * z * z
 }
 
 #[inline(always)]
-fn dilated(s: &Sym, blur: f32) -> Sym {
+fn axis<T: Real>(l: usize) -> [T; 3] {
+    [
+        T::splat(AXES[0][l]),
+        T::splat(AXES[1][l]),
+        T::splat(AXES[2][l]),
+    ]
+}
+
+#[inline(always)]
+fn dilated<T: Real>(s: &Sym<T>, blur: T) -> Sym<T> {
     [s[0] + blur, s[1], s[2], s[3] + blur, s[4], s[5] + blur]
 }
 
 #[inline(always)]
-fn areas(s: &Sym) -> Lanes {
-    let mut out = quadratic(&adjugate(s), &AXES);
-    for v in &mut out {
-        *v = v.max(f32::MIN_POSITIVE).sqrt();
+fn areas<T: Real>(s: &Sym<T>) -> [T; PLACES] {
+    let adjugate = adjugate(s);
+    let mut out = [T::splat(0.0); PLACES];
+    for l in 0..PLACES {
+        let squared = quadratic(&adjugate, axis(l));
+        out[l] = squared.max(T::splat(f32::MIN_POSITIVE)).sqrt();
     }
     out
 }
 
 /// √tr adj(S): the rendered area, √3 times its mean square over all directions.
 #[inline(always)]
-fn area(s: &Sym) -> f32 {
+fn area<T: Real>(s: &Sym<T>) -> T {
     let a = adjugate(s);
-    (a[0] + a[3] + a[5]).max(f32::MIN_POSITIVE).sqrt()
+    (a[0] + a[3] + a[5]).max(T::splat(f32::MIN_POSITIVE)).sqrt()
 }
 
-/// exp(x) for x ≤ 0, relative error 4e-7; 0 below −87.
+/// ⟨a, b⟩_d / 2π for every axis.
 #[inline(always)]
-fn exp_negative(x: Lanes) -> Lanes {
-    let mut out = [0.0; LANES];
-    for l in 0..LANES {
-        let t = x[l].max(-87.0) * std::f32::consts::LOG2_E;
-        // Adding 1.5·2²³ rounds to the nearest integer in any rounding hardware.
-        let n = (t + 12_582_912.0) - 12_582_912.0;
-        let f = (t - n) * std::f32::consts::LN_2;
-        let p =
-            1.0 + f * (1.0 + f * (0.5 + f * (1.0 / 6.0 + f * (1.0 / 24.0 + f * (1.0 / 120.0)))));
-        out[l] = p * f32::from_bits(((n as i32 + 127) << 23) as u32);
+fn overlap<T: Real>(
+    a: &Sym<T>,
+    a_areas: &[T; PLACES],
+    b: &Sym<T>,
+    b_areas: &[T; PLACES],
+    delta: [T; 3],
+) -> [T; PLACES] {
+    let mut sum = *a;
+    for k in 0..6 {
+        sum[k] = a[k] + b[k];
+    }
+    let adjugate = adjugate(&sum);
+    let mut out = [T::splat(0.0); PLACES];
+    for l in 0..PLACES {
+        let v: [T; 3] = axis(l);
+        let cross = [
+            v[1] * delta[2] - v[2] * delta[1],
+            v[2] * delta[0] - v[0] * delta[2],
+            v[0] * delta[1] - v[1] * delta[0],
+        ];
+        let d = quadratic(&adjugate, v).max(T::splat(f32::MIN_POSITIVE));
+        let exponent = T::splat(-0.5) * quadratic(&sum, cross) / d;
+        out[l] = a_areas[l] * b_areas[l] / d.sqrt() * exp_negative(exponent);
     }
     out
 }
 
-/// ⟨a, b⟩_d / 2π in every lane.
 #[inline(always)]
-fn overlap(a: &Sym, a_areas: &Lanes, b: &Sym, b_areas: &Lanes, delta: [f32; 3]) -> Lanes {
-    let sum = [
-        a[0] + b[0],
-        a[1] + b[1],
-        a[2] + b[2],
-        a[3] + b[3],
-        a[4] + b[4],
-        a[5] + b[5],
-    ];
-    let d = quadratic(&adjugate(&sum), &AXES);
-    let mut cross = [[0.0; LANES]; 3];
-    for l in 0..LANES {
-        cross[0][l] = AXES[1][l] * delta[2] - AXES[2][l] * delta[1];
-        cross[1][l] = AXES[2][l] * delta[0] - AXES[0][l] * delta[2];
-        cross[2][l] = AXES[0][l] * delta[1] - AXES[1][l] * delta[0];
-    }
-    let q = quadratic(&sum, &cross);
-    let mut exponent = [0.0; LANES];
-    let mut out = [0.0; LANES];
-    for l in 0..LANES {
-        let d = d[l].max(f32::MIN_POSITIVE);
-        exponent[l] = -0.5 * q[l] / d;
-        out[l] = a_areas[l] * b_areas[l] / d.sqrt();
-    }
-    let fall = exp_negative(exponent);
-    for l in 0..LANES {
-        out[l] *= fall[l];
-    }
-    out
+fn difference<T: Real>(a: &[T; 3], b: &[T; 3]) -> [T; 3] {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
 }
 
 impl Node {
@@ -154,12 +144,14 @@ impl Node {
         self.mass = self.alpha * area(&s);
         self
     }
+}
 
+impl<T: Real> Node<T> {
     /// The other's share of the mass of the two.
     #[inline(always)]
-    pub fn share(&self, other: &Self) -> f32 {
+    pub fn share(&self, other: &Self) -> T {
         let mass = self.mass + other.mass;
-        if mass > 0.0 { other.mass / mass } else { 0.5 }
+        T::select(mass.gt(T::splat(0.0)), other.mass / mass, T::splat(0.5))
     }
 
     /// The two as one: mean and covariance averaged by mass, mass and visibility summed.
@@ -167,21 +159,24 @@ impl Node {
     pub fn merged(&self, other: &Self) -> Self {
         let mass = self.mass + other.mass;
         let w = self.share(other);
-        let v = 1.0 - w;
-        let delta = [0, 1, 2].map(|k| other.mean[k] - self.mean[k]);
-        let [x, y, z] = delta;
+        let v = T::splat(1.0) - w;
+        let [x, y, z] = difference(&other.mean, &self.mean);
         let spread = [x * x, x * y, x * z, y * y, y * z, z * z];
-        let mut cov = [0.0; 6];
+        let mut cov = self.cov;
         for k in 0..6 {
             cov[k] = v * self.cov[k] + w * other.cov[k] + v * w * spread[k];
         }
         let blur = self.blur.min(other.blur);
         let s = dilated(&cov, blur);
         Self {
-            mean: [0, 1, 2].map(|k| self.mean[k] + w * delta[k]),
+            mean: [
+                self.mean[0] + w * x,
+                self.mean[1] + w * y,
+                self.mean[2] + w * z,
+            ],
             cov,
             blur,
-            alpha: (mass / area(&s)).min(MAX_ALPHA),
+            alpha: (mass / area(&s)).min(T::splat(MAX_ALPHA)),
             mass,
             visibility: self.visibility + other.visibility,
             areas: areas(&s),
@@ -191,53 +186,54 @@ impl Node {
     /// (λ·E_geo + |Δ|²·E_col)·(C_i + C_j)/(m_i + m_j); `color` is |Δ|², the squared difference of the two
     /// colours averaged over directions.
     #[inline(always)]
-    pub fn cost(&self, other: &Self, color: f32, geometric: f32) -> f32 {
+    pub fn cost(&self, other: &Self, color: T, geometric: T) -> T {
         self.cost_as(other, &self.merged(other), color, geometric)
     }
 
     /// The same where `m` is known to be the two merged.
     #[inline(always)]
-    pub fn cost_as(&self, other: &Self, m: &Self, color: f32, geometric: f32) -> f32 {
+    pub fn cost_as(&self, other: &Self, m: &Self, color: T, geometric: T) -> T {
         let (a, b, s) = (
             dilated(&self.cov, self.blur),
             dilated(&other.cov, other.blur),
             dilated(&m.cov, m.blur),
         );
-        let to = |n: &Self| [0, 1, 2].map(|k| n.mean[k] - m.mean[k]);
-        let between = [0, 1, 2].map(|k| other.mean[k] - self.mean[k]);
+        let between = difference(&other.mean, &self.mean);
+        let (to_a, to_b) = (
+            difference(&self.mean, &m.mean),
+            difference(&other.mean, &m.mean),
+        );
         let ab = overlap(&a, &self.areas, &b, &other.areas, between);
-        let am = overlap(&a, &self.areas, &s, &m.areas, to(self));
-        let bm = overlap(&b, &other.areas, &s, &m.areas, to(other));
-        let share = if m.mass > 0.0 {
-            other.mass / m.mass
-        } else {
-            0.5
-        };
+        let am = overlap(&a, &self.areas, &s, &m.areas, to_a);
+        let bm = overlap(&b, &other.areas, &s, &m.areas, to_b);
+        let (zero, four, most) = (T::splat(0.0), T::splat(4.0), T::splat(f32::MAX));
+        let share = T::select(m.mass.gt(zero), other.mass / m.mass, T::splat(0.5));
         let (p, q, r) = (self.alpha, other.alpha, m.alpha);
-        if r < MIN_ALPHA && p.max(q) >= MIN_ALPHA {
-            return f32::MAX; // spread so thin that it is no longer drawn, its light would be lost
-        }
-        let (u, v) = (share * p, (1.0 - share) * q);
-        let (mut geo, mut col) = (0.0, 0.0);
-        for l in 0..USED as usize {
+        let (u, v) = (share * p, (T::splat(1.0) - share) * q);
+        let (mut geo, mut col) = (zero, zero);
+        for l in 0..USED {
             let own = p * p * self.areas[l] + q * q * other.areas[l] + r * r * m.areas[l];
-            geo += own + 4.0 * (p * q * ab[l] - r * (p * am[l] + q * bm[l]));
-            col += u * u * self.areas[l] + v * v * other.areas[l] - 4.0 * u * v * ab[l];
+            geo = geo + (own + four * (p * q * ab[l] - r * (p * am[l] + q * bm[l])));
+            col = col + (u * u * self.areas[l] + v * v * other.areas[l] - four * u * v * ab[l]);
         }
-        let error = geometric * geo.max(0.0) + color * col.max(0.0);
-        let cost = error * (PI / USED) * m.visibility / m.mass.max(f32::MIN_POSITIVE);
-        if cost < f32::MAX { cost } else { f32::MAX }
+        let error = geometric * geo.max(zero) + color * col.max(zero);
+        let mass = m.mass.max(T::splat(f32::MIN_POSITIVE));
+        let cost = error * T::splat(PI / USED as f32) * m.visibility / mass;
+        // Spread so thin that it is no longer drawn, their light would be lost.
+        let drawn = T::splat(MIN_ALPHA);
+        let fades = T::select(drawn.gt(r), p.max(q), zero).ge(drawn);
+        T::select(fades, most, cost.min(most))
     }
 }
 
 /// |Δ|²: Σ over coefficients and channels of Δ²/4π.
 #[inline(always)]
 pub fn color_distance(a: &[f32], b: &[f32]) -> f32 {
-    let mut lanes = [0.0f32; LANES];
-    let (a8, a_rest) = a.as_chunks::<LANES>();
-    let (b8, b_rest) = b.as_chunks::<LANES>();
+    let mut lanes = [0.0f32; PLACES];
+    let (a8, a_rest) = a.as_chunks::<PLACES>();
+    let (b8, b_rest) = b.as_chunks::<PLACES>();
     for (x, y) in a8.iter().zip(b8) {
-        for l in 0..LANES {
+        for l in 0..PLACES {
             lanes[l] += (x[l] - y[l]) * (x[l] - y[l]);
         }
     }

@@ -7,6 +7,7 @@ use rayon::prelude::*;
 
 use super::GONE;
 use super::cost::{Node, color_distance};
+use crate::raster::simd::{Isa, Kernel, LANES, Lanes, Lanes16, dispatch};
 use crate::spatial::{RobustBounds, Tree, codes, order};
 use crate::{Control, Result};
 
@@ -59,37 +60,6 @@ impl Nodes {
     fn sh_of(&self, i: usize) -> &[f32] {
         &self.sh[i * self.width..(i + 1) * self.width]
     }
-
-    #[inline(always)]
-    fn cost(&self, i: usize, j: usize, geometric: f32) -> f32 {
-        let (i, j) = (i.min(j), i.max(j)); // the same rounding for (i, j) and (j, i)
-        let color = color_distance(self.sh_of(i), self.sh_of(j));
-        self.geometry[i].cost(&self.geometry[j], color, geometric)
-    }
-
-    /// Costs of `i` against each of `near`.
-    fn costs(&self, i: usize, near: &[(f32, u32)], geometric: f32, out: &mut [Candidate]) {
-        #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") {
-            // SAFETY: the processor has AVX2.
-            return unsafe { self.costs_avx2(i, near, geometric, out) };
-        }
-        self.costs_any(i, near, geometric, out);
-    }
-
-    /// The same code with wider registers; no fused operations, so the same bits.
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2")]
-    fn costs_avx2(&self, i: usize, near: &[(f32, u32)], geometric: f32, out: &mut [Candidate]) {
-        self.costs_any(i, near, geometric, out);
-    }
-
-    #[inline(always)]
-    fn costs_any(&self, i: usize, near: &[(f32, u32)], geometric: f32, out: &mut [Candidate]) {
-        for (candidate, &(_, j)) in out.iter_mut().zip(near) {
-            *candidate = (self.cost(i, j as usize, geometric), j);
-        }
-    }
 }
 
 /// Cost and partner.
@@ -97,6 +67,94 @@ type Candidate = (f32, u32);
 
 const NONE: Candidate = (f32::INFINITY, GONE);
 const CHUNK: usize = 1024;
+
+/// Fills in what merging each node from `first` on with each of its `k` partners costs, sixteen pairs at a time.
+struct PairCosts<'a> {
+    nodes: &'a Nodes,
+    first: usize,
+    k: usize,
+    geometric: f32,
+    lists: &'a mut [Candidate],
+}
+
+/// Values of a node that a cost reads: mean, covariance, dilation, α, mass, visibility, areas.
+const VALUES: usize = 19;
+
+impl Kernel for PairCosts<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<F: Lanes>(self) {
+        let mut values = [[Lanes16::default(); VALUES]; 2];
+        let mut color = Lanes16::default();
+        for start in (0..self.lists.len()).step_by(LANES) {
+            let pairs = LANES.min(self.lists.len() - start);
+            for l in 0..pairs {
+                let i = self.first + (start + l) / self.k;
+                let j = match self.lists[start + l].1 {
+                    GONE => i,
+                    j => j as usize,
+                };
+                let (i, j) = (i.min(j), i.max(j)); // the same rounding for (i, j) and (j, i)
+                self.nodes.geometry[i].write_lane(&mut values[0], l);
+                self.nodes.geometry[j].write_lane(&mut values[1], l);
+                color.0[l] = color_distance(self.nodes.sh_of(i), self.nodes.sh_of(j));
+            }
+            let (a, b) = (Node::<F>::read(&values[0]), Node::<F>::read(&values[1]));
+            let mut costs = Lanes16::default();
+            a.cost(&b, F::load(&color), F::splat(self.geometric))
+                .store(&mut costs);
+            for (candidate, cost) in self.lists[start..start + pairs].iter_mut().zip(costs.0) {
+                if candidate.1 != GONE {
+                    candidate.0 = cost;
+                }
+            }
+        }
+    }
+}
+
+impl Node {
+    #[inline(always)]
+    fn write_lane(&self, values: &mut [Lanes16; VALUES], lane: usize) {
+        let Self {
+            mean, cov, areas, ..
+        } = self;
+        for k in 0..3 {
+            values[k].0[lane] = mean[k];
+        }
+        for k in 0..6 {
+            values[3 + k].0[lane] = cov[k];
+            values[13 + k].0[lane] = areas[k];
+        }
+        values[9].0[lane] = self.blur;
+        values[10].0[lane] = self.alpha;
+        values[11].0[lane] = self.mass;
+        values[12].0[lane] = self.visibility;
+    }
+}
+
+impl<F: Lanes> Node<F> {
+    #[inline(always)]
+    fn read(values: &[Lanes16; VALUES]) -> Self {
+        let mut node = Self {
+            mean: [F::zero(); 3],
+            cov: [F::zero(); 6],
+            blur: F::load(&values[9]),
+            alpha: F::load(&values[10]),
+            mass: F::load(&values[11]),
+            visibility: F::load(&values[12]),
+            areas: [F::zero(); 8],
+        };
+        for k in 0..3 {
+            node.mean[k] = F::load(&values[k]);
+        }
+        for k in 0..6 {
+            node.cov[k] = F::load(&values[3 + k]);
+            node.areas[k] = F::load(&values[13 + k]);
+        }
+        node
+    }
+}
 
 /// The `k` nearest of every node, cheapest to merge with first.
 pub fn candidates(
@@ -108,20 +166,33 @@ pub fn candidates(
     let tree: Tree<f32> = Tree::over((0..nodes.len() as u32).collect(), |i| {
         nodes.geometry[i].mean
     });
+    let isa = Isa::detect();
     let mut lists = vec![NONE; nodes.len() * k];
     lists
         .par_chunks_mut(CHUNK * k)
         .enumerate()
         .try_for_each(|(chunk, lists)| {
             control.check()?;
+            let first = chunk * CHUNK;
             let mut near = Vec::with_capacity(k);
             for (at, list) in lists.chunks_mut(k).enumerate() {
-                let i = chunk * CHUNK + at;
-                tree.nearest(i, k, &mut near);
+                tree.nearest(first + at, k, &mut near);
                 if near.last().is_some_and(|last| last.0 == 0.0) {
-                    spread_duplicates(i, k, nodes.len(), &mut near);
+                    spread_duplicates(first + at, k, nodes.len(), &mut near);
                 }
-                nodes.costs(i, &near, geometric, list);
+                for (candidate, &(_, j)) in list.iter_mut().zip(&near) {
+                    candidate.1 = j;
+                }
+            }
+            let costs = PairCosts {
+                nodes,
+                first,
+                k,
+                geometric,
+                lists,
+            };
+            dispatch(isa, costs);
+            for list in lists.chunks_mut(k) {
                 list.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
             }
             Ok(())
@@ -224,6 +295,62 @@ mod tests {
             NONE,
         ];
         assert_eq!(matched(&lists, 2, 9), [(0, 1), (2, 3)]);
+    }
+
+    #[test]
+    fn sixteen_pairs_cost_what_each_does_alone_to_the_bit() {
+        let mut random = Lcg(5);
+        let mut next = || random.centred() as f32;
+        let geometry: Vec<Node> = (0..101)
+            .map(|i| Node {
+                mean: [next(), next(), next()].map(|v| v * 10f32.powi(i % 9)),
+                cov: [1.0, 0.3 * next(), 0.3 * next(), 1.0, 0.3 * next(), 0.7],
+                blur: 0.1,
+                alpha: if i % 5 == 0 {
+                    0.001
+                } else {
+                    0.5 + 0.9 * next()
+                },
+                visibility: 3.0,
+                ..Node::default()
+            })
+            .map(Node::weighed)
+            .collect();
+        let nodes = Nodes {
+            sh: (0..6 * geometry.len()).map(|_| next()).collect(),
+            geometry,
+            width: 6,
+        };
+        let (first, k) = (7, 3);
+        for isa in Isa::available() {
+            let mut lists: Vec<Candidate> = (0..k * (nodes.len() - first))
+                .map(|at| {
+                    (
+                        NONE.0,
+                        [(at * 31 % nodes.len()) as u32, GONE][usize::from(at == 4)],
+                    )
+                })
+                .collect();
+            let costs = PairCosts {
+                nodes: &nodes,
+                first,
+                k,
+                geometric: 0.03,
+                lists: &mut lists,
+            };
+            dispatch(isa, costs);
+            for (at, &(cost, j)) in lists.iter().enumerate() {
+                if j == GONE {
+                    assert_eq!(cost, f32::INFINITY);
+                    continue;
+                }
+                let (i, j) = (first + at / k, j as usize);
+                let (i, j) = (i.min(j), i.max(j));
+                let color = color_distance(nodes.sh_of(i), nodes.sh_of(j));
+                let alone = nodes.geometry[i].cost(&nodes.geometry[j], color, 0.03);
+                assert_eq!(cost.to_bits(), alone.to_bits(), "{isa:?}: {i} {j}");
+            }
+        }
     }
 
     #[test]

@@ -52,10 +52,18 @@ impl Group {
         [0, 1, 2].map(|k| f64::from(self.values[k].0[lane]))
     }
 
-    /// Whether any row can touch the camera's image.
-    pub fn meets(&self, frustum: &Frustum) -> bool {
-        frustum.meets(self.centre, self.half, self.scale)
+    /// The first and the last row of the image's tiles that any of the rows can touch.
+    pub fn tile_rows(&self, frustum: &Frustum) -> Option<[u16; 2]> {
+        frustum.tile_rows(self.centre, self.half, self.scale)
     }
+}
+
+/// A group that a view can see.
+#[derive(Debug, Clone, Copy)]
+pub struct LiveGroup {
+    pub number: u32,
+    /// The first and the last row of the image's tiles that its rows can touch.
+    pub tile_rows: [u16; 2],
 }
 
 /// The groups a view can see, one after another.

@@ -2,18 +2,19 @@
 
 mod groups;
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use rayon::prelude::*;
 
 use crate::Result;
-use crate::raster::accumulate::WEIGHT;
+use crate::raster::accumulate::{Total, WEIGHT};
 use crate::raster::disjoint::DisjointSlice;
 use crate::raster::params::check_count;
 use crate::raster::simd::LANES;
-use crate::raster::{Camera, Frustum, Rasterizer, Settings};
+use crate::raster::{Camera, Frustum, Rasterizer, Settings, TileGrid};
 use crate::scene::{Means, Ordered, SceneRef};
-use groups::{CulledGroups, Group};
+use groups::{CulledGroups, Group, LiveGroup};
 
 /// Σ αT and the smallest pixel of each of N Gaussians over the views added so far. The result depends neither on the
 /// order of the rows nor on the number of threads: equal depths are drawn in the order of the scene's content.
@@ -25,6 +26,8 @@ pub struct VisibilityAccumulator {
     weight: Vec<f64>,
     pixel_size: Vec<f32>,
     rasterizer: Rasterizer,
+    /// Groups that a band of the image may meet.
+    band: usize,
 }
 
 impl VisibilityAccumulator {
@@ -43,6 +46,7 @@ impl VisibilityAccumulator {
             ordered,
             shift,
             rasterizer: Rasterizer::default(),
+            band: BAND,
         })
     }
 
@@ -55,29 +59,43 @@ impl VisibilityAccumulator {
             r[3] += r[0] * self.shift[0] + r[1] * self.shift[1] + r[2] * self.shift[2];
         }
         let frustum = Frustum::of(&camera);
-        let numbers = 0..self.groups.len() as u32;
-        let live: Vec<u32> = numbers
-            .into_par_iter()
-            .filter(|&g| self.groups[g as usize].meets(&frustum))
+        let groups = self.groups.par_iter().enumerate();
+        let live: Vec<LiveGroup> = groups
+            .filter_map(|(g, group)| {
+                let tile_rows = group.tile_rows(&frustum)?;
+                let number = g as u32;
+                Some(LiveGroup { number, tile_rows })
+            })
             .collect();
         self.find_pixels(&camera, &live);
-        let past_end = match live.last() {
-            Some(&g) => (LANES * (g as usize + 1)).saturating_sub(self.weight.len()),
-            None => return Ok(()),
-        };
+        let grid = TileGrid::of(&camera);
+        for rows in bands(&live, grid.rows, self.band) {
+            let [first, last] = [rows.start as u16, rows.end as u16 - 1];
+            let here = live.iter();
+            let here = here.filter(|g| g.tile_rows[0] <= last && g.tile_rows[1] >= first);
+            let here: Vec<u32> = here.map(|g| g.number).collect();
+            self.add_band(&camera, settings, grid.with_rows(rows), &here);
+        }
+        Ok(())
+    }
+
+    /// Adds what some rows of the image's tiles show of the groups `live`, ascending.
+    fn add_band(&mut self, camera: &Camera, settings: &Settings, grid: TileGrid, live: &[u32]) {
+        let Some(&last) = live.last() else { return };
+        let past_end = (LANES * (last as usize + 1)).saturating_sub(self.weight.len());
         let source = CulledGroups {
             groups: &self.groups,
-            live: &live,
+            live,
             rows: live.len() * LANES - past_end,
         };
         let weight = DisjointSlice::new(&mut self.weight);
+        let add = |row: usize, total: Total| {
+            let row = live[row / LANES] as usize * LANES + row % LANES;
+            // SAFETY: the call comes once for every row.
+            unsafe { *weight.at(row) += total.weight };
+        };
         self.rasterizer
-            .accumulate_from::<WEIGHT, _>(source, &camera, settings, |row, total| {
-                let row = live[row / LANES] as usize * LANES + row % LANES;
-                // SAFETY: the call comes once for every row of a view.
-                unsafe { *weight.at(row) += total.weight };
-            });
-        Ok(())
+            .accumulate_from::<WEIGHT, _>(source, camera, settings, grid, add);
     }
 
     /// Rows that some view saw.
@@ -97,18 +115,45 @@ impl VisibilityAccumulator {
     }
 
     /// Lowers each live row's pixel size to that of this view.
-    fn find_pixels(&mut self, camera: &Camera, live: &[u32]) {
+    fn find_pixels(&mut self, camera: &Camera, live: &[LiveGroup]) {
         let count = self.pixel_size.len();
         let pixel_size = DisjointSlice::new(&mut self.pixel_size);
-        live.par_iter().for_each(|&g| {
-            let first = g as usize * LANES;
+        live.par_iter().for_each(|g| {
+            let first = g.number as usize * LANES;
             // SAFETY: no two groups share rows.
             let sizes = unsafe { pixel_size.slice(first, LANES.min(count - first)) };
             for (lane, size) in sizes.iter_mut().enumerate() {
-                camera.lower_pixel_size(self.groups[g as usize].mean(lane), size);
+                camera.lower_pixel_size(self.groups[g.number as usize].mean(lane), size);
             }
         });
     }
+}
+
+/// Groups that are drawn together where a row of tiles does not meet more: projections, lists of tiles and keys take
+/// about 130 bytes a row while they are.
+const BAND: usize = 1 << 14;
+
+/// The image's rows of tiles in bands, each as high as it can be and meet no more than `most` groups, but one row at
+/// least. A group that meets two bands is projected for both.
+fn bands(live: &[LiveGroup], rows: usize, most: usize) -> Vec<Range<usize>> {
+    let (mut starts, mut ends) = (vec![0; rows], vec![0; rows]);
+    for group in live {
+        starts[usize::from(group.tile_rows[0])] += 1;
+        ends[usize::from(group.tile_rows[1])] += 1;
+    }
+    let (mut bands, mut first, mut met) = (Vec::new(), 0, 0);
+    let mut inside = 0; // groups that meet the row
+    for row in 0..rows {
+        inside += starts[row];
+        met += starts[row];
+        if row > first && met > most {
+            bands.push(first..row);
+            (first, met) = (row, inside);
+        }
+        inside -= ends[row];
+    }
+    bands.push(first..rows);
+    bands
 }
 
 #[cfg(test)]
@@ -193,7 +238,8 @@ mod tests {
                 .accumulate(&params, &camera, &settings, &mut whole)
                 .unwrap();
             let frustum = Frustum::of(&camera);
-            met += views.groups.iter().filter(|g| g.meets(&frustum)).count();
+            let groups = views.groups.iter();
+            met += groups.filter(|g| g.tile_rows(&frustum).is_some()).count();
         }
         let (weight, pixel_size) = views.by_row();
         assert_eq!(pixel_size, whole.pixel_size);
@@ -209,6 +255,51 @@ mod tests {
             views.seen(),
             whole.weight.iter().filter(|w| **w > 0.0).count()
         );
+    }
+
+    #[test]
+    fn bands_cover_every_row_of_tiles_once_and_meet_few_groups() {
+        let mut random = Lcg(3);
+        let live: Vec<LiveGroup> = (0..1000)
+            .map(|number| {
+                let first = random.integer() as u16 % 30;
+                let last = (first + random.integer() as u16 % 3).min(29);
+                LiveGroup {
+                    number,
+                    tile_rows: [first, last],
+                }
+            })
+            .collect();
+        for most in [1, 80, 150, 400, 5000] {
+            let bands = bands(&live, 30, most);
+            let ends = bands.iter().map(|b| b.end);
+            assert!(
+                bands
+                    .iter()
+                    .map(|b| b.start)
+                    .eq([0].into_iter().chain(ends).take(bands.len()))
+            );
+            assert_eq!(bands.last().unwrap().end, 30);
+            for band in &bands {
+                let [first, last] = [band.start as u16, band.end as u16 - 1];
+                let meets = |g: &&LiveGroup| g.tile_rows[0] <= last && g.tile_rows[1] >= first;
+                let met = live.iter().filter(meets).count();
+                assert!(met <= most || band.len() == 1, "{met} in {band:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn bands_show_what_the_whole_image_does() {
+        let rows = scene();
+        let scene = made(Means::F32(&rows.0), &rows.2, &rows);
+        let (mut whole, mut split) = (accumulator(&scene), accumulator(&scene));
+        split.band = 10;
+        for camera in cameras() {
+            whole.add(&camera, &Settings::default()).unwrap();
+            split.add(&camera, &Settings::default()).unwrap();
+        }
+        assert_eq!(whole.by_row(), split.by_row());
     }
 
     #[test]

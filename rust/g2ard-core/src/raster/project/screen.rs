@@ -1,10 +1,11 @@
 //! A chunk of Gaussians' splats, written out.
 
-use super::{Projected, Splat, View, colour, direction, project};
+use super::{Projected, Splat, View, colour, direction, on_image, project};
+use crate::raster::grid::TileGrid;
 use crate::raster::params::Source;
 use crate::raster::simd::{Kernel, LANES, Lanes, Lanes16, Mask, Wide};
 use crate::raster::tile_lists::{Ellipses, TileIntersector, TileList};
-use crate::raster::{ALPHA_MIN, Convention, sh};
+use crate::raster::{ALPHA_MIN, Convention, TILE, sh};
 
 /// Projects the groups `first..last`; visible splats go to the front of `out` in row order, each with
 /// its tile_list. Returns how many.
@@ -13,7 +14,7 @@ pub struct Project<'a, S: Source> {
     pub source: S,
     pub first: usize,
     pub last: usize,
-    pub tiles: (usize, usize),
+    pub grid: TileGrid,
     pub out: &'a mut [Splat],
     pub tile_lists: &'a mut [TileList],
     pub intersector: &'a mut TileIntersector,
@@ -29,14 +30,15 @@ impl<S: Source> Kernel for Project<'_, S> {
         for group in self.first..self.last {
             let p = project::<F, S>(self.view, &self.source, group);
             let rows = (self.source.len() - group * LANES).min(LANES);
-            let bits = u32::from(p.visible.bits()) & ((1u32 << rows) - 1);
+            let visible = p.visible.and(p.on_rows(&self.grid));
+            let bits = u32::from(visible.bits()) & ((1u32 << rows) - 1);
             if bits == 0 {
                 continue;
             }
             let some = count + bits.count_ones() as usize;
             let tile_lists = &mut self.tile_lists[count..some];
             p.ellipses(self.view)
-                .tile_lists(bits, self.tiles, self.intersector, tile_lists);
+                .tile_lists(bits, self.grid, self.intersector, tile_lists);
             let mut rgb = [F::zero(); 3];
             if S::COLOURED {
                 let (dir, _) = direction::<F, S>(self.view, &self.source, group);
@@ -86,6 +88,14 @@ impl<S: Source> Kernel for Project<'_, S> {
 }
 
 impl<F: Lanes> Projected<F> {
+    /// Whether they may touch the grid's rows of tiles.
+    #[inline(always)]
+    fn on_rows(&self, grid: &TileGrid) -> F::Mask {
+        let first = (grid.first_row * TILE) as f32;
+        let y = F::narrow(self.y) - F::splat(first);
+        on_image(y, self.half[1], (grid.rows * TILE) as f32)
+    }
+
     #[inline(always)]
     fn ellipses(&self, view: &View) -> Ellipses<F> {
         let reach = (self.log2_opacity - F::splat(ALPHA_MIN.log2())).max(F::zero());

@@ -1,6 +1,6 @@
 //! Back through the projection: from a splat's gradient to the stored parameters'.
 
-use super::{HALF_LOG2_E, INRIA_FLOOR, View, colour, direction, dot, project};
+use super::{HALF_LOG2_E, INRIA_FLOOR, Projected, View, colour, direction, dot, project};
 use crate::raster::params::Source;
 use crate::raster::simd::Lanes;
 use crate::raster::{Convention, DILATION, sh};
@@ -78,21 +78,7 @@ pub fn unproject<F: Lanes, S: Source>(
         dm[1][k] = two * (gxy * p.m[0][k] + gyy * p.m[1][k]);
     }
     if view.antialiased {
-        // ln √(det0 / det), det = det0 + 0.3·tr + 0.09; det0 = |minors|², minors = M₀ × M₁.
-        let mut weight = h;
-        if view.convention == Convention::Inria {
-            weight = h.only((p.det0 / p.det).gt(F::splat(INRIA_FLOOR)));
-        }
-        let r_det = F::splat(1.0) / p.det;
-        let r_det0 = F::splat(1.0) / p.det0.max(F::splat(f32::MIN_POSITIVE));
-        let on_minors = weight * (r_det0 - r_det);
-        let on_trace = weight * F::splat(DILATION) * r_det;
-        for k in 0..3 {
-            let (i, j) = ((k + 1) % 3, (k + 2) % 3);
-            let (ni, nj) = (p.minors[i] * on_minors, p.minors[j] * on_minors);
-            dm[0][k] = dm[0][k] + (p.m[1][i] * nj - p.m[1][j] * ni) - on_trace * p.m[0][k];
-            dm[1][k] = dm[1][k] + (ni * p.m[0][j] - nj * p.m[0][i]) - on_trace * p.m[1][k];
-        }
+        add_antialiasing(view, &p, h, &mut dm);
     }
 
     let mut log_scale = [zero; 3];
@@ -114,39 +100,40 @@ pub fn unproject<F: Lanes, S: Source>(
     }
     let quat = quaternion_gradient(&p.q, p.rq, &dr);
 
-    // J·W = (f/z)·(Wᵢ − t·W₂): the 1/z in front, then t where it was not clamped.
-    let focal = [F::splat(view.fx as f32), F::splat(view.fy as f32)];
-    let on_screen = [grad_x, grad_y];
-    let mut camera = [zero, zero, g.depth];
-    for i in 0..2 {
-        let mut along = zero;
-        let mut on_t = zero;
-        for k in 0..3 {
-            along = djw[i][k].fma(p.jw[i][k], along);
-            on_t = djw[i][k].fma(p.w[2][k], on_t);
-        }
-        let j = focal[i] * p.rz;
-        let through_t = (-(on_t * j * p.rz)).only(p.inside[i]);
-        let through_ray = on_screen[i] * j;
-        camera[i] = through_t + through_ray;
-        camera[2] = camera[2] - through_t * p.t[i] - through_ray * p.ray[i] - along * p.rz;
-    }
-    let mut mean = [zero; 3];
-    for k in 0..3 {
-        mean[k] = camera[0] * p.w[0][k] + camera[1] * p.w[1][k] + camera[2] * p.w[2][k];
-    }
+    let mut mean = through_camera(view, &p, [grad_x, grad_y], g.depth, &djw);
 
+    let (basis, rgb) = through_colour(view, source, group, g.rgb, &mut mean);
+    RowGradients {
+        mean,
+        quat,
+        log_scale,
+        logit_opacity: h * p.rest_opacity,
+        basis,
+        rgb,
+        extent: Extent::of(&p.m, p.depth.ge(F::splat(view.near))),
+    }
+}
+
+/// Adds to dL/d(mean) what the colour's direction gives. Returns the SH basis and dL/d(colour) where the colour was not
+/// cut at 0.
+#[inline(always)]
+fn through_colour<F: Lanes, S: Source>(
+    view: &View,
+    source: &S,
+    group: usize,
+    mut rgb: [F; 3],
+    mean: &mut [F; 3],
+) -> ([F; 16], [F; 3]) {
     let (dir, r_distance) = direction::<F, S>(view, source, group);
     let coeffs = source.sh_coeffs();
-    let mut basis = [zero; 16];
+    let mut basis = [F::zero(); 16];
     sh::basis(coeffs, dir[0], dir[1], dir[2], &mut basis);
     let value = colour::<F, S>(source, group, &basis);
-    let mut rgb = g.rgb;
     for c in 0..3 {
-        rgb[c] = rgb[c].only(value[c].gt(zero));
+        rgb[c] = rgb[c].only(value[c].gt(F::zero()));
     }
     if coeffs > 1 {
-        let mut weights = [zero; 16];
+        let mut weights = [F::zero(); 16];
         for k in 1..coeffs {
             for c in 0..3 {
                 weights[k] = source.sh::<F>(group, k, c).fma(rgb[c], weights[k]);
@@ -158,15 +145,59 @@ pub fn unproject<F: Lanes, S: Source>(
             mean[k] = mean[k] + (d[k] - dir[k] * radial) * r_distance;
         }
     }
-    RowGradients {
-        mean,
-        quat,
-        log_scale,
-        logit_opacity: h * p.rest_opacity,
-        basis,
-        rgb,
-        extent: Extent::of(&p.m, p.depth.ge(F::splat(view.near))),
+    (basis, rgb)
+}
+
+/// Adds to dL/dM what the factor √(det0 / det) of the opacity gives: det = det0 + 0.3·tr + 0.09, det0 = |minors|²,
+/// minors = M₀ × M₁; `h` is the gradient of the opacity's logarithm.
+#[inline(always)]
+fn add_antialiasing<F: Lanes>(view: &View, p: &Projected<F>, h: F, dm: &mut [[F; 3]; 2]) {
+    let mut weight = h;
+    if view.convention == Convention::Inria {
+        weight = h.only((p.det0 / p.det).gt(F::splat(INRIA_FLOOR)));
     }
+    let r_det = F::splat(1.0) / p.det;
+    let r_det0 = F::splat(1.0) / p.det0.max(F::splat(f32::MIN_POSITIVE));
+    let on_minors = weight * (r_det0 - r_det);
+    let on_trace = weight * F::splat(DILATION) * r_det;
+    for k in 0..3 {
+        let (i, j) = ((k + 1) % 3, (k + 2) % 3);
+        let (ni, nj) = (p.minors[i] * on_minors, p.minors[j] * on_minors);
+        dm[0][k] = dm[0][k] + (p.m[1][i] * nj - p.m[1][j] * ni) - on_trace * p.m[0][k];
+        dm[1][k] = dm[1][k] + (ni * p.m[0][j] - nj * p.m[0][i]) - on_trace * p.m[1][k];
+    }
+}
+
+/// dL/d(mean) from the gradients of the centre on screen, of the depth and of J·W = (f/z)·(Wᵢ − t·W₂): through the 1/z
+/// in front, and through t where it was not clamped.
+#[inline(always)]
+fn through_camera<F: Lanes>(
+    view: &View,
+    p: &Projected<F>,
+    on_screen: [F; 2],
+    depth: F,
+    djw: &[[F; 3]; 2],
+) -> [F; 3] {
+    let focal = [F::splat(view.fx as f32), F::splat(view.fy as f32)];
+    let mut camera = [F::zero(), F::zero(), depth];
+    for i in 0..2 {
+        let mut along = F::zero();
+        let mut on_t = F::zero();
+        for k in 0..3 {
+            along = djw[i][k].fma(p.jw[i][k], along);
+            on_t = djw[i][k].fma(p.w[2][k], on_t);
+        }
+        let j = focal[i] * p.rz;
+        let through_t = (-(on_t * j * p.rz)).only(p.inside[i]);
+        let through_ray = on_screen[i] * j;
+        camera[i] = through_t + through_ray;
+        camera[2] = camera[2] - through_t * p.t[i] - through_ray * p.ray[i] - along * p.rz;
+    }
+    let mut mean = [F::zero(); 3];
+    for k in 0..3 {
+        mean[k] = camera[0] * p.w[0][k] + camera[1] * p.w[1][k] + camera[2] * p.w[2][k];
+    }
+    mean
 }
 
 /// dL/dR → dL/dq for R(q/|q|), from the unit quaternion and 1/|q|.

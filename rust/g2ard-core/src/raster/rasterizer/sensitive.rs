@@ -7,7 +7,7 @@ use crate::raster::disjoint::DisjointSlice;
 use crate::raster::params::Params;
 use crate::raster::sensitivity::{GatherSensitivity, MOMENTS, Sensitivity, TRIANGLE};
 use crate::raster::simd::dispatch;
-use crate::raster::tile_batch::{TileBatch, TileRect};
+use crate::raster::tile_batch::TileBatch;
 use crate::raster::{Camera, Settings};
 use crate::{Error, Result};
 
@@ -40,13 +40,11 @@ impl Rasterizer {
             return Ok(());
         };
         let out = DisjointSlice::new(sums);
-        let chunks = self.chunks.par_iter().enumerate();
-        chunks.for_each(|(chunk, &(first, count))| {
-            let slots = self.bins.slots_of(chunk);
+        self.visible().for_each(|(splats, slots)| {
             let gather = GatherSensitivity {
                 view: &state.view,
                 source: *params,
-                splats: &self.splats[first..first + count],
+                splats,
                 slots: &sensitive[slots.clone()],
                 written: &self.written[slots],
                 out,
@@ -64,7 +62,7 @@ impl Rasterizer {
             return sums;
         };
         let camera = &state.camera;
-        let tiles_x = camera.tiles().0;
+        let grid = state.grid;
         let slots = DisjointSlice::new(&mut sums);
         let written = DisjointSlice::new(&mut self.written);
         let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
@@ -77,9 +75,9 @@ impl Rasterizer {
             TileBatch::default,
             |tile_batch, (tile, ((batch, transmittance), last))| {
                 let sensitivity = Sensitivity {
-                    pairs: &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize],
+                    pairs: bins.pairs_of(tile),
                     splats,
-                    rect: TileRect::of(tile, tiles_x, camera.width, camera.height),
+                    rect: grid.rect(tile, camera),
                     settings: &state.settings,
                     block_masks: &self.block_masks[batch.0..batch.0 + batch.1],
                     transmittance,

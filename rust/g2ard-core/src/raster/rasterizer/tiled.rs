@@ -4,12 +4,11 @@ use rayon::prelude::*;
 
 use super::{Image, ImageGradients, Rasterizer};
 use crate::raster::BLOCKS;
-use crate::raster::accumulate::Accumulate;
 use crate::raster::backward::{self, Backward, Incoming, SUMS};
 use crate::raster::disjoint::DisjointSlice;
 use crate::raster::forward::{Forward, Pixels};
 use crate::raster::simd::{Lanes16, dispatch};
-use crate::raster::tile_batch::{BATCH, TileBatch, TileRect, for_stretches};
+use crate::raster::tile_batch::{BATCH, TileBatch, for_stretches};
 
 #[derive(Default)]
 struct Scratch {
@@ -23,7 +22,7 @@ impl Rasterizer {
     pub(crate) fn forward_tiles<const DEPTH: bool>(&mut self, image: &mut Image) {
         let Some(state) = &self.state else { return };
         let (camera, background) = (state.camera, state.background);
-        let tiles_x = camera.tiles().0;
+        let grid = state.grid;
         let tiles = self.batches.len();
         self.transmittance
             .resize(tiles, [Lanes16::default(); BLOCKS]);
@@ -42,8 +41,8 @@ impl Rasterizer {
         tile_states.enumerate().for_each_init(
             Scratch::default,
             |scratch, (tile, ((batch, transmittance), last))| {
-                let pairs = &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize];
-                let rect = TileRect::of(tile, tiles_x, camera.width, camera.height);
+                let pairs = bins.pairs_of(tile);
+                let rect = grid.rect(tile, &camera);
                 // SAFETY: every tile has its own batches, and the pixels written below are its own.
                 let block_masks =
                     unsafe { block_masks.slice(batch.0, pairs.len().div_ceil(BATCH)) };
@@ -103,7 +102,7 @@ impl Rasterizer {
         self.clear_slots();
         let Some(state) = &self.state else { return };
         let camera = &state.camera;
-        let tiles_x = camera.tiles().0;
+        let grid = state.grid;
         let slots = DisjointSlice::new(&mut self.slots);
         let written = DisjointSlice::new(&mut self.written);
         let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
@@ -115,11 +114,11 @@ impl Rasterizer {
         states.enumerate().for_each_init(
             Scratch::default,
             |scratch, (tile, ((batch, transmittance), last))| {
-                let pairs = &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize];
+                let pairs = bins.pairs_of(tile);
                 if pairs.is_empty() {
                     return;
                 }
-                let rect = TileRect::of(tile, tiles_x, camera.width, camera.height);
+                let rect = grid.rect(tile, camera);
                 let incoming = &mut scratch.incoming;
                 incoming.load(backward::RGB, image.rgb, 3, camera.width, &rect);
                 if let Some(alpha) = image.alpha {
@@ -143,34 +142,6 @@ impl Rasterizer {
                     written,
                 };
                 dispatch(isa, backward);
-            },
-        );
-    }
-
-    pub(super) fn accumulate_tiles<const KINDS: usize>(&mut self) {
-        let pairs = self.bins.pairs.len();
-        self.shares.resize(pairs * KINDS, 0.0);
-        self.written.clear();
-        self.written.resize(pairs, 0);
-        let Some(state) = &self.state else { return };
-        let camera = &state.camera;
-        let tiles_x = camera.tiles().0;
-        let slots = DisjointSlice::new(self.shares.as_chunks_mut::<KINDS>().0);
-        let written = DisjointSlice::new(&mut self.written);
-        let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
-        (0..self.batches.len()).into_par_iter().for_each_init(
-            TileBatch::default,
-            |tile_batch, tile| {
-                let accumulate = Accumulate {
-                    pairs: &bins.pairs[bins.starts[tile] as usize..bins.starts[tile + 1] as usize],
-                    splats,
-                    rect: TileRect::of(tile, tiles_x, camera.width, camera.height),
-                    settings: &state.settings,
-                    tile_batch,
-                    slots,
-                    written,
-                };
-                dispatch(isa, accumulate);
             },
         );
     }

@@ -85,19 +85,8 @@ impl Kernel for Forward<'_> {
                     }
                 }
                 for m in 0..FORWARD {
-                    for at in (0..padded).step_by(LANES) {
-                        let from = m * span + margin + at;
-                        // SAFETY: the margins hold the window's reach on both sides.
-                        unsafe {
-                            let blurred = taps::<F>(
-                                products.as_ptr().add(from),
-                                self.shape.channels,
-                                &self.weights,
-                            );
-                            blurred
-                                .store_at(ring.as_mut_ptr().add((slot * FORWARD + m) * span + at));
-                        }
-                    }
+                    let to = &mut ring[(slot * FORWARD + m) * span..][..padded];
+                    blur_row::<F>(&products[m * span..][..span], to, self.shape, &self.weights);
                 }
             } else {
                 ring[slot * FORWARD * span..(slot + 1) * FORWARD * span].fill(0.0);
@@ -110,25 +99,7 @@ impl Kernel for Forward<'_> {
             let target = &self.target[(self.first + out) * row..(self.first + out + 1) * row];
             let mut sums = [F::zero(); 2];
             for at in (0..padded).step_by(LANES) {
-                let mut means = [F::zero(); FORWARD];
-                for m in 0..FORWARD {
-                    let mut sum = F::zero();
-                    for k in 0..=RADIUS {
-                        let up = ((out + RADIUS - k) % TAPS * FORWARD + m) * span + at;
-                        let down = ((out + RADIUS + k) % TAPS * FORWARD + m) * span + at;
-                        // SAFETY: both are whole lanes of ring rows.
-                        let pair = unsafe {
-                            let up = F::load_at(ring.as_ptr().add(up));
-                            if k == 0 {
-                                up
-                            } else {
-                                up + F::load_at(ring.as_ptr().add(down))
-                            }
-                        };
-                        sum = pair.fma(F::splat(self.weights[RADIUS + k]), sum);
-                    }
-                    means[m] = sum;
-                }
+                let means = blurred_down::<F>(ring, span, out, at, &self.weights);
                 let (loss, d) = derivatives_of(&means);
                 let inside = tail_mask::<F>(row, at);
                 let e = load::<F>(image, at) - load::<F>(target, at);
@@ -143,19 +114,13 @@ impl Kernel for Forward<'_> {
                 }
             }
             for m in 0..BACK {
-                for at in (0..padded).step_by(LANES) {
-                    let from = m * span + margin + at;
-                    // SAFETY: the margins hold the window's reach; `maps` holds `BACK` padded rows for each row.
-                    unsafe {
-                        let blurred = taps::<F>(
-                            derivatives.as_ptr().add(from),
-                            self.shape.channels,
-                            &self.weights,
-                        );
-                        blurred
-                            .store_at(self.maps.as_mut_ptr().add((out * BACK + m) * padded + at));
-                    }
-                }
+                let to = &mut self.maps[(out * BACK + m) * padded..][..padded];
+                blur_row::<F>(
+                    &derivatives[m * span..][..span],
+                    to,
+                    self.shape,
+                    &self.weights,
+                );
             }
             for k in 0..2 {
                 let mut lanes = Lanes16::default();
@@ -164,6 +129,51 @@ impl Kernel for Forward<'_> {
             }
         }
     }
+}
+
+/// Blurs a row, which lies between margins, along itself into `to`, a padded row.
+#[inline(always)]
+fn blur_row<F: Lanes>(from: &[f32], to: &mut [f32], shape: Shape, weights: &[f32; TAPS]) {
+    let margin = margin(shape);
+    assert!(from.len() >= to.len() + 2 * margin);
+    for at in (0..to.len()).step_by(LANES) {
+        // SAFETY: the margins hold the window's reach on both sides; `to` is whole lanes.
+        unsafe {
+            let blurred = taps::<F>(from.as_ptr().add(margin + at), shape.channels, weights);
+            blurred.store_at(to.as_mut_ptr().add(at));
+        }
+    }
+}
+
+/// Sixteen values of output row `out`, blurred across the ring's rows, of every map.
+#[inline(always)]
+fn blurred_down<F: Lanes>(
+    ring: &[f32],
+    span: usize,
+    out: usize,
+    at: usize,
+    weights: &[f32; TAPS],
+) -> [F; FORWARD] {
+    let mut means = [F::zero(); FORWARD];
+    for m in 0..FORWARD {
+        let mut sum = F::zero();
+        for k in 0..=RADIUS {
+            let up = ((out + RADIUS - k) % TAPS * FORWARD + m) * span + at;
+            let down = ((out + RADIUS + k) % TAPS * FORWARD + m) * span + at;
+            // SAFETY: both are whole lanes of ring rows.
+            let pair = unsafe {
+                let up = F::load_at(ring.as_ptr().add(up));
+                if k == 0 {
+                    up
+                } else {
+                    up + F::load_at(ring.as_ptr().add(down))
+                }
+            };
+            sum = pair.fma(F::splat(weights[RADIUS + k]), sum);
+        }
+        means[m] = sum;
+    }
+    means
 }
 
 /// The lanes from `at` that belong to a row of `row` values.

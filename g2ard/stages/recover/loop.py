@@ -1,0 +1,308 @@
+"""The steps of one recovery, the trials before them, and what a resume must bring back."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.progress import Progress, silent
+from g2ard.splats import Splats
+from g2ard.stages.recover import checkpoint as checkpoints
+from g2ard.stages.recover.anchors import Anchors, drift95, needle
+from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.draw import drawn
+from g2ard.stages.recover.engine import Engine, engine_class
+from g2ard.stages.recover.guard import Guard
+from g2ard.stages.recover.probe import MULTIPLIERS, Probe, calm, search_multiplier, trial_steps
+from g2ard.stages.recover.schedule import multiplier_for, reach_for
+from g2ard.stages.recover.sizes import typical_share
+from g2ard.targets import Targets, fingerprint_of, mask_of
+
+__all__ = ["Loop", "Watch", "finite"]
+
+_TRIAL_STEPS = 20
+_TRIAL_SHARE, _CALM_SHARE = 0.1, 0.3
+"""Under a time limit: steps of a trial, and the share of the limit that all trials may take; the second where
+rates that are too large would spend it on nothing."""
+
+_SHORT = 20
+"""Steps under which there is no way back: none would be left to go on with."""
+
+_LOG_POINTS = 10
+"""How often Drift95 and Needle are logged over a recovery."""
+
+Watch = Callable[[int, float, Callable[[], Splats]], None]
+"""Called after every step with its number, the seconds so far and what gives the scene as it stands."""
+
+
+class Loop:
+    """The steps of one recovery; what a resume must bring back lives in `engine`, `done` and `losses`."""
+
+    def __init__(
+        self,
+        student: Splats,
+        targets: Targets,
+        config: RecoverConfig,
+        weights: NDArray[np.float64] | None,
+        anchors: Anchors,
+        probe: Probe,
+        guard: Guard,
+        held: str | None,
+    ) -> None:
+        self.targets = targets
+        self.config = config
+        self.schedule = config.schedule.within(targets.cameras.extent)
+        self.weights = weights
+        self.anchors = anchors
+        self.multiplier = 1.0
+        self.reach = math.inf
+        self.trials: list[dict[str, float]] = []
+        self.student = student
+        self.probe = probe
+        self.guard = guard
+        self._skipped = 0  # by engines before this one
+        self.done = 0
+        self.seconds = 0.0
+        self.losses: list[float] = []
+        self.geometry: list[dict[str, float]] = []
+        self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised? → steps, seconds
+        self.key = _fingerprint(student, targets, config, weights, anchors, held)
+
+    @cached_property
+    def engine(self) -> Engine:
+        """Made when first needed: trials need theirs before, and two at once would double the memory."""
+        return self._new_engine()
+
+    @property
+    def skipped(self) -> int:
+        """Steps of single Gaussians left out because a gradient was not finite."""
+        return self._skipped + self.engine.skipped
+
+    @property
+    def views_seen(self) -> NDArray[np.float64]:
+        """(N,) how many of the views have touched each Gaussian, from the steps it has taken."""
+        steps = self.done - (int(self.guard.backed_off[-1]["step"]) if self.guard.backed_off else 0)
+        return self.engine.counts * (len(self.targets.cameras) / max(1, steps))
+
+    def _new_engine(self, start: Splats | None = None) -> Engine:
+        config, student = self.config, self.student if start is None else start
+        engine: Engine = engine_class(config.engine)(
+            student,
+            self.targets.cameras.recentred(student.offset),
+            anchors=self.anchors,
+            regularizers=config.regularizers,
+            means_in_scales=config.schedule.means_in_scales,
+            ssim_weight=config.ssim_weight,
+            background=config.background,
+        )
+        return engine
+
+    def choose_rates(self, start: float) -> None:
+        """The schedule's reach and multiplier, or what the start suggests, and short trials like best.
+
+        The time of the trials counts.
+
+        Args:
+            start: PSNR before recovery: where the search begins, and all there is for short horizons.
+        """
+        rmse = 10 ** (-start / 20)
+        typical = typical_share(self.student, self.targets.cameras)
+        reach = self.config.schedule.reach
+        self.reach = reach_for(rmse, typical) if reach is None else reach
+        if self.config.schedule.multiplier is not None:
+            self.multiplier = self.config.schedule.multiplier
+            return
+        guess = multiplier_for(rmse)
+        limit = self.config.time_limit
+        steps = trial_steps(self.config.horizon) if limit is None else _TRIAL_STEPS
+        self.multiplier = guess
+        if not steps:
+            return
+        began, share = time.monotonic(), _TRIAL_SHARE
+        seen: dict[float, float] = {}
+
+        def score(multiplier: float) -> float:
+            engine = self._new_engine()
+            for step in range(steps):
+                if limit is not None and time.monotonic() - began > share * limit:
+                    raise TimeoutError
+                self._learn(engine, step, step / steps, multiplier)
+            seen[multiplier] = self.probe.all_of(engine.splats())
+            return seen[multiplier]
+
+        nearly_there = guess <= min(MULTIPLIERS)
+        try:
+            self.multiplier, _ = search_multiplier(score, guess, start)
+            tight = reach_for(0.0, typical)
+            if seen[self.multiplier] < start and self.config.schedule.reach is None and tight < self.reach:
+                self.reach = tight  # not as untrained as it looked
+                seen.clear()
+                self.multiplier, _ = search_multiplier(score, guess, start)
+            if seen[self.multiplier] < start:  # a few steps on photos that are nearly met say nothing
+                self.multiplier, share = guess, _CALM_SHARE
+                if nearly_there:
+                    self.multiplier, _ = calm(score, min(MULTIPLIERS), seen, start)
+        except TimeoutError:  # the best of what was seen, or calmer than all of it
+            best = max(seen, key=lambda m: seen[m], default=guess)
+            if seen.get(best, -math.inf) >= start:
+                self.multiplier = best
+            elif nearly_there:
+                self.multiplier = min(best / 3, multiplier_for(rmse, 0.01))
+        self.trials = [{"multiplier": m, "psnr": value} for m, value in sorted(seen.items())]
+        self.seconds = time.monotonic() - began
+
+    def _learn(
+        self, engine: Engine, step: int, share: float, multiplier: float, *, regularize: bool = False
+    ) -> float:
+        rates = self.schedule.at(share, final=self.config.final, multiplier=multiplier, reach=self.reach)
+        view = self._view(step)
+        target, mask = self.targets[view], mask_of(self.targets, view)
+        return engine.step(view, target, rates, regularize=regularize, mask=mask)
+
+    def run(self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None) -> None:
+        if checkpoint is not None and checkpoint.exists():
+            self._resume(checkpoint)
+        earlier, began, saved = self.seconds, time.monotonic(), time.monotonic()
+        with checkpoints.deferred_interrupt() as interrupted:
+            while self._share() < 1 and self.guard.stopped is None:
+                self._step()
+                self._look()
+                now = time.monotonic()
+                self.seconds = earlier + now - began
+                self._log()
+                if progress is not silent:
+                    self._tell(progress, stage)
+                if watch is not None:
+                    paused = time.monotonic()
+                    watch(self.done, self.seconds, self.engine.splats)
+                    began += time.monotonic() - paused
+                if checkpoint is not None and (interrupted.is_set() or now - saved > checkpoints.PERIOD):
+                    self._save(checkpoint)
+                    saved = now
+                if interrupted.is_set():
+                    raise KeyboardInterrupt
+
+    def _share(self) -> float:
+        """How much of the horizon, of steps or of seconds, has been used."""
+        if self.config.time_limit is not None:
+            return self.seconds / self.config.time_limit
+        return self.done / self.config.horizon
+
+    def _step(self) -> None:
+        config, step = self.config, self.done
+        regularize = config.regularizers.active and (step + 1) % config.regularizers.period == 0
+        began = time.monotonic()
+        loss = self._learn(self.engine, step, self._share(), self.multiplier, regularize=regularize)
+        self.losses.append(loss)
+        tally = self._seconds_of[regularize]
+        tally[0] += 1
+        tally[1] += time.monotonic() - began
+        self.done += 1
+
+    def _look(self) -> None:
+        """Where too much is lost to come back, go on from the best scene with a third of the rates."""
+        share = self._share()
+        short = self.config.time_limit is None and self.config.horizon < _SHORT
+        if short or not self.guard.due(share):
+            return
+        if self.guard.look(self.engine.splats(), share, self.done) == "back":
+            self.multiplier /= 3
+            self._skipped += self.engine.skipped
+            del self.engine  # two at once would double the memory
+            self.engine = self._new_engine(self.guard.best)
+
+    def _log(self) -> None:
+        """Drift95 and Needle at every tenth of the horizon."""
+        if len(self.geometry) < int(min(1.0, self._share()) * _LOG_POINTS):
+            scene = self.engine.splats()
+            figures = {"drift95": drift95(self.anchors, scene.means), "needle": needle(scene.scales)}
+            self.geometry.append({"step": self.done, **figures})
+
+    @property
+    def regularizers(self) -> dict[str, float]:
+        """How many steps were regularised, which share of the time that cost above plain steps, and their
+        period, 0 where none has weight."""
+        (plain, plain_s), (held, held_s) = self._seconds_of[False], self._seconds_of[True]
+        extra = held_s - held * plain_s / plain if plain and held else 0.0
+        weights = self.config.regularizers
+        return {
+            "steps": held,
+            "share": max(0.0, extra) / max(plain_s + held_s, 1e-9),
+            "period": weights.period if weights.active else 0,
+        }
+
+    def _tell(self, progress: Progress, stage: str) -> None:
+        speed = self.done / max(self.seconds, 1e-9)
+        recent = np.mean(self.losses[-20:])
+        total = self.config.horizon
+        if self.config.time_limit is not None:
+            total = max(self.done, round(self.done / max(self._share(), 1e-9)))
+        shown, at = self.probe.latest(self.engine.splats, self.done, self.seconds)
+        figures = {"loss": f"{recent:.4f}", "PSNR": f"{shown:.2f} @{at}", "steps/s": f"{speed:.1f}"}
+        progress(stage, self.done, total, figures)
+
+    def curve(self) -> list[float]:
+        """Up to 100 means of the loss over equal stretches of the horizon."""
+        return [float(part.mean()) for part in np.array_split(np.array(self.losses), 100) if len(part)]
+
+    def _view(self, step: int) -> int:
+        """Views in a fresh random order each epoch; depends on seed, weights and step alone."""
+        count = len(self.targets.cameras)
+        epoch, position = divmod(step, count)
+        return int(drawn(self.config.seed, epoch, count, self.weights)[position])
+
+    def _save(self, path: Path) -> None:
+        meta = {
+            "done": self.done,
+            "seconds": self.seconds,
+            "multiplier": self.multiplier,
+            "reach": finite(self.reach),
+            "trials": self.trials,
+            "geometry": self.geometry,
+            "seconds_of": [self._seconds_of[False], self._seconds_of[True]],
+            "skipped": self._skipped,
+            "guard": self.guard.meta(),
+        }
+        arrays = {**self.engine.state(), "losses": np.array(self.losses), **self.guard.arrays()}
+        checkpoints.save(path, self.key, meta, arrays)
+
+    def _resume(self, path: Path) -> None:
+        meta, arrays = checkpoints.load(path, self.key)
+        self.losses = arrays.pop("losses").tolist()
+        self.guard.load(meta["guard"], arrays)
+        self._skipped = int(meta["skipped"])
+        self.engine.load(arrays)
+        self.done, self.seconds = int(meta["done"]), float(meta["seconds"])
+        self.multiplier = float(meta["multiplier"])
+        self.reach = math.inf if meta["reach"] is None else float(meta["reach"])
+        self.trials, self.geometry = list(meta["trials"]), list(meta["geometry"])
+        self._seconds_of = dict(zip((False, True), meta["seconds_of"], strict=True))
+
+
+def finite(reach: float) -> float | None:
+    """JSON knows no infinity."""
+    return None if math.isinf(reach) else reach
+
+
+def _fingerprint(
+    student: Splats,
+    targets: Targets,
+    config: RecoverConfig,
+    weights: NDArray[np.float64] | None,
+    anchors: Anchors,
+    validation: str | None,
+) -> str:
+    often = [] if weights is None else [repr(weights.tolist())]
+    parts = (repr(config), student.fingerprint(), fingerprint_of(targets), *often)
+    parts = parts if validation is None else (*parts, validation)
+    digest = hashlib.sha256("\n".join(parts).encode())
+    for held in (anchors.means, anchors.frames, anchors.r_parallel, anchors.r_perp):
+        digest.update(np.ascontiguousarray(held).tobytes())
+    return digest.hexdigest()
