@@ -20,8 +20,10 @@ from scenes import around, checkered_ball
 
 from g2ard import viewer
 from g2ard.cameras import Camera, Cameras
+from g2ard.cli.run_view import run_view
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_splats, write_splats, write_views
+from g2ard.policy import budget
 from g2ard.policy.view import stand_of, stand_with
 from g2ard.splats import Splats
 from g2ard.viewer import Start, check_page_output, page, write_page
@@ -231,6 +233,21 @@ def test_the_command_shows_a_scene_and_a_run(command_line: CommandLine, tmp_path
     assert (tmp_path / "pages" / "two.html").read_bytes() == before
     assert command_line("view", "dense.ply", "-o", "pages/two.html", "-w", "-q", cwd=tmp_path)[0] == 0
     assert len(Parts(tmp_path / "pages" / "two.html").labels) == 1
+
+
+def test_a_run_has_a_page_unless_its_scene_is_too_large(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ball, path = checkered_ball(300), tmp_path / "view.html"
+    size, line = run_view(path, tmp_path / "scene.sog", ball, around(6), (1.0, 1.0, 1.0))
+    assert size == path.stat().st_size
+    assert "view.html" in line
+    assert Parts(path).labels == ["scene.sog: 300 Gaussians"]
+    monkeypatch.setitem(budget.DEVICES, "web", 299)
+    size, line = run_view(path, tmp_path / "scene.sog", ball, around(6), (1.0, 1.0, 1.0))
+    assert size is None
+    assert "over 299 Gaussians" in line
+    assert not path.exists()
 
 
 @pytest.mark.parametrize(
