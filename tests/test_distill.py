@@ -108,7 +108,9 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
     assert 0 <= report["unseen"] < 0.5
     assert "of another kind" in error
     left = sorted(p.name for p in (tmp_path / "run").iterdir())
-    assert left == ["preview.png", "report.html", "report.json", "scene.ply", "views.json"]
+    assert left == ["preview.png", "report.html", "report.json", "scene.ply", "view.html", "views.json"]
+    assert report["bytes"]["view"] == (tmp_path / "run" / "view.html").stat().st_size
+    assert "view: run/view.html" in error
     status, _, error = command_line(*ask, cwd=tmp_path)
     assert status == 1
     assert "run" in error

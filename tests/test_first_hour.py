@@ -58,9 +58,11 @@ def test_several_budgets_are_what_single_runs_give(command_line: CommandLine, fo
     ask = ("distill", "ball.ply", "--steps", 8, "--size", 48)
     status, _, error = command_line(*ask, "-n", "200,100", "-o", "runs/{count}", cwd=folder)
     assert status == 0, error
-    command_line(*ask, "-n", "100", "-o", "alone", cwd=folder)
+    command_line(*ask, "-n", "100", "-o", "alone", "--no-view", cwd=folder)
     assert (folder / "runs/100/scene.ply").read_bytes() == (folder / "alone/scene.ply").read_bytes()
     assert (folder / "runs/200/report.html").exists()
+    assert (folder / "runs/100/view.html").exists()
+    assert not (folder / "alone/view.html").exists()
 
 
 def test_resuming_a_finished_run_says_so(command_line: CommandLine, folder: Path) -> None:

@@ -35,7 +35,7 @@ KEPT = Path("simplified", "scene.ply")
 REPORT = "report.json"
 """In the folder of the run, written last."""
 
-_OF_THE_CALL = ("output", "resume", "keep", "crop", "dry_run", "threads", "device")
+_OF_THE_CALL = ("output", "resume", "keep", "view", "crop", "dry_run", "threads", "device")
 """Options that another call may have other values of, and yet go on with a run; of devices all but CUDA."""
 _OF_THE_BUDGET = ("count", "ratio")
 """Several are one budget for each folder."""

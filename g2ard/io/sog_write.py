@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from g2ard.splats import Splats
 
-__all__ = ["palette_size", "sog_files", "write", "write_folder"]
+__all__ = ["palette_size", "sog_bytes", "sog_files", "write", "write_folder"]
 
 _COLUMNS = 64
 """Entries of the palette beside each other in a row of its image."""
@@ -47,9 +47,21 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
     """
     from g2ard.io.atomic import atomic_output
 
-    with atomic_output(path, overwrite) as temporary, zipfile.ZipFile(temporary, "w") as bundle:
+    with atomic_output(path, overwrite) as temporary:
+        temporary.write_bytes(sog_bytes(path, splats))
+
+
+def sog_bytes(path: Path, splats: Splats) -> bytes:
+    """What `write` writes; `path` names the scene in messages.
+
+    Raises:
+        InputError: as `write`.
+    """
+    room = io.BytesIO()
+    with zipfile.ZipFile(room, "w") as bundle:
         for name, content in sog_files(path, splats).items():
             bundle.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content)
+    return room.getvalue()
 
 
 def write_folder(path: Path, splats: Splats, *, overwrite: bool = False) -> None:

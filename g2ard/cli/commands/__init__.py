@@ -16,6 +16,7 @@ COMMANDS = (
     "poses",
     "select",
     "render",
+    "view",
     "evaluate",
     "info",
     "bench",

@@ -134,6 +134,9 @@ def distill(
     clean: Annotated[
         bool, typer.Option("--clean", help="First take out what no picture needs, as `g2ard clean` does.")
     ] = False,
+    view: Annotated[
+        bool, typer.Option("--view/--no-view", help="Write view.html, the scene for any browser.")
+    ] = True,
     resume: ResumeOption = False,
     crop: CropOption = None,
     size: SizeOption = None,
@@ -227,7 +230,7 @@ def distill(
             continue
         tell_anew(run, place.parent, resume)
         result, report = _distil(
-            run, scene or Path(str(views)), job, aim.count, place, resume, keep, crop or [], began
+            run, scene or Path(str(views)), job, aim.count, place, resume, keep, view, crop or [], began
         )
         reports.append(report)
         run.kept.append(f"{place.parent} is finished")
@@ -274,6 +277,7 @@ def _distil(
     place: Path,
     resume: bool,
     keep: bool,
+    view: bool,
     crops: list[Crop],
     began: float,
 ) -> tuple[Distilled, dict[str, Any]]:
@@ -296,6 +300,7 @@ def _distil(
             told=told(report),
             crops=crops,
         )
+        page = _view(place, result.splats if view else None, job, report)
         _write(run, place, result, job.held_out, colour, report)
         _keep(output / KEPT, result.simplified if keep else None)
     if (pool := job.views.pool) is not None:
@@ -310,7 +315,7 @@ def _distil(
     say_weight(run, source, place, result.splats)
     run.say(
         f"scene: {place} ({place.stat().st_size / 1e6:.2f} MB)\npicture: {output / 'preview.png'}\n"
-        f"report: {output / 'report.html'}, {output / 'report.json'}"
+        f"report: {output / 'report.html'}, {output / 'report.json'}" + (f"\n{page}" if page else "")
     )
     return result, report
 
@@ -332,6 +337,19 @@ def _write(
     report["bytes"]["file"] = place.stat().st_size
     with atomic_output(place.parent / REPORT, overwrite=True) as temporary:
         temporary.write_text(json.dumps({**report, "config": run.config}, indent=2, default=str) + "\n")
+
+
+def _view(place: Path, scene: Splats | None, job: DistillJob, report: dict[str, Any]) -> str | None:
+    """Write the page for the browser, and say so; without a scene, none of an earlier run stays."""
+    from g2ard.cli.run_view import run_view
+
+    page = place.parent / "view.html"
+    if scene is None:
+        page.unlink(missing_ok=True)
+        return None
+    cameras, colour = job.views.train.cameras, job.config.background
+    report["bytes"]["view"], line = run_view(page, place, scene, cameras, colour)
+    return line
 
 
 def _keep(path: Path, scene: Splats | None) -> None:

@@ -1,0 +1,101 @@
+"""`g2ard view`: scenes → a page for the browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from g2ard.cli.frame import Run, command
+from g2ard.cli.options import BackgroundOption, OutputOption, UpOption, ViewsOrMadeOption
+
+if TYPE_CHECKING:
+    from g2ard.splats import Splats
+
+
+@command("view", example="g2ard view run/ dense.ply -o compare.html")
+def view(
+    run: Run,
+    scene: Annotated[
+        Path, typer.Argument(metavar="SCENE|RUN", help="A scene, or the folder of a `distill` run.")
+    ],
+    output: OutputOption,
+    other: Annotated[
+        Path | None,
+        typer.Argument(metavar="[SCENE|RUN]", help="A second one of the same world, right of a divider."),
+    ] = None,
+    views: ViewsOrMadeOption = None,
+    start: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="The view to open with; else the one that holds most."),
+    ] = None,
+    background: BackgroundOption = None,
+    up: UpOption = None,
+) -> None:
+    """Write a page that shows a scene, or two under one camera, in any browser, offline."""
+    from g2ard.policy.inputs import load_scene
+    from g2ard.policy.view import stand_of
+    from g2ard.viewer import check_page_output, write_page
+
+    check_page_output(output, run.overwrite)
+    paths = [_scene_of(path) for path in (scene, other) if path is not None]
+    run.spare_inputs(output)
+    loaded = [load_scene(path, run.say) for path in paths]
+    if views is None and scene.is_dir() and (scene / "views.json").is_file():
+        views = scene / "views.json"
+    stand = stand_of(
+        loaded[0],
+        views,
+        start=start,
+        beside=paths[0],
+        up=up,
+        seed=run.seed,
+        progress=run.progress,
+        say=run.say,
+    )
+    named = zip(_names(paths), loaded, strict=True)
+    labels = [f"{name}: {len(splats):,} Gaussians" for name, splats in named]
+    written = write_page(
+        output,
+        [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
+        start=stand.start,
+        background=background or (0.0, 0.0, 0.0),
+        overwrite=run.overwrite,
+    )
+    sizes = " and ".join(f"{size / 1e6:.2f}" for size in written.scenes)
+    run.say(f"{output}: {' | '.join(labels)}; {sizes} MB as SOG, {written.bytes / 1e6:.2f} MB in all")
+    run.result(
+        {
+            "output": str(output),
+            "bytes": written.bytes,
+            "scenes": _told(paths, loaded, written.scenes),
+            "start": stand.name,
+            "up": stand.up.tolist(),
+        }
+    )
+
+
+def _told(paths: list[Path], scenes: list[Splats], sizes: tuple[int, ...]) -> list[dict[str, Any]]:
+    return [
+        {"scene": str(path), "count": len(splats), "bytes": size}
+        for path, splats, size in zip(paths, scenes, sizes, strict=True)
+    ]
+
+
+def _scene_of(path: Path) -> Path:
+    """The scene of a run's folder; other paths, a SOG folder among them, are scenes themselves."""
+    from g2ard.io.scene_formats import FORMATS
+
+    if not (path / "report.json").is_file():
+        return path
+    found = [path / f"scene{form.suffix}" for form in FORMATS.values()]
+    return next((file for file in found if file.is_file()), path)
+
+
+def _names(paths: list[Path]) -> list[str]:
+    """Files' names, with their folders' where they are the same."""
+    names = [path.name for path in paths]
+    if len(set(names)) < len(names):
+        return ["/".join(path.absolute().parts[-2:]) for path in paths]
+    return names

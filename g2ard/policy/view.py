@@ -1,0 +1,197 @@
+"""How scenes stand in a page, and the camera that it opens with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.policy.inputs import load_views
+from g2ard.policy.views import is_made, views_or_pool
+from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.viewer import Start
+
+if TYPE_CHECKING:
+    from g2ard.cameras import Camera, Cameras
+    from g2ard.policy.inputs import Views
+    from g2ard.splats import Splats
+
+__all__ = ["Stand", "stand_of", "stand_with"]
+
+_POOL = 32
+"""Poses of which one is the start, where there are no views."""
+
+_ROWS = 100_000
+"""Gaussians that up is estimated on, and 4,096 of the opaque ones that a start is chosen by."""
+_SAMPLE = 4096
+
+_ROLL = 0.1
+"""Views tell which way is up where their x axes spread this many times less along it than across it."""
+
+_FOV = (10.0, 120.0)
+"""Degrees that the viewer takes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stand:
+    """A frame for the viewer, x right, y down, z ahead: here = rotation · (world − origin).
+
+    Args:
+        rotation: (3, 3), turns up to −y.
+        origin: (3,) world, the middle of the opaque Gaussians.
+        start: None where no pose has a view.
+        name: of the view that is the start.
+    """
+
+    rotation: NDArray[np.float64]
+    origin: NDArray[np.float64]
+    start: Start | None = None
+    name: str | None = None
+
+    @property
+    def up(self) -> NDArray[np.float64]:
+        """(3,) unit vector in the world."""
+        return -self.rotation[1]
+
+    def of(self, splats: Splats) -> Splats:
+        """A scene in this frame, without an offset."""
+        from g2ard.transform import transform
+
+        turn = np.eye(4)
+        turn[:3, :3] = self.rotation
+        return transform(replace(splats.recentred(self.origin), offset=np.zeros(3)), turn)
+
+
+def stand_of(
+    scene: Splats,
+    views: Views | None,
+    *,
+    start: str | None = None,
+    beside: str | Path | None = None,
+    up: Sequence[float] | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Stand:
+    """A frame and a start for a scene: from views given, else from those beside the scene, else from a pool.
+
+    Args:
+        scene: the scene, or the left one of two.
+        views: cameras, or where they lie; "made" is a pool.
+        start: the view to open with; None takes the one that holds most of the scene.
+        beside: where the scene lies, if cameras are to be looked for there.
+        up: (3,) away from the ground; None to take it from the views, or to estimate it.
+        seed: of poses that are made.
+        progress: told of planning.
+        say: told what is looked at.
+
+    Raises:
+        InputError: a file without views, no view of that name, or an `up` that is no direction.
+    """
+    try:
+        found = views_or_pool(
+            scene, views, beside=beside, count=_POOL, up=up, seed=seed, progress=progress, say=say
+        )
+    except InputError as error:
+        if start is not None or not (views is None or is_made(views)):
+            raise
+        say(f"no pose to start at: {error}")
+        return Stand(_turn(_estimated(scene, up)), _middle(scene))
+    cameras = load_views(found, "all", None, say)
+    return stand_with(scene, cameras, start=start, up=up)
+
+
+def stand_with(
+    scene: Splats, cameras: Cameras, *, start: str | None = None, up: Sequence[float] | None = None
+) -> Stand:
+    """As `stand_of`, with cameras that are there already.
+
+    Raises:
+        InputError: no view of that name, or an `up` that is no direction.
+    """
+    axis = _level(cameras) if up is None else None
+    stand = Stand(_turn(_estimated(scene, up) if axis is None else axis), _middle(scene))
+    points = _opaque(scene)
+    view = cameras[_chosen(cameras, points, start)]
+    return replace(stand, start=_start(stand, view, points), name=view.name)
+
+
+def _level(cameras: Cameras) -> NDArray[np.float64] | None:
+    """The direction that all views' horizons are level with; None where they roll, or face one way alone."""
+    across = cameras.viewmats[:, 0, :3]
+    values, vectors = np.linalg.eigh(across.T @ across / len(cameras))
+    if values[0] > _ROLL * values[1]:
+        return None
+    up = -cameras.viewmats[:, 1, :3].sum(axis=0)
+    axis: NDArray[np.float64] = vectors[:, 0]
+    return axis if axis @ up >= 0 else -axis
+
+
+def _estimated(scene: Splats, up: Sequence[float] | None) -> NDArray[np.float64]:
+    """Up as given, else as the scene tells, else −y."""
+    from g2ard.poses.site import Site
+
+    if up is not None:
+        axis = np.asarray(up, np.float64)
+        if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
+            raise InputError(f"up: expected three finite numbers, not all zero, got {up!r}")
+        return axis / np.linalg.norm(axis)
+    try:
+        return Site.of(scene, None, _ROWS).up.axis
+    except InputError:  # nothing to see
+        return np.array([0.0, -1.0, 0.0])
+
+
+def _turn(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) the smallest rotation that turns `up` to −y: I + K + K²/(1 + c), K the cross product's matrix of
+    axis × sine, c the cosine."""
+    down = np.array([0.0, -1.0, 0.0])
+    (x, y, z), c = np.cross(up, down), float(up @ down)
+    if c < -1 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + k + k @ k / (1 + c)
+
+
+def _opaque(scene: Splats) -> NDArray[np.float64]:
+    """(K, 3) means in the world of a sample of the Gaussians that are opaque by half or more, else of all."""
+    rows = np.flatnonzero(scene.opacities >= 0.5)
+    rows = rows if len(rows) else np.arange(len(scene))
+    some = rows[np.linspace(0, len(rows) - 1, min(_SAMPLE, len(rows))).astype(int)]
+    return scene.means[some].astype(np.float64) + scene.offset
+
+
+def _middle(scene: Splats) -> NDArray[np.float64]:
+    return np.median(_opaque(scene), axis=0)
+
+
+def _chosen(cameras: Cameras, points: NDArray[np.float64], name: str | None) -> int:
+    """The view of that name, else the first of those that hold most of the points."""
+    if name is None:
+        return int(np.argmax([view.holds(points).mean() for view in cameras]))
+    if name not in cameras.names:
+        raise InputError(f"start: no view {name!r} among {', '.join(cameras.names[:4])}, …")
+    return cameras.names.index(name)
+
+
+def _start(stand: Stand, view: Camera, points: NDArray[np.float64]) -> Start:
+    """A view as the viewer takes it, its roll left out; it turns about the median depth of what it holds."""
+    held = points[view.holds(points)]
+    if not len(held):
+        held = stand.origin[None]
+    ahead = view.viewmat[2, :3]
+    depth = float(np.median(np.abs((held - view.position) @ ahead)))
+    to_viewer = np.diag([-1.0, -1.0, 1.0]) @ stand.rotation  # it turns scenes by 180° about z
+
+    def there(point: NDArray[np.float64]) -> tuple[float, float, float]:
+        x, y, z = (float(v) for v in to_viewer @ (point - stand.origin))
+        return x, y, z
+
+    side, focal = (view.width, view.K[0, 0]) if view.width >= view.height else (view.height, view.K[1, 1])
+    fov = float(np.degrees(2 * np.arctan(side / 2 / focal)))
+    return Start(there(view.position), there(view.position + depth * ahead), float(np.clip(fov, *_FOV)))

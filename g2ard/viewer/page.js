@@ -1,0 +1,159 @@
+// The page's own part: unpacks viewer and scenes, starts a viewer for each scene, and holds two of them to one camera
+// with a divider between. `window.g2ard.ready` resolves to the viewers' handles once all of them have drawn.
+
+const read = id => document.getElementById(id).textContent;
+
+function bytes(base64) {
+  const packed = atob(base64);
+  const out = new Uint8Array(packed.length);
+  for (let i = 0; i < packed.length; i++) out[i] = packed.charCodeAt(i);
+  return out;
+}
+
+async function module(base64) {
+  const code = new Blob([bytes(base64)]).stream().pipeThrough(new DecompressionStream('gzip'));
+  const text = await new Response(code).text();
+  return import(URL.createObjectURL(new Blob([text], { type: 'text/javascript' })));
+}
+
+const { start, background, files } = JSON.parse(read('view'));
+const settings = {
+  version: 2,
+  tonemapping: 'none',
+  highPrecisionRendering: false,
+  background: { color: background },
+  postEffectSettings: {
+    sharpness: { enabled: false, amount: 0 },
+    bloom: { enabled: false, intensity: 1, blurLevel: 2 },
+    grading: { enabled: false, brightness: 1, contrast: 1, saturation: 1, tint: [1, 1, 1] },
+    vignette: { enabled: false, intensity: 0.5, inner: 0.3, outer: 0.75, curvature: 1 },
+    fringing: { enabled: false, intensity: 0.5 }
+  },
+  animTracks: [],
+  cameras: start ? [{ initial: start }] : [],
+  annotations: [],
+  startMode: 'default'
+};
+
+// Gaussians are drawn as they were trained, where the engine's own rules differ: blurred by 0.3 px², not 0.075; out to
+// where α = 1/255, not to √8 σ with lower tails; ordered by depth, not distance; α at most 0.99. The blur is put on the
+// scales, as 3 axes of the width that it has at the Gaussian's depth. GROWN is the factor on variances that makes the
+// engine's quads, of √8 σ, reach as far as α = 1/255 of an opaque Gaussian does.
+const GROWN = Math.log(255) / 4;
+
+function asTrained(gsplat) {
+  gsplat.radialSorting = false;
+  gsplat.minPixelSize = 0;
+  gsplat.minContribution = 0;
+  const chunks = gsplat.material.getShaderChunks('glsl');
+  chunks.set('gsplatModifyVS', `
+    float pixelVariance(vec3 center);
+    void modifySplatCenter(inout vec3 center) {}
+    void modifySplatRotationScale(vec3 original, vec3 center, inout vec4 rotation, inout vec3 scale) {
+      scale = sqrt(${GROWN} * scale * scale + (0.3 * ${GROWN} - 0.075) * pixelVariance(center));
+    }
+    void modifySplatColor(vec3 center, inout vec4 color) {}
+  `);
+  chunks.set('gsplatOutputVS', `
+    float pixelVariance(vec3 center) {
+      float depth = (matrix_view * matrix_model * vec4(center, 1.0)).z;
+      float size = 2.0 * depth / (viewport_size.x * matrix_projection[0][0]);
+      return size * size;
+    }
+    vec3 prepareOutputFromGamma(vec3 color, float depth) { return color; }
+  `);
+  chunks.set('gsplatModifyPS', `
+    void modifySplatColor(vec2 uv, inout vec4 color) {
+      float alpha = gaussianColor.a * exp(-4.0 * ${GROWN} * dot(uv, uv));
+      color.a = alpha < 1.0 / 255.0 ? 0.0 : min(alpha, 0.99);
+    }
+  `);
+  gsplat.material.update();
+}
+
+async function viewer(createViewer, index, container) {
+  const handle = await createViewer({
+    container,
+    settings,
+    contentUrl: files[index],
+    contents: Promise.resolve(new Response(bytes(read(`scene${index}`)))),
+    renderer: 'webgl',
+    ui: index === 0,
+    noanim: true
+  });
+  asTrained(handle.app.scene.gsplat);
+  const drawn = new Promise(resolve => {
+    if (handle.state.loaded) resolve();
+    else handle.events.once('loaded:changed', resolve);
+  });
+  return { handle, drawn };
+}
+
+// The second viewer shows what the first one's camera sees. Its own camera is set on every frame before ours is.
+function follow(leader, follower) {
+  follower.state.inputEnabled = false;
+  const [from, to] = [leader, follower].map(handle => handle.app.root.findByName('camera'));
+  follower.app.on('update', () => {
+    to.setPosition(from.getPosition());
+    to.setRotation(from.getRotation());
+    to.camera.fov = from.camera.fov;
+    to.camera.horizontalFov = from.camera.horizontalFov;
+    const scene = follower.app.root.findByName('gsplat');
+    if (!scene) return;
+    const bound = scene.gsplat.customAabb;
+    const center = scene.getWorldTransform().transformPoint(bound.center);
+    const far = Math.max(from.camera.farClip, center.distance(from.getPosition()) + bound.halfExtents.length());
+    to.camera.farClip = far;
+    to.camera.nearClip = Math.min(1, far / (1024 * 16));
+  });
+  leader.events.on('performanceMode:changed', on => { follower.state.performanceMode = on; });
+}
+
+// The divider: a handle to drag, or to move with the arrow keys while it has the focus.
+function divide(right, leader) {
+  const divider = document.getElementById('divider');
+  divider.hidden = false;
+  const place = share => {
+    const percent = 100 * Math.min(1, Math.max(0, share));
+    right.style.clipPath = `inset(0 0 0 ${percent}%)`;
+    divider.style.left = `${percent}%`;
+    divider.setAttribute('aria-valuenow', percent.toFixed(0));
+  };
+  divider.addEventListener('pointerdown', event => divider.setPointerCapture(event.pointerId));
+  divider.addEventListener('pointermove', event => {
+    if (divider.hasPointerCapture(event.pointerId)) place(event.clientX / innerWidth);
+  });
+  divider.addEventListener('keydown', event => {
+    const step = { ArrowLeft: -0.02, ArrowRight: 0.02, Home: -1, End: 1 }[event.key];
+    if (step === undefined) return;
+    place(parseFloat(divider.style.left) / 100 + step);
+    event.preventDefault();
+  });
+  divider.addEventListener('focus', () => { leader.state.inputEnabled = false; });
+  divider.addEventListener('blur', () => { leader.state.inputEnabled = true; });
+  place(0.5);
+}
+
+async function main() {
+  const { createViewer } = await module(read('viewer'));
+  const started = [await viewer(createViewer, 0, document.getElementById('scenes'))];
+  if (files.length === 2) {
+    const right = document.createElement('div');
+    right.id = 'right';
+    started[0].handle.app.graphicsDevice.canvas.after(right); // above the first picture, below the controls
+    started.push(await viewer(createViewer, 1, right));
+    follow(started[0].handle, started[1].handle);
+    divide(right, started[0].handle);
+  }
+  await Promise.all(started.map(({ drawn }) => drawn));
+  started[0].handle.events.fire('inputEvent', 'cancel'); // from the paused animation, which all scenes open with
+  return started.map(({ handle }) => handle);
+}
+
+const ready = main();
+window.g2ard = { ready };
+ready.catch(error => {
+  const trouble = document.getElementById('trouble');
+  trouble.hidden = false;
+  trouble.textContent = `This browser cannot show the scene: ${error.message ?? error}`;
+});

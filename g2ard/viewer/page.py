@@ -1,0 +1,147 @@
+"""The page: viewer, scenes and start in one HTML file."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from g2ard.errors import InputError, OutputError
+
+if TYPE_CHECKING:
+    from g2ard.splats import Splats
+
+__all__ = ["Start", "Written", "check_page_output", "write_page"]
+
+_HERE = Path(__file__).parent
+_NOTICE = "The viewer on this page is SuperSplat Viewer 1.36.2 with PlayCanvas Engine 2.22.6.\n\n"
+
+_LARGEST = 380_000_000
+"""Bytes of a scene as SOG: browsers hold no text over 2²⁹ characters, and base64 takes 4 for 3 bytes."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """The camera that a page opens with, in the viewer's axes: x right, y up, z towards us.
+
+    Args:
+        position: scene units.
+        target: what it turns about, scene units.
+        fov: degrees, along the window's longer side.
+    """
+
+    position: tuple[float, float, float]
+    target: tuple[float, float, float]
+    fov: float
+
+
+@dataclass(frozen=True)
+class Written:
+    """What a page came to.
+
+    Args:
+        bytes: of the file.
+        scenes: of each scene as SOG.
+    """
+
+    bytes: int
+    scenes: tuple[int, ...]
+
+
+def check_page_output(path: str | Path, overwrite: bool = False) -> Path:
+    """As `g2ard.io.check_output`, for a page.
+
+    Raises:
+        OutputError: as `write_page` would, before the work rather than after it.
+    """
+    from g2ard.io.atomic import check_output
+
+    if Path(path).suffix.lower() not in (".html", ".htm"):
+        raise OutputError(f"{path}: pages are written as .html")
+    return check_output(path, overwrite)
+
+
+def write_page(
+    path: str | Path,
+    scenes: Sequence[tuple[str, Splats]],
+    *,
+    start: Start | None = None,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    overwrite: bool = False,
+) -> Written:
+    """Write a page of one scene, or of two under one camera with a divider between.
+
+    Each scene goes in as a .sog of it, so what is seen is quantised as that is. An `offset` is left out.
+    Equal scenes give equal bytes.
+
+    Args:
+        path: the .html to write.
+        scenes: (label, scene), one or two, left to right, in one frame: x right, y down, z ahead.
+        start: where the camera stands; None lets the viewer hold the whole scene.
+        background: RGB in [0, 1].
+        overwrite: whether an existing file may be replaced.
+
+    Returns:
+        What it came to.
+
+    Raises:
+        OutputError: the file exists, cannot be written, or is no .html.
+        InputError: a scene is empty, has a value that is not finite, or is more than browsers take in a page.
+    """
+    from g2ard.io.atomic import atomic_output
+
+    path = check_page_output(path, overwrite)
+    packed = [_sog(path, label, splats) for label, splats in scenes]
+    shown = {
+        "start": None if start is None else asdict(start),
+        "background": [float(channel) for channel in background],
+        "files": [f"scene{index}.sog" for index in range(len(scenes))],
+    }
+    text = _page([label for label, _ in scenes], shown, packed)
+    with atomic_output(path, overwrite) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+        size = temporary.stat().st_size
+    return Written(size, tuple(map(len, packed)))
+
+
+def _sog(path: Path, label: str, splats: Splats) -> bytes:
+    from dataclasses import replace
+
+    import numpy as np
+
+    from g2ard.io.sog_write import sog_bytes
+
+    packed = sog_bytes(path, replace(splats, offset=np.zeros(3)))
+    if len(packed) > _LARGEST:
+        raise InputError(
+            f"{path}: not written: {label} has {len(packed) / 1e6:.0f} MB as SOG, and browsers take at most"
+            f" {_LARGEST / 1e6:.0f} in a page; simplify it first"
+        )
+    return packed
+
+
+def _page(labels: Sequence[str], shown: object, packed: Sequence[bytes]) -> str:
+    from g2ard import __version__
+
+    def part(name: str) -> str:
+        return (_HERE / name).read_text(encoding="utf-8")
+
+    data = (
+        f'<script type="text/plain" id="scene{index}">{base64.b64encode(sog).decode()}</script>'
+        for index, sog in enumerate(packed)
+    )
+    return part("page.html").format(
+        generator=f"g2ard {__version__}",
+        title=escape(" | ".join(labels)),
+        notice=_NOTICE + part("supersplat/LICENSE"),
+        style=part("supersplat/index.css") + part("page.css"),
+        labels="\n".join(f'<p class="label">{escape(label)}</p>' for label in labels),
+        view=json.dumps(shown).replace("<", "\\u003c"),
+        viewer=base64.b64encode((_HERE / "supersplat/index.js.gz").read_bytes()).decode(),
+        scenes="\n".join(data),
+        script=part("page.js"),
+    )

@@ -1,0 +1,145 @@
+"""A headless Chromium for tests, over its DevTools pipe: no driver and no further package is needed.
+
+Looked for in $G2ARD_CHROMIUM, then among what is installed (Debian's chromium, Chrome, playwright's own);
+tests that need one skip where there is none. It draws on the CPU (SwiftShader) and finds no host.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+_PLAYWRIGHT = ("chromium*/chrome-linux*/chrome", "chromium*/chrome-linux*/headless_shell")
+_FLAGS = [
+    *("--headless=new", "--no-sandbox", "--remote-debugging-pipe", "--no-first-run", "--mute-audio"),
+    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *("--disable-dev-shm-usage", "--disable-background-networking", "--host-resolver-rules=MAP * ~NOTFOUND"),
+    *("--force-device-scale-factor=1", "--force-color-profile=srgb"),
+]
+_SECONDS = 240
+
+
+def chromium() -> str:
+    """The browser's path; skips the test, saying why, where there is none."""
+    if sys.platform == "win32":
+        pytest.skip("the browser is spoken to by file descriptors 3 and 4, which Windows does not pass on")
+    given = os.environ.get("G2ARD_CHROMIUM")
+    found = [given] if given else [shutil.which(name) for name in _NAMES]
+    cache = Path(os.environ.get("PLAYWRIGHT_BROWSERS_PATH", Path.home() / ".cache" / "ms-playwright"))
+    found += [str(path) for pattern in _PLAYWRIGHT for path in sorted(cache.glob(pattern))]
+    path = next((name for name in found if name and Path(name).is_file()), None)
+    if path is None:
+        pytest.skip("no Chromium or Chrome (install one, or set G2ARD_CHROMIUM)")
+    return path
+
+
+class Browser:
+    """One page of `width` × `height` pixels."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        ours, theirs = os.pipe(), os.pipe()  # what it reads, what it writes
+
+        def place() -> None:
+            for source, target in ((os.dup(ours[0]), 3), (os.dup(theirs[1]), 4)):
+                os.dup2(source, target)
+
+        self._process = subprocess.Popen(
+            [chromium(), *_FLAGS, f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            preexec_fn=place,
+            close_fds=False,
+        )
+        os.close(ours[0])
+        os.close(theirs[1])
+        self._to, self._from = ours[1], theirs[0]
+        self._rest, self._number, self._session = b"", 0, None
+        self.messages: list[str] = []
+        self.requests: list[str] = []
+        target = self.send("Target.createTarget", url="about:blank")["targetId"]
+        self._session = self.send("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Network"):
+            self.send(f"{domain}.enable")
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.send("Emulation.setDeviceMetricsOverride", **size)
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.wait()
+        os.close(self._to)
+        os.close(self._from)
+        self._profile.cleanup()
+
+    def send(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Call a method of the protocol; fails with what the browser says."""
+        self._number += 1
+        call = {"id": self._number, "method": method, "params": parameters}
+        if self._session is not None:
+            call["sessionId"] = self._session
+        os.write(self._to, json.dumps(call).encode() + b"\0")
+        until = time.monotonic() + _SECONDS
+        while True:
+            answer = self._next(until)
+            if answer.get("id") == self._number:
+                assert "error" not in answer, f"{method}: {answer['error']}"
+                return answer["result"]
+            self._note(answer)
+
+    def open(self, url: str) -> None:
+        """Go to a page."""
+        self.send("Page.navigate", url=url)
+
+    def run(self, expression: str) -> Any:
+        """The value of JavaScript, awaited; fails with the exception it throws."""
+        done = self.send("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in done, (done["exceptionDetails"], self.messages)
+        return done["result"].get("value")
+
+    def picture(self) -> np.ndarray:
+        """(H, W, 3) uint8, what the page shows."""
+        shot = self.send("Page.captureScreenshot", format="png")["data"]
+        return np.asarray(Image.open(io.BytesIO(base64.b64decode(shot))).convert("RGB"))
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """Press the left button at a point, move, and let go at another."""
+        for kind, (x, y) in (("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)):
+            self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+
+    def _next(self, until: float) -> dict[str, Any]:
+        import select
+
+        while b"\0" not in self._rest:
+            ready, _, _ = select.select([self._from], [], [], max(0, until - time.monotonic()))
+            assert ready, f"the browser has not answered for {_SECONDS} s: {self.messages[-5:]}"
+            piece = os.read(self._from, 1 << 20)
+            assert piece, f"the browser has ended: {self.messages[-5:]}"
+            self._rest += piece
+        message, self._rest = self._rest.split(b"\0", 1)
+        return json.loads(message)
+
+    def _note(self, event: dict[str, Any]) -> None:
+        found = event.get("params", {})
+        if event.get("method") == "Runtime.consoleAPICalled":
+            self.messages.append(" ".join(str(a.get("value", a.get("description"))) for a in found["args"]))
+        elif event.get("method") == "Runtime.exceptionThrown":
+            self.messages.append(str(found["exceptionDetails"]))
+        elif event.get("method") == "Network.requestWillBeSent":
+            self.requests.append(found["request"]["url"])
