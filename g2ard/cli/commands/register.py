@@ -51,7 +51,20 @@ def register(
     ] = None,
     size: Annotated[
         int, typer.Option(min=32, metavar="PIXELS", help="Shrink photos to this longer side.")
-    ] = 500,
+    ] = 1000,
+    matcher: Annotated[
+        str,
+        typer.Option(
+            metavar="auto|sift|direct|MODULE:FUNCTION",
+            help="What matches photo and render: SIFT, nothing (direct alignment), or a function of yours. "
+            "All but direct need the extra `register`; auto takes it where it is there.",
+        ),
+    ] = "auto",
+    refine: Annotated[
+        Literal["auto", "none", "photometric"],
+        typer.Option(help="A pose from features as it is, aligned, or the mean of both by information."),
+    ] = "auto",
+    passes: Annotated[int, typer.Option(min=1, help="Renders to match with, at most.")] = 3,
     accept: Annotated[
         float, typer.Option(min=0.01, max=1, help="ZNCC from which a photo counts as registered.")
     ] = 0.6,
@@ -72,7 +85,7 @@ def register(
     ] = None,
     background: BackgroundOption = None,
 ) -> None:
-    """Find where photos were taken, by aligning renders of a scene with them.
+    """Find where photos were taken, by matching renders of a scene with them.
 
     Each photo is registered, uncertain or refused; OUT holds the registered ones as views.
     """
@@ -90,7 +103,7 @@ def register(
         raise typer.BadParameter("--metres-per-unit goes with --truth")
     if intrinsics is not None and focal is not None:
         raise typer.BadParameter("--intrinsics and --focal exclude each other")
-    config = RegisterConfig(size=size, accept=accept)
+    config = RegisterConfig(size=size, accept=accept, matcher=matcher, refine=refine, passes=passes)
     config = changed(config, "register", run.constants(register=config))
     check_output(output, run.overwrite)
     if report is not None:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.cameras import Camera, Cameras
+from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.images import load_image, load_mask, resized
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
-from g2ard.stages.register.align import Aligned, Level, align, level_of
+from g2ard.stages.register.attempts import Candidate, Photo, Search, Start, loaded
 from g2ard.stages.register.config import RegisterConfig
-from g2ard.stages.register.grey import band_passed, grey_of, local_zncc
+from g2ard.stages.register.grey import band_passed
+from g2ard.stages.register.matchers import matcher_named
 from g2ard.stages.register.outcome import (
     PhotoReport,
     PoseError,
@@ -42,30 +42,9 @@ Float = NDArray[np.float64]
 _KEPT = {"registered": ("registered",), "uncertain": ("registered", "uncertain")}
 
 
-@dataclass(frozen=True, eq=False)
-class _Photo:
-    """A photo at every level; `small` is at the size of the pool's renders, `whole` grey without a blur."""
-
-    pyramid: list[tuple[Camera, Level]]
-    small: tuple[Camera, Float]
-    whole: Float
-
-
-@dataclass(frozen=True)
-class _Start:
-    """A pose to start from; `turned`, where it is not None, is what alignment begins with."""
-
-    pose: Float
-    name: str
-    rank: int | None = None
-    turned: Float | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class _Candidate:
-    start: _Start
-    found: Aligned
-    zncc: float
+_FEATURES_COUNT = 0.05
+"""By how much less alike a pose that features bear out may be than one that they do not: likeness tells poses
+that are wrong by metres, features those that are wrong by decimetres."""
 
 
 def register(
@@ -80,13 +59,15 @@ def register(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     progress: Progress = silent,
 ) -> Registered:
-    """Find the poses of photos by direct alignment with renders of the scene.
+    """Find the poses of photos by features and direct alignment with renders of the scene.
 
-    A photo starts from its own pose in `starts`, and where that ends in doubt once more from there, turned
+    A photo starts from its own pose in `starts`: matches with a render there, lifted by its depth, give a
+    pose by PnP, repeated and refined (`g2ard.stages.register.solve`). Where there are too few, it is aligned
+    directly, coarse to fine (`g2ard.stages.register.align`), and where that ends in doubt once more, turned
     to where a small render lies best on the photo. Without a pose it starts from the `candidates` poses of
-    `pool` whose renders at `pool_size` pixels, turned alike, are most like it. From each start it is aligned,
-    coarse to fine (`g2ard.stages.register.align`); the result with the highest median local ZNCC is kept, and
-    that decides what it is worth.
+    `pool` whose renders at `pool_size` pixels, turned alike, are most like it: from the one with the most
+    inliers, or by alignment from each. The result with the highest median local ZNCC is kept, and that
+    decides what it is worth.
     A photo that cannot be read is refused like any other: the rest goes on.
 
     Args:
@@ -104,7 +85,9 @@ def register(
         A `Registered`: the kept cameras, and a report on all photos.
 
     Raises:
-        InputError: no photos, another `keep`, no pose to start any photo from, or a pose that is none.
+        InputError: no photos, another `keep`, no pose to start any photo from, a pose that is none, or a
+            matcher that is none.
+        MissingDependencyError: a matcher is asked for without the extra `register`.
 
     >>> from g2ard.cameras import Camera
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
@@ -124,11 +107,12 @@ def register(
         raise InputError("starts: no photo has a pose, and there is no pool to look for one in")
     renderer = Renderer(scene, background=background)
     renders = None if pool is None else PoolRenders(renderer, pool, config)
+    search = Search(renderer, config, matcher_named(config.matcher, config.ratio, config.features))
     rows, kept, poses = [], [], []
     for i, name in enumerate(photos.names):
         began = time.perf_counter()
-        start = _Start(given[name], name) if name in given else None
-        row, pose = _one(renderer, photos, i, start, renders, config, true.get(name))
+        start = Start(given[name], name) if name in given else None
+        row, pose = _one(search, photos, i, start, renders, true.get(name))
         rows.append(replace(row, seconds=time.perf_counter() - began))
         if pose is not None and row.status in _KEPT[keep]:
             kept.append(i)
@@ -154,12 +138,11 @@ def _poses(what: str, poses: Mapping[str, ArrayLike] | None, photos: Cameras) ->
 
 
 def _one(
-    renderer: Renderer,
+    search: Search,
     photos: Cameras,
     index: int,
-    given: _Start | None,
+    given: Start | None,
     pool: PoolRenders | None,
-    config: RegisterConfig,
     true: Float | None,
 ) -> tuple[PhotoReport, Float | None]:
     """One photo from whatever it can start from."""
@@ -169,78 +152,76 @@ def _one(
     if given is None and pool is None:
         return replace(refused, reason="no pose to start from"), None
     try:
-        photo = _loaded(photos, index, config)
+        photo = loaded(photos, index, search.config)
     except InputError as error:
         return replace(refused, reason=str(error)), None
-    renders = 0
+    search.renders = 0
     if given is not None:
-        starts = [given]
+        candidates = _from_pose(search, given, photo)
     else:
         assert pool is not None
-        order, renders = pool.ranked(*photo.small)
-        best = enumerate(order[: config.candidates], 1)
-        starts = [
-            _Start(pool.pool.viewmats[at], pool.pool.names[at], rank, there.viewmat)
-            for rank, (at, there) in best
-        ]
-    candidates = [found for start in starts if (found := _tried(renderer, start, photo, config))]
-    if given is not None and not any(c.zncc >= config.accept for c in candidates):
-        camera, grey = photo.small
-        render = small_render(renderer, replace(camera, viewmat=given.pose), config)
-        there = turned(given.pose, render, band_passed(grey), camera.K)
-        again = replace(given, turned=there.viewmat)
-        renders += 1
-        if there.pixels and (found := _tried(renderer, again, photo, config)):
-            candidates.append(found)
-    renders += sum(c.found.steps + 1 for c in candidates)
+        candidates = _from_pool(search, pool, photo)
+    renders = search.renders
     if not candidates:
         return replace(refused, reason="the scene is out of the starting pose's sight", renders=renders), None
-    best_one = max(candidates, key=lambda c: c.zncc)
-    row = _reported(name, best_one, config, renders)
+    best = max(candidates, key=lambda c: c.zncc + (_FEATURES_COUNT if c.solved else 0))
+    row = _reported(name, best, search.config, renders)
     if true is not None:
-        start_error = PoseError(*pose_error(best_one.start.pose, true))
-        end_error = PoseError(*pose_error(best_one.found.viewmat, true))
+        start_error = PoseError(*pose_error(best.start.pose, true))
+        end_error = PoseError(*pose_error(best.found.viewmat, true))
         row = replace(row, start_error=start_error, error=end_error)
-    return row, best_one.found.viewmat
+    return row, best.found.viewmat
 
 
-def _loaded(photos: Cameras, index: int, config: RegisterConfig) -> _Photo:
-    """Read a photo, once, and shrink it to each level."""
-    sizes = config.levels()
-    one = photos.take([index]).resized(sizes[-1])
-    image, mask = load_image(one, 0), load_mask(one, 0)
+def _from_pose(search: Search, given: Start, photo: Photo) -> list[Candidate]:
+    """Features from the pose; in doubt alignment; in doubt alignment turned; then features from its end."""
+    config = search.config
 
-    def shrunk(side: int) -> tuple[Camera, Float, NDArray[np.bool_] | None]:
-        camera = one.resized(side)[0]
-        size = camera.width, camera.height
-        grey = grey_of(resized(image, size))
-        if mask is None:
-            return camera, grey, None
-        share = resized(np.repeat(mask[..., None].astype(np.float32), 3, 2), size)[..., 0]
-        return camera, grey, share > 0.999
+    def accepted(found: list[Candidate]) -> bool:
+        return any(c.zncc >= config.accept for c in found)
 
-    levels = [shrunk(side) for side in sizes]
-    small = shrunk(config.pool_size)
-    pyramid = [(camera, level_of(grey, counts)) for camera, grey, counts in levels]
-    return _Photo(pyramid, small[:2], levels[-1][1])
-
-
-def _tried(renderer: Renderer, start: _Start, photo: _Photo, config: RegisterConfig) -> _Candidate | None:
-    """Align from one start; None where the scene is out of its sight."""
-    pose = start.pose if start.turned is None else start.turned
-    found = align(renderer, pose, photo.pyramid, config)
-    return None if found is None else _Candidate(start, found, _likeness(renderer, found, photo, config))
+    out = [c] if (c := search.by_features(given, photo)) else []
+    if accepted(out):
+        return out
+    aligned = [c] if (c := search.by_alignment(given, photo)) else []
+    if not accepted(aligned):
+        camera, grey = photo.small
+        render = small_render(search.renderer, replace(camera, viewmat=given.pose), config)
+        there = turned(given.pose, render, band_passed(grey), camera.K)
+        search.renders += 1
+        again = replace(given, turned=there.viewmat)
+        if there.pixels and (c := search.by_alignment(again, photo)):
+            aligned.append(c)
+    return out + aligned + _featured(search, aligned, photo)
 
 
-def _likeness(renderer: Renderer, found: Aligned, photo: _Photo, config: RegisterConfig) -> float:
-    """Median local ZNCC at the finest level, without a blur."""
-    camera, level = photo.pyramid[-1]
-    out = renderer.render(replace(camera, viewmat=found.viewmat))
-    mask = level.mask & (out.alpha >= config.min_alpha)
-    return local_zncc(grey_of(np.clip(out.image, 0, 1)), photo.whole, mask, config.window)
+def _from_pool(search: Search, pool: PoolRenders, photo: Photo) -> list[Candidate]:
+    """The likest poses: features from the one they bear out best, else alignment from each."""
+    order, renders = pool.ranked(*photo.small)
+    search.renders += renders
+    starts = [
+        Start(pool.pool.viewmats[at], pool.pool.names[at], rank, there.viewmat)
+        for rank, (at, there) in enumerate(order[: search.config.candidates], 1)
+    ]
+    first = [(s, start) for start in starts if (s := search.solved(start.begins, photo, 1))]
+    if first:
+        solved, start = max(first, key=lambda each: each[0].inliers)
+        if c := search.by_features(replace(start, turned=solved.viewmat), photo):
+            return [c]
+    aligned = [c for start in starts if (c := search.by_alignment(start, photo))]
+    return aligned + _featured(search, aligned, photo)
 
 
-def _reported(name: str, best: _Candidate, config: RegisterConfig, renders: int) -> PhotoReport:
+def _featured(search: Search, aligned: list[Candidate], photo: Photo) -> list[Candidate]:
+    """Features from the likest of what alignment found, unless that is nothing."""
+    best = max(aligned, key=lambda c: c.zncc, default=None)
+    if best is None or best.zncc < min(search.config.doubt, search.config.accept):
+        return []
+    found = search.by_features(replace(best.start, turned=best.found.viewmat), photo)
+    return [found] if found else []
+
+
+def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) -> PhotoReport:
     found = best.found
     sigma = None
     if found.covariance is not None:
@@ -253,6 +234,11 @@ def _reported(name: str, best: _Candidate, config: RegisterConfig, renders: int)
         reason=reason,
         start=best.start.name,
         rank=best.start.rank,
+        matches=best.solved.matches if best.solved else 0,
+        inliers=best.solved.inliers if best.solved else 0,
+        spread=best.solved.spread if best.solved else None,
+        reprojection=best.solved.reprojection if best.solved else None,
+        passes=best.solved.passes if best.solved else 0,
         zncc=best.zncc,
         gain=found.gain,
         bias=found.bias,

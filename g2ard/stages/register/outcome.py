@@ -31,6 +31,11 @@ class PhotoReport(Report):
         reason: why it is no better than that; None where it is registered.
         start: the name of the pose that was started from; None where there was none.
         rank: of that pose in the pool, from 1; None where a pose was given.
+        matches: of photo and render, whose depth is known; 0 where direct alignment found the pose alone.
+        inliers: of them, that the pose explains.
+        spread: share of the photo's 4 × 4 cells that hold an inlier; None without features.
+        reprojection: median distance of the inliers, pixels at `size`; None likewise.
+        passes: of rendering, matching and solving.
         zncc: median local ZNCC of render and photo at the result, in [−1, 1].
         gain: photo's grey = gain·render + bias.
         bias: see `gain`.
@@ -49,6 +54,11 @@ class PhotoReport(Report):
     reason: str | None = None
     start: str | None = None
     rank: int | None = None
+    matches: int = 0
+    inliers: int = 0
+    spread: float | None = None
+    reprojection: float | None = None
+    passes: int = 0
     zncc: float | None = None
     gain: float | None = None
     bias: float | None = None

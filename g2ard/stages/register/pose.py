@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["moved", "pose_error", "rotation_of"]
+__all__ = ["motion_between", "moved", "pose_error", "rotation_of"]
 
 Float = NDArray[np.float64]
 
@@ -37,6 +37,22 @@ def moved(viewmat: Float, xi: ArrayLike) -> Float:
     out[:3, :3] = U @ Vt
     out[:3, 3] = turn @ viewmat[:3, 3] + (np.eye(3) + cosine * cross + third * square) @ v
     return out
+
+
+def motion_between(first: Float, second: Float) -> Float:
+    """ξ = (v, ω), (6,), with exp(ξ)·first = second, for rotations below half a turn.
+
+    >>> np.round(motion_between(np.eye(4), moved(np.eye(4), [1, 2, 3, 0.1, 0.2, 0.3])), 12).tolist()
+    [1.0, 2.0, 3.0, 0.1, 0.2, 0.3]
+    """
+    R = second[:3, :3] @ first[:3, :3].T
+    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+    length = float(np.linalg.norm(axis))
+    angle = float(np.arctan2(length, (np.trace(R) - 1) / 2))
+    omega = axis * (angle / length if length > 1e-9 else 1.0)
+    V = np.stack([moved(np.eye(4), [*unit, *omega])[:3, 3] for unit in np.eye(3)], 1)
+    v = np.linalg.solve(V, second[:3, 3] - R @ first[:3, 3])
+    return np.concatenate([v, omega])
 
 
 def pose_error(found: Float, true: Float) -> tuple[float, float]:

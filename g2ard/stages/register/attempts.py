@@ -1,0 +1,182 @@
+"""What is tried on one photo: poses from features, from direct alignment, and from both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.cameras import Camera, Cameras
+from g2ard.images import load_image, load_mask, resized
+from g2ard.stages.register.align import Aligned, Level, align, level_of
+from g2ard.stages.register.config import RegisterConfig
+from g2ard.stages.register.grey import grey_of, local_zncc
+from g2ard.stages.register.matchers import Matcher
+from g2ard.stages.register.pose import motion_between, moved
+from g2ard.stages.register.solve import Solved, solve
+from g2ard.stages.render import Renderer
+
+__all__ = ["Candidate", "Photo", "Search", "Start", "loaded"]
+
+Float = NDArray[np.float64]
+_FINEST = 2
+"""Levels of direct alignment that a pose from features still needs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A photo at the sizes that registration looks at.
+
+    Args:
+        camera: at `size`; its pose does not count.
+        image: (H, W, 3) there.
+        mask: (H, W) its pixels that count.
+        pyramid: levels of direct alignment, coarse to fine.
+        small: at the size of the pool's renders.
+        whole: grey at the finest level, without a blur.
+    """
+
+    camera: Camera
+    image: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    pyramid: list[tuple[Camera, Level]]
+    small: tuple[Camera, Float]
+    whole: Float
+
+
+@dataclass(frozen=True)
+class Start:
+    """A pose to start from; `turned`, where it is not None, is what is begun with."""
+
+    pose: Float
+    name: str
+    rank: int | None = None
+    turned: Float | None = None
+
+    @property
+    def begins(self) -> Float:
+        """(4, 4) camera_from_world."""
+        return self.pose if self.turned is None else self.turned
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A pose found for a photo.
+
+    Args:
+        start: what it was found from.
+        found: the pose, its light and covariance.
+        zncc: median local ZNCC of render and photo there.
+        solved: what matches said, None where direct alignment found it alone.
+    """
+
+    start: Start
+    found: Aligned
+    zncc: float
+    solved: Solved | None = None
+
+
+def loaded(photos: Cameras, index: int, config: RegisterConfig) -> Photo:
+    """Read a photo, once, and shrink it to each size.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    sizes = config.levels()
+    one = photos.take([index]).resized(max(config.size, sizes[-1]))
+    image, mask = load_image(one, 0), load_mask(one, 0)
+
+    def shrunk(side: int) -> tuple[Camera, Float, NDArray[np.bool_] | None]:
+        camera = one.resized(side)[0]
+        size = camera.width, camera.height
+        grey = grey_of(resized(image, size))
+        if mask is None:
+            return camera, grey, None
+        share = resized(np.repeat(mask[..., None].astype(np.float32), 3, 2), size)[..., 0]
+        return camera, grey, share > 0.999
+
+    levels = [shrunk(side) for side in sizes]
+    small = shrunk(config.pool_size)
+    pyramid = [(camera, level_of(grey, counts)) for camera, grey, counts in levels]
+    everywhere = np.ones(image.shape[:2], bool) if mask is None else mask
+    return Photo(one[0], image, everywhere, pyramid, small[:2], levels[-1][1])
+
+
+class Search:
+    """Attempts at photos of one scene, and how many renders they took.
+
+    Args:
+        renderer: of the scene.
+        config: see `RegisterConfig`.
+        match: None is direct alignment alone.
+    """
+
+    def __init__(self, renderer: Renderer, config: RegisterConfig, match: Matcher | None) -> None:
+        self.renderer, self.config, self.match = renderer, config, match
+        self.renders = 0
+
+    def by_alignment(self, start: Start, photo: Photo) -> Candidate | None:
+        """Direct alignment, coarse to fine; None where the scene is out of the start's sight."""
+        found = self._aligned(start.begins, photo, photo.pyramid)
+        return None if found is None else Candidate(start, found, self._likeness(found.viewmat, photo))
+
+    def by_features(self, start: Start, photo: Photo, passes: int | None = None) -> Candidate | None:
+        """Matches and PnP, then what `refine` says; None where there is no matcher, or too few inliers."""
+        solved = self.solved(start.begins, photo, passes or self.config.passes)
+        return None if solved is None else self._refined(start, solved, photo)
+
+    def solved(self, pose: Float, photo: Photo, passes: int) -> Solved | None:
+        """Matches and PnP alone; None likewise."""
+        if self.match is None:
+            return None
+        found = solve(
+            self.renderer, pose, photo.camera, photo.image, photo.mask, self.match, self.config, passes
+        )
+        self.renders += passes if found is None else found.passes
+        return found if found is not None and found.inliers >= self.config.min_inliers else None
+
+    def _refined(self, start: Start, solved: Solved, photo: Photo) -> Candidate:
+        """Without refinement, the features' pose; with the photometric one, what alignment makes of it; and
+        with both, the mean of the two weighted by their information: ξ = (Λ_f + Λ_p)⁻¹ Λ_p ξ_p, ξ_p from the
+        first to the second."""
+        refine = self.config.refine
+        near = self._aligned(solved.viewmat, photo, photo.pyramid[-_FINEST:])
+        plain = Aligned(solved.viewmat, 1.0, 0.0, _inverse(solved.information), 0.0, 0, solved.depth)
+        if near is None:
+            return Candidate(start, plain, self._likeness(solved.viewmat, photo), solved)
+        found = near
+        if refine != "photometric":
+            found = replace(near, viewmat=solved.viewmat, covariance=plain.covariance, depth=solved.depth)
+        if refine == "auto" and near.covariance is not None:
+            of_light = np.linalg.inv(near.covariance)
+            both = _inverse(solved.information + of_light)
+            if both is not None:
+                xi = motion_between(solved.viewmat, near.viewmat)
+                found = replace(found, viewmat=moved(solved.viewmat, both @ of_light @ xi), covariance=both)
+        return Candidate(start, found, self._likeness(found.viewmat, photo), solved)
+
+    def _aligned(self, pose: Float, photo: Photo, levels: list[tuple[Camera, Level]]) -> Aligned | None:
+        found = align(self.renderer, pose, levels, self.config)
+        self.renders += 1 if found is None else found.steps
+        return found
+
+    def _likeness(self, viewmat: Float, photo: Photo) -> float:
+        """Median local ZNCC at the finest level, without a blur."""
+        camera, level = photo.pyramid[-1]
+        out = self.renderer.render(replace(camera, viewmat=viewmat))
+        self.renders += 1
+        mask = level.mask & (out.alpha >= self.config.min_alpha)
+        return local_zncc(grey_of(np.clip(out.image, 0, 1)), photo.whole, mask, self.config.window)
+
+
+def _inverse(matrix: Float) -> Float | None:
+    """Of a symmetric matrix, its unknowns scaled to a unit diagonal; None where it has none."""
+    diagonal = np.diag(matrix)
+    if not (np.isfinite(matrix).all() and (diagonal > 0).all()):
+        return None
+    unit = 1 / np.sqrt(diagonal)
+    scaled = matrix * unit[:, None] * unit[None, :]
+    if np.linalg.eigvalsh(scaled)[0] < 1e-12:
+        return None
+    return np.asarray(np.linalg.inv(scaled) * unit[:, None] * unit[None, :])

@@ -1,0 +1,171 @@
+"""Matchers: pixels of a photo and of a render that show the same.
+
+A matcher is a function of two (H, W, 3) float images in [0, 1], the photo and the render, that returns two
+(M, 2) arrays of pixel coordinates (u, v), of which row i shows the same thing. They count from the image's
+corner: the middle of the first pixel is (½, ½), as in COLMAP and in K.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError, MissingDependencyError
+from g2ard.stages.register.grey import grey_of
+
+__all__ = ["Matcher", "Sift", "checked_pairs", "matcher_named", "mutual"]
+
+Float = NDArray[np.float64]
+Image = NDArray[np.float32]
+Pairs = tuple[Float, Float]
+Matcher = Callable[[Image, Image], Pairs]
+
+
+def matcher_named(name: str, ratio: float, most: int) -> Matcher | None:
+    """The matcher of a name; None is direct alignment alone.
+
+    Args:
+        name: "auto" (SIFT where the extra `register` is installed), "sift", "direct" or "MODULE:FUNCTION".
+        ratio: of `mutual`, for SIFT.
+        most: features of an image, for SIFT.
+
+    Raises:
+        InputError: another name, no such module or function.
+        MissingDependencyError: a matcher is asked for, and pycolmap, which solves for poses, is absent.
+
+    >>> matcher_named("direct", 0.85, 4096) is None
+    True
+    >>> matcher_named("some", 0.85, 4096)
+    Traceback (most recent call last):
+    g2ard.errors.InputError: matcher: expected auto, sift, direct or MODULE:FUNCTION, got 'some'
+    """
+    absent = find_spec("pycolmap") is None
+    if name == "direct" or (name == "auto" and absent):
+        return None
+    if name not in ("auto", "sift") and not all(name.partition(":")):
+        raise InputError(f"matcher: expected auto, sift, direct or MODULE:FUNCTION, got {name!r}")
+    if absent:
+        raise MissingDependencyError(f"matcher {name}: poses from matches need `pip install g2ard[register]`")
+    return Sift(ratio, most) if name in ("auto", "sift") else _plugged(name)
+
+
+def _plugged(name: str) -> Matcher:
+    """A user's function; modules are also looked for in the working directory."""
+    module, _, function = name.partition(":")
+    path = list(sys.path)
+    sys.path.insert(0, os.getcwd())
+    try:
+        found = getattr(importlib.import_module(module), function, None)
+    except Exception as error:
+        raise InputError(f"matcher {name}: cannot import {module}: {_told(error)}") from error
+    finally:
+        sys.path[:] = path
+    if not callable(found):
+        raise InputError(f"matcher {name}: {module} has no function {function}")
+
+    def match(photo: Image, render: Image) -> Pairs:
+        try:
+            pairs = found(photo, render)
+        except Exception as error:
+            raise InputError(f"matcher {name}: {_told(error)}") from error
+        return checked_pairs(f"matcher {name}", pairs, photo.shape, render.shape)
+
+    return match
+
+
+def _told(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def checked_pairs(what: str, pairs: Any, *shapes: tuple[int, ...]) -> Pairs:
+    """Two (M, 2) float64 arrays of what a matcher returned; pairs out of their images are left out.
+
+    Raises:
+        InputError: it is something else, or not finite.
+
+    >>> checked_pairs("m", ([[1, 2], [9, 1]], [[3, 1], [0, 0]]), (4, 4, 3), (4, 4, 3))[1].tolist()
+    [[3.0, 1.0]]
+    """
+    expected = f"{what}: expected two (M, 2) arrays of pixel coordinates"
+    try:
+        a, b = (np.asarray(points, np.float64).reshape(-1, 2) if len(points) == 0 else
+                np.asarray(points, np.float64) for points in pairs)  # fmt: skip
+    except (TypeError, ValueError):
+        raise InputError(f"{expected}, got {type(pairs).__name__}") from None
+    if a.ndim != 2 or a.shape[1:] != (2,) or a.shape != b.shape:
+        raise InputError(f"{expected}, got shapes {a.shape} and {b.shape}")
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise InputError(f"{expected}, got some that are not finite")
+    within = np.ones(len(a), bool)
+    for points, (height, width, *_) in zip((a, b), shapes, strict=True):
+        within &= ((points >= 0) & (points <= [width, height])).all(1)
+    return a[within], b[within]
+
+
+class Sift:
+    """RootSIFT by pycolmap on the CPU, matched by `mutual`; a photo's features are kept while it is the same.
+
+    Descriptors are bytes of length 512: products of two are whole numbers below 2²⁴, whose sums float32 holds
+    exactly, in whatever order threads add them.
+
+    Args:
+        ratio: see `mutual`.
+        most: features of an image, the strongest.
+    """
+
+    def __init__(self, ratio: float, most: int) -> None:
+        import pycolmap
+
+        pycolmap.logging.minloglevel = 2  # it tells every extractor that is made
+        options = pycolmap.FeatureExtractionOptions()
+        options.use_gpu, options.num_threads = False, 1
+        options.sift.max_num_features = most
+        self._extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+        self._ratio = ratio
+        self._kept: tuple[Image, tuple[Float, NDArray[np.float32]]] | None = None
+
+    def __call__(self, photo: Image, render: Image) -> Pairs:
+        if self._kept is None or self._kept[0] is not photo:
+            self._kept = photo, self._features(photo)
+        (a, of_a), (b, of_b) = self._kept[1], self._features(render)
+        i, j = mutual(of_a, of_b, self._ratio)
+        return a[i], b[j]
+
+    def _features(self, image: Image) -> tuple[Float, NDArray[np.float32]]:
+        """(M, 2) places and (M, 128) whole-numbered descriptors."""
+        grey = np.clip(grey_of(image) * 255 + 0.5, 0, 255).astype(np.uint8)
+        found, descriptors = self._extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
+        places = np.array([(point.x, point.y) for point in found], np.float64).reshape(-1, 2)
+        return places, descriptors.data.astype(np.float32)
+
+
+def mutual(
+    a: NDArray[np.float32], b: NDArray[np.float32], ratio: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of `a` and `b` that are each other's nearest, and nearer than `ratio` times a's second nearest.
+
+    Args:
+        a: (M, D) whole numbers, below 2²⁴ in every sum of products.
+        b: (N, D), likewise.
+        ratio: of distances.
+
+    >>> a = np.array([[9, 0], [0, 9]], np.float32)
+    >>> [i.tolist() for i in mutual(a, np.array([[0, 8], [9, 1], [4, 4]], np.float32), 0.8)]
+    [[0, 1], [1, 0]]
+    """
+    if not len(a) or not len(b):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    squares = (a * a).sum(1)[:, None] + (b * b).sum(1)[None, :] - 2 * (a @ b.T)
+    nearest, back = squares.argmin(1), squares.argmin(0)
+    rows = np.arange(len(a))
+    least = squares[rows, nearest].copy()
+    squares[rows, nearest] = np.inf
+    good = (back[nearest] == rows) & (least < ratio**2 * squares.min(1))
+    return rows[good], nearest[good]

@@ -1,0 +1,246 @@
+"""Poses from matches: a render's pixels lifted by its depth, then PnP.
+
+A match (u, v) ↔ (u', v') of photo and render gives the photo's pixel the point that the render shows at
+(u', v'): its median depth there, taken back through the render's pose. The pose follows by LO-RANSAC over P3P
+and is refined by min Σ ρ(|π(T X) − u|²) with Cauchy's ρ; both by pycolmap. Rendered again at that pose, the
+scene looks more like the photo: the same is repeated until the pose stands still.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.cameras import Camera
+from g2ard.stages.register.config import RegisterConfig
+from g2ard.stages.register.matchers import Matcher
+from g2ard.stages.render import Rendered, Renderer
+
+__all__ = ["Solved", "information", "lifted", "solve", "solved"]
+
+Float = NDArray[np.float64]
+
+_LEAST = 6
+"""Matches, and inliers, below which there is no pose: three decide it, and some must bear them out."""
+_SIGMAS = 1.4826
+"""Standard deviations of a normal distribution in its median absolute deviation."""
+_LEAST_SIGMA = 0.1
+"""Pixels that a match is known to at best."""
+_STILL = 0.05
+"""Pixels (root of the mean square over the inliers): what moves the image by less was the last pass."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A pose from matches.
+
+    Args:
+        viewmat: (4, 4) camera_from_world.
+        matches: that have a depth.
+        inliers: of them.
+        spread: share of the image's 4 × 4 cells that hold an inlier.
+        reprojection: median distance of the inliers, pixels.
+        information: (6, 6) inverse covariance of ξ = (v, ω), camera axes; see `information`.
+        depth: median of the inliers, scene units.
+        passes: renders.
+        pixels, points: (inliers, 2) of the photo and (inliers, 3), world.
+        seen: (inliers, 2) pixels of the last render.
+    """
+
+    viewmat: Float
+    matches: int
+    inliers: int
+    spread: float
+    reprojection: float
+    information: Float
+    depth: float
+    passes: int
+    pixels: Float
+    points: Float
+    seen: Float
+
+
+def solve(
+    renderer: Renderer,
+    start: Float,
+    camera: Camera,
+    photo: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    match: Matcher,
+    config: RegisterConfig,
+    passes: int,
+) -> Solved | None:
+    """Match, lift and solve from a starting pose, again and again from what was found.
+
+    Args:
+        renderer: of the scene.
+        start: (4, 4) camera_from_world.
+        camera: the photo's size and K; its pose does not count.
+        photo: (H, W, 3) in [0, 1].
+        mask: (H, W) pixels of it that count.
+        match: see `g2ard.stages.register.matchers`.
+        config: see `RegisterConfig`.
+        passes: renders, at most.
+
+    Returns:
+        The last pass that led to a pose; None where the first did not.
+    """
+    found = None
+    for number in range(passes):
+        there = replace(camera, viewmat=start if found is None else found.viewmat)
+        out = renderer.render(there, median=True)
+        uv, seen = match(photo, np.clip(out.image, 0, 1))
+        counts = _at(mask, uv)
+        uv, seen = uv[counts], seen[counts]
+        points, known = lifted(out, there, seen, config)
+        after = solved(there, uv[known], points[known], config)
+        if after is None:
+            break
+        T, inlying = after
+        of, at, X = uv[known][inlying], seen[known][inlying], points[known][inlying]
+        shift = _projected(T, there.K, X) - _projected(there.viewmat, there.K, X)
+        found = _solved_of(T, camera, int(known.sum()), of, X, at, number + 1, config)
+        if float(np.sqrt((shift**2).sum(1).mean())) < _STILL:
+            break
+    return found
+
+
+def _at(image: NDArray[np.bool_], uv: Float) -> NDArray[np.bool_]:
+    height, width = image.shape
+    column, row = np.floor(uv).astype(int).T
+    return image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+
+
+def lifted(
+    out: Rendered, camera: Camera, uv: Float, config: RegisterConfig
+) -> tuple[Float, NDArray[np.bool_]]:
+    """Points that a render shows at pixels, and where they are known.
+
+    Depth is the median depth, between the four pixels around (u, v): where all four have one, opaque enough
+    (`min_alpha`), and no two differ by more than `max_edge`. The expected depth would lie between a
+    foreground and what is behind it.
+
+    Args:
+        out: a render with its median depth.
+        camera: of the render.
+        uv: (M, 2) pixels.
+        config: see `RegisterConfig`.
+
+    Returns:
+        (M, 3) world coordinates, and (M,) whether they are known.
+    """
+    assert out.median is not None
+    height, width = out.alpha.shape
+    x, y = (uv - 0.5).T
+    left = np.clip(np.floor(x).astype(int), 0, max(width - 2, 0))
+    top = np.clip(np.floor(y).astype(int), 0, max(height - 2, 0))
+    right, down = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    a, b = np.clip(x - left, 0, 1), np.clip(y - top, 0, 1)
+    share = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
+    cells = (top, left), (top, right), (down, left), (down, right)
+    depths = np.stack([out.median[cell].astype(np.float64) for cell in cells])
+    alpha = np.stack([out.alpha[cell].astype(np.float64) for cell in cells]).min(0)
+    nearest, z = depths.min(0), (share * depths).sum(0)
+    known = (nearest > 0) & (alpha >= config.min_alpha)
+    known &= depths.max(0) - nearest <= config.max_edge * nearest
+    K, T = camera.K, camera.viewmat
+    seen = np.stack([(uv[:, 0] - K[0, 2]) / K[0, 0] * z, (uv[:, 1] - K[1, 2]) / K[1, 1] * z, z], 1)
+    return np.einsum("mi,ij->mj", seen - T[:3, 3], T[:3, :3], optimize=False), known
+
+
+def solved(
+    camera: Camera, uv: Float, points: Float, config: RegisterConfig
+) -> tuple[Float, NDArray[np.bool_]] | None:
+    """A pose of PnP and which matches it explains, within `max_reprojection`; None where it explains too few.
+
+    Args:
+        camera: size and K.
+        uv: (M, 2) pixels.
+        points: (M, 3) world; taken about their middle, for map coordinates.
+        config: see `RegisterConfig`.
+    """
+    import pycolmap
+
+    if len(uv) < _LEAST:
+        return None
+    K = camera.K
+    lens = pycolmap.Camera(
+        model="PINHOLE",
+        width=camera.width,
+        height=camera.height,
+        params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+    )
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error = config.max_reprojection
+    options.ransac.random_seed, options.ransac.num_threads = 0, 1
+    refinement = pycolmap.AbsolutePoseRefinementOptions()
+    refinement.gradient_tolerance = 1e-8
+    middle = np.median(points, 0)
+    answer = pycolmap.estimate_and_refine_absolute_pose(uv, points - middle, lens, options, refinement)
+    if answer is None or int(answer["num_inliers"]) < _LEAST:
+        return None
+    T = np.eye(4)
+    T[:3] = answer["cam_from_world"].matrix()
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    T[:3, :3] = U @ Vt
+    T[:3, 3] -= T[:3, :3] @ middle
+    return (T, np.asarray(answer["inlier_mask"], bool)) if np.isfinite(T).all() else None
+
+
+def _solved_of(
+    T: Float,
+    camera: Camera,
+    matches: int,
+    uv: Float,
+    points: Float,
+    seen: Float,
+    passes: int,
+    config: RegisterConfig,
+) -> Solved:
+    cells = np.floor(4 * uv / [camera.width, camera.height]).clip(0, 3) @ [1, 4]
+    distance = np.linalg.norm(_projected(T, camera.K, points) - uv, axis=1)
+    return Solved(
+        viewmat=T,
+        matches=matches,
+        inliers=len(uv),
+        spread=len(np.unique(cells)) / 16,
+        reprojection=float(np.median(distance)),
+        information=information(T, camera.K, uv, points) / config.alike,
+        depth=float(np.median(points @ T[2, :3] + T[2, 3])),
+        passes=passes,
+        pixels=uv,
+        points=points,
+        seen=seen,
+    )
+
+
+def information(T: Float, K: Float, uv: Float, points: Float) -> Float:
+    """(6, 6) JᵀWJ/σ² of the reprojections π(exp(ξ) T X) − u, with J = ∂π/∂X·[I | −[X]ₓ].
+
+    W is Cauchy's weight 1/(1 + r²/σ²), σ the residuals' by their median absolute deviation.
+
+    Args:
+        T: (4, 4) camera_from_world.
+        K: (3, 3).
+        uv: (M, 2) pixels.
+        points: (M, 3) world.
+    """
+    X = points @ T[:3, :3].T + T[:3, 3]
+    x, y, depth = X[:, 0] / X[:, 2], X[:, 1] / X[:, 2], X[:, 2]
+    none = np.zeros(len(X))
+    right = np.stack([1 / depth, none, -x / depth, -x * y, 1 + x * x, -y]) * K[0, 0]
+    down = np.stack([none, 1 / depth, -y / depth, -1 - y * y, x * y, x]) * K[1, 1]
+    residual = _projected(T, K, points) - uv
+    sigma = max(_LEAST_SIGMA, _SIGMAS * float(np.median(np.abs(residual))))
+    weight = 1 / (1 + (residual**2).sum(1) / sigma**2)
+    J = np.concatenate([right, down], 1)
+    weights = np.concatenate([weight, weight]) / sigma**2
+    return np.einsum("in,jn->ij", J * weights, J, optimize=False)
+
+
+def _projected(T: Float, K: Float, points: Float) -> Float:
+    """(M, 2) pixels of (M, 3) world points."""
+    X = points @ T[:3, :3].T + T[:3, 3]
+    return X[:, :2] / X[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]

@@ -1,0 +1,284 @@
+"""Features: matches against a naive twin, points lifted, poses solved, and matchers that are not."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import around, checkered_ball
+from test_register_align import off
+
+from g2ard.cameras import Cameras
+from g2ard.errors import InputError, MissingDependencyError
+from g2ard.images import write_png
+from g2ard.splats import Splats
+from g2ard.stages.register import RegisterConfig, pose_error, register
+from g2ard.stages.register import matchers as module
+from g2ard.stages.register.matchers import checked_pairs, matcher_named, mutual
+from g2ard.stages.register.pose import motion_between, moved
+from g2ard.stages.register.solve import information, lifted, solved
+from g2ard.stages.render import Rendered, Renderer
+
+CommandLine = Callable[..., tuple[int, str, str]]
+CONFIG = RegisterConfig(size=400, align_size=200, matcher="sift")
+
+
+def _blotched(count: int = 6000, blotches: int = 200) -> Splats:
+    """A ball none of whose places looks like another: squares of one size match one another."""
+    ball = checkered_ball(count)
+    rng = np.random.default_rng(5)
+    middles = rng.normal(size=(blotches, 3))
+    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+    color = rng.random((blotches, 1, 3))[np.argmax(ball.means @ middles.T, axis=1)]
+    return replace(ball, sh0=((color - 0.5) / 0.28209479).astype(np.float32))
+
+
+BALL = _blotched()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10_000), st.integers(1, 12), st.integers(2, 12), st.floats(0.5, 1))
+def test_mutual_matches_are_the_twins(seed: int, m: int, n: int, ratio: float) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = (rng.integers(0, 9, (k, 5)).astype(np.float32) for k in (m, n))
+    far = np.linalg.norm(a[:, None].astype(np.float64) - b[None], axis=2)
+    expected = [
+        (i, int(far[i].argmin()))
+        for i in range(m)
+        if far[:, far[i].argmin()].argmin() == i
+        and far[i].min() ** 2 < ratio**2 * np.sort(far[i])[1] ** 2 * (1 - 1e-9)
+    ]
+    i, j = mutual(a, b, ratio)
+    close = [
+        (x, y) for x, y in zip(i.tolist(), j.tolist(), strict=True)
+        if far[x].min() ** 2 < ratio**2 * np.sort(far[x])[1] ** 2 * (1 - 1e-9)
+    ]  # fmt: skip
+    assert close == expected
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.floats(-2.5, 2.5), min_size=6, max_size=6), st.integers(0, 1000))
+def test_the_motion_between_two_poses_moves_one_to_the_other(xi: list[float], seed: int) -> None:
+    motion = np.array(xi)
+    motion[3:] *= min(1.0, 3.0 / max(np.linalg.norm(motion[3:]), 1e-12))
+    first = off(np.eye(4), 3, 100, seed)
+    found = motion_between(first, moved(first, motion))
+    np.testing.assert_allclose(found, motion, atol=1e-7)
+
+
+def test_points_are_lifted_to_where_they_are_seen() -> None:
+    camera = around(5, (160, 120), 2.5)[2]
+    rng = np.random.default_rng(0)
+    uv = rng.uniform(2, [158, 118], (200, 2))
+    K = camera.K
+    # a plane z = 3 + x/4 in the camera's axes, its depth at every pixel's middle
+    slope = 3 / (1 - ((np.arange(160) + 0.5 - K[0, 2]) / K[0, 0]) / 4)
+    depth = np.repeat(slope[None], 120, 0).astype(np.float32)
+    alpha = np.ones_like(depth)
+    alpha[:, :40] = 0.2
+    depth[60:, 100:] *= 2
+    image = np.zeros((120, 160, 3), np.float32)
+    points, known = lifted(Rendered(image, alpha, depth * alpha, depth), camera, uv, CONFIG)
+    seen = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    back = seen[:, :2] / seen[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
+    np.testing.assert_allclose(back[known], uv[known], atol=1e-6)
+    near = known & ~((uv[:, 0] > 99) & (uv[:, 1] > 59))
+    np.testing.assert_allclose(seen[near, 2], 3 + seen[near, 0] / 4, rtol=1e-4)
+    assert not known[uv[:, 0] < 39].any()
+    edge = (np.abs(uv[:, 0] - 100) < 0.4) & (uv[:, 1] > 61)
+    assert not known[edge].any()
+    assert known.mean() > 0.6
+
+
+def test_information_is_that_of_reprojections() -> None:
+    """JᵀWJ/σ² against central differences of the projections."""
+    rng = np.random.default_rng(1)
+    K = np.array([[300, 0, 160], [0, 310, 120], [0, 0, 1.0]])
+    T = off(np.eye(4), 2, 40, 3)
+    seen = rng.uniform([-1, -1, 2], [1, 1, 5], (50, 3))
+    points = (seen - T[:3, 3]) @ T[:3, :3]
+
+    def projected(pose: np.ndarray) -> np.ndarray:
+        X = points @ pose[:3, :3].T + pose[:3, 3]
+        return (X[:, :2] / X[:, 2:]) * [300, 310] + [160, 120]
+
+    uv = projected(T) + rng.normal(0, 0.7, (50, 2))
+    step = 1e-6
+    J = np.stack(
+        [(projected(moved(T, step * e)) - projected(moved(T, -step * e))) / (2 * step) for e in np.eye(6)]
+    )
+    residual = projected(T) - uv
+    sigma = 1.4826 * np.median(np.abs(residual))
+    weight = 1 / (1 + (residual**2).sum(1) / sigma**2)
+    expected = np.einsum("imk,jmk,m->ij", J, J, weight) / sigma**2
+    np.testing.assert_allclose(information(T, K, uv, points), expected, rtol=1e-5, atol=1e-5 * expected.max())
+
+
+def test_pnp_finds_the_pose_in_map_coordinates() -> None:
+    pytest.importorskip("pycolmap")
+    camera = around(5, (320, 240), 2.5)[1]
+    rng = np.random.default_rng(2)
+    offset = np.array([500_000.0, 4_000_000.0, 100.0])
+    seen = np.concatenate([rng.uniform(-1, 1, (80, 2)), rng.uniform(2, 5, (80, 1))], 1)
+    true = camera.viewmat.copy()
+    true[:3, 3] -= true[:3, :3] @ offset
+    points = (seen - true[:3, 3]) @ true[:3, :3]
+    K = camera.K
+    uv = seen[:, :2] / seen[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
+    uv[::5] += rng.uniform(20, 60, (16, 2))
+    found = solved(camera, uv, points, CONFIG)
+    assert found is not None
+    pose, inlying = found
+    assert (~inlying).tolist() == [i % 5 == 0 for i in range(80)]
+    assert pose_error(pose, true)[0] < 1e-3  # of millions
+    assert solved(camera, uv[:5], points[:5], CONFIG) is None
+
+
+def _photographed(folder: Path, count: int = 2, size: tuple[int, int] = (400, 300)) -> Cameras:
+    """Views of the ball, photographed under other light."""
+    views = around(count, size, 2.5)
+    renderer = Renderer(BALL)
+    files = []
+    for i, view in enumerate(views):
+        files.append(folder / f"photo{i}.png")
+        write_png(files[-1], np.clip(0.7 * renderer.image(view) + 0.1, 0, 1))
+    return Cameras(views.viewmats, views.Ks, views.widths, views.heights, views.names, tuple(files))
+
+
+def test_features_find_the_pose(tmp_path: Path) -> None:
+    """A quarter of the distance to the surface, and 15°, off, under other light."""
+    pytest.importorskip("pycolmap")
+    views = _photographed(tmp_path)
+    truth = dict(zip(views.names, views.viewmats, strict=True))
+    starts = {name: off(pose, 0.4, 15, i) for i, (name, pose) in enumerate(truth.items())}
+    found = register(BALL, views, starts=starts, truth=truth, config=CONFIG).report.photos
+    direct = register(BALL, views, starts=starts, truth=truth, config=replace(CONFIG, matcher="direct"))
+    for row in found:
+        assert row.status == "registered"
+        assert row.inliers >= CONFIG.min_inliers
+        assert row.error is not None
+        assert row.error.position < 0.005
+        assert row.error.rotation < 0.1
+        assert row.reprojection is not None
+        assert row.reprojection < 1
+    assert all(row.inliers == 0 and row.reprojection is None for row in direct.report.photos)
+
+
+def test_both_are_no_worse_than_the_better_of_two(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    views = _photographed(tmp_path)
+    truth = dict(zip(views.names, views.viewmats, strict=True))
+    starts = {name: off(pose, 0.2, 6, i) for i, (name, pose) in enumerate(truth.items())}
+    errors = {}
+    for refine in ("auto", "none", "photometric"):
+        config = replace(CONFIG, refine=refine)  # type: ignore[arg-type]
+        rows = register(BALL, views, starts=starts, truth=truth, config=config).report.photos
+        errors[refine] = np.median([r.error.position for r in rows if r.error])
+    assert errors["auto"] <= 1.1 * min(errors["none"], errors["photometric"]) + 2e-4
+
+
+def test_results_do_not_depend_on_threads(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    code = f"""
+import sys; sys.path[:0] = ["tests"]
+from g2ard import _core; _core.set_num_threads(int(sys.argv[1]))
+from pathlib import Path
+import test_register_features as t
+views = t._photographed(Path({str(tmp_path)!r}), 1)
+starts = {{views.names[0]: t.off(views.viewmats[0], .2, 6, 1)}}
+row = t.register(t.BALL, views, starts=starts, config=t.CONFIG).report.photos[0]
+print(row.camera_from_world, row.covariance, row.matches, row.inliers)
+"""
+    from conftest import ROOT
+
+    told = []
+    for threads in ("1", "2"):
+        for file in tmp_path.iterdir():
+            file.unlink()
+        call = [sys.executable, "-c", code, threads]
+        told.append(subprocess.run(call, capture_output=True, text=True, check=True, cwd=ROOT).stdout)
+    assert told[0] == told[1]
+    assert len(told[0]) > 500
+
+
+@pytest.mark.parametrize(
+    ("pairs", "words"),
+    [
+        (None, "got NoneType"),
+        (([[1, 2]], [[1, 2], [3, 4]]), r"got shapes \(1, 2\) and \(2, 2\)"),
+        (([[1, 2, 3]], [[1, 2, 3]]), r"got shapes \(1, 3\)"),
+        (([[1, np.nan]], [[1, 2]]), "not finite"),
+        (("ab", "cd"), "got tuple"),
+        (([[1, 2]],), "got tuple"),
+    ],
+)
+def test_nonsense_of_a_matcher_is_told(pairs: object, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        checked_pairs("matcher m:f", pairs, (9, 9, 3), (9, 9, 3))
+
+
+def test_without_pycolmap_direct_alignment_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    assert matcher_named("auto", 0.85, 100) is None
+    for name in ("sift", "json:dumps"):
+        with pytest.raises(MissingDependencyError, match=r"pip install g2ard\[register\]"):
+            matcher_named(name, 0.85, 100)
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        (None, "cannot import plugin: ModuleNotFoundError"),
+        ("def other(a, b): ...", "plugin has no function match"),
+        ("match = 3", "plugin has no function match"),
+        ("def match(a, b): return 5", "expected two (M, 2) arrays"),
+        ("def match(a, b): raise ValueError('out\\nof luck')", "plugin:match: ValueError: out of luck"),
+    ],
+)
+def test_a_plugin_that_fails_is_one_line(
+    source: str | None, words: str, command_line: CommandLine, tmp_path: Path
+) -> None:
+    pytest.importorskip("pycolmap")
+    _one_view(tmp_path)
+    if source is not None:
+        (tmp_path / "plugin.py").write_text(source + "\n")
+    status, _, err = command_line(*_CALL, "--matcher", "plugin:match", cwd=tmp_path)
+    assert status == 1
+    assert words in err
+    assert "Traceback" not in err
+
+
+def test_a_plugin_matches(command_line: CommandLine, tmp_path: Path) -> None:
+    """One that knows nothing but SIFT: the same pose as --matcher sift."""
+    pytest.importorskip("pycolmap")
+    _one_view(tmp_path)
+    (tmp_path / "plugin.py").write_text(
+        "from g2ard.stages.register.matchers import Sift\nmatch = Sift(0.85, 4096)\n"
+    )
+    for name, output in (("plugin:match", "a.json"), ("sift", "b.json")):
+        call = [output if word == "poses.json" else word for word in _CALL]
+        status, _, err = command_line(*call, "--matcher", name, cwd=tmp_path)
+        assert status == 0, err
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+
+
+_CALL = [
+    *("register", "scene.ply", "--photos", "views.json", "--poses", "coarse.json"),
+    *("--size", "400", "-o", "poses.json"),
+]
+
+
+def _one_view(folder: Path) -> None:
+    from g2ard.io import write_splats, write_views
+
+    views = _photographed(folder, 1)
+    write_splats(folder / "scene.ply", BALL)
+    write_views(folder / "views.json", views)
+    write_views(folder / "coarse.json", replace(views, viewmats=off(views.viewmats[0], 0.1, 3, 0)[None]))
