@@ -253,3 +253,33 @@ def test_a_lens_for_all_where_names_differ(site: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(taken.Ks, np.repeat(one.Ks, 4, 0))
     centred = photos_of(site / "photos", focal=100)
     assert centred.Ks[0].tolist() == [[100, 0, 64], [0, 100, 48], [0, 0, 1]]
+
+
+def test_photos_to_poses_to_an_adapted_scene(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
+    """`adapt` and `recover` read what `register` writes, and the scene takes on the photos' light."""
+    from g2ard.targets import Photos
+
+    photos = ("--photos", site / "photos", "--intrinsics", site / "views.json", "--size", "128")
+    found = command_line(
+        "register",
+        site / "scene.ply",
+        *photos,
+        "--poses",
+        site / "coarse.txt",
+        "-o",
+        "poses.json",
+        cwd=tmp_path,
+    )
+    assert found[0] == 0, found[2]
+    views = ("--views", "poses.json", "--split", "all")
+    for command, output in (("adapt", "adapted.ply"), ("recover", "recovered.ply")):
+        status, _, err = command_line(
+            command, site / "scene.ply", *views, "--steps", "40", "-o", output, cwd=tmp_path
+        )
+        assert status == 0, err
+    targets = Photos(read_views(site / "views.json"))
+    before, after = (
+        g2ard.evaluate(g2ard.load(path), targets).psnr
+        for path in (site / "scene.ply", tmp_path / "adapted.ply")
+    )
+    assert after > before + 3

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from scenes import around, checkered_ball
 from test_register_align import off
 
-from g2ard.cameras import Cameras
+from g2ard.cameras import Camera, Cameras
 from g2ard.errors import InputError, MissingDependencyError
 from g2ard.images import write_png
 from g2ard.splats import Splats
-from g2ard.stages.register import RegisterConfig, pose_error, register
+from g2ard.stages.register import PhotoReport, RegisterConfig, pose_error, register
 from g2ard.stages.register import matchers as module
 from g2ard.stages.register.matchers import checked_pairs, matcher_named, mutual
 from g2ard.stages.register.pose import motion_between, moved
@@ -30,10 +30,10 @@ CommandLine = Callable[..., tuple[int, str, str]]
 CONFIG = RegisterConfig(size=400, align_size=200, matcher="sift")
 
 
-def _blotched(count: int = 6000, blotches: int = 200) -> Splats:
+def _blotched(count: int = 6000, blotches: int = 200, seed: int = 5) -> Splats:
     """A ball none of whose places looks like another: squares of one size match one another."""
     ball = checkered_ball(count)
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng(seed)
     middles = rng.normal(size=(blotches, 3))
     middles /= np.linalg.norm(middles, axis=1, keepdims=True)
     color = rng.random((blotches, 1, 3))[np.argmax(ball.means @ middles.T, axis=1)]
@@ -282,3 +282,52 @@ def _one_view(folder: Path) -> None:
     write_splats(folder / "scene.ply", BALL)
     write_views(folder / "views.json", views)
     write_views(folder / "coarse.json", replace(views, viewmats=off(views.viewmats[0], 0.1, 3, 0)[None]))
+
+
+@pytest.mark.parametrize(("gain", "bias"), [(0.6, 0.0), (1.6, 0.0), (1.0, 0.1), (1.0, -0.1)])
+def test_light_moves_no_pose(gain: float, bias: float, tmp_path: Path) -> None:
+    """By less than a tenth of what registration takes back."""
+    pytest.importorskip("pycolmap")
+    view = around(2, (400, 300), 2.5)[0]
+    image = 0.5 * Renderer(BALL).image(view)
+    write_png(tmp_path / "photo.png", np.clip(gain * image + bias, 0, 1))
+    row = _registered(view, tmp_path)
+    assert row.status == "registered"
+    assert row.error is not None
+    assert row.start_error is not None
+    assert row.error.position < 0.1 * row.start_error.position
+    assert row.error.rotation < 0.1 * row.start_error.rotation
+
+
+def test_an_occluder_is_no_error_of_the_pose(tmp_path: Path) -> None:
+    """A fifth of the photo is something else, and the pose is right within 2σ."""
+    pytest.importorskip("pycolmap")
+    rng = np.random.default_rng(4)
+    for i in range(2):
+        view = around(2, (400, 300), 2.5)[i]
+        image = np.clip(Renderer(BALL).image(view), 0, 1)
+        image[60:210, 120:280] = rng.random((15, 16, 3)).repeat(10, 0).repeat(10, 1)
+        write_png(tmp_path / "photo.png", image, overwrite=True)
+        row = _registered(view, tmp_path)
+        assert row.status == "registered"
+        assert row.error is not None
+        assert row.sigma is not None
+        assert row.error.position < 2 * row.sigma.position
+        assert row.error.rotation < 2 * row.sigma.rotation
+
+
+def test_a_photo_of_another_scene_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    for i, view in enumerate(around(3, (400, 300), 2.5)):
+        write_png(
+            tmp_path / "photo.png", np.clip(Renderer(_blotched(seed=9)).image(view), 0, 1), overwrite=True
+        )
+        assert _registered(view, tmp_path, seed=i).status != "registered"
+
+
+def _registered(view: Camera, folder: Path, seed: int = 0) -> PhotoReport:
+    """What becomes of `photo.png`, from .1 units and 3° off."""
+    views = Cameras.of([replace(view, image_path=folder / "photo.png", name="photo")])
+    starts = {"photo": off(view.viewmat, 0.1, 3, seed)}
+    truth = {"photo": view.viewmat}
+    return register(BALL, views, starts=starts, truth=truth, config=CONFIG).report.photos[0]

@@ -38,8 +38,8 @@ class RegisterConfig:
         window: pixels of the side of ZNCC's windows.
         candidates: the best poses of a pool, by renders of `pool_size` pixels, that are aligned.
         pool_size: pixels of the longer side of those renders.
-        correlated: what variances are multiplied by, for neighbouring residuals err alike: measured at size
-            500, so that errors on caliterra's held-out photos are as large as their σ says.
+        correlated: what variances are multiplied by, for neighbouring residuals err alike: set so that
+            errors at 500 pixels on caliterra's held-out photos are about as large as their σ says.
         features: of an image, at most, for SIFT.
         ratio: SIFT's nearest feature is nearer than this share of the distance to the second nearest.
         max_reprojection: pixels within which PnP explains a match.
@@ -68,7 +68,7 @@ class RegisterConfig:
     window: int = 15
     candidates: int = 5
     pool_size: int = 64
-    correlated: float = 300.0
+    correlated: float = 1000.0
     features: int = 4096
     ratio: float = 0.85
     max_reprojection: float = 3.0

@@ -2,5 +2,5 @@
 
 from importlib import import_module
 
-for _name in ("raster", "simplify", "run", "select", "recover", "ship"):
+for _name in ("raster", "simplify", "run", "select", "recover", "ship", "register"):
     import_module(f"{__name__}.{_name}")
