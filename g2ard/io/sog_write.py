@@ -87,8 +87,8 @@ def palette_size(count: int) -> int:
     return min(1 << 16, 1 << (count.bit_length() - 1))
 
 
-def sog_files(path: Path, splats: Splats) -> dict[str, bytes]:
-    """The files of a scene by name, meta.json last.
+def sog_files(path: Path, splats: Splats, *, ordered: bool = False) -> dict[str, bytes]:
+    """The files of a scene by name, meta.json last; rows in Morton order, or `ordered` as they are.
 
     An `offset` is kept under "g2ard" in meta.json, which `read` restores; other programs see the recentred
     scene.
@@ -102,7 +102,8 @@ def sog_files(path: Path, splats: Splats) -> dict[str, bytes]:
     from g2ard.io.packing import coded, log_scales, morton_order, smallest_three, unit_quats, writable
 
     splats = writable(path, splats)
-    splats = splats.take(morton_order(splats.means))
+    if not ordered:
+        splats = splats.take(morton_order(splats.means))
     width, height = _size(path, len(splats))
     files, meta = {}, {"version": 2, "asset": {"generator": f"g2ard {__version__}"}, "count": len(splats)}
     meta["antialias"] = False
