@@ -11,6 +11,7 @@
 | `recover` | a fixed set of Gaussians against photos or a teacher's renders |
 | `adapt` | new appearance on frozen geometry |
 | `register` | poses of photos, by aligning renders with them |
+| `lod`, `save_levels` | levels of detail, as streamed SOG |
 | `render`, `Renderer`, `evaluate` | images, depths; PSNR, SSIM |
 
 They pass on `Splats`, a `Camera` or many `Cameras`, and targets: `Photos` or `TeacherRenders`. Configurations
@@ -43,8 +44,10 @@ if TYPE_CHECKING:
     from g2ard.io import read_views as load_views
     from g2ard.io import write_splats as save
     from g2ard.io import write_views as save_views
+    from g2ard.levels import save_levels
     from g2ard.pipeline import DistillConfig, Distilled
     from g2ard.policy.distill import distill
+    from g2ard.policy.levels import lod
     from g2ard.policy.simplify import simplify
     from g2ard.poses import make_pool
     from g2ard.presets import preset
@@ -97,6 +100,7 @@ __all__ = [
     "load",
     "load_points",
     "load_views",
+    "lod",
     "look_at",
     "make_pool",
     "preset",
@@ -104,6 +108,7 @@ __all__ = [
     "register",
     "render",
     "save",
+    "save_levels",
     "save_views",
     "select",
     "simplify",
@@ -113,7 +118,9 @@ _HOMES = {
     "cameras": ("Camera", "Cameras", "look_at"),
     "errors": ("G2ardError", "InputError", "MissingDependencyError", "OutputError"),
     "pipeline": ("DistillConfig", "Distilled"),
+    "levels": ("save_levels",),
     "policy.distill": ("distill",),
+    "policy.levels": ("lod",),
     "policy.simplify": ("simplify",),
     "poses": ("make_pool",),
     "presets": ("preset",),

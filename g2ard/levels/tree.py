@@ -1,4 +1,4 @@
-"""One binary kd-tree over all levels of a scene: its leaves are what a viewer loads, each at a level of its own."""
+"""One binary kd-tree over all levels of a scene: a viewer loads its leaves, each at a level of its own."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ Rows = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Cut:
-    """When a node is split: it holds more than `most` Gaussians of all levels, or it is wider than `extent` and
-    holds more than `least`. The defaults are those of PlayCanvas' writer.
+    """When a node is split: it holds more than `most` Gaussians of all levels, or it is wider than `extent`
+    and holds more than `least`. The defaults are those of PlayCanvas' writer.
 
     Args:
         most: Gaussians of a leaf; also about what one file holds.

@@ -1,7 +1,7 @@
 """Writing streamed SOG (PlayCanvas): levels of detail as SOG files that hold the leaves of one tree in a row.
 
-`lod-meta.json`, version 1: a node has a `bound` and two `children`, or, a leaf, `lods`: of each level that has
-Gaussians there the file, the offset of the first of its rows and their count; and `errors` of all levels.
+`lod-meta.json`, version 1: a node has a `bound` and two `children`, or, a leaf, `lods`: of each level that
+has Gaussians there the file, the offset of the first of its rows and their count; and `errors` of all levels.
 """
 
 from __future__ import annotations
@@ -128,9 +128,7 @@ def _node(tree: Node | Leaf, files: _Files) -> dict[str, Any]:
     return {**node, "children": [_node(child, files) for child in tree.children]}
 
 
-def _measure(
-    tree: Node | Leaf, root: dict[str, Any], levels: Sequence[Splats], progress: Progress
-) -> None:
+def _measure(tree: Node | Leaf, root: dict[str, Any], levels: Sequence[Splats], progress: Progress) -> None:
     """Put `errors` into the leaves of the tree as it is written."""
     pairs = [(tree, root)]
     leaves: list[tuple[Leaf, dict[str, Any]]] = []

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -77,8 +78,9 @@ def lod(
 ) -> Levels:
     """Levels of detail of a trained scene, as `g2ard lod` makes them, to the bit.
 
-    A level is merged from the one before, so that its Gaussians are unions of that one's. Seen from √r times as
-    far, a scene of N/r Gaussians fills as many of its pixels: level r is recovered against views shrunk by √r.
+    A level is merged from the one before, so that its Gaussians are unions of that one's. From √r times as
+    far N/r Gaussians fill as many pixels each, but a viewer that has not loaded more shows them near, too:
+    level r is recovered against views shrunk by √√r, midway between.
 
     Args:
         scene: the dense scene, or its path.
@@ -147,7 +149,7 @@ def lod(
 def _check(ratios: Sequence[float]) -> None:
     from g2ard.errors import InputError
 
-    rising = all(a < b for a, b in zip(ratios, ratios[1:], strict=False))
+    rising = all(a < b for a, b in pairwise(ratios))
     if not ratios or not rising or not all(1 <= ratio < math.inf for ratio in ratios):
         raise InputError(f"ratios: expected rising numbers of at least 1, got {', '.join(map(str, ratios))}")
 
@@ -160,7 +162,7 @@ def _level(
     from g2ard.stages.evaluate import evaluate
 
     began = time.perf_counter()
-    longest = max(_SMALLEST, round(_longest(job.views.train.cameras) / math.sqrt(ratio)))
+    longest = max(_SMALLEST, round(_longest(job.views.train.cameras) / ratio**0.25))
     held_out = _targets(job, job.views.test, longest)
     if recover:
         apart = None if job.views.apart is None or job.teacher is None else job.views.apart.resized(longest)
@@ -184,7 +186,11 @@ def _level(
         for splats in ((merged, level) if recover else (merged,))
     ]
     seconds = time.perf_counter() - began
-    return level, merged, LevelReport(count, ratio, longest, seconds, scores[0], scores[1] if recover else None)
+    return (
+        level,
+        merged,
+        LevelReport(count, ratio, longest, seconds, scores[0], scores[1] if recover else None),
+    )
 
 
 def _merged(job: DistillJob, finer: Splats, count: int) -> Splats:

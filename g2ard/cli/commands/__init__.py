@@ -17,6 +17,7 @@ COMMANDS = (
     "select",
     "render",
     "view",
+    "lod",
     "evaluate",
     "info",
     "bench",
