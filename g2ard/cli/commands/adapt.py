@@ -71,7 +71,7 @@ def adapt(
     check_stopped(run, work, resume, output)
     splats = load_scene(compact, run.say)
     dense = load_scene(teacher, run.say) if teacher else None
-    cameras = load_trained(views, split, size, run.say).cameras
+    cameras = load_trained(views, split, size, run.say, unpictured=dense is not None).cameras
     targets = make_targets(cameras, dense, config.background, progress=run.progress, say=run.say)
     with stoppable(run, work, resume):
         work.mkdir(parents=True, exist_ok=True)

@@ -84,7 +84,7 @@ def distill(
         bool | None,
         typer.Option(
             "--photos/--renders",
-            help="Targets: the views' photos, or the scene's renders; photos if there are.",
+            help="Targets: photos, or the scene's renders; else each view's photo if it has one.",
         ),
     ] = None,
     held_out: Annotated[

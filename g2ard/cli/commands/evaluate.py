@@ -68,7 +68,7 @@ def evaluate(
     dense = load_scene(teacher, run.say) if teacher else None
     frozen = load_scene(anchors, run.say) if anchors else None
     views = views_or_teacher(run, views, teacher, dense)
-    cameras = load_views(views, split, size, run.say, unpictured=photos)
+    cameras = load_views(views, split, size, run.say, unpictured=dense is not None)
     targets = make_targets(
         cameras, dense, colour, photos=photos, settings=settings, progress=run.progress, say=run.say
     )
