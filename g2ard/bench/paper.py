@@ -11,7 +11,7 @@ from g2ard.bench.methods import METHODS, MethodSpec
 __all__ = ["as_in_the_paper", "with_released"]
 
 
-def as_in_the_paper(study: Definition, released: bool | None = None) -> Definition:
+def as_in_the_paper(study: Definition, released: bool | None = None, row: str | None = None) -> Definition:
     """The study with the paper's method in g2ard's place, at its rates and on its views.
 
     Every row of the paper's method, whatever it is called, takes the paper's rates; and, unless rows of the
@@ -22,9 +22,12 @@ def as_in_the_paper(study: Definition, released: bool | None = None) -> Definiti
     Args:
         study: as it was read.
         released: whether each method's own schedule is run as well; None means that it is.
+        row: of the paper's regularisers, trained, lift or noisy, for all its rows; None leaves each its own.
     """
     chosen = any(method.policy is not None for method in study.methods)
     rows = tuple(sorted(_rows(study.methods, chosen), key=lambda method: method.reduce != "paper"))
+    if row is not None:
+        rows = tuple(replace(m, preset=row) if m.reduce == "paper" else m for m in rows)
     papers = [method.name for method in rows if method.reduce == "paper"]
     others = [method.name for method in rows if method.reduce != "paper" and method.recovers]
     said = f"run with the paper's preset, harmonics of degree 3: {', '.join(papers)} at the paper's rates"

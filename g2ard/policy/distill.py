@@ -210,7 +210,7 @@ def prepare(
     Raises:
         InputError: as `distill`.
     """
-    from g2ard.constants import changed
+    from g2ard.constants import changed, full_names
     from g2ard.io.clean import plural
     from g2ard.pipeline import DistillConfig
     from g2ard.policy.clean import clutter_seen
@@ -223,7 +223,8 @@ def prepare(
     usual = _PAPER if preset.startswith("paper") else _DEFAULT
     schedule, method = schedule or usual["schedule"], method or usual["method"]
     weighted = usual["weighted"] if weighted is None else weighted
-    paper, values = schedule == "paper", constants or {}
+    paper = schedule == "paper"
+    values = full_names(constants or {}, {"recover": DistillConfig(), "lift": LiftConfig()})
     lifting = changed(LiftConfig(), "lift", values)
     if scene is None:
         if views is None or is_made(views):

@@ -63,6 +63,8 @@ def evaluate(
 
     if photos and teacher is None:
         raise typer.BadParameter("--photos goes with --teacher: without a teacher all targets are photos")
+    if lpips_input != "scaled" and lpips is None:
+        raise typer.BadParameter("--lpips-input goes with --lpips: without weights there is no LPIPS")
     can_be_made(views, teacher)
     colour, settings = background or (0.0, 0.0, 0.0), RasterSettings(convention=convention)
     dense = load_scene(teacher, run.say) if teacher else None

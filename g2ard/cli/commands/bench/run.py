@@ -88,7 +88,10 @@ def run_(
     else:
         studies = [_narrowed(run, path, only, names, options) for path in definitions or []]
     if preset:
-        studies = [as_in_the_paper(study, released) for study in studies]
+        studies = [
+            as_in_the_paper(study, released, preset.removeprefix("paper-").removeprefix("paper") or None)
+            for study in studies
+        ]
     rows = bench_run(studies, output, keep=keep, again=run.overwrite, progress=run.progress)
     write_report(output, studies, rows)
     run.console.table(
