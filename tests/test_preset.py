@@ -75,6 +75,14 @@ def test_distill_does_all_that_the_paper_says(folder: Path, command_line: Comman
     assert (PAPER.steps, PAPER.round_steps) == (30_000, 8_000)
 
 
+def test_rounds_without_regularisers_are_named_once(folder: Path, command_line: CommandLine) -> None:
+    status, _, error = command_line(*DISTILL, "--preset", "paper", "-wv", cwd=folder)
+    assert status == 0, error
+    assert error.count("never acted") == 1
+    assert "never acted in round 1, round 2, round 3, round 4, the last recovery of round 4" in error
+    assert "there were 20 to 75" in error
+
+
 def test_what_is_said_beside_the_preset_stands(folder: Path, command_line: CommandLine) -> None:
     (folder / "c.toml").write_text('[distill]\npolicy = "pose-diverse"\nmethod = "default"\n')
     said = ("--config", "c.toml", "--method", "fast", "-k", 4, "--set", "regularizers.anchor=0.3")
