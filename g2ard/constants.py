@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from g2ard.errors import InputError
 
-__all__ = ["changed", "listed", "parsed"]
+__all__ = ["changed", "full_names", "listed", "parsed"]
 
 Config = TypeVar("Config")
 _UNIONS = (Union, types.UnionType)
@@ -58,6 +58,20 @@ def parsed(texts: Iterable[str], configs: Mapping[str, Any], without: Iterable[s
         full = _full(name.strip(), known)
         values[full] = _read(full, value.strip(), known[full])
     return values
+
+
+def full_names(values: Mapping[str, Any], configs: Mapping[str, Any]) -> dict[str, Any]:
+    """Values by the full names of constants; as `parsed`, a prefix may be left out where none else has it.
+
+    Raises:
+        InputError: a name that no config has, or several have.
+
+    >>> from g2ard.stages.recover.schedule import PAPER
+    >>> full_names({"means": 1e-3}, {"schedule": PAPER})
+    {'rates.means': 0.001}
+    """
+    known = {name: kind for name, kind, _ in _all(configs)}
+    return {_full(name, known): value for name, value in values.items()}
 
 
 def changed(config: Config, root: str, values: Mapping[str, Any]) -> Config:

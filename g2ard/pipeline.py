@@ -22,7 +22,7 @@ from g2ard.stages.recover.draw import checked_weights
 from g2ard.stages.recover.schedule import TUNED, Schedule
 from g2ard.stages.select.surfaces import CoverageOptions
 from g2ard.stages.simplify.config import SimplifyConfig
-from g2ard.targets import Photos, Subset, Targets, fingerprint_of
+from g2ard.targets import Photos, PhotosOrRenders, Subset, Targets, fingerprint_of
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
@@ -335,7 +335,7 @@ class _Rounds:
 
     def _steps(self) -> int:
         """The final horizon."""
-        photos = isinstance(self.targets, Photos)
+        photos = isinstance(self.targets, Photos | PhotosOrRenders)
         return final_steps(self.config, self.state, self.supervision.targets.cameras, photos=photos)
 
     def _seconds(self, final: bool) -> float | None:

@@ -78,5 +78,5 @@ def preset(name: str = "paper", prior: str = "trained") -> Preset:
         policy="directional",
         weighted=False,
     )
-    adapt = replace(AdaptConfig(), schedule="paper", tolerance=0.0, sh_degree=3)
+    adapt = replace(AdaptConfig(), schedule="paper", tolerance=0.0, prior_views=0.0, sh_degree=3)
     return Preset("paper", "directional", 0.5, recover, distill, adapt)

@@ -27,6 +27,8 @@ __all__ = [
     "TeacherRenders",
     "against_of",
     "fingerprint_of",
+    "kinds_of",
+    "kinds_told",
     "mask_of",
 ]
 
@@ -52,6 +54,25 @@ def against_of(targets: Targets, view: int) -> str | None:
     """What a view's target is, "photo" or "teacher"; None where the targets do not say."""
     says: Callable[[int], str | None] | None = getattr(targets, "against", None)
     return None if says is None else says(view)
+
+
+def kinds_of(targets: Targets) -> str:
+    """Of how many views the target is a photo, and of how many a teacher's render."""
+    said = [against_of(targets, view) for view in range(len(targets.cameras))]
+    return kinds_told(said.count("photo"), said.count("teacher"))
+
+
+def kinds_told(photos: int, renders: int) -> str:
+    """Targets of two kinds in words, counted where there are both.
+
+    >>> kinds_told(7, 9), kinds_told(7, 0)
+    ('7 photos and 9 teacher renders', 'photos')
+    """
+    from g2ard.io.clean import plural
+
+    if photos and renders:
+        return f"{plural(photos, 'photo')} and {plural(renders, 'teacher render')}"
+    return "photos" if photos else "teacher renders"
 
 
 def fingerprint_of(targets: Targets) -> str:

@@ -75,6 +75,14 @@ def test_distill_does_all_that_the_paper_says(folder: Path, command_line: Comman
     assert (PAPER.steps, PAPER.round_steps) == (30_000, 8_000)
 
 
+def test_rounds_without_regularisers_are_named_once(folder: Path, command_line: CommandLine) -> None:
+    status, _, error = command_line(*DISTILL, "--preset", "paper", "-wv", cwd=folder)
+    assert status == 0, error
+    assert error.count("never acted") == 1
+    assert "never acted in round 1, round 2, round 3, round 4, the last recovery of round 4" in error
+    assert "there were 20 to 75" in error
+
+
 def test_what_is_said_beside_the_preset_stands(folder: Path, command_line: CommandLine) -> None:
     (folder / "c.toml").write_text('[distill]\npolicy = "pose-diverse"\nmethod = "default"\n')
     said = ("--config", "c.toml", "--method", "fast", "-k", 4, "--set", "regularizers.anchor=0.3")
@@ -138,16 +146,58 @@ def test_the_other_commands_know_it(folder: Path, command_line: CommandLine) -> 
 
 def test_a_study_takes_it_in_g2ard_s_place() -> None:
     from g2ard.bench.definition import METHODS, Definition
-    from g2ard.cli.commands.bench.run import _as_in_the_paper
+    from g2ard.bench.paper import as_in_the_paper
 
     study = Definition(
         "s", "", (), tuple(METHODS[name] for name in ("g2ard", "pup", "g2ard-paper")), steps=(5,)
     )
-    paper, pup = _as_in_the_paper(study).methods
+    paper, pup = as_in_the_paper(study).methods
     assert (paper.name, paper.reduce, paper.rounds, paper.k) == ("g2ard-paper", "paper", "paper", 0.5)
-    assert (paper.schedule, _as_in_the_paper(study).sh_degree) == ("paper", 3)
-    assert (pup, _as_in_the_paper(study).released) == (METHODS["pup"], True)
-    assert not _as_in_the_paper(study, False).released
+    assert (paper.schedule, as_in_the_paper(study).sh_degree) == ("paper", 3)
+    assert (pup, as_in_the_paper(study).released) == (METHODS["pup"], True)
+    assert not as_in_the_paper(study, False).released
+
+
+DEFINITIONS = Path(__file__).parents[1] / "benches" / "definitions"
+
+
+@pytest.mark.parametrize("name", sorted(str(p.relative_to(DEFINITIONS)) for p in DEFINITIONS.rglob("*.toml")))
+def test_it_means_every_row_of_the_paper_s_alike(name: str) -> None:
+    from g2ard.bench.definition import read_definition
+    from g2ard.bench.paper import as_in_the_paper
+
+    study = read_definition(DEFINITIONS / name)
+    done = as_in_the_paper(study)
+    papers = [m for m in done.methods if m.reduce == "paper"]
+    assert papers
+    assert not any(m.reduce == "default" for m in done.methods)
+    assert {m.schedule for m in papers} == {"paper"}
+    if all(m.policy is None for m in study.methods):
+        assert {(m.policy, m.k) for m in papers} == {("directional", 0.5)}
+    else:  # which views there are is what is compared
+        before = {m.name: (m.policy, m.k) for m in study.methods}
+        assert all(before[m.name] == (m.policy, m.k) for m in papers)
+    told = "\n".join(done.differences)
+    for untrue in ("g2ard's rates in all rows", "all training views, not a", "not each method's released"):
+        assert untrue not in told
+    assert "rows g2ard" not in told
+    assert "row g2ard is ours" not in told
+    assert "paper's preset" in told
+    matched = "\n".join(as_in_the_paper(study, False).differences)
+    assert "stand beside" not in matched
+
+
+def test_two_priors_take_it_alike() -> None:
+    from g2ard.bench.definition import read_definition
+    from g2ard.bench.paper import as_in_the_paper
+
+    study = read_definition(DEFINITIONS / "source.toml")
+    rows = {m.name: m for m in as_in_the_paper(study).methods}
+    assert list(rows)[:3] == ["g2ard-paper", "g2ard-paper (lift)", "lightgaussian"]
+    lift = rows["g2ard-paper (lift)"]
+    assert lift == replace(rows["g2ard-paper"], name=lift.name, prior="lift")
+    alone = study.narrowed(methods=tuple(m for m in study.methods if m.name == "g2ard (lift)"))
+    assert as_in_the_paper(alone).methods == (lift,)
 
 
 def test_in_python() -> None:

@@ -93,3 +93,12 @@ def test_command(command_line: Callable[..., tuple[int, str, str]], tmp_path: Pa
     assert "--crop moon: not among the 2 views that are scored (view_000, view_008)" in err
     assert not (tmp_path / "none").exists()
     assert command_line(*common, "--crop", "9,9,9,9", "-o", "none", cwd=tmp_path)[0] == 2
+
+
+def test_a_crop_s_caption_says_whose_figure_it_gives() -> None:
+    page = Page("report", "")
+    grey = np.full((60, 80, 3), 128, np.uint8)
+    page.comparison(Comparison("view", grey, [Shown("small", grey // 2, "23.40 dB")]))
+    text = page.text()
+    captions = re.findall(r'class="crop">.*?<figcaption>(.*?)</figcaption>', text)
+    assert set(captions) == {"target", "small<br>whole view <b>23.40 dB</b>"}

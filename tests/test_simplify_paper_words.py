@@ -174,3 +174,70 @@ def test_flags_are_inherited_by_or():
     want = np.zeros(360, bool)
     want[out.parents[flags & (out.parents >= 0)]] = True
     np.testing.assert_array_equal(out.protected, want)
+
+
+# The table's constants (tab:s_config), each from both sides. E_j sums over channels: a checker of ±d: 3·d².
+
+
+@pytest.mark.parametrize(("other", "passes"), [(0.372, True), (0.378, False), (0.40, False)])
+def test_energy_and_flags_part_at_a_hundredth_summed_over_channels(other, passes):
+    points = sheet(4)
+    checks = np.where((points[:, 0] + points[:, 1]) % 2 == 0, 0.26, other)[:, None]
+    found = one_group(points, checks)
+    assert found.refused == {"energy": 0 if passes else 1, "coverage": 0}
+    assert found.merged == (15 if passes else 0)
+    assert flag(discs(points, checks), 1).any() != passes
+
+
+@pytest.mark.parametrize(("flat", "passes"), [(61, True), (59, False)])
+def test_coverage_parts_at_six_tenths_of_the_footprint_area(flat, passes):
+    points = sheet(10)
+    upright = np.random.default_rng(3).permutation(100) >= flat  # edge-on: no footprint on the floor
+    prior = discs(points, width=0.1, thickness=0.002)
+    prior.quats[upright] = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
+    out = simplify(prior, 1, method="paper", config=SimplifyConfig(retention=1e-9))
+    assert out.report.rounds[0].refused == {"energy": 0, "coverage": 0 if passes else 1}
+
+
+ALONE = SimplifyConfig(retention=1e-9, min_coverage=2)
+"""Nothing merges: what is left is what the trim keeps."""
+
+
+def thinned(areas, alphas, budget, flags=None):
+    """Which rows a trim to `budget` keeps, of single discs far apart with these areas and opacities."""
+    areas, alphas = np.asarray(areas, np.float64), np.asarray(alphas, np.float64)
+    points = sheet(20)[: len(areas)] * 5
+    # not square: A is the product of the two largest scales
+    scales = np.stack([np.sqrt(areas) * 1.5, np.sqrt(areas) / 1.5, np.full(len(areas), 1e-3)], 1)
+    prior = Splats.create(points, scales=scales, logit_opacities=np.log(alphas / (1 - alphas)))
+    flags = np.zeros(len(areas), bool) if flags is None else flags
+    out = simplify(prior, budget, method="paper", config=ALONE, protected=flags)
+    return out.parents >= 0
+
+
+def test_the_trim_ranks_by_opacity_and_footprint():
+    rng = np.random.default_rng(4)
+    areas, alphas = rng.uniform(0.1, 1, 200), rng.uniform(0.05, 0.95, 200)
+    priority = -np.log(1 - alphas) * areas
+    np.testing.assert_array_equal(thinned(areas, alphas, 80), priority >= np.sort(priority)[-80])
+
+
+@pytest.mark.parametrize("by", ["area", "opacity"])
+def test_protection_is_worth_eleven_times_the_mass_and_no_exemption(by):
+    """(1 + λ_h p), λ_h = 10; "softly boosts optical mass … rather than granting a hard exemption"."""
+    times = np.repeat([1.0, 10.5, 11.5], 20)
+    flags = times == 1
+    base = 0.02
+    areas = base * times if by == "area" else np.full(60, 0.2)
+    alphas = np.full(60, 0.5) if by == "area" else 1 - np.exp(-0.1 * times)
+    np.testing.assert_array_equal(thinned(areas, alphas, 20, flags), times == 11.5)
+    np.testing.assert_array_equal(thinned(areas, alphas, 40, flags), times != 10.5)
+    np.testing.assert_array_equal(thinned(areas, alphas, 40), times != 1)
+
+
+def test_what_is_under_a_hundredth_opaque_goes_first_whatever_its_size():
+    alphas = np.repeat([0.009, 0.011, 0.5], 40)
+    areas = np.where(alphas == 0.5, 0.001, 1.0)
+    areas[alphas == 0.009] = 4
+    np.testing.assert_array_equal(thinned(areas, alphas, 40), alphas == 0.011)
+    np.testing.assert_array_equal(thinned(areas, alphas, 80), alphas >= 0.011)

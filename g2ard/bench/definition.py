@@ -18,6 +18,7 @@ __all__ = ["METHODS", "Definition", "Matched", "MethodSpec", "SceneSpec", "read_
 
 _VARIABLE = re.compile(r"\$\{?(\w+)")
 _TARGETS = ("teacher", "photos", "either")
+_UNDONE = ("preset", "released", "matched")
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,7 @@ class Definition:
         lpips: folder of the networks' weights.
         lpips_input: "scaled" to [−1, 1], or "unscaled" as 3DGS's evaluation has it, see `g2ard.lpips.Lpips`.
         differs: in what the study differs from the paper's, a line each; reports print them.
+        differs_unless: lines that an option of the run undoes: "preset", "released", "matched" → lines.
     """
 
     name: str
@@ -103,6 +105,7 @@ class Definition:
     lpips: str | None = None
     lpips_input: str = "scaled"
     differs: tuple[str, ...] = ()
+    differs_unless: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     folder: Path = Path()
 
     def __post_init__(self) -> None:
@@ -141,6 +144,23 @@ class Definition:
                 raise InputError(f"{key}: expected {options}, got {value!r}")
         if not isinstance(self.differs, tuple) or not all(isinstance(line, str) for line in self.differs):
             raise InputError(f"differs: expected a list of lines, got {self.differs!r}")
+        if not isinstance(self.differs_unless, Mapping):
+            raise InputError(f"differs_unless: expected a table of lists, got {self.differs_unless!r}")
+        for key, lines in self.differs_unless.items():
+            if key not in _UNDONE:
+                raise InputError(f"differs_unless: expected {', '.join(_UNDONE)}, got {key!r}")
+            if not isinstance(lines, tuple) or not all(isinstance(line, str) for line in lines):
+                raise InputError(f"differs_unless: {key}: expected a list of lines, got {lines!r}")
+
+    @property
+    def differences(self) -> tuple[str, ...]:
+        """All lines that say in what the study, as it is run, differs from the paper's."""
+        return (*self.differs, *(line for lines in self.differs_unless.values() for line in lines))
+
+    def run_with(self, option: str, *lines: str) -> Definition:
+        """The same without the lines that an option undoes, and with those that it brings, first."""
+        kept = {key: value for key, value in self.differs_unless.items() if key != option}
+        return replace(self, differs=(*lines, *self.differs), differs_unless=kept)
 
     def matched(self, method: MethodSpec) -> list[Matched]:
         """The budgets under which a method is measured."""

@@ -64,9 +64,9 @@ def write_report(folder: Path, definitions: Sequence[Definition], rows: Sequence
 
 def _study(page: Page, folder: Path, definition: Definition, rows: Sequence[Row]) -> None:
     page.heading(definition.title or definition.name)
-    if definition.differs:
+    if definition.differences:
         page.paragraph("Differs from the paper:")
-        page.items(definition.differs)
+        page.items(definition.differences)
     names = [method.name for method in definition.methods]
     kinds = [kind for kind in _MARKS if any(row.matched == kind for row in rows)]
     page.html(legend(names, [_kind_label(kind) for kind in kinds]))

@@ -6,6 +6,7 @@ Exit status: 0 done · 1 failed · 2 usage · 3 a stated requirement was not met
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import os
 import traceback
@@ -124,6 +125,7 @@ class Run:
         self.verbose: bool = common["verbose"]
         self.json: str | None = common["json"]
         self.console = Console(quiet=common["quiet"])
+        self.only_checks = False  # whether the call ends once its constants are known to be right
         self.noted = False  # whether a GPU failed
         self.kept: list[str] = []  # what a Ctrl-C leaves, in words
         given = (*options.values(), common["config"])
@@ -151,6 +153,8 @@ class Run:
                 changed(config, root, values)
         except InputError as e:
             raise typer.BadParameter(f"--set: {e}") from None
+        if self.only_checks:
+            raise _Checked
         return values
 
     def progress(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
@@ -252,6 +256,8 @@ def command(
             if typed(ctx, "set"):  # after those of the config file, for the last counts
                 shared["set"] = [*(ctx.default_map or {}).get("set", []), *shared["set"]]
             if shared.pop("print_config"):
+                if shared.get("set"):
+                    _check_constants(Run(name, shared, dict(values)), fn, values)
                 typer.echo(printed(ctx, {**values, **shared}), nl=False)
                 return
             ours = interrupt.raises()
@@ -270,6 +276,17 @@ def command(
         return fn
 
     return register
+
+
+class _Checked(Exception):
+    """The constants are known and in range."""
+
+
+def _check_constants(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None:
+    """Refuse constants that the command does not have, as far as it asks for them, and do nothing else."""
+    run.only_checks = True
+    with contextlib.suppress(_Checked):
+        fn(run, **options)
 
 
 def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: bool) -> None:

@@ -173,6 +173,7 @@ CropOption = Annotated[
 Method = Literal["default", "fast", "paper"]
 ScheduleName = Literal["fast", "default", "best", "paper"]
 Preset = Literal["auto", "trained", "lift", "noisy", "paper", "paper-trained", "paper-lift", "paper-noisy"]
+Paper = Literal["paper", "paper-trained", "paper-lift", "paper-noisy"]
 
 _PAPER = {
     "method": "paper",
@@ -207,12 +208,14 @@ PresetOption = Annotated[
     ),
 ]
 PaperOption = Annotated[
-    Literal["paper"] | None,
+    Paper | None,
     typer.Option(
         "--preset",
         callback=_whole_paper,
         is_eager=True,
-        help="paper: all as in the paper, but for what other options say.",
+        help="paper, or with a row of its regularisers paper-trained, paper-lift, paper-noisy: all as in the"
+        " paper, but for what other options say.",
+        metavar="[paper|paper-…]",
     ),
 ]
 

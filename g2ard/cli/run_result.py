@@ -57,11 +57,12 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
 def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
     """What recovery kept, where it lost, and what no view saw, a line each; if `verbose`, regularisers that
     never acted too."""
-    from g2ard.stages.recover.outcome import outcome, unregularized
+    from g2ard.stages.recover.outcome import outcome, unregularized_rounds
     from g2ard.stages.recover.report import RecoverReport
 
-    done = [RecoverReport.of(done) for entry in report["rounds"] for done in entry.get("recover", [])]
-    lines = [outcome(one) for one in done] + ([unregularized(one) for one in done] if verbose else [])
+    rounds = [[RecoverReport.of(done) for done in entry.get("recover", [])] for entry in report["rounds"]]
+    lines = [outcome(one) for entry in rounds for one in entry]
+    lines += [unregularized_rounds(rounds)] if verbose else []
     found = [line for line in lines if line is not None]
     for kind, what in (("scores", "unseen views"), ("apart", "views of another kind")):
         if not report[kind]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -97,8 +98,9 @@ def distill(
         clean: first take out what no picture of the scene needs (`g2ard.clean`).
         views: cameras in world coordinates, or where they lie; None takes those beside the scene, else makes
             a pool of poses; "made" always makes one. Their test split is held out.
-        photos: True for the views' photos as targets, False for the scene's renders; None for photos if every
-            view has one. A cloud has no renders to learn from.
+        photos: True for the views' photos as targets, and no view without one; False for the scene's renders;
+            None for the photo of each view that has one, and the scene's render of the others (sec. 3.1). A
+            cloud has no renders to learn from: its lift is no picture of the place.
         held_out: views to score on instead.
         views_count: how many views recovery looks at: a count, a share in (0, 1] or "auto"; None for all, or
             for what the preset says.
@@ -208,7 +210,7 @@ def prepare(
     Raises:
         InputError: as `distill`.
     """
-    from g2ard.constants import changed
+    from g2ard.constants import changed, full_names
     from g2ard.io.clean import plural
     from g2ard.pipeline import DistillConfig
     from g2ard.policy.clean import clutter_seen
@@ -216,11 +218,13 @@ def prepare(
     from g2ard.stages.lift import LiftConfig
     from g2ard.stages.recover.presets import preset_for
     from g2ard.stages.recover.schedule import schedule_named
+    from g2ard.targets import kinds_told
 
     usual = _PAPER if preset.startswith("paper") else _DEFAULT
     schedule, method = schedule or usual["schedule"], method or usual["method"]
     weighted = usual["weighted"] if weighted is None else weighted
-    paper, values = schedule == "paper", constants or {}
+    paper = schedule == "paper"
+    values = full_names(constants or {}, {"recover": DistillConfig(), "lift": LiftConfig()})
     lifting = changed(LiftConfig(), "lift", values)
     if scene is None:
         if views is None or is_made(views):
@@ -255,12 +259,14 @@ def prepare(
         say=say,
     )
     train = looks.train.cameras
-    pictured = all(path is not None for path in (*train.image_paths, *looks.test.image_paths))
-    use_photos = lifted or (pictured if photos is None else photos)
+    pictured = [path is not None for path in (*train.image_paths, *looks.test.image_paths)]
+    use_photos = lifted or (any(pictured) if photos is None else photos)
+    taught = not (lifted or photos or (use_photos and all(pictured)))
     kind = "paper-lift" if lifted and preset == "paper" else preset
     regularizers, why, measured = preset_for(kind, prior, train if use_photos else None, paper=paper)
     counts = ", ".join(f"{aim.count:,}" for aim in aims)
-    against = "photos" if use_photos else "teacher renders"
+    shown = len(train) if not taught else sum(pictured[: len(train)]) if use_photos else 0
+    against = kinds_told(shown, len(train) - shown)
     say(f"{len(prior):,} → {counts} Gaussians; {plural(len(train), 'view')} against {against}")
     say(f"regularisers: {why}")
     config = DistillConfig(
@@ -281,8 +287,9 @@ def prepare(
     return DistillJob(
         prior=prior,
         aims=aims,
-        views=looks,
-        teacher=None if use_photos else prior,
+        views=replace(looks, apart=None) if use_photos else looks,  # photos are only where they were taken
+        teacher=prior if taught else None,
+        photos=use_photos and taught,
         config=changed(config, "recover", values),
         weights=looks.train.weights if weighted else None,
         lifting=lifting if lifted else None,

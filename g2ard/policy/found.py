@@ -46,7 +46,7 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
     if path is None:
         return None
     try:
-        views = read_view_set(path)
+        views = read_view_set(path, unpictured=True)
         for split in splits:
             split_mask(path, views.cameras.names, split, stated=views.splits)
     except InputError as error:

@@ -81,28 +81,30 @@ def load_view_sets(
     return [found.take(mask).resized(size) for mask in masks]
 
 
-def load_for_training(views: Views, size: int | None, say: Say = unsaid) -> ViewSet:
+def load_for_training(
+    views: Views, size: int | None, say: Say = unsaid, *, unpictured: bool = False
+) -> ViewSet:
     """The views to train on of a set beside which another is given to score on: its train split where it
-    states splits, else all.
+    states splits, else all; `unpictured` as for `load_views`.
 
     Raises:
         InputError: as `load_views`, and as `g2ard.splits.for_training`.
     """
     from g2ard.splits import for_training
 
-    found, path = _read(views, say)
+    found, path = _read(views, say, unpictured=unpictured)
     return found.take(for_training(path, found.cameras.names, found.splits)).resized(size)
 
 
-def load_held_out(views: Views, size: int | None, say: Say = unsaid) -> ViewSet:
-    """The views of a set given to score on.
+def load_held_out(views: Views, size: int | None, say: Say = unsaid, *, unpictured: bool = False) -> ViewSet:
+    """The views of a set given to score on; `unpictured` as for `load_views`.
 
     Raises:
         InputError: as `load_views`, and as `g2ard.splits.for_scores`.
     """
     from g2ard.splits import for_scores
 
-    found, path = _read(views, say)
+    found, path = _read(views, say, unpictured=unpictured)
     return found.take(for_scores(path, found.cameras.names, found.splits)).resized(size)
 
 
@@ -126,13 +128,16 @@ def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewS
     return train.take(keep)
 
 
-def load_trained(views: Views, split: str, size: int | None, say: Say = unsaid) -> ViewSet:
-    """The views of a split to train on, shrunk; says so if that makes training views of held-out ones.
+def load_trained(
+    views: Views, split: str, size: int | None, say: Say = unsaid, *, unpictured: bool = False
+) -> ViewSet:
+    """The views of a split to train on, shrunk; says so if that makes training views of held-out ones;
+    `unpictured` as for `load_views`.
 
     Raises:
         InputError: as `load_views`.
     """
-    pool, mask = load_split_views(views, split, say)
+    pool, mask = load_split_views(views, split, say, unpictured=unpictured)
     chosen = pool.take(mask)
     held_out = chosen.splits.count("test")
     if held_out:
@@ -140,15 +145,18 @@ def load_trained(views: Views, split: str, size: int | None, say: Say = unsaid) 
     return chosen.resized(size)
 
 
-def load_split_views(views: Views, split: str, say: Say = unsaid) -> tuple[ViewSet, NDArray[np.bool_]]:
-    """All views, each with the split it belongs to, stated or by the rule; and which of them `split` means.
+def load_split_views(
+    views: Views, split: str, say: Say = unsaid, *, unpictured: bool = False
+) -> tuple[ViewSet, NDArray[np.bool_]]:
+    """All views, each with the split it belongs to, stated or by the rule; and which of them `split` means;
+    `unpictured` as for `load_views`.
 
     Raises:
         InputError: as `load_views`.
     """
     from g2ard.splits import split_mask, splits_of
 
-    found, path = _read(views, say)
+    found, path = _read(views, say, unpictured=unpictured)
     names = found.cameras.names
     mask = split_mask(path, names, split, stated=found.splits)
     return replace(found, splits=splits_of(path, names, found.splits)), mask

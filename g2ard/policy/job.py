@@ -11,6 +11,7 @@ from g2ard.policy.inputs import make_targets
 from g2ard.policy.views import RunViews
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.splats import Splats
+from g2ard.targets import kinds_of
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
@@ -32,6 +33,7 @@ class DistillJob:
         aims: what one or more budgets came to; what they share is made once.
         views: what is looked at.
         teacher: whose renders the targets are; None where they are photos.
+        photos: with a teacher, the target of a view that has a photo is the photo.
         config: of the pipeline.
         weights: (C,) how often each view is drawn, where the views say so.
         lifting: constants of the lift; None where nothing was lifted.
@@ -46,6 +48,7 @@ class DistillJob:
     aims: tuple[Aim, ...]
     views: RunViews
     teacher: Splats | None
+    photos: bool
     config: DistillConfig
     weights: Any
     lifting: LiftConfig | None
@@ -62,8 +65,8 @@ class DistillJob:
 
     @property
     def against(self) -> str:
-        """What the targets are, in words."""
-        return "photos" if self.teacher is None else "teacher renders"
+        """What the views are scored against, in words."""
+        return kinds_of(self.held_out)
 
     @cached_property
     def targets(self) -> Targets:
@@ -99,6 +102,7 @@ class DistillJob:
             self.teacher,
             self.config.background,
             lazy=lazy,
+            photos=self.photos,
             progress=self.progress,
             say=self.say,
         )

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from g2ard.policy.budget import Budget
 from g2ard.policy.inputs import load_scene
@@ -32,6 +32,7 @@ def simplify(
     blind: bool = False,
     method: str = "default",
     config: SimplifyConfig | None = None,
+    constants: Mapping[str, Any] | None = None,
     beside: str | Path | None = None,
     up: Sequence[float] | None = None,
     seed: int = 0,
@@ -57,6 +58,8 @@ def simplify(
         blind: use no cameras at all.
         method: default, fast or paper; `g2ard.stages.simplify.simplify` says what they do.
         config: constants; None means the method's own.
+        constants: by full name, as `--set` has them, such as {"simplify.max_energy": 0.02}; they win over
+            `config`'s.
         beside: where to look for cameras, if `scene` is no path; its folder and its trainer's are looked in.
         up: (3,) away from the ground, for poses that are made; None to estimate it.
         seed: of poses that are made.
@@ -68,7 +71,7 @@ def simplify(
 
     Raises:
         InputError: not exactly one kind of budget, one that does not fit, an unknown method, views
-            that cannot be read, or both `views` and `blind`.
+            that cannot be read, no such constant, or both `views` and `blind`.
 
     >>> import numpy as np
     >>> ball = np.random.default_rng(0).normal(size=(900, 3))
@@ -77,8 +80,13 @@ def simplify(
     >>> len(small.splats), small.parents.shape, small.report.output_count
     (90, (900,), 90)
     """
+    from g2ard.constants import changed, full_names
     from g2ard.policy.fit import aim_of
+    from g2ard.stages.simplify import SimplifyConfig
 
+    if constants:
+        values = full_names(constants, {"simplify": SimplifyConfig()})
+        config = changed(config or SimplifyConfig(), "simplify", values)
     wanted = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     splats, beside, name = _scene(scene, beside, say)
     aim = aim_of(wanted, splats, name, file=f"scene.{format}", seed=seed, progress=progress, say=say)

@@ -83,7 +83,8 @@ def views_of(
         size: pixels that the longer side of a view is shrunk to; None leaves it.
         up: (3,) away from the ground, for poses that are made; None to estimate it.
         seed: of poses that are made.
-        teach: the scene can be rendered into other views than those given.
+        teach: the scene can be rendered: into views without a photo beside others, which are left out else,
+            and into other views than those given.
         progress: told of planning.
         say: told what is looked at, and why.
 
@@ -99,15 +100,16 @@ def views_of(
         found = views = found_views(beside, prior, wanted, say)
     if views is not None and not is_made(views):
         if held_out is None:
-            train, test = load_view_sets(views, ["train", "test"], size, say)
+            train, test = load_view_sets(views, ["train", "test"], size, say, unpictured=teach)
         else:
-            train, test = load_for_training(views, size, say), load_held_out(held_out, size, say)
+            train = load_for_training(views, size, say, unpictured=teach)
+            test = load_held_out(held_out, size, say, unpictured=teach)
             train = drop_held_out(train, test.cameras, say)
         if found and not size:
             train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
         apart = _near(prior, size, up, seed, progress) if teach else None
         return RunViews(train, test.cameras, apart)
-    held = None if held_out is None else load_held_out(held_out, size, say)
+    held = None if held_out is None else load_held_out(held_out, size, say, unpictured=teach)
     planned = _planned(prior, _POOL, up, seed, progress, _GROW)
     apart = planned.apart and planned.apart.resized(size)
     names = planned.cameras.names

@@ -163,9 +163,10 @@ class Page:
     def _crop(self, shown: Shown, window: Window) -> str:
         rows, columns = window.pixels(*shown.image.shape[:2])
         number = self._image(shown.image[rows, columns])
+        whole = f"<br>whole view <b>{escape(shown.caption)}</b>" if shown.caption else ""
         return (
             f'<figure class="crop"><img data-i="{number}" alt="{escape(shown.name)}">'
-            f"<figcaption>{escape(shown.name)}<br><b>{escape(shown.caption)}</b></figcaption></figure>"
+            f"<figcaption>{escape(shown.name)}{whole}</figcaption></figure>"
         )
 
     def _image(self, image: NDArray[np.uint8]) -> int:

@@ -35,8 +35,11 @@ def adapt(
     ] = 0.05,
     schedule: Annotated[Literal["default", "paper"], typer.Option(help="Rates and decay.")] = "default",
     prior_views: Annotated[
-        float, typer.Option(min=0, help="Weight of the old appearance, in views; 0 takes the fit as it is.")
-    ] = 1.0,
+        float | None,
+        typer.Option(
+            min=0, help="Weight of the old appearance, in views, 1; 0 takes the fit as it is, as paper does."
+        ),
+    ] = None,
     sh_degree: ShDegreeOption = None,
     resume: ResumeOption = False,
     split: SplitOption = "train",
@@ -53,12 +56,14 @@ def adapt(
     from g2ard.stages.adapt import adapt as refit
     from g2ard.stages.recover.schedule import schedule_named
 
+    if schedule == "paper" and prior_views:
+        raise typer.BadParameter("--prior-views: the paper's schedule takes the fit as it is")
     recovery = appearance_only(schedule_named(schedule))
     config = AdaptConfig(
         steps=steps,
         tolerance=tolerance,
         schedule=schedule,
-        prior_views=prior_views,
+        prior_views=prior_views if prior_views is not None else 1.0 if schedule == "default" else 0.0,
         sh_degree=sh_degree,
         background=background or (0.0, 0.0, 0.0),
         seed=run.seed,
@@ -71,7 +76,7 @@ def adapt(
     check_stopped(run, work, resume, output)
     splats = load_scene(compact, run.say)
     dense = load_scene(teacher, run.say) if teacher else None
-    cameras = load_trained(views, split, size, run.say).cameras
+    cameras = load_trained(views, split, size, run.say, unpictured=dense is not None).cameras
     targets = make_targets(cameras, dense, config.background, progress=run.progress, say=run.say)
     with stoppable(run, work, resume):
         work.mkdir(parents=True, exist_ok=True)

@@ -84,7 +84,7 @@ def distill(
         bool | None,
         typer.Option(
             "--photos/--renders",
-            help="Targets: the views' photos, or the scene's renders; photos if there are.",
+            help="Targets: photos, or the scene's renders; else each view's photo if it has one.",
         ),
     ] = None,
     held_out: Annotated[
@@ -151,6 +151,10 @@ def distill(
 
     Views are those of --views, else the cameras that lie beside the scene, else a pool of poses of its own.
     """
+    from g2ard.pipeline import DistillConfig
+    from g2ard.stages.lift import LiftConfig
+
+    values = run.constants(recover=DistillConfig(), lift=LiftConfig())
     budgets = budgets_of(count, ratio, fit, min_psnr, min_ssim)
     can_judge(k, policy)
     if is_made(str(held_out)):
@@ -161,13 +165,10 @@ def distill(
     if photos and is_made(views):
         raise typer.BadParameter("--photos: views that are made have none")
     from g2ard.io import kind
-    from g2ard.pipeline import DistillConfig
     from g2ard.policy.distill import prepare
     from g2ard.report.distilled import check_crops
-    from g2ard.stages.lift import LiftConfig
 
     began = time.monotonic()
-    values = run.constants(recover=DistillConfig(), lift=LiftConfig())
     one_horizon(steps, time_limit, values)
     engine = recovery_engine(run)
     name = f"scene.{format}"

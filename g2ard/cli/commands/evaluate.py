@@ -63,12 +63,14 @@ def evaluate(
 
     if photos and teacher is None:
         raise typer.BadParameter("--photos goes with --teacher: without a teacher all targets are photos")
+    if lpips_input != "scaled" and lpips is None:
+        raise typer.BadParameter("--lpips-input goes with --lpips: without weights there is no LPIPS")
     can_be_made(views, teacher)
     colour, settings = background or (0.0, 0.0, 0.0), RasterSettings(convention=convention)
     dense = load_scene(teacher, run.say) if teacher else None
     frozen = load_scene(anchors, run.say) if anchors else None
     views = views_or_teacher(run, views, teacher, dense)
-    cameras = load_views(views, split, size, run.say, unpictured=photos)
+    cameras = load_views(views, split, size, run.say, unpictured=dense is not None)
     targets = make_targets(
         cameras, dense, colour, photos=photos, settings=settings, progress=run.progress, say=run.say
     )

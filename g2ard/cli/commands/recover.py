@@ -45,6 +45,10 @@ def recover(
     output: OutputOption,
     views: ViewsOrMadeOption = None,
     teacher: TeacherOption = None,
+    photos: Annotated[
+        bool,
+        typer.Option("--photos", help="With --teacher: each view's photo where it has one, else the render."),
+    ] = False,
     anchors: Annotated[
         Path | None,
         typer.Option(
@@ -69,6 +73,7 @@ def recover(
     from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
+    from g2ard.io.clean import plural
     from g2ard.policy.inputs import (
         load_scene,
         load_trained,
@@ -79,9 +84,12 @@ def recover(
     from g2ard.stages.recover.outcome import outcome, unregularized
     from g2ard.stages.recover.presets import preset_for
     from g2ard.stages.recover.schedule import schedule_named
+    from g2ard.targets import kinds_of
 
     values = run.constants(recover=RecoverConfig())
     one_horizon(steps, time_limit, values)
+    if photos and teacher is None:
+        raise typer.BadParameter("--photos goes with --teacher: without a teacher all targets are photos")
     can_be_made(views, teacher)
     checkpoint = output.parent / f".{output.name}.checkpoint.npz"
     if left_at(checkpoint) or not (resume and output.exists()):
@@ -92,8 +100,9 @@ def recover(
     splats = load_scene(student, run.say)
     dense = load_scene(teacher, run.say) if teacher else None
     views = views_or_teacher(run, views, teacher, dense)
-    chosen = load_trained(views, split, size, run.say)
-    targets = make_targets(chosen.cameras, dense, colour, progress=run.progress, say=run.say)
+    chosen = load_trained(views, split, size, run.say, unpictured=dense is not None)
+    targets = make_targets(chosen.cameras, dense, colour, photos=photos, progress=run.progress, say=run.say)
+    run.say(f"{plural(len(chosen.cameras), 'view')} against {kinds_of(targets)}")
     weights = chosen.weights if weighted else None
     if weights is not None:
         run.say(f"views are drawn by their weights ({len(weights)})")

@@ -99,12 +99,12 @@ def register(
     from g2ard.stages.register import register as find
     from g2ard.stages.register.score import summarize
 
+    config = RegisterConfig(size=size, accept=accept, matcher=matcher, refine=refine, passes=passes)
+    config = changed(config, "register", run.constants(register=config))
     if metres_per_unit is not None and truth is None:
         raise typer.BadParameter("--metres-per-unit goes with --truth")
     if intrinsics is not None and focal is not None:
         raise typer.BadParameter("--intrinsics and --focal exclude each other")
-    config = RegisterConfig(size=size, accept=accept, matcher=matcher, refine=refine, passes=passes)
-    config = changed(config, "register", run.constants(register=config))
     check_output(output, run.overwrite)
     if report is not None:
         if report.resolve() in {p.resolve() for p in (output, scene, poses, truth, intrinsics, photos) if p}:

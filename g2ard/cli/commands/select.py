@@ -52,10 +52,10 @@ def select(
     from g2ard.stages.select import CoverageOptions
     from g2ard.stages.select import select as choose
 
+    values = run.constants(select=CoverageOptions(), over_options=True)
     if views is None:
         raise typer.BadParameter("--views VIEWS: the candidates to select from")
     can_judge(k, policy)
-    values = run.constants(select=CoverageOptions(), over_options=True)
     options = changed(CoverageOptions(cells=cells), "select", values)
     check_views_output(output, run.overwrite)
     splats = load_scene(scene, run.say)

@@ -59,6 +59,9 @@ def simplify(
     The default method weighs errors by what is seen: from --views, else from the cameras that lie beside the
     scene, else from a pool of poses of its own. The fast one looks only at given views, the paper's at none.
     """
+    from g2ard.stages.simplify import SimplifyConfig
+
+    values = run.constants(simplify=SimplifyConfig(), over_options=True)
     budgets = budgets_of(count, ratio, fit, min_psnr, min_ssim)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other")
@@ -67,9 +70,7 @@ def simplify(
     from g2ard.policy.fit import aim_of
     from g2ard.policy.inputs import say_notes
     from g2ard.policy.simplify import simplify_each
-    from g2ard.stages.simplify import SimplifyConfig
 
-    values = run.constants(simplify=SimplifyConfig(), over_options=True)
     config = changed(SimplifyConfig(retention=retention), "simplify", values)
     outputs = Outputs(run, output, budgets)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from g2ard.stages.recover.report import RecoverReport
 
-__all__ = ["outcome", "unregularized"]
+__all__ = ["outcome", "unregularized", "unregularized_rounds"]
 
 
 def outcome(report: RecoverReport) -> str | None:
@@ -44,10 +46,35 @@ def outcome(report: RecoverReport) -> str | None:
 
 def unregularized(report: RecoverReport) -> str | None:
     """One line about weights that never acted, for there were fewer steps than one period; else None."""
-    held = report.regularizers
-    if report.kept_start or held.steps or not held.period or not report.steps:
+    if not _idle(report):
         return None
     return (
-        f"the regularisers never acted: they do every {held.period} steps, and there were {report.steps} "
-        "(--set regularizers.period=…)"
+        f"the regularisers never acted: they do every {report.regularizers.period} steps, and there were "
+        f"{report.steps} (--set regularizers.period=…)"
     )
+
+
+def unregularized_rounds(rounds: Sequence[Sequence[RecoverReport]]) -> str | None:
+    """The same of all recoveries of a run, round by round: one line that names those; else None."""
+    if sum(map(len, rounds)) == 1:
+        return next(unregularized(done) for entry in rounds for done in entry)
+    idle = {
+        f"round {number}" if k == 0 else f"the last recovery of round {number}": done
+        for number, entry in enumerate(rounds, 1)
+        for k, done in enumerate(entry)
+        if _idle(done)
+    }
+    if not idle:
+        return None
+    period = next(iter(idle.values())).regularizers.period
+    steps = sorted({done.steps for done in idle.values()})
+    least = f"{steps[0]}" if len(steps) == 1 else f"{steps[0]} to {steps[-1]}"
+    return (
+        f"the regularisers never acted in {', '.join(idle)}: they do every {period} steps, and there were "
+        f"{least} (--set regularizers.period=…)"
+    )
+
+
+def _idle(report: RecoverReport) -> bool:
+    held = report.regularizers
+    return not report.kept_start and not held.steps and bool(held.period) and bool(report.steps)

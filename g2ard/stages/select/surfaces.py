@@ -33,7 +33,7 @@ Order = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class CoverageOptions:
-    """Of the policies that look at surfaces (main text, eq. 2; `tab:s_avs`).
+    """Of the policies that look at surfaces (the paper, eq. `view_selection`; `tab:s_avs`).
 
     Args:
         cells: surface cells M; adaptive voxels.

@@ -62,6 +62,7 @@ def run_(
     A stopped run goes on where it was, -w measures anew; a cell that failed is a row with its error, and is
     tried again. DIR/report.html is of the studies named last, DIR/rows.csv of all that DIR holds.
     """
+    from g2ard.bench.paper import as_in_the_paper
     from g2ard.bench.report import write_report
     from g2ard.bench.run import bench_run
 
@@ -87,7 +88,10 @@ def run_(
     else:
         studies = [_narrowed(run, path, only, names, options) for path in definitions or []]
     if preset:
-        studies = [_as_in_the_paper(study, released) for study in studies]
+        studies = [
+            as_in_the_paper(study, released, preset.removeprefix("paper-").removeprefix("paper") or None)
+            for study in studies
+        ]
     rows = bench_run(studies, output, keep=keep, again=run.overwrite, progress=run.progress)
     write_report(output, studies, rows)
     run.console.table(
@@ -135,6 +139,7 @@ def _narrowed(
 ) -> Definition:
     """A definition with the options that apply to it: it keeps to the kinds of budget it has."""
     from g2ard.bench.definition import read_definition
+    from g2ard.bench.paper import with_released
     from g2ard.errors import InputError
 
     study = read_definition(path)
@@ -150,27 +155,13 @@ def _narrowed(
     methods = _chosen(study, names) if names else None
     given = ", ".join(f"{key} {_told(value)}" for key, value in (own | shared).items() if value is not None)
     line = (f"run with {given} instead of what the study and the lines below say",) if given else ()
-    differs = (*line, *study.differs)
-    return study.narrowed(**own, **shared, scenes=scenes, methods=methods, differs=differs)
+    narrow = study.narrowed(**own, **shared, scenes=scenes, methods=methods, differs=(*line, *study.differs))
+    released = options["released"]
+    return narrow if released is None else with_released(narrow, released)
 
 
 def _told(value: object) -> str:
     return " and ".join(f"{part:g}" for part in value) if isinstance(value, tuple) else str(value)
-
-
-def _as_in_the_paper(study: Definition, released: bool | None = None) -> Definition:
-    """The study with the paper's method, views and rates in g2ard's place, and SH of degree 3.
-
-    Each method's own schedule is run as well, unless `released` says otherwise; methods that the study
-    itself defines stay as they are.
-    """
-    from dataclasses import replace
-
-    from g2ard.bench.definition import METHODS
-
-    paper = replace(METHODS["g2ard-paper"], policy="directional", k=0.5, schedule="paper")
-    methods = dict.fromkeys(paper if m.name in ("g2ard", paper.name) else m for m in study.methods)
-    return study.narrowed(methods=tuple(methods), sh_degree=3, released=released is not False)
 
 
 def _chosen(study: Definition, names: list[str]) -> tuple[MethodSpec, ...]:

@@ -1,4 +1,4 @@
-//! Greedy choice of views by how they cover the surface (main text, eq. 2; supplement, algorithm S1).
+//! Greedy choice of views by how they cover the surface (the paper, eq. `view_selection`, algorithm `alg:s_avs`).
 
 use std::cmp::{Ordering, Reverse};
 use std::collections::BinaryHeap;
