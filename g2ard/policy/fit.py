@@ -29,12 +29,15 @@ _VIEWS, _SIDE = 12, 400
 _ROWS = 100_000
 """Gaussians that those are planned on."""
 _SAMPLE = 4096
+"""Gaussians of the first probe, a file of which tells about what each takes."""
 _MARGIN = 0.985
 """Of the bytes asked for: merged scenes pack a little better or worse than the probe."""
 _PROBES, _CLOSE = 2, 0.05
+"""Further files written to find a count of bytes, and the share of the bytes that is close enough to stop."""
 _STEP = 0.65
 """Share of the Gaussians between looks at the quality."""
 _FEWEST = 64
+"""Gaussians that the search for a quality stops at."""
 
 
 @dataclass(frozen=True)
@@ -129,10 +132,7 @@ def count_for_quality(
     counts PSNR is taken as linear in the logarithm of the count, which one more look checks.
 
     Returns:
-        The count, and what the scene of the shrinking had at or just above it.
-
-    Raises:
-        InputError: the first step falls short already by more than the whole scene could gain.
+        The count, at most the scene's own, and what the scene of the shrinking had at or just above it.
     """
     renders = _images(splats, cameras)
     above, scene, good = len(splats), splats, Quality(float("inf"), 1.0)
@@ -258,14 +258,14 @@ def aim_of(
     Args:
         budget: of any kind.
         splats: the scene.
-        name: what errors call it.
+        name: what errors call the scene.
         file: a name whose suffix is the format of the file that `Budget.fit` speaks of.
         seed: of the views that quality is measured in.
         progress: told of planning.
         say: told what was found.
 
     Raises:
-        InputError: the budget is above the scene's count, or nothing meets it.
+        InputError: the budget is above the scene's count, or no file of its format has so few bytes.
         OutputError: `file` names no format of scenes.
     """
     if budget.min_psnr is not None or budget.min_ssim is not None:
