@@ -330,3 +330,15 @@ def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
     view = np.eye(4)
     view[:3, :3], view[:3, 3] = R, -R @ eye
     return view
+
+
+def unseeing(cameras: Cameras, what: str) -> str:
+    """What an error says where no view sees `what`, and what to do.
+
+    >>> unseeing(Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0])]), "the scene")
+    'none of 1 view sees the scene; the views and the scene must be of one world (`g2ard info` shows both)'
+    """
+    count = f"{len(cameras):,} view{'s' * (len(cameras) != 1)}"
+    return (
+        f"none of {count} sees {what}; the views and the scene must be of one world (`g2ard info` shows both)"
+    )

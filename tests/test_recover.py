@@ -492,5 +492,8 @@ def test_refuses_a_horizon_that_is_none(wrong: dict[str, Any]) -> None:
 def test_views_that_see_nothing_of_the_scene_are_refused() -> None:
     ahead = VIEWS.take([0])
     behind = replace(TEACHER, means=(TEACHER.means - 99 * ahead.forwards[0]).astype(np.float32))
-    with pytest.raises(InputError, match="none of the 1 views sees the scene"):
+    with pytest.raises(
+        InputError,
+        match="recover: none of 1 view sees the scene; the views and the scene must be of one world",
+    ):
         recover(behind, TeacherRenders(TEACHER, ahead), RecoverConfig(steps=2))

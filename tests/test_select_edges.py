@@ -181,7 +181,7 @@ def test_the_command_on_pools_of_all_shapes(command_line: CommandLine, folder: P
     write_views(folder / "pool.json", cameras([away]), overwrite=True)
     status, _, error = ask(command_line, folder, 1, "-w", "--split", "all")
     assert status == 1
-    assert "none of the 1 candidate views sees the scene" in error
+    assert "none of 1 view sees the scene" in error
 
 
 def test_the_command_reads_k_off_the_curve(command_line: CommandLine, folder: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from g2ard.cameras import unseeing
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
@@ -92,7 +93,7 @@ def recover(
     if not len(student) or not len(targets.cameras):
         raise InputError(f"recover: {len(student)} Gaussians and {len(targets.cameras)} views: nothing to do")
     if not targets.cameras.facing(student.means.astype(np.float64) + student.offset).any():
-        raise InputError(f"recover: none of the {len(targets.cameras)} views sees the scene")
+        raise InputError(f"recover: {unseeing(targets.cameras, 'the scene')}")
     if config.sh_degree is not None:
         student = student.with_sh_degree(config.sh_degree)
     anchors = anchors or Anchors.of(student, config.regularizers.in_plane)

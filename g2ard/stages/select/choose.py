@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Cameras
+from g2ard.cameras import Cameras, unseeing
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
@@ -124,7 +124,7 @@ def select(
     wanted = poses.inverse_density(alike)
     usable = (depths > 0) & ~poses.inside_geometry(splats, cameras, depths, progress)
     if not usable.any():
-        raise InputError(f"none of the {len(cameras)} candidate views sees the scene")
+        raise InputError(unseeing(cameras, "the scene"))
     seconds["poses"] = time.perf_counter() - began
     evaluations = 0
     if policy in ("directional", "coverage"):
@@ -140,7 +140,7 @@ def select(
         order = _blind(policy, np.flatnonzero(usable), k, seed)
         gains = poses.gains_of(order, alike, wanted)
     if not len(order):
-        raise InputError(f"none of the {len(cameras)} candidate views sees a cell of the surface")
+        raise InputError(unseeing(cameras, "a cell of the surface"))
     count = _knee(gains) if k == "auto" else min(k, len(order))
     share = gains / total if (total := gains.sum()) > 0 else np.full(len(gains), 1 / len(gains))
     seconds["total"] = time.perf_counter() - began
