@@ -10,7 +10,12 @@ def main() -> None:
     interrupt.ends_the_program()
     from g2ard.cli import main as command_line
 
-    command_line()
+    try:
+        command_line()
+    except SystemExit as end:
+        if end.code == interrupt.STATUS:
+            interrupt.leave()
+        raise
 
 
 if __name__ == "__main__":

@@ -13,12 +13,15 @@ if TYPE_CHECKING:
     from types import FrameType
     from typing import NoReturn
 
-__all__ = ["ends_the_program", "raises"]
+__all__ = ["STATUS", "ends_the_program", "leave", "raises"]
+
+STATUS = 130
+"""What the program ends with after Ctrl-C."""
 
 
 def _end(number: int, frame: FrameType | None) -> NoReturn:
     os.write(2, b"g2ard: interrupted\n")
-    os._exit(130)
+    os._exit(STATUS)
 
 
 def ends_the_program() -> None:
@@ -33,3 +36,16 @@ def raises() -> bool:
         return False
     signal.signal(signal.SIGINT, signal.default_int_handler)
     return True
+
+
+def leave() -> NoReturn:
+    """End at once with `STATUS`.
+
+    If the signal came while source was executed from a string, as making a dataclass does, Python remembers
+    that as an interrupt nobody handled, and would end a program that has handled it by the signal.
+    """
+    import sys
+
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(STATUS)

@@ -154,3 +154,22 @@ def test_a_format_that_is_not_written_is_refused_before_the_work(
     assert status == 1
     assert words in error
     assert len(error.splitlines()) == 1
+
+
+def test_an_interrupt_while_a_string_is_executed_ends_with_130_too() -> None:
+    """Python itself would end by the signal, though the interrupt was handled."""
+    code = """
+import sys
+import g2ard.cli
+from g2ard.__main__ import main
+def stopped():
+    try:
+        exec("raise KeyboardInterrupt")
+    except KeyboardInterrupt:
+        print("kept")
+    sys.exit(130)
+g2ard.cli.main = stopped
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (130, "kept\n")

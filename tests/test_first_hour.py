@@ -265,6 +265,15 @@ def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_pa
     assert (status, "give a SCENE, or photos" in error) == (2, True)
 
 
+def test_a_result_that_outweighs_the_photos_points_says_so(command_line: CommandLine, tmp_path: Path) -> None:
+    photos_of(tmp_path / "photos", points=True)
+    ask = ("distill", "--views", "photos", "-n", 900, "--steps", 3)
+    error = command_line(*ask, "-o", "run", cwd=tmp_path)[2]
+    assert "MB, the points, lifted as they are, have 0." in error, error
+    light = command_line(*ask, "--sh-degree", 0, "-n", 300, "-o", "light", cwd=tmp_path)[2]
+    assert "lifted as they are" not in light, light
+
+
 def test_points_within_sight_lie_on_what_is_seen(tmp_path: Path) -> None:
     photos_of(tmp_path / "photos")
     cameras = g2ard.load_views(tmp_path / "photos")

@@ -229,7 +229,9 @@ def _duration(text: str) -> float:
 
 TimeLimitOption = Annotated[
     float | None,
-    typer.Option("--time-limit", parser=_duration, metavar="TIME", help="Fit recovery into 90s, 2m or 1h."),
+    typer.Option(
+        "--time-limit", parser=_duration, metavar="TIME", help="Fit recovery alone into 90s, 2m or 1h."
+    ),
 ]
 
 

@@ -103,17 +103,17 @@ def say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:
         )
 
 
-def say_weight(run: Run, source: Path, output: Path, splats: Splats) -> None:
-    """A result that outweighs the file it was made from: what of it is colour by direction, and how to be rid
-    of it."""
-    if (
-        source.suffix.lower() == ".json"
-        or not source.is_file()
-        or output.stat().st_size < source.stat().st_size
-    ):
+def say_weight(run: Run, source: Path, output: Path, splats: Splats, *, lifted: Splats | None = None) -> None:
+    """A result that outweighs what it was made from, the file or the points `lifted`: what of it is colour by
+    direction, and how to be rid of it."""
+    inputs = [] if lifted is None else [(lifted.nbytes, "the points, lifted as they are, have")]
+    if source.is_file() and source.suffix.lower() != ".json":
+        inputs.append((source.stat().st_size, f"{source.name} has"))
+    made = output.stat().st_size
+    given, what = min(inputs, default=(made + 1, ""))
+    if made < given:
         return
-    made, given = (path.stat().st_size / 1e6 for path in (output, source))
-    sizes = f"{output}: {made:.2f} MB, {source.name} has {given:.2f} MB"
+    sizes = f"{output}: {made / 1e6:.2f} MB, {what} {given / 1e6:.2f} MB"
     share = splats.shN.nbytes / splats.nbytes
     hint = "packed formats are smaller than .ply"
     if share:

@@ -80,7 +80,8 @@ def convert(
     io.write_splats(output, splats, overwrite=run.overwrite, **options)
     size = _size(output)
     kept = f"{len(splats):,}" if len(splats) == read else f"{len(splats):,} of {read:,}"
-    run.say(f"{output}: {kept} Gaussians, {size / 1e6:.2f} MB, {size / len(splats):.1f} bytes each")
+    what = "Gaussian" if kept == "1" else "Gaussians"
+    run.say(f"{output}: {kept} {what}, {size / 1e6:.2f} MB, {size / len(splats):.1f} bytes each")
     run.result({"output": str(output), "input_count": read, "output_count": len(splats), "bytes": size})
 
 

@@ -313,7 +313,7 @@ def _distil(
     for line in told(report, verbose=run.verbose):
         run.say(line)
     say_views(run, report["views"], job.config.views is not None)
-    say_weight(run, source, place, result.splats)
+    say_weight(run, source, place, result.splats, lifted=None if job.lifting is None else job.prior)
     run.say(
         f"scene: {place} ({place.stat().st_size / 1e6:.2f} MB)\npicture: {output / 'preview.png'}\n"
         f"report: {output / 'report.html'}, {output / 'report.json'}" + (f"\n{page}" if page else "")
