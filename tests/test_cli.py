@@ -156,9 +156,9 @@ def test_a_format_that_is_not_written_is_refused_before_the_work(
     assert len(error.splitlines()) == 1
 
 
-def test_an_interrupt_while_a_string_is_executed_ends_with_130_too() -> None:
-    """Python itself would end by the signal, though the interrupt was handled."""
-    code = """
+def test_an_interrupt_while_a_string_is_executed_ends_with_130_too(tmp_path: Path) -> None:
+    """`python -m` would end by the signal, though the interrupt was handled."""
+    (tmp_path / "stopped.py").write_text("""
 import sys
 import g2ard.cli
 from g2ard.__main__ import main
@@ -170,6 +170,7 @@ def stopped():
     sys.exit(130)
 g2ard.cli.main = stopped
 main()
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+""")
+    command = [sys.executable, "-m", "stopped"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (130, "kept\n")
