@@ -324,7 +324,7 @@ def test_every_policy_on_every_pool(policy):
     partly = run(away, 3)
     assert sorted(partly.order.tolist()) == [0, 1]
     assert partly.refused.tolist() == [2]
-    with pytest.raises(InputError, match="none of the 1"):
+    with pytest.raises(InputError, match="none of 1 view sees the scene"):
         run(away.take([2]), 1)
 
 
