@@ -17,7 +17,6 @@ from g2ard.poses.shape import shape_of
 from g2ard.poses.sight import Lens, Poses
 from g2ard.poses.site import Site
 from g2ard.poses.walk import plan_walk
-from g2ard.splats import Splats
 
 __all__ = ["plan_auto"]
 
@@ -42,7 +41,7 @@ looked through."""
 
 def plan_auto(
     site: Site,
-    splats: Splats,
+    look: Callable[[], Glance],
     inside: Inside,
     count: int,
     lens: Lens,
@@ -69,7 +68,7 @@ def plan_auto(
     if missing():
         shape, shape_why = shape_of(site)
         why.append(f"{shape}: {shape_why}")
-        glance = Glance(splats)
+        glance = look()
         far = _far(site, glance, "aerial" if shape == "landscape" else "orbit", missing(), lens, seed, tell)
         if shape != "object" and far.sharp:
             part = round((_STREET if shape == "landscape" else 1.0) * missing())

@@ -68,7 +68,7 @@ class Focus:
 class Glance:
     """Small renders of a sample of a scene, sky and floaters included, that tell what is in focus."""
 
-    def __init__(self, splats: Splats) -> None:
+    def __init__(self, splats: Splats, represents: float = 1.0) -> None:
         rows = np.flatnonzero(splats.opacities > 1 / 255)
         some = rows[canonical_order(splats, rows)[:_ROWS]]
         sample = splats.take(some[splats.take(some).finite_rows()])
@@ -76,7 +76,7 @@ class Glance:
         self._sigma = np.sqrt(scales[:, 1] * scales[:, 2])
         self._middle = sample.offset + np.median(sample.means.astype(np.float64), axis=0)
         means = sample.means.astype(np.float64) + sample.offset - self._middle
-        widen = min(_MOST_WIDENED, np.sqrt(len(rows) / max(1, len(some))))
+        widen = min(_MOST_WIDENED, np.sqrt(represents * len(rows) / max(1, len(some))))
         shortest = np.arange(3) == np.argmin(sample.scales, axis=1)[:, None]
         logs = np.log(np.maximum(sample.scales, np.finfo(np.float32).tiny))
         self._means = means

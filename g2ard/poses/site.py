@@ -46,13 +46,15 @@ class Site:
     up: Up
 
     @classmethod
-    def of(cls, splats: Splats, up: ArrayLike | None = None, rows: int | None = None) -> Site:
-        """Stand a scene upright, looking at `rows` of its Gaussians at most.
+    def of(
+        cls, splats: Splats, up: ArrayLike | None = None, rows: int | None = None, represents: float = 1.0
+    ) -> Site:
+        """Stand a scene upright, looking at `rows` of its Gaussians at most; each represents so many.
 
         Raises:
             InputError: nothing visible, or an `up` that is no direction.
         """
-        volume = OccupiedVolume.of(splats, rows)
+        volume = OccupiedVolume.of(splats, rows, represents)
         some = volume.sample()
         found = estimate_up(some) if up is None else given_up(some, up)
         axes = _axes(some, found.axis)

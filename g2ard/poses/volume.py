@@ -78,10 +78,11 @@ class OccupiedVolume:
     represents: float = 1.0
 
     @classmethod
-    def of(cls, splats: Splats, limit: int | None = None) -> OccupiedVolume:
+    def of(cls, splats: Splats, limit: int | None = None, represents: float = 1.0) -> OccupiedVolume:
         """Weigh a scene's rows, leave out what is invisible or far off, and normalise the rest.
 
-        Of more than `limit` rows only a fair sample is looked at.
+        Of more than `limit` rows only a fair sample is looked at; the scene itself may be one, of which every
+        row represents so many.
 
         Raises:
             InputError: nothing is visible.
@@ -90,7 +91,7 @@ class OccupiedVolume:
         rows = np.flatnonzero(opacities > 1 / 255)
         visible = len(rows)
         rows = rows[canonical_order(splats, rows)[:limit]]
-        represents = visible / max(1, len(rows))
+        represents *= visible / max(1, len(rows))
         if len(rows):
             rows = rows[splats.take(rows).finite_rows()]
         opacities = opacities[rows]

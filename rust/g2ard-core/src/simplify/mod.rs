@@ -18,6 +18,7 @@ mod paper;
 mod real;
 mod residual;
 mod rows;
+mod tile;
 mod trim;
 
 pub use guards::{coverage, disc};
@@ -26,7 +27,10 @@ pub use moments::{MAX_OPACITY, Merged, merge, optical_mass, pool, weights};
 pub use outcome::Outcome;
 pub use pairwise::{Pairwise, PairwiseRound, Visibility};
 pub use paper::{Paper, PaperRound};
+pub use importance::Importance;
 pub use residual::{Texture, color, flags};
+pub use matching::Pair;
+pub use tile::{Frame, Tile, TilePlan};
 
 use crate::Splats;
 
