@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
-from g2ard.io.clean import BLOCK, LOG_SCALE_LIMIT, Raw, Tally, cleaned, plural
-from g2ard.io.plyfiles import offset_of, read_element, read_header, require
+from g2ard.io.clean import BLOCK, LOG_SCALE_LIMIT, Raw, cleaned, plural
+from g2ard.io.plyfiles import offset_of, read_element, read_header, require, row_blocks
 from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Note, Scene
 from g2ard.splats import Splats, unit_quats
@@ -90,34 +90,20 @@ def stream(path: Path) -> SceneStream:
 
 class _PlyStream(SceneStream):
     def __init__(self, path: Path) -> None:
-        self.path, self._layout, self.tally = path, _Layout.of(path), Tally()
-        self.count, self.offset = len(self._layout.rows), self._layout.offset
-        self.sh_degree = _REST_OF_BANDS.index(self._layout.kept)
-        self.notes = tuple(self._layout.notes)
+        layout = self._layout = _Layout.of(path)
+        super().__init__(path, len(layout.rows), layout.kept, layout.offset, tuple(layout.notes))
 
     def identity(self) -> list[Any]:
         return file_identity([self.path])
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
-        with np.errstate(over="ignore", invalid="ignore"):
-            yield from (_means(block, self._layout.shift) for block in self._rows(rows, 0))
+        for _, block in row_blocks(self.path, self._layout.rows, rows):
+            with np.errstate(over="ignore", invalid="ignore"):
+                means = _means(block, self._layout.shift)
+            yield means
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
-        return (self._layout.raw(block) for block in self._rows(rows, start))
-
-    def _rows(self, rows: int, start: int) -> Iterator[NDArray[Any]]:
-        """Read, not mapped: pages of a mapping count as memory of the process."""
-        every = self._layout.rows
-        for first in range(start, self.count, rows):
-            count = min(rows, self.count - first)
-            if not isinstance(every, np.memmap):
-                yield every[first : first + count]
-                continue
-            at = every.offset + first * every.itemsize
-            block = np.fromfile(self.path, every.dtype, count, offset=at)
-            if len(block) < count:
-                raise InputError(f"{self.path}: became shorter while it was read")
-            yield block
+        return (self._layout.raw(block) for _, block in row_blocks(self.path, self._layout.rows, rows, start))
 
 
 def _bands(path: Path, rest: list[str]) -> tuple[int, int]:

@@ -56,7 +56,7 @@ def ingest(
     Where it was interrupted the same call goes on from the last block, and where all is done it returns.
 
     Args:
-        source: a scene that `g2ard.io.stream.open_stream` knows.
+        source: a scene, or several as one, as `g2ard.io.stream.open_stream` takes them.
         folder: where the tiles go; absent, empty, or holding these tiles in part or whole.
         tile_rows: Gaussians of a tile at the most; only Gaussians of one position are never parted.
         block_rows: rows in memory at a time; None takes 16 MiB of them.
@@ -71,7 +71,7 @@ def ingest(
     folder = Path(folder)
     if tile_rows < 1 or (block_rows is not None and block_rows < 1):
         raise InputError(f"tile_rows and block_rows: expected at least 1, got {tile_rows}, {block_rows}")
-    stream = open_stream(source if isinstance(source, str | Path) else next(iter(source)))
+    stream = open_stream(source)
     settings = {"tile_rows": tile_rows}
     key = _key(stream, settings)
     if (folder / MANIFEST).is_file():
@@ -88,7 +88,7 @@ def ingest(
     try:
         while True:
             _pour(journal, stream, rows, progress)
-            notes = [*stream.notes, *stream.tally.notes(stream.path)]
+            notes = list(stream.all_notes())
             parts = _overfull(journal, tile_rows)
             if not parts:
                 break
