@@ -166,7 +166,7 @@ def test_neither_blocks_nor_order_decide(tmp_path: Path) -> None:
 
 
 def test_a_sample_decides_no_more_by_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("g2ard.tiles.ingest._SAMPLE", 400)
+    monkeypatch.setattr("g2ard.tiles.pour._SAMPLE", 400)
     scene = town(20_000)
     source = saved(tmp_path / "town.ply", scene)
     mixed = saved(tmp_path / "mixed.ply", scene.take(np.random.default_rng(1).permutation(len(scene))))
@@ -183,7 +183,7 @@ def test_a_sample_decides_no_more_by_order(tmp_path: Path, monkeypatch: pytest.M
 def test_tiles_that_a_sample_left_too_full_are_cut_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("g2ard.tiles.ingest._SAMPLE", 60)
+    monkeypatch.setattr("g2ard.tiles.pour._SAMPLE", 60)
     monkeypatch.setattr("g2ard.tiles.cells._SIGMAS", 0.0)
     source = saved(tmp_path / "town.ply", town(20_000))
     said: list[str] = []
@@ -337,8 +337,8 @@ import sys, time
 from pathlib import Path
 from g2ard.tiles import ingest, journal
 add = journal.Journal.add
-def slow(self, splats):
-    add(self, splats)
+def slow(self, rows, means):
+    add(self, rows, means)
     time.sleep(0.02)
 journal.Journal.add = slow
 ingest.ingest(sys.argv[1], sys.argv[2], tile_rows=900, block_rows=200)

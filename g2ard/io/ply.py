@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.clean import BLOCK, LOG_SCALE_LIMIT, Raw, cleaned, plural
-from g2ard.io.plyfiles import offset_of, read_element, read_header, require, row_blocks
+from g2ard.io.plyfiles import offset_of, read_element, read_header, require, row_blocks, spread_rows
 from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Note, Scene
 from g2ard.splats import Splats, unit_quats
@@ -50,7 +50,7 @@ class _Layout:
         rest = sorted((p for p in properties if re.fullmatch(r"f_rest_\d+", p)), key=lambda p: int(p[7:]))
         stored, kept = _bands(path, rest)
         (rows,) = read_element(path, header, "vertex")
-        shift = _recentre(_spread(rows)) if rows.dtype["x"].itemsize == 8 else np.zeros(3)
+        shift = _recentre(spread_rows(rows)) if rows.dtype["x"].itemsize == 8 else np.zeros(3)
         offset = offset_of(path, header) + shift
         return cls(rows, rest, stored, kept, offset, shift, _ignored(properties, rest, stored, kept))
 
@@ -125,19 +125,6 @@ def _ignored(properties: list[str], rest: list[str], stored: int, kept: int) -> 
     if stored > kept:
         notes.append(Note("ignored_bands", 1, "spherical harmonics past degree 3 ignored"))
     return notes
-
-
-def _spread(rows: NDArray[Any]) -> NDArray[Any]:
-    """Some 100,000 rows, evenly spread; of a mapped file without touching the pages between them."""
-    step = max(1, len(rows) // 100_000)
-    if not isinstance(rows, np.memmap) or step == 1:
-        return np.asarray(rows[::step])
-    parts = []
-    with Path(rows.filename or "").open("rb", buffering=0) as file:
-        for row in range(0, len(rows), step):
-            file.seek(rows.offset + row * rows.itemsize)
-            parts.append(file.read(rows.itemsize))
-    return np.frombuffer(b"".join(parts), rows.dtype)
 
 
 def _recentre(sample: NDArray[Any]) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["PlyHeader", "offset_of", "read_element", "read_header", "require", "row_blocks"]
+__all__ = ["PlyHeader", "offset_of", "read_element", "read_header", "require", "row_blocks", "spread_rows"]
 
 _OFFSET = re.compile(r"g2ard offset (\S+) (\S+) (\S+)$")
 _HEADER_LIMIT = 1 << 20
@@ -146,6 +146,21 @@ def row_blocks(
         if len(block) < count:
             raise InputError(f"{path}: became shorter while it was read")
         yield first, block
+
+
+def spread_rows(rows: NDArray[Any]) -> NDArray[Any]:
+    """Some 100,000 rows, evenly spread; of a mapped file without touching the pages between them."""
+    import numpy as np
+
+    step = max(1, len(rows) // 100_000)
+    if not isinstance(rows, np.memmap) or step == 1:
+        return np.asarray(rows[::step])
+    parts = []
+    with Path(rows.filename or "").open("rb", buffering=0) as file:
+        for row in range(0, len(rows), step):
+            file.seek(rows.offset + row * rows.itemsize)
+            parts.append(file.read(rows.itemsize))
+    return np.frombuffer(b"".join(parts), rows.dtype)
 
 
 def _parse_failure(path: Path, header: PlyHeader, error: Any) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 import zlib
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -13,18 +15,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, OutputError
-from g2ard.io.clean import Tally
 from g2ard.io.jsonfile import read_json
-from g2ard.splats import Splats
-from g2ard.tiles.cells import Cell
-from g2ard.tiles.store import FORMAT, MANIFEST, VERSION, halo_name, packed, tile_name
+from g2ard.tiles.cells import Cell, Points
+from g2ard.tiles.store import FORMAT, MANIFEST, VERSION, halo_name, tile_name
 
-__all__ = ["JOURNAL", "Journal", "write_json"]
+__all__ = ["JOURNAL", "POINTS", "Journal", "clear", "is_ours"]
 
 JOURNAL = "journal.json"
+POINTS = ".points"
+"""The folder within for points that are still to be lifted."""
+
+_OURS = re.compile(r"(tile|halo)-\d{5,}\.f32|\.?(tiles|journal)\.json(\.new)?|\.points")
 
 
-def write_json(path: Path, content: dict[str, Any]) -> None:
+def is_ours(name: str) -> bool:
+    """Whether a file or folder of this name belongs to tiles, whole or begun."""
+    return _OURS.fullmatch(name) is not None
+
+
+def clear(folder: Path) -> None:
+    """Remove all that belongs to tiles, the manifest first, and nothing else."""
+    for path in sorted(folder.iterdir(), key=lambda path: path.name != MANIFEST):
+        if path.is_dir() and path.name == POINTS:
+            shutil.rmtree(path)
+        elif is_ours(path.name):
+            path.unlink()
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
     """Write beside and rename: the file is the old one or the new one."""
     temporary = path.with_name(f".{path.name}.new")
     temporary.write_text(json.dumps(content) + "\n")
@@ -45,6 +63,15 @@ class Journal:
 
     `save` follows the rows, so that what it names has been written; whatever else the files hold is cut off
     when it is opened again.
+
+    Args:
+        folder: where the tiles are.
+        key: of their content.
+        cells: the kd tree.
+        margin: of halos.
+        row_bytes: bytes of a row.
+        tally: a dataclass of what the source counts while it is read.
+        next_row: the first row of the source that is not in its tile yet.
     """
 
     folder: Path
@@ -52,8 +79,8 @@ class Journal:
     cells: Cell
     margin: float
     row_bytes: int
+    tally: Any
     next_row: int = 0
-    tally: Tally = field(default_factory=Tally)
     low: list[float] = field(default_factory=lambda: [np.inf] * 3)
     high: list[float] = field(default_factory=lambda: [-np.inf] * 3)
     tiles: _Files = field(init=False)
@@ -64,7 +91,7 @@ class Journal:
         self.tiles, self.halos = (_Files([0] * count, [0] * count) for _ in range(2))
 
     @classmethod
-    def open(cls, folder: Path, row_bytes: int) -> Journal | None:
+    def open(cls, folder: Path, row_bytes: int, tally: type) -> Journal | None:
         """The journal in a folder, its files cut to what it names; None if there is none.
 
         Raises:
@@ -76,8 +103,9 @@ class Journal:
         content = read_json(path)
         try:
             cells = Cell.from_json(content["cells"])
-            journal = cls(folder, str(content["key"]), cells, float(content["margin"]), row_bytes)
-            journal.next_row, journal.tally = int(content["next_row"]), Tally(**content["tally"])
+            key, margin = str(content["key"]), float(content["margin"])
+            journal = cls(folder, key, cells, margin, row_bytes, tally(**content["tally"]))
+            journal.next_row = int(content["next_row"])
             journal.low, journal.high = content["low"], content["high"]
             for kind in ("tiles", "halos"):
                 files = _Files(**content[kind])
@@ -106,11 +134,20 @@ class Journal:
         """Bytes written."""
         return self.row_bytes * (sum(self.tiles.rows) + sum(self.halos.rows))
 
-    def add(self, splats: Splats) -> None:
-        """Append each row to its tile, and to the halos of all tiles that it is near to."""
-        if not len(splats):
+    def positions(self, name: str, count: int) -> Points:
+        """(count, 3) float32: the first three numbers of each row of a file."""
+        rows = np.memmap(self.folder / name, "u1", "r", shape=(count, self.row_bytes))
+        return np.ascontiguousarray(rows[:, :12]).view("<f4")
+
+    def add(self, rows: NDArray[Any], means: Points) -> None:
+        """Append each row to its tile, and to the halos of all tiles that it is near to.
+
+        Args:
+            rows: (N, …) rows of `row_bytes`, contiguous.
+            means: (N, 3) where they are.
+        """
+        if not len(rows):
             return
-        rows, means = packed(splats), np.asarray(splats.means, np.float32)
         self.low = np.minimum(self.low, means.min(axis=0).astype(np.float64)).tolist()
         self.high = np.maximum(self.high, means.max(axis=0).astype(np.float64)).tolist()
         for index, (core, halo) in enumerate(self.cells.route(means, self.margin)):
@@ -118,12 +155,11 @@ class Journal:
             self._append(self.halos, index, halo_name(index), rows, halo)
 
     def _append(
-        self, files: _Files, index: int, name: str, rows: NDArray[np.float32], chosen: NDArray[np.intp]
+        self, files: _Files, index: int, name: str, rows: NDArray[Any], chosen: NDArray[np.intp]
     ) -> None:
         if not len(chosen):
             return
-        part = rows if len(chosen) == len(rows) else rows[chosen]
-        data = part.data.cast("B")
+        data = (rows if len(chosen) == len(rows) else rows[chosen]).view(np.uint8).data
         try:
             with (self.folder / name).open("ab") as file:
                 file.write(data)
@@ -145,7 +181,7 @@ class Journal:
             "tiles": asdict(self.tiles),
             "halos": asdict(self.halos),
         }
-        write_json(self.folder / JOURNAL, content)
+        _write_json(self.folder / JOURNAL, content)
 
     def finish(self, manifest: dict[str, Any]) -> None:
         """Write the manifest, which makes the folder a store, and forget the journal."""
@@ -170,5 +206,5 @@ class Journal:
             "cells": self.cells.to_json(),
             "tiles": tiles,
         }
-        write_json(self.folder / MANIFEST, content)
+        _write_json(self.folder / MANIFEST, content)
         (self.folder / JOURNAL).unlink(missing_ok=True)

@@ -55,7 +55,7 @@ def packed(splats: Splats) -> NDArray[np.float32]:
     rows[:, 7:10] = splats.scales
     rows[:, 10] = splats.logit_opacities
     rows[:, 11:14] = splats.sh0[:, 0]
-    rows[:, 14:] = splats.shN.reshape(len(splats), -1)
+    rows[:, 14:] = splats.shN.reshape(len(splats), rows.shape[1] - 14)
     return rows
 
 
