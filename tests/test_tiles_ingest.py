@@ -388,3 +388,29 @@ def test_an_interruption_costs_a_block(tmp_path: Path) -> None:
     said: list[str] = []
     assert ingest(source, folder, tile_rows=900, say=said.append).tiles == whole.tiles
     assert "goes on after row 2,500" in said[0]
+
+
+def test_the_command(tmp_path: Path, command_line) -> None:
+    write_splats(tmp_path / "a.ply", town(3000))
+    write_splats(tmp_path / "b.splat", town(1000, seed=1))
+    given = ("ingest", "a.ply", "b.splat", "-o", "deep/tiles", "--tile-rows", "1k", "--json")
+    status, out, said = command_line(*given, "-", cwd=tmp_path)
+    assert status == 0, said
+    report = json.loads(out)
+    store = TileStore.open(tmp_path / "deep" / "tiles")
+    assert (report["rows"], report["tiles"], report["key"]) == (4000, len(store.tiles), store.key)
+    assert report["bytes"] == sum(f.stat().st_size for f in store.folder.glob("*.f32"))
+    assert report["halo_rows"] == sum(tile.halo for tile in store.tiles) > 0
+    assert 0 < report["seconds"] < 60
+    assert report["peak_rss"] is None or report["peak_rss"] > 1e6
+    assert f"4,000 Gaussians in {len(store.tiles)} tile(s)" in said
+
+    status, out, said = command_line(*given, "again.json", cwd=tmp_path)
+    assert (status, "skipped" in said) == (0, True)
+    status, _, said = command_line("ingest", "a.ply", "-o", "deep/tiles", cwd=tmp_path)
+    assert status == 1
+    assert "another scene" in said
+    assert "give -w (--overwrite) to replace it" in said
+    assert said.count("\n") == 1
+    for wrong in (("--tile-rows", "10%"), ("--set", "lift.neighbours=3")):
+        assert command_line("ingest", "a.ply", "-o", "x", *wrong, cwd=tmp_path)[0] == 2

@@ -186,7 +186,7 @@ def _check_folder(folder: Path, key: str, overwrite: bool) -> None:
         return
     if not overwrite:
         raise OutputError(
-            f"{folder}: exists: tiles of another scene or of other settings; overwrite=True replaces them"
+            f"{folder}: holds tiles of another scene or of other settings; overwrite=True replaces it"
         )
     clear(folder)
 
