@@ -13,7 +13,7 @@ from g2ard.errors import InputError
 from g2ard.io.types import Note, Scene
 from g2ard.splats import DRAWN_LOGIT, Splats
 
-__all__ = ["BLOCK", "LOGIT_LIMIT", "LOG_SCALE_LIMIT", "Raw", "cleaned", "plural"]
+__all__ = ["BLOCK", "LOGIT_LIMIT", "LOG_SCALE_LIMIT", "Raw", "Tally", "cleaned", "plural"]
 
 BLOCK = 8192
 """Rows handled at a time: 60 float32 columns of them are 2 MB and stay in the cache."""
@@ -47,6 +47,24 @@ class Raw:
 
         return cls(room(3), room(4), room(3), room(), room(1, 3), room(rest, 3), np.zeros(3))
 
+    def take(self, rows: slice) -> Raw:
+        """A view of some rows."""
+        return Raw(
+            self.means[rows],
+            self.quats[rows],
+            self.log_scales[rows],
+            self.logit_opacities[rows],
+            self.sh0[rows],
+            self.shN[rows],
+            self.offset,
+        )
+
+    def activated(self) -> Splats:
+        """The scene, once `Tally.clean` has exponentiated `log_scales` in place."""
+        return Splats(
+            self.means, self.quats, self.log_scales, self.logit_opacities, self.sh0, self.shN, self.offset
+        )
+
 
 def plural(count: int, one: str, many: str | None = None) -> str:
     """`1 row`, `2 rows`, `1,234 rows`."""
@@ -63,52 +81,81 @@ def cleaned(path: Path, raw: Raw, notes: list[Note] | None = None) -> Scene:
     Raises:
         InputError: no row is left.
     """
-    notes = list(notes or ())
     count = len(raw.means)
-    if count == 0:
-        raise InputError(f"{path}: holds no Gaussians")
-    keep = np.ones(count, bool)
-    tally: dict[str, int] = {"logits": 0, "scales": 0, "quats": 0}
+    keep, tally = np.ones(count, bool), Tally()
     for start in range(0, count, BLOCK):
-        _clean_block(raw, slice(start, start + BLOCK), keep, tally)
-    dropped = count - int(np.count_nonzero(keep))
-    if dropped == count:
-        raise InputError(f"{path}: none of its {plural(count, 'Gaussian')} is finite")
-    if dropped:
-        first = int(np.argmin(keep))
-        text = f"{plural(dropped, 'non-finite Gaussian')} dropped (the first is row {first})"
-        notes.append(Note("dropped_rows", dropped, text))
-    for key, code, what, then in (
-        ("logits", "clamped_logits", "opacity logit", f"beyond ±{LOGIT_LIMIT:g} clamped"),
-        ("scales", "clamped_scales", "log-scale", f"beyond ±{LOG_SCALE_LIMIT:g} clamped"),
-        ("quats", "zero_quats", "quaternion", "of length zero made the identity"),
-    ):
-        if tally[key]:
-            notes.append(Note(code, tally[key], f"{plural(tally[key], what)} {then}"))
-    if np.max(raw.logit_opacities, where=keep, initial=-np.inf) < DRAWN_LOGIT:
-        notes.append(Note("invisible", count - dropped, "nothing of it shows: every α is below 1/255"))
-    splats = Splats(
-        raw.means, raw.quats, raw.log_scales, raw.logit_opacities, raw.sh0, raw.shN, raw.offset
-    )  # `log_scales` were exponentiated in place
-    return Scene(splats.take(keep) if dropped else splats, tuple(notes))
+        rows = slice(start, start + BLOCK)
+        keep[rows] = tally.clean(raw.take(rows))
+    notes = [*(notes or ()), *tally.notes(path)]
+    splats = raw.activated()
+    return Scene(splats.take(keep) if tally.dropped else splats, tuple(notes))
 
 
-def _clean_block(raw: Raw, rows: slice, keep: NDArray[np.bool_], tally: dict[str, int]) -> None:
-    logits, scales, quats = raw.logit_opacities[rows], raw.log_scales[rows], raw.quats[rows]
-    good = ~np.isnan(logits) & ~(np.isnan(scales) | (scales == np.inf)).any(1)
-    for values in (raw.means[rows], quats, raw.sh0[rows], raw.shN[rows]):
-        good &= _finite_rows(values)
-    keep[rows] = good
+@dataclass
+class Tally:
+    """Counts of what was dropped, clamped and mended in the rows so far, of a scene taken in blocks."""
 
-    tally["logits"] += int(np.count_nonzero(good & (np.abs(logits) > LOGIT_LIMIT)))
-    np.clip(logits, -LOGIT_LIMIT, LOGIT_LIMIT, out=logits)
-    tally["scales"] += int(np.count_nonzero(good[:, None] & (np.abs(scales) > LOG_SCALE_LIMIT)))
-    np.clip(scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT, out=scales)
-    scales[:] = np.exp(scales, dtype=np.float64)
-    zero = good & ~quats.any(1)
-    if zero.any():
-        tally["quats"] += int(np.count_nonzero(zero))
-        quats[zero] = (1, 0, 0, 0)
+    rows: int = 0
+    dropped: int = 0
+    first: int = -1
+    logits: int = 0
+    scales: int = 0
+    quats: int = 0
+    brightest: float = -LOGIT_LIMIT
+
+    def clean(self, raw: Raw) -> NDArray[np.bool_]:
+        """Clamp and activate the next rows in place, so that `raw.log_scales` hold linear scales.
+
+        Returns:
+            (N,) which rows are to be kept.
+        """
+        logits, scales, quats = raw.logit_opacities, raw.log_scales, raw.quats
+        good = ~np.isnan(logits) & ~(np.isnan(scales) | (scales == np.inf)).any(1)
+        for values in (raw.means, quats, raw.sh0, raw.shN):
+            good &= _finite_rows(values)
+
+        self.logits += int(np.count_nonzero(good & (np.abs(logits) > LOGIT_LIMIT)))
+        np.clip(logits, -LOGIT_LIMIT, LOGIT_LIMIT, out=logits)
+        self.scales += int(np.count_nonzero(good[:, None] & (np.abs(scales) > LOG_SCALE_LIMIT)))
+        np.clip(scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT, out=scales)
+        scales[:] = np.exp(scales, dtype=np.float64)
+        zero = good & ~quats.any(1)
+        if zero.any():
+            self.quats += int(np.count_nonzero(zero))
+            quats[zero] = (1, 0, 0, 0)
+        lost = len(good) - int(np.count_nonzero(good))
+        if lost and not self.dropped:
+            self.first = self.rows + int(np.argmin(good))
+        self.dropped += lost
+        self.rows += len(good)
+        self.brightest = float(np.max(logits, where=good, initial=self.brightest))
+        return good
+
+    def notes(self, path: Path) -> list[Note]:
+        """What was done to all rows.
+
+        Raises:
+            InputError: there were none, or none is left.
+        """
+        if not self.rows:
+            raise InputError(f"{path}: holds no Gaussians")
+        if self.dropped == self.rows:
+            raise InputError(f"{path}: none of its {plural(self.rows, 'Gaussian')} is finite")
+        notes = []
+        if self.dropped:
+            text = f"{plural(self.dropped, 'non-finite Gaussian')} dropped (the first is row {self.first})"
+            notes.append(Note("dropped_rows", self.dropped, text))
+        for count, code, what, then in (
+            (self.logits, "clamped_logits", "opacity logit", f"beyond ±{LOGIT_LIMIT:g} clamped"),
+            (self.scales, "clamped_scales", "log-scale", f"beyond ±{LOG_SCALE_LIMIT:g} clamped"),
+            (self.quats, "zero_quats", "quaternion", "of length zero made the identity"),
+        ):
+            if count:
+                notes.append(Note(code, count, f"{plural(count, what)} {then}"))
+        if self.brightest < DRAWN_LOGIT:
+            left = self.rows - self.dropped
+            notes.append(Note("invisible", left, "nothing of it shows: every α is below 1/255"))
+        return notes
 
 
 def _finite_rows(values: NDArray[Any]) -> NDArray[np.bool_]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,11 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.clean import plural
-from g2ard.io.plyfiles import read_element, read_header, require
+from g2ard.io.plyfiles import read_element, read_header, require, row_blocks, spread_rows
+from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
 from g2ard.io.types import Cloud, Note, Points
 
-__all__ = ["finite_cloud", "read", "write"]
+__all__ = ["finite_cloud", "read", "stream", "write"]
 
 _POSITION = ["x", "y", "z"]
 _COLOR_NAMES = (["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"])
@@ -26,16 +28,47 @@ def read(path: Path) -> Cloud:
     Raises:
         InputError: not a PLY, truncated, a position or colour property is missing, nothing finite in it.
     """
+    rows, names = _vertices(path)
+    return finite_cloud(path, *_points(path, np.asarray(rows), names))
+
+
+def stream(path: Path) -> PointStream:
+    """The same cloud in blocks. A text file, or one with lists before its points, is held as a whole.
+
+    Raises:
+        InputError: as for `read`; rows are looked at later.
+    """
+    return _PlyPoints(path)
+
+
+class _PlyPoints(PointStream):
+    def __init__(self, path: Path) -> None:
+        self._vertices, self._names = _vertices(path)
+        sample = spread_rows(self._vertices)
+        at = np.stack([sample[name].astype(np.float64) for name in _POSITION], axis=1)
+        at = at[np.isfinite(at).all(1)]
+        low, high = np.percentile(at, (1, 99), axis=0) if len(at) else np.zeros((2, 3))
+        super().__init__(path, len(self._vertices), cloud_middle(low, high))
+
+    def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
+        for _, block in row_blocks(self.path, self._vertices, rows, start):
+            yield _points(self.path, block, self._names)
+
+
+def _vertices(path: Path) -> tuple[NDArray[Any], list[str]]:
+    """The rows, and the names of their colours."""
     header = read_header(path)
     properties = header.properties.get("vertex", [])
     require(path, properties, _POSITION, "a point cloud")
     names = next((n for n in _COLOR_NAMES if set(n) <= set(properties)), _COLOR_NAMES[0])
     require(path, properties, names, "a coloured point cloud")
     (rows,) = read_element(path, header, "vertex")
-    rows = np.asarray(rows)
+    return rows, names
+
+
+def _points(path: Path, rows: NDArray[Any], names: list[str]) -> RawPoints:
     positions = np.stack([rows[name].astype(np.float64) for name in _POSITION], axis=1)
-    colors = np.stack([_unit(path, rows[name], name) for name in names], axis=1)
-    return finite_cloud(path, positions, colors)
+    return positions, np.stack([_unit(path, rows[name], name) for name in names], axis=1)
 
 
 def _unit(path: Path, values: NDArray[Any], name: str) -> NDArray[np.float32]:

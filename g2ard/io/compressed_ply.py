@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product, repeat
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +14,12 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.clean import Raw, cleaned
-from g2ard.io.plyfiles import offset_of, read_element, read_header, require
+from g2ard.io.plyfiles import offset_of, read_element, read_header, require, row_blocks
+from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Scene
 from g2ard.splats import SH_C0
 
-__all__ = ["read"]
+__all__ = ["read", "stream"]
 
 _CHUNK = 256
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
@@ -27,6 +31,50 @@ def read(path: Path) -> Scene:
     Raises:
         InputError: a property is missing, the file is truncated, or nothing in it is finite.
     """
+    layout = _layout(path)
+    return cleaned(path, _raw(layout, 0, layout.vertex, layout.sh))
+
+
+def stream(path: Path) -> SceneStream:
+    """The same scene in blocks; the bounds of its chunks are held as a whole, 72 bytes for 256 Gaussians.
+
+    Raises:
+        InputError: as for `read`; rows are looked at later.
+    """
+    return _PackedStream(path)
+
+
+class _PackedStream(SceneStream):
+    def __init__(self, path: Path) -> None:
+        layout = self._layout = _layout(path)
+        super().__init__(path, len(layout.vertex), layout.rest, layout.offset)
+
+    def identity(self) -> list[Any]:
+        return file_identity([self.path])
+
+    def raw(self, rows: int, start: int) -> Iterator[Raw]:
+        layout = self._layout
+        bands: Iterator[Any] = repeat((0, None))
+        if layout.sh is not None:
+            bands = row_blocks(self.path, layout.sh, rows, start)
+        vertices = row_blocks(self.path, layout.vertex, rows, start)
+        for (first, vertex), (_, sh) in zip(vertices, bands, strict=False):
+            yield _raw(layout, first, vertex, sh)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """The elements of a file: `chunk` in memory, the others mapped."""
+
+    vertex: NDArray[Any]
+    chunk: NDArray[Any]
+    sh: NDArray[Any] | None
+    rest: int
+    colored: bool
+    offset: NDArray[np.float64]
+
+
+def _layout(path: Path) -> _Layout:
     header = read_header(path)
     require(path, header.properties.get("vertex", []), _PACKED, "a compressed scene")
     chunk_properties = header.properties.get("chunk", [])
@@ -42,26 +90,33 @@ def read(path: Path) -> Scene:
         raise InputError(f"{path}: its 'sh' element has {len(rest)} coefficients; expected 9, 24 or 45")
 
     names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")
-    vertex, chunk, *sh = (np.asarray(rows) for rows in read_element(path, header, *names))
+    vertex, chunk, *sh = read_element(path, header, *names)
     if len(chunk) * _CHUNK < len(vertex) or (sh and len(sh[0]) != len(vertex)):
         raise InputError(f"{path}: {len(chunk)} chunks and {len(vertex):,} Gaussians do not fit")
-    raw = Raw.empty(len(vertex), len(rest) // 3)
-    raw.offset = offset_of(path, header)
-    of = np.arange(len(vertex)) // _CHUNK
+    bands, colored = sh[0] if sh else None, "min_r" in chunk_properties
+    offset = offset_of(path, header)
+    return _Layout(vertex, np.array(chunk), bands, len(rest) // 3, colored, offset)
+
+
+def _raw(layout: _Layout, first: int, vertex: NDArray[Any], sh: NDArray[Any] | None) -> Raw:
+    """What some rows hold, the first of which is number `first` of the file."""
+    raw, chunk, rest = Raw.empty(len(vertex), layout.rest), layout.chunk, layout.rest
+    raw.offset = layout.offset
+    of = np.arange(first, first + len(vertex)) // _CHUNK
     raw.means[:] = _between(chunk, of, "{}_{}", "xyz", _three(vertex["packed_position"]))
     raw.log_scales[:] = _between(chunk, of, "{}_scale_{}", "xyz", _three(vertex["packed_scale"]))
     raw.quats[:] = _quats(vertex["packed_rotation"])
     color = np.stack([_unit(vertex["packed_color"], shift, 8) for shift in (24, 16, 8, 0)], axis=1)
     rgb = color[:, :3]
-    if "min_r" in chunk_properties:  # older files quantise colour over [0, 1] instead
+    if layout.colored:  # older files quantise colour over [0, 1] instead
         rgb = _between(chunk, of, "{}_{}", "rgb", rgb)
     raw.sh0[:, 0] = (rgb - 0.5) / SH_C0
     with np.errstate(divide="ignore"):
         raw.logit_opacities[:] = np.log(color[:, 3]) - np.log1p(-color[:, 3])
-    for k in range(len(rest) // 3):
-        for channel in range(3):
-            raw.shN[:, k, channel] = _coefficient(sh[0][f"f_rest_{channel * (len(rest) // 3) + k}"])
-    return cleaned(path, raw)
+    if sh is not None:
+        for k, channel in product(range(rest), range(3)):
+            raw.shN[:, k, channel] = _coefficient(sh[f"f_rest_{channel * rest + k}"])
+    return raw
 
 
 def _unit(packed: NDArray[Any], shift: int, bits: int) -> NDArray[np.float64]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +12,10 @@ import numpy as np
 
 from g2ard.errors import InputError, MissingDependencyError
 from g2ard.io.cloud_ply import finite_cloud
+from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
 from g2ard.io.types import Cloud, Note
 
-__all__ = ["read"]
+__all__ = ["read", "stream"]
 
 _LARGEST_CHUNK = 1 << 30
 """Bytes of points that lazrs may make room for where a file has fewer points than a chunk holds."""
@@ -25,6 +28,70 @@ def read(path: Path) -> Cloud:
         InputError: not a LAS file, truncated, its point format has no colour, or no finite point.
         MissingDependencyError: laspy or its lazrs backend is not installed.
     """
+    with _opened(path) as reader:
+        las, promised = reader.read(), reader.header.point_count
+    if len(las.points) < promised:
+        raise InputError(f"{path}: truncated: {promised:,} points promised, {len(las.points):,} there")
+    positions, rgb = _points(las)
+    notes, divisor = _depth(len(rgb), float(rgb.max(initial=0)))
+    return finite_cloud(path, positions, rgb / np.float32(divisor), notes)
+
+
+def stream(path: Path) -> PointStream:
+    """The same cloud in blocks; of a .laz one chunk at a time is unpacked.
+
+    Raises:
+        InputError: as for `read`; points are looked at later.
+        MissingDependencyError: as for `read`.
+    """
+    return _LasPoints(path)
+
+
+class _LasPoints(PointStream):
+    def __init__(self, path: Path) -> None:
+        with _opened(path) as reader:
+            header = reader.header
+            low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
+            super().__init__(path, header.point_count, cloud_middle(low, high))
+
+    @property
+    def divisor(self) -> float:
+        return _depth(self.tally.rows, self.tally.brightest)[1]
+
+    def notes(self) -> tuple[Note, ...]:
+        return _depth(self.tally.rows, self.tally.brightest)[0]
+
+    def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
+        with _opened(self.path) as reader:
+            if start:
+                reader.seek(start)
+            for first in range(start, self.count, rows):
+                wanted = min(rows, self.count - first)
+                las = reader.read_points(wanted)
+                if len(las) < wanted:
+                    there = first + len(las)
+                    raise InputError(
+                        f"{self.path}: truncated: {self.count:,} points promised, {there:,} there"
+                    )
+                yield _points(las)
+
+
+def _points(las: Any) -> RawPoints:
+    positions = np.stack([np.asarray(las[name], np.float64) for name in ("x", "y", "z")], axis=1)
+    rgb = np.stack([np.asarray(las[name], np.float32) for name in ("red", "green", "blue")], axis=1)
+    return positions, rgb
+
+
+def _depth(count: int, brightest: float) -> tuple[tuple[Note, ...], float]:
+    """What colours are divided by, by the largest there is; and the note if that was unusual."""
+    if brightest > 255:
+        return (), 65535.0
+    return (Note("eight_bit_colors", count, "8-bit colours in 16-bit fields"),), 255.0
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """laspy's reader of a file whose header promises nothing that the file has no room for."""
     try:
         import laspy
         import lazrs  # noqa: F401 - what laspy reads .laz with; its absence is told here
@@ -44,23 +111,13 @@ def read(path: Path) -> Cloud:
                 _check_chunks(path, header)
             else:
                 _check_size(path, header.offset_to_point_data, header.point_count, header.point_format.size)
-            las = reader.read()
-    except InputError:
+            yield reader
+    except (InputError, GeneratorExit):
         raise
     except BaseException as error:  # on damage laspy raises whatever it stumbles over, and lazrs may panic
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         raise InputError(f"{path}: cannot be read as LAS: {str(error) or type(error).__name__}") from error
-    if len(las.points) < header.point_count:
-        raise InputError(
-            f"{path}: truncated: {header.point_count:,} points promised, {len(las.points):,} there"
-        )
-    rgb = np.stack([np.asarray(las[name]) for name in ("red", "green", "blue")], axis=1)
-    eight_bit = int(rgb.max(initial=0)) <= 255
-    notes = (Note("eight_bit_colors", len(rgb), "8-bit colours in 16-bit fields"),) if eight_bit else ()
-    colors = rgb / np.float32(255 if eight_bit else 65535)
-    positions = np.stack([np.asarray(las.x), np.asarray(las.y), np.asarray(las.z)], axis=1)
-    return finite_cloud(path, positions, colors.astype(np.float32), notes)
 
 
 def _check_records(path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,12 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.clean import BLOCK, LOG_SCALE_LIMIT, Raw, cleaned, plural
-from g2ard.io.plyfiles import offset_of, read_element, read_header, require
+from g2ard.io.plyfiles import offset_of, read_element, read_header, require, row_blocks, spread_rows
+from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Note, Scene
 from g2ard.splats import Splats, unit_quats
 
-__all__ = ["read", "write"]
+__all__ = ["read", "stream", "write"]
 
 _MEANS = ["x", "y", "z"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
@@ -28,6 +30,43 @@ _NORMALS = ["nx", "ny", "nz"]
 _REST_OF_BANDS = (0, 3, 8, 15)
 
 
+@dataclass(frozen=True)
+class _Layout:
+    """What a header says of the rows."""
+
+    rows: NDArray[Any]
+    rest: list[str]
+    stored: int
+    kept: int
+    offset: NDArray[np.float64]
+    shift: NDArray[np.float64]
+    notes: list[Note]
+
+    @classmethod
+    def of(cls, path: Path) -> _Layout:
+        header = read_header(path)
+        properties = header.properties.get("vertex", [])
+        require(path, properties, _NEEDED, "a 3DGS scene")
+        rest = sorted((p for p in properties if re.fullmatch(r"f_rest_\d+", p)), key=lambda p: int(p[7:]))
+        stored, kept = _bands(path, rest)
+        (rows,) = read_element(path, header, "vertex")
+        shift = _recentre(spread_rows(rows)) if rows.dtype["x"].itemsize == 8 else np.zeros(3)
+        offset = offset_of(path, header) + shift
+        return cls(rows, rest, stored, kept, offset, shift, _ignored(properties, rest, stored, kept))
+
+    def raw(self, rows: NDArray[Any]) -> Raw:
+        """What `rows` of the file hold."""
+        raw = Raw.empty(len(rows), self.kept)
+        raw.offset = self.offset
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # float64 past float32 becomes inf: such a row is dropped
+            for start in range(0, len(rows), BLOCK):
+                at = slice(start, start + BLOCK)
+                _read_block(rows[at], raw, at, self.rest, self.stored, self.shift)
+        return raw
+
+
 def read(path: Path) -> Scene:
     """Read a 3DGS .ply: any SH degree, property order, scalar type, byte order, or ascii.
 
@@ -36,23 +75,35 @@ def read(path: Path) -> Scene:
     Raises:
         InputError: not a PLY, a property is missing, the file is truncated, nothing finite in it.
     """
-    header = read_header(path)
-    properties = header.properties.get("vertex", [])
-    require(path, properties, _NEEDED, "a 3DGS scene")
-    rest = sorted((p for p in properties if re.fullmatch(r"f_rest_\d+", p)), key=lambda p: int(p[7:]))
-    stored, kept = _bands(path, rest)
-    (rows,) = read_element(path, header, "vertex")
-    rows = np.asarray(rows)
-    raw = Raw.empty(len(rows), kept)
-    raw.offset, notes = offset_of(path, header), _ignored(properties, rest, stored, kept)
-    shift = _recentre(rows) if rows.dtype["x"].itemsize == 8 else np.zeros(3)
-    raw.offset = raw.offset + shift
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # float64 past float32 becomes inf: such a row is dropped
-        for start in range(0, len(rows), BLOCK):
-            _read_block(rows[start : start + BLOCK], raw, slice(start, start + BLOCK), rest, stored, shift)
-    return cleaned(path, raw, notes)
+    layout = _Layout.of(path)
+    return cleaned(path, layout.raw(np.asarray(layout.rows)), layout.notes)
+
+
+def stream(path: Path) -> SceneStream:
+    """The same scene in blocks. A text file, or one with lists before its Gaussians, is held as a whole.
+
+    Raises:
+        InputError: as for `read`; rows are looked at later.
+    """
+    return _PlyStream(path)
+
+
+class _PlyStream(SceneStream):
+    def __init__(self, path: Path) -> None:
+        layout = self._layout = _Layout.of(path)
+        super().__init__(path, len(layout.rows), layout.kept, layout.offset, tuple(layout.notes))
+
+    def identity(self) -> list[Any]:
+        return file_identity([self.path])
+
+    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+        for _, block in row_blocks(self.path, self._layout.rows, rows):
+            with np.errstate(over="ignore", invalid="ignore"):
+                means = _means(block, self._layout.shift)
+            yield means
+
+    def raw(self, rows: int, start: int) -> Iterator[Raw]:
+        return (self._layout.raw(block) for _, block in row_blocks(self.path, self._layout.rows, rows, start))
 
 
 def _bands(path: Path, rest: list[str]) -> tuple[int, int]:
@@ -76,12 +127,11 @@ def _ignored(properties: list[str], rest: list[str], stored: int, kept: int) -> 
     return notes
 
 
-def _recentre(rows: NDArray[Any]) -> NDArray[np.float64]:
+def _recentre(sample: NDArray[Any]) -> NDArray[np.float64]:
     """The whole-unit shift that lets float32 hold float64 positions; zero where it holds them anyway.
 
-    Judged on percentiles of at most 100,000 rows, so that a stray floater decides nothing.
+    Judged on percentiles of a sample of rows, so that a stray floater decides nothing.
     """
-    sample = rows[:: max(1, len(rows) // 100_000)]
     positions = np.stack([sample[name] for name in _MEANS], axis=1)
     positions = positions[np.isfinite(positions).all(1)]
     if not len(positions):
@@ -96,8 +146,7 @@ def _read_block(
 ) -> None:
     from numpy.lib.recfunctions import structured_to_unstructured
 
-    means = structured_to_unstructured(block[_MEANS])
-    raw.means[at] = means - shift if shift.any() else means
+    raw.means[at] = _means(block, shift)
     raw.sh0[at, 0] = structured_to_unstructured(block[_DC])
     raw.log_scales[at] = structured_to_unstructured(block[_SCALES])
     raw.quats[at] = structured_to_unstructured(block[_QUATS])
@@ -106,6 +155,13 @@ def _read_block(
         bands = structured_to_unstructured(block[rest]).reshape(-1, 3, stored)
         for channel in range(3):  # numpy's own transposed copy takes thrice as long
             raw.shN[at, :, channel] = bands[:, channel, : raw.shN.shape[1]]
+
+
+def _means(block: NDArray[Any], shift: NDArray[np.float64]) -> NDArray[np.float32]:
+    from numpy.lib.recfunctions import structured_to_unstructured
+
+    means = structured_to_unstructured(block[_MEANS])
+    return np.asarray(means - shift if shift.any() else means, np.float32)
 
 
 def write(path: Path, splats: Splats, *, overwrite: bool = False, normals: bool = False) -> None:

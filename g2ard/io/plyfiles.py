@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["PlyHeader", "offset_of", "read_element", "read_header", "require"]
+__all__ = ["PlyHeader", "offset_of", "read_element", "read_header", "require", "row_blocks", "spread_rows"]
 
 _OFFSET = re.compile(r"g2ard offset (\S+) (\S+) (\S+)$")
 _HEADER_LIMIT = 1 << 20
@@ -121,6 +122,45 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
     except (PlyParseError, ValueError, OSError, OverflowError, MemoryError) as error:
         raise InputError(f"{path}: cannot be read as a PLY: {error}") from error
     return [ply[name].data for name in names]
+
+
+def row_blocks(
+    path: Path, every: NDArray[Any], rows: int, start: int = 0
+) -> Iterator[tuple[int, NDArray[Any]]]:
+    """An element's rows from `start` on, `rows` at a time, each block with the number of its first row.
+
+    They are read, not mapped, where `read_element` mapped them: pages of a mapping count as memory of the
+    process.
+
+    Raises:
+        InputError: the file ends before them.
+    """
+    import numpy as np
+
+    for first in range(start, len(every), rows):
+        count = min(rows, len(every) - first)
+        if not isinstance(every, np.memmap):
+            yield first, every[first : first + count]
+            continue
+        block = np.fromfile(path, every.dtype, count, offset=every.offset + first * every.itemsize)
+        if len(block) < count:
+            raise InputError(f"{path}: became shorter while it was read")
+        yield first, block
+
+
+def spread_rows(rows: NDArray[Any]) -> NDArray[Any]:
+    """Some 100,000 rows, evenly spread; of a mapped file without touching the pages between them."""
+    import numpy as np
+
+    step = max(1, len(rows) // 100_000)
+    if not isinstance(rows, np.memmap) or step == 1:
+        return np.asarray(rows[::step])
+    parts = []
+    with Path(rows.filename or "").open("rb", buffering=0) as file:
+        for row in range(0, len(rows), step):
+            file.seek(rows.offset + row * rows.itemsize)
+            parts.append(file.read(rows.itemsize))
+    return np.frombuffer(b"".join(parts), rows.dtype)
 
 
 def _parse_failure(path: Path, header: PlyHeader, error: Any) -> str:

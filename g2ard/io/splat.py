@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,11 @@ from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.clean import Raw, cleaned
 from g2ard.io.packing import world_means, writable
+from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Scene
 from g2ard.splats import SH_C0, Splats, unit_quats
 
-__all__ = ["read", "write"]
+__all__ = ["read", "stream", "write"]
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
@@ -26,10 +28,41 @@ def read(path: Path) -> Scene:
     Raises:
         InputError: the size is not a multiple of 32, or nothing in it is finite.
     """
-    data = path.read_bytes()
-    if not data or len(data) % _ROW.itemsize:
-        raise InputError(f"{path}: not a whole .splat: {len(data):,} bytes are not a multiple of 32")
-    rows = np.frombuffer(data, _ROW)
+    return cleaned(path, _raw(np.fromfile(path, _ROW, _count(path))))
+
+
+def stream(path: Path) -> SceneStream:
+    """The same scene in blocks.
+
+    Raises:
+        InputError: the size is not a multiple of 32.
+    """
+    return _SplatStream(path)
+
+
+class _SplatStream(SceneStream):
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, _count(path))
+
+    def identity(self) -> list[Any]:
+        return file_identity([self.path])
+
+    def raw(self, rows: int, start: int) -> Iterator[Raw]:
+        for first in range(start, self.count, rows):
+            block = np.fromfile(self.path, _ROW, rows, offset=first * _ROW.itemsize)
+            if len(block) < min(rows, self.count - first):
+                raise InputError(f"{self.path}: became shorter while it was read")
+            yield _raw(block)
+
+
+def _count(path: Path) -> int:
+    size = path.stat().st_size
+    if not size or size % _ROW.itemsize:
+        raise InputError(f"{path}: not a whole .splat: {size:,} bytes are not a multiple of 32")
+    return size // _ROW.itemsize
+
+
+def _raw(rows: NDArray[Any]) -> Raw:
     raw = Raw.empty(len(rows), 0)
     raw.means[:] = rows["mean"]
     with np.errstate(divide="ignore", invalid="ignore"):  # a negative scale becomes NaN: the row is dropped
@@ -38,7 +71,7 @@ def read(path: Path) -> Scene:
         raw.logit_opacities[:] = np.log(alphas) - np.log1p(-alphas)
     raw.sh0[:, 0] = (rows["rgba"][:, :3] / 255 - 0.5) / SH_C0
     raw.quats[:] = (rows["quat"].astype(np.float32) - 128) / 128
-    return cleaned(path, raw)
+    return raw
 
 
 def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:

@@ -11,6 +11,7 @@ COMMANDS = (
     "adapt",
     "register",
     "lift",
+    "ingest",
     "convert",
     "clean",
     "poses",

@@ -1,0 +1,78 @@
+"""`g2ard ingest`: a scene of any size → tiles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from g2ard.cli.budget_options import Count
+from g2ard.cli.frame import Run, command
+
+
+@command("ingest", example="g2ard ingest city.ply -o tiles/ --tile-rows 2M", constants=True)
+def ingest(
+    run: Run,
+    scenes: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SCENE…", help="A scene, or several as one; or coloured clouds, which are lifted."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the tiles.")],
+    tile_rows: Annotated[
+        Count | None,
+        typer.Option(
+            parser=Count.parse, metavar="COUNT", help="Gaussians of a tile at the most; 5M if not given."
+        ),
+    ] = None,
+) -> None:
+    """Stream a scene larger than memory into tiles; the same call again goes on where it was stopped."""
+    import time
+
+    from g2ard.constants import changed
+    from g2ard.memory import peak_rss
+    from g2ard.stages.lift import LiftConfig
+    from g2ard.tiles.ingest import TILE_ROWS
+    from g2ard.tiles.ingest import ingest as into_tiles
+
+    if tile_rows is not None and tile_rows.is_share:
+        raise typer.BadParameter("--tile-rows: a count, not a share")
+    config = LiftConfig()
+    config = changed(config, "lift", run.constants(lift=config))
+    run.kept = [f"what is in {output} stands, and the same command goes on"]
+    began = time.perf_counter()
+    store = into_tiles(
+        scenes,
+        output,
+        tile_rows=TILE_ROWS if tile_rows is None else tile_rows.of(0),
+        lift=config,
+        overwrite=run.overwrite,
+        progress=run.progress,
+        say=run.say,
+    )
+    seconds = time.perf_counter() - began
+    for note in store.notes:
+        run.say(f"{scenes[0]}: {note}")
+    halo = sum(tile.halo for tile in store.tiles)
+    run.say(
+        f"{output}: {store.count:,} Gaussians in {len(store.tiles):,} tile(s), {halo / store.count:.1%} more "
+        f"in halos, {store.nbytes / 1e9:,.2f} GB"
+    )
+    run.result(
+        {
+            "output": str(output),
+            "key": store.key,
+            "rows": store.count,
+            "tiles": len(store.tiles),
+            "halo_rows": halo,
+            "margin": store.margin,
+            "bytes": store.nbytes,
+            "sh_degree": store.sh_degree,
+            "offset": store.offset,
+            "notes": {note.code: note.count for note in store.notes},
+            "seconds": seconds,
+            "peak_rss": peak_rss(),
+        }
+    )

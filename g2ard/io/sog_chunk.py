@@ -1,0 +1,250 @@
+"""One chunk of a SOG scene: its meta.json, its images, and the Gaussians they stand for."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from g2ard.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from PIL.Image import Image
+
+    from g2ard.io.clean import Raw
+
+__all__ = ["Chunk", "Decoder", "count_of", "means_of", "meta_errors", "rest_of"]
+
+_COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
+_PALETTE_COLUMNS = 64
+"""Entries of the SH palette beside each other in one row of its image."""
+
+
+class Chunk(NamedTuple):
+    """One meta.json, and how to get at the files beside it."""
+
+    name: str
+    meta: dict[str, Any]
+    load: Callable[[str], bytes]
+
+
+@contextmanager
+def meta_errors(chunk: Chunk) -> Iterator[None]:
+    """Turn what a malformed meta.json causes into one line that names it."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{chunk.name}: malformed meta.json ({error!r})") from error
+
+
+def count_of(chunk: Chunk) -> int:
+    with meta_errors(chunk):
+        version = chunk.meta.get("version", 1)
+        if version not in (1, 2):
+            raise InputError(f"{chunk.name}: SOG version {version!r} is not known (1 and 2 are)")
+        count = chunk.meta["count"] if version == 2 else chunk.meta["means"]["shape"][0]
+        if not isinstance(count, int) or count < 0:
+            raise InputError(f"{chunk.name}: malformed meta.json (count is {count!r})")
+        first = chunk.meta["means"]["files"][0]
+    with _opened_image(chunk, first) as image:  # before room is made for them
+        if image.width * image.height < count:
+            pixels = image.width * image.height
+            raise InputError(f"{chunk.name}: {first} has {pixels:,} pixels for {count:,} Gaussians")
+    return count
+
+
+def rest_of(chunk: Chunk) -> int:
+    """How many coefficients past band 0; version 1 tells only by the width of its palette image."""
+    with meta_errors(chunk):
+        if "shN" not in chunk.meta:
+            return 0
+        if "bands" in chunk.meta["shN"]:
+            return _COEFFICIENTS[chunk.meta["shN"]["bands"]]
+        width = _image(chunk, _sh_files(chunk)[0]).shape[1]
+        return {_PALETTE_COLUMNS * k: k for k in (3, 8, 15)}[width]
+
+
+def _sh_files(chunk: Chunk) -> tuple[str, str]:
+    files = chunk.meta["shN"]["files"]
+    centroids = next((f for f in files if "centroids" in f), files[0])
+    return centroids, next((f for f in files if f != centroids), files[1])
+
+
+@contextmanager
+def _opened_image(chunk: Chunk, name: str) -> Iterator[Image]:
+    from PIL import (
+        WebPImagePlugin,  # noqa: F401  (Pillow would load all its formats to find this one)
+    )
+
+    from g2ard.io.limits import opened_image
+
+    where = f"{chunk.name}: {name}"
+    try:
+        data = chunk.load(name)
+    except (KeyError, FileNotFoundError) as error:
+        raise InputError(f"{where} is missing") from error
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise InputError(f"{where} cannot be read ({error})") from error
+    with opened_image(where, io.BytesIO(data)) as image:
+        yield image
+
+
+def _image(chunk: Chunk, name: str) -> NDArray[np.uint8]:
+    """(height, width, 4) bytes."""
+    import numpy as np
+
+    with _opened_image(chunk, name) as image:
+        return np.asarray(image.convert("RGBA"))
+
+
+def _rows(chunk: Chunk, name: str, count: int) -> NDArray[np.uint8]:
+    """(count, 4) bytes, one pixel a Gaussian."""
+    pixels = _image(chunk, name).reshape(-1, 4)
+    if len(pixels) < count:
+        raise InputError(f"{chunk.name}: {name} has {len(pixels):,} pixels for {count:,} Gaussians")
+    return pixels[:count]
+
+
+class Decoder:
+    """A chunk's images, 20 to 28 bytes a Gaussian, and the tables that its bytes are looked up in.
+
+    Raises:
+        InputError: a part is missing or broken.
+    """
+
+    def __init__(self, chunk: Chunk, count: int) -> None:
+        meta, self.chunk = chunk.meta, chunk
+        with meta_errors(chunk):
+            self._low, self._high, self._quats, self._scales, self._base = (
+                _rows(chunk, name, count)
+                for part, files in (("means", 2), ("quats", 1), ("scales", 1), ("sh0", 1))
+                for name in meta[part]["files"][:files]
+            )
+            self._positions, self._logits = _positions(meta["means"]), _logits(meta["sh0"])
+            self._rest = rest_of(chunk)
+            if self._rest:
+                self._palette, self._labels = _palette(chunk, self._rest, count)
+
+    def fill(self, rows: slice, raw: Raw) -> None:
+        """Decode the Gaussians `rows` into `raw`, in blocks that stay in the cache."""
+        from g2ard.io.clean import BLOCK
+
+        for start in range(rows.start, rows.stop, BLOCK):
+            stop = min(start + BLOCK, rows.stop)
+            with meta_errors(self.chunk):
+                self._fill(slice(start, stop), raw.take(slice(start - rows.start, stop - rows.start)))
+
+    def _fill(self, rows: slice, raw: Raw) -> None:
+        meta = self.chunk.meta
+        _fill_means(raw.means, self._low[rows], self._high[rows], self._positions)
+        raw.quats[:] = _quats(self._quats[rows])
+        raw.log_scales[:] = _values(meta["scales"], self._scales[rows, :3], slice(3))
+        raw.sh0[:, 0] = _values(meta["sh0"], self._base[rows, :3], slice(3))
+        raw.logit_opacities[:] = self._logits[self._base[rows, 3]]
+        raw.shN[:, self._rest :] = 0
+        if self._rest:
+            self._fill_rest(rows, raw.shN)
+
+    def _fill_rest(self, rows: slice, out: NDArray[np.float32]) -> None:
+        """Each Gaussian's label picks a palette entry."""
+        import numpy as np
+
+        index = self._labels[rows, 0] + (self._labels[rows, 1].astype(np.intp) << 8)
+        if index.max() >= len(self._palette):
+            row = int(np.argmax(index >= len(self._palette)))
+            named = f"Gaussian {rows.start + row} names entry {index[row]} of {len(self._palette)}"
+            raise InputError(f"{self.chunk.name}: {_sh_files(self.chunk)[1]}: {named}")
+        np.take(self._palette, index, axis=0, out=out[:, : self._rest], mode="clip")
+
+
+def means_of(chunk: Chunk, count: int) -> NDArray[np.float32]:
+    """(count, 3) means alone.
+
+    Raises:
+        InputError: a part is missing or broken.
+    """
+    import numpy as np
+
+    with meta_errors(chunk):
+        low, high = (_rows(chunk, name, count) for name in chunk.meta["means"]["files"][:2])
+        means = np.empty((count, 3), np.float32)
+        _fill_means(means, low, high, _positions(chunk.meta["means"]))
+        return means
+
+
+def _fill_means(
+    out: NDArray[np.float32], low: NDArray[np.uint8], high: NDArray[np.uint8], positions: NDArray[Any]
+) -> None:
+    """Positions of 16-bit codes, a byte in each of two images."""
+    for axis in range(3):
+        out[:, axis] = positions[axis][low[:, axis] + (high[:, axis].astype(int) << 8)]
+
+
+def _positions(part: dict[str, Any]) -> NDArray[Any]:
+    """(3, 65536) what each code stands for on each axis; stored as sign(x)·ln(|x| + 1)."""
+    import numpy as np
+
+    logs = _lerp(part, np.arange(65536)[:, None] / 65535, slice(3))
+    return (np.sign(logs) * np.expm1(np.abs(logs))).T.astype(np.float32)
+
+
+def _logits(part: dict[str, Any]) -> NDArray[Any]:
+    """(256,) what each byte of opacity stands for: an α (version 2), or a logit (version 1)."""
+    import numpy as np
+
+    alpha = np.arange(256) / 255
+    if "codebook" not in part:
+        return _lerp(part, alpha, 3)
+    with np.errstate(divide="ignore"):
+        return np.log(alpha) - np.log1p(-alpha)
+
+
+def _values(part: dict[str, Any], codes: NDArray[np.uint8], channels: slice) -> NDArray[Any]:
+    """Bytes to values: by codebook (version 2), or between mins and maxs (version 1)."""
+    import numpy as np
+
+    if "codebook" in part:
+        return np.asarray(part["codebook"], np.float32)[codes]
+    return _lerp(part, codes / 255, channels)
+
+
+def _lerp(part: dict[str, Any], t: NDArray[Any], channels: slice | int) -> NDArray[Any]:
+    import numpy as np
+
+    low, high = np.asarray(part["mins"], np.float64), np.asarray(part["maxs"], np.float64)
+    if low.ndim:
+        low, high = low[channels], high[channels]
+    return low + (high - low) * t
+
+
+def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:
+    """(N, 4) wxyz: three components in ±1/√2; the fourth byte − 252 says which is left out, the largest.
+
+    Any other fourth byte gives a zero quaternion, which is counted and made the identity later.
+    """
+    import numpy as np
+
+    parts = np.zeros((len(codes), 5))  # the three, the largest, and nothing
+    parts[:, :3] = (codes[:, :3] / 255 - 0.5) * np.sqrt(2)
+    parts[:, 3] = np.sqrt(np.maximum(0, 1 - (parts[:, :3] ** 2).sum(1)))
+    source = np.full((256, 4), 4)
+    source[252:] = [[3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2], [0, 1, 2, 3]]
+    quats: NDArray[Any] = np.take_along_axis(parts, source[codes[:, 3]], axis=1)
+    return quats
+
+
+def _palette(chunk: Chunk, rest: int, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """(entries, K−1, 3) coefficients, whose bytes pick values, and the image of labels."""
+    import numpy as np
+
+    centroids, labels = _sh_files(chunk)
+    image = _image(chunk, centroids)
+    if image.shape[1] != _PALETTE_COLUMNS * rest:
+        raise InputError(f"{chunk.name}: {centroids} is {image.shape[1]} wide, not {_PALETTE_COLUMNS * rest}")
+    palette = _values(chunk.meta["shN"], image[:, :, :3].reshape(-1, rest, 3), slice(3)).astype(np.float32)
+    return palette, _rows(chunk, labels, count)

@@ -1,0 +1,205 @@
+"""Scenes read block by block, so that memory does not bound their size."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.io.clean import BLOCK, Raw, Tally
+from g2ard.io.types import Note
+from g2ard.splats import Splats
+
+__all__ = ["SceneStream", "file_identity", "open_stream"]
+
+_STREAMED = {"ply": "ply", "compressed_ply": "compressed_ply", "sog": "sog", "splat": "splat"}
+"""Format → the module with its `stream(path)`; scenes of other formats are held as a whole."""
+
+_ENDS = 1 << 16
+"""Bytes at each end of a file that tell it from others of its name, size and time."""
+
+_DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
+
+
+class SceneStream(ABC):
+    """A scene as a sequence of rows, any part of which can be read again.
+
+    Attributes:
+        path: names the scene in messages.
+        count: rows in the source, those that will be dropped included.
+        sh_degree: 0–3.
+        offset: (3,) float64, world = means + offset.
+        notes: what the header told; what the rows told is in `tally`.
+        tally: counts over the rows that `blocks` has been through.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        count: int,
+        rest: int = 0,
+        offset: NDArray[np.float64] | None = None,
+        notes: tuple[Note, ...] = (),
+    ) -> None:
+        self.path, self.count, self.notes, self.tally = path, count, notes, Tally()
+        self.sh_degree = _DEGREE_OF_REST[rest]
+        self.offset = np.zeros(3) if offset is None else offset
+
+    @abstractmethod
+    def raw(self, rows: int, start: int) -> Iterator[Raw]:
+        """The source's rows from `start` on, at most `rows` at a time; the caller may change the arrays."""
+
+    @abstractmethod
+    def identity(self) -> list[Any]:
+        """What tells this source from another, as JSON: files by name, size, time and ends."""
+
+    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+        """(n, 3) means of all rows in order, in blocks; not cleaned."""
+        return (raw.means for raw in self.raw(rows, 0))
+
+    def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
+        """All rows from `start` on, cleaned as `g2ard.io.read_scene` cleans them.
+
+        Args:
+            rows: rows of the source a block is made of, at the most; dropped rows make it shorter.
+            start: the first row of the source.
+        """
+        for raw in self.raw(rows, start):
+            keep, before = np.ones(len(raw.means), bool), self.tally.dropped
+            for first in range(0, len(keep), BLOCK):
+                part = slice(first, first + BLOCK)
+                keep[part] = self.tally.clean(raw.take(part))
+            splats = raw.activated()
+            yield splats if self.tally.dropped == before else splats.take(keep)
+
+    def all_notes(self) -> tuple[Note, ...]:
+        """What was noticed, once `blocks` is through.
+
+        Raises:
+            InputError: there was no row, or none that is finite.
+        """
+        return (*self.notes, *self.tally.notes(self.path))
+
+
+def open_stream(path: str | Path | Sequence[str | Path]) -> SceneStream:
+    """A scene, or several as one, to be read block by block.
+
+    Args:
+        path: a scene in any format that `g2ard.io.read_scene` reads, or several. Of .ply, .compressed.ply,
+            .splat and SOG a block at a time is held (of SOG also the images of one chunk), of others all.
+            Several take the offset of the first and the highest of their SH degrees.
+
+    Raises:
+        InputError: nothing is there, or it is broken as far as its header tells.
+    """
+    from g2ard.io.detect import file_format, kind
+
+    if not isinstance(path, str | Path):
+        streams = [open_stream(part) for part in path]
+        if not streams:
+            raise InputError("no scene was given")
+        return streams[0] if len(streams) == 1 else _Joined(streams)
+    path, found = Path(path), file_format(path)
+    if found in _STREAMED:
+        stream: SceneStream = import_module(f"g2ard.io.{_STREAMED[found]}").stream(path)
+        return stream
+    if kind(path) != "splats":
+        raise InputError(f"{path}: a Gaussian scene is needed, this is {kind(path)}")
+    return _Whole(path)
+
+
+class _Whole(SceneStream):
+    """A scene that is held as a whole."""
+
+    def __init__(self, path: Path) -> None:
+        from g2ard.io import read_scene
+
+        scene = read_scene(path)
+        self._splats = scene.splats
+        rest = scene.splats.shN.shape[1]
+        super().__init__(path, len(scene.splats), rest, scene.splats.offset, scene.notes)
+
+    def identity(self) -> list[Any]:
+        return file_identity([self.path])
+
+    def raw(self, rows: int, start: int) -> Iterator[Raw]:
+        for first in range(start, self.count, rows):
+            part = self._splats.take(slice(first, first + rows))
+            raw = Raw.empty(len(part), part.shN.shape[1])
+            raw.means[:], raw.quats[:], raw.log_scales[:] = part.means, part.quats, np.log(part.scales)
+            raw.logit_opacities[:], raw.sh0[:], raw.shN[:] = part.logit_opacities, part.sh0, part.shN
+            raw.offset = self.offset
+            yield raw
+
+    def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
+        for first in range(start, self.count, rows):
+            part = self._splats.take(slice(first, first + rows))
+            self.tally.rows = first + len(part)
+            yield part
+
+    def all_notes(self) -> tuple[Note, ...]:
+        return self.notes
+
+
+class _Joined(SceneStream):
+    """Several scenes, one after the other."""
+
+    def __init__(self, streams: list[SceneStream]) -> None:
+        highest = max(stream.sh_degree for stream in streams)
+        rest = (highest + 1) ** 2 - 1
+        count = sum(stream.count for stream in streams)
+        notes = [replace(n, text=f"{s.path}: {n.text}") for s in streams for n in s.notes]
+        super().__init__(streams[0].path, count, rest, streams[0].offset, tuple(notes))
+        self._streams, self._rest = streams, rest
+
+    def identity(self) -> list[Any]:
+        return [stream.identity() for stream in self._streams]
+
+    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+        for stream in self._streams:
+            for means in stream.positions(rows):
+                yield self._moved(means, stream)
+
+    def raw(self, rows: int, start: int) -> Iterator[Raw]:
+        for stream in self._streams:
+            if start < stream.count:
+                for raw in stream.raw(rows, start):
+                    yield self._fitted(raw, stream)
+            start = max(0, start - stream.count)
+
+    def _moved(self, means: NDArray[np.float32], stream: SceneStream) -> NDArray[np.float32]:
+        shift = stream.offset - self.offset
+        return (means + shift).astype(np.float32) if shift.any() else means
+
+    def _fitted(self, raw: Raw, stream: SceneStream) -> Raw:
+        stored = raw.shN.shape[1]
+        if stored < self._rest:
+            shN = np.zeros((len(raw.means), self._rest, 3), np.float32)
+            shN[:, :stored] = raw.shN
+            raw.shN = shN
+        raw.means, raw.offset = self._moved(raw.means, stream), self.offset
+        return raw
+
+
+def file_identity(files: Sequence[Path]) -> list[Any]:
+    """Of each file its name, size, time of change and the hash of its ends."""
+    identity = []
+    for path in files:
+        try:
+            state = path.stat()
+            with path.open("rb") as file:
+                digest = hashlib.sha256(file.read(_ENDS))
+                file.seek(max(0, state.st_size - _ENDS))
+                digest.update(file.read(_ENDS))
+        except OSError as error:
+            raise InputError(f"{path}: {error.strerror}") from error
+        identity.append([path.name, state.st_size, state.st_mtime_ns, digest.hexdigest()])
+    return identity

@@ -1,0 +1,1 @@
+"""Scenes larger than memory, as tiles in a folder."""

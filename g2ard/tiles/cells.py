@@ -1,0 +1,226 @@
+"""The kd tree whose leaves are tiles: cut at medians of points, and what lies in and around each leaf."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Cell", "Sampler", "cut_cells", "margin_of"]
+
+_SIGMAS = 4.0
+"""A tile may hold more than a sample foretells; by so many standard deviations at the most, it is taken."""
+
+_HALO = 0.03
+"""The margin of a halo, in sides of a tile."""
+
+_TAILS = 1, 99
+"""Percentiles between which a cell's sides are measured, so that stray floaters decide nothing."""
+
+Points = NDArray[np.float32]
+Rows = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A node: points with `x[axis] < at` are `below`'s. A leaf has neither."""
+
+    axis: int = -1
+    at: float = 0.0
+    below: Cell | None = None
+    above: Cell | None = None
+
+    @property
+    def leaves(self) -> int:
+        """How many tiles there are."""
+        return self.below.leaves + self.above.leaves if self.below and self.above else 1
+
+    def boxes(self) -> NDArray[np.float64]:
+        """(leaves, 2, 3) low and high corners, infinite where nothing was cut."""
+        boxes = [np.array([[-np.inf] * 3, [np.inf] * 3])]
+        if self.below and self.above:
+            below, above = self.below.boxes(), self.above.boxes()
+            below[:, 1, self.axis] = np.minimum(below[:, 1, self.axis], self.at)
+            above[:, 0, self.axis] = np.maximum(above[:, 0, self.axis], self.at)
+            boxes = [*below, *above]
+        return np.stack(boxes)
+
+    def route(self, points: Points, margin: float = 0.0) -> Iterator[tuple[Rows, Rows]]:
+        """For each leaf in order: the rows in its cell, and those of other cells within `margin`.
+
+        A point is within the margin where it lies in the cell after all of its sides moved outwards by it.
+
+        Args:
+            points: (N, 3) float32, finite.
+            margin: as far as a halo reaches; 0 makes none.
+        """
+        core, halo = np.arange(len(points)), np.empty(0, np.intp)
+        columns = tuple(np.ascontiguousarray(points.T))
+        yield from self._route(columns, core, halo, margin)
+
+    def _route(
+        self, columns: tuple[Points, ...], core: Rows, halo: Rows, margin: float
+    ) -> Iterator[tuple[Rows, Rows]]:
+        if not (self.below and self.above):
+            yield core, np.sort(halo)
+            return
+        values, outer = columns[self.axis][core], columns[self.axis][halo]
+        low, high = np.float32(self.at - margin), np.float32(self.at + margin)
+        inside = values < np.float32(self.at)
+        left, right = core[inside], core[~inside]
+        near_left = near_right = core[:0]
+        if margin > 0:
+            near_left, near_right = core[~inside & (values <= high)], core[inside & (values >= low)]
+        halo_left = np.concatenate([halo[outer <= high], near_left])
+        halo_right = np.concatenate([halo[outer >= low], near_right])
+        yield from self.below._route(columns, left, halo_left, margin)
+        yield from self.above._route(columns, right, halo_right, margin)
+
+    def refined(self, parts: dict[int, Cell]) -> Cell:
+        """The same tree with some leaves, by number, replaced by trees."""
+        numbers = iter(range(self.leaves))
+
+        def build(cell: Cell) -> Cell:
+            if cell.below and cell.above:
+                return Cell(cell.axis, cell.at, build(cell.below), build(cell.above))
+            return parts.get(next(numbers), cell)
+
+        return build(self)
+
+    def to_json(self) -> Any:
+        """Nested lists [axis, at, below, above]; null for a leaf."""
+        if self.below and self.above:
+            return [self.axis, self.at, self.below.to_json(), self.above.to_json()]
+        return None
+
+    @classmethod
+    def from_json(cls, content: Any) -> Cell:
+        """What `to_json` gave.
+
+        Raises:
+            ValueError, TypeError: it is something else.
+        """
+        if content is None:
+            return cls()
+        axis, at, below, above = content
+        if axis not in (0, 1, 2) or not np.isfinite(at):
+            raise ValueError(f"a cut at {at!r} along {axis!r}")
+        return cls(int(axis), float(at), cls.from_json(below), cls.from_json(above))
+
+
+def cut_cells(points: Points, rows_each: float, most: int) -> Cell:
+    """Cut until no leaf is expected to hold more than `most` rows.
+
+    Along the longest side, at the quantile that leaves both parts with whole tiles. The order of the points
+    decides nothing.
+
+    Args:
+        points: (N, 3) float32, finite: all rows or a sample of them.
+        rows_each: how many rows a point stands for; 1 where they are all.
+        most: rows of a leaf.
+
+    Returns:
+        A tree; a leaf whose points all coincide may hold more.
+    """
+    parts = _parts(len(points), rows_each, most)
+    if parts == 1 or len(points) < 2:
+        return Cell()
+    low, high = np.percentile(points, _TAILS, axis=0)
+    spans = np.ptp(points, axis=0)
+    for axis in sorted(range(3), key=lambda a: (-(high[a] - low[a]), -spans[a], a)):
+        values = np.sort(points[:, axis])
+        at = _between(values, len(values) * (parts // 2) / parts)
+        if at is not None:
+            inside = points[:, axis] < at
+            below, above = (cut_cells(points[side], rows_each, most) for side in (inside, ~inside))
+            return Cell(axis, float(at), below, above)
+    return Cell()
+
+
+def _parts(points: int, rows_each: float, most: int) -> int:
+    """The least number of equal parts none of which will hold more than `most` rows."""
+    parts = max(1, int(np.ceil(points * rows_each / most)))
+    sigmas = _SIGMAS if rows_each > 1 else 0.0
+    while parts < points and (points / parts + sigmas * np.sqrt(points / parts)) * rows_each > most:
+        parts += 1
+    return parts
+
+
+def _between(values: Points, rank: float) -> np.float32 | None:
+    """The value with something below it whose number of lesser values is nearest to `rank`."""
+    middle = values[min(int(rank), len(values) - 1)]
+    first = int(np.searchsorted(values, middle, "left"))
+    after = int(np.searchsorted(values, middle, "right"))
+    options = [cut for cut in (first, after) if 0 < cut < len(values)]
+    if not options:
+        return None
+    value: np.float32 = values[min(options, key=lambda cut: (abs(cut - rank), cut))]
+    return value
+
+
+def margin_of(cells: Cell, points: Points) -> float:
+    """How far halos reach: 3 % of the median over tiles of √(ab), a and b a tile's two longer sides.
+
+    Args:
+        cells: the tiles.
+        points: (N, 3) float32, all rows or a sample of them.
+    """
+    if cells.leaves == 1:
+        return 0.0
+    sizes = []
+    for core, _ in cells.route(points):
+        if len(core):
+            low, high = np.percentile(points[core], _TAILS, axis=0)
+            sides = np.sort(high.astype(np.float64) - low)
+            sizes.append(float(np.sqrt(sides[1] * sides[2])))
+    return _HALO * float(np.median(sizes)) if sizes else 0.0
+
+
+class Sampler:
+    """A sample of points that neither their order nor how they come in blocks decides: those whose hash is
+    below a limit, which is halved when they are too many."""
+
+    def __init__(self, count: int, size: int) -> None:
+        self._limit = min(1 << 32, max(1, (size << 32) // max(1, count)))
+        self._most, self._held = 2 * size, 0
+        self._points: list[Points] = []
+        self._hashes: list[NDArray[np.uint32]] = []
+
+    def add(self, points: Points) -> None:
+        """Draw from (N, 3) float32 points; those that are not finite are left out."""
+        hashes = _hashes(points)
+        chosen = np.isfinite(points).all(1)
+        if self._limit < 1 << 32:
+            chosen &= hashes < np.uint32(self._limit)
+        self._points.append(points[chosen])
+        self._hashes.append(hashes[chosen])
+        self._held += len(self._points[-1])
+        while self._held > self._most and self._limit > 1:
+            self._limit //= 2
+            points, hashes = np.concatenate(self._points), np.concatenate(self._hashes)
+            stay = hashes < np.uint32(self._limit)
+            self._points, self._hashes = [points[stay]], [hashes[stay]]
+            self._held = len(self._points[0])
+
+    def result(self) -> tuple[Points, float]:
+        """(n, 3) points, and how many rows each stands for."""
+        points = np.concatenate(self._points) if self._points else np.empty((0, 3), np.float32)
+        return points, (1 << 32) / self._limit
+
+
+def _hashes(points: Points) -> NDArray[np.uint32]:
+    """(N,) of each row's bits: multiplied and mixed as MurmurHash3 ends."""
+    bits = np.ascontiguousarray(points).view(np.uint32)
+    h = bits[:, 0] * np.uint32(0x9E3779B1)
+    for axis, factor in ((1, 0x85EBCA77), (2, 0xC2B2AE3D)):
+        h ^= h >> np.uint32(15)
+        h = (h + bits[:, axis]) * np.uint32(factor)
+    h ^= h >> np.uint32(16)
+    h *= np.uint32(0x85EBCA6B)
+    h ^= h >> np.uint32(13)
+    h *= np.uint32(0xC2B2AE35)
+    h ^= h >> np.uint32(16)
+    return h

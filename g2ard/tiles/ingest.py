@@ -1,0 +1,208 @@
+"""Streaming a scene, or a coloured cloud, of any size into tiles, in memory that does not grow with it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError, OutputError
+from g2ard.io import kind
+from g2ard.io.clean import Tally, plural
+from g2ard.io.point_stream import open_point_stream
+from g2ard.io.stream import SceneStream, open_stream
+from g2ard.io.types import Note
+from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.stages.lift import LiftConfig
+from g2ard.tiles.cells import Points
+from g2ard.tiles.journal import JOURNAL, POINTS, Journal, clear, is_ours
+from g2ard.tiles.points import PointFeed, lift_tiles
+from g2ard.tiles.pour import pour
+from g2ard.tiles.store import MANIFEST, VERSION, TileStore, packed, row_width
+
+__all__ = ["TILE_ROWS", "ingest"]
+
+TILE_ROWS = 5_000_000
+"""Rows of a tile at the most, unless told otherwise."""
+
+_BLOCK_BYTES = 1 << 24
+"""Bytes of rows in memory at a time; some five copies of them are made on the way."""
+
+
+class _SceneFeed:
+    """A scene's Gaussians as rows of its tiles."""
+
+    def __init__(self, stream: SceneStream) -> None:
+        self._stream, self.path, self.count = stream, stream.path, stream.count
+        self.row_bytes = self.room = 4 * row_width(stream.sh_degree)
+        self.sh_degree, self.offset = stream.sh_degree, stream.offset
+
+    @property
+    def tally(self) -> Tally:
+        return self._stream.tally
+
+    @tally.setter
+    def tally(self, tally: Tally) -> None:
+        self._stream.tally = tally
+
+    def positions(self, rows: int) -> Iterator[Points]:
+        return self._stream.positions(rows)
+
+    def rows(self, rows: int, start: int) -> Iterator[tuple[NDArray[Any], Points]]:
+        return ((packed(splats), splats.means) for splats in self._stream.blocks(rows, start))
+
+    def all_notes(self) -> tuple[Note, ...]:
+        return self._stream.all_notes()
+
+    def identity(self) -> list[Any]:
+        return self._stream.identity()
+
+
+def ingest(
+    source: str | Path | Sequence[str | Path],
+    folder: str | Path,
+    *,
+    tile_rows: int = TILE_ROWS,
+    block_rows: int | None = None,
+    lift: LiftConfig | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> TileStore:
+    """Write a scene as tiles of at most `tile_rows` Gaussians, each with a halo of its neighbours.
+
+    A kd tree cuts at medians of a sample of positions, along the longest side. A halo holds the Gaussians of
+    other tiles that lie in the tile's cell once its sides are moved outwards by 3 % of the median over tiles
+    of √(ab), a and b a tile's two longer sides. Which tile a Gaussian comes to depends neither on the order
+    of the rows nor on `block_rows`; within a tile the rows keep their order.
+
+    The points of a cloud come to tiles in the same way, and are lifted tile by tile, each with its halo
+    around, so that a point at a border has its neighbours.
+
+    Where it was interrupted the same call goes on from the last block, and where all is done it returns.
+
+    Args:
+        source: a scene, or several as one, as `g2ard.io.stream.open_stream` takes them; or coloured clouds,
+            as `g2ard.io.point_stream.open_point_stream` does.
+        folder: where the tiles go; absent, empty, or holding these tiles in part or whole.
+        tile_rows: Gaussians of a tile at the most; only Gaussians of one position are never parted.
+        block_rows: rows in memory at a time; None takes 16 MiB of them.
+        lift: how points are lifted; None is `LiftConfig()`.
+        overwrite: whether tiles of another scene, or of other settings, may be replaced.
+        progress: told of rows done.
+        say: told what was noticed.
+
+    Raises:
+        InputError: the source cannot be read, or `tile_rows` is less than 1.
+        OutputError: the folder holds something else, or the disk has too little room.
+
+    >>> import tempfile
+    >>> from g2ard.io import write_splats
+    >>> from g2ard.splats import Splats
+    >>> work = Path(tempfile.mkdtemp())
+    >>> row = np.stack([np.arange(100.0), np.zeros(100), np.zeros(100)], 1)
+    >>> write_splats(work / "row.ply", Splats.create(row, scales=np.ones((100, 3))))
+    >>> store = ingest(work / "row.ply", work / "tiles", tile_rows=50)
+    >>> [(tile.rows, tile.halo, tile.low[0], tile.high[0]) for tile in store.tiles]
+    [(50, 0, 0.0, 50.0), (50, 0, 50.0, 99.0)]
+    """
+    folder, sources = Path(folder), [source] if isinstance(source, str | Path) else list(source)
+    if tile_rows < 1 or (block_rows is not None and block_rows < 1):
+        raise InputError(f"tile_rows and block_rows: expected at least 1, got {tile_rows}, {block_rows}")
+    settings: dict[str, Any] = {"tile_rows": tile_rows}
+    feed: _SceneFeed | PointFeed
+    if sources and all(kind(path) == "points" for path in sources):
+        config = lift or LiftConfig()
+        feed = PointFeed(open_point_stream(sources), config)
+        settings["lift"] = asdict(config)
+    else:
+        feed = _SceneFeed(open_stream(sources))
+    key = _key(feed.identity(), settings)
+    done = _done(folder, key, overwrite)
+    if done is not None:
+        say(f"{folder}: holds these {plural(done.count, 'Gaussian')} already; skipped")
+        return done
+    _check_folder(folder, key, overwrite)
+    rows = block_rows or max(1, _BLOCK_BYTES // feed.row_bytes)
+    try:
+        if isinstance(feed, PointFeed):
+            journal = lift_tiles(folder, key, feed, tile_rows, rows, progress, say)
+        else:
+            journal = pour(folder, key, feed, tile_rows, rows, progress, say)
+    except InputError:
+        clear(folder)
+        raise
+    notes = [*feed.all_notes(), *_overfull_note(journal, tile_rows)]
+    manifest = {
+        "sh_degree": feed.sh_degree,
+        "offset": feed.offset.tolist(),
+        "source": [str(path) for path in sources],
+        "settings": settings,
+        "notes": [asdict(note) for note in notes],
+    }
+    journal.finish(manifest)
+    return TileStore.open(folder)
+
+
+def _key(identity: list[Any], settings: dict[str, Any]) -> str:
+    decisive = {"version": VERSION, "source": identity, **settings}
+    return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
+
+
+def _done(folder: Path, key: str, overwrite: bool) -> TileStore | None:
+    """The store, if it is this very one and whole; one that is broken may be replaced under `overwrite`."""
+    if not (folder / MANIFEST).is_file():
+        return None
+    try:
+        store = TileStore.open(folder)
+    except InputError:
+        if overwrite:
+            return None
+        raise
+    return store if store.key == key else None
+
+
+def _check_folder(folder: Path, key: str, overwrite: bool) -> None:
+    """Make the folder; refuse one that holds anything but the beginnings of these very tiles."""
+    if folder.is_file():
+        raise OutputError(f"{folder}: is a file; a folder is to be written there")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        names = {path.name for path in folder.iterdir()}
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot write there: {error.strerror}") from error
+    foreign = sorted(name for name in names if not is_ours(name))
+    if foreign:
+        raise OutputError(f"{folder}: holds {foreign[0]}, which is no part of tiles; name another folder")
+    begun = _begun(folder)
+    if MANIFEST not in names and begun in (None, key):
+        if begun is None:
+            clear(folder)
+        return
+    if not overwrite:
+        raise OutputError(
+            f"{folder}: holds tiles of another scene or of other settings; overwrite=True replaces it"
+        )
+    clear(folder)
+
+
+def _begun(folder: Path) -> str | None:
+    """The key in the journal of what was begun; "" where it cannot be read, None where nothing was begun."""
+    for path in (folder / JOURNAL, folder / POINTS / JOURNAL):
+        if path.is_file():
+            try:
+                return str(json.loads(path.read_text())["key"])
+            except (ValueError, KeyError, TypeError):
+                return ""
+    return None
+
+
+def _overfull_note(journal: Journal, tile_rows: int) -> list[Note]:
+    over = sum(count > tile_rows for count in journal.tiles.rows)
+    text = f"{plural(over, 'tile')} of more than {tile_rows:,} Gaussians: many share one position"
+    return [Note("overfull_tiles", over, text)] if over else []

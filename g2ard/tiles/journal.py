@@ -1,0 +1,210 @@
+"""How far the writing of tiles has come, kept beside them, so that any interruption costs one block."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import zlib
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError, OutputError
+from g2ard.io.jsonfile import read_json
+from g2ard.tiles.cells import Cell, Points
+from g2ard.tiles.store import FORMAT, MANIFEST, VERSION, halo_name, tile_name
+
+__all__ = ["JOURNAL", "POINTS", "Journal", "clear", "is_ours"]
+
+JOURNAL = "journal.json"
+POINTS = ".points"
+"""The folder within for points that are still to be lifted."""
+
+_OURS = re.compile(r"(tile|halo)-\d{5,}\.f32|\.?(tiles|journal)\.json(\.new)?|\.points")
+
+
+def is_ours(name: str) -> bool:
+    """Whether a file or folder of this name belongs to tiles, whole or begun."""
+    return _OURS.fullmatch(name) is not None
+
+
+def clear(folder: Path) -> None:
+    """Remove all that belongs to tiles, the manifest first, and nothing else."""
+    for path in sorted(folder.iterdir(), key=lambda path: path.name != MANIFEST):
+        if path.is_dir() and path.name == POINTS:
+            shutil.rmtree(path)
+        elif is_ours(path.name):
+            path.unlink()
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write beside and rename: the file is the old one or the new one."""
+    temporary = path.with_name(f".{path.name}.new")
+    temporary.write_text(json.dumps(content) + "\n")
+    os.replace(temporary, path)
+
+
+@dataclass
+class _Files:
+    """What has been written of the files of one kind."""
+
+    rows: list[int]
+    checks: list[int]
+
+
+@dataclass
+class Journal:
+    """The tiles of a scene while they are written.
+
+    `save` follows the rows, so that what it names has been written; whatever else the files hold is cut off
+    when it is opened again.
+
+    Args:
+        folder: where the tiles are.
+        key: of their content.
+        cells: the kd tree.
+        margin: of halos.
+        row_bytes: bytes of a row.
+        tally: a dataclass of what the source counts while it is read.
+        next_row: the first row of the source that is not in its tile yet.
+    """
+
+    folder: Path
+    key: str
+    cells: Cell
+    margin: float
+    row_bytes: int
+    tally: Any
+    next_row: int = 0
+    low: list[float] = field(default_factory=lambda: [np.inf] * 3)
+    high: list[float] = field(default_factory=lambda: [-np.inf] * 3)
+    tiles: _Files = field(init=False)
+    halos: _Files = field(init=False)
+
+    def __post_init__(self) -> None:
+        count = self.cells.leaves
+        self.tiles, self.halos = (_Files([0] * count, [0] * count) for _ in range(2))
+
+    @classmethod
+    def open(cls, folder: Path, row_bytes: int, tally: type) -> Journal | None:
+        """The journal in a folder, its files cut to what it names; None if there is none.
+
+        Raises:
+            InputError: it is malformed, or a file is shorter than it says.
+        """
+        path = folder / JOURNAL
+        if not path.is_file():
+            return None
+        content = read_json(path)
+        try:
+            cells = Cell.from_json(content["cells"])
+            key, margin = str(content["key"]), float(content["margin"])
+            journal = cls(folder, key, cells, margin, row_bytes, tally(**content["tally"]))
+            journal.next_row = int(content["next_row"])
+            journal.low, journal.high = content["low"], content["high"]
+            for kind in ("tiles", "halos"):
+                files = _Files(**content[kind])
+                if len(files.rows) != cells.leaves or len(files.checks) != cells.leaves:
+                    raise ValueError(f"{len(files.rows)} {kind} of {cells.leaves}")
+                setattr(journal, kind, files)
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+            raise InputError(f"{path}: malformed journal ({error!r})") from error
+        return journal
+
+    def cut(self) -> None:
+        """Cut the files to what the journal names, and make those that are absent and ought to be empty."""
+        for name, rows in self._named():
+            path = self.folder / name
+            with path.open("ab") as file:
+                if file.tell() < rows * self.row_bytes:
+                    raise InputError(f"{path}: {file.tell():,} bytes, the journal says more")
+                file.truncate(rows * self.row_bytes)
+
+    def _named(self) -> list[tuple[str, int]]:
+        names = [(tile_name(i), rows) for i, rows in enumerate(self.tiles.rows)]
+        return names + [(halo_name(i), rows) for i, rows in enumerate(self.halos.rows)]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes written."""
+        return self.row_bytes * (sum(self.tiles.rows) + sum(self.halos.rows))
+
+    def positions(self, name: str, count: int) -> Points:
+        """(count, 3) float32: the first three numbers of each row of a file."""
+        rows = np.memmap(self.folder / name, "u1", "r", shape=(count, self.row_bytes))
+        return np.ascontiguousarray(rows[:, :12]).view("<f4")
+
+    def add(self, rows: NDArray[Any], means: Points) -> None:
+        """Append each row to its tile, and to the halos of all tiles that it is near to.
+
+        Args:
+            rows: (N, …) rows of `row_bytes`, contiguous.
+            means: (N, 3) where they are.
+        """
+        if not len(rows):
+            return
+        self.low = np.minimum(self.low, means.min(axis=0).astype(np.float64)).tolist()
+        self.high = np.maximum(self.high, means.max(axis=0).astype(np.float64)).tolist()
+        for index, (core, halo) in enumerate(self.cells.route(means, self.margin)):
+            self._append(self.tiles, index, tile_name(index), rows, core)
+            self._append(self.halos, index, halo_name(index), rows, halo)
+
+    def _append(
+        self, files: _Files, index: int, name: str, rows: NDArray[Any], chosen: NDArray[np.intp]
+    ) -> None:
+        if not len(chosen):
+            return
+        data = (rows if len(chosen) == len(rows) else rows[chosen]).view(np.uint8).data
+        try:
+            with (self.folder / name).open("ab") as file:
+                file.write(data)
+        except OSError as error:
+            raise OutputError(f"{self.folder / name}: cannot write: {error.strerror or error}") from error
+        files.rows[index] += len(chosen)
+        files.checks[index] = zlib.crc32(data, files.checks[index])
+
+    def save(self) -> None:
+        """Tell the disk how far the rows have come."""
+        content = {
+            "key": self.key,
+            "cells": self.cells.to_json(),
+            "margin": self.margin,
+            "next_row": self.next_row,
+            "tally": asdict(self.tally),
+            "low": self.low,
+            "high": self.high,
+            "tiles": asdict(self.tiles),
+            "halos": asdict(self.halos),
+        }
+        _write_json(self.folder / JOURNAL, content)
+
+    def finish(self, manifest: dict[str, Any]) -> None:
+        """Write the manifest, which makes the folder a store, and forget the journal."""
+        low, high = np.array(self.low), np.array(self.high)
+        tiles = [
+            {
+                "rows": self.tiles.rows[i],
+                "halo": self.halos.rows[i],
+                "low": np.clip(box[0], low, high).tolist(),
+                "high": np.clip(box[1], low, high).tolist(),
+                "crc32": [self.tiles.checks[i], self.halos.checks[i]],
+            }
+            for i, box in enumerate(self.cells.boxes())
+        ]
+        content = {
+            "format": FORMAT,
+            "version": VERSION,
+            "key": self.key,
+            "count": sum(self.tiles.rows),
+            **manifest,
+            "margin": self.margin,
+            "cells": self.cells.to_json(),
+            "tiles": tiles,
+        }
+        _write_json(self.folder / MANIFEST, content)
+        (self.folder / JOURNAL).unlink(missing_ok=True)

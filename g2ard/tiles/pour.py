@@ -1,0 +1,136 @@
+"""Rows of any kind poured into the files of tiles: cells by a sample, then every row to where it belongs."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import OutputError
+from g2ard.io.clean import plural
+from g2ard.io.types import Note
+from g2ard.progress import Progress, Say
+from g2ard.tiles.cells import Cell, Points, Sampler, cut_cells, margin_of
+from g2ard.tiles.journal import Journal, clear
+from g2ard.tiles.store import tile_name
+
+__all__ = ["Feed", "pour"]
+
+_SAMPLE = 1 << 20
+"""Positions that tiles are cut by: 12 MB."""
+
+
+class Feed(Protocol):
+    """What is poured: rows of bytes, each with a position.
+
+    Attributes:
+        path: names the source in messages.
+        count: rows of the source.
+        tally: a dataclass of what was counted while rows were read.
+        row: the dtype of a row, whose positions are float32 (x, y, z) or float64 less `offset`.
+        room: bytes on disk that a row takes in the end, all copies counted.
+    """
+
+    path: Path
+    count: int
+    tally: Any
+    row_bytes: int
+    room: int
+
+    def positions(self, rows: int) -> Iterator[Points]:
+        """(n, 3) positions of all rows, in blocks."""
+        ...
+
+    def rows(self, rows: int, start: int) -> Iterator[tuple[NDArray[Any], Points]]:
+        """The rows to be kept from the source's row `start` on, and their positions; counted in `tally`."""
+        ...
+
+    def all_notes(self) -> tuple[Note, ...]:
+        """What was noticed, after the last row."""
+        ...
+
+
+def pour(
+    folder: Path, key: str, feed: Feed, tile_rows: int, rows: int, progress: Progress, say: Say
+) -> Journal:
+    """Write all tiles and halos of a feed, going on where an earlier call was interrupted.
+
+    Args:
+        folder: there already; empty or with the journal of this very key.
+        key: of the content.
+        feed: the rows.
+        tile_rows: rows of a tile at the most.
+        rows: rows in memory at a time.
+        progress: told of rows read.
+        say: told what was decided.
+
+    Raises:
+        InputError: the source is broken, or has no row to be kept.
+        OutputError: the disk has too little room.
+    """
+    journal = Journal.open(folder, feed.row_bytes, type(feed.tally))
+    if journal is None:
+        journal = _started(folder, key, feed, tile_rows, rows, progress)
+    else:
+        journal.cut()
+        say(f"{folder}: goes on after row {journal.next_row:,}")
+    while True:
+        feed.tally = journal.tally
+        for block, positions in feed.rows(rows, journal.next_row):
+            journal.add(block, positions)
+            journal.next_row = feed.tally.rows
+            journal.save()
+            progress("tiles", journal.next_row, feed.count)
+        feed.all_notes()
+        parts = _overfull(journal, tile_rows)
+        if not parts:
+            return journal
+        say(f"{plural(len(parts), 'tile')} hold more than {tile_rows:,} rows; cut once more")
+        cells = journal.cells.refined(parts)
+        points, _ = _sampled(feed, rows, progress)
+        clear(folder)
+        journal = Journal(folder, key, cells, margin_of(cells, points), feed.row_bytes, type(feed.tally)())
+        journal.cut()
+        journal.save()
+
+
+def _started(folder: Path, key: str, feed: Feed, tile_rows: int, rows: int, progress: Progress) -> Journal:
+    """Cut the tiles, and see to it that there is room for them."""
+    cells, points, each = Cell(), np.empty((0, 3), np.float32), 1.0
+    if feed.count > tile_rows:
+        points, each = _sampled(feed, rows, progress)
+        cells = cut_cells(points, each, tile_rows)
+    journal = Journal(folder, key, cells, margin_of(cells, points), feed.row_bytes, type(feed.tally)())
+    around = each * sum(len(halo) for _, halo in cells.route(points, journal.margin))
+    needed, free = int((feed.count + around) * feed.room), shutil.disk_usage(folder).free
+    if needed > free:
+        raise OutputError(
+            f"{folder}: the tiles need {needed / 1e9:,.1f} GB, the disk has {free / 1e9:,.1f} GB free"
+        )
+    journal.cut()
+    journal.save()
+    return journal
+
+
+def _sampled(feed: Feed, rows: int, progress: Progress) -> tuple[Points, float]:
+    sampler, done = Sampler(feed.count, _SAMPLE), 0
+    for points in feed.positions(rows):
+        sampler.add(points)
+        done += len(points)
+        progress("sample", done, feed.count)
+    return sampler.result()
+
+
+def _overfull(journal: Journal, tile_rows: int) -> dict[int, Cell]:
+    """How tiles are to be cut that came to hold more rows than the sample foretold."""
+    parts = {}
+    for index, count in enumerate(journal.tiles.rows):
+        if count > tile_rows:
+            cells = cut_cells(journal.positions(tile_name(index), count), 1.0, tile_rows)
+            if cells.leaves > 1:
+                parts[index] = cells
+    return parts

@@ -1,0 +1,231 @@
+"""A folder of tiles: fixed rows of float32, and a manifest that says what they are.
+
+`tiles.json` tells what the tiles hold together; `tile-00007.f32` has the rows of a tile, `halo-00007.f32`
+rows of its neighbours that lie around it. A row is little-endian float32: mean (3, relative to the offset),
+quaternion wxyz (4), scales (3, linear), logit of opacity (1), sh0 (3), shN (K × 3, a coefficient's channels
+beside each other).
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.io.jsonfile import read_json
+from g2ard.io.types import Note
+from g2ard.splats import Splats
+from g2ard.tiles.cells import Cell
+
+__all__ = ["MANIFEST", "Tile", "TileStore", "halo_name", "packed", "row_width", "tile_name"]
+
+MANIFEST = "tiles.json"
+FORMAT, VERSION = "g2ard tiles", 1
+
+_AT_ONCE = 1 << 16
+"""Rows read at a time into a tile's arrays."""
+
+
+def tile_name(index: int) -> str:
+    """The file of a tile's own rows."""
+    return f"tile-{index:05}.f32"
+
+
+def halo_name(index: int) -> str:
+    """The file of the rows around a tile."""
+    return f"halo-{index:05}.f32"
+
+
+def row_width(sh_degree: int) -> int:
+    """Numbers in a row: 14 + 3K."""
+    return 14 + 3 * ((sh_degree + 1) ** 2 - 1)
+
+
+def packed(splats: Splats) -> NDArray[np.float32]:
+    """(N, 14 + 3K) rows as tiles hold them."""
+    rows = np.empty((len(splats), row_width(splats.sh_degree)), "<f4")
+    rows[:, 0:3] = splats.means
+    rows[:, 3:7] = splats.quats
+    rows[:, 7:10] = splats.scales
+    rows[:, 10] = splats.logit_opacities
+    rows[:, 11:14] = splats.sh0[:, 0]
+    rows[:, 14:] = splats.shN.reshape(len(splats), rows.shape[1] - 14)
+    return rows
+
+
+@dataclass(frozen=True)
+class Tile:
+    """What the manifest says of a tile.
+
+    Args:
+        index: its place, along the kd tree.
+        rows: Gaussians whose mean lies in its cell.
+        halo: Gaussians of other tiles within the margin around the cell.
+        low: corner of the cell, cut to the bounds of the whole scene's means, relative to the offset.
+        high: the other corner.
+        checks: CRC-32 of both files.
+    """
+
+    index: int
+    rows: int
+    halo: int
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    checks: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class TileStore:
+    """A scene as tiles in a folder; `open` reads the manifest, `read` a tile.
+
+    Args:
+        folder: where it lies.
+        tiles: in the order of the kd tree.
+        count: Gaussians in all, halos not counted.
+        sh_degree: 0–3.
+        offset: (3,) float64, world = means + offset.
+        margin: how far halos reach beyond a cell's sides, scene units.
+        cells: the kd tree.
+        notes: what was noticed while ingesting.
+        key: SHA-256 of all that decides the content: which source, which settings.
+        settings: those settings.
+    """
+
+    folder: Path
+    tiles: tuple[Tile, ...]
+    count: int
+    sh_degree: int
+    offset: NDArray[np.float64]
+    margin: float
+    cells: Cell
+    notes: tuple[Note, ...]
+    key: str
+    settings: Mapping[str, Any]
+
+    @classmethod
+    def open(cls, folder: str | Path) -> TileStore:
+        """The store in a folder; every file must have its size, contents are checked as they are read.
+
+        Raises:
+            InputError: no manifest, one that is broken or of another version, or a file that is absent or
+                has another size.
+        """
+        folder = Path(folder)
+        path = folder / MANIFEST
+        if not path.is_file():
+            raise InputError(f"{folder}: holds no finished tiles (no {MANIFEST})")
+        content = read_json(path)
+        if content.get("format") != FORMAT:
+            raise InputError(f"{path}: not a manifest of tiles")
+        if content.get("version") != VERSION:
+            raise InputError(f"{path}: version {content.get('version')!r} is not known ({VERSION} is)")
+        try:
+            store = cls._parsed(folder, content)
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+            raise InputError(f"{path}: malformed manifest ({error!r})") from error
+        for tile in store.tiles:
+            store._check_size(tile_name(tile.index), tile.rows)
+            store._check_size(halo_name(tile.index), tile.halo)
+        return store
+
+    @classmethod
+    def _parsed(cls, folder: Path, content: dict[str, Any]) -> TileStore:
+        tiles = []
+        for index, tile in enumerate(content["tiles"]):
+            rows, halo = int(tile["rows"]), int(tile["halo"])
+            (x, y, z), (X, Y, Z) = map(float, tile["low"]), map(float, tile["high"])
+            first, second = map(int, tile["crc32"])
+            tiles.append(Tile(index, rows, halo, (x, y, z), (X, Y, Z), (first, second)))
+        offset = np.array(content["offset"], np.float64)
+        cells = Cell.from_json(content["cells"])
+        notes = tuple(Note(str(n["code"]), int(n["count"]), str(n["text"])) for n in content["notes"])
+        store = cls(
+            folder,
+            tuple(tiles),
+            int(content["count"]),
+            int(content["sh_degree"]),
+            offset,
+            float(content["margin"]),
+            cells,
+            notes,
+            str(content["key"]),
+            dict(content["settings"]),
+        )
+        fits = offset.shape == (3,) and store.sh_degree in range(4) and cells.leaves == len(tiles)
+        if not fits or sum(tile.rows for tile in tiles) != store.count:
+            raise ValueError("its numbers contradict each other")
+        return store
+
+    def _check_size(self, name: str, rows: int) -> None:
+        path = self.folder / name
+        expected = self.row_bytes * rows
+        try:
+            size = path.stat().st_size
+        except OSError as error:
+            raise InputError(f"{path}: {error.strerror}") from error
+        if size != expected:
+            raise InputError(f"{path}: {size:,} bytes, the manifest says {expected:,}")
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of a row."""
+        return 4 * row_width(self.sh_degree)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all tiles and halos."""
+        return self.row_bytes * sum(tile.rows + tile.halo for tile in self.tiles)
+
+    def read(self, index: int) -> Splats:
+        """A tile's own rows, in the order of the source.
+
+        Raises:
+            InputError: the file is absent, has another size, or its contents changed.
+        """
+        tile = self.tiles[index]
+        return self._read(tile_name(index), tile.rows, tile.checks[0])
+
+    def read_halo(self, index: int) -> Splats:
+        """The rows around a tile, in the order of the source.
+
+        Raises:
+            InputError: as for `read`.
+        """
+        tile = self.tiles[index]
+        return self._read(halo_name(index), tile.halo, tile.checks[1])
+
+    def means(self, index: int) -> NDArray[np.float32]:
+        """(rows, 3) a view of the mapped file: the means of a tile's own rows, contents not checked."""
+        tile = self.tiles[index]
+        if not tile.rows:
+            return np.empty((0, 3), np.float32)
+        self._check_size(tile_name(index), tile.rows)
+        width = row_width(self.sh_degree)
+        rows = np.memmap(self.folder / tile_name(index), "<f4", "r", shape=(tile.rows, width))
+        return rows[:, :3]
+
+    def _read(self, name: str, count: int, check: int) -> Splats:
+        self._check_size(name, count)
+        rest = (self.sh_degree + 1) ** 2 - 1
+        means, quats = np.empty((count, 3), np.float32), np.empty((count, 4), np.float32)
+        scales, logits = np.empty((count, 3), np.float32), np.empty(count, np.float32)
+        sh0, shN = np.empty((count, 1, 3), np.float32), np.empty((count, rest, 3), np.float32)
+        crc = 0
+        with (self.folder / name).open("rb") as file:
+            for start in range(0, count, _AT_ONCE):
+                at = slice(start, min(start + _AT_ONCE, count))
+                data = file.read(self.row_bytes * (at.stop - start))
+                crc = zlib.crc32(data, crc)
+                rows = np.frombuffer(data, "<f4").reshape(at.stop - start, -1)
+                means[at], quats[at], scales[at] = rows[:, :3], rows[:, 3:7], rows[:, 7:10]
+                logits[at], sh0[at, 0] = rows[:, 10], rows[:, 11:14]
+                shN[at] = rows[:, 14:].reshape(len(rows), rest, 3)
+        if crc != check:
+            raise InputError(f"{self.folder / name}: its contents are not those that were written")
+        return Splats(means, quats, scales, logits, sh0, shN, self.offset.copy())
