@@ -27,7 +27,7 @@ class DaskExecutor:
 
     def __init__(self, scheduler: str, workers: int, threads: int):
         try:
-            from dask.distributed import Client, LocalCluster
+            from distributed import Client, LocalCluster
         except ImportError:
             raise InputError(
                 '--scheduler: Dask is not installed; pip install "g2ard[distributed]" brings it'
@@ -35,15 +35,21 @@ class DaskExecutor:
         self._threads = threads
         self._cluster: Any = None
         if scheduler == "local":
-            self._cluster = LocalCluster(
-                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
+            self._cluster = LocalCluster(  # type: ignore[no-untyped-call]
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=None,
+                memory_limit=0,
             )
             scheduler = self._cluster.scheduler_address
         try:
-            self.client: Any = Client(scheduler, timeout="10s", set_as_default=False)
+            self.client: Any = Client(  # type: ignore[no-untyped-call]
+                scheduler, timeout="10s", set_as_default=False
+            )
         except (OSError, TimeoutError, ValueError) as error:
             raise InputError(
-                f"--scheduler {scheduler}: does not answer ({error}); `dask scheduler` starts one, and prints "
+                f"--scheduler {scheduler}: does not answer ({error}); `dask scheduler` starts one and prints "
                 "its address"
             ) from None
 
@@ -57,20 +63,18 @@ class DaskExecutor:
 
     def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
         """As `Executor.run`; a worker's death costs a retry."""
-        from dask.distributed import as_completed
+        from distributed import as_completed
 
         todo = {task.key: task for task in tasks if not task.output.exists()}
         total = sum(task.cost for task in tasks)
         done = total - sum(task.cost for task in todo.values())
         futures = [
-            self.client.submit(
-                _work, task, self._threads, key=f"g2ard-{key}", retries=_RETRIES, pure=True
-            )
+            self.client.submit(_work, task, self._threads, key=f"g2ard-{key}", retries=_RETRIES, pure=True)
             for key, task in todo.items()
         ]
         try:
             progress(stage, done, total)
-            for future in as_completed(futures):
+            for future in as_completed(futures, loop=self.client.loop):  # type: ignore[no-untyped-call]
                 future.result()
                 done += todo[future.key.removeprefix("g2ard-")].cost
                 progress(stage, done, total)
@@ -79,7 +83,9 @@ class DaskExecutor:
             raise
         missing = [task.output for task in tasks if not task.output.exists()]
         if missing:
-            raise InputError(f"{missing[0]}: a worker made it, but it is not here; share that folder with all")
+            raise InputError(
+                f"{missing[0]}: a worker made it, but it is not here; share that folder with all"
+            )
         return [task.output for task in tasks]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ def cheapest(costs: Sequence[Callable[[], NDArray[np.float32]]], count: int) -> 
     upper = sum((_histogram(_bits(make) >> 16) for make in costs), np.zeros(_HALF, np.int64))
     first, below = _rank(upper, count)
     lower = sum(
-        (_histogram(bits[bits >> 16 == first] & 0xFFFF) for bits in map(_bits, costs)),
+        (_histogram(bits[bits >> 16 == first] & np.uint32(0xFFFF)) for bits in map(_bits, costs)),
         np.zeros(_HALF, np.int64),
     )
     second, under = _rank(lower, count - below)
@@ -49,7 +50,7 @@ def _bits(make: Callable[[], NDArray[np.float32]]) -> NDArray[np.uint32]:
     return np.ascontiguousarray(make(), np.float32).view(np.uint32)
 
 
-def _histogram(values: NDArray[np.uint32]) -> NDArray[np.int64]:
+def _histogram(values: NDArray[Any]) -> NDArray[np.int64]:
     return np.bincount(values, minlength=_HALF)
 
 

@@ -30,7 +30,9 @@ class Executor(Protocol):
 
 
 @contextmanager
-def executor(workers: int = 1, threads: int | None = None, scheduler: str | None = None) -> Iterator[Executor]:
+def executor(
+    workers: int = 1, threads: int | None = None, scheduler: str | None = None
+) -> Iterator[Executor]:
     """Where tasks run.
 
     Args:

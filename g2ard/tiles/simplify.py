@@ -90,6 +90,7 @@ def simplify_tiles(
     work: Path,
     config: SimplifyConfig | None = None,
     views: Cameras | None = None,
+    beside: Callable[[Splats], Cameras | None] = lambda sample: None,
     blind: bool = False,
     up: Any = None,
     seed: int = 0,
@@ -116,7 +117,9 @@ def simplify_tiles(
         executor: runs the tasks.
         work: a folder for their files.
         config: constants; None means the method's own.
-        views: cameras to look from; None plans a pool.
+        views: cameras to look from; None takes those that `beside` finds for a fair sample of the scene, else
+            plans a pool.
+        beside: finds cameras.
         blind: use no cameras at all.
         up: (3,) away from the ground, for poses that are made; None to estimate it.
         seed: of poses that are made.
@@ -134,7 +137,8 @@ def simplify_tiles(
     frame = run.sampled_frame(coarse)
     sights: _Sights | None = None
     if not blind:
-        cameras = views or _planned(run, coarse, up, seed, say)
+        sample = joined([scene_of(path, "sample") for path in coarse])
+        cameras = views or beside(sample) or _planned(run, sample, up, seed, say)
         sights = None if cameras is None else _Sights(run, coarse, cameras, frame)
         frame = frame if sights is None else sights.frame
     costs = run.each("run_costs", "costs", frame=frame, **_look_of(sights))
@@ -233,7 +237,9 @@ class _Sights:
         self.run, self.coarse, self.cameras = run, coarse, cameras.resized(_LONGEST)
         self.shrunk = float((self.cameras.widths / cameras.widths).mean())
         self.views = self._written()
-        self.boxes = np.array([np.percentile(scene_of(path, "near").means, (1, 99), axis=0) for path in coarse])
+        self.boxes = np.array(
+            [np.percentile(scene_of(path, "near").means, (1, 99), axis=0) for path in coarse]
+        )
         light = self._light()
         self.arguments = [
             {
@@ -260,7 +266,10 @@ class _Sights:
             for given, path, look in zip(self._inputs(), merged, self.looks, strict=True)
         ]
         again = run.each(
-            "look_again", "look again", per_tile=[{"levels": a["levels"]} for a in self.arguments], inputs=inputs
+            "look_again",
+            "look again",
+            per_tile=[{"levels": a["levels"]} for a in self.arguments],
+            inputs=inputs,
         )
         mean = sum(float(load(path, "wanted")[0].sum()) for path in merged) / sum(counts)
         unseen = sum(int(load(path, "unseen")[0]) for path in merged)
@@ -338,11 +347,10 @@ def _look_of(sights: _Sights | None) -> dict[str, Any]:
     return {} if sights is None else {"inputs": [{"look": path} for path in sights.looks]}
 
 
-def _planned(run: _Run, coarse: list[Path], up: Any, seed: int, say: Say) -> Cameras | None:
+def _planned(run: _Run, sample: Splats, up: Any, seed: int, say: Say) -> Cameras | None:
     """A pool that grows with the scene."""
     from g2ard.poses import plan_pool
 
-    sample = joined([scene_of(path, "sample") for path in coarse])
     times = max(1.0, run.store.count / _POOL_ROWS)
     try:
         pool = plan_pool(

@@ -27,7 +27,7 @@ from g2ard.tiles.task import Arrays, load
 __all__ = ["coarse", "glance", "look", "look_again", "merge", "pair_plan", "run_costs"]
 
 COARSE = (32, 512)
-"""How many times fewer Gaussians stand for a tile beside the one that is looked at, and for one far from it."""
+"""How many times fewer Gaussians stand for a tile near the one that is looked at, and for one far."""
 
 _DEEPER = 0.6
 """Share of the Gaussians that a tile is expected to keep down to which its merges are planned."""
@@ -44,6 +44,9 @@ _NEAR = 1e-3
 _OUTLINE, _BESIDE = 20_000, 8
 """Gaussians of a tile by whose means its images are cropped, and pixels left around them."""
 
+_THINNED = 8
+"""Of so many rows in Morton order one is merged to coarse Gaussians, widened to stand for all."""
+
 GONE = np.uint32(0xFFFFFFFF)
 """The cluster of a row that is dropped."""
 
@@ -58,7 +61,8 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """A tile merged to a few Gaussians, near and far, and a fair sample of its rows."""
     scene = _tile(arguments, places)
     config = _config(arguments)
-    near = simplify(scene, max(1, len(scene) // COARSE[0]), method="fast", config=config).splats
+    some = _widened(scene.take(scene.core.order[::_THINNED]), _THINNED)
+    near = simplify(some, max(1, len(scene) // COARSE[0]), method="fast", config=config).splats
     far = simplify(near, max(1, len(scene) // COARSE[1]), method="fast", config=config).splats
     rows = scene.core.order[:: COARSE[0]]
     return {**_arrays(near, "near"), **_arrays(far, "far"), **_arrays(scene.take(rows), "sample")}
@@ -245,7 +249,8 @@ def _with_surroundings(core: Splats, arguments: Arguments, inputs: Inputs, place
     """A tile's Gaussians first, then its halo, then coarse ones of all other tiles outside of that."""
     store, tile = TileStore.open(places["store"]), arguments["tile"]
     halo = store.read_halo(tile)
-    low, high = (np.float32(store.tiles[tile].low) - store.margin, np.float32(store.tiles[tile].high) + store.margin)
+    low = np.array(store.tiles[tile].low) - store.margin
+    high = np.array(store.tiles[tile].high) + store.margin
     parts = [core, halo.with_sh_degree(0)]
     for path, level in zip(inputs["coarse"], arguments["levels"], strict=True):
         if not level:
@@ -276,6 +281,13 @@ def _cropped(cameras: Cameras, core: PreparedScene, settings: RasterSettings) ->
     Ks[:, 0, 2] -= left
     Ks[:, 1, 2] -= top
     return replace(cameras, Ks=Ks, widths=right - left, heights=bottom - top)
+
+
+def _widened(scene: Splats, times: int) -> Splats:
+    """Rows that each stand for so many: their two longer axes cover as much."""
+    longer = np.arange(3) != np.argmin(scene.scales, axis=1)[:, None]
+    factor = np.where(longer, np.float32(math.sqrt(times)), np.float32(1))
+    return replace(scene, scales=scene.scales * factor)
 
 
 def _spread(count: int) -> list[int]:

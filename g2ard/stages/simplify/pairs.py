@@ -17,7 +17,15 @@ from g2ard.progress import Progress, counter
 from g2ard.splats import DRAWN_LOGIT, Splats
 from g2ard.stages.simplify.config import SimplifyConfig, schedule
 
-__all__ = ["Visibility", "VisibilitySource", "fit_opacities", "merge", "merge_and_fit", "rows_of", "splats_of"]
+__all__ = [
+    "Visibility",
+    "VisibilitySource",
+    "fit_opacities",
+    "merge",
+    "merge_and_fit",
+    "rows_of",
+    "splats_of",
+]
 
 _FIT = 1 / 4
 """Exponent of the ratio of what views saw to what they see: ½ fits the views looked from by up to 0.1 dB
