@@ -119,12 +119,16 @@ def test_one_tile_is_the_whole_to_the_bit(seen: bool) -> None:
         frame = frame.with_views(0.01, *tile(frame).sums())
     here = tile(frame)
     assert len(here.run_costs()) < len(prepared)  # the transparent are not among them
-    counts = [n for n in schedule(len(prepared), budget, config.retention_of("default")) if n < 3 * budget]
+    rounds = schedule(len(prepared), budget, config.retention_of("default"))
+    counts = [n for n in rounds if n < 3 * budget]
     of, a, b, costs = here.plan(3 * budget, counts)
     assert len(a) == 2 * budget
     assert (costs >= 0).all()
     out = here.assemble(clusters(of, a, b, 3 * budget), budget)
-    both = [(np.float32(out["means"]), out["logit_opacities"]), (np.float32(whole.means), whole.logit_opacities)]
+    both = [
+        (np.float32(out["means"]), out["logit_opacities"]),
+        (np.float32(whole.means), whole.logit_opacities),
+    ]
     rows = [np.column_stack(pair)[np.lexsort(np.column_stack(pair).T)] for pair in both]
     np.testing.assert_array_equal(*rows)
 
@@ -178,26 +182,29 @@ def test_a_cluster_of_two_workers_gives_the_same_bits(store: TileStore, tmp_path
 
 def test_workers_killed_at_random_cost_time_alone(store: TileStore, tmp_path: Path) -> None:
     here = reduced(store, tmp_path / "here", views=ring())
-    stop, killed, draw = threading.Event(), [], random.Random(0)
+    stop, killed, draw, work = threading.Event(), [], random.Random(0), tmp_path / "killed"
 
     def kill() -> None:
+        done = 0
         while not stop.is_set() and len(killed) < 5:
-            time.sleep(draw.uniform(0.5, 1.0))
-            if children := _children():
-                victim = draw.choice(children)
-                os.kill(victim, signal.SIGKILL)
-                killed.append(victim)
+            time.sleep(0.02)
+            files = len(list(work.glob("*.npz")))
+            if files >= done + 3 and (children := _children()):
+                time.sleep(draw.uniform(0, 0.05))
+                os.kill(draw.choice(children), signal.SIGKILL)
+                killed.append(files)
+                done = files
 
     killer = threading.Thread(target=kill)
     killer.start()
     try:
-        small = reduced(store, tmp_path / "killed", views=ring(), workers=2)
+        small = reduced(store, work, views=ring(), workers=2)
     finally:
         stop.set()
         killer.join()
-    assert killed
+    assert len(killed) == 5
     assert small.fingerprint() == here.fingerprint()
-    assert not list((tmp_path / "killed").glob(".*"))
+    assert len(list(work.glob("*.npz"))) == len(list((tmp_path / "here").glob("*.npz")))
 
 
 def _children() -> list[int]:
