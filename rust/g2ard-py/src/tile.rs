@@ -73,10 +73,7 @@ impl PyTileMerging {
         let splats = scene.splats(py)?;
         let rows = splats.borrow()?;
         let seen: Option<[PyReadonlyArray1<'_, f32>; 2]> = match &self.seen {
-            Some([weight, pixel]) => Some([
-                weight.bind(py).extract()?,
-                pixel.bind(py).extract()?,
-            ]),
+            Some([weight, pixel]) => Some([weight.bind(py).extract()?, pixel.bind(py).extract()?]),
             None => None,
         };
         let visibility = match &seen {
@@ -152,7 +149,8 @@ impl PyTileMerging {
         let plan = self.with(py, |tile| {
             long(py, progress, |control| tile.plan(runs, &schedule, control))
         })?;
-        let names = |of: fn(&g2ard_core::simplify::Pair) -> u32| plan.merges.iter().map(of).collect();
+        let names =
+            |of: fn(&g2ard_core::simplify::Pair) -> u32| plan.merges.iter().map(of).collect();
         let (a, b) = (names(|p| p.a), names(|p| p.b));
         let costs = plan.merges.iter().map(|p| p.cost).collect();
         Ok((

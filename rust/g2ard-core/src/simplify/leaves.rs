@@ -79,7 +79,9 @@ impl<'a> Leaves<'a> {
             .collect();
         let mass: f64 = masses.iter().map(|&m| f64::from(m)).sum();
         let weight = |v| self.kept.iter().map(move |&i| self.weight(v, i));
-        let total = self.visibility.map_or(0.0, |v| weight(v).map(f64::from).sum());
+        let total = self
+            .visibility
+            .map_or(0.0, |v| weight(v).map(f64::from).sum());
         (total, mass)
     }
 

@@ -6,7 +6,6 @@
 //! farther than any budget asks for and tells the order of the merges and their costs; once it is decided how
 //! many of those a tile does, [`Tile::assemble`] makes its Gaussians.
 
-
 use super::clusters::Partition;
 use super::importance::Importance;
 use super::leaves::{Leaves, floor, typical_size};
@@ -99,7 +98,11 @@ impl Tile<'_> {
         let (blur, kept) = (self.blurs(), self.kept());
         let leaves = self.leaves(kept.clone(), &blur);
         if runs == 0 || runs > leaves.len() {
-            return Err(Error::invalid("runs", format!("1 to {}", leaves.len()), runs));
+            return Err(Error::invalid(
+                "runs",
+                format!("1 to {}", leaves.len()),
+                runs,
+            ));
         }
         control.begin((runs - schedule.last().map_or(runs, |&last| last.min(runs))) as u64);
         let (mut nodes, at) = if runs < leaves.len() {
@@ -156,7 +159,11 @@ impl Tile<'_> {
         control: &Control,
     ) -> Result<Outcome<PairwiseRound>> {
         if of.len() != self.scene.len() {
-            return Err(Error::invalid("of", format!("{} rows", self.scene.len()), of.len()));
+            return Err(Error::invalid(
+                "of",
+                format!("{} rows", self.scene.len()),
+                of.len(),
+            ));
         }
         let blur = self.blurs();
         let flags = vec![false; of.len()];
@@ -182,11 +189,19 @@ impl Tile<'_> {
 
     fn blurs(&self) -> Vec<f32> {
         let usual = Some(self.frame.pixel_size);
-        self.policy.blurs(self.scene, self.ordered, self.visibility, usual)
+        self.policy
+            .blurs(self.scene, self.ordered, self.visibility, usual)
     }
 
     fn leaves<'b>(&'b self, kept: Vec<u32>, blur: &'b [f32]) -> Leaves<'b> {
-        Leaves::new(self.scene, self.ordered, kept, blur, self.visibility, Some(&self.frame))
+        Leaves::new(
+            self.scene,
+            self.ordered,
+            kept,
+            blur,
+            self.visibility,
+            Some(&self.frame),
+        )
     }
 
     fn geometric(&self) -> f32 {
