@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from g2ard.levels import save_levels
     from g2ard.pipeline import DistillConfig, Distilled
     from g2ard.policy.distill import distill
+    from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.levels import lod
     from g2ard.policy.simplify import simplify
     from g2ard.poses import make_pool
@@ -72,6 +73,7 @@ __all__ = [
     "Cameras",
     "CoverageOptions",
     "DistillConfig",
+    "DistillOptions",
     "Distilled",
     "Evaluation",
     "G2ardError",
@@ -120,6 +122,7 @@ _HOMES = {
     "pipeline": ("DistillConfig", "Distilled"),
     "levels": ("save_levels",),
     "policy.distill": ("distill",),
+    "policy.distill_options": ("DistillOptions",),
     "policy.levels": ("lod",),
     "policy.simplify": ("simplify",),
     "poses": ("make_pool",),

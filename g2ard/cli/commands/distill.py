@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.choices import Method, ScheduleName
 from g2ard.cli.budget_options import (
     Count,
     CountsOption,
@@ -23,11 +24,9 @@ from g2ard.cli.options import (
     BackgroundOption,
     CropOption,
     FormatOption,
-    Method,
     PolicyOption,
     PresetOption,
     ResumeOption,
-    ScheduleName,
     SizeOption,
     TimeLimitOption,
     UpOption,
@@ -166,6 +165,7 @@ def distill(
         raise typer.BadParameter("--photos: views that are made have none")
     from g2ard.io import kind
     from g2ard.policy.distill import prepare
+    from g2ard.policy.distill_options import DistillOptions
     from g2ard.report.distilled import check_crops
 
     began = time.monotonic()
@@ -188,9 +188,7 @@ def distill(
         )
     if scene is not None and kind(scene) != "splats" and not given:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
-    job = prepare(
-        scene,
-        budgets,
+    options = DistillOptions(
         format=format,
         clean=clean,
         views=views,
@@ -212,9 +210,8 @@ def distill(
         up=up,
         seed=run.seed,
         engine=engine,
-        progress=run.progress,
-        say=run.say,
     )
+    job = prepare(scene, budgets, options, progress=run.progress, say=run.say)
     check_crops(crop or [], job.views.test.names)
     outputs.check(check, len(job.prior))
     places = [folder / name for folder in outputs.paths(len(job.prior))]

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from g2ard.choices import ScheduleName
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
     OutputOption,
     PresetOption,
     ResumeOption,
-    ScheduleName,
     ShDegreeOption,
     SizeOption,
     SplitOption,
