@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from g2ard.cli.frame import Run
 from g2ard.cli.outputs import Outputs
+from g2ard.cli.run_folder import write_report
 
 if TYPE_CHECKING:
     from g2ard.policy.budget import Budget
+    from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.tiled import Tiling
     from g2ard.stages.simplify import SimplifyConfig
     from g2ard.tiles.simplify import TiledScene
@@ -69,6 +71,45 @@ class TiledCommand:
                     "peak_rss_bytes": peak_rss(),
                 }
             )
+        run.result(reports[0] if len(reports) == 1 else {"runs": reports})
+        forget(self.tiling)
+
+    def distill(self, options: DistillOptions, name: str) -> None:
+        """`g2ard distill`: in each run's folder the scene, its views and the report."""
+        from dataclasses import asdict
+
+        from g2ard import io
+        from g2ard.memory import peak_rss
+        from g2ard.policy.tiled import forget
+        from g2ard.policy.tiled_distill import distill_in_tiles
+
+        run, began, reports = self.run, time.perf_counter(), []
+        made = distill_in_tiles(
+            self.scene, self.budgets, self.tiling, options, progress=run.progress, say=run.say
+        )
+        for at, (store, small, scores, views) in enumerate(made):
+            folder = self.outputs.paths(store.count)[at]
+            report = {
+                "input_count": store.count,
+                "output_count": len(small),
+                "tiles": list(small.counts),
+                "scores": asdict(scores),
+                "views": {"train": len(views.train.cameras), "test": len(views.test)},
+                "notes": {note.code: note.count for note in store.notes},
+                "config": run.config,
+                "seconds": {"total": time.perf_counter() - began},
+                "peak_rss_bytes": peak_rss(),
+            }
+            if (pool := views.pool) is not None:
+                io.write_views(folder / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
+            self._write(folder / name, store, small)
+            write_report(folder, report)
+            run.say(
+                f"{folder}: {len(small):,} of {store.count:,} Gaussians; held-out views "
+                f"{scores.simplified:.2f} → {scores.recovered:.2f} dB over the pixels that tiles own"
+            )
+            run.kept.append(f"{folder} is finished")
+            reports.append(report)
         run.result(reports[0] if len(reports) == 1 else {"runs": reports})
         forget(self.tiling)
 

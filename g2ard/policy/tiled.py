@@ -23,7 +23,17 @@ if TYPE_CHECKING:
     from g2ard.tiles.simplify import TiledScene
     from g2ard.tiles.store import TileStore
 
-__all__ = ["Tiling", "bytes_of", "check_memory", "forget", "is_tiled", "simplify_in_tiles", "tiles_of"]
+__all__ = [
+    "Tiling",
+    "bytes_of",
+    "check_memory",
+    "cores_of",
+    "forget",
+    "is_tiled",
+    "simplify_in_tiles",
+    "tiles_of",
+    "workers_for",
+]
 
 _SMALLEST_ROW = 4
 """Bytes of a Gaussian in a file, at least: a smaller file need not be opened to know that it is small."""
@@ -177,7 +187,7 @@ def simplify_in_tiles(
     assert folder is not None
     with tiles_of(scene, tiling, progress, say) as store:
         workers = workers_for(store, tiling)
-        threads = max(1, (tiling.cores or _cores()) // workers)
+        threads = max(1, cores_of(tiling) // workers)
         say(f"{len(store.tiles):,} tiles of {store.count:,} Gaussians, {workers} at a time")
         with executor(workers, threads, tiling.scheduler) as runs:
             for budget in budgets:
@@ -200,15 +210,15 @@ def simplify_in_tiles(
                 )
 
 
-def workers_for(store: TileStore, tiling: Tiling) -> int:
-    """As many workers as memory and cores allow.
+def workers_for(store: TileStore, tiling: Tiling, times: float = 1.0) -> int:
+    """As many workers as memory and cores allow, where a tile takes so many times what merging it takes.
 
     Raises:
         InputError: not even one tile fits.
     """
     memory = tiling.memory or int(0.8 * _physical_memory())
     largest = max(tile.rows + tile.halo for tile in store.tiles)
-    need = _TASK_BYTES + int(largest * (_ROW_BYTES + _ROW_TIMES * store.row_bytes))
+    need = _TASK_BYTES + int(times * largest * (_ROW_BYTES + _ROW_TIMES * store.row_bytes))
     fit = memory // need
     if fit < 1:
         raise InputError(
@@ -220,7 +230,7 @@ def workers_for(store: TileStore, tiling: Tiling) -> int:
             f"--workers {tiling.workers} take about {tiling.workers * need / 1e9:.1f} GB, more than "
             f"--memory {memory / 1e9:.1f}GB; --workers {fit} fit"
         )
-    return tiling.workers or max(1, min(fit, tiling.cores or _cores()))
+    return tiling.workers or max(1, min(fit, cores_of(tiling)))
 
 
 def _rows_within(memory: int, row_bytes: float) -> int:
@@ -246,7 +256,10 @@ def _found(scene: Path, sample: Splats, say: Say) -> Cameras | None:
     return as_pool(load_views(found, "train", None, say)) if found else None
 
 
-def _cores() -> int:
+def cores_of(tiling: Tiling) -> int:
+    """Cores that workers share."""
+    if tiling.cores:
+        return tiling.cores
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -21,10 +21,27 @@ from g2ard.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.splats import Splats
 from g2ard.stages.render import RasterSettings, view_of
 from g2ard.stages.simplify import SimplifyConfig, schedule, simplify
+from g2ard.stages.simplify.pairs import fit_opacities
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.task import Arrays, load
 
-__all__ = ["coarse", "glance", "look", "look_again", "merge", "pair_plan", "run_costs"]
+__all__ = [
+    "COARSE",
+    "coarse",
+    "cropped",
+    "far_around",
+    "glance",
+    "joined",
+    "look",
+    "look_again",
+    "merge",
+    "pair_plan",
+    "run_costs",
+    "scene_of",
+    "small_scene",
+    "tile_of",
+    "within_halo",
+]
 
 COARSE = (32, 512)
 """How many times fewer Gaussians stand for a tile near the one that is looked at, and for one far."""
@@ -59,7 +76,7 @@ _FIELDS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset"
 
 def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """A tile merged to a few Gaussians, near and far, and a fair sample of its rows."""
-    scene = _tile(arguments, places)
+    scene = tile_of(arguments, places)
     config = _config(arguments)
     some = _widened(scene.take(scene.core.order[::_THINNED]), _THINNED)
     near = simplify(some, max(1, len(scene) // COARSE[0]), method="fast", config=config).splats
@@ -89,12 +106,12 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     The views that have it in sight look sixteen at a time until the next sixteen find few Gaussians that were
     not seen before; their sums are raised to stand for all that have it in sight.
     """
-    core = _tile(arguments, places, sh=False)
+    core = tile_of(arguments, places, sh=False)
     cameras = cameras_of(inputs["views"]).recentred(core.offset)
     here = cameras.take(arguments["views"])
     distance = np.median(np.linalg.norm(here.positions - core.core.origin, axis=1)) if len(here) else 0.0
     settings = RasterSettings(near=_NEAR * float(distance) or None)
-    here = _cropped(here, core, settings)
+    here = cropped(here, core, settings)
     sums = _core.VisibilityAccumulator(_with_surroundings(core, arguments, inputs, places).core)
     apart = max(1, math.ceil(len(here) / _ROUND))
     light, used, seen = np.asarray(arguments["light"]), [], 0
@@ -126,7 +143,7 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
 def run_costs(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """What merging along Morton order costs, a value for each gap between rows."""
-    scene = _tile(arguments, places, sh=False)
+    scene = tile_of(arguments, places, sh=False)
     return {"costs": _seen_tile(scene, arguments, inputs).run_costs()}
 
 
@@ -135,7 +152,7 @@ def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
     `costs` never falls: what a merge waits for costs no less than it.
     """
-    scene = _tile(arguments, places)
+    scene = tile_of(arguments, places)
     config = _config(arguments).resolved("default")
     runs, expected = arguments["runs"], arguments["expected"]
     last = max(1, min(runs, round(_DEEPER * expected)))
@@ -146,7 +163,7 @@ def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
 def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """The tile's Gaussians after the first `merges` of its plan, and what the views saw of their members."""
-    scene = _tile(arguments, places)
+    scene = tile_of(arguments, places)
     runs, merges = arguments["runs"], arguments["merges"]
     of, a, b = load(inputs["plan"], "of", "a", "b")
     into = np.arange(runs)
@@ -182,10 +199,24 @@ def look_again(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     used, share, near = load(inputs["look"], "used", "share", "near")
     cameras = cameras_of(inputs["views"]).recentred(core.offset).take(used)
     settings = RasterSettings(near=float(near))
-    cameras = _cropped(cameras, core, settings)
+    cameras = cropped(cameras, core, settings)
     sums = _core.VisibilityAccumulator(_with_surroundings(core, arguments, inputs, places).core)
     sums.add([view_of(cameras, i, settings) for i in range(len(cameras))], settings, None)
     return {"weight": sums.by_row()[0][: len(core)] / np.float32(share)}
+
+
+def small_scene(files: Mapping[str, Path], mean: float | None) -> Splats:
+    """A tile's Gaussians from what `merge` made, with opacities fitted to what views see where they looked.
+
+    Args:
+        files: "merged", and with views "again" of `look_again`.
+        mean: of what the views saw, over all tiles; None without views.
+    """
+    small = scene_of(files["merged"], "scene")
+    if mean is None:
+        return small
+    members, wanted = load(files["merged"], "members", "wanted")
+    return fit_opacities(small, members, wanted, load(files["again"], "weight")[0], mean)
 
 
 def scene_of(path: Path, name: str) -> Splats:
@@ -194,8 +225,8 @@ def scene_of(path: Path, name: str) -> Splats:
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
-    """Scenes of one offset as one, of the least SH degree among them."""
-    degree = min(part.sh_degree for part in parts)
+    """Scenes of one offset as one, of the highest SH degree among them."""
+    degree = max(part.sh_degree for part in parts)
     parts = [part.with_sh_degree(degree) for part in parts]
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _FIELDS[:-1]}
     return Splats(**arrays, offset=parts[0].offset)
@@ -207,7 +238,7 @@ def cameras_of(path: Path) -> Cameras:
     return Cameras(viewmats, Ks, widths, heights, tuple(str(i) for i in range(len(viewmats))))
 
 
-def _tile(arguments: Arguments, places: Places, sh: bool = True) -> PreparedScene:
+def tile_of(arguments: Arguments, places: Places, sh: bool = True) -> PreparedScene:
     scene = TileStore.open(places["store"]).read(arguments["tile"])
     return finite_rows_of(scene if sh else scene.with_sh_degree(0))[0]
 
@@ -247,22 +278,33 @@ def _seen_tile(scene: PreparedScene, arguments: Arguments, inputs: Inputs) -> _c
 
 def _with_surroundings(core: Splats, arguments: Arguments, inputs: Inputs, places: Places) -> PreparedScene:
     """A tile's Gaussians first, then its halo, then coarse ones of all other tiles outside of that."""
-    store, tile = TileStore.open(places["store"]), arguments["tile"]
-    halo = store.read_halo(tile)
+    store = TileStore.open(places["store"])
+    halo = store.read_halo(arguments["tile"])
+    parts = [core, halo, *far_around(store, arguments, inputs)]
+    return as_prepared(joined([part.with_sh_degree(0) for part in parts if len(part)]))
+
+
+def far_around(store: TileStore, arguments: Arguments, inputs: Inputs) -> list[Splats]:
+    """Coarse Gaussians of all other tiles outside of the reach of a tile's halo."""
+    parts = []
+    for path, level in zip(inputs["coarse"], arguments["levels"], strict=True):
+        if level:
+            other = scene_of(path, level)
+            parts.append(other.take(~within_halo(store, arguments["tile"], other.means)))
+    return parts
+
+
+def within_halo(store: TileStore, tile: int, means: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(N,) whether positions lie in a tile's cell or within the margin around it."""
     low = np.array(store.tiles[tile].low) - store.margin
     high = np.array(store.tiles[tile].high) + store.margin
-    parts = [core, halo.with_sh_degree(0)]
-    for path, level in zip(inputs["coarse"], arguments["levels"], strict=True):
-        if not level:
-            continue
-        other = scene_of(path, level).with_sh_degree(0)
-        outside = ((other.means < low) | (other.means > high)).any(axis=1)
-        parts.append(other.take(outside))
-    return as_prepared(joined([part for part in parts if len(part)]))
+    return np.asarray(((means >= low) & (means <= high)).all(axis=1))
 
 
-def _cropped(cameras: Cameras, core: PreparedScene, settings: RasterSettings) -> Cameras:
-    """The parts of the images that show a tile: the others need not be drawn."""
+def cropped(
+    cameras: Cameras, core: PreparedScene, settings: RasterSettings, beside: int = _BESIDE
+) -> Cameras:
+    """The parts of the images that show a tile, and some pixels `beside`: the others need not be drawn."""
     points = core.means[core.core.order[:: max(1, len(core) // _OUTLINE)]].astype(np.float64)
     boxes = []
     for view, (viewmat, K) in enumerate(zip(cameras.viewmats, cameras.Ks, strict=True)):
@@ -273,8 +315,8 @@ def _cropped(cameras: Cameras, core: PreparedScene, settings: RasterSettings) ->
             boxes.append((0, 0, 1, 1))
             continue
         u, v = K[:2, :2] @ np.stack([x[ahead], y[ahead]]) / z[ahead] + K[:2, 2:]
-        low = np.clip(np.floor([u.min(), v.min()]) - _BESIDE, 0, size - 1)
-        high = np.clip(np.ceil([u.max(), v.max()]) + _BESIDE, low + 1, size)
+        low = np.clip(np.floor([u.min(), v.min()]) - beside, 0, size - 1)
+        high = np.clip(np.ceil([u.max(), v.max()]) + beside, low + 1, size)
         boxes.append((*low, *high))
     left, top, right, bottom = np.array(boxes, np.int64).T
     Ks = cameras.Ks.copy()

@@ -40,7 +40,6 @@ from g2ard.cli.options import (
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_folder import (
     KEPT,
-    REPORT,
     WORK,
     check_place,
     drop_older,
@@ -48,8 +47,18 @@ from g2ard.cli.run_folder import (
     tell_anew,
     tell_finished,
     work_folder,
+    write_report,
 )
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
+from g2ard.cli.tile_options import (
+    MemoryOption,
+    SchedulerOption,
+    TileRowsOption,
+    WorkersOption,
+    WorkOption,
+    tiling_of,
+)
+from g2ard.cli.tiled import TiledCommand
 
 if TYPE_CHECKING:
     from g2ard.pipeline import Distilled
@@ -145,10 +154,16 @@ def distill(
         bool,
         typer.Option("--dry-run", help="Tell about how long it will take, and what memory; write nothing."),
     ] = False,
+    tile_rows: TileRowsOption = None,
+    memory: MemoryOption = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    work: WorkOption = None,
 ) -> None:
     """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget.
 
     Views are those of --views, else the cameras that lie beside the scene, else a pool of poses of its own.
+    A scene larger than memory, or a folder of tiles, is distilled tile by tile.
     """
     from g2ard.pipeline import DistillConfig
     from g2ard.stages.lift import LiftConfig
@@ -166,6 +181,7 @@ def distill(
     from g2ard.io import kind
     from g2ard.policy.distill import prepare
     from g2ard.policy.distill_options import DistillOptions
+    from g2ard.policy.tiled import is_tiled
     from g2ard.report.distilled import check_crops
 
     began = time.monotonic()
@@ -211,6 +227,12 @@ def distill(
         seed=run.seed,
         engine=engine,
     )
+    tiling = tiling_of(run, output / "scene", tile_rows, memory, workers, scheduler, work)
+    if scene is not None and is_tiled(scene, tiling):
+        if dry_run:
+            raise typer.BadParameter("--dry-run: not in tiles; --tile-rows above the count avoids them")
+        TiledCommand(run, scene, outputs, tiling, budgets).distill(options, name)
+        return
     job = prepare(scene, budgets, options, progress=run.progress, say=run.say)
     check_crops(crop or [], job.views.test.names)
     outputs.check(check, len(job.prior))
@@ -322,10 +344,8 @@ def _write(
     run: Run, place: Path, result: Distilled, unseen: Targets, colour: Colour, report: dict[str, Any]
 ) -> None:
     """The picture, the scene and, last, what is said of both."""
-    import json
 
     from g2ard.io import write_splats
-    from g2ard.io.atomic import atomic_output
     from g2ard.preview import preview
 
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
@@ -333,8 +353,7 @@ def _write(
     write_splats(place, result.splats, overwrite=True)
     drop_older(place)
     report["bytes"]["file"] = place.stat().st_size
-    with atomic_output(place.parent / REPORT, overwrite=True) as temporary:
-        temporary.write_text(json.dumps({**report, "config": run.config}, indent=2, default=str) + "\n")
+    write_report(place.parent, {**report, "config": run.config})
 
 
 def _view(place: Path, scene: Splats | None, job: DistillJob, report: dict[str, Any]) -> str | None:

@@ -31,6 +31,7 @@ class Objective:
         means_in_scales: the means' variables are multiples of each Gaussian's initial radius.
         ssim_weight: λ in (1−λ)·L1 + λ·(1−SSIM).
         background: RGB behind the scene.
+        frozen: (N,) bool, Gaussians that no step changes; None freezes none.
     """
 
     start: Splats
@@ -40,6 +41,7 @@ class Objective:
     means_in_scales: bool
     ssim_weight: float
     background: tuple[float, float, float]
+    frozen: NDArray[np.bool_] | None = None
 
 
 class Engine(Protocol):

@@ -33,6 +33,8 @@ class FusedEngine:
             anchors.r_perp,
         )
         self._trainer.anchor(*self._anchors)
+        if objective.frozen is not None:
+            self._trainer.freeze(objective.frozen)
 
     def step(
         self,

@@ -55,6 +55,7 @@ class Loop:
         probe: Probe,
         guard: Guard,
         held: str | None,
+        frozen: NDArray[np.bool_] | None,
     ) -> None:
         self.targets = targets
         self.config = config
@@ -67,13 +68,14 @@ class Loop:
         self.student = student
         self.probe = probe
         self.guard = guard
+        self.frozen = frozen
         self._skipped = 0  # by engines before this one
         self.done = 0
         self.seconds = 0.0
         self.losses: list[float] = []
         self.geometry: list[dict[str, float]] = []
         self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised? → steps, seconds
-        self.key = _fingerprint(student, targets, config, weights, anchors, held)
+        self.key = _fingerprint(student, targets, config, weights, anchors, held, frozen)
 
     @cached_property
     def engine(self) -> Engine:
@@ -101,6 +103,7 @@ class Loop:
             config.schedule.means_in_scales,
             config.ssim_weight,
             config.background,
+            self.frozen,
         )
         return engine_class(config.engine)(objective)
 
@@ -298,6 +301,7 @@ def _fingerprint(
     weights: NDArray[np.float64] | None,
     anchors: Anchors,
     validation: str | None,
+    frozen: NDArray[np.bool_] | None,
 ) -> str:
     often = [] if weights is None else [repr(weights.tolist())]
     parts = (repr(config), student.fingerprint(), fingerprint_of(targets), *often)
@@ -305,4 +309,6 @@ def _fingerprint(
     digest = hashlib.sha256("\n".join(parts).encode())
     for held in (anchors.means, anchors.frames, anchors.r_parallel, anchors.r_perp):
         digest.update(np.ascontiguousarray(held).tobytes())
+    if frozen is not None:
+        digest.update(frozen.tobytes())
     return digest.hexdigest()
