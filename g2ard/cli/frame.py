@@ -21,7 +21,7 @@ import typer
 from g2ard import __version__, interrupt
 from g2ard.cli.config import load_config, printed
 from g2ard.cli.console import Console
-from g2ard.cli.usage import in_flags, typed
+from g2ard.cli.usage import in_flags, present_name, typed
 from g2ard.errors import G2ardError
 
 __all__ = ["Run", "app", "command", "group"]
@@ -31,7 +31,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "token_normalize_func": present_name},
 )
 
 
@@ -53,7 +53,7 @@ def _root(
 _RIVALS = (
     *combinations(("count", "ratio", "fit", "min_psnr"), 2),
     *combinations(("count", "ratio", "fit", "min_ssim"), 2),
-    ("steps", "time_limit"),
+    ("steps", "recovery_time"),
     ("views", "no_views"),
 )
 """Options that exclude each other."""
@@ -127,6 +127,7 @@ class Run:
         self.console = Console(quiet=common["quiet"])
         self.only_checks = False  # whether the call ends once its constants are known to be right
         self.noted = False  # whether a GPU failed
+        self._adapter: str | None = None  # the last that was in use
         self.kept: list[str] = []  # what a Ctrl-C leaves, in words
         given = (*options.values(), common["config"])
         paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
@@ -163,13 +164,18 @@ class Run:
         self.console(stage, done, total, info)
 
     def tell_notes(self) -> None:
-        """Why the CPU took over from a GPU, if it has since last told."""
+        """Why the CPU took over from a GPU, if it has since last told, and that a GPU is none."""
         if self.device in ("auto", "gpu"):
             from g2ard import devices
 
             for note in devices.notes():
                 self.noted = True
                 self.console.say(note)
+            adapter = devices.state().adapter
+            if adapter not in (None, self._adapter) and devices.is_software():
+                told = f"{adapter} is software on this CPU, as a rule slower than --device cpu"
+                self.console.say(f"--device {self.device}: {told}")
+            self._adapter = adapter
 
     def say(self, text: str) -> None:
         """A line of status on stderr, unless --quiet."""
@@ -211,6 +217,12 @@ class Run:
                 raise typer.BadParameter(
                     f"{output} would be written over, and is an input; name another output"
                 )
+
+    def reads(self, scenes: list[Path], output: Path) -> None:
+        """Of the paths given as `scenes` the last one was `output`; as a usage check, see `spare_inputs`."""
+        self.config |= {"scenes": scenes, "output": output}
+        self._inputs = [path for path in self._inputs if path is not output]
+        self.spare_inputs(output)
 
     def unmet(self, requirement: str) -> NoReturn:
         """End with status 3: all is written, but a stated requirement was not met."""

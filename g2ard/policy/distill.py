@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -64,7 +64,7 @@ def distill(
     preset: str = "auto",
     schedule: str | None = None,
     steps: int | None = None,
-    time_limit: float | None = None,
+    recovery_time: float | None = None,
     sh_degree: int | None = None,
     size: int | None = None,
     background: Colour = (0.0, 0.0, 0.0),
@@ -113,7 +113,7 @@ def distill(
             what the paper has.
         schedule: of recovery: fast, default, best or paper; "default" if None.
         steps: the final horizon.
-        time_limit: seconds that all recovery is fitted into; the result then depends on the machine.
+        recovery_time: seconds that all recovery is fitted into; the result then depends on the machine.
         sh_degree: of the result; None keeps the scene's, and takes 3 from a cloud or for the paper's.
         size: pixels that the longer side of views is shrunk to.
         background: RGB in [0, 1] behind the scene.
@@ -158,7 +158,7 @@ def distill(
         preset=preset,
         schedule=schedule,
         steps=steps,
-        time_limit=time_limit,
+        recovery_time=recovery_time,
         sh_degree=sh_degree,
         size=size,
         background=background,
@@ -193,7 +193,7 @@ def prepare(
     preset: str = "auto",
     schedule: str | None = None,
     steps: int | None = None,
-    time_limit: float | None = None,
+    recovery_time: float | None = None,
     sh_degree: int | None = None,
     size: int | None = None,
     background: Colour = (0.0, 0.0, 0.0),
@@ -202,10 +202,14 @@ def prepare(
     up: Sequence[float] | None = None,
     seed: int = 0,
     engine: Literal["fused", "torch", "gsplat"] = "fused",
+    counted: Callable[[int], object] | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> DistillJob:
     """Read and decide all that a distillation needs, at one budget or several; arguments as for `distill`.
+
+    `counted` is told how many Gaussians the dense scene has before anything else is done with it; what it
+    raises ends the preparation.
 
     Raises:
         InputError: as `distill`.
@@ -242,6 +246,8 @@ def prepare(
     if clean:
         found, _ = clutter_seen(prior, seed=seed, progress=progress, say=say)
         prior, cleaned = prior.take(found.keep), found.counts
+    if counted is not None:
+        counted(len(prior))
     file = f"scene.{format}"
     aims = tuple(
         aim_of(budget, prior, name, file=file, seed=seed, progress=progress, say=say) for budget in budgets
@@ -273,7 +279,7 @@ def prepare(
         method=method,
         schedule=schedule_named(schedule, steps),
         steps=steps,
-        time_limit=time_limit,
+        recovery_time=recovery_time,
         regularizers=regularizers,
         sh_degree=3 if sh_degree is None and (lifted or paper or usual is _PAPER) else sh_degree,
         background=background,

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import SceneArgument
+from g2ard.cli.options import SceneArgument, picture
 
 
 @command("clean", example="g2ard clean garden.ply -o garden_clean.ply --preview found.png")
@@ -24,7 +24,9 @@ def clean(
     ] = None,
     preview: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.png", help="A picture with what would go painted by its kind."),
+        typer.Option(
+            parser=picture, metavar="FILE.png", help="A picture with what would go painted by its kind."
+        ),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say and show it, write no scene.")] = False,
 ) -> None:
@@ -44,7 +46,7 @@ def clean(
         raise typer.BadParameter(f"--only: {', '.join(KINDS)}, not {wrong[0]!r}")
     if output is None and not dry_run:
         raise typer.BadParameter("name an output with -o, or ask with --dry-run")
-    if output is not None:
+    if output is not None and not dry_run:
         io.check_scene_output(output, run.overwrite)
     if preview is not None:
         if preview.resolve() in {path.resolve() for path in (scene, output) if path}:

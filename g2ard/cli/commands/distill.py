@@ -26,10 +26,10 @@ from g2ard.cli.options import (
     Method,
     PolicyOption,
     PresetOption,
+    RecoveryTimeOption,
     ResumeOption,
     ScheduleName,
     SizeOption,
-    TimeLimitOption,
     UpOption,
     ViewsOrMadeOption,
     can_judge,
@@ -119,7 +119,7 @@ def distill(
         ScheduleName, typer.Option(help="Recovery; paper also goes round by round.")
     ] = "default",
     steps: Annotated[int | None, typer.Option(min=1, help="Overrides the final horizon.")] = None,
-    time_limit: TimeLimitOption = None,
+    recovery_time: RecoveryTimeOption = None,
     sh_degree: Annotated[
         int | None,
         typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own, 3 from a cloud."),
@@ -169,17 +169,18 @@ def distill(
     from g2ard.report.distilled import check_crops
 
     began = time.monotonic()
-    one_horizon(steps, time_limit, values)
+    one_horizon(steps, recovery_time, values)
     engine = recovery_engine(run)
     name = f"scene.{format}"
     outputs = Outputs(run, output, budgets)
 
     def check(folder: Path, budget: Budget) -> None:
-        check_place(run, folder / name, budget, given, resume)
+        if not dry_run:
+            check_place(run, folder / name, budget, given, resume)
 
     outputs.check(check)
     early = [folder / name for folder in outputs.paths()]
-    if early and all(is_done(run, place, resume) for place in early):
+    if early and not dry_run and all(is_done(run, place, resume) for place in early):
         _tell_all(run, [tell_finished(run, place) for place in early])
         return
     if scene is not None and kind(scene) == "views":
@@ -204,7 +205,7 @@ def distill(
         preset=preset,
         schedule=schedule,
         steps=steps,
-        time_limit=time_limit,
+        recovery_time=recovery_time,
         sh_degree=sh_degree,
         size=size,
         background=background or (0.0, 0.0, 0.0),
@@ -212,11 +213,11 @@ def distill(
         up=up,
         seed=run.seed,
         engine=engine,
+        counted=lambda total: outputs.check(check, total),
         progress=run.progress,
         say=run.say,
     )
     check_crops(crop or [], job.views.test.names)
-    outputs.check(check, len(job.prior))
     places = [folder / name for folder in outputs.paths(len(job.prior))]
     if dry_run:
         _tell_estimates(run, job, [place.parent for place in places])

@@ -16,6 +16,9 @@ _KINDS = ("auto", "orbit", "walk", "aerial", "inside", "focus")
 class _Size(tuple[int, int]):
     """Width and height in one argument (see `g2ard.cli.options.Triple`)."""
 
+    def __str__(self) -> str:
+        return f"{self[0]}x{self[1]}"
+
 
 def _size(text: str) -> _Size:
     match = re.fullmatch(r"(\d+)[x×](\d+)", text.strip())

@@ -13,13 +13,13 @@ from g2ard.cli.options import (
     BackgroundOption,
     OutputOption,
     PresetOption,
+    RecoveryTimeOption,
     ResumeOption,
     ScheduleName,
     ShDegreeOption,
     SizeOption,
     SplitOption,
     TeacherOption,
-    TimeLimitOption,
     ViewsOrMadeOption,
     can_be_made,
     one_horizon,
@@ -59,7 +59,7 @@ def recover(
     preset: PresetOption = "auto",
     schedule: Annotated[ScheduleName, typer.Option(help="Rates, decay and horizon.")] = "default",
     steps: Annotated[int | None, typer.Option(min=1, help="Overrides the schedule's horizon.")] = None,
-    time_limit: TimeLimitOption = None,
+    recovery_time: RecoveryTimeOption = None,
     sh_degree: ShDegreeOption = None,
     resume: ResumeOption = False,
     split: SplitOption = "train",
@@ -87,7 +87,7 @@ def recover(
     from g2ard.targets import kinds_of
 
     values = run.constants(recover=RecoverConfig())
-    one_horizon(steps, time_limit, values)
+    one_horizon(steps, recovery_time, values)
     if photos and teacher is None:
         raise typer.BadParameter("--photos goes with --teacher: without a teacher all targets are photos")
     can_be_made(views, teacher)
@@ -115,7 +115,7 @@ def recover(
     config = RecoverConfig(
         schedule=schedule_named(schedule),
         steps=steps,
-        time_limit=time_limit,
+        recovery_time=recovery_time,
         regularizers=regularizers,
         sh_degree=sh_degree,
         background=colour,

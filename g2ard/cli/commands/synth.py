@@ -18,6 +18,9 @@ synth = group("synth", "Make data where none is at hand.\n\nExample: g2ard synth
 class _Size(tuple[int, int]):
     """Width and height in one argument (see `Triple`)."""
 
+    def __str__(self) -> str:
+        return f"{self[0]}x{self[1]}"
+
 
 def _size(text: str) -> _Size:
     match = re.fullmatch(r"(\d+)[x×](\d+)", text.strip())

@@ -11,7 +11,7 @@ import typer
 from g2ard.cli.budget_options import parse_ratio
 from g2ard.cli.commands.bench.group import bench
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import BackgroundOption, ProtocolOption, SizeOption, TimeLimitOption, ViewsOption
+from g2ard.cli.options import BackgroundOption, ProtocolOption, RecoveryTimeOption, SizeOption, ViewsOption
 
 if TYPE_CHECKING:
     from g2ard.bench.recover import Look
@@ -42,7 +42,7 @@ def recover(
     ] = None,
     steps: Annotated[str, typer.Option(help="Horizons of the default schedule.")] = "100,300,1000",
     protocol: ProtocolOption = "pool",
-    time_limit: TimeLimitOption = None,
+    recovery_time: RecoveryTimeOption = None,
     seeds: Annotated[str, typer.Option(help="Comma-separated.")] = "0",
     variants: Annotated[str | None, typer.Option(help="Some of the study's; all if not given.")] = None,
     csv: Annotated[
@@ -55,7 +55,7 @@ def recover(
 
     curves: the default's horizons beside the paper's schedule at a tenth, with and without a decay.
     paper: beside all of it. regularizers: with and without each. rounds: against one shot in equal time
-    (--time-limit). multiplier: of the rates. endurance: 5,000 steps.
+    (--recovery-time). multiplier: of the rates. endurance: 5,000 steps.
 
     With --protocol standing runs are scored from near and from where people stand: on the views of a
     standing.json beside the scene, else on made ones that no run sees.
@@ -72,7 +72,7 @@ def recover(
         ratios=[parse_ratio(part) for part in ratios.split(",")],
         seeds=_whole_numbers("seeds", seeds),
         steps=_whole_numbers("steps", steps),
-        seconds=time_limit or 30.0,
+        seconds=recovery_time or 30.0,
         variants=[part.strip() for part in variants.split(",")] if variants else None,
         progress=run.progress,
     )
