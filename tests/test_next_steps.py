@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 from scenes import around, checkered_ball
@@ -14,7 +16,10 @@ from scenes import around, checkered_ball
 import g2ard
 from g2ard import devices
 from g2ard.cli.budget_options import Count, Counts
-from g2ard.io import write_views
+from g2ard.cli.frame import Run
+from g2ard.cli.resume import rows_kept
+from g2ard.errors import InputError
+from g2ard.io import Points, write_points, write_views
 from g2ard.report.window import Crop
 
 CommandLine = Callable[..., tuple[int, str, str]]
@@ -193,3 +198,90 @@ def test_render_tells_what_its_count_is(command_line: CommandLine, folder: Path)
     assert "How many views to make of the scene; with --color flags, cells or parents the budget" in shown
     ask = ("render", "ball.ply", "-n", 2, "--views", "views.json", "-o", "out")
     assert "a number of views to make, where none are given" in refused(command_line, folder, *ask)
+
+
+def test_a_folder_that_is_nothing_says_what_in_it_would_do(command_line: CommandLine, folder: Path) -> None:
+    for name in ("bare/photo.jpg", "project/images/photo.PNG", "empty"):
+        place = folder / name
+        (place.parent if place.suffix else place).mkdir(parents=True, exist_ok=True)
+        if place.suffix:
+            Image.new("RGB", (16, 16)).save(place)
+    for name, photos in (("bare", "bare"), ("project", "project/images")):
+        error = refused(command_line, folder, "distill", "--views", name, "-n", 9, "-o", "x", status=1)
+        assert "photos, without their poses; COLMAP finds them: colmap automatic_recon" in error
+        assert f"--image_path {photos}, then give project" in error
+    assert "looked for SOG's meta.json" in refused(command_line, folder, "info", "empty", status=1)
+    ask = ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 3, "--size", 32, "--no-view")
+    assert command_line(*ask, cwd=folder)[0] == 0
+    held = "run: nothing known in this folder; name what is meant of its files: scene.ply (a scene), views"
+    for ask in (
+        ("simplify", "run", "-r", 2, "-o", "x.ply"),
+        ("evaluate", "ball.ply", "--teacher", "ball.ply", "--views", "run"),
+    ):
+        assert f"{held}.json (views)\n" in refused(command_line, folder, *ask, status=1)
+
+
+def test_a_city_s_folder_names_its_cloud_and_its_views(command_line: CommandLine, tmp_path: Path) -> None:
+    city = ("synth", "city", "-o", "city", "--points", "1k", "--views", 8, "--size", "16x16")
+    assert command_line(*city, cwd=tmp_path)[0] == 0
+    error = refused(command_line, tmp_path, "info", "city", status=1)
+    assert "cloud.ply (a cloud), adapt.json, ood.json, train.json, val.json (views)\n" in error
+
+
+def test_views_without_photos_say_what_stands_in(command_line: CommandLine, folder: Path) -> None:
+    colors = np.full((400, 3), 0.5, np.float32)
+    write_points(folder / "cloud.ply", Points(BALL.means.astype(np.float64), colors))
+    to = ("-r", 4, "-o", "x", "--views", "views.json")
+    for ask, words in (
+        (("distill", "ball.ply", *to, "--photos"), "without --photos the scene's render stands in for it"),
+        (("distill", "cloud.ply", *to), "give views with photos, or a trained scene"),
+        (("distill", *to[2:], "-n", 50), "give views with photos, or a scene beside them"),
+        (("recover", "ball.ply", "-o", "x.ply", *to[4:]), "--teacher SCENE stands in"),
+    ):
+        status, _, error = command_line(*ask, cwd=folder)
+        last = error.splitlines()[-1]
+        assert (status, "has no" in last or "has none" in last, words in last) == (1, True, True), error
+
+
+def test_what_is_of_the_wrong_kind_says_what_it_is(folder: Path) -> None:
+    with pytest.raises(InputError, match="g2ard's views, no scene; name the scene's own file"):
+        g2ard.load(folder / "views.json")
+    with pytest.raises(InputError, match=r"views are needed .*, this is a Gaussian scene"):
+        g2ard.load_views(folder / "ball.ply")
+
+
+def test_sizes_say_of_what_they_are(command_line: CommandLine, folder: Path) -> None:
+    assert command_line("convert", "ball.ply", "ball.sog", cwd=folder)[0] == 0
+    assert command_line("convert", "ball.ply", "folder/meta.json", cwd=folder)[0] == 0
+    ask = ("evaluate", "ball.ply", "ball.sog", "folder", "--teacher", "ball.ply", "--views", "views.json")
+    status, out, error = command_line(*ask, "--json", "-", cwd=folder)
+    assert status == 0, error
+    assert "file MB" in error
+    whole, packed, chunks = (row["file_bytes"] for row in json.loads(out)["scenes"])
+    assert (whole, packed) == tuple((folder / name).stat().st_size for name in ("ball.ply", "ball.sog"))
+    assert chunks == sum(file.stat().st_size for file in (folder / "folder").iterdir())
+    assert f"{whole / 1e6:.2f}" != f"{packed / 1e6:.2f}"
+    assert f"{packed / 1e6:.2f}" in error
+
+
+def test_one_is_one(command_line: CommandLine, folder: Path) -> None:
+    ask = ("distill", "ball.ply", "-n", 1, "-o", "run", "--steps", 2, "--size", 32, "--format", "splat")
+    status, _, error = command_line(*ask, cwd=folder)
+    assert status == 0, error
+    assert "400 → 1 Gaussian;" in error
+    assert "MB as .ply" in error
+    for ask in (("simplify", "ball.ply", "-n", 1, "-o", "s.ply"), ("convert", "s.ply", "t.splat")):
+        error += command_line(*ask, cwd=folder)[2]
+    error += "".join(command_line("info", "run", cwd=folder)[1:])
+    ask = ("evaluate", "s.ply", "--teacher", "s.ply", "--views", "views.json", "--size", 16)
+    error += command_line(*ask, cwd=folder)[2]
+    assert re.findall(r"(?<![\d.,])1 [A-Za-z]*(?:Gaussian|view|step|point|photo|disc)s\b", error) == []
+
+
+def test_an_interrupt_says_which_rows_stay(folder: Path) -> None:
+    common = dict.fromkeys(("overwrite", "verbose", "quiet", "json", "config")) | {"seed": 0, "threads": 0}
+    for table, told in ((folder / "ball.ply", ["goes on"]), (folder / "none.csv", [])):
+        run = Run("simplify", {**common, "device": "cpu"}, {})
+        with pytest.raises(KeyboardInterrupt), rows_kept(run, table, goes_on=True):
+            raise KeyboardInterrupt
+        assert [line.split("the same command ")[-1] for line in run.kept] == told

@@ -23,6 +23,7 @@ from g2ard.cli.config import load_config, printed
 from g2ard.cli.console import Console
 from g2ard.cli.usage import in_flags, present_name, typed
 from g2ard.errors import G2ardError
+from g2ard.progress import plural
 
 __all__ = ["Run", "app", "command", "group"]
 
@@ -358,7 +359,7 @@ def _device(run: Run) -> Iterator[None]:
         elif state.served and run.verbose:
             longest = sorted(state.seconds.items(), key=lambda item: -item[1])[:6]
             took = "".join(f", {name} {seconds:.3f} s" for name, seconds in longest)
-            run.say(f"GPU: {state.served} kernels on {state.adapter}{took}")
+            run.say(f"GPU: {plural(state.served, 'kernel')} on {state.adapter}{took}")
 
 
 def _one_line(error: BaseException) -> str:

@@ -18,6 +18,7 @@ _FLAGS = {
     "to take a ratio of: give a count": "to take a ratio of: give a count, -n COUNT",
     "its photos are needed as views": "give its photos with --views",
     "TeacherRenders of a scene can stand in": "--teacher SCENE stands in with its renders",
+    "photos=None takes renders there": "without --photos the scene's render stands in for it",
     "crop ": "--crop ",
 }
 """What the library calls by the name of a parameter → what a shell calls it."""

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.types import Note, Scene
+from g2ard.progress import plural
 from g2ard.splats import DRAWN_LOGIT, Splats
 
-__all__ = ["BLOCK", "LOGIT_LIMIT", "LOG_SCALE_LIMIT", "Raw", "cleaned", "plural"]
+__all__ = ["BLOCK", "LOGIT_LIMIT", "LOG_SCALE_LIMIT", "Raw", "cleaned"]
 
 BLOCK = 8192
 """Rows handled at a time: 60 float32 columns of them are 2 MB and stay in the cache."""
@@ -46,11 +47,6 @@ class Raw:
             return np.empty((count, *shape), np.float32)
 
         return cls(room(3), room(4), room(3), room(), room(1, 3), room(rest, 3), np.zeros(3))
-
-
-def plural(count: int, one: str, many: str | None = None) -> str:
-    """`1 row`, `2 rows`, `1,234 rows`."""
-    return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
 def cleaned(path: Path, raw: Raw, notes: list[Note] | None = None) -> Scene:

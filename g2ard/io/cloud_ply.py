@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
-from g2ard.io.clean import plural
 from g2ard.io.plyfiles import read_element, read_header, require
 from g2ard.io.types import Cloud, Note, Points
+from g2ard.progress import plural
 
 __all__ = ["finite_cloud", "read", "write"]
 

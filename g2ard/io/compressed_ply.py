@@ -13,6 +13,7 @@ from g2ard.errors import InputError
 from g2ard.io.clean import Raw, cleaned
 from g2ard.io.plyfiles import offset_of, read_element, read_header, require
 from g2ard.io.types import Scene
+from g2ard.progress import plural
 from g2ard.splats import SH_C0
 
 __all__ = ["read"]
@@ -44,7 +45,7 @@ def read(path: Path) -> Scene:
     names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")
     vertex, chunk, *sh = (np.asarray(rows) for rows in read_element(path, header, *names))
     if len(chunk) * _CHUNK < len(vertex) or (sh and len(sh[0]) != len(vertex)):
-        raise InputError(f"{path}: {len(chunk)} chunks and {len(vertex):,} Gaussians do not fit")
+        raise InputError(f"{path}: {len(chunk)} chunks and {plural(len(vertex), 'Gaussian')} do not fit")
     raw = Raw.empty(len(vertex), len(rest) // 3)
     raw.offset = offset_of(path, header)
     of = np.arange(len(vertex)) // _CHUNK

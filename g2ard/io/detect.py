@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
 from g2ard.errors import InputError
 
-__all__ = ["KINDS", "Format", "Kind", "file_format", "kind"]
+__all__ = ["KINDS", "Format", "Kind", "file_format", "is_photo", "kind"]
 
 Format = Literal[
     "ply",
@@ -36,6 +37,9 @@ KINDS: dict[str, Kind] = {
     **dict.fromkeys(("colmap", "transforms", "cambridge", "views"), "views"),
     **dict.fromkeys(("inria", "nerfstudio", "nerfstudio_export", "gsplat_run"), "views"),
 }
+
+
+_READ = (".ply", ".sog", ".spz", ".glb", ".splat", ".las", ".laz", ".json")
 
 
 def kind(path: str | Path) -> Kind:
@@ -89,6 +93,11 @@ def file_format(path: str | Path) -> Format:
     )
 
 
+def is_photo(path: Path) -> bool:
+    """Whether a file's name is a photo's."""
+    return path.suffix.lower() in (".png", ".jpg", ".jpeg", ".webp")
+
+
 def _folder_format(path: Path) -> Format:
     from g2ard.io.sog import chunks_of
 
@@ -117,9 +126,31 @@ def _folder_format(path: Path) -> Format:
         return "inria"
     if gsplat_run.is_run(path / gsplat_run.NAME):
         return "gsplat_run"
-    raise InputError(
-        f"{path}: nothing known in this folder (looked for SOG's meta.json, a COLMAP sparse/0, "
-        "transforms.json, cameras.json, nerfstudio's and gsplat's runs, Cambridge's dataset_train.txt)"
+    raise InputError(f"{path}: nothing known in this folder{_instead(path)}")
+
+
+def _instead(path: Path) -> str:
+    """What to do with a folder that is nothing: name a file in it, find poses; else what was looked for."""
+    held: dict[Kind, list[str]] = {"splats": [], "points": [], "views": []}
+    for file in sorted(path.iterdir()):
+        if file.suffix.lower() in _READ and file.is_file():
+            with suppress(InputError):
+                held[kind(file)].append(file.name)
+    words = {"splats": "a scene", "points": "a cloud", "views": "views"}
+    found = [f"{', '.join(names[:5])} ({words[what]})" for what, names in held.items() if names]
+    if found:
+        return f"; name what is meant of its files: {', '.join(found)}"
+    photos = next(
+        (p for p in (path, path / "images") if p.is_dir() and any(map(is_photo, p.iterdir()))), None
+    )
+    if photos is not None:
+        return (
+            ": photos, without their poses; COLMAP finds them: colmap automatic_reconstructor "
+            f"--workspace_path project --image_path {photos}, then give project"
+        )
+    return (
+        " (looked for SOG's meta.json, a COLMAP sparse/0, transforms.json, cameras.json, nerfstudio's and "
+        "gsplat's runs, Cambridge's dataset_train.txt)"
     )
 
 
@@ -150,7 +181,7 @@ def _json_format(path: Path) -> Format:
         raise InputError(
             f"{path}: a JSON list, but neither INRIA's cameras nor those of nerfstudio's ns-export"
         )
-    if "views" in content:
+    if isinstance(content.get("views"), list) or ("views" in content and "format" in content):
         return "views"
     if "frames" in content:
         return "transforms"

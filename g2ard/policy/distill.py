@@ -12,7 +12,7 @@ from g2ard.policy.budget import Budget
 from g2ard.policy.inputs import load_scene
 from g2ard.policy.job import DistillJob
 from g2ard.policy.views import is_made, views_of
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.splats import Splats
 
 if TYPE_CHECKING:
@@ -215,7 +215,6 @@ def prepare(
         InputError: as `distill`.
     """
     from g2ard.constants import changed, full_names
-    from g2ard.io.clean import plural
     from g2ard.pipeline import DistillConfig
     from g2ard.policy.clean import clutter_seen
     from g2ard.policy.fit import aim_of
@@ -268,12 +267,18 @@ def prepare(
     pictured = [path is not None for path in (*train.image_paths, *looks.test.image_paths)]
     use_photos = lifted or (any(pictured) if photos is None else photos)
     taught = not (lifted or photos or (use_photos and all(pictured)))
+    if (lifted or photos) and not all(pictured):
+        bare = (*train.names, *looks.test.names)[pictured.index(False)]
+        instead = (
+            "give views with photos, or a trained scene" if lifted else "photos=None takes renders there"
+        )
+        raise InputError(f"view {bare} has no photo; {instead}")
     kind = "paper-lift" if lifted and preset == "paper" else preset
     regularizers, why, measured = preset_for(kind, prior, train if use_photos else None, paper=paper)
-    counts = ", ".join(f"{aim.count:,}" for aim in aims)
+    counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
     shown = len(train) if not taught else sum(pictured[: len(train)]) if use_photos else 0
     against = kinds_told(shown, len(train) - shown)
-    say(f"{len(prior):,} → {counts} Gaussians; {plural(len(train), 'view')} against {against}")
+    say(f"{len(prior):,} → {counts}; {plural(len(train), 'view')} against {against}")
     say(f"regularisers: {why}")
     config = DistillConfig(
         method=method,

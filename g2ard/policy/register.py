@@ -22,7 +22,6 @@ __all__ = ["matched", "photos_of", "pool_of", "poses_for", "read_poses"]
 Poses = dict[str, NDArray[np.float64]]
 Found = TypeVar("Found")
 
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 _ROWS = 200_000
 """Gaussians that poses are planned on."""
 
@@ -58,7 +57,9 @@ def photos_of(
             say(f"{path}: {note}")
         missing = next((v.name for v in found.cameras if v.image_path is None), None)
         if missing is not None:
-            raise InputError(f"{path}: view {missing} has no photo")
+            raise InputError(
+                f"{path}: view {missing} has no photo to register; give the folder of the photos"
+            )
         if intrinsics is not None or focal is not None:
             raise InputError(f"{path}: these views state their intrinsics; others would contradict them")
         return found.cameras
@@ -84,14 +85,14 @@ def photos_of(
 
 def _photos_in(path: Path) -> list[Path]:
     """The photos of a folder that holds no views; [] for anything else."""
-    from g2ard.io.detect import file_format
+    from g2ard.io.detect import file_format, is_photo
 
     if not path.is_dir():
         return []
     try:
         file_format(path)
     except InputError:
-        return sorted(f for f in path.rglob("*") if f.suffix.lower() in _SUFFIXES and f.is_file())
+        return sorted(f for f in path.rglob("*") if is_photo(f) and f.is_file())
     return []
 
 

@@ -20,6 +20,7 @@ from g2ard.cli.options import (
     TeacherOption,
     trained_on,
 )
+from g2ard.progress import plural
 
 
 @command("adapt", example="g2ard adapt small.ply --views winter/ -o winter.ply", constants=True)
@@ -84,7 +85,7 @@ def adapt(
         write_splats(output, result.splats, overwrite=run.overwrite)
     gain, end = result.report.psnr, "converged" if result.report.converged else "all steps taken"
     run.say(
-        f"{output}: {len(splats):,} Gaussians, {result.report.steps:,} steps ({end}), "
+        f"{output}: {plural(len(splats), 'Gaussian')}, {plural(result.report.steps, 'step')} ({end}), "
         f"{trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB"
     )
     constants = listed({"adapt": config}, run.config)

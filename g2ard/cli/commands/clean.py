@@ -9,6 +9,7 @@ import typer
 
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import SceneArgument, picture
+from g2ard.progress import plural
 
 
 @command("clean", example="g2ard clean garden.ply -o garden_clean.ply --preview found.png")
@@ -56,11 +57,12 @@ def clean(
     found, cameras = clutter_seen(splats, kinds, seed=run.seed, progress=run.progress, say=run.say)
     if preview is not None:
         paint_clutter(preview, splats, found, cameras, run.overwrite)
+        run.kept.append(f"{preview} is written")
         run.say(f"picture: {preview}")
     kept = int(found.keep.sum())
     if not dry_run and output is not None:
         if not kept:
             raise InputError(f"{scene}: nothing would be left; look at it with --dry-run --preview")
         io.write_splats(output, splats.take(found.keep), overwrite=run.overwrite)
-        run.say(f"{output}: {kept:,} Gaussians")
+        run.say(f"{output}: {plural(kept, 'Gaussian')}")
     run.result({"input_count": len(splats), "output_count": kept, "found": found.counts})

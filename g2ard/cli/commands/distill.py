@@ -51,6 +51,7 @@ from g2ard.cli.run_folder import (
     work_folder,
 )
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.pipeline import Distilled
@@ -257,8 +258,8 @@ def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[Path]) -> None:
         one = estimate(job, budget)
         parts = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in one.seconds.items())
         run.say(
-            f"{folder}: {budget:,} Gaussians, {one.views} views of {one.pixels:,} pixels, "
-            f"{one.steps:,} steps: about {one.total:.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
+            f"{folder}: {plural(budget, 'Gaussian')}, {plural(one.views, 'view')} of {one.pixels:,} pixels, "
+            f"{plural(one.steps, 'step')}: about {one.total:.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
         )
         found.append(one)
         told.append({"output": str(folder), "count": budget, **asdict(one), "total_seconds": one.total})

@@ -22,6 +22,7 @@ from g2ard.cli.options import (
     is_made,
     picture,
 )
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     import numpy as np
@@ -66,7 +67,6 @@ def render(
 
     from g2ard.images import write_png
     from g2ard.io.atomic import check_output
-    from g2ard.io.clean import plural
     from g2ard.policy.inputs import load_scene, load_views
     from g2ard.policy.views import views_or_pool
     from g2ard.stages.render import RasterSettings, Renderer
@@ -171,7 +171,8 @@ def _painted(
         assert budget is not None  # _check has seen to it
         flags = flag(splats, budget, progress=run.progress)
         run.say(
-            f"flags: {flags.mean():.1%} of {len(splats):,} Gaussians are protected, over {budget:,} cells"
+            f"flags: {flags.mean():.1%} of {plural(len(splats), 'Gaussian')} are protected, "
+            f"over {plural(budget, 'cell')}"
         )
         return painted(splats, flag_colors(flags))
     if color == "cells":
@@ -185,7 +186,9 @@ def _painted(
         assert budget is not None
         labels = simplify(splats, budget, method=method, progress=run.progress).parents
     gone = int((labels < 0).sum())
-    run.say(f"parents: {labels.max() + 1:,} Gaussians of {len(splats):,}; {gone:,} went nowhere (black)")
+    run.say(
+        f"parents: {plural(labels.max() + 1, 'Gaussian')} of {len(splats):,}; {gone:,} went nowhere (black)"
+    )
     return painted(splats, label_colors(labels))
 
 

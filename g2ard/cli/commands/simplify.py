@@ -21,6 +21,7 @@ from g2ard.cli.options import (
 )
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_weight, tell_quality
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.io import Scene
@@ -172,7 +173,7 @@ def _tell(run: Run, scene: Path, small: Simplified, output: Path, total: int, se
     if share >= 0.02:
         run.say(f"no view sees {share:.0%} of the Gaussians: they count by their own size alone")
     say_weight(run, scene, output, small.splats)
-    run.say(f"{output}: {len(small.splats):,} of {total:,} Gaussians in {seconds:.1f} s")
+    run.say(f"{output}: {len(small.splats):,} of {plural(total, 'Gaussian')} in {seconds:.1f} s")
 
 
 def _table(run: Run, small: Simplified) -> None:

@@ -12,6 +12,7 @@ from g2ard.cli.budget_options import parse_ratio
 from g2ard.cli.commands.bench.group import bench
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import BackgroundOption, ProtocolOption, RecoveryTimeOption, SizeOption, ViewsOption
+from g2ard.cli.resume import rows_kept
 
 if TYPE_CHECKING:
     from g2ard.bench.recover import Look
@@ -65,17 +66,18 @@ def recover(
     from g2ard.bench.speedup import speedups
 
     colour = background or (0.0, 0.0, 0.0)
-    looks = bench_recover(
-        RecoverBench(scene, views, held_out, photos, size, colour, protocol=protocol),
-        study,
-        csv,
-        ratios=[parse_ratio(part) for part in ratios.split(",")],
-        seeds=_whole_numbers("seeds", seeds),
-        steps=_whole_numbers("steps", steps),
-        seconds=recovery_time or 30.0,
-        variants=[part.strip() for part in variants.split(",")] if variants else None,
-        progress=run.progress,
-    )
+    with rows_kept(run, csv, goes_on=True):
+        looks = bench_recover(
+            RecoverBench(scene, views, held_out, photos, size, colour, protocol=protocol),
+            study,
+            csv,
+            ratios=[parse_ratio(part) for part in ratios.split(",")],
+            seeds=_whole_numbers("seeds", seeds),
+            steps=_whole_numbers("steps", steps),
+            seconds=recovery_time or 30.0,
+            variants=[part.strip() for part in variants.split(",")] if variants else None,
+            progress=run.progress,
+        )
     columns = ["scene", "ratio", "variant", "views", "seed", "steps", "seconds", "CPU s", "PSNR", "SSIM"]
     run.console.table(
         f"{machine()}; unseen views at the end of each run",
