@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 from PIL import Image
 from scenes import around, checkered_ball
 
@@ -21,6 +22,7 @@ from g2ard.cli.resume import rows_kept
 from g2ard.errors import InputError
 from g2ard.io import Points, write_points, write_views
 from g2ard.report.window import Crop
+from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS
 
 CommandLine = Callable[..., tuple[int, str, str]]
 BALL = checkered_ball(400)
@@ -285,3 +287,56 @@ def test_an_interrupt_says_which_rows_stay(folder: Path) -> None:
         with pytest.raises(KeyboardInterrupt), rows_kept(run, table, goes_on=True):
             raise KeyboardInterrupt
         assert [line.split("the same command ")[-1] for line in run.kept] == told
+
+
+def test_scripts_need_no_deep_imports() -> None:
+    """Examples and pages import `g2ard` and what stands right under it."""
+    pages = [*ROOT.glob("examples/*.py"), *ROOT.glob("docs/methods/*.md"), ROOT / "README.md"]
+    pages += [page for page in ROOT.glob("docs/*.md") if page.name != "benchmarks.md"]
+    deep = [
+        f"{page.name}: {line}"
+        for page in pages
+        for line in page.read_text(encoding="utf-8").splitlines()
+        if re.match(r"\s*(from g2ard\.(?!synth import)|import g2ard\.)", line)
+    ]
+    assert deep == []
+    assert g2ard.Regularizers.of("lift") == PRESETS["lift"]
+    assert g2ard.Regularizers.of("noisy", paper=True) == PAPER_PRESETS["noisy"]
+    with pytest.raises(InputError, match="one of trained, lift, noisy, got 'lifted'"):
+        g2ard.Regularizers.of("lifted")
+    targets = g2ard.TeacherRenders(BALL, around(4, (32, 24)))
+    found = g2ard.distill_against(BALL, 50, targets, g2ard.DistillConfig(steps=2))
+    assert len(found.splats) == 50
+
+
+@pytest.mark.parametrize("name", ["a.las", "b.LAZ"])
+def test_a_scanned_cloud_and_photos_are_distilled(
+    name: str, command_line: CommandLine, tmp_path: Path
+) -> None:
+    """As of a city on a map: positions of a million metres, one offset, photos in the same coordinates."""
+    laspy = pytest.importorskip("laspy")
+    city = ("synth", "city", "-o", "city", "--points", "2k", "--views", 16, "--size", "32x24")
+    assert command_line(*city, "--offset", "443000,4428000,1600", cwd=tmp_path)[0] == 0
+    cloud = g2ard.load_points(tmp_path / "city" / "cloud.ply")
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.offsets, header.scales = cloud.positions.mean(0).round(), [1e-3] * 3
+    scan = laspy.LasData(header)
+    scan.x, scan.y, scan.z = cloud.positions.T
+    scan.red, scan.green, scan.blue = (cloud.colors * 65535).astype(np.uint16).T
+    scan.write(tmp_path / name)
+    ask = ("distill", name, "--views", "city/train.json", "-n", 400, "-o", "run", "--steps", 3, "--no-view")
+    status, _, error = command_line(*ask, "--held-out", "city/val.json", cwd=tmp_path)
+    assert (status, "2,000 → 400 Gaussians" in error) == (0, True), error
+    np.testing.assert_allclose(g2ard.load(tmp_path / "run" / "scene.ply").offset[1], 4428000, rtol=1e-4)
+    away = g2ard.Cameras.of([g2ard.Camera.facing([0, 0, 0], [0, -9, 0], width=48, height=36)])
+    g2ard.save_views(tmp_path / "away.json", away)
+    assert command_line("lift", name, "-o", "lifted.ply", cwd=tmp_path)[0] == 0
+    ask = ("recover", "lifted.ply", "--teacher", "lifted.ply", "--views", "away.json", "-o", "r.ply")
+    status, _, error = command_line(*ask, "--split", "all", cwd=tmp_path)
+    moved = "of one world (`g2ard info` shows both, `g2ard convert --transform` moves a scene)"
+    assert (status, moved in error) == (1, True), error
+    plain = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    plain.x, plain.y, plain.z = cloud.positions.T
+    plain.write(tmp_path / "plain.las")
+    error = refused(command_line, tmp_path, "lift", "plain.las", "-o", "p.ply", status=1)
+    assert "points must be coloured (as by PDAL's filters.colorization)" in error
