@@ -340,3 +340,45 @@ def test_a_scanned_cloud_and_photos_are_distilled(
     plain.write(tmp_path / "plain.las")
     error = refused(command_line, tmp_path, "lift", "plain.las", "-o", "p.ply", status=1)
     assert "points must be coloured (as by PDAL's filters.colorization)" in error
+
+
+def test_a_name_mistyped_is_told_with_one_alike(command_line: CommandLine, folder: Path) -> None:
+    ask = ("simplify", "bal.ply", "-r", 2, "-o", "o.ply")
+    assert "bal.ply: no such file or folder; did you mean ball.ply?\n" in refused(
+        command_line, folder, *ask, status=1
+    )
+    (folder / "sub").mkdir()
+    with pytest.raises(InputError, match=r"folder$"):
+        g2ard.load(folder / "sub" / "zzz.ply")
+    with pytest.raises(InputError, match=r"folder, nor a folder .*gone$"):
+        g2ard.load(folder / "gone" / "ball.ply")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".sog", ".spz", ".glb"])
+def test_a_damaged_file_is_told_what_to_do_about(
+    suffix: str, command_line: CommandLine, folder: Path
+) -> None:
+    g2ard.save(folder / f"a{suffix}", BALL)
+    (folder / f"b{suffix}").write_bytes((folder / f"a{suffix}").read_bytes()[:-700])
+    error = refused(command_line, folder, "info", f"b{suffix}", status=1)
+    assert error.endswith("; the file is damaged: copy or export it again\n")
+
+
+def test_what_is_missing_or_too_much_is_named(command_line: CommandLine, folder: Path) -> None:
+    """Refusals of common mistakes end with what would do."""
+    for name in ("bare", "d.ply"):
+        (folder / name).mkdir()
+    Image.new("RGB", (16, 16)).save(folder / "bare" / "a.png")
+    for ask, status, step in (
+        (("recover", "ball.ply", "-o", "o.ply", "--steps", 3, "--recovery-time", 9), 2, "; give one"),
+        (("simplify", "ball.ply", "-r", 2, "-o", "o.ply", "--views", "v", "--no-views"), 2, "; give one"),
+        (("simplify", "ball.ply", "-r", 2, "-o", "d.ply"), 1, "name one in it"),
+        (("render", "ball.ply", "-n", 1, "-o", "ball.ply"), 2, "name another output"),
+        (("render", "ball.ply", "-n", 1, "-o", "views.json"), 1, "name another"),
+        (("simplify", "ball.ply", "-r", 2, "-o", "o.ply", "--json", "o.ply"), 2, "name another file for one"),
+        (("convert", "ball.ply", "o.ply", "--box", "1,1,1,0,0,0"), 1, "the lower corner comes first"),
+        (("lift", "ball.ply", "-o", "o.ply"), 1, "ready for `simplify` and `distill`"),
+        (("register", "ball.ply", "--photos", "bare", "-o", "o.json", "--pool", 8), 1, "--focal PIXELS"),
+        (("evaluate", "ball.ply", "--views", "views.json", "--split", "val"), 1, "there are test, train"),
+    ):
+        assert step in refused(command_line, folder, *ask, status=status)

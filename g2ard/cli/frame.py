@@ -307,7 +307,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
         raise typer.BadParameter(f"--device: auto, cpu, gpu or cuda, not {run.device!r}")
     outputs = [Path(o) for o in (options.get("output"), run.json) if o not in (None, "-")]
     if len({output.resolve() for output in outputs}) < len(outputs):
-        raise typer.BadParameter(f"--json and --output are both {run.json}")
+        raise typer.BadParameter(f"--json and --output are both {run.json}; name another file for one")
     run.spare_inputs(*outputs)
     if run.device == "cuda" and not cuda:
         run.say("--device cuda: this command computes on the CPU only, and does")

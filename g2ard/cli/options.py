@@ -274,9 +274,9 @@ def can_judge(k: Count | str | None, policy: str) -> None:
 def one_horizon(steps: int | None, recovery_time: float | None, constants: Mapping[str, object]) -> None:
     """Usage check: --steps, --recovery-time and --set schedule.steps all set the horizon."""
     if steps is not None and recovery_time is not None:
-        raise typer.BadParameter("--steps and --recovery-time exclude each other")
+        raise typer.BadParameter("--steps and --recovery-time exclude each other; give one")
     if steps is not None and "schedule.steps" in constants:
-        raise typer.BadParameter("--steps and --set schedule.steps exclude each other")
+        raise typer.BadParameter("--steps and --set schedule.steps exclude each other; give one")
 
 
 def recovery_engine(run: Run) -> Literal["fused", "gsplat"]:

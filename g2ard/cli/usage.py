@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from typing import Any
 
@@ -18,22 +19,29 @@ _FLAGS = {
     "to take a ratio of: give a count": "to take a ratio of: give a count, -n COUNT",
     "its photos are needed as views": "give its photos with --views",
     "TeacherRenders of a scene can stand in": "--teacher SCENE stands in with its renders",
+    "views that hold them, or focal=PIXELS": "--intrinsics VIEWS or --focal PIXELS",
     "photos=None takes renders there": "without --photos the scene's render stands in for it",
     "crop ": "--crop ",
 }
 """What the library calls by the name of a parameter → what a shell calls it."""
 
 
+_DAMAGED = re.compile(r": (truncated|not a whole|broken|stream \d+ (holds|unpacks))|cut off")
+"""What readers say of a file that is not as its writer left it."""
+
+
 def in_flags(message: str) -> str:
-    """An error of the library in the words of the command line.
+    """An error of the library in the words of the command line, with what to do about a damaged file.
 
     >>> in_flags("a.ply: exists; overwrite=True replaces it")
     'a.ply: exists; give -w (--overwrite) to replace it'
+    >>> in_flags("a.spz: truncated in stream 2")
+    'a.spz: truncated in stream 2; the file is damaged: copy or export it again'
     """
     for words, flag in _FLAGS.items():
         if words != "crop " or message.startswith(words):
             message = message.replace(words, flag)
-    return message
+    return f"{message}; the file is damaged: copy or export it again" if _DAMAGED.search(message) else message
 
 
 _RENAMED = {"time-limit": "recovery-time"}

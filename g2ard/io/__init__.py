@@ -215,8 +215,10 @@ def read_cloud(path: str | Path) -> Cloud:
     path, found = Path(path), file_format(path)
     modules = {"cloud_ply": "cloud_ply", "las": "las", "points3d": "points3d", "colmap": "points3d"}
     if found not in modules:
-        what = "a Gaussian scene" if kind(path) == "splats" else found
-        raise InputError(f"{path}: a coloured point cloud is needed, this is {what}")
+        scene = kind(path) == "splats"
+        what = "a Gaussian scene" if scene else found
+        hint = ", ready for `simplify` and `distill`" if scene else "; name the cloud's own file"
+        raise InputError(f"{path}: a coloured point cloud is needed, this is {what}{hint}")
     return import_module(f"g2ard.io.{modules[found]}").read(path)
 
 

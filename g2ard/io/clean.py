@@ -69,7 +69,9 @@ def cleaned(path: Path, raw: Raw, notes: list[Note] | None = None) -> Scene:
         _clean_block(raw, slice(start, start + BLOCK), keep, tally)
     dropped = count - int(np.count_nonzero(keep))
     if dropped == count:
-        raise InputError(f"{path}: none of its {plural(count, 'Gaussian')} is finite")
+        raise InputError(
+            f"{path}: none of its {plural(count, 'Gaussian')} is finite; take an earlier state of it"
+        )
     if dropped:
         first = int(np.argmin(keep))
         text = f"{plural(dropped, 'non-finite Gaussian')} dropped (the first is row {first})"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Literal
 
@@ -63,7 +64,7 @@ def file_format(path: str | Path) -> Format:
     if path.is_dir():
         return _folder_format(path)
     if not path.exists():
-        raise InputError(f"{path}: no such file or folder")
+        raise InputError(f"{path}: no such file or folder{_near(path)}")
     name, suffix = path.name.lower(), path.suffix.lower()
     if name in ("meta.json", "lod-meta.json"):
         return "sog"
@@ -127,6 +128,14 @@ def _folder_format(path: Path) -> Format:
     if gsplat_run.is_run(path / gsplat_run.NAME):
         return "gsplat_run"
     raise InputError(f"{path}: nothing known in this folder{_instead(path)}")
+
+
+def _near(path: Path) -> str:
+    """Names alike in the folder where something was looked for, or that there is no such folder."""
+    if not path.parent.is_dir():
+        return f", nor a folder {path.parent}"
+    close = get_close_matches(path.name, [file.name for file in path.parent.iterdir()], 2)
+    return f"; did you mean {' or '.join(str(path.with_name(name)) for name in close)}?" if close else ""
 
 
 def _instead(path: Path) -> str:

@@ -141,7 +141,9 @@ def points_within_sight(
         InputError: fewer than three views, one without a photo, or views that share no sight.
     """
     if len(cameras) < 3:
-        raise InputError(f"photos: expected at least 3 views, got {len(cameras)}")
+        raise InputError(
+            f"photos: expected at least 3 views, got {len(cameras)}; give more, or a scene beside them"
+        )
     bare = [name for name, path in zip(cameras.names, cameras.image_paths, strict=True) if path is None]
     if bare:
         raise InputError(
@@ -155,7 +157,9 @@ def points_within_sight(
     positions, colors, tried = np.zeros((0, 3)), np.zeros((0, 3), np.float32), 0
     while len(positions) < count:
         if tried > 64 * max(count, _RAYS):
-            raise InputError("photos: the views share no sight: no point is seen by three of them")
+            raise InputError(
+                "photos: the views share no sight: no point is seen by three of them; give a cloud"
+            )
         view = int(rng.integers(len(cameras)))
         rays = min(_RAYS, max(64, -(-count // len(cameras))))
         xyz, rgb = _swept(cameras, photos, view, near[view], float(reach[view]), rays, background, rng)

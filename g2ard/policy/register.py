@@ -61,13 +61,17 @@ def photos_of(
                 f"{path}: view {missing} has no photo to register; give the folder of the photos"
             )
         if intrinsics is not None or focal is not None:
-            raise InputError(f"{path}: these views state their intrinsics; others would contradict them")
+            raise InputError(
+                f"{path}: these views state their intrinsics; others would contradict them: leave those out"
+            )
         return found.cameras
     if split != "all":
-        raise InputError(f"{path}: a folder of photos has no split {split!r}")
+        raise InputError(
+            f"{path}: a folder of photos has no split {split!r}: all of it is meant, or views are to be given"
+        )
     if (intrinsics is None) == (focal is None):
         raise InputError(
-            f"{path}: photos without views need their intrinsics: either views, or a focal length"
+            f"{path}: photos without views need their intrinsics: views that hold them, or focal=PIXELS"
         )
     names = [file.relative_to(path).as_posix() for file in files]
     sizes = _sizes(files)
@@ -123,7 +127,10 @@ def _lenses(path: Path, names: list[str]) -> list[Camera]:
     shared = all(_same_lens(view, one) for view in views)
     missing = next((name for name in names if name not in by_name), None)
     if missing is not None and not shared:
-        raise InputError(f"{path}: no intrinsics for {missing}, and its views are of several lenses")
+        raise InputError(
+            f"{path}: no intrinsics for {missing}, and its views are of several lenses; name it there, or "
+            "give one lens"
+        )
     return [by_name.get(name, one) for name in names]
 
 
@@ -141,7 +148,7 @@ def _check_aspects(files: list[Path], sizes: list[tuple[int, int]], views: list[
         (w, h), view = sizes[0], views[0]
         raise InputError(
             f"{files[0]}: the photo is {w}×{h}, its intrinsics are for {view.width}×{view.height}: "
-            "the aspects differ"
+            "the aspects differ; give the intrinsics of these photos"
         )
 
 
@@ -167,7 +174,9 @@ def poses_for(path: Path, names: Sequence[str]) -> Poses:
     """
     found = matched(read_poses(path), names)
     if not found:
-        raise InputError(f"{path}: names none of the photos, of which the first is {names[0]}")
+        raise InputError(
+            f"{path}: names none of the photos, of which the first is {names[0]}; poses are found by name"
+        )
     return found
 
 

@@ -58,7 +58,9 @@ def adapt(
     from g2ard.stages.recover.schedule import schedule_named
 
     if schedule == "paper" and prior_views:
-        raise typer.BadParameter("--prior-views: the paper's schedule takes the fit as it is")
+        raise typer.BadParameter(
+            "--prior-views: the paper's schedule takes the fit as it is; leave one of them out"
+        )
     recovery = appearance_only(schedule_named(schedule))
     config = AdaptConfig(
         steps=steps,

@@ -93,7 +93,9 @@ def evaluate(
         row["file_bytes"] = bytes_of(path)
         if frozen is not None:
             if len(frozen) != len(splats):
-                raise InputError(f"{anchors}: {plural(len(frozen), 'Gaussian')}, {path} has {len(splats)}")
+                raise InputError(
+                    f"{anchors}: not the Gaussians of {path} before recovery: their counts differ"
+                )
             row["drift95"] = drift95(Anchors.of(frozen), splats.means)
         rows.append(row)
     against = _against(rows[0]["views"])

@@ -105,7 +105,7 @@ def register(
     if metres_per_unit is not None and truth is None:
         raise typer.BadParameter("--metres-per-unit goes with --truth")
     if intrinsics is not None and focal is not None:
-        raise typer.BadParameter("--intrinsics and --focal exclude each other")
+        raise typer.BadParameter("--intrinsics and --focal exclude each other; give one")
     check_output(output, run.overwrite)
     if report is not None:
         if report.resolve() in {p.resolve() for p in (output, scene, poses, truth, intrinsics, photos) if p}:

@@ -65,7 +65,7 @@ def simplify(
     values = run.constants(simplify=SimplifyConfig(), over_options=True)
     budgets = budgets_of(count, ratio, fit, min_psnr, min_ssim)
     if views is not None and no_views:
-        raise typer.BadParameter("--views and --no-views exclude each other")
+        raise typer.BadParameter("--views and --no-views exclude each other; give one")
     from g2ard import io
     from g2ard.constants import changed
     from g2ard.policy.fit import aim_of
