@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from difflib import get_close_matches
+from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -40,6 +41,8 @@ KINDS: dict[str, Kind] = {
 }
 
 
+_LOOKED_INTO = 64
+"""Files of a folder at most, for what may be meant of them."""
 _READ = (".ply", ".sog", ".spz", ".glb", ".splat", ".las", ".laz", ".json")
 
 
@@ -141,10 +144,10 @@ def _near(path: Path) -> str:
 def _instead(path: Path) -> str:
     """What to do with a folder that is nothing: name a file in it, find poses; else what was looked for."""
     held: dict[Kind, list[str]] = {"splats": [], "points": [], "views": []}
-    for file in sorted(path.iterdir()):
-        if file.suffix.lower() in _READ and file.is_file():
-            with suppress(InputError):
-                held[kind(file)].append(file.name)
+    files = (file for file in sorted(path.iterdir()) if file.suffix.lower() in _READ and file.is_file())
+    for file in islice(files, _LOOKED_INTO):
+        with suppress(InputError):
+            held[kind(file)].append(file.name)
     words = {"splats": "a scene", "points": "a cloud", "views": "views"}
     found = [f"{', '.join(names[:5])} ({words[what]})" for what, names in held.items() if names]
     if found:

@@ -236,7 +236,8 @@ def distill(
             run, scene or Path(str(views)), job, aim.count, place, resume, keep, view, crop or [], began
         )
         reports.append(report)
-        run.kept.append(f"{place.parent} is finished")
+        others = " (--resume makes the others)" if len(places) > 1 else ""
+        run.kept.append(f"{place.parent} is finished{others}")
         began = time.monotonic()
     _tell_all(run, reports)
     if len(finished) < len(places):
