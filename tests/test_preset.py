@@ -276,7 +276,7 @@ def test_what_was_kept_gives_the_drift_again(folder: Path, command_line: Command
     status, _, error = command_line(*ask, *short, "-w", "--anchors", "ball.ply", cwd=folder)
     assert (status, error.splitlines()[-1]) == (
         1,
-        "g2ard: ball.ply: 3000 Gaussians, the student has 1000; anchors are the student as it was "
+        "g2ard: ball.ply: 3,000 Gaussians, the student has 1,000; anchors are the student as it was "
         "simplified, before any recovery",
     )
     run(command_line, folder, *DISTILL, "--schedule", "fast")

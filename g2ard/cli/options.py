@@ -35,6 +35,7 @@ __all__ = [
     "can_be_made",
     "can_judge",
     "is_made",
+    "picture",
     "recovery_engine",
     "trained_on",
     "views_count",
@@ -83,6 +84,13 @@ ViewsOrMadeOption = Annotated[
 ]
 LookOption = Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")]
 OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Where the result goes.")]
+
+
+def picture(text: str) -> Path:
+    """Read the name of a picture that is written."""
+    if Path(text).suffix.lower() != ".png":
+        raise typer.BadParameter(f"pictures are written as .png, not {text!r}")
+    return Path(text)
 
 
 class Triple(tuple[float, float, float]):
@@ -222,10 +230,13 @@ def _duration(text: str) -> float:
     return float(match[1]) * {"s": 1, "m": 60, "min": 60, "h": 3600}[match[2] or "s"]
 
 
-TimeLimitOption = Annotated[
+RecoveryTimeOption = Annotated[
     float | None,
     typer.Option(
-        "--time-limit", parser=_duration, metavar="TIME", help="Fit recovery alone into 90s, 2m or 1h."
+        "--recovery-time",
+        parser=_duration,
+        metavar="TIME",
+        help="Fit recovery, and no other part, into 90s, 2m or 1h.",
     ),
 ]
 
@@ -244,12 +255,12 @@ def can_judge(k: Count | str | None, policy: str) -> None:
         raise typer.BadParameter(f"-k auto: --policy {policy} does not measure what views add; give a count")
 
 
-def one_horizon(steps: int | None, time_limit: float | None, constants: Mapping[str, object]) -> None:
-    """Usage check: --steps, --time-limit and --set schedule.steps all set the horizon."""
-    if steps is not None and time_limit is not None:
-        raise typer.BadParameter("--steps and --time-limit exclude each other")
+def one_horizon(steps: int | None, recovery_time: float | None, constants: Mapping[str, object]) -> None:
+    """Usage check: --steps, --recovery-time and --set schedule.steps all set the horizon."""
+    if steps is not None and recovery_time is not None:
+        raise typer.BadParameter("--steps and --recovery-time exclude each other; give one")
     if steps is not None and "schedule.steps" in constants:
-        raise typer.BadParameter("--steps and --set schedule.steps exclude each other")
+        raise typer.BadParameter("--steps and --set schedule.steps exclude each other; give one")
 
 
 def recovery_engine(run: Run) -> Engine:

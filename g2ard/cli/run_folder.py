@@ -182,7 +182,9 @@ def _check_same(run: Run, folder: Path, told: Path, budget: Budget, how: str) ->
         return
     before = read_json(told)
     if other := _others(run, before, budget):
-        raise OutputError(f"{folder}: {how} with another {', '.join(other)}; -w without --resume starts anew")
+        raise OutputError(
+            f"{folder}: {how} with other options ({', '.join(other)}); -w without --resume starts anew"
+        )
 
 
 def _others(run: Run, before: Mapping[str, Any], budget: Budget) -> list[str]:

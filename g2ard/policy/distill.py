@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ from g2ard.policy.distill_options import DistillOptions, takes_options
 from g2ard.policy.inputs import load_scene
 from g2ard.policy.job import DistillJob
 from g2ard.policy.views import is_made, views_of
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.splats import Splats
 
 if TYPE_CHECKING:
@@ -92,16 +92,19 @@ def prepare(
     budgets: Sequence[Budget],
     options: DistillOptions,
     *,
+    counted: Callable[[int], object] | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> DistillJob:
     """Read and decide all that a distillation needs, at one budget or several; else as `distill`.
 
+    `counted` is told how many Gaussians the dense scene has before anything else is done with it; what it
+    raises ends the preparation.
+
     Raises:
         InputError: as `distill`.
     """
     from g2ard.constants import changed, full_names
-    from g2ard.io.clean import plural
     from g2ard.pipeline import DistillConfig
     from g2ard.policy.clean import clutter_seen
     from g2ard.policy.fit import aim_of
@@ -121,6 +124,8 @@ def prepare(
     if options.clean:
         found, _ = clutter_seen(prior, seed=seed, progress=progress, say=say)
         prior, cleaned = prior.take(found.keep), found.counts
+    if counted is not None:
+        counted(len(prior))
     file = f"scene.{options.format}"
     aims = tuple(
         aim_of(budget, prior, name, file=file, seed=seed, progress=progress, say=say) for budget in budgets
@@ -141,13 +146,19 @@ def prepare(
     pictured = [path is not None for path in (*train.image_paths, *looks.test.image_paths)]
     use_photos = lifted or (any(pictured) if options.photos is None else options.photos)
     taught = not (lifted or options.photos or (use_photos and all(pictured)))
+    if (lifted or options.photos) and not all(pictured):
+        bare = (*train.names, *looks.test.names)[pictured.index(False)]
+        instead = (
+            "give views with photos, or a trained scene" if lifted else "photos=None takes renders there"
+        )
+        raise InputError(f"view {bare} has no photo; {instead}")
     kind = "paper-lift" if lifted and options.preset == "paper" else options.preset
     photographed = train if use_photos else None
     regularizers, why, measured = preset_for(kind, prior, photographed, paper=chosen["schedule"] == "paper")
-    counts = ", ".join(f"{aim.count:,}" for aim in aims)
+    counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
     shown = len(train) if not taught else sum(pictured[: len(train)]) if use_photos else 0
     against = kinds_told(shown, len(train) - shown)
-    say(f"{len(prior):,} → {counts} Gaussians; {plural(len(train), 'view')} against {against}")
+    say(f"{len(prior):,} → {counts}; {plural(len(train), 'view')} against {against}")
     say(f"regularisers: {why}")
     return DistillJob(
         prior=prior,
@@ -178,7 +189,7 @@ def _config(
         method=chosen["method"],
         schedule=schedule_named(chosen["schedule"], options.steps),
         steps=options.steps,
-        time_limit=options.time_limit,
+        recovery_time=options.recovery_time,
         regularizers=regularizers,
         sh_degree=3 if options.sh_degree is None and whole else options.sh_degree,
         background=options.background,

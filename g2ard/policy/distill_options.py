@@ -43,7 +43,7 @@ class DistillOptions:
             what the paper has.
         schedule: of recovery: fast, default, best or paper; "default" if None.
         steps: the final horizon.
-        time_limit: seconds that all recovery is fitted into; the result then depends on the machine.
+        recovery_time: seconds that all recovery is fitted into; the result then depends on the machine.
         sh_degree: of the result; None keeps the scene's, and takes 3 from a cloud or for the paper's.
         size: pixels that the longer side of views is shrunk to.
         background: RGB in [0, 1] behind the scene.
@@ -67,7 +67,7 @@ class DistillOptions:
     preset: str = "auto"
     schedule: str | None = None
     steps: int | None = None
-    time_limit: float | None = None
+    recovery_time: float | None = None
     sh_degree: int | None = None
     size: int | None = None
     background: Colour = (0.0, 0.0, 0.0)

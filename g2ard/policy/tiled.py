@@ -107,7 +107,11 @@ def is_tiled(scene: Path, tiling: Tiling) -> bool:
 
     if (scene / MANIFEST).is_file():
         return len(TileStore.open(scene).tiles) > 1
-    if scene.is_file() and scene.suffix.lower() != ".json" and scene.stat().st_size < _SMALLEST_ROW * tiling.most_rows:
+    if (
+        scene.is_file()
+        and scene.suffix.lower() != ".json"
+        and scene.stat().st_size < _SMALLEST_ROW * tiling.most_rows
+    ):
         return False
     from g2ard.io.stream import open_stream
 

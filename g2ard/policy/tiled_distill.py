@@ -114,7 +114,7 @@ def _refuse(scene: Path, budgets: Sequence[Budget], options: DistillOptions) -> 
     usual = type(options)()
     whole = [
         name
-        for name in ("clean", "photos", "views_count", "reselect", "time_limit", "engine")
+        for name in ("clean", "photos", "views_count", "reselect", "recovery_time", "engine")
         if getattr(options, name) != getattr(usual, name)
     ]
     whole += ["method"] if options.method not in (None, "default") else []

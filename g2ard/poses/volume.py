@@ -101,7 +101,9 @@ class OccupiedVolume:
         scales = np.take_along_axis(scales, order, axis=1).astype(np.float64)
         areas = scales[:, 1] * scales[:, 2]
         if not (areas > 0).any():
-            raise InputError("the scene has nothing to look at: no visible Gaussian with a surface")
+            raise InputError(
+                "the scene has nothing to look at: no visible Gaussian with a surface; give views of it"
+            )
         weights = opacities * np.minimum(areas / middle(areas[areas > 0]), _WIDEST)
         near = _near(means, opacities)
         origin, size = _frame(means[near][:_SAMPLE], weights[near][:_SAMPLE], scales[near][:_SAMPLE])

@@ -21,6 +21,7 @@ from g2ard.cli.options import (
     TeacherOption,
     trained_on,
 )
+from g2ard.progress import plural
 
 
 @command("adapt", example="g2ard adapt small.ply --views winter/ -o winter.ply", constants=True)
@@ -58,7 +59,9 @@ def adapt(
     from g2ard.stages.recover.schedule import schedule_named
 
     if schedule == "paper" and prior_views:
-        raise typer.BadParameter("--prior-views: the paper's schedule takes the fit as it is")
+        raise typer.BadParameter(
+            "--prior-views: the paper's schedule takes the fit as it is; leave one of them out"
+        )
     recovery = appearance_only(schedule_named(schedule))
     config = AdaptConfig(
         steps=steps,
@@ -85,7 +88,7 @@ def adapt(
         write_splats(output, result.splats, overwrite=run.overwrite)
     gain, end = result.report.psnr, "converged" if result.report.converged else "all steps taken"
     run.say(
-        f"{output}: {len(splats):,} Gaussians, {result.report.steps:,} steps ({end}), "
+        f"{output}: {plural(len(splats), 'Gaussian')}, {plural(result.report.steps, 'step')} ({end}), "
         f"{trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB"
     )
     constants = listed({"adapt": config}, run.config)

@@ -26,9 +26,9 @@ from g2ard.cli.options import (
     FormatOption,
     PolicyOption,
     PresetOption,
+    RecoveryTimeOption,
     ResumeOption,
     SizeOption,
-    TimeLimitOption,
     UpOption,
     ViewsOrMadeOption,
     can_judge,
@@ -59,6 +59,7 @@ from g2ard.cli.tile_options import (
     tiling_of,
 )
 from g2ard.cli.tiled import TiledCommand
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.pipeline import Distilled
@@ -127,7 +128,7 @@ def distill(
         ScheduleName, typer.Option(help="Recovery; paper also goes round by round.")
     ] = "default",
     steps: Annotated[int | None, typer.Option(min=1, help="Overrides the final horizon.")] = None,
-    time_limit: TimeLimitOption = None,
+    recovery_time: RecoveryTimeOption = None,
     sh_degree: Annotated[
         int | None,
         typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own, 3 from a cloud."),
@@ -185,17 +186,18 @@ def distill(
     from g2ard.report.distilled import check_crops
 
     began = time.monotonic()
-    one_horizon(steps, time_limit, values)
+    one_horizon(steps, recovery_time, values)
     engine = recovery_engine(run)
     name = f"scene.{format}"
     outputs = Outputs(run, output, budgets)
 
     def check(folder: Path, budget: Budget) -> None:
-        check_place(run, folder / name, budget, given, resume)
+        if not dry_run:
+            check_place(run, folder / name, budget, given, resume)
 
     outputs.check(check)
     early = [folder / name for folder in outputs.paths()]
-    if early and all(is_done(run, place, resume) for place in early):
+    if early and not dry_run and all(is_done(run, place, resume) for place in early):
         _tell_all(run, [tell_finished(run, place) for place in early])
         return
     if scene is not None and kind(scene) == "views":
@@ -218,7 +220,7 @@ def distill(
         preset=preset,
         schedule=schedule,
         steps=steps,
-        time_limit=time_limit,
+        recovery_time=recovery_time,
         sh_degree=sh_degree,
         size=size,
         background=background or (0.0, 0.0, 0.0),
@@ -233,9 +235,15 @@ def distill(
             raise typer.BadParameter("--dry-run: not in tiles; --tile-rows above the count avoids them")
         TiledCommand(run, scene, outputs, tiling, budgets).distill(options, name)
         return
-    job = prepare(scene, budgets, options, progress=run.progress, say=run.say)
+    job = prepare(
+        scene,
+        budgets,
+        options,
+        counted=lambda total: outputs.check(check, total),
+        progress=run.progress,
+        say=run.say,
+    )
     check_crops(crop or [], job.views.test.names)
-    outputs.check(check, len(job.prior))
     places = [folder / name for folder in outputs.paths(len(job.prior))]
     if dry_run:
         _tell_estimates(run, job, [place.parent for place in places])
@@ -253,7 +261,8 @@ def distill(
             run, scene or Path(str(views)), job, aim.count, place, resume, keep, view, crop or [], began
         )
         reports.append(report)
-        run.kept.append(f"{place.parent} is finished")
+        others = " (--resume makes the others)" if len(places) > 1 else ""
+        run.kept.append(f"{place.parent} is finished{others}")
         began = time.monotonic()
     _tell_all(run, reports)
     if len(finished) < len(places):
@@ -275,8 +284,8 @@ def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[Path]) -> None:
         one = estimate(job, budget)
         parts = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in one.seconds.items())
         run.say(
-            f"{folder}: {budget:,} Gaussians, {one.views} views of {one.pixels:,} pixels, "
-            f"{one.steps:,} steps: about {one.total:.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
+            f"{folder}: {plural(budget, 'Gaussian')}, {plural(one.views, 'view')} of {one.pixels:,} pixels, "
+            f"{plural(one.steps, 'step')}: about {one.total:.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
         )
         found.append(one)
         told.append({"output": str(folder), "count": budget, **asdict(one), "total_seconds": one.total})

@@ -30,6 +30,7 @@ from g2ard.cli.tile_options import (
     tiling_of,
 )
 from g2ard.cli.tiled import TiledCommand
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.io import Scene
@@ -79,7 +80,7 @@ def simplify(
     values = run.constants(simplify=SimplifyConfig(), over_options=True)
     budgets = budgets_of(count, ratio, fit, min_psnr, min_ssim)
     if views is not None and no_views:
-        raise typer.BadParameter("--views and --no-views exclude each other")
+        raise typer.BadParameter("--views and --no-views exclude each other; give one")
     tiling = tiling_of(run, output, tile_rows, memory, workers, scheduler, work)
     from g2ard import io
     from g2ard.constants import changed
@@ -203,7 +204,7 @@ def _tell(run: Run, scene: Path, small: Simplified, output: Path, total: int, se
     if share >= 0.02:
         run.say(f"no view sees {share:.0%} of the Gaussians: they count by their own size alone")
     say_weight(run, scene, output, small.splats)
-    run.say(f"{output}: {len(small.splats):,} of {total:,} Gaussians in {seconds:.1f} s")
+    run.say(f"{output}: {len(small.splats):,} of {plural(total, 'Gaussian')} in {seconds:.1f} s")
 
 
 def _table(run: Run, small: Simplified) -> None:

@@ -22,7 +22,10 @@ def check_cuda() -> None:
         InputError: torch sees no CUDA device, or gsplat is not installed.
     """
     if not torch.cuda.is_available():
-        raise InputError("engine 'gsplat': torch sees no CUDA device here")
+        raise InputError(
+            "engine 'gsplat': torch sees no CUDA device here; it takes an NVIDIA GPU, torch for CUDA and "
+            "g2ard[cuda]; engine 'fused' needs none"
+        )
     if find_spec("gsplat") is None:
         raise InputError("engine 'gsplat': gsplat is not installed (pip install 'g2ard[cuda]')")
 

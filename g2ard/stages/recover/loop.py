@@ -123,7 +123,7 @@ class Loop:
             self.multiplier = self.config.schedule.multiplier
             return
         guess = multiplier_for(rmse)
-        limit = self.config.time_limit
+        limit = self.config.recovery_time
         steps = trial_steps(self.config.horizon) if limit is None else _TRIAL_STEPS
         self.multiplier = guess
         if not steps:
@@ -194,8 +194,8 @@ class Loop:
 
     def _share(self) -> float:
         """How much of the horizon, of steps or of seconds, has been used."""
-        if self.config.time_limit is not None:
-            return self.seconds / self.config.time_limit
+        if self.config.recovery_time is not None:
+            return self.seconds / self.config.recovery_time
         return self.done / self.config.horizon
 
     def _step(self) -> None:
@@ -212,7 +212,7 @@ class Loop:
     def _look(self) -> None:
         """Where too much is lost to come back, go on from the best scene with a third of the rates."""
         share = self._share()
-        short = self.config.time_limit is None and self.config.horizon < _SHORT
+        short = self.config.recovery_time is None and self.config.horizon < _SHORT
         if short or not self.guard.due(share):
             return
         if self.guard.look(self.engine.splats(), share, self.done) == "back":
@@ -245,7 +245,7 @@ class Loop:
         speed = self.done / max(self.seconds, 1e-9)
         recent = np.mean(self.losses[-20:])
         total = self.config.horizon
-        if self.config.time_limit is not None:
+        if self.config.recovery_time is not None:
             total = max(self.done, round(self.done / max(self._share(), 1e-9)))
         shown, at = self.probe.latest(self.engine.splats, self.done, self.seconds)
         figures = {"loss": f"{recent:.4f}", "PSNR": f"{shown:.2f} @{at}", "steps/s": f"{speed:.1f}"}
