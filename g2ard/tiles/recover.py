@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,9 @@ _BESIDE = 16
 _OWN = 0.5
 """Share of a pixel's light that comes from a tile where the pixel counts for it."""
 
+_FEWEST = 256
+"""Pixels that count in a view, at least: fewer teach nothing."""
+
 _SH0 = 0.28209479177387814
 
 
@@ -72,19 +75,25 @@ class TiledScores:
 class TileTargets(TeacherRenders):
     """The dense scene's renders, of which the pixels count that a tile gives most of the light of."""
 
-    def __init__(self, teacher: Splats, own: int, cameras: Cameras, **options: Any) -> None:
-        self._masks: dict[int, NDArray[np.bool_]] = {}
-        bright = np.full((len(teacher), 1, 3), -0.5 / _SH0, np.float32)
-        bright[:own] = 0.5 / _SH0
-        nothing = np.zeros((len(teacher), 0, 3), np.float32)
-        self._share = Renderer(replace(teacher, sh0=bright, shN=nothing))
-        super().__init__(teacher, cameras, **options)
+    def __init__(
+        self, teacher: Splats, own: int, cameras: Cameras, background: tuple[float, float, float]
+    ) -> None:
+        masks = _masks(teacher, own, cameras)
+        shown = [view for view, mask in enumerate(masks) if mask.sum() >= _FEWEST]
+        self._masks = [masks[view] for view in shown]
+        super().__init__(teacher, cameras.take(shown), background=background, lazy=True)
 
     def mask(self, view: int) -> NDArray[np.bool_]:
         """(H, W), where a pixel counts."""
-        if view not in self._masks:
-            self._masks[view] = self._share.image(self.cameras[view])[..., 0] > _OWN
         return self._masks[view]
+
+
+def _masks(scene: Splats, own: int, cameras: Cameras) -> list[NDArray[np.bool_]]:
+    """(H, W) of each view, where the first `own` Gaussians give most of the light."""
+    white = np.full((len(scene), 1, 3), -0.5 / _SH0, np.float32)
+    white[:own] = 0.5 / _SH0
+    renderer = Renderer(replace(scene, sh0=white, shN=np.zeros((len(scene), 0, 3), np.float32)))
+    return [renderer.image(camera)[..., 0] > _OWN for camera in cameras]
 
 
 def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
@@ -107,13 +116,10 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
 
     def targets(name: str) -> TileTargets | None:
         cameras = cameras_of(inputs[name]).take(arguments[name])
-        if not len(cameras):
-            return None
         settings = settings_for(core.means, RasterSettings())
         here = cropped(cameras.recentred(store.offset), core, settings, _BESIDE)
-        return TileTargets(
-            teacher, len(core), here.recentred(-store.offset), background=background, lazy=True
-        )
+        found = TileTargets(teacher, len(core), here.recentred(-store.offset), background)
+        return found if len(found.cameras) else None
 
     train, held_out, apart = targets("train"), targets("test"), targets("apart")
     if train is None or not arguments["steps"]:
