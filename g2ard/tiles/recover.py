@@ -47,7 +47,7 @@ _BESIDE = 16
 """Pixels around a tile that its images show too: SSIM's windows reach over its edge."""
 
 _OWN = 0.5
-"""Share of a pixel's light that comes from a tile where the pixel counts for it."""
+"""Share of a pixel's alpha that is a tile's where the pixel counts for it; an empty one counts for all."""
 
 _FEWEST = 256
 """Pixels that count in a view, at least: fewer teach nothing."""
@@ -73,7 +73,7 @@ class TiledScores:
 
 
 class TileTargets(TeacherRenders):
-    """The dense scene's renders, of which the pixels count that a tile gives most of the light of."""
+    """The dense scene's renders, of which the pixels count that no other tile gives most of."""
 
     def __init__(
         self, teacher: Splats, own: int, cameras: Cameras, background: tuple[float, float, float]
@@ -89,11 +89,12 @@ class TileTargets(TeacherRenders):
 
 
 def _masks(scene: Splats, own: int, cameras: Cameras) -> list[NDArray[np.bool_]]:
-    """(H, W) of each view, where the first `own` Gaussians give most of the light."""
+    """(H, W) of each view, where the first `own` Gaussians give most of the alpha."""
     white = np.full((len(scene), 1, 3), -0.5 / _SH0, np.float32)
     white[:own] = 0.5 / _SH0
     renderer = Renderer(replace(scene, sh0=white, shN=np.zeros((len(scene), 0, 3), np.float32)))
-    return [renderer.image(camera)[..., 0] > _OWN for camera in cameras]
+    drawn = (renderer.render(camera) for camera in cameras)
+    return [image.image[..., 0] >= _OWN * image.alpha for image in drawn]
 
 
 def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
@@ -172,8 +173,8 @@ def recover_tiles(
     """Recover each tile against the dense scene's renders, as if it were part of one recovery of all.
 
     A tile's Gaussians learn; those of others within its margin, and coarse ones of all else, stand frozen
-    around them, so that what hides what is right. Only the pixels count that the tile gives most of the
-    light of in the dense scene; images are cropped to them. A tile takes the share of `steps` that views
+    around them, so that what hides what is right. Only the pixels count that no other tile gives most of
+    in the dense scene; images are cropped to the tile. A tile takes the share of `steps` that views
     which have it in sight are of all.
 
     Args:
