@@ -1,0 +1,151 @@
+"""Commands on scenes in tiles: files, refusals, and recovery with frozen surroundings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_tiles_simplify import ring, town
+
+from g2ard.errors import InputError
+from g2ard.io import read_splats, write_splats, write_views
+from g2ard.policy.tiled import Tiling, bytes_of, check_memory, is_tiled, workers_for
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.schedule import schedule_named
+from g2ard.stages.simplify import simplify
+from g2ard.targets import TeacherRenders
+from g2ard.tiles.ingest import ingest
+from g2ard.tiles.store import TileStore
+
+CommandLine = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("town")
+    write_splats(folder / "town.ply", town())
+    write_views(folder / "views.json", ring(8), splits=["train"] * 6 + ["test"] * 2)
+    return folder
+
+
+def good(command_line: CommandLine, cwd: Path, *arguments: object) -> None:
+    code, _, said = command_line(*arguments, cwd=cwd)
+    assert code == 0, said
+
+
+def test_frozen_rows_stay_and_the_others_learn() -> None:
+    dense = town(1500)
+    small = simplify(dense, 300).splats
+    frozen = np.arange(300) % 3 == 0
+    config = RecoverConfig(schedule=schedule_named("fast", 40), steps=40)
+    done = recover(small, TeacherRenders(dense, ring()), config, frozen=frozen)
+    assert done.report.psnr.after > done.report.psnr.before
+    for name in ("means", "scales", "logit_opacities", "sh0"):
+        was, now = (np.asarray(getattr(s, name), np.float32).reshape(300, -1) for s in (small, done.splats))
+        np.testing.assert_allclose(now[frozen], was[frozen], rtol=2e-6, atol=1e-6)
+        assert (np.abs(now - was)[~frozen] > 1e-5).any(axis=1).mean() > 0.9
+    with pytest.raises(InputError, match=r"frozen: expected bool of shape \(300,\)"):
+        recover(small, TeacherRenders(dense, ring()), config, frozen=frozen[:5])
+
+
+def test_simplify_works_in_tiles_and_forgets_them(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
+    out, views = tmp_path / "small_{ratio}x.ply", folder / "views.json"
+    args = ["simplify", folder / "town.ply", "-r", "10,20", "-o", out, "--tile-rows", "2500"]
+    good(command_line, tmp_path, *args, "--views", views, "--workers", "1", "--json", tmp_path / "told.json")
+    told = json.loads((tmp_path / "told.json").read_text())["runs"]
+    for ratio, report in zip((10, 20), told, strict=True):
+        small = read_splats(tmp_path / f"small_{ratio}x.ply")
+        assert len(small) == 9000 // ratio == report["output_count"] == sum(report["tiles"])
+    assert {path.name for path in tmp_path.iterdir()} == {"small_10x.ply", "small_20x.ply", "told.json"}
+
+
+def test_a_folder_of_tiles_is_a_scene(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
+    common = ["-n", "900", "--no-views", "--workers", "1"]
+    good(
+        command_line,
+        tmp_path,
+        "simplify",
+        store.folder,
+        *common,
+        "-o",
+        tmp_path / "a.ply",
+        "--work",
+        tmp_path / "work",
+    )
+    good(
+        command_line,
+        tmp_path,
+        "simplify",
+        folder / "town.ply",
+        *common,
+        "-o",
+        tmp_path / "b.ply",
+        "--tile-rows",
+        "2500",
+    )
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    assert (tmp_path / "work" / "steps").is_dir()  # named by the user, so it stays
+
+
+def test_what_tiles_do_not_have_is_refused(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    def refused(code: int, *args: object) -> str:
+        status, _, said = command_line(*args, "--tile-rows", "2500", cwd=tmp_path)
+        assert status == code, said
+        assert not [path for path in tmp_path.iterdir() if not path.name.startswith(".")]
+        return " ".join(said.split())
+
+    scene, out = folder / "town.ply", tmp_path / "x.ply"
+    assert "--method fast: not in tiles" in refused(
+        2, "simplify", scene, "-r", 10, "-o", out, "--method", "fast"
+    )
+    told = refused(1, "simplify", scene, "--fit", "50kB", "-o", out)
+    assert "takes the scene in one piece, not in tiles; give -n or -r" in told
+    told = refused(1, "simplify", scene, "-r", 10, "-o", out, "--memory", "200MB")
+    assert "--tile-rows" in told
+    assert "makes smaller ones" in told
+    assert "a size such as 4GB" in refused(2, "simplify", scene, "-r", 10, "-o", out, "--memory", "much")
+    told = refused(1, "distill", scene, "-r", 10, "-o", tmp_path / "run", "--clean")
+    assert "clean takes the scene in one piece" in told
+
+
+def test_memory_decides_how_many_work_and_nothing_else(folder: Path, tmp_path: Path) -> None:
+    store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
+    need = 10**9
+    assert workers_for(store, Tiling(memory=need, cores=64)) < workers_for(
+        store, Tiling(memory=4 * need, cores=64)
+    )
+    with pytest.raises(
+        InputError, match=r"--workers 9 take about .* GB, more than --memory .*; --workers \d fit"
+    ):
+        workers_for(store, Tiling(memory=need, workers=9))
+    scene = town(100)
+    check_memory(scene, Tiling(), "scene")
+    with pytest.raises(InputError, match="scene: 100 Gaussians in one piece take about"):
+        check_memory(scene, Tiling(memory=1_000_000), "scene")
+    assert bytes_of("4GB") == 4 * 10**9
+    assert not is_tiled(folder / "town.ply", Tiling())
+    assert is_tiled(folder / "town.ply", Tiling(tile_rows=8999))
+    assert len(TileStore.open(tmp_path / "tiles").tiles) > 1
+
+
+def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    good(
+        command_line,
+        tmp_path,
+        *("distill", folder / "town.ply", "-r", 10, "-o", tmp_path / "run", "--views", folder / "views.json"),
+        *("--tile-rows", 4000, "--steps", 200, "--workers", 1),
+    )
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["scores"]["recovered"] > report["scores"]["simplified"] + 0.2
+    small = read_splats(tmp_path / "run" / "scene.ply")
+    assert len(small) == 900
+    held_out = TeacherRenders(read_splats(folder / "town.ply"), ring(8).take([6, 7]))
+    assert evaluate(small, held_out).psnr > report["scores"]["simplified"]
+    assert not list(tmp_path.glob("run/.*"))
