@@ -6,14 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import g2ard
-from g2ard.stages.recover.anchors import PRESETS
 from g2ard.synth import City, city
 
 SKY = (0.6, 0.8, 1.0)
 
 
 class CityPhotos:
-    """A target is anything with `cameras` and an image for each; see also `g2ard.targets`."""
+    """A target is anything with `cameras` and an image for each; `g2ard.Photos` are such."""
 
     def __init__(self, town: City, split: str) -> None:
         self.cameras = town.views[split]
@@ -37,7 +36,9 @@ def stage_by_stage(prior: g2ard.Splats, town: City) -> tuple[float, float]:
     print(f"{small.report.input_count:,} discs → {small.report.output_count:,} Gaussians")
 
     train, unseen = CityPhotos(town, "train"), CityPhotos(town, "val")
-    config = g2ard.RecoverConfig(steps=200, regularizers=PRESETS["lift"], sh_degree=1, background=SKY)
+    config = g2ard.RecoverConfig(
+        steps=200, regularizers=g2ard.Regularizers.of("lift"), sh_degree=1, background=SKY
+    )
     better = g2ard.recover(small.splats, train, config)
 
     before = g2ard.evaluate(small.splats, unseen, background=SKY).psnr

@@ -5,6 +5,7 @@
 | `load`, `save` | scenes, by extension |
 | `load_views`, `save_views`, `load_points` | cameras, and coloured clouds |
 | `distill` | the whole job, as `g2ard distill` does it |
+| `distill_against` | the same on a scene, against targets of one's own |
 | `lift` | coloured points → surface-aligned discs |
 | `simplify` | fewer Gaussians, at an exact count, as `g2ard simplify` does it |
 | `make_pool`, `select` | views for a scene that has none; the views worth having |
@@ -14,7 +15,8 @@
 | `lod`, `save_levels` | levels of detail, as streamed SOG |
 | `render`, `Renderer`, `evaluate` | images, depths; PSNR, SSIM |
 
-They pass on `Splats`, a `Camera` or many `Cameras`, and targets: `Photos` or `TeacherRenders`. Configurations
+They pass on `Splats`, a `Camera` or many `Cameras`, coloured `Points`, and targets: `Photos`,
+`TeacherRenders`, or anything that has `cameras` and gives an image for each. Configurations
 of stages are dataclasses (`SimplifyConfig`, `RecoverConfig`, …); `preset` holds the paper's. What stages do
 with them is in `g2ard.stages`, how they are joined in `g2ard.pipeline`. All errors are `G2ardError`s.
 
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 
     from g2ard.cameras import Camera, Cameras, look_at
     from g2ard.errors import G2ardError, InputError, MissingDependencyError, OutputError
+    from g2ard.io import Points
     from g2ard.io import read_points as load_points
     from g2ard.io import read_splats as load
     from g2ard.io import read_views as load_views
@@ -46,7 +49,9 @@ if TYPE_CHECKING:
     from g2ard.io import write_views as save_views
     from g2ard.levels import save_levels
     from g2ard.pipeline import DistillConfig, Distilled
+    from g2ard.pipeline import distill as distill_against
     from g2ard.policy.distill import distill
+    from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.levels import lod
     from g2ard.policy.simplify import simplify
     from g2ard.poses import make_pool
@@ -72,6 +77,7 @@ __all__ = [
     "Cameras",
     "CoverageOptions",
     "DistillConfig",
+    "DistillOptions",
     "Distilled",
     "Evaluation",
     "G2ardError",
@@ -79,6 +85,7 @@ __all__ = [
     "MissingDependencyError",
     "OutputError",
     "Photos",
+    "Points",
     "RasterSettings",
     "RecoverConfig",
     "Recovered",
@@ -95,6 +102,7 @@ __all__ = [
     "__version__",
     "adapt",
     "distill",
+    "distill_against",
     "evaluate",
     "lift",
     "load",
@@ -117,9 +125,11 @@ __all__ = [
 _HOMES = {
     "cameras": ("Camera", "Cameras", "look_at"),
     "errors": ("G2ardError", "InputError", "MissingDependencyError", "OutputError"),
+    "io.types": ("Points",),
     "pipeline": ("DistillConfig", "Distilled"),
     "levels": ("save_levels",),
     "policy.distill": ("distill",),
+    "policy.distill_options": ("DistillOptions",),
     "policy.levels": ("lod",),
     "policy.simplify": ("simplify",),
     "poses": ("make_pool",),
@@ -138,23 +148,24 @@ _HOMES = {
 }
 """Module → what it gives under its own name."""
 
-_FILES = {
-    "load": "read_splats",
-    "load_points": "read_points",
-    "load_views": "read_views",
-    "save": "write_splats",
-    "save_views": "write_views",
+_ALIASES = {
+    "distill_against": ("pipeline", "distill"),
+    "load": ("io", "read_splats"),
+    "load_points": ("io", "read_points"),
+    "load_views": ("io", "read_views"),
+    "save": ("io", "write_splats"),
+    "save_views": ("io", "write_views"),
 }
-"""What `g2ard.io` calls them."""
+"""Name → module, and what that calls it."""
 
 
 def __getattr__(name: str) -> Any:
-    home = "io" if name in _FILES else next((m for m, names in _HOMES.items() if name in names), None)
+    home, own = _ALIASES.get(name, (next((m for m, names in _HOMES.items() if name in names), None), name))
     if home is None:
         raise AttributeError(f"module 'g2ard' has no attribute {name!r}")
     from importlib import import_module
 
-    found = getattr(import_module(f"g2ard.{home}"), _FILES.get(name, name))
+    found = getattr(import_module(f"g2ard.{home}"), own)
     globals()[name] = found  # asked for once
     return found
 

@@ -89,6 +89,38 @@ def simplify_pairwise(
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]: ...
 
+class TileFrame:
+    def __init__(
+        self, unit: float, pixel_size: float, floor: float, exponent: float, usual: float
+    ) -> None: ...
+    @staticmethod
+    def of_sample(scene: Scene, pixel_scale: float) -> TileFrame: ...
+    def with_views(self, pixel_size: float, weight: float, mass: float) -> TileFrame: ...
+    def values(self) -> tuple[float, float, float, float, float]: ...
+
+class TileMerging:
+    def __init__(
+        self,
+        scene: Scene,
+        frame: TileFrame,
+        *,
+        weight: NDArray[np.float32] | None,
+        pixel_size: NDArray[np.float32] | None,
+        min_opacity: float,
+        neighbors: int,
+        geometric_weight: float,
+        dilation: float,
+        max_growth: float,
+    ) -> None: ...
+    def sums(self) -> tuple[float, float]: ...
+    def run_costs(self) -> NDArray[np.float32]: ...
+    def plan(
+        self, runs: int, schedule: list[int], progress: Callable[[int, int], None] | None = None
+    ) -> tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32], NDArray[np.float32]]: ...
+    def assemble(
+        self, of: NDArray[np.uint32], count: int, progress: Callable[[int, int], None] | None = None
+    ) -> dict[str, Any]: ...
+
 class Scene:
     def __init__(self, splats: Splats) -> None: ...
     @property
@@ -129,6 +161,7 @@ class Rasterizer:
 
 class Trainer:
     def __init__(self, arrays: _Arrays, units: _F32 | None = None, isa: str | None = None) -> None: ...
+    def freeze(self, frozen: NDArray[np.bool_]) -> None: ...
     def anchor(self, means: _F32, frames: _F32, r_parallel: _F32, r_perp: _F32) -> None: ...
     def step(
         self,

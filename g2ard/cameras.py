@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.limits import check_image
+from g2ard.progress import plural
 
 __all__ = ["Camera", "Cameras", "look_at"]
 
@@ -335,10 +336,10 @@ def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
 def unseeing(cameras: Cameras, what: str) -> str:
     """What an error says where no view sees `what`, and what to do.
 
-    >>> unseeing(Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0])]), "the scene")
-    'none of 1 view sees the scene; the views and the scene must be of one world (`g2ard info` shows both)'
+    >>> unseeing(Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0])]), "the scene").partition(" (")[0]
+    'none of 1 view sees the scene; the views and the scene must be of one world'
     """
-    count = f"{len(cameras):,} view{'s' * (len(cameras) != 1)}"
     return (
-        f"none of {count} sees {what}; the views and the scene must be of one world (`g2ard info` shows both)"
+        f"none of {plural(len(cameras), 'view')} sees {what}; the views and the scene must be of one world "
+        "(`g2ard info` shows both, `g2ard convert --transform` moves a scene)"
     )

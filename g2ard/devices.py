@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from g2ard import _core
 from g2ard.errors import InputError
 
-__all__ = ["Adapter", "State", "adapters", "notes", "state", "use"]
+__all__ = ["Adapter", "State", "adapters", "is_software", "notes", "state", "use"]
 
 
 @dataclass(frozen=True)
@@ -94,6 +94,12 @@ def _hush() -> None:
 def state() -> State:
     """Where kernels run, and what there is to tell."""
     return State(**_core.device_state())
+
+
+def is_software() -> bool:
+    """Whether the adapter in use is a driver that computes on the CPU."""
+    name = state().adapter
+    return any(found.name == name and found.kind == "cpu" for found in adapters() or ())
 
 
 def notes() -> list[str]:

@@ -55,7 +55,9 @@ def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
     """
     path, name = cameras.image_paths[index], cameras.names[index]
     if path is None:
-        raise InputError(f"view {index} ({name}) has no photo: its views name no image for it")
+        raise InputError(
+            f"view {index} ({name}) has no photo: its views name no image for it; give views with photos"
+        )
     listed_in = "" if cameras.source is None else f"{cameras.source}: view {name!r}: "
     image = _open(f"{listed_in}{path}", path)
     height, width = image.shape[:2]
@@ -63,7 +65,7 @@ def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
     if abs(width * target[1] - height * target[0]) > _ASPECT_SLACK * height * target[0]:
         raise InputError(
             f"{listed_in}{path}: the photo is {width}×{height}, its view {target[0]}×{target[1]}: "
-            "the aspects differ"
+            "the aspects differ; give the photos as their poses were made from, uncropped"
         )
     distortion = cameras.distortions[index]
     if distortion.any():
@@ -124,7 +126,7 @@ def _open(where: str, path: Path) -> NDArray[np.float32]:
                 return rgba[..., :3] * rgba[..., 3:]
             return np.asarray(image.convert("RGB"), np.float32) / np.float32(255)
     except FileNotFoundError as error:
-        raise InputError(f"{where}: no such photo") from error
+        raise InputError(f"{where}: no such photo; it must lie where its views name it") from error
 
 
 def _undistorted(

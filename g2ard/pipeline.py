@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from g2ard.choices import Engine
 from g2ard.errors import require
 from g2ard.pipeline_report import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.progress import Progress, silent
@@ -43,7 +44,7 @@ class DistillConfig:
             them the reduction is one shot and all recovery happens at the target count.
         steps: the final horizon; None means the schedule's, more where a view holds little of the scene
             (`g2ard.stages.recover.need`).
-        time_limit: seconds for all recovery, shared out over rounds in proportion to their steps; horizons
+        recovery_time: seconds for all recovery, shared out over rounds in proportion to their steps; horizons
             become what fits into them.
         regularizers: weights of L_anchor and L_shape.
         sh_degree: of the result; None keeps the prior's.
@@ -64,7 +65,7 @@ class DistillConfig:
     method: str = "default"
     schedule: Schedule = TUNED
     steps: int | None = None
-    time_limit: float | None = None
+    recovery_time: float | None = None
     regularizers: Regularizers = PRESETS["trained"]
     sh_degree: int | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -73,7 +74,7 @@ class DistillConfig:
     weighted: bool = True
     reselect: bool = False
     seed: int = 0
-    engine: Literal["fused", "torch", "gsplat"] = "fused"
+    engine: Engine = "fused"
     ssim_weight: float = 0.2
     simplify: SimplifyConfig = field(default_factory=SimplifyConfig)
     select: CoverageOptions = field(default_factory=CoverageOptions)
@@ -305,7 +306,7 @@ class _Rounds:
             config = RecoverConfig(
                 schedule=self.config.schedule,
                 steps=self._steps() if final else None,
-                time_limit=self._seconds(final),
+                recovery_time=self._seconds(final),
                 regularizers=self.config.regularizers,
                 ssim_weight=self.config.ssim_weight,
                 background=self.config.background,
@@ -340,12 +341,12 @@ class _Rounds:
 
     def _seconds(self, final: bool) -> float | None:
         """This recovery's part of the time limit."""
-        if self.config.time_limit is None:
+        if self.config.recovery_time is None:
             return None
         schedule = self.config.schedule
         last = schedule.steps if self.config.steps is None else self.config.steps
         whole = last + self.count * schedule.round_steps
-        return self.config.time_limit * (last if final else schedule.round_steps) / whole
+        return self.config.recovery_time * (last if final else schedule.round_steps) / whole
 
     def _save(self, name: str, entry: dict[str, Any]) -> None:
         if self.work is None:

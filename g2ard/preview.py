@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from g2ard.progress import plural
 from g2ard.splats import Splats
 from g2ard.targets import Targets
 
@@ -45,5 +46,5 @@ def preview(
             for (name, _), image in zip(scenes, rows[-1][1:], strict=True)
         ]
         captions.append(", ".join([targets.cameras.names[view], *scores]))
-    labels = ["target", *(f"{name}: {len(splats):,} Gaussians" for name, splats in scenes)]
+    labels = ["target", *(f"{name}: {plural(len(splats), 'Gaussian')}" for name, splats in scenes)]
     write_png(path, contact_sheet(rows, labels, row_labels=captions), overwrite=True)

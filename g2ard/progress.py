@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-__all__ = ["Progress", "Say", "counter", "silent", "unsaid"]
+__all__ = ["Progress", "Say", "counter", "plural", "silent", "unsaid"]
 
 
 class Progress(Protocol):
@@ -36,3 +36,12 @@ Say = Callable[[str], None]
 
 def unsaid(text: str) -> None:
     """Say nothing."""
+
+
+def plural(count: int, one: str, many: str | None = None) -> str:
+    """A count with its noun.
+
+    >>> plural(1, "row"), plural(1234, "row"), plural(2, "vertex", "vertices")
+    ('1 row', '1,234 rows', '2 vertices')
+    """
+    return f"{count:,} {one if count == 1 else many or one + 's'}"

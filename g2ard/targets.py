@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.progress import Progress, silent
+from g2ard.progress import Progress, plural, silent
 from g2ard.splats import Splats
 
 if TYPE_CHECKING:
@@ -68,8 +68,6 @@ def kinds_told(photos: int, renders: int) -> str:
     >>> kinds_told(7, 9), kinds_told(7, 0)
     ('7 photos and 9 teacher renders', 'photos')
     """
-    from g2ard.io.clean import plural
-
     if photos and renders:
         return f"{plural(photos, 'photo')} and {plural(renders, 'teacher render')}"
     return "photos" if photos else "teacher renders"

@@ -167,7 +167,9 @@ def in_box(splats: Splats, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]
     """
     low, high = (np.asarray(v, np.float64) for v in (low, high))
     if not (low <= high).all():
-        raise InputError(f"box: from {low.tolist()} to {high.tolist()} holds nothing")
+        raise InputError(
+            f"box: from {low.tolist()} to {high.tolist()} holds nothing; the lower corner comes first"
+        )
     world = splats.means.astype(np.float64) + splats.offset
     inside: NDArray[np.bool_] = np.all((world >= low) & (world <= high), axis=1)
     return inside

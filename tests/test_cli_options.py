@@ -123,7 +123,7 @@ def test_a_flag_wins_over_what_it_excludes_in_the_config(folder: Path, command_l
     ask = ("simplify", "a.ply", "-r", 10, "-n", 5, "-o", "o.ply", "--config", "c.toml")
     assert "either -n COUNT or -r RATIO" in refused(command_line, folder, *ask)
     ask = ("recover", "small.ply", "--views", "views.json", "--teacher", "a.ply", "-o", "o.ply")
-    status, _, error = command_line(*ask, "--config", "c.toml", "--time-limit", "1s", cwd=folder)
+    status, _, error = command_line(*ask, "--config", "c.toml", "--recovery-time", "1s", cwd=folder)
     assert status == 0, error
 
 

@@ -210,9 +210,9 @@ def small(folder: Path) -> Splats:
         (["distill", "s.ply", "-r", "2", "-o", "run", "--preset", "gentle"], 2, "gentle"),
         (["distill", "s.ply", "-r", "2", "-o", "run", "--method", "magic"], 2, "magic"),
         (
-            ["distill", "s.ply", "-r", "2", "-o", "run", "--steps", "5", "--time-limit", "2s"],
+            ["distill", "s.ply", "-r", "2", "-o", "run", "--steps", "5", "--recovery-time", "2s"],
             2,
-            "--time-limit",
+            "--recovery-time",
         ),
         (["distill", "s.ply", "-r", "2", "-o", "run", "--json", "s.ply/where.json"], 1, "where.json"),
         (["simplify", "s.ply", "-r", "2", "-o", "o.ply", "--json", "o.ply"], 2, "o.ply"),

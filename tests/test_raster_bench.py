@@ -47,7 +47,7 @@ def test_the_built_in_view_sees_the_scene() -> None:
 
 
 def test_a_count_must_fit() -> None:
-    with pytest.raises(InputError, match="counts: the scene has only 3000"):
+    with pytest.raises(InputError, match="counts: the scene has only 3,000"):
         bench_raster(cloud(), counts=[5000])
     with pytest.raises(InputError, match="count: expected 1 to 3000"):
         drawn(cloud(), 0)

@@ -221,7 +221,7 @@ def test_both_engines_limit_the_same_gaussians(student: Splats, targets: Teacher
 
 def test_a_start_that_is_nearly_there_takes_small_steps_without_trials(targets: TeacherRenders) -> None:
     near = replace(TEACHER, sh0=TEACHER.sh0 + np.float32(0.004))
-    report = recover(near, targets, RecoverConfig(time_limit=0.05)).report
+    report = recover(near, targets, RecoverConfig(recovery_time=0.05)).report
     assert report.trials == ()
     assert report.multiplier < 1 / 3
 
@@ -258,14 +258,14 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("clock")
 def test_trials_stop_where_the_clock_is_short(student: Splats, targets: TeacherRenders) -> None:
-    report = recover(student, targets, RecoverConfig(time_limit=0.05)).report
+    report = recover(student, targets, RecoverConfig(recovery_time=0.05)).report
     assert report.trials == ()
     assert report.seconds < 0.3
 
 
 @pytest.mark.usefixtures("clock")
-def test_a_time_limit_sets_the_horizon(student: Splats, targets: TeacherRenders) -> None:
-    report = recover(student, targets, RecoverConfig(time_limit=6.0)).report
+def test_a_recovery_time_sets_the_horizon(student: Splats, targets: TeacherRenders) -> None:
+    report = recover(student, targets, RecoverConfig(recovery_time=6.0)).report
     assert 50 < report.steps < 600
     assert 6.0 <= report.seconds < 6.1
     assert report.psnr.after > report.psnr.before + 1
@@ -367,7 +367,7 @@ def test_a_resume_after_going_back_is_never_having_stopped(targets: TeacherRende
             recover(start, targets, config, checkpoint=checkpoint, progress=_StopAt(step))
         resumed = recover(start, targets, config, checkpoint=checkpoint)
         assert_same_bits(whole.splats, resumed.splats)
-        for key in ("backed_off", "multiplier", "psnr", "stopped", "way"):
+        for key in ("backed_off", "multiplier", "psnr", "stopped", "blend"):
             assert getattr(whole.report, key) == getattr(resumed.report, key), key
 
 
@@ -482,7 +482,13 @@ def test_both_engines_count_the_same_steps(student: Splats, targets: TeacherRend
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"steps": 0}, {"steps": -1}, {"time_limit": 0.0}, {"time_limit": float("nan")}, {"ssim_weight": 2.0}],
+    [
+        {"steps": 0},
+        {"steps": -1},
+        {"recovery_time": 0.0},
+        {"recovery_time": float("nan")},
+        {"ssim_weight": 2.0},
+    ],
 )
 def test_refuses_a_horizon_that_is_none(wrong: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=next(iter(wrong))):

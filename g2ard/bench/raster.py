@@ -13,7 +13,7 @@ import numpy as np
 from g2ard import _core
 from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
-from g2ard.progress import Progress, silent
+from g2ard.progress import Progress, plural, silent
 from g2ard.splats import Splats
 from g2ard.stages.recover.schedule import Rates
 from g2ard.stages.render import RasterSettings, arrays_of, view_of
@@ -136,7 +136,7 @@ def bench_raster(
     before = _core.num_threads()
     counts = [n for n in counts if n <= len(splats)]
     if not counts:
-        raise InputError(f"counts: the scene has only {len(splats)} Gaussians")
+        raise InputError(f"counts: the scene has only {plural(len(splats), 'Gaussian')}")
     isas = isas or _core.instruction_sets()[:1]
     threads = threads or [before]
     rows: list[SceneFigures] = []

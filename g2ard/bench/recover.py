@@ -279,7 +279,7 @@ class _Run:
         config = RecoverConfig(
             schedule=plan.schedule,
             steps=plan.steps,
-            time_limit=plan.time_limit,
+            recovery_time=plan.recovery_time,
             regularizers=plan.regularizers,
             background=bench.background,
             seed=self.key[3],
@@ -296,7 +296,7 @@ class _Run:
         config = DistillConfig(
             schedule=plan.schedule,
             steps=plan.steps,
-            time_limit=plan.time_limit,
+            recovery_time=plan.recovery_time,
             regularizers=plan.regularizers,
             sh_degree=bench.sh_degree,
             background=bench.background,

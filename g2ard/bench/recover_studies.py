@@ -20,7 +20,7 @@ class Plan:
 
     schedule: Schedule
     steps: int | None = None
-    time_limit: float | None = None
+    recovery_time: float | None = None
     regularizers: Regularizers | None = None
 
 
@@ -47,7 +47,7 @@ def _rounds(steps: Sequence[int], seconds: float, preset: Regularizers) -> dict[
     """Equal recovery seconds: one shot, or shared with rounds in the paper's proportion or a lighter one."""
     shares = {"one-shot": 0.0, "rounds": PAPER.round_steps / PAPER.steps, "light-rounds": 0.05}
     return {
-        name: Plan(replace(TUNED, round_steps=round(share * TUNED.steps)), time_limit=seconds)
+        name: Plan(replace(TUNED, round_steps=round(share * TUNED.steps)), recovery_time=seconds)
         for name, share in shares.items()
     }
 

@@ -134,7 +134,7 @@ def _recover(job: Job) -> dict[str, Any]:
     config = RecoverConfig(
         schedule=_schedule(job["schedule"], targets.cameras),
         steps=job["steps"],
-        time_limit=job["seconds"],
+        recovery_time=job["seconds"],
         regularizers=Regularizers(**job["regularizers"]),
         sh_degree=job["sh_degree"],
         background=tuple(job["background"]),

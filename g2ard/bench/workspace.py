@@ -21,7 +21,7 @@ from g2ard.bench.stage import Stage, fingerprint, folder_of, scene_key
 from g2ard.bench.worker import StoredTargets, store_targets
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.progress import Progress, silent
+from g2ard.progress import Progress, plural, silent
 from g2ard.splats import Splats
 from g2ard.splits import (
     for_scores,
@@ -145,7 +145,9 @@ class Workspace:
             if what == "adapt" or name != "adapt-val":  # another light's photos may be of places trained on
                 keep &= not_held_out(cameras, scored)
         if not keep.any():
-            raise InputError(f"scene {self.scene.name}: all {len(keep)} views to {what} on are scored on")
+            raise InputError(
+                f"scene {self.scene.name}: all {plural(len(keep), 'view')} to {what} on are scored on"
+            )
         path = self.folder / "dropped.json"
         counts = json.loads(path.read_text()) if path.exists() else {}
         path.write_text(json.dumps({**counts, what: int(np.count_nonzero(~keep))}))

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Count",
-    "CountOption",
     "Counts",
     "CountsOption",
     "FitOption",
+    "LooksOption",
     "MinPsnrOption",
     "MinSsimOption",
     "RatioOption",
@@ -29,6 +29,7 @@ __all__ = [
 
 _COUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmM%]?)")
 _GROUPED = re.compile(r"\d{1,3}(?:,\d{3})+|\d{1,3}(?:_\d{3})+")
+_DOTTED = re.compile(r"[1-9]\d{0,2}(?:\.\d{3})+")
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,9 @@ class Count:
         plain = text.strip()
         if _GROUPED.fullmatch(plain):
             plain = re.sub("[,_]", "", plain)
+        if _DOTTED.fullmatch(plain):
+            bare = plain.replace(".", "")
+            raise typer.BadParameter(f"thousands have no dots: write {bare} or {int(bare):_}, not {text!r}")
         match = _COUNT.fullmatch(plain)
         if match is None or not float(match[1]) > 0:
             raise typer.BadParameter(f"a positive count such as 250000, 250k, 1.5M or 25%, not {text!r}")
@@ -59,6 +63,8 @@ class Count:
             if number > 100:
                 raise typer.BadParameter(f"a share is at most 100%, not {text!r}")
             return cls(number / 100, True, text)
+        if not unit and "." in match[1]:
+            raise typer.BadParameter(f"a whole number without a dot, or a share such as 25%, not {text!r}")
         number *= {"": 1, "k": 1_000, "m": 1_000_000}[unit]
         if number != round(number):
             raise typer.BadParameter(f"a whole number, not {text!r}")
@@ -94,14 +100,6 @@ def parse_ratio(text: str) -> float:
     return value
 
 
-CountOption = Annotated[
-    Count | None,
-    typer.Option(
-        "-n", "--count", parser=Count.parse, metavar="COUNT", help="Budget: 250000, 250k, 1.5M or 25%."
-    ),
-]
-
-
 class Counts(tuple[Count, ...]):
     """Several in one argument, 10k,20k; a class, for typer reads a bare tuple as several arguments."""
 
@@ -115,7 +113,11 @@ class Counts(tuple[Count, ...]):
         groups = text.strip().split(",")
         if _GROUPED.fullmatch(text.strip()) and any(group.startswith("0") for group in groups[1:]):
             return cls([Count.parse(text)])
-        return cls(Count.parse(part) for part in text.split(","))
+        if any(re.fullmatch(r"0\d\d", group.strip()) for group in groups[1:]):
+            raise typer.BadParameter(
+                f"commas part counts here: write several as 5_000,4_000 or 5k,4k, not {text!r}"
+            )
+        return cls(Count.parse(part) for part in groups)
 
 
 class Ratios(tuple[float, ...]):
@@ -144,6 +146,16 @@ RatiosOption = Annotated[
         parser=Ratios.parse,
         metavar="RATIO",
         help="Budget as a ratio: 10 keeps a tenth; several, 5,10,20, want {ratio} in the output's name.",
+    ),
+]
+LooksOption = Annotated[
+    Count | None,
+    typer.Option(
+        "-n",
+        "--count",
+        parser=Count.parse,
+        metavar="COUNT",
+        help="How many views to make of the scene; with --color flags, cells or parents the budget.",
     ),
 ]
 RatioOption = Annotated[

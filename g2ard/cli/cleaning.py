@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from g2ard.progress import plural
+
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.clean import Cleaning
@@ -35,7 +37,7 @@ def paint_clutter(path: Path, splats: Splats, found: Cleaning, cameras: Cameras,
     renderers = [Renderer(scene) for scene in scenes]
     rows = [[np.clip(r.image(cameras[int(view)]), 0, 1) for r in renderers] for view in chosen]
     legend = ", ".join(f"{name} {word}" for name, word in zip(KINDS, _WORDS, strict=True))
-    labels = [f"{len(splats):,} Gaussians", legend, f"{len(scenes[2]):,} stay"]
+    labels = [f"{plural(len(splats), 'Gaussian')}", legend, f"{len(scenes[2]):,} stay"]
     write_png(path, contact_sheet(rows, labels), overwrite=overwrite)
 
 

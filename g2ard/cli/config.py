@@ -7,6 +7,9 @@ from typing import Any
 
 import typer
 
+from g2ard.cli.budget_options import Count
+from g2ard.cli.usage import meant, present_name
+
 __all__ = ["load_config", "printed"]
 
 _NOT_KEPT = ("config", "print_config", "overwrite", "resume")
@@ -24,10 +27,11 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     table = _of_command(ctx, path, values)
     constants = _flat(table.pop("set", {}))
     params = {flag.lstrip("-").replace("-", "_"): p for p in ctx.command.params for flag in (*p.opts, p.name)}
-    table = {key.replace("-", "_"): value for key, value in table.items()}
-    unknown = sorted(set(table) - {key for key in params if len(key) > 1})
+    table = {_dashed(key).replace("-", "_"): value for key, value in table.items()}
+    unknown = {_dashed(key) for key in table if key not in params or len(key) == 1}
     if unknown:
-        raise typer.BadParameter(f"{path}: no option of `{ctx.info_name}` is called {', '.join(unknown)}")
+        near = meant(unknown, _options(ctx.command))
+        raise typer.BadParameter(f"{path}: no option of `{ctx.info_name}` is called {near}")
     found: dict[str, Any] = {}
     for key, value in table.items():
         many = getattr(params[key], "multiple", False)
@@ -61,7 +65,7 @@ def _of_command(ctx: typer.Context, path: Path, values: dict[str, Any]) -> dict[
     top = {key: value for key, value in values.items() if key == "set" or not isinstance(value, dict)}
     strange = sorted(set(values) - set(top) - {*COMMANDS, name})
     if strange:
-        raise typer.BadParameter(f"{path}: no command is called {', '.join(strange)}")
+        raise typer.BadParameter(f"{path}: no command is called {meant(strange, {*COMMANDS, name})}")
     own = values.get(name, {})
     if not isinstance(own, dict):
         raise typer.BadParameter(f"{path}: {name}: a table of options")
@@ -70,7 +74,8 @@ def _of_command(ctx: typer.Context, path: Path, values: dict[str, Any]) -> dict[
         of_others = _check_others(path, {key: values[key] for key in values if key not in {*top, name}})
         strange = [key for key in top if _dashed(key) not in known | of_others and key != "set"]
         if strange:
-            raise typer.BadParameter(f"{path}: no command it is for has an option {', '.join(strange)}")
+            near = meant(strange, known | of_others)
+            raise typer.BadParameter(f"{path}: no command it is for has an option {near}")
         top = {key: value for key, value in top.items() if _dashed(key) in known or key == "set"}
     constants = {**_flat(top.pop("set", {})), **_flat(own.get("set", {}))}
     return {**top, **own} | ({"set": constants} if constants else {})
@@ -91,7 +96,7 @@ def _check_others(path: Path, tables: dict[str, Any]) -> set[str]:
             continue  # a group's tables are of tables
         options = _options(command)
         if strange := [key for key in table if key != "set" and _dashed(key) not in options]:
-            raise typer.BadParameter(f"{path}: no option of `{name}` is called {', '.join(strange)}")
+            raise typer.BadParameter(f"{path}: no option of `{name}` is called {meant(strange, options)}")
         found |= options
     return found
 
@@ -102,7 +107,8 @@ def _options(command: Any) -> set[str]:
 
 
 def _dashed(key: str) -> str:
-    return key.replace("_", "-")
+    """A key as the flag of that name has it today."""
+    return present_name(key.replace("_", "-"))
 
 
 def _flat(table: Any, prefix: str = "") -> dict[str, Any]:
@@ -139,12 +145,27 @@ def printed(ctx: typer.Context, values: dict[str, Any]) -> str:
             constants = list(value)
             continue
         flag = max((opt for opt in parameter.opts if opt.startswith("--")), key=len, default=f"--{name}")
-        lines.append(f"{flag[2:]} = {_toml(value)}")
+        lines.append(f"{flag[2:]} = {_toml(_plain(value))}")
     if constants:
         lines.append(f"[{ctx.info_name}.set]")
         pairs = (text.partition("=") for text in constants)
         lines += [f"{name.strip()} = {_toml(value.strip())}" for name, _, value in pairs]
     return "\n".join(lines) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    """An option's value in the types of TOML: 5,10 is [5, 10], 10.0 is 10; what has none there is text."""
+    if isinstance(value, list):
+        items = [item for one in map(_plain, value) for item in (one if isinstance(one, list) else [one])]
+        return items if len(items) > 1 or not isinstance(value[0], tuple) else items[0]
+    if isinstance(value, tuple) and type(value).__str__ is tuple.__str__:
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
+        return int(value)
+    if isinstance(value, bool | int | float):
+        return value
+    text = str(value)
+    return int(text) if isinstance(value, Count) and text.isdecimal() else text
 
 
 def _toml(value: Any) -> str:
@@ -154,5 +175,4 @@ def _toml(value: Any) -> str:
         return str(value)
     if isinstance(value, list):
         return f"[{', '.join(_toml(item) for item in value)}]"
-    text = ",".join(str(item) for item in value) if isinstance(value, tuple) else str(value)
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'

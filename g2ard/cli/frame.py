@@ -21,8 +21,9 @@ import typer
 from g2ard import __version__, interrupt
 from g2ard.cli.config import load_config, printed
 from g2ard.cli.console import Console
-from g2ard.cli.usage import in_flags, typed
+from g2ard.cli.usage import in_flags, present_name, typed
 from g2ard.errors import G2ardError
+from g2ard.progress import plural
 
 __all__ = ["Run", "app", "command", "group"]
 
@@ -31,7 +32,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "token_normalize_func": present_name},
 )
 
 
@@ -53,7 +54,7 @@ def _root(
 _RIVALS = (
     *combinations(("count", "ratio", "fit", "min_psnr"), 2),
     *combinations(("count", "ratio", "fit", "min_ssim"), 2),
-    ("steps", "time_limit"),
+    ("steps", "recovery_time"),
     ("views", "no_views"),
 )
 """Options that exclude each other."""
@@ -127,6 +128,7 @@ class Run:
         self.console = Console(quiet=common["quiet"])
         self.only_checks = False  # whether the call ends once its constants are known to be right
         self.noted = False  # whether a GPU failed
+        self._adapter: str | None = None  # the last that was in use
         self.kept: list[str] = []  # what a Ctrl-C leaves, in words
         given = (*options.values(), common["config"])
         paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
@@ -163,13 +165,18 @@ class Run:
         self.console(stage, done, total, info)
 
     def tell_notes(self) -> None:
-        """Why the CPU took over from a GPU, if it has since last told."""
+        """Why the CPU took over from a GPU, if it has since last told, and that a GPU is none."""
         if self.device in ("auto", "gpu"):
             from g2ard import devices
 
             for note in devices.notes():
                 self.noted = True
                 self.console.say(note)
+            adapter = devices.state().adapter
+            if adapter not in (None, self._adapter) and devices.is_software():
+                told = f"{adapter} is software on this CPU, as a rule slower than --device cpu"
+                self.console.say(f"--device {self.device}: {told}")
+            self._adapter = adapter
 
     def say(self, text: str) -> None:
         """A line of status on stderr, unless --quiet."""
@@ -211,6 +218,12 @@ class Run:
                 raise typer.BadParameter(
                     f"{output} would be written over, and is an input; name another output"
                 )
+
+    def reads(self, scenes: list[Path], output: Path) -> None:
+        """Of the paths given as `scenes` the last one was `output`; as a usage check, see `spare_inputs`."""
+        self.config |= {"scenes": scenes, "output": output}
+        self._inputs = [path for path in self._inputs if path is not output]
+        self.spare_inputs(output)
 
     def unmet(self, requirement: str) -> NoReturn:
         """End with status 3: all is written, but a stated requirement was not met."""
@@ -294,7 +307,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
         raise typer.BadParameter(f"--device: auto, cpu, gpu or cuda, not {run.device!r}")
     outputs = [Path(o) for o in (options.get("output"), run.json) if o not in (None, "-")]
     if len({output.resolve() for output in outputs}) < len(outputs):
-        raise typer.BadParameter(f"--json and --output are both {run.json}")
+        raise typer.BadParameter(f"--json and --output are both {run.json}; name another file for one")
     run.spare_inputs(*outputs)
     if run.device == "cuda" and not cuda:
         run.say("--device cuda: this command computes on the CPU only, and does")
@@ -346,7 +359,7 @@ def _device(run: Run) -> Iterator[None]:
         elif state.served and run.verbose:
             longest = sorted(state.seconds.items(), key=lambda item: -item[1])[:6]
             took = "".join(f", {name} {seconds:.3f} s" for name, seconds in longest)
-            run.say(f"GPU: {state.served} kernels on {state.adapter}{took}")
+            run.say(f"GPU: {plural(state.served, 'kernel')} on {state.adapter}{took}")
 
 
 def _one_line(error: BaseException) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from g2ard.choices import UNMEASURED, Convention, Engine, FormatName, PaperPresetName, Policy, PresetName
 from g2ard.cli.budget_options import Count
 from g2ard.report.window import Crop
 
@@ -25,7 +26,6 @@ __all__ = [
     "OutputOption",
     "PaperOption",
     "PolicyOption",
-    "Preset",
     "PresetOption",
     "ProtocolOption",
     "SceneArgument",
@@ -35,6 +35,7 @@ __all__ = [
     "can_be_made",
     "can_judge",
     "is_made",
+    "picture",
     "recovery_engine",
     "trained_on",
     "views_count",
@@ -85,6 +86,13 @@ LookOption = Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Wher
 OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Where the result goes.")]
 
 
+def picture(text: str) -> Path:
+    """Read the name of a picture that is written."""
+    if Path(text).suffix.lower() != ".png":
+        raise typer.BadParameter(f"pictures are written as .png, not {text!r}")
+    return Path(text)
+
+
 class Triple(tuple[float, float, float]):
     """Three numbers in one argument; a class, for typer reads a bare tuple as several."""
 
@@ -128,7 +136,7 @@ ShDegreeOption = Annotated[
     typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own if not given."),
 ]
 FormatOption = Annotated[
-    Literal["ply", "sog", "spz", "glb", "compressed.ply", "splat"],
+    FormatName,
     typer.Option("--format", help="Of the scene's file in RUN."),
 ]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on with a stopped run.")]
@@ -145,7 +153,7 @@ TeacherOption = Annotated[
 ]
 
 ConventionOption = Annotated[
-    Literal["gsplat", "inria"],
+    Convention,
     typer.Option(help="The renderer's conventions; inria: near plane 0.2, splats cut to their 3σ tiles."),
 ]
 
@@ -169,11 +177,6 @@ CropOption = Annotated[
         "(front.png:0.4,0.3,0.2,0.2); may be repeated.",
     ),
 ]
-
-Method = Literal["default", "fast", "paper"]
-ScheduleName = Literal["fast", "default", "best", "paper"]
-Preset = Literal["auto", "trained", "lift", "noisy", "paper", "paper-trained", "paper-lift", "paper-noisy"]
-Paper = Literal["paper", "paper-trained", "paper-lift", "paper-noisy"]
 
 _PAPER = {
     "method": "paper",
@@ -199,7 +202,7 @@ def _whole_paper(ctx: typer.Context, preset: str | None) -> str | None:
 
 
 PresetOption = Annotated[
-    Preset,
+    PresetName,
     typer.Option(
         callback=_whole_paper,
         is_eager=True,
@@ -208,7 +211,7 @@ PresetOption = Annotated[
     ),
 ]
 PaperOption = Annotated[
-    Paper | None,
+    PaperPresetName | None,
     typer.Option(
         "--preset",
         callback=_whole_paper,
@@ -227,15 +230,15 @@ def _duration(text: str) -> float:
     return float(match[1]) * {"s": 1, "m": 60, "min": 60, "h": 3600}[match[2] or "s"]
 
 
-TimeLimitOption = Annotated[
+RecoveryTimeOption = Annotated[
     float | None,
     typer.Option(
-        "--time-limit", parser=_duration, metavar="TIME", help="Fit recovery alone into 90s, 2m or 1h."
+        "--recovery-time",
+        parser=_duration,
+        metavar="TIME",
+        help="Fit recovery, and no other part, into 90s, 2m or 1h.",
     ),
 ]
-
-
-_POLICIES = "auto|directional|coverage|pose-diverse|random|uniform"
 
 
 def views_count(text: str) -> Count | str:
@@ -243,32 +246,24 @@ def views_count(text: str) -> Count | str:
     return "auto" if text.strip() == "auto" else Count.parse(text)
 
 
-def _policy(text: str) -> str:
-    if text not in _POLICIES.split("|"):
-        raise typer.BadParameter(f"one of {_POLICIES.replace('|', ', ')}, not {text!r}")
-    return text
-
-
-PolicyOption = Annotated[
-    str, typer.Option("--policy", parser=_policy, metavar=_POLICIES, help="What makes views good.")
-]
+PolicyOption = Annotated[Policy, typer.Option("--policy", help="What makes views good.")]
 
 
 def can_judge(k: Count | str | None, policy: str) -> None:
     """Usage check: `-k auto` needs a policy that measures what views add."""
-    if k == "auto" and policy in ("random", "uniform"):
+    if k == "auto" and policy in UNMEASURED:
         raise typer.BadParameter(f"-k auto: --policy {policy} does not measure what views add; give a count")
 
 
-def one_horizon(steps: int | None, time_limit: float | None, constants: Mapping[str, object]) -> None:
-    """Usage check: --steps, --time-limit and --set schedule.steps all set the horizon."""
-    if steps is not None and time_limit is not None:
-        raise typer.BadParameter("--steps and --time-limit exclude each other")
+def one_horizon(steps: int | None, recovery_time: float | None, constants: Mapping[str, object]) -> None:
+    """Usage check: --steps, --recovery-time and --set schedule.steps all set the horizon."""
+    if steps is not None and recovery_time is not None:
+        raise typer.BadParameter("--steps and --recovery-time exclude each other; give one")
     if steps is not None and "schedule.steps" in constants:
-        raise typer.BadParameter("--steps and --set schedule.steps exclude each other")
+        raise typer.BadParameter("--steps and --set schedule.steps exclude each other; give one")
 
 
-def recovery_engine(run: Run) -> Literal["fused", "gsplat"]:
+def recovery_engine(run: Run) -> Engine:
     """What takes recovery's steps on the device asked for.
 
     Raises:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -56,6 +57,14 @@ class Outputs:
     def __init__(self, run: Run, pattern: Path, budgets: Sequence[Budget], *, name: str = "--output") -> None:
         self._run, self._pattern, self._budgets = run, str(pattern), budgets
         self._checked: set[Path] = set()
+        if strange := set(re.findall(r"{[^{}]*}", self._pattern)) - {"{ratio}", "{count}"}:
+            raise typer.BadParameter(
+                f"{name}: {min(strange)} stands for nothing; {{ratio}} and {{count}} stand for the budget's"
+            )
+        if len(set(budgets)) < len(budgets):
+            raise typer.BadParameter(
+                f"{name}: a budget is given twice, and would be written to the same place; give each once"
+            )
         named = any(word in self._pattern for word in ("{ratio}", "{count}"))
         if named and any(budget.is_measured for budget in budgets):
             raise typer.BadParameter(f"{name}: {{ratio}} and {{count}} stand for budgets of -r and -n")
@@ -73,7 +82,10 @@ class Outputs:
             return []
         found = [Path(self._named(budget, total)) for budget in self._budgets]
         if len(set(found)) < len(found):
-            raise typer.BadParameter(f"{self._pattern}: two budgets would be written to the same place")
+            raise typer.BadParameter(
+                f"{self._pattern}: two budgets would be written to the same place; "
+                "give budgets that differ more, or name both {ratio} and {count}"
+            )
         return found
 
     def check(self, check: Callable[[Path, Budget], object], total: int | None = None) -> None:

@@ -12,7 +12,7 @@ import typer
 from g2ard.cli.frame import Run
 from g2ard.errors import OutputError
 
-__all__ = ["OPTIONS", "check_stopped", "left_at", "stoppable"]
+__all__ = ["OPTIONS", "check_stopped", "left_at", "rows_kept", "stoppable"]
 
 OPTIONS = "options.json"
 """In a folder of checkpoints: what they belong to. Alone it is nothing to go on from."""
@@ -52,6 +52,18 @@ def stoppable(run: Run, place: Path, resume: bool) -> Iterator[None]:
     finally:
         if not left_at(place):
             _remove(place)
+
+
+@contextmanager
+def rows_kept(run: Run, table: Path, *, goes_on: bool) -> Iterator[None]:
+    """While it lasts a table grows; Ctrl-C says that its rows stay, and whether another call goes on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if table.exists():
+            onward = "the same command goes on" if goes_on else "the same command with -w starts anew"
+            run.kept.append(f"{table} holds what is done; {onward}")
+        raise
 
 
 def left_at(place: Path) -> bool:

@@ -26,6 +26,7 @@ __all__ = [
     "tell_anew",
     "tell_finished",
     "work_folder",
+    "write_report",
 ]
 
 WORK = ".unfinished"
@@ -35,10 +36,21 @@ KEPT = Path("simplified", "scene.ply")
 REPORT = "report.json"
 """In the folder of the run, written last."""
 
-_OF_THE_CALL = ("output", "resume", "keep", "view", "crop", "dry_run", "threads", "device")
+_OF_THE_CALL = (
+    *("output", "resume", "keep", "view", "crop", "dry_run", "threads", "device"),
+    *("memory", "workers", "scheduler", "work"),
+)
 """Options that another call may have other values of, and yet go on with a run; of devices all but CUDA."""
 _OF_THE_BUDGET = ("count", "ratio")
 """Several are one budget for each folder."""
+
+
+def write_report(folder: Path, report: dict[str, Any]) -> None:
+    """A run's numbers, the last file of its folder."""
+    from g2ard.io.atomic import atomic_output
+
+    with atomic_output(folder / REPORT, overwrite=True) as temporary:
+        temporary.write_text(json.dumps(report, indent=2, default=str) + "\n")
 
 
 def check_place(run: Run, place: Path, budget: Budget, given: bool, resume: bool) -> None:
@@ -170,7 +182,9 @@ def _check_same(run: Run, folder: Path, told: Path, budget: Budget, how: str) ->
         return
     before = read_json(told)
     if other := _others(run, before, budget):
-        raise OutputError(f"{folder}: {how} with another {', '.join(other)}; -w without --resume starts anew")
+        raise OutputError(
+            f"{folder}: {how} with other options ({', '.join(other)}); -w without --resume starts anew"
+        )
 
 
 def _others(run: Run, before: Mapping[str, Any], budget: Budget) -> list[str]:

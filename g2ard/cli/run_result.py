@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from g2ard.cli.frame import Run
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.policy.fit import Aim
@@ -33,14 +34,14 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
 
     size = report["bytes"]
     times = ", ".join(f"{name} {value:.1f} s" for name, value in report["seconds"].items())
-    counts = [str(len(scores["recovered"]["views"])) for scores in kinds]
-    apart = f" and {counts[1]} of another kind (nearer)" if len(kinds) > 1 else ""
+    counts = [len(scores["recovered"]["views"]) for scores in kinds]
+    apart = f" and {counts[1]:,} of another kind (nearer)" if len(kinds) > 1 else ""
     run.console.table(
-        f"{counts[0]} unseen views{apart} against {report['against']}; {times}",
+        f"{plural(counts[0], 'unseen view')}{apart} against {report['against']}; {times}",
         [
             "scene",
             "Gaussians",
-            "MB",
+            "MB as .ply",
             "bytes each",
             "PSNR",
             "SSIM",
@@ -89,8 +90,6 @@ def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
 
 def say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:
     """What was made of the candidates, where it is not simply all of them."""
-    from g2ard.io.clean import plural
-
     if views is None:
         return
     if views["refused"]:

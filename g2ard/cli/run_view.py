@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from g2ard.progress import plural
+
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.splats import Splats
@@ -36,6 +38,6 @@ def run_view(
         path.unlink(missing_ok=True)
         return None, f"no {path}: over {most:,} Gaussians (`g2ard view` writes one all the same)"
     stand = stand_with(splats, cameras)
-    shown = [(f"{scene.name}: {count:,} Gaussians", stand.of(splats))]
+    shown = [(f"{scene.name}: {plural(count, 'Gaussian')}", stand.of(splats))]
     written = write_page(path, shown, start=stand.start, background=background, overwrite=True)
     return written.bytes, f"view: {path} ({written.bytes / 1e6:.2f} MB)"

@@ -2,35 +2,74 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from typing import Any
 
 import typer
 
-__all__ = ["in_flags", "typed", "usage_line"]
+__all__ = ["in_flags", "meant", "present_name", "typed", "usage_line"]
 
 _FLAGS = {
     "overwrite=True replaces it": "give -w (--overwrite) to replace it",
     "another checkpoint or folder of work starts anew": "-w without --resume starts anew",
     "engine 'gsplat'": "--device cuda",
+    "engine 'fused' needs none": "--device cpu needs none",
     "count, ratio:": "-n, -r:",
     "to take a ratio of: give a count": "to take a ratio of: give a count, -n COUNT",
     "its photos are needed as views": "give its photos with --views",
     "TeacherRenders of a scene can stand in": "--teacher SCENE stands in with its renders",
+    "views that hold them, or focal=PIXELS": "--intrinsics VIEWS or --focal PIXELS",
+    "photos=None takes renders there": "without --photos the scene's render stands in for it",
     "crop ": "--crop ",
 }
 """What the library calls by the name of a parameter → what a shell calls it."""
 
 
+_DAMAGED = re.compile(r": (truncated|not a whole|broken|stream \d+ (holds|unpacks))|cut off")
+"""What readers say of a file that is not as its writer left it."""
+
+
 def in_flags(message: str) -> str:
-    """An error of the library in the words of the command line.
+    """An error of the library in the words of the command line, with what to do about a damaged file.
 
     >>> in_flags("a.ply: exists; overwrite=True replaces it")
     'a.ply: exists; give -w (--overwrite) to replace it'
+    >>> in_flags("a.spz: truncated in stream 2")
+    'a.spz: truncated in stream 2; the file is damaged: copy or export it again'
     """
     for words, flag in _FLAGS.items():
         if words != "crop " or message.startswith(words):
             message = message.replace(words, flag)
-    return message
+    return f"{message}; the file is damaged: copy or export it again" if _DAMAGED.search(message) else message
+
+
+_RENAMED = {"time-limit": "recovery-time"}
+"""What options were called before → what they are called; the old names are still taken, and not shown."""
+
+
+def present_name(name: str) -> str:
+    """What an option is called now, as it stands after its dashes.
+
+    >>> present_name("time-limit"), present_name("ratio")
+    ('recovery-time', 'ratio')
+    """
+    return _RENAMED.get(name, name)
+
+
+def meant(words: Iterable[str], known: Iterable[str]) -> str:
+    """Words that nothing is called, each with those near to it that something is.
+
+    >>> meant(["rato", "zzz"], ["ratio", "count"])
+    'rato (did you mean ratio?), zzz'
+    """
+    from difflib import get_close_matches
+
+    there, told = sorted(known), []
+    for word in sorted(words):
+        near = get_close_matches(word, there, 2)
+        told.append(f"{word} (did you mean {' or '.join(near)}?)" if near else word)
+    return ", ".join(told)
 
 
 def usage_line(error: typer.TyperException) -> str:

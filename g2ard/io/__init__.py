@@ -105,8 +105,17 @@ def read_scene(path: str | Path) -> Scene:
 
     path, found = Path(path), file_format(path)
     if found not in ("ply", "compressed_ply", "sog", "spz", "glb", "splat"):
-        what = {"cloud_ply": "a point cloud (no f_dc, scale, rot)", "las": "a point cloud"}.get(found, found)
-        hint = "; `g2ard lift` makes a scene of it" if kind(path) == "points" else ""
+        words = {
+            "cloud_ply": "a point cloud (no f_dc, scale, rot)",
+            "las": "a point cloud",
+            "views": "g2ard's views",
+        }
+        what = words.get(found, found)
+        hints = {
+            "points": "; `g2ard lift` makes a scene of it",
+            "views": ", no scene; name the scene's own file",
+        }
+        hint = hints.get(kind(path), "")
         raise InputError(f"{path}: a Gaussian scene is needed, this is {what}{hint}")
     return import_module(f"g2ard.io.{found}").read(path)
 
@@ -206,8 +215,10 @@ def read_cloud(path: str | Path) -> Cloud:
     path, found = Path(path), file_format(path)
     modules = {"cloud_ply": "cloud_ply", "las": "las", "points3d": "points3d", "colmap": "points3d"}
     if found not in modules:
-        what = "a Gaussian scene" if kind(path) == "splats" else found
-        raise InputError(f"{path}: a coloured point cloud is needed, this is {what}")
+        scene = kind(path) == "splats"
+        what = "a Gaussian scene" if scene else found
+        hint = ", ready for `simplify` and `distill`" if scene else "; name the cloud's own file"
+        raise InputError(f"{path}: a coloured point cloud is needed, this is {what}{hint}")
     return import_module(f"g2ard.io.{modules[found]}").read(path)
 
 
@@ -281,7 +292,10 @@ def read_view_set(
 
     path, found = Path(path), file_format(path)
     if KINDS[found] != "views":
-        raise InputError(f"{path}: views are needed (a COLMAP folder, transforms.json, g2ard's .json)")
+        what = "a Gaussian scene" if KINDS[found] == "splats" else "a cloud"
+        raise InputError(
+            f"{path}: views are needed (a COLMAP folder, transforms.json, g2ard's .json), this is {what}"
+        )
     if images is not None and not Path(images).is_dir():
         raise InputError(f"{images}: no such folder of photos")
     try:

@@ -42,7 +42,7 @@ def check_output(path: str | Path, overwrite: bool = False, *, folder: bool = Fa
     except OutputError:
         raise
     except OSError as error:
-        raise OutputError(f"{path}: cannot write there: {error.strerror}") from error
+        raise OutputError(f"{path}: cannot write there: {error.strerror}; name another place") from error
     return path
 
 
@@ -50,9 +50,9 @@ def _refuse_existing(path: Path, overwrite: bool, folder: bool) -> None:
     if not path.exists():
         return
     if path.is_dir() and not folder:
-        raise OutputError(f"{path}: is a folder; a file is to be written there")
+        raise OutputError(f"{path}: is a folder; a file is to be written there: name one in it")
     if folder and not path.is_dir():
-        raise OutputError(f"{path}: is a file; a folder is to be written there")
+        raise OutputError(f"{path}: is a file; a folder is to be written there: name another")
     if not overwrite and (not folder or any(path.iterdir())):
         raise OutputError(f"{path}: exists; overwrite=True replaces it")
 

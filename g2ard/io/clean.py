@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.types import Note, Scene
+from g2ard.progress import plural
 from g2ard.splats import DRAWN_LOGIT, Splats
 
-__all__ = ["BLOCK", "LOGIT_LIMIT", "LOG_SCALE_LIMIT", "Raw", "Tally", "cleaned", "plural"]
+__all__ = ["BLOCK", "LOGIT_LIMIT", "LOG_SCALE_LIMIT", "Raw", "Tally", "cleaned"]
 
 BLOCK = 8192
 """Rows handled at a time: 60 float32 columns of them are 2 MB and stay in the cache."""
@@ -64,11 +65,6 @@ class Raw:
         return Splats(
             self.means, self.quats, self.log_scales, self.logit_opacities, self.sh0, self.shN, self.offset
         )
-
-
-def plural(count: int, one: str, many: str | None = None) -> str:
-    """`1 row`, `2 rows`, `1,234 rows`."""
-    return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
 def cleaned(path: Path, raw: Raw, notes: list[Note] | None = None) -> Scene:
@@ -140,7 +136,9 @@ class Tally:
         if not self.rows:
             raise InputError(f"{path}: holds no Gaussians")
         if self.dropped == self.rows:
-            raise InputError(f"{path}: none of its {plural(self.rows, 'Gaussian')} is finite")
+            raise InputError(
+                f"{path}: none of its {plural(self.rows, 'Gaussian')} is finite; take an earlier state of it"
+            )
         notes = []
         if self.dropped:
             text = f"{plural(self.dropped, 'non-finite Gaussian')} dropped (the first is row {self.first})"

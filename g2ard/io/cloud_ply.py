@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
-from g2ard.io.clean import plural
 from g2ard.io.plyfiles import read_element, read_header, require, row_blocks, spread_rows
 from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
 from g2ard.io.types import Cloud, Note, Points
+from g2ard.progress import plural
 
 __all__ = ["finite_cloud", "read", "stream", "write", "write_blocks"]
 

@@ -17,6 +17,7 @@ from g2ard.io.clean import Raw, cleaned
 from g2ard.io.plyfiles import offset_of, read_element, read_header, require, row_blocks
 from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Scene
+from g2ard.progress import plural
 from g2ard.splats import SH_C0
 
 __all__ = ["read", "stream"]
@@ -92,7 +93,7 @@ def _layout(path: Path) -> _Layout:
     names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")
     vertex, chunk, *sh = read_element(path, header, *names)
     if len(chunk) * _CHUNK < len(vertex) or (sh and len(sh[0]) != len(vertex)):
-        raise InputError(f"{path}: {len(chunk)} chunks and {len(vertex):,} Gaussians do not fit")
+        raise InputError(f"{path}: {len(chunk)} chunks and {plural(len(vertex), 'Gaussian')} do not fit")
     bands, colored = sh[0] if sh else None, "min_r" in chunk_properties
     offset = offset_of(path, header)
     return _Layout(vertex, np.array(chunk), bands, len(rest) // 3, colored, offset)

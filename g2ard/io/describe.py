@@ -16,7 +16,7 @@ from g2ard.io.sog import chunks_of
 from g2ard.io.types import Points, ViewSet
 from g2ard.splats import Splats
 
-__all__ = ["describe"]
+__all__ = ["bytes_of", "describe"]
 
 _QUANTILES = (0, 1, 25, 50, 75, 99, 100)
 
@@ -50,13 +50,13 @@ def describe(path: str | Path) -> dict[str, Any]:
         "path": str(path),
         "kind": what,
         "format": file_format(path),
-        "bytes": _bytes(path),
+        "bytes": bytes_of(path),
         **figures,
         "notes": [{"code": n.code, "count": n.count, "text": n.text} for n in notes],
     }
 
 
-def _bytes(path: Path) -> int:
+def bytes_of(path: Path) -> int:
     """Size on disk; of a SOG folder only the chunks that are read."""
     folders = chunks_of(path) or [path]
     files = [file for folder in folders for file in (folder.rglob("*") if folder.is_dir() else [folder])]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from difflib import get_close_matches
+from itertools import islice
 from pathlib import Path
 from typing import Literal
 
 from g2ard.errors import InputError
 
-__all__ = ["KINDS", "Format", "Kind", "file_format", "kind"]
+__all__ = ["KINDS", "Format", "Kind", "file_format", "is_photo", "kind"]
 
 Format = Literal[
     "ply",
@@ -38,6 +41,11 @@ KINDS: dict[str, Kind] = {
 }
 
 
+_LOOKED_INTO = 64
+"""Files of a folder at most, for what may be meant of them."""
+_READ = (".ply", ".sog", ".spz", ".glb", ".splat", ".las", ".laz", ".json")
+
+
 def kind(path: str | Path) -> Kind:
     """What `path` holds: "splats" (a Gaussian scene), "points" (a coloured cloud) or "views".
 
@@ -59,7 +67,7 @@ def file_format(path: str | Path) -> Format:
     if path.is_dir():
         return _folder_format(path)
     if not path.exists():
-        raise InputError(f"{path}: no such file or folder")
+        raise InputError(f"{path}: no such file or folder{_near(path)}")
     name, suffix = path.name.lower(), path.suffix.lower()
     if name in ("meta.json", "lod-meta.json"):
         return "sog"
@@ -87,6 +95,11 @@ def file_format(path: str | Path) -> Format:
         f"{path}: unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .splat; clouds: .ply .las "
         ".laz; views: a COLMAP folder, a .json, or a trainer's run)"
     )
+
+
+def is_photo(path: Path) -> bool:
+    """Whether a file's name is a photo's."""
+    return path.suffix.lower() in (".png", ".jpg", ".jpeg", ".webp")
 
 
 def _folder_format(path: Path) -> Format:
@@ -117,9 +130,39 @@ def _folder_format(path: Path) -> Format:
         return "inria"
     if gsplat_run.is_run(path / gsplat_run.NAME):
         return "gsplat_run"
-    raise InputError(
-        f"{path}: nothing known in this folder (looked for SOG's meta.json, a COLMAP sparse/0, "
-        "transforms.json, cameras.json, nerfstudio's and gsplat's runs, Cambridge's dataset_train.txt)"
+    raise InputError(f"{path}: nothing known in this folder{_instead(path)}")
+
+
+def _near(path: Path) -> str:
+    """Names alike in the folder where something was looked for, or that there is no such folder."""
+    if not path.parent.is_dir():
+        return f", nor a folder {path.parent}"
+    close = get_close_matches(path.name, [file.name for file in path.parent.iterdir()], 2)
+    return f"; did you mean {' or '.join(str(path.with_name(name)) for name in close)}?" if close else ""
+
+
+def _instead(path: Path) -> str:
+    """What to do with a folder that is nothing: name a file in it, find poses; else what was looked for."""
+    held: dict[Kind, list[str]] = {"splats": [], "points": [], "views": []}
+    files = (file for file in sorted(path.iterdir()) if file.suffix.lower() in _READ and file.is_file())
+    for file in islice(files, _LOOKED_INTO):
+        with suppress(InputError):
+            held[kind(file)].append(file.name)
+    words = {"splats": "a scene", "points": "a cloud", "views": "views"}
+    found = [f"{', '.join(names[:5])} ({words[what]})" for what, names in held.items() if names]
+    if found:
+        return f"; name what is meant of its files: {', '.join(found)}"
+    photos = next(
+        (p for p in (path, path / "images") if p.is_dir() and any(map(is_photo, p.iterdir()))), None
+    )
+    if photos is not None:
+        return (
+            ": photos, without their poses; COLMAP finds them: colmap automatic_reconstructor "
+            f"--workspace_path project --image_path {photos}, then give project"
+        )
+    return (
+        " (looked for SOG's meta.json, a COLMAP sparse/0, transforms.json, cameras.json, nerfstudio's and "
+        "gsplat's runs, Cambridge's dataset_train.txt)"
     )
 
 
@@ -150,7 +193,7 @@ def _json_format(path: Path) -> Format:
         raise InputError(
             f"{path}: a JSON list, but neither INRIA's cameras nor those of nerfstudio's ns-export"
         )
-    if "views" in content:
+    if isinstance(content.get("views"), list) or ("views" in content and "format" in content):
         return "views"
     if "frames" in content:
         return "transforms"

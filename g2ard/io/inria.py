@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from g2ard.errors import InputError
-from g2ard.io.clean import plural
 from g2ard.io.jsonfile import read_json_list
 from g2ard.io.photos import Frame, find_photo, inverse, pixels, rigid, view_set
 from g2ard.io.types import Note, ViewSet
+from g2ard.progress import plural
 
 __all__ = ["NAME", "is_inria", "read"]
 

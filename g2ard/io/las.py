@@ -104,7 +104,8 @@ def _opened(path: Path) -> Iterator[Any]:
             names = set(header.point_format.dimension_names)
             if not {"red", "green", "blue"} <= names:
                 raise InputError(
-                    f"{path}: its point format {header.point_format.id} has no 'red', 'green', 'blue'"
+                    f"{path}: its point format {header.point_format.id} has no 'red', 'green', 'blue'; "
+                    "points must be coloured (as by PDAL's filters.colorization)"
                 )
             if header.are_points_compressed:
                 _check_chunk_table(path, header.offset_to_point_data, header.point_count)

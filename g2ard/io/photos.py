@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.io.clean import plural
 from g2ard.io.limits import opened_image
 from g2ard.io.types import Note, ViewSet
+from g2ard.progress import plural
 
 __all__ = [
     "Frame",

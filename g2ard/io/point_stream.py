@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.io.clean import plural
 from g2ard.io.stream import file_identity
 from g2ard.io.types import Note
+from g2ard.progress import plural
 
 __all__ = ["PointStream", "PointTally", "RawPoints", "cloud_middle", "open_point_stream"]
 

@@ -17,6 +17,7 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import read_json
 from g2ard.io.photos import Frame, pixels, rigid, view_set
 from g2ard.io.types import ViewSet
+from g2ard.progress import plural
 
 __all__ = ["read", "write"]
 
@@ -106,7 +107,9 @@ def write(
     drawn = [None if np.isnan(weight) else weight for weight in given.tolist()]
     parts = list(splits) or [None] * count
     if not count or len(parts) != count or len(drawn) != count:
-        raise InputError(f"{path}: {count} views, {len(parts)} splits and {len(drawn)} weights do not fit")
+        raise InputError(
+            f"{path}: {plural(count, 'view')}, {len(parts)} splits and {len(drawn)} weights do not fit"
+        )
     lines = []
     for i in range(count):
         view: dict[str, Any] = {

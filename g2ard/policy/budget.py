@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass
 
 from g2ard.errors import InputError
+from g2ard.progress import plural
 
 __all__ = ["DEVICES", "Budget"]
 
@@ -94,6 +95,7 @@ class Budget:
         assert self.count is not None
         if self.count > total:
             raise InputError(
-                f"{name}: a budget of {self.count:,} is above its {total:,} Gaussians; {total:,} at most"
+                f"{name}: a budget of {self.count:,} is above its {plural(total, 'Gaussian')}; "
+                f"{total:,} at most"
             )
         return self.count

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.progress import Progress, Say, plural, silent, unsaid
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
@@ -53,5 +53,5 @@ def clutter_seen(
     found = find_clutter(splats, seen, within_reach(splats, cameras, progress), pixels, kinds)
     parts = [f"{count:,} {name}" for name, count in found.counts.items() if name in kinds]
     gone = len(splats) - int(found.keep.sum())
-    say(f"{gone:,} of {len(splats):,} Gaussians can go: {', '.join(parts)}")
+    say(f"{gone:,} of {plural(len(splats), 'Gaussian')} can go: {', '.join(parts)}")
     return found, cameras

@@ -83,7 +83,7 @@ def estimate(job: DistillJob, budget: int) -> Estimate:
     views = len(train) + len(test) + (0 if apart is None or job.teacher is None else len(apart))
     scored = len(test) + (0 if apart is None else len(apart) // 2)
     small = per_view * len(merged) / len(job.prior) if job.teacher is not None else per_step / 3
-    limit = job.config.time_limit
+    limit = job.config.recovery_time
     pixels = int(np.mean(train.widths.astype(np.int64) * train.heights))
     return Estimate(
         views=views,

@@ -15,7 +15,7 @@ from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.metrics import psnr, ssim
 from g2ard.policy.budget import Budget
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.splats import Splats
 from g2ard.stages.render import Renderer
 
@@ -205,7 +205,7 @@ class Aim:
             fewer = max(1, int(len(splats) * self.bytes / size * 0.99))
             if fewer == len(splats):
                 break
-            say(f"{size:,} bytes: merged on from {len(splats):,} to {fewer:,} Gaussians")
+            say(f"{size:,} bytes: merged on from {len(splats):,} to {plural(fewer, 'Gaussian')}")
             made = simplify(splats, fewer, method="fast")
             rows = _onward(rows, made.parents)
             splats = made.splats
@@ -235,9 +235,8 @@ class Aim:
         assert self.dense is not None
         assert self.cameras is not None
         got = quality(_images(self.dense, self.cameras), splats, self.cameras)
-        line = (
-            f"{len(splats):,} Gaussians: {got.psnr:.2f} dB, SSIM {got.ssim:.4f} in {len(self.cameras)} views"
-        )
+        count, views = plural(len(splats), "Gaussian"), plural(len(self.cameras), "view")
+        line = f"{count}: {got.psnr:.2f} dB, SSIM {got.ssim:.4f} in {views}"
         if got.meets(self.wanted):
             return True, line
         return False, f"{line}, which is less than was asked; ask for a count above {len(splats):,}"
@@ -273,11 +272,11 @@ def aim_of(
         return _by_quality(splats, wanted, seed, progress, say)
     if budget.bytes is not None:
         found = count_for_bytes(splats, budget.bytes, file, _fast)
-        say(f"{budget.fit}: about {found:,} Gaussians")
+        say(f"{budget.fit}: about {plural(found, 'Gaussian')}")
         return Aim(found, bytes=budget.bytes, file=file)
     found = budget.of(len(splats), name)
     if budget.fit is not None:
-        say(f"{budget.fit}: {found:,} Gaussians")
+        say(f"{budget.fit}: {plural(found, 'Gaussian')}")
     return Aim(found)
 
 
@@ -287,7 +286,7 @@ def _by_quality(splats: Splats, wanted: Quality, seed: int, progress: Progress, 
     pool = plan_pool(splats, _VIEWS, seed=seed, rows=_ROWS, looks=True, progress=progress)
     cameras = pool.cameras.resized(_SIDE)
     found, near = count_for_quality(splats, wanted, cameras, _fast)
-    say(f"{found:,} Gaussians should keep {near.psnr:.2f} dB, SSIM {near.ssim:.4f}")
+    say(f"{plural(found, 'Gaussian')} should keep {near.psnr:.2f} dB, SSIM {near.ssim:.4f}")
     return Aim(found, wanted=wanted, dense=splats, cameras=cameras)
 
 

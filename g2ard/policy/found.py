@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g2ard.progress import Say, unsaid
+from g2ard.progress import Say, plural, unsaid
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,7 +39,6 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
     """
     from g2ard.errors import InputError
     from g2ard.io import find_views, read_view_set
-    from g2ard.io.clean import plural
     from g2ard.splits import split_mask
 
     path = find_views(scene)
@@ -55,7 +54,7 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
     count = len(views.cameras)
     seeing = int(views.cameras.facing(_opaque(splats)).sum())
     if seeing < _SEEING * count:
-        say(f"views beside the scene are not used: {path}: {seeing} of {count} cameras see it")
+        say(f"views beside the scene are not used: {path}: {seeing} of {plural(count, 'camera')} see it")
         return None
     cameras = plural(count, "camera")
     say(f"views: {cameras} of {path} (found beside the scene; --views made for a pool of its own)")

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.progress import Progress, Say, plural, silent, unsaid
 
 if TYPE_CHECKING:
     import numpy as np
@@ -120,11 +120,11 @@ def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewS
     keep = not_held_out(train.cameras, held_out)
     if not keep.any():
         raise InputError(
-            f"held-out views: all {len(keep)} views to train on are among them; hold out fewer, or "
+            f"held-out views: all {plural(len(keep), 'view')} to train on are among them; hold out fewer, or "
             "train on others"
         )
     if not keep.all():
-        say(f"held out, so not trained on: {len(keep) - int(keep.sum())} of {len(keep)} views")
+        say(f"held out, so not trained on: {len(keep) - int(keep.sum())} of {plural(len(keep), 'view')}")
     return train.take(keep)
 
 
@@ -189,7 +189,6 @@ def make_targets(
 ) -> Targets:
     """The teacher's renders (`lazy`: when first asked for), or the photos where no teacher is given; with
     `photos` the photo of each view that has one, and the teacher's render of the others."""
-    from g2ard.io.clean import plural
     from g2ard.io.exposures import find_exposures
     from g2ard.targets import Photos, PhotosOrRenders, TeacherRenders
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from g2ard.policy.budget import Budget
 from g2ard.policy.inputs import make_targets
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.reports import Report
 from g2ard.splats import Splats
 
@@ -114,19 +114,22 @@ def lod(
     [800, 200, 100]
     """
     from g2ard.policy.distill import prepare
+    from g2ard.policy.distill_options import DistillOptions
 
     _check(ratios)
     job = prepare(
         scene,
         [Budget(ratio=ratio) for ratio in ratios],
-        views=views,
-        photos=photos,
-        steps=steps,
-        size=size,
-        background=background,
-        beside=beside,
-        up=up,
-        seed=seed,
+        DistillOptions(
+            views=views,
+            photos=photos,
+            steps=steps,
+            size=size,
+            background=background,
+            beside=beside,
+            up=up,
+            seed=seed,
+        ),
         progress=progress,
         say=say,
     )
@@ -138,7 +141,7 @@ def lod(
             splats.append(job.prior)
             reports.append(LevelReport(len(job.prior), 1.0, _longest(job.views.train.cameras), 0.0))
             continue
-        say(f"level {len(splats)}: {aim.count:,} Gaussians")
+        say(f"level {len(splats)}: {plural(aim.count, 'Gaussian')}")
         place = None if work is None else work / f"level-{len(splats)}"
         level, finer, report = _level(job, finer, aim.count, ratio, recover, place)
         splats.append(level)

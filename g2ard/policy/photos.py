@@ -17,7 +17,7 @@ from g2ard.errors import InputError
 from g2ard.images import load_image
 from g2ard.io.types import Points
 from g2ard.policy.inputs import load_for_training, load_view_sets
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.progress import Progress, Say, plural, silent, unsaid
 
 if TYPE_CHECKING:
     from g2ard.policy.inputs import Views
@@ -66,8 +66,6 @@ def points_of_photos(
     Raises:
         InputError: a view without a photo, or no sparse points and no `count`.
     """
-    from g2ard.io.clean import plural
-
     sparse = None if not isinstance(views, str | Path) else sparse_points(Path(views))
     found = len(sparse) if sparse is not None else 0
     if count is None and sparse is None:
@@ -143,7 +141,14 @@ def points_within_sight(
         InputError: fewer than three views, one without a photo, or views that share no sight.
     """
     if len(cameras) < 3:
-        raise InputError(f"photos: expected at least 3 views, got {len(cameras)}")
+        raise InputError(
+            f"photos: expected at least 3 views, got {len(cameras)}; give more, or a scene beside them"
+        )
+    bare = [name for name, path in zip(cameras.names, cameras.image_paths, strict=True) if path is None]
+    if bare:
+        raise InputError(
+            f"photos: view {bare[0]} has none to start from; give views with photos, or a scene beside them"
+        )
     photos = [load_image(cameras, i) for i in range(len(cameras))]
     rng = np.random.default_rng([seed, 11])
     middle = _looked_at(cameras)
@@ -152,7 +157,9 @@ def points_within_sight(
     positions, colors, tried = np.zeros((0, 3)), np.zeros((0, 3), np.float32), 0
     while len(positions) < count:
         if tried > 64 * max(count, _RAYS):
-            raise InputError("photos: the views share no sight: no point is seen by three of them")
+            raise InputError(
+                "photos: the views share no sight: no point is seen by three of them; give a cloud"
+            )
         view = int(rng.integers(len(cameras)))
         rays = min(_RAYS, max(64, -(-count // len(cameras))))
         xyz, rgb = _swept(cameras, photos, view, near[view], float(reach[view]), rays, background, rng)

@@ -22,7 +22,6 @@ __all__ = ["matched", "photos_of", "pool_of", "poses_for", "read_poses"]
 Poses = dict[str, NDArray[np.float64]]
 Found = TypeVar("Found")
 
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 _ROWS = 200_000
 """Gaussians that poses are planned on."""
 
@@ -58,15 +57,21 @@ def photos_of(
             say(f"{path}: {note}")
         missing = next((v.name for v in found.cameras if v.image_path is None), None)
         if missing is not None:
-            raise InputError(f"{path}: view {missing} has no photo")
+            raise InputError(
+                f"{path}: view {missing} has no photo to register; give the folder of the photos"
+            )
         if intrinsics is not None or focal is not None:
-            raise InputError(f"{path}: these views state their intrinsics; others would contradict them")
+            raise InputError(
+                f"{path}: these views state their intrinsics; others would contradict them: leave those out"
+            )
         return found.cameras
     if split != "all":
-        raise InputError(f"{path}: a folder of photos has no split {split!r}")
+        raise InputError(
+            f"{path}: a folder of photos has no split {split!r}: all of it is meant, or views are to be given"
+        )
     if (intrinsics is None) == (focal is None):
         raise InputError(
-            f"{path}: photos without views need their intrinsics: either views, or a focal length"
+            f"{path}: photos without views need their intrinsics: views that hold them, or focal=PIXELS"
         )
     names = [file.relative_to(path).as_posix() for file in files]
     sizes = _sizes(files)
@@ -84,14 +89,14 @@ def photos_of(
 
 def _photos_in(path: Path) -> list[Path]:
     """The photos of a folder that holds no views; [] for anything else."""
-    from g2ard.io.detect import file_format
+    from g2ard.io.detect import file_format, is_photo
 
     if not path.is_dir():
         return []
     try:
         file_format(path)
     except InputError:
-        return sorted(f for f in path.rglob("*") if f.suffix.lower() in _SUFFIXES and f.is_file())
+        return sorted(f for f in path.rglob("*") if is_photo(f) and f.is_file())
     return []
 
 
@@ -122,7 +127,10 @@ def _lenses(path: Path, names: list[str]) -> list[Camera]:
     shared = all(_same_lens(view, one) for view in views)
     missing = next((name for name in names if name not in by_name), None)
     if missing is not None and not shared:
-        raise InputError(f"{path}: no intrinsics for {missing}, and its views are of several lenses")
+        raise InputError(
+            f"{path}: no intrinsics for {missing}, and its views are of several lenses; name it there, or "
+            "give one lens"
+        )
     return [by_name.get(name, one) for name in names]
 
 
@@ -140,7 +148,7 @@ def _check_aspects(files: list[Path], sizes: list[tuple[int, int]], views: list[
         (w, h), view = sizes[0], views[0]
         raise InputError(
             f"{files[0]}: the photo is {w}×{h}, its intrinsics are for {view.width}×{view.height}: "
-            "the aspects differ"
+            "the aspects differ; give the intrinsics of these photos"
         )
 
 
@@ -166,7 +174,9 @@ def poses_for(path: Path, names: Sequence[str]) -> Poses:
     """
     found = matched(read_poses(path), names)
     if not found:
-        raise InputError(f"{path}: names none of the photos, of which the first is {names[0]}")
+        raise InputError(
+            f"{path}: names none of the photos, of which the first is {names[0]}; poses are found by name"
+        )
     return found
 
 

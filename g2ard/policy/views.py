@@ -20,13 +20,15 @@ if TYPE_CHECKING:
 
     Up = Sequence[float] | None
 
-__all__ = ["RunViews", "cameras_for_looks", "is_made", "views_of", "views_or_pool"]
+__all__ = ["RunViews", "cameras_for_looks", "is_made", "pool_times", "views_of", "views_or_pool"]
 
 _POOL, _GROW, _NEAR = 160, 2.0, 0.25
 """Poses of a pool made for a scene without views, how many times as many there may be where a view holds
 little of it, and the most that step nearer; every 8th is held out for scoring."""
 _APART = 24
 """Views of another kind: half of them validate recovery, half are scored."""
+_POOL_GAUSSIANS = 4_000_000
+"""Gaussians in tiles for which such a pool is made; for more of these, more of those."""
 _ROWS = 200_000
 """Gaussians that poses are planned on."""
 
@@ -69,6 +71,7 @@ def views_of(
     up: Up = None,
     seed: int = 0,
     teach: bool = True,
+    represents: float = 1.0,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> RunViews:
@@ -85,6 +88,8 @@ def views_of(
         seed: of poses that are made.
         teach: the scene can be rendered: into views without a photo beside others, which are left out else,
             and into other views than those given.
+        represents: of a fair sample of a scene: how many Gaussians each of its rows stands for. The pool of a
+            scene too large for memory grows with it.
         progress: told of planning.
         say: told what is looked at, and why.
 
@@ -107,10 +112,10 @@ def views_of(
             train = drop_held_out(train, test.cameras, say)
         if found and not size:
             train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
-        apart = _near(prior, size, up, seed, progress) if teach else None
+        apart = _near(prior, size, up, seed, progress, represents) if teach else None
         return RunViews(train, test.cameras, apart)
     held = None if held_out is None else load_held_out(held_out, size, say, unpictured=teach)
-    planned = _planned(prior, _POOL, up, seed, progress, _GROW)
+    planned = _planned(prior, _POOL, up, seed, progress, _GROW, represents)
     apart = planned.apart and planned.apart.resized(size)
     names = planned.cameras.names
     say(f"poses: {_of(planned)}")
@@ -226,29 +231,46 @@ def cameras_for_looks(
     return pool.cameras
 
 
-def _planned(prior: Splats, count: int, up: Up, seed: int, progress: Progress, grow: float = 1.0) -> Pool:
+def _planned(
+    prior: Splats,
+    count: int,
+    up: Up,
+    seed: int,
+    progress: Progress,
+    grow: float = 1.0,
+    represents: float = 1.0,
+) -> Pool:
     """A pool of `count` views or up to `grow` times as many, and views of another kind."""
     from g2ard.poses import plan_pool
 
+    times = pool_times(len(prior) * represents) if represents > 1 else 1.0
     return plan_pool(
         prior,
-        count,
+        round(count * times),
         up=up,
         seed=seed,
-        rows=_ROWS,
-        apart=_APART,
+        rows=round(_ROWS * times),
+        apart=round(_APART * times),
         grow=grow,
         near=_NEAR,
+        represents=represents,
         progress=progress,
     )
 
 
-def _near(prior: Splats, size: int | None, up: Up, seed: int, progress: Progress) -> Cameras | None:
+def pool_times(count: float) -> float:
+    """How many times the usual views are made for a scene of `count` Gaussians in tiles."""
+    return max(1.0, count / _POOL_GAUSSIANS)
+
+
+def _near(
+    prior: Splats, size: int | None, up: Up, seed: int, progress: Progress, represents: float
+) -> Cameras | None:
     """Views of another kind beside those that were given; None where the scene has no place for any."""
     from g2ard.errors import InputError
 
     try:
-        apart = _planned(prior, _APART, up, seed, progress).apart
+        apart = _planned(prior, _APART, up, seed, progress, represents=represents).apart
     except InputError:
         return None
     return apart and apart.resized(size)

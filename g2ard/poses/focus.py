@@ -41,6 +41,9 @@ _GOOD = ((0.8, 0.3), (0.7, 0.2), (0.5, 0.1))
 """Least share of the image that the scene covers, and that something fine does: of good poses first, then of
 worse ones where those are too few."""
 
+_COARSEST = 0.9
+"""Quantile of the angular sizes of what is seen that `Focus.coarse` is: one part in ten may be fog."""
+
 _PITCHES = (-35.0, 20.0)
 """Degrees above the horizon of the gazes tried."""
 
@@ -68,7 +71,7 @@ class Focus:
 class Glance:
     """Small renders of a sample of a scene, sky and floaters included, that tell what is in focus."""
 
-    def __init__(self, splats: Splats) -> None:
+    def __init__(self, splats: Splats, represents: float = 1.0) -> None:
         rows = np.flatnonzero(splats.opacities > 1 / 255)
         some = rows[canonical_order(splats, rows)[:_ROWS]]
         sample = splats.take(some[splats.take(some).finite_rows()])
@@ -76,7 +79,7 @@ class Glance:
         self._sigma = np.sqrt(scales[:, 1] * scales[:, 2])
         self._middle = sample.offset + np.median(sample.means.astype(np.float64), axis=0)
         means = sample.means.astype(np.float64) + sample.offset - self._middle
-        widen = min(_MOST_WIDENED, np.sqrt(len(rows) / max(1, len(some))))
+        widen = min(_MOST_WIDENED, np.sqrt(represents * len(rows) / max(1, len(some))))
         shortest = np.arange(3) == np.argmin(sample.scales, axis=1)[:, None]
         logs = np.log(np.maximum(sample.scales, np.finfo(np.float32).tiny))
         self._means = means
@@ -111,7 +114,7 @@ class Glance:
             if seen.any():
                 angle = self._sigma[seen] / np.maximum(depth[seen], np.finfo(float).tiny)
                 fine = weight[seen][angle < _FINE].sum() / pixels
-                figures[1:, i] = fine, quantile(angle, weight[seen], 0.9)
+                figures[1:, i] = fine, quantile(angle, weight[seen], _COARSEST)
             tell(i + 1, len(here))
         return Focus(*figures)
 

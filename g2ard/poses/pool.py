@@ -43,6 +43,9 @@ _POINTS = 4096
 _FOV, _FOV_INSIDE = 50.0, 70.0
 """Degrees: within rooms people take wider lenses."""
 
+_MOSTLY_INSIDE = 0.5
+"""Share of a pool within rooms above which all of it has that lens."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pool:
@@ -81,6 +84,7 @@ def plan_pool(
     grow: float = 1.0,
     near: float = 0.0,
     looks: bool = False,
+    represents: float = 1.0,
     progress: Progress = silent,
 ) -> Pool:
     """As `make_pool` (see there for all but the result), and what was found out about the scene.
@@ -88,7 +92,8 @@ def plan_pool(
     `apart` asks for so many views of another kind, at most. `count` is for views that hold the whole scene:
     where they hold a share h of it there are 1/√h times as many, at most `grow` times. A part of them, at
     most `near`, steps nearer to what the others see, as far as those show matter under a pixel only; in a
-    pool for `looks`, which weigh and do not teach, near·(1 − h) of them do.
+    pool for `looks`, which weigh and do not teach, near·(1 − h) of them do. `splats` may be a fair sample of
+    the scene, of which every row `represents` so many.
 
     Raises:
         InputError: as `make_pool`.
@@ -101,16 +106,16 @@ def plan_pool(
     if kind not in KINDS:
         raise InputError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
     progress("scene", 0, 1)
-    site = Site.of(splats, up, rows)
+    site = Site.of(splats, up, rows, represents)
     progress("scene", 1, 1)
     tell = counter(progress, "poses")
     inside = find_inside(site, seed) if kind == "auto" else None
-    if inside is not None and fov is None and inside.weight > 0.5:
+    if inside is not None and fov is None and inside.weight > _MOSTLY_INSIDE:
         lens = _lens(size, _FOV_INSIDE)
 
     def plan(count: int) -> tuple[Poses, list[str], str]:
         if inside is not None:
-            return plan_auto(site, splats, inside, count, lens, seed, tell)
+            return plan_auto(site, lambda: Glance(splats, represents), inside, count, lens, seed, tell)
         return _planned(site, splats, kind, count, lens, seed, tell), [kind], "as asked"
 
     poses, used, why = plan(count)

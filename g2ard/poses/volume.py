@@ -78,10 +78,11 @@ class OccupiedVolume:
     represents: float = 1.0
 
     @classmethod
-    def of(cls, splats: Splats, limit: int | None = None) -> OccupiedVolume:
+    def of(cls, splats: Splats, limit: int | None = None, represents: float = 1.0) -> OccupiedVolume:
         """Weigh a scene's rows, leave out what is invisible or far off, and normalise the rest.
 
-        Of more than `limit` rows only a fair sample is looked at.
+        Of more than `limit` rows only a fair sample is looked at; the scene itself may be one, of which every
+        row represents so many.
 
         Raises:
             InputError: nothing is visible.
@@ -90,7 +91,7 @@ class OccupiedVolume:
         rows = np.flatnonzero(opacities > 1 / 255)
         visible = len(rows)
         rows = rows[canonical_order(splats, rows)[:limit]]
-        represents = visible / max(1, len(rows))
+        represents *= visible / max(1, len(rows))
         if len(rows):
             rows = rows[splats.take(rows).finite_rows()]
         opacities = opacities[rows]
@@ -100,7 +101,9 @@ class OccupiedVolume:
         scales = np.take_along_axis(scales, order, axis=1).astype(np.float64)
         areas = scales[:, 1] * scales[:, 2]
         if not (areas > 0).any():
-            raise InputError("the scene has nothing to look at: no visible Gaussian with a surface")
+            raise InputError(
+                "the scene has nothing to look at: no visible Gaussian with a surface; give views of it"
+            )
         weights = opacities * np.minimum(areas / middle(areas[areas > 0]), _WIDEST)
         near = _near(means, opacities)
         origin, size = _frame(means[near][:_SAMPLE], weights[near][:_SAMPLE], scales[near][:_SAMPLE])

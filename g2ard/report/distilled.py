@@ -10,6 +10,7 @@ import numpy as np
 
 from g2ard.errors import InputError
 from g2ard.images import to_bytes
+from g2ard.progress import plural
 from g2ard.report.charts import Point, chart
 from g2ard.report.page import Comparison, Page, Shown, legend
 from g2ard.report.window import Crop
@@ -54,7 +55,7 @@ def distill_report(
     """
     check_crops(crops, targets.cameras.names)
     against = report["against"]
-    page = Page(title, f"{len(targets.cameras)} unseen views against {against}")
+    page = Page(title, f"{plural(len(targets.cameras), 'unseen view')} against {against}")
     scores, seconds = report["scores"], report["seconds"]
     names = [name for name, _ in scenes]
     took = [seconds["simplify"], seconds["simplify"] + seconds["recover"]]
@@ -63,7 +64,7 @@ def distill_report(
     apart = report.get("apart")
     near = ["PSNR near", "SSIM near"] if apart else []
     page.table(
-        ["scene", "Gaussians", "MB", "PSNR", "SSIM", *near, "seconds"],
+        ["scene", "Gaussians", "MB as .ply", "PSNR", "SSIM", *near, "seconds"],
         [
             [
                 name,
@@ -79,12 +80,14 @@ def distill_report(
         set(),
     )
     page.paragraph(
-        f"From {report['input_count']:,} Gaussians ({report['bytes']['input'] / 1e6:.2f} MB). "
-        f"Regularisers: {report['preset']}."
+        f"From {plural(report['input_count'], 'Gaussian')} "
+        f"({report['bytes']['input'] / 1e6:.2f} MB as .ply). Regularisers: {report['preset']}."
     )
     if apart:
         count = len(apart[names[-1]]["views"])
-        page.paragraph(f"Near: {count} views of another kind, nearer, that recovery did not learn from.")
+        page.paragraph(
+            f"Near: {plural(count, 'view')} of another kind, nearer, that recovery did not learn from."
+        )
     for line in told:
         page.paragraph(line)
     page.heading("Worst views first")
@@ -113,7 +116,9 @@ def check_crops(crops: Sequence[Crop], names: Sequence[str]) -> None:
     for crop in crops:
         if crop.view is not None and crop.view not in names:
             few = ", ".join(names[:4]) + (", …" if len(names) > 4 else "")
-            raise InputError(f"crop {crop.view}: not among the {len(names)} views that are scored ({few})")
+            raise InputError(
+                f"crop {crop.view}: not among the {plural(len(names), 'view')} that are scored ({few})"
+            )
 
 
 def _error_charts(

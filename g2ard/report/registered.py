@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.images import load_image, to_bytes
+from g2ard.progress import plural
 from g2ard.report.page import Comparison, Page, Shown
 from g2ard.splats import Splats
 from g2ard.stages.render import Renderer
@@ -47,7 +48,7 @@ def registration_report(
         background: RGB behind the scene.
         size: pixels of the longer side of the pictures.
     """
-    page = Page(title, f"{len(photos)} photos against {len(scene):,} Gaussians")
+    page = Page(title, f"{plural(len(photos), 'photo')} against {plural(len(scene), 'Gaussian')}")
     for line in told:
         page.paragraph(line)
     page.table(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 from g2ard.errors import InputError
 
@@ -65,6 +65,10 @@ class Crop:
         except ValueError:
             raise InputError(f"crop {text!r}: expected [VIEW:]LEFT,TOP,WIDTH,HEIGHT") from None
         return cls(Window(left, top, width, height), view or None)
+
+    def __str__(self) -> str:
+        at = ",".join(str(value) for value in astuple(self.window))
+        return at if self.view is None else f"{self.view}:{at}"
 
 
 def _span(start: float, extent: float, size: int) -> slice:

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io import kind
-from g2ard.io.clean import Tally, plural
+from g2ard.io.clean import Tally
 from g2ard.io.point_stream import open_point_stream
 from g2ard.io.stream import SceneStream, open_stream
 from g2ard.io.types import Note
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig
 from g2ard.tiles.cells import Points
 from g2ard.tiles.journal import JOURNAL, POINTS, Journal, clear, is_ours

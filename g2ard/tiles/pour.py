@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import OutputError
-from g2ard.io.clean import plural
 from g2ard.io.types import Note
-from g2ard.progress import Progress, Say
+from g2ard.progress import Progress, Say, plural
 from g2ard.tiles.cells import Cell, Points, Sampler, cut_cells, margin_of
 from g2ard.tiles.journal import Journal, clear
 from g2ard.tiles.store import tile_name

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
+from g2ard.choices import AdaptSchedule
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
@@ -20,6 +21,7 @@ from g2ard.cli.options import (
     TeacherOption,
     trained_on,
 )
+from g2ard.progress import plural
 
 
 @command("adapt", example="g2ard adapt small.ply --views winter/ -o winter.ply", constants=True)
@@ -33,7 +35,7 @@ def adapt(
     tolerance: Annotated[
         float, typer.Option(min=0, help="Stop when a stretch gains less, dB; 0 takes all steps.")
     ] = 0.05,
-    schedule: Annotated[Literal["default", "paper"], typer.Option(help="Rates and decay.")] = "default",
+    schedule: Annotated[AdaptSchedule, typer.Option(help="Rates and decay.")] = "default",
     prior_views: Annotated[
         float | None,
         typer.Option(
@@ -57,7 +59,9 @@ def adapt(
     from g2ard.stages.recover.schedule import schedule_named
 
     if schedule == "paper" and prior_views:
-        raise typer.BadParameter("--prior-views: the paper's schedule takes the fit as it is")
+        raise typer.BadParameter(
+            "--prior-views: the paper's schedule takes the fit as it is; leave one of them out"
+        )
     recovery = appearance_only(schedule_named(schedule))
     config = AdaptConfig(
         steps=steps,
@@ -84,7 +88,7 @@ def adapt(
         write_splats(output, result.splats, overwrite=run.overwrite)
     gain, end = result.report.psnr, "converged" if result.report.converged else "all steps taken"
     run.say(
-        f"{output}: {len(splats):,} Gaussians, {result.report.steps:,} steps ({end}), "
+        f"{output}: {plural(len(splats), 'Gaussian')}, {plural(result.report.steps, 'step')} ({end}), "
         f"{trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB"
     )
     constants = listed({"adapt": config}, run.config)

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import SceneArgument
+from g2ard.cli.options import SceneArgument, picture
+from g2ard.progress import plural
 
 
 @command("clean", example="g2ard clean garden.ply -o garden_clean.ply --preview found.png")
@@ -24,7 +25,9 @@ def clean(
     ] = None,
     preview: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.png", help="A picture with what would go painted by its kind."),
+        typer.Option(
+            parser=picture, metavar="FILE.png", help="A picture with what would go painted by its kind."
+        ),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say and show it, write no scene.")] = False,
 ) -> None:
@@ -44,7 +47,7 @@ def clean(
         raise typer.BadParameter(f"--only: {', '.join(KINDS)}, not {wrong[0]!r}")
     if output is None and not dry_run:
         raise typer.BadParameter("name an output with -o, or ask with --dry-run")
-    if output is not None:
+    if output is not None and not dry_run:
         io.check_scene_output(output, run.overwrite)
     if preview is not None:
         if preview.resolve() in {path.resolve() for path in (scene, output) if path}:
@@ -54,11 +57,12 @@ def clean(
     found, cameras = clutter_seen(splats, kinds, seed=run.seed, progress=run.progress, say=run.say)
     if preview is not None:
         paint_clutter(preview, splats, found, cameras, run.overwrite)
+        run.kept.append(f"{preview} is written")
         run.say(f"picture: {preview}")
     kept = int(found.keep.sum())
     if not dry_run and output is not None:
         if not kept:
             raise InputError(f"{scene}: nothing would be left; look at it with --dry-run --preview")
         io.write_splats(output, splats.take(found.keep), overwrite=run.overwrite)
-        run.say(f"{output}: {kept:,} Gaussians")
+        run.say(f"{output}: {plural(kept, 'Gaussian')}")
     run.result({"input_count": len(splats), "output_count": kept, "found": found.counts})

@@ -18,13 +18,19 @@ if TYPE_CHECKING:
 @command("convert", example="g2ard convert room.ply tree.spz --box -2,-2,-2,2,2,2 both.sog")
 def convert(
     run: Run,
-    scenes: Annotated[list[Path], typer.Argument(metavar="SCENE…", help="What to read; several are merged.")],
-    output: Annotated[
-        Path,
-        typer.Argument(
-            metavar="OUT", help=".ply, .compressed.ply, .sog, .spz, .glb, .splat or NAME/meta.json."
-        ),
+    scenes: Annotated[
+        list[Path],
+        typer.Argument(metavar="SCENE… OUT", help="What to read, several are merged; and the result, or -o."),
     ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="OUT",
+            help=".ply, .compressed.ply, .sog, .spz, .glb, .splat or NAME/meta.json; all else is then read.",
+        ),
+    ] = None,
     box: Annotated[
         str | None,
         typer.Option(metavar="X,Y,Z,X,Y,Z", help="Keep what lies between two corners, scene units."),
@@ -58,6 +64,7 @@ def convert(
     from g2ard.transform import in_box, in_sphere, merge
     from g2ard.transform import transform as moved
 
+    scenes, output = _parted(run, scenes, output)
     options: dict[str, Any] = {} if spz_version is None else {"version": spz_version}
     corners = None if box is None else numbers("--box", box, 6)
     ball = None if sphere is None else numbers("--sphere", sphere, 4)
@@ -83,6 +90,17 @@ def convert(
     what = "Gaussian" if kept == "1" else "Gaussians"
     run.say(f"{output}: {kept} {what}, {size / 1e6:.2f} MB, {size / len(splats):.1f} bytes each")
     run.result({"output": str(output), "input_count": read, "output_count": len(splats), "bytes": size})
+
+
+def _parted(run: Run, paths: list[Path], output: Path | None) -> tuple[list[Path], Path]:
+    """What is read, and where the result goes: the last of the paths where no option says so."""
+    if output is not None:
+        return paths, output
+    *scenes, output = paths
+    if not scenes:
+        raise typer.BadParameter("name what to read and where it goes: SCENE… OUT, or SCENE… -o OUT")
+    run.reads(scenes, output)
+    return scenes, output
 
 
 def _check_left(splats: Splats, read: int) -> None:

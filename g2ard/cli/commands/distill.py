@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.choices import Method, ScheduleName
 from g2ard.cli.budget_options import (
     Count,
     CountsOption,
@@ -23,13 +24,11 @@ from g2ard.cli.options import (
     BackgroundOption,
     CropOption,
     FormatOption,
-    Method,
     PolicyOption,
     PresetOption,
+    RecoveryTimeOption,
     ResumeOption,
-    ScheduleName,
     SizeOption,
-    TimeLimitOption,
     UpOption,
     ViewsOrMadeOption,
     can_judge,
@@ -41,7 +40,6 @@ from g2ard.cli.options import (
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_folder import (
     KEPT,
-    REPORT,
     WORK,
     check_place,
     drop_older,
@@ -49,8 +47,19 @@ from g2ard.cli.run_folder import (
     tell_anew,
     tell_finished,
     work_folder,
+    write_report,
 )
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
+from g2ard.cli.tile_options import (
+    MemoryOption,
+    SchedulerOption,
+    TileRowsOption,
+    WorkersOption,
+    WorkOption,
+    tiling_of,
+)
+from g2ard.cli.tiled import TiledCommand
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.pipeline import Distilled
@@ -119,7 +128,7 @@ def distill(
         ScheduleName, typer.Option(help="Recovery; paper also goes round by round.")
     ] = "default",
     steps: Annotated[int | None, typer.Option(min=1, help="Overrides the final horizon.")] = None,
-    time_limit: TimeLimitOption = None,
+    recovery_time: RecoveryTimeOption = None,
     sh_degree: Annotated[
         int | None,
         typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own, 3 from a cloud."),
@@ -146,10 +155,16 @@ def distill(
         bool,
         typer.Option("--dry-run", help="Tell about how long it will take, and what memory; write nothing."),
     ] = False,
+    tile_rows: TileRowsOption = None,
+    memory: MemoryOption = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    work: WorkOption = None,
 ) -> None:
     """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget.
 
     Views are those of --views, else the cameras that lie beside the scene, else a pool of poses of its own.
+    A scene larger than memory, or a folder of tiles, is distilled tile by tile.
     """
     from g2ard.pipeline import DistillConfig
     from g2ard.stages.lift import LiftConfig
@@ -166,20 +181,23 @@ def distill(
         raise typer.BadParameter("--photos: views that are made have none")
     from g2ard.io import kind
     from g2ard.policy.distill import prepare
+    from g2ard.policy.distill_options import DistillOptions
+    from g2ard.policy.tiled import is_tiled
     from g2ard.report.distilled import check_crops
 
     began = time.monotonic()
-    one_horizon(steps, time_limit, values)
+    one_horizon(steps, recovery_time, values)
     engine = recovery_engine(run)
     name = f"scene.{format}"
     outputs = Outputs(run, output, budgets)
 
     def check(folder: Path, budget: Budget) -> None:
-        check_place(run, folder / name, budget, given, resume)
+        if not dry_run:
+            check_place(run, folder / name, budget, given, resume)
 
     outputs.check(check)
     early = [folder / name for folder in outputs.paths()]
-    if early and all(is_done(run, place, resume) for place in early):
+    if early and not dry_run and all(is_done(run, place, resume) for place in early):
         _tell_all(run, [tell_finished(run, place) for place in early])
         return
     if scene is not None and kind(scene) == "views":
@@ -188,9 +206,7 @@ def distill(
         )
     if scene is not None and kind(scene) != "splats" and not given:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
-    job = prepare(
-        scene,
-        budgets,
+    options = DistillOptions(
         format=format,
         clean=clean,
         views=views,
@@ -204,7 +220,7 @@ def distill(
         preset=preset,
         schedule=schedule,
         steps=steps,
-        time_limit=time_limit,
+        recovery_time=recovery_time,
         sh_degree=sh_degree,
         size=size,
         background=background or (0.0, 0.0, 0.0),
@@ -212,11 +228,22 @@ def distill(
         up=up,
         seed=run.seed,
         engine=engine,
+    )
+    tiling = tiling_of(run, output / "scene", tile_rows, memory, workers, scheduler, work)
+    if scene is not None and is_tiled(scene, tiling):
+        if dry_run:
+            raise typer.BadParameter("--dry-run: not in tiles; --tile-rows above the count avoids them")
+        TiledCommand(run, scene, outputs, tiling, budgets).distill(options, name)
+        return
+    job = prepare(
+        scene,
+        budgets,
+        options,
+        counted=lambda total: outputs.check(check, total),
         progress=run.progress,
         say=run.say,
     )
     check_crops(crop or [], job.views.test.names)
-    outputs.check(check, len(job.prior))
     places = [folder / name for folder in outputs.paths(len(job.prior))]
     if dry_run:
         _tell_estimates(run, job, [place.parent for place in places])
@@ -234,7 +261,8 @@ def distill(
             run, scene or Path(str(views)), job, aim.count, place, resume, keep, view, crop or [], began
         )
         reports.append(report)
-        run.kept.append(f"{place.parent} is finished")
+        others = " (--resume makes the others)" if len(places) > 1 else ""
+        run.kept.append(f"{place.parent} is finished{others}")
         began = time.monotonic()
     _tell_all(run, reports)
     if len(finished) < len(places):
@@ -256,8 +284,8 @@ def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[Path]) -> None:
         one = estimate(job, budget)
         parts = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in one.seconds.items())
         run.say(
-            f"{folder}: {budget:,} Gaussians, {one.views} views of {one.pixels:,} pixels, "
-            f"{one.steps:,} steps: about {one.total:.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
+            f"{folder}: {plural(budget, 'Gaussian')}, {plural(one.views, 'view')} of {one.pixels:,} pixels, "
+            f"{plural(one.steps, 'step')}: about {one.total:.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
         )
         found.append(one)
         told.append({"output": str(folder), "count": budget, **asdict(one), "total_seconds": one.total})
@@ -325,10 +353,8 @@ def _write(
     run: Run, place: Path, result: Distilled, unseen: Targets, colour: Colour, report: dict[str, Any]
 ) -> None:
     """The picture, the scene and, last, what is said of both."""
-    import json
 
     from g2ard.io import write_splats
-    from g2ard.io.atomic import atomic_output
     from g2ard.preview import preview
 
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
@@ -336,8 +362,7 @@ def _write(
     write_splats(place, result.splats, overwrite=True)
     drop_older(place)
     report["bytes"]["file"] = place.stat().st_size
-    with atomic_output(place.parent / REPORT, overwrite=True) as temporary:
-        temporary.write_text(json.dumps({**report, "config": run.config}, indent=2, default=str) + "\n")
+    write_report(place.parent, {**report, "config": run.config})
 
 
 def _view(place: Path, scene: Splats | None, job: DistillJob, report: dict[str, Any]) -> str | None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
+from g2ard.choices import LpipsInput
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
@@ -18,6 +19,7 @@ from g2ard.cli.options import (
     can_be_made,
     views_or_teacher,
 )
+from g2ard.progress import plural
 
 
 @command("evaluate", example="g2ard evaluate small.ply --views poses.json --teacher scene.ply --json -")
@@ -38,7 +40,7 @@ def evaluate(
         Path | None, typer.Option(metavar="DIR", help="Weights of LPIPS; without them it is absent.")
     ] = None,
     lpips_input: Annotated[
-        Literal["scaled", "unscaled"],
+        LpipsInput,
         typer.Option(help="Images in [-1, 1], LPIPS's own, or in [0, 1] as 3DGS's evaluation feeds them."),
     ] = "scaled",
     convention: ConventionOption = "gsplat",
@@ -54,7 +56,7 @@ def evaluate(
     3DGS's own evaluation is --convention inria --8bit --lpips-input unscaled.
     """
     from g2ard.errors import InputError
-    from g2ard.io.clean import plural
+    from g2ard.io.describe import bytes_of
     from g2ard.lpips import load_lpips
     from g2ard.policy.inputs import load_scene, load_views, make_targets
     from g2ard.stages.evaluate import evaluate as score
@@ -89,10 +91,12 @@ def evaluate(
             stage=path.name,
         )
         row = {"scene": str(path), **scored.as_dict(), "drift95": None, "needle": needle(splats.scales)}
-        row["file_bytes"] = path.stat().st_size if path.is_file() else None
+        row["file_bytes"] = bytes_of(path)
         if frozen is not None:
             if len(frozen) != len(splats):
-                raise InputError(f"{anchors}: {len(frozen)} Gaussians, {path} has {len(splats)}")
+                raise InputError(
+                    f"{anchors}: not the Gaussians of {path} before recovery: their counts differ"
+                )
             row["drift95"] = drift95(Anchors.of(frozen), splats.means)
         rows.append(row)
     against = _against(rows[0]["views"])
@@ -115,7 +119,7 @@ def _against(views: list[dict[str, Any]]) -> dict[str, int]:
 def _named(against: dict[str, int]) -> str:
     if len(against) == 1:
         return "photos" if "photo" in against else "the teacher"
-    return f"{against['photo']} photos and {against['teacher']} renders of the teacher"
+    return f"{plural(against['photo'], 'photo')} and {plural(against['teacher'], 'render')} of the teacher"
 
 
 def _protocol(convention: str, eight_bit: bool) -> str:
@@ -126,12 +130,21 @@ def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
     drifts = any(r["drift95"] is not None for r in rows)
     run.console.table(
         title,
-        ["scene", "Gaussians", "MB", "PSNR", "SSIM", "LPIPS", "needle", *(["Drift95"] if drifts else [])],
+        [
+            "scene",
+            "Gaussians",
+            "file MB",
+            "PSNR",
+            "SSIM",
+            "LPIPS",
+            "needle",
+            *(["Drift95"] if drifts else []),
+        ],
         [
             [
                 Path(r["scene"]).name,
                 f"{r['count']:,}",
-                f"{r['bytes'] / 1e6:.2f}",
+                f"{r['file_bytes'] / 1e6:.2f}",
                 f"{r['psnr']:.2f}",
                 f"{r['ssim']:.4f}",
                 " ".join(f"{net} {value:.4f}" for net, value in (r["lpips"] or {}).items()) or "–",

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from g2ard.cli.frame import Run, command
+from g2ard.progress import plural
 
 
 @command("info", example="g2ard info scene.ply --json -")
@@ -56,7 +57,7 @@ def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
     figures, report = describe(scene), read_json(told)
     scores = {name: {k: found[k] for k in ("psnr", "ssim")} for name, found in report["scores"].items()}
     figures["run"] = {"input_count": report["input_count"], "against": report["against"], "scores": scores}
-    rows = [["made from", f"{report['input_count']:,} Gaussians"]]
+    rows = [["made from", plural(report["input_count"], "Gaussian")]]
     rows += [
         [name, f"{found['psnr']:.2f} dB, SSIM {found['ssim']:.4f} against {report['against']}"]
         for name, found in scores.items()

@@ -10,6 +10,7 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import OutputOption
 from g2ard.cli.run_result import say_weight
+from g2ard.progress import plural
 
 
 @command("lift", example="g2ard lift stadium.laz -o prior.ply")
@@ -49,7 +50,8 @@ def lift(
     io.write_splats(output, splats, overwrite=run.overwrite)
     written = time.perf_counter()
     say_weight(run, cloud, output, splats)
-    run.say(f"{output}: {len(splats):,} discs from {len(found.points):,} points in {written - began:.1f} s")
+    discs, points = plural(len(splats), "disc"), plural(len(found.points), "point")
+    run.say(f"{output}: {discs} from {points} in {written - began:.1f} s")
     run.result(
         {
             "input_count": len(found.points),

@@ -10,6 +10,7 @@ import typer
 from g2ard.cli.budget_options import Ratios
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import BackgroundOption, ResumeOption, SizeOption, UpOption, ViewsOrMadeOption
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.policy.levels import Levels
@@ -105,7 +106,7 @@ def _tell(run: Run, output: Path, levels: Levels, size: int) -> None:
             if psnr is not None
         ]
         told = f" ({', '.join(figures)}, in unseen views of {report.size} pixels)" if figures else ""
-        run.say(f"level {number}: {report.count:,} Gaussians{told}")
-    run.say(f"{output}: {len(levels.reports)} levels, {size / 1e6:.2f} MB")
+        run.say(f"level {number}: {plural(report.count, 'Gaussian')}{told}")
+    run.say(f"{output}: {plural(len(levels.reports), 'level')}, {size / 1e6:.2f} MB")
     result: dict[str, Any] = {"output": str(output), "bytes": size}
     run.result({**result, "levels": [report.as_dict() for report in levels.reports]})

@@ -9,12 +9,16 @@ import typer
 
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import OutputOption, SceneArgument, UpOption
+from g2ard.progress import plural
 
 _KINDS = ("auto", "orbit", "walk", "aerial", "inside", "focus")
 
 
 class _Size(tuple[int, int]):
     """Width and height in one argument (see `g2ard.cli.options.Triple`)."""
+
+    def __str__(self) -> str:
+        return f"{self[0]}x{self[1]}"
 
 
 def _size(text: str) -> _Size:
@@ -56,7 +60,6 @@ def poses(
 ) -> None:
     """Make a pool of candidate views for a scene without photos: poses in free space that see it well."""
     from g2ard.io import check_views_output, write_views
-    from g2ard.io.clean import plural
     from g2ard.policy.inputs import load_scene
     from g2ard.poses import plan_pool
     from g2ard.splits import splits_of

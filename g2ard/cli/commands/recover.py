@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from g2ard.choices import ScheduleName
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
     OutputOption,
     PresetOption,
+    RecoveryTimeOption,
     ResumeOption,
-    ScheduleName,
     ShDegreeOption,
     SizeOption,
     SplitOption,
     TeacherOption,
-    TimeLimitOption,
     ViewsOrMadeOption,
     can_be_made,
     one_horizon,
@@ -27,6 +27,7 @@ from g2ard.cli.options import (
     trained_on,
     views_or_teacher,
 )
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.splats import Splats
@@ -59,7 +60,7 @@ def recover(
     preset: PresetOption = "auto",
     schedule: Annotated[ScheduleName, typer.Option(help="Rates, decay and horizon.")] = "default",
     steps: Annotated[int | None, typer.Option(min=1, help="Overrides the schedule's horizon.")] = None,
-    time_limit: TimeLimitOption = None,
+    recovery_time: RecoveryTimeOption = None,
     sh_degree: ShDegreeOption = None,
     resume: ResumeOption = False,
     split: SplitOption = "train",
@@ -73,7 +74,6 @@ def recover(
     from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
-    from g2ard.io.clean import plural
     from g2ard.policy.inputs import (
         load_scene,
         load_trained,
@@ -87,7 +87,7 @@ def recover(
     from g2ard.targets import kinds_of
 
     values = run.constants(recover=RecoverConfig())
-    one_horizon(steps, time_limit, values)
+    one_horizon(steps, recovery_time, values)
     if photos and teacher is None:
         raise typer.BadParameter("--photos goes with --teacher: without a teacher all targets are photos")
     can_be_made(views, teacher)
@@ -115,7 +115,7 @@ def recover(
     config = RecoverConfig(
         schedule=schedule_named(schedule),
         steps=steps,
-        time_limit=time_limit,
+        recovery_time=recovery_time,
         regularizers=regularizers,
         sh_degree=sh_degree,
         background=colour,
@@ -139,10 +139,8 @@ def recover(
         run.say(told)
     if run.verbose and (told := unregularized(result.report)) is not None:
         run.say(told)
-    gain = result.report.psnr
-    run.say(
-        f"{output}: {len(splats):,} Gaussians, {trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB"
-    )
+    gain, count = result.report.psnr, plural(len(splats), "Gaussian")
+    run.say(f"{output}: {count}, {trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB")
     used = replace(config, schedule=replace(config.schedule, steps=config.steps or config.schedule.steps))
     report = {**result.report.as_dict(), "preset": why, "prior": measured.as_dict()}
     report["constants"] = listed({"recover": used}, run.config)
@@ -162,7 +160,7 @@ def _anchors(run: Run, path: Path, student: Splats, in_plane: float) -> Anchors:
     scene = load_scene(path, run.say)
     if len(scene) != len(student):
         raise InputError(
-            f"{path}: {len(scene)} Gaussians, the student has {len(student)}; anchors are the student "
-            "as it was simplified, before any recovery"
+            f"{path}: {plural(len(scene), 'Gaussian')}, the student has {len(student):,}; anchors are the "
+            "student as it was simplified, before any recovery"
         )
     return Anchors.of(scene.recentred(student.offset), in_plane)

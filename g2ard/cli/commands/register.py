@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from g2ard.choices import Refinement
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import BackgroundOption, OutputOption, SceneArgument
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.stages.register.score import Accuracy, Summary
@@ -61,7 +63,7 @@ def register(
         ),
     ] = "auto",
     refine: Annotated[
-        Literal["auto", "none", "photometric"],
+        Refinement,
         typer.Option(help="A pose from features as it is, aligned, or the mean of both by information."),
     ] = "auto",
     passes: Annotated[int, typer.Option(min=1, help="Renders to match with, at most.")] = 3,
@@ -104,7 +106,7 @@ def register(
     if metres_per_unit is not None and truth is None:
         raise typer.BadParameter("--metres-per-unit goes with --truth")
     if intrinsics is not None and focal is not None:
-        raise typer.BadParameter("--intrinsics and --focal exclude each other")
+        raise typer.BadParameter("--intrinsics and --focal exclude each other; give one")
     check_output(output, run.overwrite)
     if report is not None:
         if report.resolve() in {p.resolve() for p in (output, scene, poses, truth, intrinsics, photos) if p}:
@@ -154,15 +156,15 @@ def register(
     )
     if not len(found.cameras):
         first = next(row for row in rows if row.status != "registered")
-        raise InputError(f"none of {len(rows)} photos was registered; {first.name}: {first.reason}")
-    run.say(f"{output}: {len(found.cameras)} of {len(rows)} photos")
+        raise InputError(f"none of {plural(len(rows), 'photo')} was registered; {first.name}: {first.reason}")
+    run.say(f"{output}: {len(found.cameras)} of {plural(len(rows), 'photo')}")
 
 
 def _told(summary: Summary) -> list[str]:
     counts = f"{summary.registered} registered, {summary.uncertain} uncertain, {summary.refused} refused"
     scored = (("started from", summary.start), ("found", summary.found))
     return [
-        f"{summary.photos} photos: {counts}",
+        f"{plural(summary.photos, 'photo')}: {counts}",
         *(f"{words}: {_said(accuracy, summary)}" for words, accuracy in scored if accuracy is not None),
     ]
 

@@ -9,18 +9,20 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from g2ard.cli.budget_options import Count, CountOption, RatioOption, one_budget
+from g2ard.choices import Method
+from g2ard.cli.budget_options import Count, LooksOption, RatioOption, one_budget
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
     ConventionOption,
-    Method,
     SceneArgument,
     SizeOption,
     SplitOption,
     ViewsOrMadeOption,
     is_made,
+    picture,
 )
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,14 +42,15 @@ def render(
     ] = None,
     views: ViewsOrMadeOption = None,
     sheet: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="All views on one picture, for a look.")
+        Path | None,
+        typer.Option(parser=picture, metavar="FILE.png", help="All views on one picture, for a look."),
     ] = None,
     depth: Annotated[bool, typer.Option("--depth", help="Also write NAME.depth.npy, scene units.")] = False,
     color: Annotated[
         Color,
         typer.Option(help="What simplification to -n or -r sees: protection flags, cells, where rows went."),
     ] = "scene",
-    count: CountOption = None,
+    count: LooksOption = None,
     ratio: RatioOption = None,
     method: Annotated[Method, typer.Option(help="Of --color parents, without views.")] = "default",
     parents: Annotated[
@@ -64,18 +67,13 @@ def render(
 
     from g2ard.images import write_png
     from g2ard.io.atomic import check_output
-    from g2ard.io.clean import plural
     from g2ard.policy.inputs import load_scene, load_views
     from g2ard.policy.views import views_or_pool
     from g2ard.stages.render import RasterSettings, Renderer
 
     if output is None and sheet is None:
         raise typer.BadParameter("give -o DIR, --sheet FILE.png or both")
-    looks = count if color == "scene" and ratio is None else None
-    if looks is None:
-        _check(color, count, ratio, parents)
-    elif parents is not None or looks.is_share or (views is not None and not is_made(views)):
-        raise typer.BadParameter("-n: how many views to make, where none are given")
+    looks = _looks(color, count, ratio, parents, views)
     if output is not None:
         check_output(output, run.overwrite, folder=True)
     if sheet is not None:
@@ -88,7 +86,7 @@ def render(
         splats,
         "made" if looks is not None else views,
         beside=scene,
-        count=None if looks is None else int(looks.value),
+        count=looks,
         seed=run.seed,
         progress=run.progress,
         say=run.say,
@@ -139,6 +137,20 @@ def _write_sheet(
     write_png(path, contact_sheet(rows, [""] * columns, row_labels=captions), overwrite=overwrite)
 
 
+def _looks(
+    color: Color, count: Count | None, ratio: float | None, parents: Path | None, views: Path | None
+) -> int | None:
+    """Usage check: how many views are to be made, where -n says so and is no budget."""
+    if color != "scene" or ratio is not None or count is None:
+        _check(color, count, ratio, parents)
+        return None
+    if parents is not None or count.is_share or (views is not None and not is_made(views)):
+        raise typer.BadParameter(
+            "-n: a number of views to make, where none are given; a budget goes with --color flags or cells"
+        )
+    return int(count.value)
+
+
 def _check(color: Color, count: Count | None, ratio: float | None, parents: Path | None) -> None:
     """Usage check: a budget where it decides something, and nothing that would be ignored."""
     if parents is not None and color != "parents":
@@ -159,7 +171,8 @@ def _painted(
         assert budget is not None  # _check has seen to it
         flags = flag(splats, budget, progress=run.progress)
         run.say(
-            f"flags: {flags.mean():.1%} of {len(splats):,} Gaussians are protected, over {budget:,} cells"
+            f"flags: {flags.mean():.1%} of {plural(len(splats), 'Gaussian')} are protected, "
+            f"over {plural(budget, 'cell')}"
         )
         return painted(splats, flag_colors(flags))
     if color == "cells":
@@ -173,7 +186,9 @@ def _painted(
         assert budget is not None
         labels = simplify(splats, budget, method=method, progress=run.progress).parents
     gone = int((labels < 0).sum())
-    run.say(f"parents: {labels.max() + 1:,} Gaussians of {len(splats):,}; {gone:,} went nowhere (black)")
+    run.say(
+        f"parents: {plural(labels.max() + 1, 'Gaussian')} of {len(splats):,}; {gone:,} went nowhere (black)"
+    )
     return painted(splats, label_colors(labels))
 
 

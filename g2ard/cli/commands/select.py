@@ -19,6 +19,7 @@ from g2ard.cli.options import (
     can_judge,
     views_count,
 )
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.io import ViewSet
@@ -47,7 +48,6 @@ def select(
     """
     from g2ard.constants import changed, listed
     from g2ard.io import check_views_output
-    from g2ard.io.clean import plural
     from g2ard.policy.inputs import load_scene, load_split_views
     from g2ard.stages.select import CoverageOptions
     from g2ard.stages.select import select as choose
@@ -76,7 +76,7 @@ def select(
         count = plural(len(chosen.refused), "view")
         run.say(f"{count} refused: nothing of the scene in sight, or within its matter")
     run.say(
-        f"{output}: {len(kept)} of {len(cameras)} views by {policy};"
+        f"{output}: {len(kept)} of {plural(len(cameras), 'view')} by {policy};"
         f" those left out would add {100 * chosen.left_out:.1f} %"
     )
     run.result(
@@ -103,7 +103,6 @@ def _write(run: Run, output: Path, pool: ViewSet, chosen: Any, weights: Any) -> 
     import numpy as np
 
     from g2ard.io import write_views
-    from g2ard.io.clean import plural
 
     kept = np.isin(np.arange(len(pool.splits)), chosen)
     held_out = [i for i, word in enumerate(pool.splits) if word not in ("train", None) and not kept[i]]

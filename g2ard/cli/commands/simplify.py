@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.choices import Method
 from g2ard.cli.budget_options import CountsOption, FitOption, MinPsnrOption, MinSsimOption, RatiosOption
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
-    Method,
     OutputOption,
     PaperOption,
     SceneArgument,
@@ -21,6 +21,16 @@ from g2ard.cli.options import (
 )
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_weight, tell_quality
+from g2ard.cli.tile_options import (
+    MemoryOption,
+    SchedulerOption,
+    TileRowsOption,
+    WorkersOption,
+    WorkOption,
+    tiling_of,
+)
+from g2ard.cli.tiled import TiledCommand
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.io import Scene
@@ -53,33 +63,47 @@ def simplify(
         typer.Option(help="Share of the Gaussians that a round keeps; the method's own if absent."),
     ] = None,
     up: UpOption = None,
+    tile_rows: TileRowsOption = None,
+    memory: MemoryOption = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    work: WorkOption = None,
 ) -> None:
     """Reduce a scene to an exact number of Gaussians; no images needed.
 
     The default method weighs errors by what is seen: from --views, else from the cameras that lie beside the
     scene, else from a pool of poses of its own. The fast one looks only at given views, the paper's at none.
+    A scene larger than memory, or a folder of tiles, is worked on tile by tile, at one exact budget.
     """
     from g2ard.stages.simplify import SimplifyConfig
 
     values = run.constants(simplify=SimplifyConfig(), over_options=True)
     budgets = budgets_of(count, ratio, fit, min_psnr, min_ssim)
     if views is not None and no_views:
-        raise typer.BadParameter("--views and --no-views exclude each other")
+        raise typer.BadParameter("--views and --no-views exclude each other; give one")
+    tiling = tiling_of(run, output, tile_rows, memory, workers, scheduler, work)
     from g2ard import io
     from g2ard.constants import changed
     from g2ard.policy.fit import aim_of
     from g2ard.policy.inputs import say_notes
     from g2ard.policy.simplify import simplify_each
+    from g2ard.policy.tiled import check_memory, is_tiled
 
     config = changed(SimplifyConfig(retention=retention), "simplify", values)
     outputs = Outputs(run, output, budgets)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite))
+    if is_tiled(scene, tiling):
+        _refuse_whole(method, parents)
+        tiled = TiledCommand(run, scene, outputs, tiling, budgets)
+        tiled.simplify(config, views, no_views, up)
+        return
     maps = None if parents is None else Outputs(run, parents, budgets, name="--parents")
     if maps is not None:
         maps.check(lambda path, _: _check_parents(run, path, scene, views))
     clock = [time.perf_counter()]
     found = io.read_scene(scene)
     say_notes(scene, found.notes, run.say)
+    check_memory(found.splats, tiling, str(scene))
     total = len(found.splats)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite), total)
     clock.append(time.perf_counter())
@@ -123,6 +147,14 @@ def simplify(
         clock = [clock[-1] - (clock[1] - clock[0]), clock[-1]]  # reading is shared
     run.result(reports[0] if len(reports) == 1 else {"runs": reports})
     tell_quality(run, aims[0], small.splats)
+
+
+def _refuse_whole(method: str, parents: Path | None) -> None:
+    """What needs the scene in one piece."""
+    if method != "default":
+        raise typer.BadParameter(f"--method {method}: not in tiles; --tile-rows above the count avoids them")
+    if parents is not None:
+        raise typer.BadParameter("--parents: not in tiles; --tile-rows above the count avoids them")
 
 
 def _report(
@@ -172,7 +204,7 @@ def _tell(run: Run, scene: Path, small: Simplified, output: Path, total: int, se
     if share >= 0.02:
         run.say(f"no view sees {share:.0%} of the Gaussians: they count by their own size alone")
     say_weight(run, scene, output, small.splats)
-    run.say(f"{output}: {len(small.splats):,} of {total:,} Gaussians in {seconds:.1f} s")
+    run.say(f"{output}: {len(small.splats):,} of {plural(total, 'Gaussian')} in {seconds:.1f} s")
 
 
 def _table(run: Run, small: Simplified) -> None:

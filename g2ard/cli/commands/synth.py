@@ -11,12 +11,16 @@ import typer
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command, group
 from g2ard.cli.options import BackgroundOption, Triple
+from g2ard.progress import plural
 
 synth = group("synth", "Make data where none is at hand.\n\nExample: g2ard synth city -o city/")
 
 
 class _Size(tuple[int, int]):
     """Width and height in one argument (see `Triple`)."""
+
+    def __str__(self) -> str:
+        return f"{self[0]}x{self[1]}"
 
 
 def _size(text: str) -> _Size:
@@ -106,5 +110,7 @@ def city(
     )
     seconds = time.monotonic() - began
     splits = ", ".join(f"{count} {name}" for name, count in manifest["views"].items())
-    run.say(f"{output}: {config.points:,} points, {splits} views of {config.size[0]}×{config.size[1]}")
+    run.say(
+        f"{output}: {plural(config.points, 'point')}, {splits} views of {config.size[0]}×{config.size[1]}"
+    )
     run.result({**manifest, "output": str(output), "seconds": seconds})

@@ -9,6 +9,7 @@ import typer
 
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import BackgroundOption, OutputOption, UpOption, ViewsOrMadeOption
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.splats import Splats
@@ -55,7 +56,7 @@ def view(
         say=run.say,
     )
     named = zip(_names(paths), loaded, strict=True)
-    labels = [f"{name}: {len(splats):,} Gaussians" for name, splats in named]
+    labels = [f"{name}: {plural(len(splats), 'Gaussian')}" for name, splats in named]
     written = write_page(
         output,
         [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],

@@ -59,6 +59,24 @@ class Regularizers:
         require("period", self.period, self.period >= 1, "at least 1")
         require("in_plane", self.in_plane, 0 < self.in_plane < float("inf"), "more than 0")
 
+    @classmethod
+    def of(cls, prior: str, *, paper: bool = False) -> Regularizers:
+        """The weights for a kind of dense scene.
+
+        Args:
+            prior: trained, lift (a cloud's, untrained), or noisy (trained, with needles).
+            paper: the row of `tab:s_recovery`, for its rates and steps.
+
+        Raises:
+            InputError: another kind.
+
+        >>> Regularizers.of("lift").anchor, Regularizers.of("lift", paper=True).anchor
+        (0.1, 0.001)
+        """
+        rows = PAPER_PRESETS if paper else PRESETS
+        require("prior", repr(prior), prior in rows, f"one of {', '.join(rows)}")
+        return rows[prior]
+
     @property
     def active(self) -> bool:
         """Whether any term has weight."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
+from g2ard.choices import Engine
 from g2ard.errors import InputError
 from g2ard.stages.recover.anchors import PRESETS, Regularizers
 from g2ard.stages.recover.schedule import TUNED, Schedule
@@ -19,7 +19,7 @@ class RecoverConfig:
     Args:
         schedule: rates, horizon and decay.
         steps: overrides the schedule's horizon.
-        time_limit: seconds; the horizon becomes what fits into them, so that the result depends on the
+        recovery_time: seconds; the horizon becomes what fits into them, so that the result depends on the
             machine's speed.
         regularizers: weights of L_anchor and L_shape (`tab:s_recovery`).
         sh_degree: of the result; None keeps the student's.
@@ -36,20 +36,20 @@ class RecoverConfig:
 
     schedule: Schedule = TUNED
     steps: int | None = None
-    time_limit: float | None = None
+    recovery_time: float | None = None
     regularizers: Regularizers = PRESETS["trained"]
     sh_degree: int | None = None
     ssim_weight: float = 0.2
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     final: bool = True
     seed: int = 0
-    engine: Literal["fused", "torch", "gsplat"] = "fused"
+    engine: Engine = "fused"
 
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 1:
             raise InputError(f"steps: expected at least 1, got {self.steps}")
-        if self.time_limit is not None and not 0 < self.time_limit < float("inf"):
-            raise InputError(f"time_limit: expected seconds, more than 0, got {self.time_limit}")
+        if self.recovery_time is not None and not 0 < self.recovery_time < float("inf"):
+            raise InputError(f"recovery_time: expected seconds, more than 0, got {self.recovery_time}")
         if not 0 <= self.ssim_weight <= 1:
             raise InputError(f"ssim_weight: expected a value in [0, 1], got {self.ssim_weight}")
 

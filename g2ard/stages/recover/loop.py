@@ -18,7 +18,7 @@ from g2ard.stages.recover import checkpoint as checkpoints
 from g2ard.stages.recover.anchors import Anchors, drift95, needle
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import drawn
-from g2ard.stages.recover.engine import Engine, engine_class
+from g2ard.stages.recover.engine import Engine, Objective, engine_class
 from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.probe import MULTIPLIERS, Probe, calm, search_multiplier, trial_steps
 from g2ard.stages.recover.schedule import multiplier_for, reach_for
@@ -55,6 +55,7 @@ class Loop:
         probe: Probe,
         guard: Guard,
         held: str | None,
+        frozen: NDArray[np.bool_] | None,
     ) -> None:
         self.targets = targets
         self.config = config
@@ -67,13 +68,14 @@ class Loop:
         self.student = student
         self.probe = probe
         self.guard = guard
+        self.frozen = frozen
         self._skipped = 0  # by engines before this one
         self.done = 0
         self.seconds = 0.0
         self.losses: list[float] = []
         self.geometry: list[dict[str, float]] = []
         self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised? → steps, seconds
-        self.key = _fingerprint(student, targets, config, weights, anchors, held)
+        self.key = _fingerprint(student, targets, config, weights, anchors, held, frozen)
 
     @cached_property
     def engine(self) -> Engine:
@@ -93,16 +95,17 @@ class Loop:
 
     def _new_engine(self, start: Splats | None = None) -> Engine:
         config, student = self.config, self.student if start is None else start
-        engine: Engine = engine_class(config.engine)(
+        objective = Objective(
             student,
             self.targets.cameras.recentred(student.offset),
-            anchors=self.anchors,
-            regularizers=config.regularizers,
-            means_in_scales=config.schedule.means_in_scales,
-            ssim_weight=config.ssim_weight,
-            background=config.background,
+            self.anchors,
+            config.regularizers,
+            config.schedule.means_in_scales,
+            config.ssim_weight,
+            config.background,
+            self.frozen,
         )
-        return engine
+        return engine_class(config.engine)(objective)
 
     def choose_rates(self, start: float) -> None:
         """The schedule's reach and multiplier, or what the start suggests, and short trials like best.
@@ -120,7 +123,7 @@ class Loop:
             self.multiplier = self.config.schedule.multiplier
             return
         guess = multiplier_for(rmse)
-        limit = self.config.time_limit
+        limit = self.config.recovery_time
         steps = trial_steps(self.config.horizon) if limit is None else _TRIAL_STEPS
         self.multiplier = guess
         if not steps:
@@ -191,8 +194,8 @@ class Loop:
 
     def _share(self) -> float:
         """How much of the horizon, of steps or of seconds, has been used."""
-        if self.config.time_limit is not None:
-            return self.seconds / self.config.time_limit
+        if self.config.recovery_time is not None:
+            return self.seconds / self.config.recovery_time
         return self.done / self.config.horizon
 
     def _step(self) -> None:
@@ -209,7 +212,7 @@ class Loop:
     def _look(self) -> None:
         """Where too much is lost to come back, go on from the best scene with a third of the rates."""
         share = self._share()
-        short = self.config.time_limit is None and self.config.horizon < _SHORT
+        short = self.config.recovery_time is None and self.config.horizon < _SHORT
         if short or not self.guard.due(share):
             return
         if self.guard.look(self.engine.splats(), share, self.done) == "back":
@@ -242,7 +245,7 @@ class Loop:
         speed = self.done / max(self.seconds, 1e-9)
         recent = np.mean(self.losses[-20:])
         total = self.config.horizon
-        if self.config.time_limit is not None:
+        if self.config.recovery_time is not None:
             total = max(self.done, round(self.done / max(self._share(), 1e-9)))
         shown, at = self.probe.latest(self.engine.splats, self.done, self.seconds)
         figures = {"loss": f"{recent:.4f}", "PSNR": f"{shown:.2f} @{at}", "steps/s": f"{speed:.1f}"}
@@ -298,6 +301,7 @@ def _fingerprint(
     weights: NDArray[np.float64] | None,
     anchors: Anchors,
     validation: str | None,
+    frozen: NDArray[np.bool_] | None,
 ) -> str:
     often = [] if weights is None else [repr(weights.tolist())]
     parts = (repr(config), student.fingerprint(), fingerprint_of(targets), *often)
@@ -305,4 +309,6 @@ def _fingerprint(
     digest = hashlib.sha256("\n".join(parts).encode())
     for held in (anchors.means, anchors.frames, anchors.r_parallel, anchors.r_perp):
         digest.update(np.ascontiguousarray(held).tobytes())
+    if frozen is not None:
+        digest.update(frozen.tobytes())
     return digest.hexdigest()

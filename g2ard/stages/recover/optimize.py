@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from g2ard.cameras import unseeing
 from g2ard.errors import InputError
@@ -53,6 +53,7 @@ def recover(
     weights: ArrayLike | None = None,
     anchors: Anchors | None = None,
     validation: Targets | None = None,
+    frozen: NDArray[np.bool_] | None = None,
     checkpoint: Path | None = None,
     progress: Progress = silent,
     stage: str = "recover",
@@ -76,6 +77,8 @@ def recover(
             learned from: where they lose, they decide how much of what the steps changed stays, Gaussian by
             Gaussian as it was seen (`recover.guard`), and end a recovery that they only lose by. At
             most eight are looked at.
+        frozen: (N,) bool, Gaussians of the student that stay as they are, such as those of another tile; the
+            engine must be `fused`. None freezes none.
         checkpoint: a file written every minute and at Ctrl-C; if it is there, recovery goes on from it, and
             the result is bitwise that of never having stopped.
         progress: told of every step, with loss, PSNR of a few training views and steps/s.
@@ -94,6 +97,11 @@ def recover(
         raise InputError(f"recover: {len(student)} Gaussians and {len(targets.cameras)} views: nothing to do")
     if not targets.cameras.facing(student.means.astype(np.float64) + student.offset).any():
         raise InputError(f"recover: {unseeing(targets.cameras, 'the scene')}")
+    if frozen is not None and (config.engine != "fused" or frozen.shape != (len(student),)):
+        raise InputError(
+            f"frozen: expected bool of shape ({len(student)},) and the engine fused, got {frozen.shape} and "
+            f"{config.engine}"
+        )
     if config.sh_degree is not None:
         student = student.with_sh_degree(config.sh_degree)
     anchors = anchors or Anchors.of(student, config.regularizers.in_plane)
@@ -104,16 +112,17 @@ def recover(
     others = None if validation is None else Probe(validation, config.background).all_of
     guard = Guard(probe.all_of, student, before, others, config.schedule.guarded)
     held = None if validation is None else fingerprint_of(validation)
-    loop = Loop(student, targets, config, often, anchors, probe, guard, held)
+    loop = Loop(student, targets, config, often, anchors, probe, guard, held, frozen)
     if checkpoint is None or not checkpoint.exists():
         loop.choose_rates(before)
     loop.run(checkpoint, progress, stage, watch)
     end = loop.engine.splats()
-    result, after, way = guard.judge(end)
-    doubt: float | None = 0.0
+    result, after, blend = guard.judge(end)
+    prior_views: float | None = 0.0
     if result is end and validation is not None:
-        result, doubt = guard.settle(end, loop.views_seen, loop.done)
-        after, way = (after, way) if result is end else (probe.all_of(result), float(result is not student))
+        result, prior_views = guard.settle(end, loop.views_seen, loop.done)
+        if result is not end:
+            after, blend = probe.all_of(result), float(result is not student)
     return Recovered(
         result,
         RecoverReport(
@@ -131,11 +140,13 @@ def recover(
             regularizers=Regularized.of(loop.regularizers),
             backed_off=tuple(map(Look.of, loop.guard.backed_off)),
             stopped=loop.guard.stopped,
-            way=way,
-            kept_start=way == 0,
+            blend=blend,
+            kept_start=blend == 0,
             validation=None
             if validation is None
-            else Validation(tuple(map(Look.of, guard.validation)), None if doubt is None else finite(doubt)),
+            else Validation(
+                tuple(map(Look.of, guard.validation)), None if prior_views is None else finite(prior_views)
+            ),
             skipped={"non_finite": loop.skipped},
         ),
     )

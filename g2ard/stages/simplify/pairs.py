@@ -17,7 +17,15 @@ from g2ard.progress import Progress, counter
 from g2ard.splats import DRAWN_LOGIT, Splats
 from g2ard.stages.simplify.config import SimplifyConfig, schedule
 
-__all__ = ["Visibility", "VisibilitySource", "merge", "merge_and_fit", "rows_of", "splats_of"]
+__all__ = [
+    "Visibility",
+    "VisibilitySource",
+    "fit_opacities",
+    "merge",
+    "merge_and_fit",
+    "rows_of",
+    "splats_of",
+]
 
 _FIT = 1 / 4
 """Exponent of the ratio of what views saw to what they see: ½ fits the views looked from by up to 0.1 dB
@@ -105,7 +113,9 @@ def merge_and_fit(
     out = merge(scene, budget, method, visibility, flags, config, counter(progress, "simplify"))
     merged, parents = splats_of(scene, out), out["parents"]
     order = scene.core.order  # sums round alike whatever the order of the rows
-    fitted = _fitted(merged, parents[order], visibility.weight[order], source(merged).weight)
+    of, wanted = parents[order], visibility.weight[order]
+    members, target = (np.bincount(of[of >= 0], w, len(merged)) for w in (None, wanted[of >= 0]))
+    fitted = fit_opacities(merged, members, target, source(merged).weight, target.mean())
     changed = fitted.logit_opacities != merged.logit_opacities
     changed |= (fitted.scales != merged.scales).any(axis=1)
     return {
@@ -117,7 +127,9 @@ def merge_and_fit(
     }
 
 
-def _fitted(scene: Splats, parents: NDArray[np.int64], wanted: NDArray[Any], now: NDArray[Any]) -> Splats:
+def fit_opacities(
+    scene: Splats, members: NDArray[Any], wanted: NDArray[Any], now: NDArray[Any], mean: float
+) -> Splats:
     """The scene with opacities by which the views see of each row about what they saw of its members.
 
     α is multiplied by the fourth root of the ratio, within 0.84–1.19: neighbours share what is missing, and
@@ -126,15 +138,13 @@ def _fitted(scene: Splats, parents: NDArray[np.int64], wanted: NDArray[Any], now
 
     Args:
         scene: M merged Gaussians.
-        parents: (N,) the row each of N Gaussians went to, or −1.
-        wanted: (N,) Σ αT of the N.
+        members: (M,) how many Gaussians each was merged from.
+        wanted: (M,) Σ αT of those.
         now: (M,) Σ αT of the M.
+        mean: of `wanted`; over all tiles, where these are one's.
     """
-    kept = parents >= 0
-    members = np.bincount(parents[kept], minlength=len(scene))
-    target = np.bincount(parents[kept], wanted[kept], len(scene))
-    floor = 0.05 * target.mean()
-    factor = np.clip((target + floor) / np.maximum(now + floor, np.finfo(float).tiny), 0.5, 2.0) ** _FIT
+    floor = 0.05 * mean
+    factor = np.clip((wanted + floor) / np.maximum(now + floor, np.finfo(float).tiny), 0.5, 2.0) ** _FIT
     alone = (members < 2) | ~np.isfinite(factor)
     alpha = scene.opacities.astype(np.float64)
     held = np.minimum(alpha * factor, np.maximum(alpha, MAX_OPACITY))

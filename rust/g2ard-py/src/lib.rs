@@ -14,6 +14,7 @@ mod select;
 mod simplify;
 mod spatial;
 mod ssim;
+mod tile;
 mod train;
 mod views;
 mod visibility;
@@ -34,6 +35,7 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     raster::register(m)?;
     select::register(m)?;
     ssim::register(m)?;
+    tile::register(m)?;
     train::register(m)?;
     Ok(())
 }

@@ -7,6 +7,7 @@ use numpy::{
     PyArray1, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
+use pyo3::{PyTraverseError, PyVisit};
 
 use crate::arrays;
 use crate::work::long;
@@ -72,6 +73,11 @@ impl PyScene {
             splats: splats.clone().unbind(),
             ordered: Arc::new(ordered),
         })
+    }
+
+    /// A scene holds its `Scene`, which holds the scene: the collector must see that.
+    fn __traverse__(&self, visit: PyVisit<'_>) -> Result<(), PyTraverseError> {
+        visit.call(&self.splats)
     }
 
     /// The scene's median point.

@@ -190,7 +190,7 @@ fn round_dict<'py>(py: Python<'py>, r: &PaperRound) -> PyResult<Bound<'py, PyDic
     Ok(round)
 }
 
-fn outcome_dict<'py, R>(
+pub fn outcome_dict<'py, R>(
     py: Python<'py>,
     outcome: Outcome<R>,
     rounds: Vec<Bound<'py, PyDict>>,

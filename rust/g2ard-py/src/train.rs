@@ -102,6 +102,12 @@ impl PyTrainer {
             .map_err(crate::error::to_py)
     }
 
+    /// (N,) rows that no step changes.
+    fn freeze(&mut self, frozen: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
+        let frozen = crate::arrays::flat("frozen", &frozen)?;
+        self.inner.freeze(frozen).map_err(crate::error::to_py)
+    }
+
     /// One step: (photometric loss before it, Gaussians moved). `mask`: where the loss counts. `reach`: pixels beyond
     /// which geometry stands still.
     #[pyo3(signature = (view, options, background, target, ssim_weight, rates, regularizers = None, mask = None, reach = None))]

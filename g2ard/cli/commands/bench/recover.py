@@ -11,7 +11,8 @@ import typer
 from g2ard.cli.budget_options import parse_ratio
 from g2ard.cli.commands.bench.group import bench
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import BackgroundOption, ProtocolOption, SizeOption, TimeLimitOption, ViewsOption
+from g2ard.cli.options import BackgroundOption, ProtocolOption, RecoveryTimeOption, SizeOption, ViewsOption
+from g2ard.cli.resume import rows_kept
 
 if TYPE_CHECKING:
     from g2ard.bench.recover import Look
@@ -42,7 +43,7 @@ def recover(
     ] = None,
     steps: Annotated[str, typer.Option(help="Horizons of the default schedule.")] = "100,300,1000",
     protocol: ProtocolOption = "pool",
-    time_limit: TimeLimitOption = None,
+    recovery_time: RecoveryTimeOption = None,
     seeds: Annotated[str, typer.Option(help="Comma-separated.")] = "0",
     variants: Annotated[str | None, typer.Option(help="Some of the study's; all if not given.")] = None,
     csv: Annotated[
@@ -55,7 +56,7 @@ def recover(
 
     curves: the default's horizons beside the paper's schedule at a tenth, with and without a decay.
     paper: beside all of it. regularizers: with and without each. rounds: against one shot in equal time
-    (--time-limit). multiplier: of the rates. endurance: 5,000 steps.
+    (--recovery-time). multiplier: of the rates. endurance: 5,000 steps.
 
     With --protocol standing runs are scored from near and from where people stand: on the views of a
     standing.json beside the scene, else on made ones that no run sees.
@@ -65,17 +66,18 @@ def recover(
     from g2ard.bench.speedup import speedups
 
     colour = background or (0.0, 0.0, 0.0)
-    looks = bench_recover(
-        RecoverBench(scene, views, held_out, photos, size, colour, protocol=protocol),
-        study,
-        csv,
-        ratios=[parse_ratio(part) for part in ratios.split(",")],
-        seeds=_whole_numbers("seeds", seeds),
-        steps=_whole_numbers("steps", steps),
-        seconds=time_limit or 30.0,
-        variants=[part.strip() for part in variants.split(",")] if variants else None,
-        progress=run.progress,
-    )
+    with rows_kept(run, csv, goes_on=True):
+        looks = bench_recover(
+            RecoverBench(scene, views, held_out, photos, size, colour, protocol=protocol),
+            study,
+            csv,
+            ratios=[parse_ratio(part) for part in ratios.split(",")],
+            seeds=_whole_numbers("seeds", seeds),
+            steps=_whole_numbers("steps", steps),
+            seconds=recovery_time or 30.0,
+            variants=[part.strip() for part in variants.split(",")] if variants else None,
+            progress=run.progress,
+        )
     columns = ["scene", "ratio", "variant", "views", "seed", "steps", "seconds", "CPU s", "PSNR", "SSIM"]
     run.console.table(
         f"{machine()}; unseen views at the end of each run",

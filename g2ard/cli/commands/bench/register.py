@@ -10,6 +10,7 @@ import typer
 from g2ard.cli.budget_options import parse_ratio
 from g2ard.cli.commands.bench.group import bench
 from g2ard.cli.frame import Run, command
+from g2ard.cli.resume import rows_kept
 
 
 @command(
@@ -57,19 +58,20 @@ def register(
     check_output(csv, run.overwrite)
     names = [part.strip() for part in starts.split(",")]
     taken = photos_of(photos, split="test", say=run.say)
-    cells = bench_register(
-        scenes,
-        taken,
-        csv,
-        pool=read_view_set(photos, split="train", unpictured=True).cameras,
-        ratios=[parse_ratio(part) for part in ratios.split(",")],
-        matchers=[part.strip() for part in matchers.split(",")],
-        starts=names,
-        seeds=seeds,
-        metres_per_unit=metres_per_unit,
-        config=RegisterConfig(size=size),
-        progress=run.progress,
-    )
+    with rows_kept(run, csv, goes_on=False):
+        cells = bench_register(
+            scenes,
+            taken,
+            csv,
+            pool=read_view_set(photos, split="train", unpictured=True).cameras,
+            ratios=[parse_ratio(part) for part in ratios.split(",")],
+            matchers=[part.strip() for part in matchers.split(",")],
+            starts=names,
+            seeds=seeds,
+            metres_per_unit=metres_per_unit,
+            config=RegisterConfig(size=size),
+            progress=run.progress,
+        )
     unit = "units" if metres_per_unit is None else "cm"
     found = ["registered", f"{unit} / °", "worst", "≤ 10 cm", "≤ 5 cm"]
     run.console.table(

@@ -13,6 +13,8 @@ from g2ard.cli.budget_options import parse_ratio
 from g2ard.cli.commands.bench.group import bench
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import PaperOption, SizeOption, ViewsOption
+from g2ard.cli.resume import rows_kept
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.bench.definition import Definition, MethodSpec
@@ -92,7 +94,8 @@ def run_(
             as_in_the_paper(study, released, preset.removeprefix("paper-").removeprefix("paper") or None)
             for study in studies
         ]
-    rows = bench_run(studies, output, keep=keep, again=run.overwrite, progress=run.progress)
+    with rows_kept(run, output / "rows.csv", goes_on=True):
+        rows = bench_run(studies, output, keep=keep, again=run.overwrite, progress=run.progress)
     write_report(output, studies, rows)
     run.console.table(
         "PSNR and SSIM on unseen views; CPU seconds of reduction and recovery",
@@ -115,7 +118,7 @@ def run_(
     run.result({"rows": [asdict(row) for row in rows]})
     failed = sum(bool(row.error) for row in rows)
     if failed:
-        run.unmet(f"{failed} cells failed; the same command tries them again")
+        run.unmet(f"{plural(failed, 'cell')} failed; the same command tries them again")
 
 
 def _ad_hoc(

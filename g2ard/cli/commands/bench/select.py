@@ -13,6 +13,7 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     SizeOption,
 )
+from g2ard.cli.resume import rows_kept
 
 Gains = dict[str, float | str]
 
@@ -50,19 +51,20 @@ def select(
     from g2ard.bench.select_workspaces import Size
     from g2ard.bench.simplify import machine
 
-    trials = bench_select(
-        scenes,
-        csv,
-        pools=[p.strip() for p in pools.split(",")],
-        arms=[a.strip() for a in arms.split(",")] if arms else ARMS,
-        percents=[_percent(p) for p in percents.split(",")],
-        seeds=seeds,
-        draws=draws,
-        steps=steps,
-        size=Size(count, size or 256, candidates),
-        cache=cache,
-        progress=run.progress,
-    )
+    with rows_kept(run, csv, goes_on=True):
+        trials = bench_select(
+            scenes,
+            csv,
+            pools=[p.strip() for p in pools.split(",")],
+            arms=[a.strip() for a in arms.split(",")] if arms else ARMS,
+            percents=[_percent(p) for p in percents.split(",")],
+            seeds=seeds,
+            draws=draws,
+            steps=steps,
+            size=Size(count, size or 256, candidates),
+            cache=cache,
+            progress=run.progress,
+        )
     gains = summary(trials)
     run.console.table(
         f"{machine()}; dB over mean random (random: PSNR), ± over pools; in and out of distribution",

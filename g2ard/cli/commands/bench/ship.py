@@ -10,6 +10,7 @@ import typer
 from g2ard.cli.budget_options import parse_ratio
 from g2ard.cli.commands.bench.group import bench
 from g2ard.cli.frame import Run, command
+from g2ard.cli.resume import rows_kept
 
 
 @command("ship", parent=bench, example="g2ard bench ship scene.ply --ratios 1,10 --formats sog,spz")
@@ -35,15 +36,16 @@ def ship(
     from g2ard.io import check_output
 
     check_output(csv, run.overwrite)
-    cells = bench_ship(
-        scenes,
-        csv,
-        ratios=[parse_ratio(part) for part in ratios.split(",")],
-        formats=[part.strip() for part in formats.split(",")],
-        splat_transform=find_splat_transform(splat_transform) if splat_transform else None,
-        seed=run.seed,
-        progress=run.progress,
-    )
+    with rows_kept(run, csv, goes_on=False):
+        cells = bench_ship(
+            scenes,
+            csv,
+            ratios=[parse_ratio(part) for part in ratios.split(",")],
+            formats=[part.strip() for part in formats.split(",")],
+            splat_transform=find_splat_transform(splat_transform) if splat_transform else None,
+            seed=run.seed,
+            progress=run.progress,
+        )
     run.console.table(
         f"{machine()}; against the dense scene; `lost` is what the format alone takes",
         [

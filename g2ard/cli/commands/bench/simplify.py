@@ -12,6 +12,7 @@ from g2ard.cli.budget_options import parse_ratio
 from g2ard.cli.commands.bench.group import bench
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import ProtocolOption, ViewsOption
+from g2ard.cli.resume import rows_kept
 
 if TYPE_CHECKING:
     from g2ard.bench.simplify import Cell
@@ -51,17 +52,18 @@ def simplify(
     if program is None and any(m.startswith("splat-transform") for m in chosen):
         run.say("splat-transform is not on PATH (--splat-transform PROGRAM): left out")
         chosen = [m for m in chosen if not m.startswith("splat-transform")]
-    cells = bench_simplify(
-        scenes,
-        csv,
-        ratios=[parse_ratio(part) for part in ratios.split(",")],
-        methods=chosen,
-        views=views,
-        splat_transform=program,
-        seed=run.seed,
-        protocol=protocol,
-        progress=run.progress,
-    )
+    with rows_kept(run, csv, goes_on=True):
+        cells = bench_simplify(
+            scenes,
+            csv,
+            ratios=[parse_ratio(part) for part in ratios.split(",")],
+            methods=chosen,
+            views=views,
+            splat_transform=program,
+            seed=run.seed,
+            protocol=protocol,
+            progress=run.progress,
+        )
     run.console.table(
         f"{machine()}; PSNR and SSIM on unseen views, CPU seconds and peak MB of the whole command",
         ["scene", "ratio", "method", "views", "Gaussians", "PSNR", "SSIM", "CPU s", "wall s", "MB"],

@@ -9,8 +9,10 @@ use super::cost::Node;
 /// reason, large ones are plain or hidden, small ones carry the detail: every one counts alike.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Importance {
-    exponent: f64,
-    usual: f64,
+    /// a.
+    pub exponent: f64,
+    /// The median mass.
+    pub usual: f64,
 }
 
 impl Default for Importance {

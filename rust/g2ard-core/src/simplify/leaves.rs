@@ -8,6 +8,7 @@ use super::matching::Nodes;
 use super::moments::sigmoid;
 use super::pairwise::Visibility;
 use super::rows::Rows;
+use super::tile::Frame;
 use crate::scene::{Ordered, SceneRef};
 
 /// What a few views do not see counts as this share of its mass: other views will see some of it.
@@ -35,38 +36,31 @@ pub struct Leaves<'a> {
 }
 
 impl<'a> Leaves<'a> {
+    /// `frame`: what holds for a scene of which this is a tile; `None` finds it in the scene itself.
     pub fn new(
         scene: &'a SceneRef<'a>,
         ordered: &'a Ordered,
         kept: Vec<u32>,
         blur: &'a [f32],
         visibility: Option<Visibility<'a>>,
+        frame: Option<&Frame>,
     ) -> Self {
-        let unit = typical_size(scene);
         let mut leaves = Self {
             scene,
             ordered,
             kept,
             blur,
             visibility,
-            unit,
-            floor: 0.0,
-            importance: Importance::default(),
+            unit: frame.map_or_else(|| typical_size(scene), |f| f.unit),
+            floor: frame.map_or(0.0, |f| f.floor),
+            importance: frame.map_or_else(Importance::default, |f| f.importance),
         };
-        if let Some(visibility) = visibility {
-            let masses: Vec<f32> = (0..leaves.len())
-                .into_par_iter()
-                .map(|i| leaves.node(i).mass)
-                .collect();
-            let mass: f64 = masses.iter().map(|&m| f64::from(m)).sum();
-            let rows = leaves.kept.iter();
-            let total: f64 = rows.map(|&i| f64::from(leaves.weight(visibility, i))).sum();
-            leaves.floor = UNSEEN
-                * if total > 0.0 {
-                    (total / mass) as f32
-                } else {
-                    1.0
-                };
+        if frame.is_some() {
+            return leaves;
+        }
+        if visibility.is_some() {
+            let (weight, mass) = leaves.sums();
+            leaves.floor = floor(weight, mass);
         } else {
             let nodes: Vec<Node> = (0..leaves.len())
                 .into_par_iter()
@@ -75,6 +69,25 @@ impl<'a> Leaves<'a> {
             leaves.importance = Importance::of_scene(&nodes);
         }
         leaves
+    }
+
+    /// Σ αT over the views, and mass, of all rows.
+    pub fn sums(&self) -> (f64, f64) {
+        let masses: Vec<f32> = (0..self.len())
+            .into_par_iter()
+            .map(|i| self.node(i).mass)
+            .collect();
+        let mass: f64 = masses.iter().map(|&m| f64::from(m)).sum();
+        let weight = |v| self.kept.iter().map(move |&i| self.weight(v, i));
+        let total = self
+            .visibility
+            .map_or(0.0, |v| weight(v).map(f64::from).sum());
+        (total, mass)
+    }
+
+    /// What a row counts for without views, as [`Self::new`] finds it.
+    pub fn importance(&self) -> Importance {
+        self.importance
     }
 
     /// Their Morton codes, ascending.
@@ -147,8 +160,18 @@ impl Rows for Leaves<'_> {
     }
 }
 
+/// Σ αT that a unit of mass counts for though no view sees it.
+pub fn floor(weight: f64, mass: f64) -> f32 {
+    UNSEEN
+        * if weight > 0.0 {
+            (weight / mass) as f32
+        } else {
+            1.0
+        }
+}
+
 /// A power of two near the median of the middle scale, so that dividing by it rounds nothing.
-fn typical_size(scene: &SceneRef) -> f64 {
+pub fn typical_size(scene: &SceneRef) -> f64 {
     let middle = |s: &[f32; 3]| s[0].max(s[1]).min(s[2]).max(s[0].min(s[1]));
     let positive = scene
         .scales

@@ -174,16 +174,15 @@ pub fn candidates(
         .try_for_each(|(chunk, lists)| {
             control.check()?;
             let first = chunk * CHUNK;
-            let mut near = Vec::with_capacity(k);
-            for (at, list) in lists.chunks_mut(k).enumerate() {
-                tree.nearest(first + at, k, &mut near);
+            tree.nearest(first..first + lists.len() / k, k, |i, near| {
                 if near.last().is_some_and(|last| last.0 == 0.0) {
-                    spread_duplicates(first + at, k, nodes.len(), &mut near);
+                    spread_duplicates(i, k, nodes.len(), near);
                 }
-                for (candidate, &(_, j)) in list.iter_mut().zip(&near) {
+                let list = &mut lists[(i - first) * k..][..k];
+                for (candidate, &mut (_, j)) in list.iter_mut().zip(near) {
                     candidate.1 = j;
                 }
-            }
+            });
             let costs = PairCosts {
                 nodes,
                 first,
@@ -213,11 +212,19 @@ fn spread_duplicates(i: usize, k: usize, n: usize, near: &mut Vec<(f32, u32)>) {
     );
 }
 
-/// Up to `merges` disjoint pairs (lower index first), cheapest first, between equals the lower index.
+/// Two rows that merge, the lower index first, and what that costs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pair {
+    pub a: u32,
+    pub b: u32,
+    pub cost: f32,
+}
+
+/// Up to `merges` disjoint pairs, cheapest first, between equals the lower index.
 ///
 /// A row whose partner is taken falls back on its next candidate. Merged rows are locked: otherwise the cheapest
 /// cluster would absorb its surroundings.
-pub fn matched(lists: &[Candidate], k: usize, merges: usize) -> Vec<(u32, u32)> {
+pub fn matched(lists: &[Candidate], k: usize, merges: usize) -> Vec<Pair> {
     let n = lists.len() / k;
     // Costs are ≥ 0, so their bits sort as they do.
     let mut best: Vec<(u32, u32)> = (0..n)
@@ -243,14 +250,18 @@ pub fn matched(lists: &[Candidate], k: usize, merges: usize) -> Vec<(u32, u32)> 
         };
         let Some((_, i, at)) = next else { break };
         let list = &lists[i as usize * k..(i as usize + 1) * k];
-        let partner = list[at as usize].1;
+        let (cost, partner) = list[at as usize];
         if locked[i as usize] || partner == GONE {
             continue;
         }
         if !locked[partner as usize] {
             locked[i as usize] = true;
             locked[partner as usize] = true;
-            pairs.push((i.min(partner), i.max(partner)));
+            pairs.push(Pair {
+                a: i.min(partner),
+                b: i.max(partner),
+                cost,
+            });
             continue;
         }
         let free = |c: &Candidate| c.1 != GONE && !locked[c.1 as usize];
@@ -267,6 +278,10 @@ mod tests {
     use super::*;
     use crate::random::Lcg;
 
+    fn pairs_of(pairs: &[Pair]) -> Vec<(u32, u32)> {
+        pairs.iter().map(|p| (p.a, p.b)).collect()
+    }
+
     #[test]
     fn takes_the_cheapest_disjoint_pairs_and_falls_back() {
         // 0–1 costs 1, 1–2 costs 2, 2–3 costs 5, 3–4 costs 3.
@@ -282,8 +297,10 @@ mod tests {
             (3.0, 3),
             NONE,
         ];
-        assert_eq!(matched(&lists, 2, 9), [(0, 1), (3, 4)]);
-        assert_eq!(matched(&lists, 2, 1), [(0, 1)]);
+        let rows = |merges| pairs_of(&matched(&lists, 2, merges));
+        assert_eq!(rows(9), [(0, 1), (3, 4)]);
+        assert_eq!(rows(1), [(0, 1)]);
+        assert_eq!(matched(&lists, 2, 9)[1].cost, 3.0);
         let lists = [
             (1.0, 1),
             NONE,
@@ -294,7 +311,7 @@ mod tests {
             (5.0, 2),
             NONE,
         ];
-        assert_eq!(matched(&lists, 2, 9), [(0, 1), (2, 3)]);
+        assert_eq!(pairs_of(&matched(&lists, 2, 9)), [(0, 1), (2, 3)]);
     }
 
     #[test]
@@ -381,6 +398,6 @@ mod tests {
                 want.push(((i as u32).min(j), (i as u32).max(j)));
             }
         }
-        assert_eq!(matched(&lists, k, n), want);
+        assert_eq!(pairs_of(&matched(&lists, k, n)), want);
     }
 }

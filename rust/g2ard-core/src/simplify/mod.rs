@@ -15,18 +15,21 @@ mod morton_tree;
 mod outcome;
 mod pairwise;
 mod paper;
-mod real;
 mod residual;
 mod rows;
+mod tile;
 mod trim;
 
 pub use guards::{coverage, disc};
+pub use importance::Importance;
 pub use kernels::{Group, GroupKernels, means_of};
+pub use matching::Pair;
 pub use moments::{MAX_OPACITY, Merged, merge, optical_mass, pool, weights};
 pub use outcome::Outcome;
 pub use pairwise::{Pairwise, PairwiseRound, Visibility};
 pub use paper::{Paper, PaperRound};
 pub use residual::{Texture, color, flags};
+pub use tile::{Frame, Tile, TilePlan};
 
 use crate::Splats;
 

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::clusters::Partition;
 use super::importance::median;
 use super::leaves::Leaves;
-use super::matching::{Nodes, candidates, matched};
+use super::matching::{Nodes, Pair, candidates, matched};
 use super::moments::sigmoid;
 use super::morton_tree::{cut, merge_costs};
 use super::rows::{Rows, Shuffled};
@@ -109,12 +109,12 @@ impl Pairwise {
     ) -> Result<Outcome<PairwiseRound>> {
         self.check(scene, visibility, flags)?;
         let flags = flags.map_or_else(|| vec![false; scene.len()], |f| ordered.sorted(f));
-        let blur = self.blurs(scene, ordered, visibility);
+        let blur = self.blurs(scene, ordered, visibility, None);
         let budget = schedule.last().copied().unwrap_or(scene.len());
         control.begin(scene.len().saturating_sub(budget) as u64);
         let (mut partition, dropped) = self.drop_transparent(scene, ordered, budget);
         let kept = (0..scene.len() as u32).filter(|&i| partition.of[i as usize] != GONE);
-        let leaves = Leaves::new(scene, ordered, kept.collect(), &blur, visibility);
+        let leaves = Leaves::new(scene, ordered, kept.collect(), &blur, visibility, None);
         let geometric = self.geometric(visibility);
         let mut rounds = Vec::new();
         let mut nodes = self.premerge(leaves, geometric, &mut partition, budget, &mut rounds);
@@ -181,7 +181,7 @@ impl Pairwise {
     }
 
     /// The weight of the geometric error, in the kernels' precision.
-    fn geometric(&self, visibility: Option<Visibility>) -> f32 {
+    pub(super) fn geometric(&self, visibility: Option<Visibility>) -> f32 {
         let share = if visibility.is_some() {
             1.0
         } else {
@@ -190,7 +190,7 @@ impl Pairwise {
         (self.geometric_weight * share) as f32
     }
 
-    fn check(
+    pub(super) fn check(
         &self,
         scene: &SceneRef,
         visibility: Option<Visibility>,
@@ -223,23 +223,20 @@ impl Pairwise {
         Ok(())
     }
 
-    /// The variance that rendering adds to each ordered row.
-    fn blurs(
+    /// The variance that rendering adds to each ordered row. `usual` is the size of a pixel where no view tells it;
+    /// `None` takes the scene's median.
+    pub(super) fn blurs(
         &self,
         scene: &SceneRef,
         ordered: &Ordered,
         visibility: Option<Visibility>,
+        usual: Option<f32>,
     ) -> Vec<f32> {
         let pixel = visibility.map_or_else(Vec::new, |v| ordered.sorted(v.pixel_size));
         let finite = pixel.iter().copied().filter(|p| p.is_finite() && *p > 0.0);
-        let usual = median(finite.collect()).unwrap_or_else(|| {
-            let largest = scene
-                .scales
-                .iter()
-                .map(|s| s[0].max(s[1]).max(s[2]))
-                .collect();
-            self.pixel_scale as f32 * median(largest).unwrap_or(1.0)
-        });
+        let usual = usual
+            .or_else(|| median(finite.collect()))
+            .unwrap_or_else(|| self.pixel_without_views(scene));
         let of = |i: usize| {
             let p = pixel
                 .get(i)
@@ -252,9 +249,15 @@ impl Pairwise {
         (0..scene.len()).into_par_iter().map(of).collect()
     }
 
+    /// The size of a pixel where there are no views.
+    pub(super) fn pixel_without_views(&self, scene: &SceneRef) -> f32 {
+        let largest = scene.scales.iter().map(|s| s[0].max(s[1]).max(s[2]));
+        self.pixel_scale as f32 * median(largest.collect()).unwrap_or(1.0)
+    }
+
     /// Every row that can be seen a cluster of its own; if those are fewer than the budget, the most opaque
     /// of the others too.
-    fn drop_transparent(
+    pub(super) fn drop_transparent(
         &self,
         scene: &SceneRef,
         ordered: &Ordered,
@@ -307,10 +310,10 @@ impl RunMerging<'_> {
 }
 
 /// Merges the pairs and puts the nodes that are left in Morton order. Returns where each node went.
-fn merge(nodes: &mut Nodes, pairs: &[(u32, u32)]) -> Vec<u32> {
+pub(super) fn merge(nodes: &mut Nodes, pairs: &[Pair]) -> Vec<u32> {
     let width = nodes.width;
     let mut into = vec![GONE; nodes.len()];
-    for &(a, b) in pairs {
+    for &Pair { a, b, .. } in pairs {
         let (x, y) = (nodes.geometry[a as usize], nodes.geometry[b as usize]);
         nodes.geometry[a as usize] = x.merged(&y);
         let share = x.share(&y);
@@ -334,5 +337,6 @@ fn merge(nodes: &mut Nodes, pairs: &[(u32, u32)]) -> Vec<u32> {
     map
 }
 
-/// Where the lattice lies, in shares of the frame's radius.
+/// By how much the Morton lattice is shifted in each step, along x, y and z, in shares of the bounds' radius: any
+/// numbers without a common measure, so that no plane that parts cells in one step does so in the next.
 const LATTICES: [[f64; 3]; 3] = [[0.0; 3], [0.31, 0.17, 0.43], [0.13, 0.41, 0.23]];

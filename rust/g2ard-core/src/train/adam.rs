@@ -39,6 +39,8 @@ pub struct Update<'a> {
     pub rates: &'a Rates,
     pub reach: Option<f32>,
     pub regularize: Option<(&'a Regularizers, &'a Anchors)>,
+    /// A bit for each row of a group, 0 where it is frozen; `None` freezes nothing.
+    pub free: Option<&'a [u16]>,
 }
 
 impl Kernel for Update<'_> {
@@ -52,7 +54,9 @@ impl Kernel for Update<'_> {
         for group in sums.first_group..sums.last_group {
             let (mut active, screen) =
                 collect::<F>(sums.splats, &mut next, group, sums.slots, sums.written);
-            if active == 0 && self.regularize.is_none() {
+            let free = self.free.map_or(u16::MAX, |free| free[group]);
+            active &= free;
+            if free == 0 || (active == 0 && self.regularize.is_none()) {
                 continue;
             }
             // SAFETY: a group belongs to one chunk, a chunk to one thread, and the last group's block is gone.
@@ -62,7 +66,7 @@ impl Kernel for Update<'_> {
                 let seen = F::Mask::from_bits(active);
                 zero_unseen(&mut g, seen);
                 let rows = (self.blocks.rows - group * LANES).min(LANES);
-                let real = ((1u32 << rows) - 1) as u16;
+                let real = ((1u32 << rows) - 1) as u16 & free;
                 active |= anchors.add_gradients(weights, &block.parameters(), group, &mut g) & real;
                 if active == 0 {
                     continue;

@@ -18,7 +18,7 @@ use std::time::Instant;
 use crate::raster::gradients::Discard;
 use crate::raster::memory::bytes;
 use crate::raster::rasterizer::ChunkSums;
-use crate::raster::simd::dispatch;
+use crate::raster::simd::{LANES, dispatch};
 use crate::raster::{
     Camera, Image, ImageGradients, Isa, Memory, Params, Passes, Rasterizer, Settings,
 };
@@ -82,6 +82,10 @@ pub struct Trainer {
     image: Vec<f32>,
     alpha: Vec<f32>,
     gradient: Vec<f32>,
+    /// As the caller numbers rows; empty where nothing is frozen.
+    frozen: Vec<bool>,
+    /// A bit for each row of a group of the store, 0 where it is frozen; empty where nothing is.
+    free: Vec<u16>,
 }
 
 impl Trainer {
@@ -97,6 +101,8 @@ impl Trainer {
             image: Vec::new(),
             alpha: Vec::new(),
             gradient: Vec::new(),
+            frozen: Vec::new(),
+            free: Vec::new(),
         })
     }
 
@@ -106,7 +112,34 @@ impl Trainer {
 
     /// Restores an earlier [`Store::export`]; training then continues bit for bit.
     pub fn import(&mut self, state: &Exported) -> Result<()> {
-        self.store.import(state)
+        self.store.import(state)?;
+        self.mark_free();
+        Ok(())
+    }
+
+    /// Rows that no step changes, as the caller numbers them.
+    pub fn freeze(&mut self, frozen: &[bool]) -> Result<()> {
+        if frozen.len() != self.store.len() {
+            let expected = format!("{} rows", self.store.len());
+            return Err(Error::invalid("frozen", expected, frozen.len()));
+        }
+        self.frozen = frozen.to_vec();
+        self.mark_free();
+        Ok(())
+    }
+
+    fn mark_free(&mut self) {
+        let frozen = &self.frozen;
+        self.free = match frozen.iter().any(|&f| f) {
+            false => Vec::new(),
+            true => (self.store.order().chunks(LANES))
+                .map(|rows| {
+                    let bit =
+                        |(lane, &row): (usize, &u32)| u16::from(!frozen[row as usize]) << lane;
+                    rows.iter().enumerate().map(bit).sum()
+                })
+                .collect(),
+        };
     }
 
     /// Freezes the surface that [`StepInput::regularizers`] hold the Gaussians to; rows as the caller numbers them.
@@ -235,6 +268,7 @@ impl Trainer {
     fn adam_step(&mut self, input: &StepInput) -> (usize, usize) {
         self.biases.extend_to(self.store.most_steps() as usize + 1);
         let (biases, anchors, isa) = (&self.biases, self.anchors.as_ref(), self.isa);
+        let free = &self.free[..];
         let blocks = self.store.blocks();
         let finish = |sums: &ChunkSums| {
             let regularize = input.regularizers.as_ref().zip(anchors);
@@ -247,6 +281,7 @@ impl Trainer {
                     rates: &input.rates,
                     reach: input.reach,
                     regularize,
+                    free: (!free.is_empty()).then_some(free),
                 },
             )
         };

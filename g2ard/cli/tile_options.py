@@ -1,0 +1,82 @@
+"""Options for scenes larger than memory: --tile-rows, --memory, --workers, --scheduler, --work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from g2ard.cli.budget_options import Count
+
+if TYPE_CHECKING:
+    from g2ard.cli.frame import Run
+    from g2ard.policy.tiled import Tiling
+
+__all__ = [
+    "MemoryOption",
+    "SchedulerOption",
+    "TileRowsOption",
+    "WorkOption",
+    "WorkersOption",
+    "tiling_of",
+]
+
+TileRowsOption = Annotated[
+    Count | None,
+    typer.Option(
+        parser=Count.parse,
+        metavar="COUNT",
+        help="A scene of more Gaussians is worked on in tiles of at most so many; 5M if not given.",
+    ),
+]
+MemoryOption = Annotated[
+    str | None, typer.Option(metavar="SIZE", help="What all workers together may take, such as 4GB.")
+]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="Processes that work on tiles; as many as cores and memory allow if not given."),
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS", help="Tiles on a Dask cluster: tcp://HOST:PORT, or local (extra distributed)."
+    ),
+]
+WorkOption = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="Keep tiles and steps here, for other budgets; else beside the output."),
+]
+
+
+def tiling_of(
+    run: Run,
+    output: Path,
+    tile_rows: Count | None,
+    memory: str | None,
+    workers: int | None,
+    scheduler: str | None,
+    work: Path | None,
+) -> Tiling:
+    """The options as the library takes them, after a usage check."""
+    from g2ard.errors import InputError
+    from g2ard.policy.tiled import Tiling, bytes_of
+
+    if tile_rows is not None and tile_rows.is_share:
+        raise typer.BadParameter("--tile-rows: a count such as 2M, not a share")
+    try:
+        size = None if memory is None else bytes_of(memory)
+    except InputError as error:
+        raise typer.BadParameter(f"--{error}") from None
+    if scheduler is not None and scheduler != "local" and "://" not in scheduler:
+        raise typer.BadParameter(f"--scheduler: tcp://HOST:PORT or local, not {scheduler!r}")
+    name = output.name.replace("{", "").replace("}", "")
+    return Tiling(
+        None if tile_rows is None else tile_rows.of(0),
+        size,
+        workers,
+        run.threads or None,
+        scheduler,
+        work or output.with_name(f".{name}.tiles"),
+        keep=work is not None,
+    )

@@ -1,0 +1,125 @@
+"""Commands on scenes in tiles: their outputs, reports and lines."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from g2ard.cli.frame import Run
+from g2ard.cli.outputs import Outputs
+from g2ard.cli.run_folder import write_report
+
+if TYPE_CHECKING:
+    from g2ard.policy.budget import Budget
+    from g2ard.policy.distill_options import DistillOptions
+    from g2ard.policy.tiled import Tiling
+    from g2ard.stages.simplify import SimplifyConfig
+    from g2ard.tiles.simplify import TiledScene
+    from g2ard.tiles.store import TileStore
+
+__all__ = ["TiledCommand"]
+
+
+class TiledCommand:
+    """One command on one scene; what is done stays in the tiling's folder until the command has succeeded,
+    longer where the user named the folder."""
+
+    def __init__(
+        self, run: Run, scene: Path, outputs: Outputs, tiling: Tiling, budgets: Sequence[Budget]
+    ) -> None:
+        self.run, self.scene, self.outputs, self.tiling, self.budgets = run, scene, outputs, tiling, budgets
+        run.kept = [f"what is done stands in {tiling.folder}, and the same command goes on"]
+
+    def simplify(self, config: SimplifyConfig, views: Any, blind: bool, up: Sequence[float] | None) -> None:
+        """`g2ard simplify`."""
+        from g2ard.constants import listed
+        from g2ard.memory import peak_rss
+        from g2ard.policy.tiled import forget, simplify_in_tiles
+
+        run, began, reports = self.run, time.perf_counter(), []
+        made = simplify_in_tiles(
+            self.scene,
+            self.budgets,
+            self.tiling,
+            views=views,
+            blind=blind,
+            config=config,
+            up=up,
+            seed=run.seed,
+            progress=run.progress,
+            say=run.say,
+        )
+        for at, (store, small) in enumerate(made):
+            place = self.outputs.paths(store.count)[at]
+            self._write(place, store, small)
+            seconds = time.perf_counter() - began
+            run.say(f"{place}: {len(small):,} of {store.count:,} Gaussians in {seconds:.1f} s")
+            run.kept.append(f"{place} is written")
+            reports.append(
+                {
+                    "input_count": store.count,
+                    "output_count": len(small),
+                    "tiles": list(small.counts),
+                    "views": small.views,
+                    "unseen": small.unseen,
+                    "method": "default",
+                    "constants": listed({"simplify": config.resolved("default")}),
+                    "notes": {note.code: note.count for note in store.notes},
+                    "seconds": {"total": seconds},
+                    "peak_rss_bytes": peak_rss(),
+                }
+            )
+        run.result(reports[0] if len(reports) == 1 else {"runs": reports})
+        forget(self.tiling)
+
+    def distill(self, options: DistillOptions, name: str) -> None:
+        """`g2ard distill`: in each run's folder the scene, its views and the report."""
+        from dataclasses import asdict
+
+        from g2ard import io
+        from g2ard.memory import peak_rss
+        from g2ard.policy.tiled import forget
+        from g2ard.policy.tiled_distill import distill_in_tiles
+
+        run, began, reports = self.run, time.perf_counter(), []
+        made = distill_in_tiles(
+            self.scene, self.budgets, self.tiling, options, progress=run.progress, say=run.say
+        )
+        for at, (store, small, scores, views) in enumerate(made):
+            folder = self.outputs.paths(store.count)[at]
+            report = {
+                "input_count": store.count,
+                "output_count": len(small),
+                "tiles": list(small.counts),
+                "scores": asdict(scores),
+                "views": {"train": len(views.train.cameras), "test": len(views.test)},
+                "notes": {note.code: note.count for note in store.notes},
+                "config": run.config,
+                "seconds": {"total": time.perf_counter() - began},
+                "peak_rss_bytes": peak_rss(),
+            }
+            if (pool := views.pool) is not None:
+                io.write_views(folder / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
+            self._write(folder / name, store, small)
+            write_report(folder, report)
+            run.say(
+                f"{folder}: {len(small):,} of {store.count:,} Gaussians; held-out views "
+                f"{scores.simplified:.2f} → {scores.recovered:.2f} dB over the pixels that tiles own"
+            )
+            run.kept.append(f"{folder} is finished")
+            reports.append(report)
+        run.result(reports[0] if len(reports) == 1 else {"runs": reports})
+        forget(self.tiling)
+
+    def _write(self, place: Path, store: TileStore, small: TiledScene) -> None:
+        from g2ard import io
+        from g2ard.io.ply import write_parts
+        from g2ard.io.scene_formats import scene_format
+
+        if scene_format(place).suffix == ".ply":
+            overwrite = self.run.overwrite
+            write_parts(place, small, len(small), small.sh_degree, small.offset, overwrite=overwrite)
+        else:
+            io.write_splats(place, small.whole(), overwrite=self.run.overwrite)

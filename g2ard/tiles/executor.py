@@ -1,0 +1,136 @@
+"""Where tasks run: in this process, in processes of this machine, or on a Dask cluster."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Protocol
+
+from g2ard.errors import InputError
+from g2ard.progress import Progress, silent
+from g2ard.tiles.task import Task, run_task
+
+__all__ = ["Executor", "executor"]
+
+_TRIES = 5
+"""How often in a row workers may die with no task done between, before it is no accident."""
+
+
+class Executor(Protocol):
+    """Runs tasks that do not read each other's files."""
+
+    def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
+        """The tasks' files, in the tasks' order; those that are there are not made again."""
+
+
+@contextmanager
+def executor(
+    workers: int = 1, threads: int | None = None, scheduler: str | None = None
+) -> Iterator[Executor]:
+    """Where tasks run.
+
+    Args:
+        workers: processes at once; 1 runs tasks in this process.
+        threads: of each worker; None shares the cores out.
+        scheduler: `tcp://HOST:PORT` of a Dask scheduler whose workers see the same files, or `local` for a
+            Dask cluster of `workers` processes here.
+
+    Raises:
+        InputError: Dask is not installed, or does not answer.
+    """
+    threads = threads or max(1, (os.cpu_count() or 1) // workers)
+    if scheduler:
+        from g2ard.tiles.cluster import DaskExecutor
+
+        with DaskExecutor(scheduler, workers, threads) as cluster:
+            yield cluster
+    elif workers == 1:
+        yield _Here()
+    else:
+        with _Processes(workers, threads) as processes:
+            yield processes
+
+
+class _Here:
+    def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
+        todo = [task for task in tasks if not task.output.exists()]
+        done = total = sum(task.cost for task in tasks)
+        done -= sum(task.cost for task in todo)
+        for task in todo:
+            progress(stage, done, total)
+            run_task(task)
+            done += task.cost
+        progress(stage, total, total)
+        return [task.output for task in tasks]
+
+
+class _Processes:
+    """A pool of processes; where one is killed the pool is made anew, and what was not done is done again."""
+
+    def __init__(self, workers: int, threads: int):
+        self._workers, self._threads = workers, threads
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> _Processes:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        self._stop(at_once=kind is not None)
+
+    def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
+        total, failures = sum(task.cost for task in tasks), 0
+        while todo := [task for task in tasks if not task.output.exists()]:
+            before = len(todo)
+            try:
+                self._round(todo, total, stage, progress)
+            except BrokenProcessPool:
+                self._stop(at_once=True)
+                left = sum(not task.output.exists() for task in tasks)
+                failures = failures + 1 if left == before else 0
+                if failures == _TRIES:
+                    raise InputError(
+                        f"{stage}: workers die before they finish anything; with less --memory or fewer "
+                        "--workers they take less each"
+                    ) from None
+        progress(stage, total, total)
+        return [task.output for task in tasks]
+
+    def _round(self, todo: Sequence[Task], total: int, stage: str, progress: Progress) -> None:
+        if self._pool is None:
+            context = get_context("spawn")
+            self._pool = ProcessPoolExecutor(self._workers, context, _begin, (self._threads,))
+        futures: dict[Future[Path], Task] = {self._pool.submit(run_task, task): task for task in todo}
+        done, pending = total - sum(task.cost for task in todo), set(futures)
+        while pending:
+            progress(stage, done, total)
+            finished, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)
+            for future in finished:
+                future.result()
+                done += futures[future].cost
+
+    def _stop(self, at_once: bool) -> None:
+        if self._pool is None:
+            return
+        processes = list((self._pool._processes or {}).values())
+        self._pool.shutdown(wait=not at_once, cancel_futures=True)
+        if at_once:
+            for process in processes:
+                with suppress(OSError, ValueError):
+                    process.kill()
+            for process in processes:
+                process.join()
+        self._pool = None
+
+
+def _begin(threads: int) -> None:
+    """A worker's start: Ctrl-C is its parent's to act on."""
+    from g2ard import _core
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _core.set_num_threads(threads)

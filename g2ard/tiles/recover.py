@@ -1,0 +1,260 @@
+"""Recovery of a scene in tiles: each tile learns where it stands, its surroundings frozen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.cameras import Cameras
+from g2ard.constants import changed, listed
+from g2ard.errors import InputError
+from g2ard.progress import Progress, silent
+from g2ard.splats import Splats
+from g2ard.stages.recover import RecoverConfig
+from g2ard.stages.recover.anchors import Anchors
+from g2ard.stages.render import RasterSettings, Renderer, settings_for
+from g2ard.targets import TeacherRenders
+from g2ard.tiles.executor import Executor
+from g2ard.tiles.sights import Surroundings, in_sight, light_of, written
+from g2ard.tiles.simplify import TiledScene, finished
+from g2ard.tiles.steps import (
+    Arguments,
+    Inputs,
+    Places,
+    cameras_of,
+    cropped,
+    far_around,
+    joined,
+    scene_of,
+    small_scene,
+    tile_of,
+    within_halo,
+)
+from g2ard.tiles.store import TileStore
+from g2ard.tiles.task import Arrays, Task, load
+
+if TYPE_CHECKING:
+    from g2ard.policy.views import RunViews
+
+__all__ = ["TiledScores", "recover_tile", "recover_tiles"]
+
+_BESIDE = 16
+"""Pixels around a tile that its images show too: SSIM's windows reach over its edge."""
+
+_OWN = 0.5
+"""Share of a pixel's light that comes from a tile where the pixel counts for it."""
+
+_SH0 = 0.28209479177387814
+
+
+@dataclass(frozen=True)
+class TiledScores:
+    """Held-out views, over all pixels that tiles own in them.
+
+    Args:
+        simplified: PSNR, dB, before recovery.
+        recovered: and after it.
+        pixels: that it is taken over.
+        steps: of all tiles together.
+    """
+
+    simplified: float
+    recovered: float
+    pixels: int
+    steps: int
+
+
+class TileTargets(TeacherRenders):
+    """The dense scene's renders, of which the pixels count that a tile gives most of the light of."""
+
+    def __init__(self, teacher: Splats, own: int, cameras: Cameras, **options: Any) -> None:
+        self._masks: dict[int, NDArray[np.bool_]] = {}
+        bright = np.full((len(teacher), 1, 3), -0.5 / _SH0, np.float32)
+        bright[:own] = 0.5 / _SH0
+        nothing = np.zeros((len(teacher), 0, 3), np.float32)
+        self._share = Renderer(replace(teacher, sh0=bright, shN=nothing))
+        super().__init__(teacher, cameras, **options)
+
+    def mask(self, view: int) -> NDArray[np.bool_]:
+        """(H, W), where a pixel counts."""
+        if view not in self._masks:
+            self._masks[view] = self._share.image(self.cameras[view])[..., 0] > _OWN
+        return self._masks[view]
+
+
+def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+    """A tile's Gaussians after recovery, and squared errors in held-out views before it and after."""
+    from g2ard.stages.recover import recover
+
+    store = TileStore.open(places["store"])
+    core, far = tile_of(arguments, places), far_around(store, arguments, inputs)
+    teacher = joined([part for part in (core, store.read_halo(arguments["tile"]), *far) if len(part)])
+    files = {"merged": inputs["merged"], "again": inputs["again"]}
+    small = small_scene(files, arguments["mean"])
+    beside = []
+    for merged, again in zip(inputs["beside"], inputs["beside_again"], strict=True):
+        other = small_scene({"merged": merged, "again": again}, arguments["mean"])
+        beside.append(other.take(within_halo(store, arguments["tile"], other.means)))
+    student = joined([part for part in (small, *beside, *far) if len(part)])
+    frozen = np.arange(len(student)) >= len(small)
+    config = changed(RecoverConfig(), "recover", arguments["config"])
+    background = config.background
+
+    def targets(name: str) -> TileTargets | None:
+        cameras = cameras_of(inputs[name]).take(arguments[name])
+        if not len(cameras):
+            return None
+        settings = settings_for(core.means, RasterSettings())
+        here = cropped(cameras.recentred(store.offset), core, settings, _BESIDE)
+        return TileTargets(
+            teacher, len(core), here.recentred(-store.offset), background=background, lazy=True
+        )
+
+    train, held_out, apart = targets("train"), targets("test"), targets("apart")
+    if train is None or not arguments["steps"]:
+        return {**_arrays(small), "errors": np.zeros((2, 2)), "steps": np.array(0)}
+    done = recover(
+        student,
+        train,
+        replace(config, steps=arguments["steps"]),
+        anchors=Anchors.of(student, config.regularizers.in_plane),
+        validation=apart,
+        frozen=frozen,
+    )
+    result = done.splats.take(slice(len(small)))
+    whole = joined([result, student.take(frozen)])
+    errors = [_errors(scene, held_out, background) for scene in (student, whole)]
+    return {**_arrays(result), "errors": np.array(errors), "steps": np.array(done.report.steps)}
+
+
+def _errors(
+    scene: Splats, targets: TileTargets | None, background: tuple[float, float, float]
+) -> tuple[float, int]:
+    """Squared error summed over the pixels that count and their channels, and how many values those are."""
+    if targets is None:
+        return 0.0, 0
+    total, count, renderer = 0.0, 0, Renderer(scene, background=background)
+    for view, camera in enumerate(targets.cameras):
+        mask = targets.mask(view)
+        lost = np.clip(renderer.image(camera), 0, 1)[mask] - targets[view][mask]
+        total += float(np.sum(np.square(lost, dtype=np.float64)))
+        count += lost.size
+    return total, count
+
+
+def _arrays(scene: Splats) -> Arrays:
+    names = ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset")
+    return {f"scene_{name}": getattr(scene, name) for name in names}
+
+
+def recover_tiles(
+    store: TileStore,
+    small: TiledScene,
+    views: RunViews,
+    config: RecoverConfig,
+    steps: int,
+    *,
+    executor: Executor,
+    work: Path,
+    progress: Progress = silent,
+) -> tuple[TiledScene, TiledScores]:
+    """Recover each tile against the dense scene's renders, as if it were part of one recovery of all.
+
+    A tile's Gaussians learn; those of others within its margin, and coarse ones of all else, stand frozen
+    around them, so that what hides what is right. Only the pixels count that the tile gives most of the
+    light of in the dense scene; images are cropped to them. A tile takes the share of `steps` that views
+    which have it in sight are of all.
+
+    Args:
+        store: the dense scene.
+        small: what `simplify_tiles` made of it, with views.
+        views: to learn from, to score on, and of another kind to judge by.
+        config: of recovery; its steps are not read.
+        steps: of a recovery of all.
+        executor: runs the tasks.
+        work: a folder for their files.
+        progress: told of tiles done.
+
+    Raises:
+        InputError: the scene was simplified without views.
+    """
+    around = small.surroundings
+    if around is None:
+        raise InputError("recovery in tiles: needs views")
+    sight = {
+        name: (written(work, cameras), _seen(store, around, cameras, executor, work, progress))
+        for name, cameras in (
+            ("train", views.train.cameras),
+            ("test", views.test),
+            ("apart", views.apart or views.test.take([])),
+        )
+    }
+    tasks = [
+        _task(store, around, tile, sight, steps / max(1, len(views.train.cameras)), config, work)
+        for tile in range(len(store.tiles))
+    ]
+    paths = executor.run(tasks, "recover", progress)
+    errors = np.sum([load(path, "errors")[0] for path in paths], axis=0)
+    taken = sum(int(load(path, "steps")[0]) for path in paths)
+    psnr = [float(-10 * math.log10(max(e, 1e-12) / max(n, 1))) for e, n in errors]
+    scene = replace(
+        small,
+        tiles=lambda tile: finished(scene_of(paths[tile], "scene"), small.sh_degree),
+    )
+    return scene, TiledScores(psnr[0], psnr[1], int(errors[0][1]) // 3, taken)
+
+
+def _seen(
+    store: TileStore,
+    around: Surroundings,
+    cameras: Cameras,
+    executor: Executor,
+    work: Path,
+    progress: Progress,
+) -> list[list[int]]:
+    """For each tile the views that have it in sight."""
+    if not len(cameras):
+        return [[] for _ in store.tiles]
+    light = light_of(store, around.coarse, cameras, executor, work, progress)
+    return [in_sight(light, tile).tolist() for tile in range(len(store.tiles))]
+
+
+def _task(
+    store: TileStore,
+    around: Surroundings,
+    tile: int,
+    sight: dict[str, tuple[Path, list[list[int]]]],
+    steps_a_view: float,
+    config: RecoverConfig,
+    work: Path,
+) -> Task:
+    near = [other for other, level in enumerate(around.levels[tile]) if level == "near"]
+    views = {name: seen[tile] for name, (_, seen) in sight.items()}
+    return Task(
+        "g2ard.tiles.recover:recover_tile",
+        f"recover-{tile:05}",
+        work,
+        {
+            "store": store.key,
+            "tile": tile,
+            "levels": around.levels[tile],
+            "mean": around.mean,
+            "steps": round(steps_a_view * len(views["train"])),
+            "config": listed({"recover": config}),
+            **views,
+        },
+        {
+            "coarse": around.coarse,
+            **around.files[tile],
+            "beside": [around.files[other]["merged"] for other in near],
+            "beside_again": [around.files[other]["again"] for other in near],
+            **{name: path for name, (path, _) in sight.items()},
+        },
+        {"store": store.folder},
+        store.tiles[tile].rows,
+    )

@@ -1,0 +1,194 @@
+"""Which views have which tile in sight, and what they see of it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.cameras import Cameras
+from g2ard.io.atomic import atomic_output
+from g2ard.progress import Progress
+from g2ard.tiles.executor import Executor
+from g2ard.tiles.run import TiledRun
+from g2ard.tiles.steps import COARSE, scene_of
+from g2ard.tiles.store import TileStore
+from g2ard.tiles.task import Task, load
+
+__all__ = ["Sights", "Surroundings", "in_sight", "light_of", "written"]
+
+_LOOKS = 96
+"""The most views that look at one tile."""
+
+_LONGEST = 300
+"""Longer side of what they render, pixels."""
+
+_IN_SIGHT = 0.01
+"""Share of a view's light that comes from a tile that it has in sight."""
+
+_GLANCED = 200_000
+"""Coarse Gaussians of a scene up to which the nearer level tells which views have which tile in sight."""
+
+_CHUNK = 64
+"""Views a task that tells so."""
+
+_TAILS = 1, 99
+"""Percentiles of its Gaussians that count as a tile's box: floaters decide nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Where tiles stand.
+
+    Args:
+        coarse: each tile's file of coarse Gaussians.
+        levels: for each tile, by which of them every other stands beside it; None is itself.
+        files: each tile's, as `g2ard.tiles.steps.small_scene` reads them.
+        mean: as it takes it.
+    """
+
+    coarse: list[Path]
+    levels: list[list[str | None]]
+    files: list[dict[str, Path]]
+    mean: float
+
+
+class Sights:
+    """Which views have which tile in sight, and what they see of it."""
+
+    def __init__(self, run: TiledRun, coarse: list[Path], cameras: Cameras, frame: tuple[float, ...]):
+        self.run, self.coarse, self.cameras = run, coarse, cameras.resized(_LONGEST)
+        self.shrunk = float((self.cameras.widths / cameras.widths).mean())
+        self.views = written(run.work, self.cameras)
+        self.boxes = boxes_of(coarse)
+        light = light_of(run.store, coarse, self.cameras, run.executor, run.work, run.progress)
+        self.arguments = [
+            {
+                **self._chosen(light, tile),
+                "levels": self._levels(tile),
+                "shrunk": self.shrunk,
+            }
+            for tile in range(len(coarse))
+        ]
+        self.looks = run.each("look", "look", frame=frame, per_tile=self.arguments, inputs=self._inputs())
+        pixels = np.array([float(load(path, "pixel")[0]) for path in self.looks])
+        sums = np.array([load(path, "sums")[0] for path in self.looks]).sum(axis=0)
+        self.frame = frame
+        if np.isfinite(pixels).any():
+            known = np.isfinite(pixels)
+            pixel = _weighted_median(pixels[known], np.array(run.sizes)[known])
+            self.frame = _core.TileFrame(*frame).with_views(pixel, *map(float, sums)).values()
+
+    def surroundings(self, merged: list[Path], count: int) -> Surroundings:
+        """Where the merged tiles stand, `count` Gaussians in all, after another look at them."""
+        run = self.run
+        inputs = [
+            {**given, "merged": path, "look": look}
+            for given, path, look in zip(self._inputs(), merged, self.looks, strict=True)
+        ]
+        again = run.each(
+            "look_again",
+            "look again",
+            per_tile=[{"levels": a["levels"]} for a in self.arguments],
+            inputs=inputs,
+        )
+        mean = sum(float(load(path, "wanted")[0].sum()) for path in merged) / count
+        files = [{"merged": one, "again": other} for one, other in zip(merged, again, strict=True)]
+        return Surroundings(self.coarse, [given["levels"] for given in self.arguments], files, mean)
+
+    def _inputs(self) -> list[dict[str, Any]]:
+        return [{"coarse": self.coarse, "views": self.views} for _ in self.coarse]
+
+    def _chosen(self, light: NDArray[np.float64], tile: int) -> dict[str, Any]:
+        """The views that look at a tile: evenly spaced among those that have it in sight."""
+        sight = in_sight(light, tile)
+        some = sight[np.unique(np.linspace(0, len(sight) - 1, min(_LOOKS, len(sight))).round().astype(int))]
+        return {
+            "views": some.tolist(),
+            "light": light[some, tile].tolist(),
+            "all_light": float(light[:, tile].sum()) or 1.0,
+        }
+
+    def _levels(self, tile: int) -> list[str | None]:
+        """By which coarse level each tile stands beside `tile`, which has none itself."""
+        low, high = self.boxes[:, 0], self.boxes[:, 1]
+        gaps = np.maximum(0.0, np.maximum(low - high[tile], low[tile] - high))
+        near = np.linalg.norm(gaps, axis=1) <= np.linalg.norm(high[tile] - low[tile])
+        levels: list[str | None] = ["near" if is_near else "far" for is_near in near]
+        levels[tile] = None
+        return levels
+
+
+def boxes_of(coarse: Sequence[Path]) -> NDArray[np.float64]:
+    """(T, 2, 3) low and high corners of tiles."""
+    return np.array([np.percentile(scene_of(path, "near").means, _TAILS, axis=0) for path in coarse])
+
+
+def in_sight(light: NDArray[np.float64], tile: int) -> NDArray[np.intp]:
+    """The views that have a tile in sight; where those are few, also the best of the others.
+
+    Args:
+        light: (V, T) of `light_of`.
+        tile: which.
+    """
+    own = light[:, tile]
+    sight = np.flatnonzero(own > _IN_SIGHT * light.sum(axis=1))
+    if len(sight) < _LOOKS:
+        best = np.argsort(-own, kind="stable")[:_LOOKS]
+        sight = np.sort(best[own[best] > 0])
+    return sight
+
+
+def written(work: Path, cameras: Cameras) -> Path:
+    """Cameras as a task's input, named by their content."""
+    arrays = {name: getattr(cameras, name) for name in ("viewmats", "Ks", "widths", "heights")}
+    content = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays.values())
+    path = work / f"views-{hashlib.sha256(content).hexdigest()[:16]}.npz"
+    if not path.exists():
+        with atomic_output(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, **arrays)
+    return path
+
+
+def light_of(
+    store: TileStore,
+    coarse: list[Path],
+    cameras: Cameras,
+    executor: Executor,
+    work: Path,
+    progress: Progress,
+) -> NDArray[np.float64]:
+    """(V, T) Σ αT that each view gets from each tile, of the tiles' coarse Gaussians, in small renders."""
+    level = "near" if store.count // COARSE[0] <= _GLANCED else "far"
+    small = cameras.resized(_LONGEST)
+    views = written(work, small)
+    here = small.recentred(store.offset)
+    middles = boxes_of(coarse).mean(axis=1)
+    away = np.linalg.norm(here.positions[:, None] - middles, axis=2).min(axis=1)
+    near = 1e-3 * float(np.median(away)) or None
+    chunks = [range(i, min(i + _CHUNK, len(here))) for i in range(0, len(here), _CHUNK)]
+    tasks = [
+        Task(
+            "g2ard.tiles.steps:glance",
+            f"glance-{number:05}",
+            work,
+            {"views": list(chunk), "level": level, "near": near},
+            {"coarse": coarse, "views": views},
+            cost=len(chunk),
+        )
+        for number, chunk in enumerate(chunks)
+    ]
+    paths = executor.run(tasks, "glance", progress)
+    return np.concatenate([load(path, "weights")[0] for path in paths])
+
+
+def _weighted_median(values: NDArray[np.float64], weights: NDArray[Any]) -> float:
+    order = np.argsort(values, kind="stable")
+    sums = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(sums, sums[-1] / 2)])

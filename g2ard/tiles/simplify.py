@@ -1,0 +1,234 @@
+"""Simplification of a scene in tiles, at one exact budget."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.splats import Splats, unit_quats
+from g2ard.stages.simplify import SimplifyConfig
+from g2ard.tiles.cut import cheapest
+from g2ard.tiles.executor import Executor
+from g2ard.tiles.run import TiledRun
+from g2ard.tiles.sights import Sights, Surroundings
+from g2ard.tiles.steps import joined, scene_of, small_scene
+from g2ard.tiles.store import TileStore
+from g2ard.tiles.task import load
+
+if TYPE_CHECKING:
+    from g2ard.cameras import Cameras
+
+__all__ = ["TiledScene", "finished", "sample_of", "simplify_tiles"]
+
+_POOL, _POOL_ROWS = 96, 4_000_000
+"""Poses to look from for so many Gaussians; more of these, more of those."""
+
+_PLANNED_ON = 100_000
+"""Gaussians of a fair sample that so many poses are planned on."""
+
+
+@dataclass(frozen=True, eq=False)
+class TiledScene:
+    """A simplified scene, in tiles.
+
+    Args:
+        counts: Gaussians of each tile.
+        tiles: reads the Gaussians of a tile, opacities fitted.
+        sh_degree: of all.
+        offset: (3,) float64.
+        views: that the tiles were looked at from; 0 without views.
+        unseen: Gaussians of the dense scene that no view sees; None without views.
+        surroundings: what recovery needs beside; None without views.
+    """
+
+    counts: tuple[int, ...]
+    tiles: Callable[[int], Splats]
+    sh_degree: int
+    offset: NDArray[np.float64]
+    views: int = 0
+    unseen: int | None = None
+    surroundings: Surroundings | None = None
+
+    def __len__(self) -> int:
+        return sum(self.counts)
+
+    def __iter__(self) -> Iterator[Splats]:
+        return (self.tiles(tile) for tile in range(len(self.counts)))
+
+    def whole(self) -> Splats:
+        """All tiles as one scene in memory."""
+        return joined(list(self))
+
+
+def simplify_tiles(
+    store: TileStore,
+    budget: int,
+    *,
+    executor: Executor,
+    work: Path,
+    config: SimplifyConfig | None = None,
+    views: Cameras | None = None,
+    beside: Callable[[Splats], Cameras | None] = lambda sample: None,
+    blind: bool = False,
+    up: Any = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> TiledScene:
+    """Reduce a scene in tiles to exactly `budget` Gaussians with the method `default`.
+
+    1. Each tile is merged to a few coarse Gaussians, which stand for it where others are looked at.
+    2. Poses are planned on those; each tile is looked at, by the views that have it in sight, where it stands
+       in the whole scene: its own Gaussians, its halo's, coarse ones of all else.
+    3. What merging along Morton order costs is found in every tile; of all gaps the cheapest close, down to
+       three times the budget. Then each tile plans merges of pairs, farther than it will need; of all plans
+       the cheapest merges are done, down to the budget.
+    4. Opacities are fitted to what the same views see of the result.
+
+    Every step is a task whose file stays in `work`: the same call goes on where it was interrupted. The
+    result depends on the scene, the tiles and the seed alone, not on where, in which order or how often
+    tasks ran.
+
+    Args:
+        store: the scene.
+        budget: Gaussians to keep.
+        executor: runs the tasks.
+        work: a folder for their files.
+        config: constants; None means the method's own.
+        views: cameras to look from; None takes those that `beside` finds for a fair sample of the scene, else
+            plans a pool.
+        beside: finds cameras.
+        blind: use no cameras at all.
+        up: (3,) away from the ground, for poses that are made; None to estimate it.
+        seed: of poses that are made.
+        progress: told of tasks done, step by step.
+        say: told in lines what was decided.
+
+    Raises:
+        InputError: a budget below 1 or above what a renderer draws of the scene.
+    """
+    if not 1 <= budget <= store.count:
+        raise InputError(f"budget: expected 1 to the {store.count:,} Gaussians there are, got {budget:,}")
+    work.mkdir(parents=True, exist_ok=True)
+    run = TiledRun(store, executor, work, config or SimplifyConfig(), progress)
+    coarse = run.each("coarse", "coarse")
+    frame = run.sampled_frame(coarse)
+    sights: Sights | None = None
+    if not blind:
+        sample = joined([scene_of(path, "sample") for path in coarse])
+        cameras = views or beside(sample) or _planned(run, sample, up, seed, say)
+        sights = None if cameras is None else Sights(run, coarse, cameras, frame)
+        frame = frame if sights is None else sights.frame
+    costs = run.each("run_costs", "costs", frame=frame, **_look_of(sights))
+    runs = _runs(run, costs, budget)
+    of_all = budget / sum(runs)
+    plans = run.each(
+        "pair_plan",
+        "plans",
+        frame=frame,
+        per_tile=[{"runs": n, "expected": of_all * n} for n in runs],
+        **_look_of(sights),
+    )
+    merges = cheapest([_reader(path) for path in plans], sum(runs) - budget)
+    _check_reached(sum(runs) - sum(merges), budget)
+    per_tile = [{"runs": n, "merges": m} for n, m in zip(runs, merges, strict=True)]
+    merged = run.each(
+        "merge",
+        "merge",
+        frame=frame,
+        per_tile=per_tile,
+        inputs=[
+            {"plan": plan, **({"look": sights.looks[tile]} if sights else {})}
+            for tile, plan in enumerate(plans)
+        ],
+    )
+    counts = tuple(n - m for n, m in zip(runs, merges, strict=True))
+    if sights is None:
+        return _scene(store, counts, [{"merged": path} for path in merged], None)
+    around = sights.surroundings(merged, sum(counts))
+    unseen = sum(int(load(path, "unseen")[0]) for path in merged)
+    scene = _scene(store, counts, around.files, around.mean)
+    return replace(scene, views=len(sights.cameras), unseen=unseen, surroundings=around)
+
+
+def sample_of(store: TileStore, executor: Executor, work: Path, progress: Progress = silent) -> Splats:
+    """A fair sample of a scene in tiles; its task is one of `simplify_tiles`, which does not do it again."""
+    work.mkdir(parents=True, exist_ok=True)
+    run = TiledRun(store, executor, work, SimplifyConfig(), progress)
+    return joined([scene_of(path, "sample") for path in run.each("coarse", "coarse")])
+
+
+def _scene(
+    store: TileStore, counts: tuple[int, ...], files: list[dict[str, Path]], mean: float | None
+) -> TiledScene:
+    """The scene of what all tiles were merged to."""
+
+    def tile(i: int) -> Splats:
+        return finished(small_scene(files[i], mean), store.sh_degree)
+
+    return TiledScene(counts, tile, store.sh_degree, store.offset)
+
+
+def finished(small: Splats, sh_degree: int) -> Splats:
+    """A tile's Gaussians as they are written."""
+    return replace(small.with_sh_degree(sh_degree), quats=unit_quats(small.quats))
+
+
+def _look_of(sights: Sights | None) -> dict[str, Any]:
+    return {} if sights is None else {"inputs": [{"look": path} for path in sights.looks]}
+
+
+def _planned(run: TiledRun, sample: Splats, up: Any, seed: int, say: Say) -> Cameras | None:
+    """A pool that grows with the scene."""
+    from g2ard.poses import plan_pool
+
+    times = max(1.0, run.store.count / _POOL_ROWS)
+    try:
+        pool = plan_pool(
+            sample,
+            round(_POOL * times),
+            up=up,
+            seed=seed,
+            rows=round(_PLANNED_ON * times),
+            near=0.25,
+            looks=True,
+            represents=run.store.count / len(sample),
+            progress=run.progress,
+        )
+    except InputError as e:
+        say(f"goes on without views: {e}")
+        return None
+    say(f"poses: {len(pool.cameras)}, {pool.kind}")
+    return pool.cameras
+
+
+def _runs(run: TiledRun, costs: list[Path], budget: int) -> list[int]:
+    """How many runs of Morton order each tile keeps."""
+    kept = [_length(path) + 1 for path in costs]
+    if sum(kept) < budget:
+        raise InputError(
+            f"budget: expected at most the {sum(kept):,} Gaussians that a renderer draws, got {budget:,}"
+        )
+    target = min(sum(kept), int(run.config["morton_premerge_ratio"] * budget))
+    closed = cheapest([_reader(path) for path in costs], sum(kept) - max(target, len(kept)))
+    return [n - c for n, c in zip(kept, closed, strict=True)]
+
+
+def _length(path: Path) -> int:
+    return len(load(path, "costs")[0])
+
+
+def _reader(path: Path) -> Callable[[], NDArray[np.float32]]:
+    return lambda: load(path, "costs")[0]
+
+
+def _check_reached(count: int, budget: int) -> None:
+    if count != budget:
+        raise InputError(f"budget: {count:,} Gaussians is the fewest that the tiles come to, not {budget:,}")

@@ -1,0 +1,217 @@
+//! The pairwise policy on one tile of a scene too large for memory, in steps between which the tiles agree on
+//! what each of them keeps.
+//!
+//! All tiles measure in one [`Frame`], so that their costs compare. [`Tile::run_costs`] says what merging along
+//! Morton order costs; once it is decided how many runs a tile keeps, [`Tile::plan`] merges pairs of neighbours
+//! farther than any budget asks for and tells the order of the merges and their costs; once it is decided how
+//! many of those a tile does, [`Tile::assemble`] makes its Gaussians.
+
+use super::clusters::Partition;
+use super::importance::Importance;
+use super::leaves::{Leaves, floor, typical_size};
+use super::matching::{Pair, candidates, matched};
+use super::morton_tree::{cut, merge_costs};
+use super::pairwise::{PairwiseRound, merge};
+use super::rows::{Rows, Shuffled};
+use super::{GONE, Outcome, Pairwise, Visibility};
+use crate::scene::{Ordered, SceneRef};
+use crate::{Control, Error, Result};
+
+/// What tiles must agree on for their costs to compare.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Frame {
+    /// What lengths are divided by.
+    pub unit: f64,
+    /// The size of a pixel where no view tells it.
+    pub pixel_size: f32,
+    /// Σ αT that a unit of mass counts for though no view sees it.
+    pub floor: f32,
+    /// Estimates Σ αT without views.
+    pub importance: Importance,
+}
+
+impl Frame {
+    /// The frame of a scene without views, from all of it or a fair sample.
+    pub fn of_sample(policy: &Pairwise, scene: &SceneRef, ordered: &Ordered) -> Self {
+        let pixel_size = policy.pixel_without_views(scene);
+        let blur = policy.blurs(scene, ordered, None, Some(pixel_size));
+        let rows = (0..scene.len() as u32).collect();
+        let leaves = Leaves::new(scene, ordered, rows, &blur, None, None);
+        Self {
+            unit: typical_size(scene),
+            pixel_size,
+            floor: 0.0,
+            importance: leaves.importance(),
+        }
+    }
+
+    /// The same with views: the median size of a pixel, and the sums of [`Tile::sums`] over all tiles.
+    pub fn with_views(self, pixel_size: f32, weight: f64, mass: f64) -> Self {
+        Self {
+            pixel_size,
+            floor: floor(weight, mass),
+            ..self
+        }
+    }
+}
+
+/// Merges of a tile in the order they are done, over the runs of Morton order that it begins with.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct TilePlan {
+    /// The run of each ordered row, or [`GONE`] where it is dropped.
+    pub run_of: Vec<u32>,
+    /// How many runs there are.
+    pub runs: usize,
+    /// Runs `b` joins `a`; each is named by the run that it began with.
+    pub merges: Vec<Pair>,
+}
+
+/// A tile and what it is measured by.
+pub struct Tile<'a> {
+    pub policy: Pairwise,
+    pub scene: &'a SceneRef<'a>,
+    pub ordered: &'a Ordered,
+    pub visibility: Option<Visibility<'a>>,
+    pub frame: Frame,
+}
+
+impl Tile<'_> {
+    /// Σ αT of the views, and mass, of the rows that are kept; the frame's floor is not read.
+    pub fn sums(&self) -> Result<(f64, f64)> {
+        self.policy.check(self.scene, self.visibility, None)?;
+        let (blur, kept) = (self.blurs(), self.kept());
+        Ok(self.leaves(kept, &blur).sums())
+    }
+
+    /// What closing each gap between neighbours in Morton order costs, from the first kept row on.
+    pub fn run_costs(&self) -> Result<Vec<f32>> {
+        self.policy.check(self.scene, self.visibility, None)?;
+        let (blur, kept) = (self.blurs(), self.kept());
+        let leaves = self.leaves(kept, &blur);
+        Ok(merge_costs(&leaves.codes(), &leaves, self.geometric()))
+    }
+
+    /// Merges down to `runs` runs along Morton order, then pairs of neighbours in rounds down to each count of
+    /// `schedule`.
+    pub fn plan(&self, runs: usize, schedule: &[usize], control: &Control) -> Result<TilePlan> {
+        self.policy.check(self.scene, self.visibility, None)?;
+        let (blur, kept) = (self.blurs(), self.kept());
+        let leaves = self.leaves(kept.clone(), &blur);
+        if runs == 0 || runs > leaves.len() {
+            return Err(Error::invalid(
+                "runs",
+                format!("1 to {}", leaves.len()),
+                runs,
+            ));
+        }
+        control.begin((runs - schedule.last().map_or(runs, |&last| last.min(runs))) as u64);
+        let (mut nodes, at) = if runs < leaves.len() {
+            let costs = merge_costs(&leaves.codes(), &leaves, self.geometric());
+            let parts = cut(&costs, runs);
+            let merged = leaves.merged(&parts);
+            let every: Vec<u32> = (0..runs as u32).collect();
+            let (from, map, _) = merged.morton(&every, [0.0; 3]);
+            let of = parts.of.iter().map(|&run| map[run as usize]);
+            let of: Vec<u32> = of.collect();
+            (Shuffled::new(merged, from).settled(), of)
+        } else {
+            (leaves.nodes(), (0..runs as u32).collect())
+        };
+        let mut run_of = vec![GONE; self.scene.len()];
+        for (&row, &run) in kept.iter().zip(&at) {
+            run_of[row as usize] = run;
+        }
+        let mut names: Vec<u32> = (0..runs as u32).collect();
+        let mut merges = Vec::new();
+        for &target in schedule {
+            while nodes.len() > target {
+                let before = nodes.len();
+                let lists = candidates(&nodes, self.policy.neighbors, self.geometric(), control)?;
+                let pairs = matched(&lists, self.policy.neighbors, before - target);
+                drop(lists);
+                merges.extend(pairs.iter().map(|p| Pair {
+                    a: names[p.a as usize],
+                    b: names[p.b as usize],
+                    cost: p.cost,
+                }));
+                let kept: Vec<bool> = left(before, &pairs);
+                let map = merge(&mut nodes, &pairs);
+                let mut next = vec![0; nodes.len()];
+                for i in (0..before).filter(|&i| kept[i]) {
+                    next[map[i] as usize] = names[i];
+                }
+                names = next;
+                control.advance(pairs.len() as u64);
+            }
+        }
+        Ok(TilePlan {
+            run_of,
+            runs,
+            merges,
+        })
+    }
+
+    /// The Gaussians of a partition: `of` has the cluster of each ordered row, or [`GONE`], `count` of them.
+    pub fn assemble(
+        &self,
+        of: Vec<u32>,
+        count: usize,
+        control: &Control,
+    ) -> Result<Outcome<PairwiseRound>> {
+        if of.len() != self.scene.len() {
+            return Err(Error::invalid(
+                "of",
+                format!("{} rows", self.scene.len()),
+                of.len(),
+            ));
+        }
+        let blur = self.blurs();
+        let flags = vec![false; of.len()];
+        let (step, clamped) = Partition { of, count }.assemble(
+            self.scene,
+            self.ordered,
+            &flags,
+            self.policy.max_growth,
+            |i| blur[i].into(),
+            control,
+        )?;
+        let mut outcome = step.finish(self.scene, self.ordered, Vec::new());
+        outcome.clamped_opacities = clamped;
+        Ok(outcome)
+    }
+
+    /// The ordered rows that a renderer draws; one row at least.
+    fn kept(&self) -> Vec<u32> {
+        let (partition, _) = self.policy.drop_transparent(self.scene, self.ordered, 1);
+        let rows = 0..self.scene.len() as u32;
+        rows.filter(|&i| partition.of[i as usize] != GONE).collect()
+    }
+
+    fn blurs(&self) -> Vec<f32> {
+        let usual = Some(self.frame.pixel_size);
+        self.policy
+            .blurs(self.scene, self.ordered, self.visibility, usual)
+    }
+
+    fn leaves<'b>(&'b self, kept: Vec<u32>, blur: &'b [f32]) -> Leaves<'b> {
+        Leaves::new(
+            self.scene,
+            self.ordered,
+            kept,
+            blur,
+            self.visibility,
+            Some(&self.frame),
+        )
+    }
+
+    fn geometric(&self) -> f32 {
+        self.policy.geometric(self.visibility)
+    }
+}
+
+/// The nodes that no pair takes away.
+fn left(count: usize, pairs: &[Pair]) -> Vec<bool> {
+    let mut left = vec![true; count];
+    pairs.iter().for_each(|p| left[p.b as usize] = false);
+    left
+}

@@ -1,0 +1,184 @@
+//! `_core.TileMerging`: simplification of one tile, in the steps that tiles agree between.
+
+use g2ard_core::simplify::{Frame, Importance, Pairwise, Tile, Visibility};
+use numpy::{PyArray1, PyReadonlyArray1};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::arrays;
+use crate::scene::PyScene;
+use crate::simplify::outcome_dict;
+use crate::work::long;
+
+type Floats<'py> = Bound<'py, PyArray1<f32>>;
+type Rows<'py> = Bound<'py, PyArray1<u32>>;
+
+/// What all tiles of a scene are measured in.
+#[pyclass(name = "TileFrame", module = "g2ard._core", frozen, from_py_object)]
+#[derive(Clone, Copy)]
+struct PyFrame(Frame);
+
+#[pymethods]
+impl PyFrame {
+    #[new]
+    fn new(unit: f64, pixel_size: f32, floor: f32, exponent: f64, usual: f64) -> Self {
+        Self(Frame {
+            unit,
+            pixel_size,
+            floor,
+            importance: Importance { exponent, usual },
+        })
+    }
+
+    /// That of a fair sample of a scene, without views.
+    #[staticmethod]
+    fn of_sample(py: Python<'_>, scene: &PyScene, pixel_scale: f64) -> PyResult<Self> {
+        let (splats, ordered) = (scene.splats(py)?, &scene.ordered);
+        let policy = Pairwise {
+            pixel_scale,
+            ..Pairwise::default()
+        };
+        Ok(Self(Frame::of_sample(&policy, &splats.borrow()?, ordered)))
+    }
+
+    /// The same with views: the usual size of a pixel, and `sums` added up over all tiles.
+    fn with_views(&self, pixel_size: f32, weight: f64, mass: f64) -> Self {
+        Self(self.0.with_views(pixel_size, weight, mass))
+    }
+
+    /// The arguments that make it.
+    fn values(&self) -> (f64, f32, f32, f64, f64) {
+        let f = self.0;
+        (
+            f.unit,
+            f.pixel_size,
+            f.floor,
+            f.importance.exponent,
+            f.importance.usual,
+        )
+    }
+}
+
+#[pyclass(name = "TileMerging", module = "g2ard._core", frozen)]
+struct PyTileMerging {
+    scene: Py<PyScene>,
+    seen: Option<[Py<PyArray1<f32>>; 2]>,
+    policy: Pairwise,
+    frame: Frame,
+}
+
+impl PyTileMerging {
+    fn with<T>(&self, py: Python<'_>, work: impl FnOnce(&Tile) -> PyResult<T>) -> PyResult<T> {
+        let scene = self.scene.get();
+        let splats = scene.splats(py)?;
+        let rows = splats.borrow()?;
+        let seen: Option<[PyReadonlyArray1<'_, f32>; 2]> = match &self.seen {
+            Some([weight, pixel]) => Some([weight.bind(py).extract()?, pixel.bind(py).extract()?]),
+            None => None,
+        };
+        let visibility = match &seen {
+            Some([weight, pixel]) => Some(Visibility {
+                weight: arrays::flat("weight", weight)?,
+                pixel_size: arrays::flat("pixel_size", pixel)?,
+            }),
+            None => None,
+        };
+        work(&Tile {
+            policy: self.policy,
+            scene: &rows,
+            ordered: &scene.ordered,
+            visibility,
+            frame: self.frame,
+        })
+    }
+}
+
+#[pymethods]
+impl PyTileMerging {
+    #[new]
+    #[pyo3(signature = (
+        scene, frame, *, weight, pixel_size, min_opacity, neighbors, geometric_weight, dilation, max_growth
+    ))]
+    fn new(
+        scene: Py<PyScene>,
+        frame: PyFrame,
+        weight: Option<Py<PyArray1<f32>>>,
+        pixel_size: Option<Py<PyArray1<f32>>>,
+        min_opacity: f64,
+        neighbors: usize,
+        geometric_weight: f64,
+        dilation: f64,
+        max_growth: f64,
+    ) -> Self {
+        let policy = Pairwise {
+            min_opacity,
+            neighbors,
+            geometric_weight,
+            dilation,
+            max_growth,
+            ..Pairwise::default()
+        };
+        Self {
+            scene,
+            seen: weight.zip(pixel_size).map(|(w, p)| [w, p]),
+            policy,
+            frame: frame.0,
+        }
+    }
+
+    /// Σ αT of the views, and mass, of the rows that are kept.
+    fn sums(&self, py: Python<'_>) -> PyResult<(f64, f64)> {
+        self.with(py, |tile| long(py, None, |_| tile.sums()))
+    }
+
+    /// What closing each gap between neighbours in Morton order costs, from the first kept row on.
+    fn run_costs<'py>(&self, py: Python<'py>) -> PyResult<Floats<'py>> {
+        let costs = self.with(py, |tile| long(py, None, |_| tile.run_costs()))?;
+        Ok(PyArray1::from_vec(py, costs))
+    }
+
+    /// The run of each row in the scene's order, or 2³² − 1, and merges `a`, `b` of runs with their costs.
+    #[pyo3(signature = (runs, schedule, progress=None))]
+    fn plan<'py>(
+        &self,
+        py: Python<'py>,
+        runs: usize,
+        schedule: Vec<usize>,
+        progress: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<(Rows<'py>, Rows<'py>, Rows<'py>, Floats<'py>)> {
+        let plan = self.with(py, |tile| {
+            long(py, progress, |control| tile.plan(runs, &schedule, control))
+        })?;
+        let names =
+            |of: fn(&g2ard_core::simplify::Pair) -> u32| plan.merges.iter().map(of).collect();
+        let (a, b) = (names(|p| p.a), names(|p| p.b));
+        let costs = plan.merges.iter().map(|p| p.cost).collect();
+        Ok((
+            PyArray1::from_vec(py, plan.run_of),
+            PyArray1::from_vec(py, a),
+            PyArray1::from_vec(py, b),
+            PyArray1::from_vec(py, costs),
+        ))
+    }
+
+    /// The Gaussians of a partition into `count` clusters: as `simplify_pairwise`.
+    #[pyo3(signature = (of, count, progress=None))]
+    fn assemble<'py>(
+        &self,
+        py: Python<'py>,
+        of: PyReadonlyArray1<'py, u32>,
+        count: usize,
+        progress: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let of = arrays::flat("of", &of)?.to_vec();
+        let outcome = self.with(py, |tile| {
+            long(py, progress, |control| tile.assemble(of, count, control))
+        })?;
+        outcome_dict(py, outcome, Vec::new())
+    }
+}
+
+pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_class::<PyFrame>()?;
+    m.add_class::<PyTileMerging>()
+}

@@ -1,0 +1,245 @@
+"""Simplification in tiles: one exact budget, the same bits wherever tasks run, and one tile is the whole."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard import _core
+from g2ard.cameras import Cameras, look_at
+from g2ard.errors import InputError
+from g2ard.io import read_splats, write_splats
+from g2ard.prepared import finite_rows_of
+from g2ard.splats import Splats
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.simplify import SimplifyConfig, schedule, simplify
+from g2ard.targets import TeacherRenders
+from g2ard.tiles.cut import cheapest
+from g2ard.tiles.executor import executor
+from g2ard.tiles.ingest import ingest
+from g2ard.tiles.simplify import simplify_tiles
+from g2ard.tiles.steps import GONE
+from g2ard.tiles.store import TileStore
+
+
+def town(count: int = 9000, seed: int = 0) -> Splats:
+    """A textured ground with boxes on it."""
+    rng = np.random.default_rng(seed)
+    ground = rng.uniform([-8, -4, 0], [8, 4, 0], (count, 3))
+    high = rng.random(count) < 0.4
+    ground[high, :2] = (
+        rng.choice([-6.0, -2.0, 3.0, 7.0], (count, 1))[high] + rng.uniform(-0.5, 0.5, (count, 2))[high]
+    )
+    ground[high, 1] *= 0.3
+    ground[high, 2] = rng.uniform(0, 1, count)[high]
+    color = np.sin(ground @ rng.normal(size=(3, 3)) * 2)
+    return Splats.create(
+        ground,
+        quats=rng.normal(size=(count, 4)),
+        scales=np.exp(rng.normal(-2.6, 0.3, (count, 3))),
+        logit_opacities=rng.normal(2, 2, count),
+        sh0=color[:, None],
+    )
+
+
+def ring(count: int = 6) -> Cameras:
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    eyes = np.stack([12 * np.cos(angles), 8 * np.sin(angles), np.full(count, 5.0)], 1)
+    K = [[150, 0, 80], [0, 150, 60], [0, 0, 1]]
+    return Cameras.from_lists(
+        [look_at(eye, [0, 0, 0]) for eye in eyes],
+        [K] * count,
+        [(160, 120)] * count,
+        [f"{i}" for i in range(count)],
+    )
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("town") / "town.ply"
+    write_splats(path, town())
+    return path
+
+
+@pytest.fixture(scope="module")
+def store(scene: Path) -> TileStore:
+    return ingest(scene, scene.parent / "tiles", tile_rows=2500)
+
+
+def reduced(store: TileStore, work: Path, budget: int = 900, **options: object) -> Splats:
+    where = {key: options.pop(key) for key in ("workers", "threads", "scheduler") if key in options}
+    with executor(**where) as runs:  # type: ignore[arg-type]
+        return simplify_tiles(store, budget, executor=runs, work=work, **options).whole()  # type: ignore[arg-type]
+
+
+def clusters(of: np.ndarray, a: np.ndarray, b: np.ndarray, runs: int) -> np.ndarray:
+    """Naive: one merge after another."""
+    into = list(range(runs))
+    for x, y in zip(a, b, strict=True):
+        into = [int(x) if i == y else i for i in into]
+    names = {root: name for name, root in enumerate(sorted(set(into)))}
+    return np.array([GONE if run == GONE else names[into[run]] for run in of], np.uint32)
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_one_tile_is_the_whole_to_the_bit(seen: bool) -> None:
+    prepared, _ = finite_rows_of(town(2500))
+    rng = np.random.default_rng(1)
+    budget, config = 250, SimplifyConfig().resolved("default")
+
+    class Seen:
+        weight = rng.gamma(1, 1, len(prepared)).astype(np.float32)
+        pixel_size = np.where(rng.random(len(prepared)) < 0.9, 0.01, np.inf).astype(np.float32)
+
+    whole = simplify(prepared, budget, visibility=Seen() if seen else None).splats
+    frame = _core.TileFrame.of_sample(prepared.core, config.pixel_scale)
+
+    def tile(frame: _core.TileFrame) -> _core.TileMerging:
+        return _core.TileMerging(
+            prepared.core,
+            frame,
+            weight=Seen.weight if seen else None,
+            pixel_size=Seen.pixel_size if seen else None,
+            min_opacity=config.min_opacity_of("default"),
+            neighbors=config.neighbors,
+            geometric_weight=config.geometric_weight,
+            dilation=config.dilation,
+            max_growth=config.max_growth,
+        )
+
+    if seen:
+        frame = frame.with_views(0.01, 1, 1)
+        frame = frame.with_views(0.01, *tile(frame).sums())
+    here = tile(frame)
+    assert len(here.run_costs()) < len(prepared)  # the transparent are not among them
+    rounds = schedule(len(prepared), budget, config.retention_of("default"))
+    counts = [n for n in rounds if n < 3 * budget]
+    of, a, b, costs = here.plan(3 * budget, counts)
+    assert len(a) == 2 * budget
+    assert (costs >= 0).all()
+    out = here.assemble(clusters(of, a, b, 3 * budget), budget)
+    both = [
+        (np.float32(out["means"]), out["logit_opacities"]),
+        (np.float32(whole.means), whole.logit_opacities),
+    ]
+    rows = [np.column_stack(pair)[np.lexsort(np.column_stack(pair).T)] for pair in both]
+    np.testing.assert_array_equal(*rows)
+
+
+def test_the_cheapest_of_several_arrays_are_those_of_all() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        arrays = [rng.integers(0, 6, rng.integers(0, 40)).astype(np.float32) * 0.3 for _ in range(4)]
+        tagged = sorted((float(v), t, i) for t, array in enumerate(arrays) for i, v in enumerate(array))
+        count = int(rng.integers(0, len(tagged) + 1))
+        naive = [sum(t == tile for _, t, _ in tagged[:count]) for tile in range(4)]
+        assert cheapest([lambda a=a: a for a in arrays], count) == naive
+
+
+@pytest.mark.parametrize("blind", [False, True])
+def test_an_exact_count_about_as_good_as_in_one_piece(
+    store: TileStore, scene: Path, tmp_path: Path, blind: bool
+) -> None:
+    views = ring(8)
+    small = reduced(store, tmp_path, blind=blind, views=views)
+    assert len(store.tiles) >= 4
+    assert len(small) == 900
+    assert small.finite_rows().all()
+    dense = read_splats(scene)
+    from g2ard.visibility import visibility_source
+
+    whole = simplify(dense, 900, visibility=None if blind else visibility_source(views)).splats
+    targets = TeacherRenders(dense, ring(5))
+    tiled_db, whole_db = (evaluate(splats, targets).psnr for splats in (small, whole))
+    assert tiled_db > whole_db - 0.4  # tiles of 2,300 rows have many borders
+
+
+def test_neither_workers_nor_the_order_of_rows_change_a_bit(
+    store: TileStore, scene: Path, tmp_path: Path
+) -> None:
+    here = reduced(store, tmp_path / "here", views=ring(), threads=1)
+    two = reduced(store, tmp_path / "two", views=ring(), workers=2)
+    assert here.fingerprint() == two.fingerprint()
+    rows = np.random.default_rng(3).permutation(9000)
+    write_splats(tmp_path / "shuffled.ply", read_splats(scene).take(rows))
+    other = ingest(tmp_path / "shuffled.ply", tmp_path / "tiles", tile_rows=2500)
+    assert reduced(other, tmp_path / "shuffled", views=ring()).fingerprint() == here.fingerprint()
+
+
+def test_a_cluster_of_two_workers_gives_the_same_bits(store: TileStore, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    here = reduced(store, tmp_path / "here", views=ring())
+    cluster = reduced(store, tmp_path / "cluster", views=ring(), workers=2, scheduler="local")
+    assert cluster.fingerprint() == here.fingerprint()
+
+
+def test_workers_killed_at_random_cost_time_alone(store: TileStore, tmp_path: Path) -> None:
+    here = reduced(store, tmp_path / "here", views=ring())
+    stop, killed, draw, work = threading.Event(), [], random.Random(0), tmp_path / "killed"
+
+    def kill() -> None:
+        done = 0
+        while not stop.is_set() and len(killed) < 5:
+            time.sleep(0.02)
+            files = len(list(work.glob("*.npz")))
+            if files >= done + 3 and (children := _children()):
+                time.sleep(draw.uniform(0, 0.05))
+                os.kill(draw.choice(children), signal.SIGKILL)
+                killed.append(files)
+                done = files
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    try:
+        small = reduced(store, work, views=ring(), workers=2)
+    finally:
+        stop.set()
+        killer.join()
+    assert len(killed) == 5
+    assert small.fingerprint() == here.fingerprint()
+    assert len(list(work.glob("*.npz"))) == len(list((tmp_path / "here").glob("*.npz")))
+
+
+def _children() -> list[int]:
+    """Worker processes of this one."""
+    text = Path(f"/proc/self/task/{os.getpid()}/children")
+    if not text.exists():
+        pytest.skip("no /proc tells of children")
+    pids = [int(pid) for pid in text.read_text().split()]
+    return [pid for pid in pids if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+
+
+def test_what_is_done_is_not_done_again(store: TileStore, tmp_path: Path) -> None:
+    class StopError(Exception):
+        pass
+
+    def stop(stage: str, done: int, total: int, info: object = None) -> None:
+        if stage == "plans" and done:
+            raise StopError
+
+    with pytest.raises(StopError):
+        reduced(store, tmp_path, views=ring(), progress=stop)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    assert sum(path.name.startswith("plans") for path in before) == 1
+    again = reduced(store, tmp_path, views=ring())
+    assert all(path.stat().st_mtime_ns == time for path, time in before.items())
+    assert again.fingerprint() == reduced(store, tmp_path / "fresh", views=ring()).fingerprint()
+    looks = {path for path in before if path.name.startswith("look")}
+    reduced(store, tmp_path, budget=450, views=ring())  # another budget looks at the same
+    assert looks == {path for path in tmp_path.iterdir() if path.name.startswith("look-")}
+
+
+def test_budgets_out_of_reach_are_refused(store: TileStore, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"expected 1 to the 9,000 Gaussians"):
+        reduced(store, tmp_path, budget=9001, blind=True)
+    with pytest.raises(InputError, match="that a renderer draws, got 9,000"):
+        reduced(store, tmp_path, budget=9000, blind=True)
+    with pytest.raises(InputError, match="is the fewest that the tiles come to, not 2"):
+        reduced(store, tmp_path, budget=2, blind=True)
