@@ -128,6 +128,48 @@ def test_scan_is_exact_in_count_and_denser_near_scanners(large, large_scan):
     assert street / carriageway > 3 * edge / outer
 
 
+def test_a_scan_in_parts_is_as_the_scan_at_once(large, large_scan, monkeypatch):
+    monkeypatch.setattr("g2ard.synth.lidar.PART", 2500)
+    blocks = list(large.scans())
+    assert len(blocks) >= 16  # eight parts, each from the streets and from the air
+    assert max(len(b.positions) for b in blocks) <= 2500
+    parts = large.points()
+    for name in ("positions", "colors", "primitives"):
+        np.testing.assert_array_equal(
+            getattr(parts, name), np.concatenate([getattr(b, name) for b in blocks])
+        )
+    assert len(parts.positions) == LARGE.points == len(np.unique(parts.positions, axis=0))
+    whole, split = (
+        np.bincount(large.layout.materials[s.primitives], minlength=len(Material))
+        for s in (large_scan, parts)
+    )
+    spread = np.sqrt(whole + split)
+    assert (np.abs(whole - split) < 5 * spread + 0.01 * LARGE.points).all()
+    np.testing.assert_allclose(parts.positions.mean(0), large_scan.positions.mean(0), atol=3)
+    np.testing.assert_allclose(parts.positions.std(0), large_scan.positions.std(0), rtol=0.1)
+    shapes = large.layout.shapes
+    for p in np.unique(parts.primitives)[::7]:
+        at = parts.positions[parts.primitives == p]
+        away = naive.surface_distance(Kind(shapes.kinds[p]), shapes.lo[p], shapes.hi[p], at)
+        assert away.max() < 6 * large.config.noise
+
+
+def test_a_million_is_so_many_points_on_a_city_of_that_size(tmp_path, command_line):
+    few = ("--views", "8", "--size", "32x24")
+    status, _, said = command_line("synth", "city", "-o", "a", "--million", "0.012", *few, cwd=tmp_path)
+    assert status == 0, said
+    given = ("synth", "city", "-o", "b", "--points", "12k", "--blocks", "1", *few)
+    assert command_line(*given, cwd=tmp_path)[0] == 0
+    assert (tmp_path / "a" / "cloud.ply").read_bytes() == (tmp_path / "b" / "cloud.ply").read_bytes()
+    scan = city(points=12_000, blocks=1, views=8).points()
+    found = read_points(tmp_path / "a" / "cloud.ply")
+    np.testing.assert_array_equal(found.positions, scan.positions)
+    assert np.abs(found.colors - scan.colors).max() <= 0.5001 / 255
+    both = command_line("synth", "city", "-o", "c", "--million", "1", "--points", "5", cwd=tmp_path)
+    assert both[0] == 2
+    assert "not both" in both[2]
+
+
 def test_cloud_and_photos_agree_in_colour(large, large_scan):
     seen, difference = 0, []
     for name in ("train", "adapt", "ood"):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -311,6 +313,46 @@ def test_damage_is_named(tmp_path: Path) -> None:
             TileStore.open(folder)
     manifest.write_text(text[:50])
     with pytest.raises(InputError, match="not JSON"):
+        TileStore.open(folder)
+
+
+def test_any_manifest_is_data_or_one_line(tmp_path: Path) -> None:
+    folder = tmp_path / "tiles"
+    store = ingest(saved(tmp_path / "town.ply", town(400)), folder, tile_rows=150)
+    path = folder / "tiles.json"
+    text, rng = path.read_bytes(), np.random.default_rng(0)
+    words = [
+        b"null",
+        b"-1",
+        b"1e999",
+        b"[]",
+        b"{}",
+        b'"x"',
+        b"NaN",
+        b"7",
+        b"[[0,1,null]]",
+        b"99999999999999999999",
+    ]
+    values = [(m.start(), m.end()) for m in re.finditer(rb'-?[0-9.][0-9.e+-]*|null|"[^"]*"(?!:)', text)]
+    refused = []
+    for _ in range(400):
+        (start, end), word = values[rng.integers(len(values))], words[rng.integers(len(words))]
+        path.write_bytes(text[:start] + word + text[end:])
+        try:
+            found = TileStore.open(folder)
+            assert [tile.rows for tile in found.tiles] == [tile.rows for tile in store.tiles]
+            with contextlib.suppress(InputError):
+                found.read(0)
+        except InputError as error:
+            refused.append(str(error))
+    assert len(refused) > 200
+    assert not any("\n" in line for line in refused)
+    path.write_bytes(
+        text.replace(b'"cells": ', b'"cells": ' + b"[0, 1, null, " * 900, 1).replace(
+            b'"tiles"', b"]" * 900 + b'"tiles"', 1
+        )
+    )
+    with pytest.raises(InputError):
         TileStore.open(folder)
 
 

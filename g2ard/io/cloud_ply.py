@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
 from g2ard.io.types import Cloud, Note, Points
 from g2ard.progress import plural
 
-__all__ = ["finite_cloud", "read", "stream", "write"]
+__all__ = ["finite_cloud", "read", "stream", "write", "write_blocks"]
 
 _POSITION = ["x", "y", "z"]
 _COLOR_NAMES = (["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"])
@@ -108,15 +108,32 @@ def write(path: Path, points: Points, *, overwrite: bool = False) -> None:
         OutputError: see `atomic_output`.
         InputError: the cloud is empty or has a non-finite value.
     """
+    write_blocks(path, len(points), [points], overwrite=overwrite)
+
+
+def write_blocks(path: Path, count: int, blocks: Iterable[Points], *, overwrite: bool = False) -> None:
+    """As `write`, of `count` points that come in blocks.
+
+    Raises:
+        OutputError: see `atomic_output`.
+        InputError: there are none, other than `count`, or one with a non-finite value.
+    """
     from plyfile import PlyData, PlyElement
 
-    finite_rows = np.isfinite(points.positions).all(1) & np.isfinite(points.colors).all(1)
-    if not len(points) or not finite_rows.all():
-        raise InputError(f"{path}: not written: an empty cloud or a non-finite point")
     names = [(n, "<f8") for n in _POSITION] + [(n, "u1") for n in _COLOR_NAMES[0]]
-    rows = np.empty(len(points), names)
-    for axis in range(3):
-        rows[_POSITION[axis]] = points.positions[:, axis]
-        rows[_COLOR_NAMES[0][axis]] = np.rint(np.clip(points.colors[:, axis], 0, 1) * 255)
-    with atomic_output(path, overwrite) as temporary:
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
+    every = np.broadcast_to(np.zeros(1, names), count)  # costs no memory
+    header = PlyData([PlyElement.describe(every, "vertex")], byte_order="<").header
+    written = 0
+    with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
+        file.write(header.encode("ascii") + b"\n")
+        for points in blocks:
+            if not (np.isfinite(points.positions).all() and np.isfinite(points.colors).all()):
+                raise InputError(f"{path}: not written: a non-finite point")
+            rows = np.empty(len(points), names)
+            for axis in range(3):
+                rows[_POSITION[axis]] = points.positions[:, axis]
+                rows[_COLOR_NAMES[0][axis]] = np.rint(np.clip(points.colors[:, axis], 0, 1) * 255)
+            file.write(rows.data)
+            written += len(rows)
+        if written != count or not count:
+            raise InputError(f"{path}: not written: {written:,} points of {count:,}")

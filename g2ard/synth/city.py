@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -119,19 +120,23 @@ class City:
 
     def points(self, count: int | None = None) -> Scan:
         """A laser scan of `count` returns (default: the configuration's), coloured as photos are."""
+        parts = list(self.scans(count))
+        positions, colors, primitives = zip(
+            *((p.positions, p.colors, p.primitives) for p in parts), strict=True
+        )
+        return Scan(np.concatenate(positions), np.concatenate(colors), np.concatenate(primitives))
+
+    def scans(self, count: int | None = None) -> Iterator[Scan]:
+        """The returns of `points` in its order, in blocks: some two million are in memory at a time."""
         config = self.config
         rng = np.random.default_rng([config.seed, 2])
-        points, colors, primitives = [], [], []
         for returns in scan(self.layout, config.points if count is None else count, config.seed):
             for i in range(0, len(returns.ranges), _CHUNK):
                 part = returns.take(np.arange(i, min(i + _CHUNK, len(returns.ranges))))
                 o, d, t = part.origins, part.directions, part.ranges
                 color = self._shade(o, d, t, part.primitives, _BEAM[0] + _BEAM[1] * t)
                 noisy = o + d * (t + config.noise * rng.standard_normal(len(t)))
-                points.append(noisy.T + self._offset)
-                colors.append(color.T)
-                primitives.append(part.primitives)
-        return Scan(np.concatenate(points), np.concatenate(colors), np.concatenate(primitives))
+                yield Scan(noisy.T + self._offset, color.T, part.primitives)
 
     def cast(self, origins: ArrayLike, directions: ArrayLike, width: float = 0.01) -> Hits:
         """Exact first hits of any rays, in world coordinates.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from g2ard.synth.layout import Layout
 from g2ard.synth.shapes import Float, cast
 
-__all__ = ["Returns", "scan"]
+__all__ = ["PART", "Returns", "scan"]
 
 _SPACING = 12.0
 """Metres between two positions of a scanner."""
@@ -21,8 +22,14 @@ _STREET_RANGE = 120.0
 _AERIAL_SHARE = 0.4
 _RAYS = 5000
 """At least so many a position: fewer positions serve a thin cloud, and cost less."""
-_SECTORS = 12
-"""Rays leave in this many sectors a position, so that neighbours in a packet look the same way."""
+_LEAST = 12
+"""Rays of a position at the least."""
+_PACKET = 128, 512
+"""Rays that are cast together, at the least and at the most; some forty packets a position."""
+_SQUARE = 2.5
+"""How many times more packets a full turn is wide than high."""
+PART = 2_000_000
+"""Returns in memory at a time: a larger cloud is several scans, each from every so-manieth position."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +90,13 @@ def _fire(layout: Layout, rng: Generator, stations: Float, rays: int, aerial: bo
     """About `rays` rays shared among the stations; the first hits of those that hit."""
     count = int(np.clip(rays // _RAYS, min(8 * layout.blocks, len(stations)), len(stations)))
     stations = stations[((np.arange(count) + rng.random()) * len(stations) / count).astype(int)]
-    each = max(_SECTORS, -(-rays // count))
+    each = max(_LEAST, -(-rays // count))
     parts = []
     for at in stations:
         origin = (at + rng.normal(0.0, 0.3, 3) * [1.0, 1.0, 0.2])[:, None]
         d = _swath(rng, each) if aerial else _spin(rng, each)
         far = np.inf if aerial else _STREET_RANGE
-        t, hit = cast(layout.shapes, origin, d, far=far, packet=max(64, min(8192, each // _SECTORS)))
+        t, hit = _cast_in_patches(layout, origin, d, far)
         found = np.flatnonzero(hit >= 0)
         parts.append(Returns(np.broadcast_to(origin, (3, len(found))), d[:, found], t[found], hit[found]))
     return Returns(
@@ -100,18 +107,41 @@ def _fire(layout: Layout, rng: Generator, stations: Float, rays: int, aerial: bo
     )
 
 
-def scan(layout: Layout, count: int, seed: int) -> list[Returns]:
-    """Exactly `count` returns: from the streets, then from the air."""
-    aerial = int(count * _AERIAL_SHARE)
-    parts = []
-    for k, (stations, wanted) in enumerate(zip(_stations(layout), (count - aerial, aerial), strict=True)):
-        got, rays, attempt = 0, int(wanted * 1.3) + len(stations), 0
-        while got < wanted:
-            rng = np.random.default_rng([seed, 1, k, attempt])
-            returns = _fire(layout, rng, stations, rays, aerial=k == 1)
-            found = len(returns.ranges)
-            keep = min(found, wanted - got)
-            parts.append(returns.take(np.sort(rng.permutation(found)[:keep])))
-            got += keep
-            rays, attempt = int((wanted - got) * 1.6) + len(stations), attempt + 1
-    return parts
+def _cast_in_patches(layout: Layout, origin: Float, d: Float, far: float) -> tuple[Float, NDArray[np.int64]]:
+    """First hits of rays that are sorted by azimuth, in packets narrow in azimuth and elevation.
+
+    A packet tests all that its bounds may meet, and one ray into the sky keeps it from stopping early.
+    """
+    n = d.shape[1]
+    packet = int(np.clip(n // 40, *_PACKET))
+    sector = packet * max(1, round(float(np.sqrt(n / packet / _SQUARE))))
+    order = np.concatenate([i + np.argsort(d[2, i : i + sector], kind="stable") for i in range(0, n, sector)])
+    t, hit = np.empty(n), np.empty(n, np.int64)
+    t[order], hit[order] = cast(layout.shapes, origin, d[:, order], far=far, packet=packet)
+    return t, hit
+
+
+def scan(layout: Layout, count: int, seed: int) -> Iterator[Returns]:
+    """Exactly `count` returns, at the most `PART` at a time: of each part from the streets, then the air."""
+    street, flight = _stations(layout)
+    parts = min(-(-count // PART), len(street), len(flight))
+    for part in range(parts):
+        share = count * (part + 1) // parts - count * part // parts
+        aerial = int(share * _AERIAL_SHARE)
+        seeds = [part] if parts > 1 else []
+        yield from _survey(layout, street[part::parts], share - aerial, [seed, 1, 0], seeds)
+        yield from _survey(layout, flight[part::parts], aerial, [seed, 1, 1], seeds)
+
+
+def _survey(
+    layout: Layout, stations: Float, wanted: int, seed: list[int], part: list[int]
+) -> Iterator[Returns]:
+    got, rays, attempt = 0, int(wanted * 1.3) + len(stations), 0
+    while got < wanted:
+        rng = np.random.default_rng([*seed, attempt, *part])
+        returns = _fire(layout, rng, stations, rays, aerial=seed[-1] == 1)
+        found = len(returns.ranges)
+        keep = min(found, wanted - got)
+        yield returns.take(np.sort(rng.permutation(found)[:keep]))
+        got += keep
+        rays, attempt = int((wanted - got) * 1.6) + len(stations), attempt + 1

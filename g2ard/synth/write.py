@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -15,7 +15,8 @@ from PIL import Image
 
 from g2ard import __version__
 from g2ard.cameras import Cameras
-from g2ard.io import Points, atomic_folder, check_output, write_points, write_views
+from g2ard.io import Points, atomic_folder, check_output, write_views
+from g2ard.io.cloud_ply import write_blocks
 from g2ard.progress import Progress, silent
 from g2ard.synth.city import City, CityConfig, city
 
@@ -67,10 +68,7 @@ def write_city(
     check_output(folder, overwrite, folder=True)
     town = city(config)
     with atomic_folder(folder, overwrite) as place:
-        progress("cloud", 0, 1)
-        scan = town.points()
-        write_points(place / "cloud.ply", Points(scan.positions, scan.colors))
-        progress("cloud", 1, 1)
+        _scan(town, place / "cloud.ply", progress)
         for name, cameras in town.views.items():
             paths = tuple(place / "images" / f"{view}.png" for view in cameras.names)
             write_views(place / f"{name}.json", replace(cameras, image_paths=paths))
@@ -79,6 +77,20 @@ def write_city(
         (place / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")
         (place / "README.txt").write_text(_readme(config, manifest), encoding="utf-8")
     return manifest
+
+
+def _scan(town: City, path: Path, progress: Progress) -> None:
+    count = town.config.points
+
+    def blocks() -> Iterator[Points]:
+        done = 0
+        progress("cloud", 0, count)
+        for part in town.scans():
+            yield Points(part.positions, part.colors)
+            done += len(part.positions)
+            progress("cloud", done, count)
+
+    write_blocks(path, count, blocks())
 
 
 def _photograph(town: City, place: Path, depth: bool, threads: int, progress: Progress) -> None:

@@ -111,17 +111,14 @@ def ingest(
     >>> [(tile.rows, tile.halo, tile.low[0], tile.high[0]) for tile in store.tiles]
     [(50, 0, 0.0, 50.0), (50, 0, 50.0, 99.0)]
     """
-    folder, sources = Path(folder), [source] if isinstance(source, str | Path) else list(source)
+    folder = Path(folder)
+    sources: list[str | Path] = [source] if isinstance(source, str | Path) else list(source)
     if tile_rows < 1 or (block_rows is not None and block_rows < 1):
         raise InputError(f"tile_rows and block_rows: expected at least 1, got {tile_rows}, {block_rows}")
+    feed = _feed(sources, lift or LiftConfig())
     settings: dict[str, Any] = {"tile_rows": tile_rows}
-    feed: _SceneFeed | PointFeed
-    if sources and all(kind(path) == "points" for path in sources):
-        config = lift or LiftConfig()
-        feed = PointFeed(open_point_stream(sources), config)
-        settings["lift"] = asdict(config)
-    else:
-        feed = _SceneFeed(open_stream(sources))
+    if isinstance(feed, PointFeed):
+        settings["lift"] = asdict(feed.config)
     key = _key(feed.identity(), settings)
     done = _done(folder, key, overwrite)
     if done is not None:
@@ -147,6 +144,12 @@ def ingest(
     }
     journal.finish(manifest)
     return TileStore.open(folder)
+
+
+def _feed(sources: list[str | Path], config: LiftConfig) -> _SceneFeed | PointFeed:
+    if sources and all(kind(path) == "points" for path in sources):
+        return PointFeed(open_point_stream(sources), config)
+    return _SceneFeed(open_stream(sources))
 
 
 def _key(identity: list[Any], settings: dict[str, Any]) -> str:

@@ -112,7 +112,7 @@ class Journal:
                 if len(files.rows) != cells.leaves or len(files.checks) != cells.leaves:
                     raise ValueError(f"{len(files.rows)} {kind} of {cells.leaves}")
                 setattr(journal, kind, files)
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
             raise InputError(f"{path}: malformed journal ({error!r})") from error
         return journal
 

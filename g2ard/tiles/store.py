@@ -127,7 +127,7 @@ class TileStore:
             raise InputError(f"{path}: version {content.get('version')!r} is not known ({VERSION} is)")
         try:
             store = cls._parsed(folder, content)
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
             raise InputError(f"{path}: malformed manifest ({error!r})") from error
         for tile in store.tiles:
             store._check_size(tile_name(tile.index), tile.rows)
@@ -158,7 +158,8 @@ class TileStore:
             dict(content["settings"]),
         )
         fits = offset.shape == (3,) and store.sh_degree in range(4) and cells.leaves == len(tiles)
-        if not fits or sum(tile.rows for tile in tiles) != store.count:
+        finite = np.isfinite([*offset.ravel(), store.margin, *(x for t in tiles for x in (*t.low, *t.high))])
+        if not fits or not finite.all() or sum(tile.rows for tile in tiles) != store.count:
             raise ValueError("its numbers contradict each other")
         return store
 

@@ -48,12 +48,26 @@ def city(
             parser=Count.parse, metavar="COUNT", help="Points of the cloud, such as 1M; 500k if not given."
         ),
     ] = None,
+    million: Annotated[
+        float | None,
+        typer.Option(
+            min=0.001,
+            max=1000,
+            metavar="N",
+            help="So many million points instead, on a city as large as that.",
+        ),
+    ] = None,
     views: Annotated[int, typer.Option(min=8, help="Photos in all four splits together.")] = 120,
     size: Annotated[
         _Size | None,
         typer.Option(parser=_size, metavar="WxH", help="Size of a photo; 800x600 if not given."),
     ] = None,
-    blocks: Annotated[int, typer.Option(min=1, max=40, help="City blocks along each side.")] = 3,
+    blocks: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=40, help="City blocks along each side; 3, or with --million a block for each million."
+        ),
+    ] = None,
     fov: Annotated[float, typer.Option(min=1, max=170, help="Horizontal field of view, degrees.")] = 65.0,
     noise: Annotated[float, typer.Option(min=0, help="Noise of the laser's range, metres.")] = 0.015,
     supersample: Annotated[int, typer.Option(min=1, max=8, help="Samples a pixel along each axis.")] = 2,
@@ -64,20 +78,26 @@ def city(
     ] = None,
     depth: Annotated[bool, typer.Option("--depth", help="Also write exact depth, metres, as .npy.")] = False,
 ) -> None:
-    """A small procedural city: coloured LiDAR cloud, photos with exact poses, splits train/val/adapt/ood."""
+    """A procedural city: coloured LiDAR cloud, photos with exact poses, splits train/val/adapt/ood."""
     import time
 
     from g2ard.synth import CityConfig, write_city
 
     if points is not None and points.is_share:
         raise typer.BadParameter("--points: a count, not a share")
+    if points is not None and million is not None:
+        raise typer.BadParameter("give --points or --million, not both")
     began = time.monotonic()
     default = CityConfig()
+    count = default.points if points is None else points.of(0)
+    if million is not None:
+        count = round(million * 1e6)
+        blocks = blocks or min(40, max(1, round(million**0.5)))
     config = CityConfig(
-        points=default.points if points is None else points.of(0),
+        points=count,
         views=views,
         size=size or default.size,
-        blocks=blocks,
+        blocks=blocks or default.blocks,
         seed=run.seed,
         noise=noise,
         fov=fov,
