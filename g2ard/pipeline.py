@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from g2ard.choices import Engine
 from g2ard.errors import require
 from g2ard.pipeline_report import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.progress import Progress, silent
@@ -73,7 +74,7 @@ class DistillConfig:
     weighted: bool = True
     reselect: bool = False
     seed: int = 0
-    engine: Literal["fused", "torch", "gsplat"] = "fused"
+    engine: Engine = "fused"
     ssim_weight: float = 0.2
     simplify: SimplifyConfig = field(default_factory=SimplifyConfig)
     select: CoverageOptions = field(default_factory=CoverageOptions)

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from g2ard.bench.methods import METHODS, SCHEDULES, Matched, MethodSpec
+from g2ard.bench.methods import METHODS, Matched, MethodSpec
+from g2ard.choices import ADAPT_SCHEDULES, CONVENTIONS, LPIPS_INPUTS, SCHEDULE_NAMES
 from g2ard.errors import InputError
 
 __all__ = ["METHODS", "Definition", "Matched", "MethodSpec", "SceneSpec", "read_definition"]
@@ -131,11 +132,11 @@ class Definition:
             if value is not None and (not isinstance(value, int) or value < least):
                 raise InputError(f"{key}: expected a whole number, at least {least}, got {value!r}")
         for key, known in (
-            ("schedule", SCHEDULES),
-            ("adapt_schedule", ("default", "paper")),
+            ("schedule", SCHEDULE_NAMES),
+            ("adapt_schedule", ADAPT_SCHEDULES),
             ("adapt_on", ("train", "all")),
-            ("convention", ("gsplat", "inria")),
-            ("lpips_input", ("scaled", "unscaled")),
+            ("convention", CONVENTIONS),
+            ("lpips_input", LPIPS_INPUTS),
             ("eight_bit", (False, True)),
         ):
             value = getattr(self, key)

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from g2ard import baselines
+from g2ard.choices import METHODS as SIMPLIFIERS
+from g2ard.choices import POLICIES, SCHEDULE_NAMES
 from g2ard.errors import InputError
 
-__all__ = ["FINAL_STEPS", "METHODS", "ROUND_STEPS", "SCHEDULES", "Leg", "Matched", "MethodSpec"]
+__all__ = ["FINAL_STEPS", "METHODS", "ROUND_STEPS", "Leg", "Matched", "MethodSpec"]
 
-_OURS = ("default", "no-views", "fast", "paper")
+_OURS = (*SIMPLIFIERS, "no-views")
 _RIVALS = ("splat-transform", "splat-transform-adaptive")
 _REDUCERS = (*_OURS, *baselines.METHODS, *_RIVALS, "none")
-_POLICIES = ("auto", "directional", "coverage", "pose-diverse", "random", "uniform")
-SCHEDULES = ("default", "fast", "best", "paper")
 
 ROUND_STEPS, FINAL_STEPS = 8_000, 30_000
 """Of the paper's recoveries (`tab:s_config`): after each round, and once more at the target count."""
@@ -103,10 +103,10 @@ class MethodSpec:
             ("reduce", _REDUCERS),
             ("rounds", ("one", "paper", "pup")),
             ("prior", (None, "lift", "trained", "given")),
-            ("policy", (None, *_POLICIES)),
+            ("policy", (None, *POLICIES)),
             ("preset", ("auto", "trained", "lift", "noisy")),
             ("lambdas", ("own", "paper")),
-            ("schedule", (None, *SCHEDULES)),
+            ("schedule", (None, *SCHEDULE_NAMES)),
             ("released_schedule", ("3dgs", "paper", "default")),
         ):
             if getattr(self, key) not in known:

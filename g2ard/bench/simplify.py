@@ -20,6 +20,7 @@ from g2ard.bench import rows as table
 from g2ard.bench.process import measured
 from g2ard.bench.raster import cpu_name
 from g2ard.bench.standing import check_protocol, standing_targets
+from g2ard.choices import METHODS as SIMPLIFIERS
 from g2ard.errors import InputError
 from g2ard.poses import make_pool
 from g2ard.progress import Progress, silent
@@ -38,10 +39,8 @@ __all__ = [
 ]
 
 METHODS = (
-    "default",
+    *SIMPLIFIERS,
     "no-views",
-    "fast",
-    "paper",
     "splat-transform",
     "splat-transform-adaptive",
     *baselines.METHODS,

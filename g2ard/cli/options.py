@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from g2ard.choices import UNMEASURED, Convention, Engine, FormatName, PaperPresetName, Policy, PresetName
 from g2ard.cli.budget_options import Count
 from g2ard.report.window import Crop
 
@@ -25,7 +26,6 @@ __all__ = [
     "OutputOption",
     "PaperOption",
     "PolicyOption",
-    "Preset",
     "PresetOption",
     "ProtocolOption",
     "SceneArgument",
@@ -136,7 +136,7 @@ ShDegreeOption = Annotated[
     typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own if not given."),
 ]
 FormatOption = Annotated[
-    Literal["ply", "sog", "spz", "glb", "compressed.ply", "splat"],
+    FormatName,
     typer.Option("--format", help="Of the scene's file in RUN."),
 ]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on with a stopped run.")]
@@ -153,7 +153,7 @@ TeacherOption = Annotated[
 ]
 
 ConventionOption = Annotated[
-    Literal["gsplat", "inria"],
+    Convention,
     typer.Option(help="The renderer's conventions; inria: near plane 0.2, splats cut to their 3σ tiles."),
 ]
 
@@ -177,11 +177,6 @@ CropOption = Annotated[
         "(front.png:0.4,0.3,0.2,0.2); may be repeated.",
     ),
 ]
-
-Method = Literal["default", "fast", "paper"]
-ScheduleName = Literal["fast", "default", "best", "paper"]
-Preset = Literal["auto", "trained", "lift", "noisy", "paper", "paper-trained", "paper-lift", "paper-noisy"]
-Paper = Literal["paper", "paper-trained", "paper-lift", "paper-noisy"]
 
 _PAPER = {
     "method": "paper",
@@ -207,7 +202,7 @@ def _whole_paper(ctx: typer.Context, preset: str | None) -> str | None:
 
 
 PresetOption = Annotated[
-    Preset,
+    PresetName,
     typer.Option(
         callback=_whole_paper,
         is_eager=True,
@@ -216,7 +211,7 @@ PresetOption = Annotated[
     ),
 ]
 PaperOption = Annotated[
-    Paper | None,
+    PaperPresetName | None,
     typer.Option(
         "--preset",
         callback=_whole_paper,
@@ -246,28 +241,17 @@ RecoveryTimeOption = Annotated[
 ]
 
 
-_POLICIES = "auto|directional|coverage|pose-diverse|random|uniform"
-
-
 def views_count(text: str) -> Count | str:
     """Read K: a count, a share, or auto."""
     return "auto" if text.strip() == "auto" else Count.parse(text)
 
 
-def _policy(text: str) -> str:
-    if text not in _POLICIES.split("|"):
-        raise typer.BadParameter(f"one of {_POLICIES.replace('|', ', ')}, not {text!r}")
-    return text
-
-
-PolicyOption = Annotated[
-    str, typer.Option("--policy", parser=_policy, metavar=_POLICIES, help="What makes views good.")
-]
+PolicyOption = Annotated[Policy, typer.Option("--policy", help="What makes views good.")]
 
 
 def can_judge(k: Count | str | None, policy: str) -> None:
     """Usage check: `-k auto` needs a policy that measures what views add."""
-    if k == "auto" and policy in ("random", "uniform"):
+    if k == "auto" and policy in UNMEASURED:
         raise typer.BadParameter(f"-k auto: --policy {policy} does not measure what views add; give a count")
 
 
@@ -279,7 +263,7 @@ def one_horizon(steps: int | None, recovery_time: float | None, constants: Mappi
         raise typer.BadParameter("--steps and --set schedule.steps exclude each other; give one")
 
 
-def recovery_engine(run: Run) -> Literal["fused", "gsplat"]:
+def recovery_engine(run: Run) -> Engine:
     """What takes recovery's steps on the device asked for.
 
     Raises:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
+from g2ard.choices import FormatName
 from g2ard.errors import OutputError
 
 __all__ = ["FORMATS", "SceneFormat", "check_options", "scene_format"]
@@ -26,7 +27,7 @@ class SceneFormat(NamedTuple):
     options: tuple[str, ...] = ()
 
 
-FORMATS = {
+FORMATS: dict[FormatName, SceneFormat] = {
     "compressed.ply": SceneFormat(".compressed.ply", "compressed_ply_write"),
     "ply": SceneFormat(".ply", "ply", options=("normals",)),
     "sog": SceneFormat(".sog", "sog_write"),

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from g2ard.choices import Engine
 from g2ard.errors import InputError
 from g2ard.policy.budget import Budget
 from g2ard.policy.inputs import load_scene
@@ -72,7 +73,7 @@ def distill(
     beside: str | Path | None = None,
     up: Sequence[float] | None = None,
     seed: int = 0,
-    engine: Literal["fused", "torch", "gsplat"] = "fused",
+    engine: Engine = "fused",
     work: Path | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -201,7 +202,7 @@ def prepare(
     beside: str | Path | None = None,
     up: Sequence[float] | None = None,
     seed: int = 0,
-    engine: Literal["fused", "torch", "gsplat"] = "fused",
+    engine: Engine = "fused",
     counted: Callable[[int], object] | None = None,
     progress: Progress = silent,
     say: Say = unsaid,

@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 
 from g2ard.appearance import blended, colour_change, recoloured, views_seeing
+from g2ard.choices import ADAPT_SCHEDULES, AdaptSchedule
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, silent
 from g2ard.reports import Report
@@ -53,7 +54,7 @@ class AdaptConfig:
 
     steps: int = 7000
     tolerance: float = 0.05
-    schedule: Literal["default", "paper"] = "default"
+    schedule: AdaptSchedule = "default"
     prior_views: float = 1.0
     sh_degree: int | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -68,8 +69,8 @@ class AdaptConfig:
             raise InputError(f"adapt: {self.steps} steps, tolerance {self.tolerance}: expected ≥ 1 and ≥ 0")
         if not 0 <= self.prior_views < float("inf"):
             raise InputError(f"prior_views: expected a number of views, at least 0, got {self.prior_views}")
-        if self.schedule not in ("default", "paper"):
-            raise InputError(f"schedule: expected default or paper, got {self.schedule!r}")
+        if self.schedule not in ADAPT_SCHEDULES:
+            raise InputError(f"schedule: expected {' or '.join(ADAPT_SCHEDULES)}, got {self.schedule!r}")
         require("first_stretch", self.first_stretch, self.first_stretch >= 1, "at least 1")
         if self.recovery is not None and self.recovery != appearance_only(self.recovery):
             raise InputError("adapt: geometry stays: the rates of means, log_scales and quats are 0")

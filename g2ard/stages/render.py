@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.cameras import Camera, Cameras
+from g2ard.choices import CONVENTIONS, Convention
 from g2ard.errors import InputError
 from g2ard.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS
 from g2ard.splats import Splats
@@ -49,14 +50,14 @@ class RasterSettings:
     0.2
     """
 
-    convention: Literal["gsplat", "inria"] = "gsplat"
+    convention: Convention = "gsplat"
     antialiased: bool = False
     alpha_max: float = 0.99
     near: float | Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        if self.convention not in ("gsplat", "inria"):
-            raise InputError(f"convention: expected 'gsplat' or 'inria', got {self.convention!r}")
+        if self.convention not in CONVENTIONS:
+            raise InputError(f"convention: expected {' or '.join(CONVENTIONS)}, got {self.convention!r}")
         if not 1 / 255 <= self.alpha_max < 1:
             raise InputError(f"alpha_max: expected a value in [1/255, 1), got {self.alpha_max}")
 

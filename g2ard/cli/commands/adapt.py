@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
+from g2ard.choices import AdaptSchedule
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
@@ -34,7 +35,7 @@ def adapt(
     tolerance: Annotated[
         float, typer.Option(min=0, help="Stop when a stretch gains less, dB; 0 takes all steps.")
     ] = 0.05,
-    schedule: Annotated[Literal["default", "paper"], typer.Option(help="Rates and decay.")] = "default",
+    schedule: Annotated[AdaptSchedule, typer.Option(help="Rates and decay.")] = "default",
     prior_views: Annotated[
         float | None,
         typer.Option(

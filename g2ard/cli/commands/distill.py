@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.choices import Method, ScheduleName
 from g2ard.cli.budget_options import (
     Count,
     CountsOption,
@@ -23,12 +24,10 @@ from g2ard.cli.options import (
     BackgroundOption,
     CropOption,
     FormatOption,
-    Method,
     PolicyOption,
     PresetOption,
     RecoveryTimeOption,
     ResumeOption,
-    ScheduleName,
     SizeOption,
     UpOption,
     ViewsOrMadeOption,

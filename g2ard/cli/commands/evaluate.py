@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
+from g2ard.choices import LpipsInput
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
@@ -39,7 +40,7 @@ def evaluate(
         Path | None, typer.Option(metavar="DIR", help="Weights of LPIPS; without them it is absent.")
     ] = None,
     lpips_input: Annotated[
-        Literal["scaled", "unscaled"],
+        LpipsInput,
         typer.Option(help="Images in [-1, 1], LPIPS's own, or in [0, 1] as 3DGS's evaluation feeds them."),
     ] = "scaled",
     convention: ConventionOption = "gsplat",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from g2ard.choices import ScheduleName
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
@@ -15,7 +16,6 @@ from g2ard.cli.options import (
     PresetOption,
     RecoveryTimeOption,
     ResumeOption,
-    ScheduleName,
     ShDegreeOption,
     SizeOption,
     SplitOption,

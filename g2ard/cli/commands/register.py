@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from g2ard.choices import Refinement
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import BackgroundOption, OutputOption, SceneArgument
 from g2ard.progress import plural
@@ -62,7 +63,7 @@ def register(
         ),
     ] = "auto",
     refine: Annotated[
-        Literal["auto", "none", "photometric"],
+        Refinement,
         typer.Option(help="A pose from features as it is, aligned, or the mean of both by information."),
     ] = "auto",
     passes: Annotated[int, typer.Option(min=1, help="Renders to match with, at most.")] = 3,

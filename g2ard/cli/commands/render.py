@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from g2ard.choices import Method
 from g2ard.cli.budget_options import Count, LooksOption, RatioOption, one_budget
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
     ConventionOption,
-    Method,
     SceneArgument,
     SizeOption,
     SplitOption,

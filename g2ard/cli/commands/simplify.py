@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.choices import Method
 from g2ard.cli.budget_options import CountsOption, FitOption, MinPsnrOption, MinSsimOption, RatiosOption
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
-    Method,
     OutputOption,
     PaperOption,
     SceneArgument,

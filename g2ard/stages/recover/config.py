@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
+from g2ard.choices import Engine
 from g2ard.errors import InputError
 from g2ard.stages.recover.anchors import PRESETS, Regularizers
 from g2ard.stages.recover.schedule import TUNED, Schedule
@@ -43,7 +43,7 @@ class RecoverConfig:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     final: bool = True
     seed: int = 0
-    engine: Literal["fused", "torch", "gsplat"] = "fused"
+    engine: Engine = "fused"
 
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 1:

@@ -163,7 +163,7 @@ own. Its rate of means bears no unit: 3DGS's is 1.6e-4 times the cameras' extent
 of 5.75, and so it is read here (`docs/decisions.md`). `PAPER.scaled(3000)` is the same at a tenth of the
 length."""
 
-SCHEDULES = {
+SCHEDULES: dict[str, Schedule] = {
     "fast": replace(TUNED, steps=300),
     "default": TUNED,
     "best": replace(TUNED, steps=6000),

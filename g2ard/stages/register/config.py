@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
+from g2ard.choices import REFINEMENTS, Refinement
 from g2ard.errors import require
 
 __all__ = ["RegisterConfig"]
@@ -53,7 +53,7 @@ class RegisterConfig:
     size: int = 1000
     align_size: int = 500
     matcher: str = "auto"
-    refine: Literal["auto", "none", "photometric"] = "auto"
+    refine: Refinement = "auto"
     passes: int = 3
     coarsest: int = 32
     iterations: int = 12
@@ -78,8 +78,7 @@ class RegisterConfig:
     def __post_init__(self) -> None:
         require("size", self.size, self.size >= 32, "at least 32 pixels")
         require("align_size", self.align_size, self.align_size >= 32, "at least 32 pixels")
-        words = ("auto", "none", "photometric")
-        require("refine", self.refine, self.refine in words, "auto, none or photometric")
+        require("refine", self.refine, self.refine in REFINEMENTS, f"one of {', '.join(REFINEMENTS)}")
         require("coarsest", self.coarsest, self.coarsest >= 16, "at least 16 pixels")
         require("iterations", self.iterations, self.iterations >= 1, "at least 1")
         require("still", self.still, self.still > 0, "a positive number of pixels")

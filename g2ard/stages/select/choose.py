@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.cameras import Cameras, unseeing
+from g2ard.choices import POLICIES, UNMEASURED
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
@@ -17,8 +18,6 @@ from g2ard.stages.select import poses
 from g2ard.stages.select.surfaces import CoverageOptions, greedy, surface
 
 __all__ = ["POLICIES", "Selection", "select"]
-
-POLICIES = ("auto", "directional", "coverage", "pose-diverse", "random", "uniform")
 
 Float = NDArray[np.float64]
 Order = NDArray[np.int64]
@@ -103,7 +102,7 @@ def select(
     """
     if policy not in POLICIES:
         raise InputError(f"policy: expected {', '.join(POLICIES)}, got {policy!r}")
-    if k == "auto" and policy in ("random", "uniform"):
+    if k == "auto" and policy in UNMEASURED:
         raise InputError(f"k: 'auto' needs a policy that measures what views add, not {policy!r}")
     if k != "auto" and not isinstance(k, int | np.integer):
         raise InputError(f"k: expected 'auto' or a whole number of views, got {k!r}")

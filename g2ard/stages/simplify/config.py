@@ -6,14 +6,12 @@ import math
 from dataclasses import dataclass, replace
 
 from g2ard import _core
+from g2ard.choices import METHODS
 from g2ard.errors import InputError
 
 __all__ = ["METHODS", "SimplifyConfig", "schedule"]
 
-METHODS = ("default", "fast", "paper")
-"""The policies."""
-
-_RETENTION = {"default": 0.65, "fast": 0.65, "paper": 0.75}
+_RETENTION: dict[str, float] = {"default": 0.65, "fast": 0.65, "paper": 0.75}
 
 _CORE = _core.defaults()
 """The core's constants by method: the one place of the defaults below."""

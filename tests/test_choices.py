@@ -1,0 +1,39 @@
+"""Every list of names is the keys of what it names."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import pytest
+
+from g2ard import choices
+from g2ard.cameras import Cameras
+from g2ard.errors import InputError
+from g2ard.io.scene_formats import FORMATS
+from g2ard.splats import Splats
+from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS
+from g2ard.stages.recover.engine import engine_class
+from g2ard.stages.recover.schedule import SCHEDULES
+from g2ard.stages.select import select
+from g2ard.stages.simplify import SimplifyConfig
+
+
+def test_names_and_what_they_name_agree() -> None:
+    assert tuple(SCHEDULES) == choices.SCHEDULE_NAMES
+    assert set(FORMATS) == set(get_args(choices.FormatName))
+    presets = {"auto", *PRESETS, "paper", *(f"paper-{name}" for name in PAPER_PRESETS)}
+    assert set(get_args(choices.PresetName)) == presets
+    for method in choices.METHODS:
+        assert 0 < SimplifyConfig().retention_of(method) < 1
+
+
+def test_other_names_are_refused_with_the_list() -> None:
+    with pytest.raises(InputError, match="expected auto, directional, .*, uniform, got 'best'"):
+        select(
+            Splats.create([[0, 0, 0]], scales=[[1, 1, 1]]),
+            Cameras.from_lists([], [], [], []),
+            1,
+            policy="best",
+        )
+    with pytest.raises(InputError, match="engine: expected fused, torch, gsplat, got 'jax'"):
+        engine_class("jax")
