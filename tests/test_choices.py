@@ -28,12 +28,8 @@ def test_names_and_what_they_name_agree() -> None:
 
 
 def test_other_names_are_refused_with_the_list() -> None:
-    with pytest.raises(InputError, match="expected auto, directional, .*, uniform, got 'best'"):
-        select(
-            Splats.create([[0, 0, 0]], scales=[[1, 1, 1]]),
-            Cameras.from_lists([], [], [], []),
-            1,
-            policy="best",
-        )
-    with pytest.raises(InputError, match="engine: expected fused, torch, gsplat, got 'jax'"):
+    scene, views = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]]), Cameras.from_lists([], [], [], [])
+    with pytest.raises(InputError, match=r"expected auto, directional, .*, uniform, got 'best'"):
+        select(scene, views, 1, policy="best")
+    with pytest.raises(InputError, match=r"engine: expected fused, torch, gsplat, got 'jax'"):
         engine_class("jax")

@@ -229,7 +229,7 @@ def test_the_paper_s_steps_are_kept_whatever_comes_of_them(targets: TeacherRende
     start = replace(PRIOR, sh0=PRIOR.sh0 + grain)  # so near that such steps only lose
     done = recover(start, targets, config, validation=targets)
     assert done.report.psnr.after < done.report.psnr.before
-    assert (done.report.kept_start, done.report.way, done.report.validation) == (False, 1.0, None)
+    assert (done.report.kept_start, done.report.blend, done.report.validation) == (False, 1.0, None)
     assert (done.splats.sh0 != start.sh0).any()
     guarded = replace(config, schedule=replace(PAPER, guarded=True))
     assert recover(start, targets, guarded).report.kept_start

@@ -367,7 +367,7 @@ def test_a_resume_after_going_back_is_never_having_stopped(targets: TeacherRende
             recover(start, targets, config, checkpoint=checkpoint, progress=_StopAt(step))
         resumed = recover(start, targets, config, checkpoint=checkpoint)
         assert_same_bits(whole.splats, resumed.splats)
-        for key in ("backed_off", "multiplier", "psnr", "stopped", "way"):
+        for key in ("backed_off", "multiplier", "psnr", "stopped", "blend"):
             assert getattr(whole.report, key) == getattr(resumed.report, key), key
 
 

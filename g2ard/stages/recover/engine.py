@@ -2,16 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.cameras import Cameras
+from g2ard.choices import ENGINES
 from g2ard.errors import InputError
 from g2ard.splats import Splats
+from g2ard.stages.recover.anchors import Anchors, Regularizers
 from g2ard.stages.recover.schedule import Rates
 
-__all__ = ["Engine", "engine_class"]
+__all__ = ["Engine", "Objective", "engine_class"]
+
+
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """What an engine minimises, from where, in which variables.
+
+    Args:
+        start: the scene to begin with.
+        cameras: of the views, relative to its offset.
+        anchors: that the regularisers hold it to.
+        regularizers: their weights.
+        means_in_scales: the means' variables are multiples of each Gaussian's initial radius.
+        ssim_weight: λ in (1−λ)·L1 + λ·(1−SSIM).
+        background: RGB behind the scene.
+    """
+
+    start: Splats
+    cameras: Cameras
+    anchors: Anchors
+    regularizers: Regularizers
+    means_in_scales: bool
+    ssim_weight: float
+    background: tuple[float, float, float]
 
 
 class Engine(Protocol):
@@ -40,7 +68,7 @@ class Engine(Protocol):
     def skipped(self) -> int: ...
 
 
-def engine_class(name: str) -> Any:
+def engine_class(name: str) -> Callable[[Objective], Engine]:
     """The class of an engine by its name in `RecoverConfig.engine`; its packages are imported only then."""
     if name == "fused":
         from g2ard.stages.recover.fused_engine import FusedEngine
@@ -54,4 +82,4 @@ def engine_class(name: str) -> Any:
         from g2ard.stages.recover.gsplat_engine import GsplatEngine
 
         return GsplatEngine
-    raise InputError(f"engine: expected fused, torch or gsplat, got {name!r}")
+    raise InputError(f"engine: expected {', '.join(ENGINES)}, got {name!r}")

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.cameras import Cameras
 from g2ard.splats import Splats
-from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.engine import Objective
 from g2ard.stages.recover.schedule import Rates
 from g2ard.stages.recover.sizes import radii
 from g2ard.stages.render import arrays_of, settings_for, view_of
@@ -22,25 +21,11 @@ __all__ = ["FusedEngine"]
 class FusedEngine:
     """Does what `TorchEngine` does, to rounding."""
 
-    def __init__(
-        self,
-        splats: Splats,
-        cameras: Cameras,
-        *,
-        anchors: Anchors,
-        regularizers: Regularizers,
-        means_in_scales: bool,
-        ssim_weight: float,
-        background: tuple[float, float, float],
-    ) -> None:
-        self._template = splats
-        self._cameras = cameras
+    def __init__(self, objective: Objective) -> None:
+        self._objective = objective
+        start, anchors = objective.start, objective.anchors
         self._settings = settings_for(anchors.means)
-        self._regularizers = regularizers
-        self._ssim_weight = ssim_weight
-        self._background = list(background)
-        units = radii(splats) if means_in_scales else None
-        self._trainer = _core.Trainer(arrays_of(splats), units)
+        self._trainer = _core.Trainer(arrays_of(start), radii(start) if objective.means_in_scales else None)
         self._anchors = (
             anchors.means,
             np.ascontiguousarray(anchors.frames),
@@ -59,14 +44,15 @@ class FusedEngine:
         mask: NDArray[np.bool_] | None = None,
     ) -> float:
         """One optimiser step on one view; returns its photometric loss."""
+        objective = self._objective
         loss, _ = self._trainer.step(
-            view_of(self._cameras, view, self._settings),
+            view_of(objective.cameras, view, self._settings),
             self._settings,
-            self._background,
+            list(objective.background),
             target,
-            self._ssim_weight,
+            objective.ssim_weight,
             rates,
-            self._regularizers if regularize else None,
+            objective.regularizers if regularize else None,
             mask,
             self._reach(view, rates.reach),
         )
@@ -76,7 +62,8 @@ class FusedEngine:
         """In pixels."""
         if math.isinf(share):
             return None
-        return share * float(max(self._cameras.widths[view], self._cameras.heights[view]))
+        cameras = self._objective.cameras
+        return share * float(max(cameras.widths[view], cameras.heights[view]))
 
     def splats(self) -> Splats:
         """The scene as it stands, quaternions normalised."""
@@ -90,7 +77,7 @@ class FusedEngine:
             logit_opacities=logit_opacities,
             sh0=sh0,
             shN=shN,
-            offset=self._template.offset,
+            offset=self._objective.start.offset,
         )
 
     def state(self) -> dict[str, NDArray[Any]]:

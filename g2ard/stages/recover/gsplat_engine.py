@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from g2ard.errors import InputError
+from g2ard.stages.recover.engine import Objective
 from g2ard.stages.recover.losses import l1_ssim_anywhere
 from g2ard.stages.recover.torch_engine import TorchEngine
 
@@ -35,16 +35,16 @@ class GsplatEngine(TorchEngine):
 
     device = torch.device("cuda")
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, objective: Objective) -> None:
         check_cuda()
-        super().__init__(*args, **kwargs)
-        self._viewmats = torch.from_numpy(self._cameras.viewmats).float().to(self.device)
-        self._Ks = torch.from_numpy(self._cameras.Ks).float().to(self.device)
+        super().__init__(objective)
+        self._viewmats = torch.from_numpy(objective.cameras.viewmats).float().to(self.device)
+        self._Ks = torch.from_numpy(objective.cameras.Ks).float().to(self.device)
 
     def _render(self, means: Tensor, view: int) -> Tensor:
         from gsplat import rasterization
 
-        p = self._parameters
+        p, objective = self._parameters, self._objective
         coefficients = torch.cat([p["sh0"], p["shN"]], 1)
         image, _, _ = rasterization(
             means=means,
@@ -54,14 +54,14 @@ class GsplatEngine(TorchEngine):
             colors=coefficients,
             viewmats=self._viewmats[view][None],
             Ks=self._Ks[view][None],
-            width=int(self._cameras.widths[view]),
-            height=int(self._cameras.heights[view]),
+            width=int(objective.cameras.widths[view]),
+            height=int(objective.cameras.heights[view]),
             sh_degree=round(coefficients.shape[1] ** 0.5) - 1,
-            backgrounds=torch.tensor([self._background], device=self.device),
+            backgrounds=torch.tensor([objective.background], device=self.device),
             near_plane=self._settings.near_of(view),
             packed=False,
         )
         return image[0]
 
     def _loss(self, image: Tensor, target: Tensor) -> Tensor:
-        return l1_ssim_anywhere(image, target, self._ssim_weight)
+        return l1_ssim_anywhere(image, target, self._objective.ssim_weight)

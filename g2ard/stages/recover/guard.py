@@ -1,4 +1,4 @@
-"""Whether the steps improve a scene: scores on the way, steps back, and blends of start and result."""
+"""Whether the steps improve a scene: scores at some steps, steps back, and blends of start and result."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _LOST = (5.0, 3.0, 1.0, 0.0)
 """dB under the start at each of them from which nothing comes back: good runs dip by up to 3.6 dB under full
 rates and are level again at half of the horizon; one that went on to lose was 9 dB down at a tenth of it."""
 
-_SHARES = (0.5, 0.25)
-"""Of the way from the start to a result that is worse than it."""
+_BLENDS = (0.5, 0.25)
+"""Weights of a result that is worse than the start, in blends of the two."""
 
-_DOUBTS = (2.0, 5.0, 10.0, 20.0)
-"""How many views must have touched a Gaussian for half of its change to stay."""
+_PRIOR_VIEWS = (2.0, 5.0, 10.0, 20.0)
+"""k of the shrinkage v/(v + k): views that must have touched a Gaussian for half of its change to stay."""
 _TIE = 0.1
 """dB of the other views that are no loss yet."""
 _HALF, _HOPELESS = 0.5, 0.5
@@ -98,7 +98,8 @@ class Guard:
         """What of a result's changes stays, by the views of another kind; all of them where there are none.
 
         While they gain against the start, or lose under 0.1 dB, everything stays. Else they choose: a
-        Gaussian that v views touched goes v/(v + k) of its way, or all go the same part of it, or none.
+        Gaussian that v views touched keeps v/(v + k) of its change (shrinkage towards the start), or all keep
+        the same part of it, or none.
 
         Args:
             result: where the steps ended.
@@ -106,7 +107,7 @@ class Guard:
             step: its number, for the log.
 
         Returns:
-            The scene, and its k: 0 is all of the way, ∞ none of it, None a part of it for all alike.
+            The scene, and its k: 0 keeps all of the change, ∞ none of it, None a part of it for all alike.
         """
         if self.others is None:
             return result, 0.0
@@ -115,12 +116,12 @@ class Guard:
             return result, 0.0
         best, most = self.start, self.validation[0]["psnr"]
         chosen: float | None = math.inf
-        ways: list[tuple[float | None, NDArray[np.float64] | float]] = [
+        shares: list[tuple[float | None, NDArray[np.float64] | float]] = [
             (0.0, 1.0),
-            *((k, views / (views + k)) for k in _DOUBTS),
-            *((None, share) for share in _SHARES),
+            *((k, views / (views + k)) for k in _PRIOR_VIEWS),
+            *((None, share) for share in _BLENDS),
         ]
-        for k, share in ways:
+        for k, share in shares:
             part = blended(self.start, result, share)
             value = self.others(part)
             if value > most:
@@ -129,17 +130,17 @@ class Guard:
         return best, chosen
 
     def judge(self, result: Splats) -> tuple[Splats, float, float]:
-        """The best of the result, what was seen before it, and half or a quarter of the way where it lost.
+        """The best of the result, what was seen before it, and where it lost, of blends with the start.
 
         Returns:
-            The scene, its score, and how much of the way to the result it went: 1, or 0 for the start.
+            The scene, its score, and the result's weight in it: 1, or 0 for the start.
         """
         value = self.score(result)
         if value >= self.best_score or not self.active:
             return result, value, 1.0
         if self.best is not self.start:
             return self.best, self.best_score, 1.0
-        for share in _SHARES:
+        for share in _BLENDS:
             part = blended(self.start, result, share)
             value = self.score(part)
             if value > self.before:
@@ -178,7 +179,7 @@ def blended(start: Splats, end: Splats, share: ArrayLike) -> Splats:
     Args:
         start: where `share` is 0.
         end: where it is 1.
-        share: of the way, one for all or (N,).
+        share: weight of `end`, one for all or (N,).
 
     >>> a = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]])
     >>> b = Splats.create([[2, 0, 0]], scales=[[4, 1, 1]])
@@ -191,9 +192,9 @@ def blended(start: Splats, end: Splats, share: ArrayLike) -> Splats:
     q0, q1 = (q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-30) for q in (q0, q1))
     q0 = q0 * np.where((q0 * q1).sum(1, keepdims=True) < 0, -1, 1)
     pairs = (m0, m1), (q0, q1), (l0, l1), (o0, o1), (d0, d1), (n0, n1)
-    way = np.broadcast_to(np.asarray(share, np.float32), (len(start),))
+    weight = np.broadcast_to(np.asarray(share, np.float32), (len(start),))
     means, quats, log_scales, logits, sh0, shN = (
-        (a + way.reshape(-1, *[1] * (a.ndim - 1)) * (b - a)).astype(np.float32) for a, b in pairs
+        (a + weight.reshape(-1, *[1] * (a.ndim - 1)) * (b - a)).astype(np.float32) for a, b in pairs
     )
     scales = np.exp(log_scales.astype(np.float64)).astype(np.float32)
     return Splats(means, quats, scales, logits, sh0, shN, end.offset)

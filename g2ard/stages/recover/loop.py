@@ -18,7 +18,7 @@ from g2ard.stages.recover import checkpoint as checkpoints
 from g2ard.stages.recover.anchors import Anchors, drift95, needle
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import drawn
-from g2ard.stages.recover.engine import Engine, engine_class
+from g2ard.stages.recover.engine import Engine, Objective, engine_class
 from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.probe import MULTIPLIERS, Probe, calm, search_multiplier, trial_steps
 from g2ard.stages.recover.schedule import multiplier_for, reach_for
@@ -93,16 +93,16 @@ class Loop:
 
     def _new_engine(self, start: Splats | None = None) -> Engine:
         config, student = self.config, self.student if start is None else start
-        engine: Engine = engine_class(config.engine)(
+        objective = Objective(
             student,
             self.targets.cameras.recentred(student.offset),
-            anchors=self.anchors,
-            regularizers=config.regularizers,
-            means_in_scales=config.schedule.means_in_scales,
-            ssim_weight=config.ssim_weight,
-            background=config.background,
+            self.anchors,
+            config.regularizers,
+            config.schedule.means_in_scales,
+            config.ssim_weight,
+            config.background,
         )
-        return engine
+        return engine_class(config.engine)(objective)
 
     def choose_rates(self, start: float) -> None:
         """The schedule's reach and multiplier, or what the start suggests, and short trials like best.

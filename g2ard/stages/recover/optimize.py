@@ -109,11 +109,12 @@ def recover(
         loop.choose_rates(before)
     loop.run(checkpoint, progress, stage, watch)
     end = loop.engine.splats()
-    result, after, way = guard.judge(end)
-    doubt: float | None = 0.0
+    result, after, blend = guard.judge(end)
+    prior_views: float | None = 0.0
     if result is end and validation is not None:
-        result, doubt = guard.settle(end, loop.views_seen, loop.done)
-        after, way = (after, way) if result is end else (probe.all_of(result), float(result is not student))
+        result, prior_views = guard.settle(end, loop.views_seen, loop.done)
+        if result is not end:
+            after, blend = probe.all_of(result), float(result is not student)
     return Recovered(
         result,
         RecoverReport(
@@ -131,11 +132,13 @@ def recover(
             regularizers=Regularized.of(loop.regularizers),
             backed_off=tuple(map(Look.of, loop.guard.backed_off)),
             stopped=loop.guard.stopped,
-            way=way,
-            kept_start=way == 0,
+            blend=blend,
+            kept_start=blend == 0,
             validation=None
             if validation is None
-            else Validation(tuple(map(Look.of, guard.validation)), None if doubt is None else finite(doubt)),
+            else Validation(
+                tuple(map(Look.of, guard.validation)), None if prior_views is None else finite(prior_views)
+            ),
             skipped={"non_finite": loop.skipped},
         ),
     )

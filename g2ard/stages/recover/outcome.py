@@ -36,10 +36,10 @@ def outcome(report: RecoverReport) -> str | None:
     if lines:
         thirds = "a third" if len(lines) == 1 else f"1/{3 ** len(lines)}"
         return f"recovery fell to {', '.join(lines)}: it went on from the best with {thirds} of the rates"
-    if report.way < 1:
+    if report.blend < 1:
         return (
             "recovery ended below its start in the training views: the scene goes"
-            f" {report.way:.0%} of the way to where it ended, which is above both"
+            f" {report.blend:.0%} of the way to where it ended, which is above both"
         )
     return None
 

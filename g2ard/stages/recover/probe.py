@@ -1,4 +1,4 @@
-"""PSNR of a few views on the way, and the rate multiplier that short trials choose."""
+"""PSNR of a few views during recovery, and the rate multiplier that short trials choose."""
 
 from __future__ import annotations
 
@@ -26,12 +26,15 @@ _TIE = 0.04
 _CALMEST = 0.01
 """Smaller ones change nothing that 8 bits show."""
 _VIEWS = 8
+"""Training views that are scored."""
 _SHARE = 0.01
 """Share of the time that scoring the views may take while progress is shown."""
 _FIRST_SHARE = 0.1
 """The same of the first look, where short runs would end before the second."""
 _FEWEST, _MOST, _PART = 10, 60, 50
+"""Steps of a trial: the least, the most, and which part of the horizon between them."""
 _SHORTEST_HORIZON = 100
+"""Steps of a horizon under which trials would take too much of it."""
 
 
 def trial_steps(horizon: int) -> int:
@@ -68,8 +71,8 @@ def search_multiplier(
         return seen[i] >= best - _TIE * max(best - start, 0.0)
 
     at = min(range(len(MULTIPLIERS)), key=lambda i: abs(math.log(MULTIPLIERS[i] / guess)))
-    for way in (range(at, -1, -1), range(at + 1, len(MULTIPLIERS))):
-        for i in way:
+    for neighbours in (range(at, -1, -1), range(at + 1, len(MULTIPLIERS))):
+        for i in neighbours:
             value = score(MULTIPLIERS[i])
             seen[i] = value if math.isfinite(value) else -math.inf
             if not good(i):

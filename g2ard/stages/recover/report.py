@@ -57,13 +57,13 @@ class Validation(Report):
     """What views of another kind had to say.
 
     Args:
-        looks: on the way, the last of the result.
-        doubt: a Gaussian that v views touched keeps v/(v + doubt) of its change; None where all keep the same
-            part, or none.
+        looks: at some steps, the last of the result.
+        prior_views: k of the shrinkage towards the student: a Gaussian that v views touched keeps v/(v + k)
+            of its change; None where all keep the same part, or none.
     """
 
     looks: tuple[Look, ...]
-    doubt: float | None
+    prior_views: float | None
 
 
 @dataclass(frozen=True)
@@ -81,12 +81,13 @@ class RecoverReport(Report):
         trials: those that chose the multiplier.
         drift95: of the result.
         needle: of the result.
-        geometry: ten on the way.
+        geometry: at ten steps, evenly spaced.
         regularizers: how much they cost.
         backed_off: where so much was lost that recovery went on from the best scene with a third of the
             rates.
         stopped: the step at which it was given up, else None.
-        way: how far the result goes from the student to where the steps ended: 1 but where that lost.
+        blend: weight of where the steps ended in the result, which is interpolated between the student (0)
+            and that (1): 1 but where that lost.
         kept_start: the student was better than all that came of it, and is the result.
         validation: None without such views.
         skipped: `non_finite`: steps of single Gaussians whose gradient was not finite.
@@ -106,7 +107,7 @@ class RecoverReport(Report):
     regularizers: Regularized
     backed_off: tuple[Look, ...]
     stopped: int | None
-    way: float
+    blend: float
     kept_start: bool
     validation: Validation | None
     skipped: dict[str, int]

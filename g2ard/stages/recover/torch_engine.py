@@ -11,9 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from g2ard.cameras import Cameras
 from g2ard.splats import Splats
-from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.engine import Objective
 from g2ard.stages.recover.extent import extents, share_of_rate
 from g2ard.stages.recover.losses import l1_ssim
 from g2ard.stages.recover.rasterize import rasterize
@@ -38,26 +37,13 @@ class TorchEngine:
 
     device = torch.device("cpu")
 
-    def __init__(
-        self,
-        splats: Splats,
-        cameras: Cameras,
-        *,
-        anchors: Anchors,
-        regularizers: Regularizers,
-        means_in_scales: bool,
-        ssim_weight: float,
-        background: tuple[float, float, float],
-    ) -> None:
-        self._template = splats
-        self._cameras = cameras
+    def __init__(self, objective: Objective) -> None:
+        self._objective = objective
+        splats, anchors = objective.start, objective.anchors
         self._anchors = TorchAnchors(anchors).to(self.device)
         self._settings = settings_for(anchors.means)
-        self._regularizers = regularizers
-        self._ssim_weight = ssim_weight
-        self._background = background
         self._base = torch.from_numpy(splats.means.astype(np.float32)).to(self.device)
-        unit = radii(splats) if means_in_scales else np.ones(len(splats), np.float32)
+        unit = radii(splats) if objective.means_in_scales else np.ones(len(splats), np.float32)
         self._unit = torch.from_numpy(unit[:, None]).to(self.device)
         start = {
             "means": np.zeros((len(splats), 3), np.float32),
@@ -91,10 +77,9 @@ class TorchEngine:
             share = mask.size / max(1, int(mask.sum()))
         loss = share * self._loss(image, wanted)
         total = loss
-        if regularize and self._regularizers.active:
-            total = loss + regularization(
-                means, p["quats"], p["log_scales"], self._anchors, self._regularizers
-            )
+        weights = self._objective.regularizers
+        if regularize and weights.active:
+            total = loss + regularization(means, p["quats"], p["log_scales"], self._anchors, weights)
         self._adam.zero_grad(set_to_none=True)
         torch.autograd.backward(total)
         shares = self._shares(means.detach(), view, rates.reach)
@@ -107,9 +92,9 @@ class TorchEngine:
         """What is left of each rate, by row or by value, for the size of things in this view."""
         if math.isinf(reach):
             return {}
-        p, near = self._parameters, self._settings.near_of(view)
-        largest, axes = extents(means, p["quats"], p["log_scales"], self._cameras, view, near)
-        pixels = reach * float(max(self._cameras.widths[view], self._cameras.heights[view]))
+        p, near, cameras = self._parameters, self._settings.near_of(view), self._objective.cameras
+        largest, axes = extents(means, p["quats"], p["log_scales"], cameras, view, near)
+        pixels = reach * float(max(cameras.widths[view], cameras.heights[view]))
         whole = share_of_rate(largest, pixels)[:, None]
         return {"means": whole, "quats": whole, "log_scales": share_of_rate(axes, pixels)}
 
@@ -123,15 +108,15 @@ class TorchEngine:
             p["logit_opacities"],
             p["sh0"],
             p["shN"],
-            self._cameras,
+            self._objective.cameras,
             view,
-            background=self._background,
+            background=self._objective.background,
             settings=self._settings,
         )
         return image
 
     def _loss(self, image: Tensor, target: Tensor) -> Tensor:
-        return l1_ssim(image, target, self._ssim_weight)
+        return l1_ssim(image, target, self._objective.ssim_weight)
 
     def splats(self) -> Splats:
         """The scene as it stands, quaternions normalised."""
@@ -143,7 +128,7 @@ class TorchEngine:
             logit_opacities=p["logit_opacities"].numpy().copy(),
             sh0=p["sh0"].numpy().copy(),
             shN=p["shN"].numpy().copy(),
-            offset=self._template.offset,
+            offset=self._objective.start.offset,
         )
 
     def state(self) -> dict[str, NDArray[Any]]:
