@@ -2,31 +2,67 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
+import io
 import os
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
+Said = tuple[int, str, str]
+
+_OF_THE_PROCESS = {"--threads", "--device", "--devices"}
+"""Options that set what a process has once: calls with them get one of their own."""
+
 
 @pytest.fixture(scope="session")
-def command_line() -> Callable[..., tuple[int, str, str]]:
-    """Runs `g2ard …` as a program in a folder: (exit status, stdout, stderr)."""
+def command_line() -> Callable[..., Said]:
+    """Runs `g2ard …` in a folder: (exit status, stdout, stderr).
 
-    def run(*arguments: object, cwd: Path) -> tuple[int, str, str]:
+    In this process, for most of a short command is Python's start; in one of its own where `apart` says so.
+    """
+
+    def run(*arguments: object, cwd: Path, apart: bool = False) -> Said:
+        words = [str(argument) for argument in arguments]
         path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-        done = subprocess.run(
-            [sys.executable, "-m", "g2ard", *map(str, arguments)],
-            cwd=cwd,
-            env={**os.environ, "PYTHONPATH": path, "COLUMNS": "200"},
-            capture_output=True,
-            text=True,
-            timeout=300,
-        )
-        return done.returncode, done.stdout, done.stderr
+        env = {**os.environ, "PYTHONPATH": path, "COLUMNS": "200"}
+        return (_apart if apart or _OF_THE_PROCESS & set(words) else _here)(words, cwd, env)
 
     return run
+
+
+def _apart(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
+    done = subprocess.run(
+        [sys.executable, "-m", "g2ard", *words], cwd=cwd, env=env, capture_output=True, text=True, timeout=300
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
+    from g2ard.cli import main
+
+    out, err = io.StringIO(), io.StringIO()
+    status: object = 0
+    before = Path.cwd()
+    with (
+        patch.dict(os.environ, env),
+        patch.object(sys, "argv", ["g2ard", *words]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        os.chdir(cwd)
+        try:
+            main()
+        except SystemExit as end:
+            status = end.code
+        finally:
+            os.chdir(before)
+            gc.unfreeze()  # `main` takes it that the program ends
+    return int(status or 0) if isinstance(status, int | None) else 1, out.getvalue(), err.getvalue()
