@@ -7,7 +7,7 @@
 
 use std::f32::consts::PI;
 
-use super::real::{Real, exp_negative};
+use crate::raster::simd::{Real, exp_negative};
 
 /// Six axes in eight places, which fill a register; the last two repeat and weigh nothing.
 const PLACES: usize = 8;

@@ -15,7 +15,6 @@ mod morton_tree;
 mod outcome;
 mod pairwise;
 mod paper;
-mod real;
 mod residual;
 mod rows;
 mod trim;

@@ -3,7 +3,7 @@
 use std::arch::x86_64::*;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use super::{LANES, Lanes, Lanes16, Mask, TO_NEAREST, Wide, exp2_fraction};
+use super::{LANES, Lanes, Lanes16, Mask, Real, TO_NEAREST, Wide, exp2_fraction};
 
 /// Intrinsics that touch no memory.
 macro_rules! avx2 {
@@ -128,14 +128,69 @@ impl Wide for Avx2Wide {
     }
 }
 
-impl Lanes for Avx2 {
+impl Real for Avx2 {
     type Mask = Avx2Mask;
-    type Wide = Avx2Wide;
 
     #[inline(always)]
     fn splat(value: f32) -> Self {
         avx2!(Self(_mm256_set1_ps(value), _mm256_set1_ps(value)))
     }
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        avx2!(Self(
+            _mm256_min_ps(self.0, other.0),
+            _mm256_min_ps(self.1, other.1),
+        ))
+    }
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        avx2!(Self(
+            _mm256_max_ps(self.0, other.0),
+            _mm256_max_ps(self.1, other.1),
+        ))
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        avx2!(Self(_mm256_sqrt_ps(self.0), _mm256_sqrt_ps(self.1)))
+    }
+    #[inline(always)]
+    fn ldexp(self, n: Self) -> Self {
+        avx2!({
+            let one = _mm256_set1_epi32(127);
+            let low = _mm256_slli_epi32::<23>(_mm256_add_epi32(_mm256_cvttps_epi32(n.0), one));
+            let high = _mm256_slli_epi32::<23>(_mm256_add_epi32(_mm256_cvttps_epi32(n.1), one));
+            Self(
+                _mm256_mul_ps(self.0, _mm256_castsi256_ps(low)),
+                _mm256_mul_ps(self.1, _mm256_castsi256_ps(high)),
+            )
+        })
+    }
+    #[inline(always)]
+    fn ge(self, other: Self) -> Avx2Mask {
+        avx2!(Avx2Mask(
+            _mm256_cmp_ps::<_CMP_GE_OQ>(self.0, other.0),
+            _mm256_cmp_ps::<_CMP_GE_OQ>(self.1, other.1),
+        ))
+    }
+    #[inline(always)]
+    fn gt(self, other: Self) -> Avx2Mask {
+        avx2!(Avx2Mask(
+            _mm256_cmp_ps::<_CMP_GT_OQ>(self.0, other.0),
+            _mm256_cmp_ps::<_CMP_GT_OQ>(self.1, other.1),
+        ))
+    }
+    #[inline(always)]
+    fn select(mask: Avx2Mask, yes: Self, no: Self) -> Self {
+        avx2!(Self(
+            _mm256_blendv_ps(no.0, yes.0, mask.0),
+            _mm256_blendv_ps(no.1, yes.1, mask.1),
+        ))
+    }
+}
+
+impl Lanes for Avx2 {
+    type Wide = Avx2Wide;
+
     #[inline(always)]
     fn load(row: &Lanes16) -> Self {
         // SAFETY: a row holds 16 values, aligned to 64 bytes; the instructions exist (`avx2!`).
@@ -182,59 +237,8 @@ impl Lanes for Avx2 {
         ))
     }
     #[inline(always)]
-    fn min(self, other: Self) -> Self {
-        avx2!(Self(
-            _mm256_min_ps(self.0, other.0),
-            _mm256_min_ps(self.1, other.1),
-        ))
-    }
-    #[inline(always)]
-    fn max(self, other: Self) -> Self {
-        avx2!(Self(
-            _mm256_max_ps(self.0, other.0),
-            _mm256_max_ps(self.1, other.1),
-        ))
-    }
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        avx2!(Self(_mm256_sqrt_ps(self.0), _mm256_sqrt_ps(self.1)))
-    }
-    #[inline(always)]
     fn floor(self) -> Self {
         avx2!(Self(_mm256_floor_ps(self.0), _mm256_floor_ps(self.1)))
-    }
-    #[inline(always)]
-    fn ldexp(self, n: Self) -> Self {
-        avx2!({
-            let one = _mm256_set1_epi32(127);
-            let low = _mm256_slli_epi32::<23>(_mm256_add_epi32(_mm256_cvttps_epi32(n.0), one));
-            let high = _mm256_slli_epi32::<23>(_mm256_add_epi32(_mm256_cvttps_epi32(n.1), one));
-            Self(
-                _mm256_mul_ps(self.0, _mm256_castsi256_ps(low)),
-                _mm256_mul_ps(self.1, _mm256_castsi256_ps(high)),
-            )
-        })
-    }
-    #[inline(always)]
-    fn ge(self, other: Self) -> Avx2Mask {
-        avx2!(Avx2Mask(
-            _mm256_cmp_ps::<_CMP_GE_OQ>(self.0, other.0),
-            _mm256_cmp_ps::<_CMP_GE_OQ>(self.1, other.1),
-        ))
-    }
-    #[inline(always)]
-    fn gt(self, other: Self) -> Avx2Mask {
-        avx2!(Avx2Mask(
-            _mm256_cmp_ps::<_CMP_GT_OQ>(self.0, other.0),
-            _mm256_cmp_ps::<_CMP_GT_OQ>(self.1, other.1),
-        ))
-    }
-    #[inline(always)]
-    fn select(mask: Avx2Mask, yes: Self, no: Self) -> Self {
-        avx2!(Self(
-            _mm256_blendv_ps(no.0, yes.0, mask.0),
-            _mm256_blendv_ps(no.1, yes.1, mask.1),
-        ))
     }
     #[inline(always)]
     fn only(self, mask: Avx2Mask) -> Self {

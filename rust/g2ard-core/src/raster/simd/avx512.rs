@@ -3,7 +3,7 @@
 use std::arch::x86_64::*;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use super::{LANES, Lanes, Lanes16, Mask, TO_NEAREST, Wide, exp2_fraction};
+use super::{LANES, Lanes, Lanes16, Mask, Real, TO_NEAREST, Wide, exp2_fraction};
 
 /// Intrinsics that touch no memory.
 macro_rules! avx512 {
@@ -102,14 +102,46 @@ impl Wide for Avx512Wide {
     }
 }
 
-impl Lanes for Avx512 {
+impl Real for Avx512 {
     type Mask = Avx512Mask;
-    type Wide = Avx512Wide;
 
     #[inline(always)]
     fn splat(value: f32) -> Self {
         Self(avx512!(_mm512_set1_ps(value)))
     }
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        Self(avx512!(_mm512_min_ps(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        Self(avx512!(_mm512_max_ps(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        Self(avx512!(_mm512_sqrt_ps(self.0)))
+    }
+    #[inline(always)]
+    fn ldexp(self, n: Self) -> Self {
+        Self(avx512!(_mm512_scalef_ps(self.0, n.0)))
+    }
+    #[inline(always)]
+    fn ge(self, other: Self) -> Avx512Mask {
+        Avx512Mask(avx512!(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn gt(self, other: Self) -> Avx512Mask {
+        Avx512Mask(avx512!(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn select(mask: Avx512Mask, yes: Self, no: Self) -> Self {
+        Self(avx512!(_mm512_mask_blend_ps(mask.0, no.0, yes.0)))
+    }
+}
+
+impl Lanes for Avx512 {
+    type Wide = Avx512Wide;
+
     #[inline(always)]
     fn load(row: &Lanes16) -> Self {
         // SAFETY: a row holds 16 values, aligned to 64 bytes; the instructions exist (`avx512!`).
@@ -139,36 +171,8 @@ impl Lanes for Avx512 {
         Self(avx512!(_mm512_fnmadd_ps(self.0, factor.0, addend.0)))
     }
     #[inline(always)]
-    fn min(self, other: Self) -> Self {
-        Self(avx512!(_mm512_min_ps(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn max(self, other: Self) -> Self {
-        Self(avx512!(_mm512_max_ps(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        Self(avx512!(_mm512_sqrt_ps(self.0)))
-    }
-    #[inline(always)]
     fn floor(self) -> Self {
         Self(avx512!(_mm512_roundscale_ps::<TO_FLOOR>(self.0)))
-    }
-    #[inline(always)]
-    fn ldexp(self, n: Self) -> Self {
-        Self(avx512!(_mm512_scalef_ps(self.0, n.0)))
-    }
-    #[inline(always)]
-    fn ge(self, other: Self) -> Avx512Mask {
-        Avx512Mask(avx512!(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn gt(self, other: Self) -> Avx512Mask {
-        Avx512Mask(avx512!(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn select(mask: Avx512Mask, yes: Self, no: Self) -> Self {
-        Self(avx512!(_mm512_mask_blend_ps(mask.0, no.0, yes.0)))
     }
     #[inline(always)]
     fn only(self, mask: Avx512Mask) -> Self {

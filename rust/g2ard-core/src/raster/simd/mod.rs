@@ -4,7 +4,7 @@
 //! has the instruction set's features enabled. Everything on the way must be `#[inline(always)]` (and free of
 //! closures), or the intrinsics stay calls.
 
-use std::ops::{Add, Div, Mul, Neg, Sub};
+use std::ops::{Add, Div, Mul};
 
 #[cfg(target_arch = "x86_64")]
 mod avx2;
@@ -13,8 +13,10 @@ mod avx512;
 #[cfg(target_arch = "aarch64")]
 mod neon;
 mod portable;
+mod real;
 
 pub use portable::Portable;
+pub use real::{Real, exp_negative};
 
 pub const LANES: usize = 16;
 
@@ -51,18 +53,9 @@ pub trait Wide: Copy + Add<Output = Self> + Mul<Output = Self> + Div<Output = Se
 }
 
 /// Sixteen f32 lanes.
-pub trait Lanes:
-    Copy
-    + Add<Output = Self>
-    + Sub<Output = Self>
-    + Mul<Output = Self>
-    + Div<Output = Self>
-    + Neg<Output = Self>
-{
-    type Mask: Mask;
+pub trait Lanes: Real<Mask: Mask> {
     type Wide: Wide;
 
-    fn splat(value: f32) -> Self;
     fn load(row: &Lanes16) -> Self;
     /// Sixteen values from `at`, which may be unaligned.
     ///
@@ -77,18 +70,7 @@ pub trait Lanes:
     fn fma(self, factor: Self, addend: Self) -> Self;
     /// `addend − self · factor`.
     fn fnma(self, factor: Self, addend: Self) -> Self;
-    /// NaN in `self` gives `other`.
-    fn min(self, other: Self) -> Self;
-    /// NaN in `self` gives `other`.
-    fn max(self, other: Self) -> Self;
-    fn sqrt(self) -> Self;
     fn floor(self) -> Self;
-    /// `self · 2^n` for integral n in −126…127.
-    fn ldexp(self, n: Self) -> Self;
-    fn ge(self, other: Self) -> Self::Mask;
-    fn gt(self, other: Self) -> Self::Mask;
-    /// `yes` where the mask holds, else `no`.
-    fn select(mask: Self::Mask, yes: Self, no: Self) -> Self;
     fn widen(self) -> Self::Wide;
     fn narrow(wide: Self::Wide) -> Self;
     /// Lane `k` of the result is the sum of `rows[k]`, in one fixed order; lanes past 10 are unspecified.

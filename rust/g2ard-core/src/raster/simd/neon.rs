@@ -5,7 +5,7 @@
 use std::arch::aarch64::*;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use super::{LANES, Lanes, Lanes16, Mask, TO_NEAREST, Wide, exp2_fraction};
+use super::{LANES, Lanes, Lanes16, Mask, Real, TO_NEAREST, Wide, exp2_fraction};
 
 /// Intrinsics that touch no memory.
 macro_rules! neon {
@@ -128,14 +128,66 @@ impl Wide for NeonWide {
     }
 }
 
-impl Lanes for Neon {
+impl Real for Neon {
     type Mask = NeonMask;
-    type Wide = NeonWide;
 
     #[inline(always)]
     fn splat(value: f32) -> Self {
         Self([neon!(vdupq_n_f32(value)); 4])
     }
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        // Not `vminq_f32`, which keeps a NaN of `self`.
+        Self::select(other.gt(self), self, other)
+    }
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        Self::select(self.gt(other), self, other)
+    }
+    #[inline(always)]
+    fn sqrt(mut self) -> Self {
+        for k in 0..4 {
+            self.0[k] = neon!(vsqrtq_f32(self.0[k]));
+        }
+        self
+    }
+    #[inline(always)]
+    fn ldexp(mut self, n: Self) -> Self {
+        for k in 0..4 {
+            let exponent = neon!(vaddq_s32(vcvtq_s32_f32(n.0[k]), vdupq_n_s32(127)));
+            let power = neon!(vreinterpretq_f32_s32(vshlq_n_s32::<23>(exponent)));
+            self.0[k] = neon!(vmulq_f32(self.0[k], power));
+        }
+        self
+    }
+    #[inline(always)]
+    fn ge(self, other: Self) -> NeonMask {
+        let mut mask = [neon!(vdupq_n_u32(0)); 4];
+        for k in 0..4 {
+            mask[k] = neon!(vcgeq_f32(self.0[k], other.0[k]));
+        }
+        NeonMask(mask)
+    }
+    #[inline(always)]
+    fn gt(self, other: Self) -> NeonMask {
+        let mut mask = [neon!(vdupq_n_u32(0)); 4];
+        for k in 0..4 {
+            mask[k] = neon!(vcgtq_f32(self.0[k], other.0[k]));
+        }
+        NeonMask(mask)
+    }
+    #[inline(always)]
+    fn select(mask: NeonMask, yes: Self, mut no: Self) -> Self {
+        for k in 0..4 {
+            no.0[k] = neon!(vbslq_f32(mask.0[k], yes.0[k], no.0[k]));
+        }
+        no
+    }
+}
+
+impl Lanes for Neon {
+    type Wide = NeonWide;
+
     #[inline(always)]
     fn load(row: &Lanes16) -> Self {
         // SAFETY: a row holds 16 values.
@@ -177,59 +229,11 @@ impl Lanes for Neon {
         self
     }
     #[inline(always)]
-    fn min(self, other: Self) -> Self {
-        // Not `vminq_f32`, which keeps a NaN of `self`.
-        Self::select(other.gt(self), self, other)
-    }
-    #[inline(always)]
-    fn max(self, other: Self) -> Self {
-        Self::select(self.gt(other), self, other)
-    }
-    #[inline(always)]
-    fn sqrt(mut self) -> Self {
-        for k in 0..4 {
-            self.0[k] = neon!(vsqrtq_f32(self.0[k]));
-        }
-        self
-    }
-    #[inline(always)]
     fn floor(mut self) -> Self {
         for k in 0..4 {
             self.0[k] = neon!(vrndmq_f32(self.0[k]));
         }
         self
-    }
-    #[inline(always)]
-    fn ldexp(mut self, n: Self) -> Self {
-        for k in 0..4 {
-            let exponent = neon!(vaddq_s32(vcvtq_s32_f32(n.0[k]), vdupq_n_s32(127)));
-            let power = neon!(vreinterpretq_f32_s32(vshlq_n_s32::<23>(exponent)));
-            self.0[k] = neon!(vmulq_f32(self.0[k], power));
-        }
-        self
-    }
-    #[inline(always)]
-    fn ge(self, other: Self) -> NeonMask {
-        let mut mask = [neon!(vdupq_n_u32(0)); 4];
-        for k in 0..4 {
-            mask[k] = neon!(vcgeq_f32(self.0[k], other.0[k]));
-        }
-        NeonMask(mask)
-    }
-    #[inline(always)]
-    fn gt(self, other: Self) -> NeonMask {
-        let mut mask = [neon!(vdupq_n_u32(0)); 4];
-        for k in 0..4 {
-            mask[k] = neon!(vcgtq_f32(self.0[k], other.0[k]));
-        }
-        NeonMask(mask)
-    }
-    #[inline(always)]
-    fn select(mask: NeonMask, yes: Self, mut no: Self) -> Self {
-        for k in 0..4 {
-            no.0[k] = neon!(vbslq_f32(mask.0[k], yes.0[k], no.0[k]));
-        }
-        no
     }
     #[inline(always)]
     fn only(mut self, mask: NeonMask) -> Self {

@@ -2,7 +2,7 @@
 
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use super::{LANES, Lanes, Lanes16, Mask, Wide};
+use super::{LANES, Lanes, Lanes16, Mask, Real, Wide};
 
 #[derive(Clone, Copy)]
 pub struct Portable([f32; LANES]);
@@ -116,45 +116,12 @@ impl Wide for PortableWide {
     }
 }
 
-impl Lanes for Portable {
+impl Real for Portable {
     type Mask = PortableMask;
-    type Wide = PortableWide;
 
     #[inline(always)]
     fn splat(value: f32) -> Self {
         Self([value; LANES])
-    }
-    #[inline(always)]
-    fn load(row: &Lanes16) -> Self {
-        Self(row.0)
-    }
-    #[inline(always)]
-    unsafe fn load_at(at: *const f32) -> Self {
-        // SAFETY: the caller vouches for 16 readable values.
-        Self(unsafe { at.cast::<[f32; LANES]>().read_unaligned() })
-    }
-    #[inline(always)]
-    fn store(self, row: &mut Lanes16) {
-        row.0 = self.0;
-    }
-    #[inline(always)]
-    unsafe fn store_at(self, at: *mut f32) {
-        // SAFETY: the caller vouches for 16 writable values.
-        unsafe { at.cast::<[f32; LANES]>().write_unaligned(self.0) }
-    }
-    #[inline(always)]
-    fn fma(mut self, factor: Self, addend: Self) -> Self {
-        for l in 0..LANES {
-            self.0[l] = mul_add(self.0[l], factor.0[l], addend.0[l]);
-        }
-        self
-    }
-    #[inline(always)]
-    fn fnma(mut self, factor: Self, addend: Self) -> Self {
-        for l in 0..LANES {
-            self.0[l] = mul_add(-self.0[l], factor.0[l], addend.0[l]);
-        }
-        self
     }
     #[inline(always)]
     fn min(mut self, other: Self) -> Self {
@@ -182,15 +149,6 @@ impl Lanes for Portable {
     fn sqrt(mut self) -> Self {
         for l in 0..LANES {
             self.0[l] = self.0[l].sqrt();
-        }
-        self
-    }
-    #[inline(always)]
-    fn floor(mut self) -> Self {
-        for l in 0..LANES {
-            // Truncate and correct: `f32::floor` is a library call without SSE4.1.
-            let t = self.0[l] as i32 as f32;
-            self.0[l] = if t > self.0[l] { t - 1.0 } else { t };
         }
         self
     }
@@ -226,6 +184,52 @@ impl Lanes for Portable {
             no.0[l] = f32::from_bits((yes.0[l].to_bits() & m) | (no.0[l].to_bits() & !m));
         }
         no
+    }
+}
+
+impl Lanes for Portable {
+    type Wide = PortableWide;
+
+    #[inline(always)]
+    fn load(row: &Lanes16) -> Self {
+        Self(row.0)
+    }
+    #[inline(always)]
+    unsafe fn load_at(at: *const f32) -> Self {
+        // SAFETY: the caller vouches for 16 readable values.
+        Self(unsafe { at.cast::<[f32; LANES]>().read_unaligned() })
+    }
+    #[inline(always)]
+    fn store(self, row: &mut Lanes16) {
+        row.0 = self.0;
+    }
+    #[inline(always)]
+    unsafe fn store_at(self, at: *mut f32) {
+        // SAFETY: the caller vouches for 16 writable values.
+        unsafe { at.cast::<[f32; LANES]>().write_unaligned(self.0) }
+    }
+    #[inline(always)]
+    fn fma(mut self, factor: Self, addend: Self) -> Self {
+        for l in 0..LANES {
+            self.0[l] = mul_add(self.0[l], factor.0[l], addend.0[l]);
+        }
+        self
+    }
+    #[inline(always)]
+    fn fnma(mut self, factor: Self, addend: Self) -> Self {
+        for l in 0..LANES {
+            self.0[l] = mul_add(-self.0[l], factor.0[l], addend.0[l]);
+        }
+        self
+    }
+    #[inline(always)]
+    fn floor(mut self) -> Self {
+        for l in 0..LANES {
+            // Truncate and correct: `f32::floor` is a library call without SSE4.1.
+            let t = self.0[l] as i32 as f32;
+            self.0[l] = if t > self.0[l] { t - 1.0 } else { t };
+        }
+        self
     }
     #[inline(always)]
     fn widen(self) -> PortableWide {

@@ -3,10 +3,10 @@
 use std::f32::consts::{LN_2, LOG2_E};
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use crate::raster::simd::{Lanes, TO_NEAREST};
+use super::TO_NEAREST;
 
-/// An f32, or lanes of them. Generic functions over it must be `#[inline(always)]` and free of closures
-/// (see [`crate::raster::simd`]).
+/// An f32, or lanes of them ([`super::Lanes`]). Generic functions over it must be `#[inline(always)]` and free of
+/// closures (see [`super`]).
 pub trait Real:
     Copy
     + Add<Output = Self>
@@ -66,43 +66,6 @@ impl Real for f32 {
     #[inline(always)]
     fn select(mask: bool, yes: Self, no: Self) -> Self {
         if mask { yes } else { no }
-    }
-}
-
-impl<F: Lanes> Real for F {
-    type Mask = F::Mask;
-
-    #[inline(always)]
-    fn splat(value: f32) -> Self {
-        <F as Lanes>::splat(value)
-    }
-    #[inline(always)]
-    fn max(self, other: Self) -> Self {
-        Lanes::max(self, other)
-    }
-    #[inline(always)]
-    fn min(self, other: Self) -> Self {
-        Lanes::min(self, other)
-    }
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        Lanes::sqrt(self)
-    }
-    #[inline(always)]
-    fn ldexp(self, n: Self) -> Self {
-        Lanes::ldexp(self, n)
-    }
-    #[inline(always)]
-    fn ge(self, other: Self) -> F::Mask {
-        Lanes::ge(self, other)
-    }
-    #[inline(always)]
-    fn gt(self, other: Self) -> F::Mask {
-        Lanes::gt(self, other)
-    }
-    #[inline(always)]
-    fn select(mask: F::Mask, yes: Self, no: Self) -> Self {
-        <F as Lanes>::select(mask, yes, no)
     }
 }
 
