@@ -49,12 +49,12 @@ mod spatial {
     fn six_nearest_of_all(bencher: Bencher, count: usize) {
         let tree = Tree::build(&Scene::of(count).means);
         bencher.bench(|| {
-            (0..count)
-                .into_par_iter()
-                .for_each_init(Vec::new, |found, at| {
-                    tree.nearest(at, NEIGHBORS, found);
+            (0..count.div_ceil(1024)).into_par_iter().for_each(|chunk| {
+                let range = chunk * 1024..count.min((chunk + 1) * 1024);
+                tree.nearest(range, NEIGHBORS, |_, found| {
                     black_box(found);
                 });
+            });
         });
     }
 }

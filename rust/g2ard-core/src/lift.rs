@@ -81,12 +81,10 @@ pub fn lift(points: &[[f64; 3]], config: &LiftConfig, control: &Control) -> Resu
         .map(|chunk| {
             control.check()?;
             let here = chunk * CHUNK..((chunk + 1) * CHUNK).min(points.len());
-            let mut near = Vec::new();
-            let patches = here.clone().map(|at| {
-                tree.nearest(at, config.neighbors, &mut near);
-                patch(points, tree.rows()[at], &near, config)
+            let mut patches = Vec::with_capacity(here.len());
+            tree.nearest(here.clone(), config.neighbors, |at, near| {
+                patches.push(patch(points, tree.rows()[at], near, config));
             });
-            let patches = patches.collect();
             control.advance(here.len() as u64);
             Ok(patches)
         })

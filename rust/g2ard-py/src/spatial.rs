@@ -32,20 +32,22 @@ fn knn<'py>(
 }
 
 fn neighbors(points: &[[f64; 3]], k: usize) -> Array2<u32> {
+    const CHUNK: usize = 1024;
     let tree = Tree::build(points);
-    let found: Vec<(u32, Vec<u32>)> = (0..points.len())
-        .into_par_iter()
-        .map_init(Vec::new, |near, at| {
-            tree.nearest(at, k, near);
-            (tree.rows()[at], near.iter().map(|n| n.1).collect())
-        })
-        .collect();
+    let mut found = vec![0; points.len() * k];
+    let chunks = found.par_chunks_mut(CHUNK * k).enumerate();
+    chunks.for_each(|(chunk, found)| {
+        let range = chunk * CHUNK..points.len().min((chunk + 1) * CHUNK);
+        let mut rows = found.chunks_mut(k);
+        tree.nearest(range, k, |_, near| {
+            let row = rows.next().into_iter().flatten();
+            row.zip(near).for_each(|(to, n)| *to = n.1);
+        });
+    });
     let mut rows = Array2::zeros((points.len(), k));
-    for (row, near) in found {
-        rows.row_mut(row as usize)
-            .iter_mut()
-            .zip(near)
-            .for_each(|(to, from)| *to = from);
+    for (&row, near) in tree.rows().iter().zip(found.chunks(k)) {
+        let to = rows.row_mut(row as usize);
+        to.into_iter().zip(near).for_each(|(to, from)| *to = *from);
     }
     rows
 }

@@ -174,16 +174,15 @@ pub fn candidates(
         .try_for_each(|(chunk, lists)| {
             control.check()?;
             let first = chunk * CHUNK;
-            let mut near = Vec::with_capacity(k);
-            for (at, list) in lists.chunks_mut(k).enumerate() {
-                tree.nearest(first + at, k, &mut near);
+            tree.nearest(first..first + lists.len() / k, k, |i, near| {
                 if near.last().is_some_and(|last| last.0 == 0.0) {
-                    spread_duplicates(first + at, k, nodes.len(), &mut near);
+                    spread_duplicates(i, k, nodes.len(), near);
                 }
-                for (candidate, &(_, j)) in list.iter_mut().zip(&near) {
+                let list = &mut lists[(i - first) * k..][..k];
+                for (candidate, &mut (_, j)) in list.iter_mut().zip(near) {
                     candidate.1 = j;
                 }
-            }
+            });
             let costs = PairCosts {
                 nodes,
                 first,

@@ -1,50 +1,22 @@
 //! Exact nearest neighbours: an eight-way box tree over blocks of eight points in Morton order.
 //!
-//! Exact in the arithmetic of the coordinates: f64 where cancellation matters, f32 where speed does.
+//! Exact in the arithmetic of the coordinates: f64 where cancellation matters, f32 where speed does. The eight points
+//! of a block are near each other and walk the tree together.
 
-use std::ops::{AddAssign, Mul, Sub};
+mod coordinate;
+mod search;
+
+use std::ops::Range;
 
 use rayon::prelude::*;
+
+pub use coordinate::{Coordinate, Neighbor};
+use search::Search;
 
 use super::{RobustBounds, codes, order};
 
 const WIDTH: usize = 8;
 type Lanes<T> = [T; WIDTH];
-
-/// f32 or f64.
-pub trait Real:
-    Copy + PartialOrd + Send + Sync + Default + Sub<Output = Self> + Mul<Output = Self> + AddAssign
-{
-    const INFINITY: Self;
-    const NEG_INFINITY: Self;
-    fn least(self, other: Self) -> Self;
-    fn most(self, other: Self) -> Self;
-}
-
-macro_rules! real {
-    ($t:ident) => {
-        impl Real for $t {
-            const INFINITY: Self = $t::INFINITY;
-            const NEG_INFINITY: Self = $t::NEG_INFINITY;
-
-            #[inline(always)]
-            fn least(self, other: Self) -> Self {
-                if self < other { self } else { other }
-            }
-
-            #[inline(always)]
-            fn most(self, other: Self) -> Self {
-                if self > other { self } else { other }
-            }
-        }
-    };
-}
-
-real!(f32);
-real!(f64);
-
-/// Squared distance and row.
-pub type Neighbor<T> = (T, u32);
 
 /// Eight boxes, side by side.
 #[derive(Clone, Copy)]
@@ -53,25 +25,48 @@ struct Boxes<T> {
     high: [Lanes<T>; 3],
 }
 
-impl<T: Real> Boxes<T> {
+impl<T: Coordinate> Boxes<T> {
     const NOWHERE: Self = Self {
         low: [[T::INFINITY; WIDTH]; 3],
         high: [[T::NEG_INFINITY; WIDTH]; 3],
     };
 
-    /// Squared distances from `q`; infinite for an empty box.
+    /// Squared distances from another box; infinite for an empty one.
     #[inline(always)]
-    fn distances(&self, q: [T; 3]) -> Lanes<T> {
+    fn gaps(&self, low: [T; 3], high: [T; 3]) -> Lanes<T> {
         let mut sum = [T::default(); WIDTH];
         for k in 0..3 {
             for i in 0..WIDTH {
-                let d = (self.low[k][i] - q[k])
-                    .most(q[k] - self.high[k][i])
+                let d = (self.low[k][i] - high[k])
+                    .most(low[k] - self.high[k][i])
                     .most(T::default());
                 sum[i] += d * d;
             }
         }
         sum
+    }
+
+    /// Squared distances of eight points from the `i`-th box.
+    #[inline(always)]
+    fn distances(&self, i: usize, points: &[Lanes<T>; 3]) -> Lanes<T> {
+        let mut sum = [T::default(); WIDTH];
+        for k in 0..3 {
+            let (low, high) = (self.low[k][i], self.high[k][i]);
+            for lane in 0..WIDTH {
+                let q = points[k][lane];
+                let d = (low - q).most(q - high).most(T::default());
+                sum[lane] += d * d;
+            }
+        }
+        sum
+    }
+
+    #[inline(always)]
+    fn of(&self, i: usize) -> ([T; 3], [T; 3]) {
+        (
+            [0, 1, 2].map(|k| self.low[k][i]),
+            [0, 1, 2].map(|k| self.high[k][i]),
+        )
     }
 
     fn union(&self) -> ([T; 3], [T; 3]) {
@@ -99,7 +94,7 @@ impl Tree<f64> {
     }
 }
 
-impl<T: Real> Tree<T> {
+impl<T: Coordinate> Tree<T> {
     /// `rows` in an order that keeps near points together, and where each row lies.
     pub fn over(rows: Vec<u32>, point: impl Fn(usize) -> [T; 3] + Sync) -> Self {
         let blocks: Vec<[Lanes<T>; 3]> = rows
@@ -140,99 +135,142 @@ impl<T: Real> Tree<T> {
         &self.rows
     }
 
-    /// The `k` points nearest to the `at`-th of [`Tree::rows`], itself excepted, by (distance, row), into `found`.
+    /// Calls `visit(at, found)` for every `at` of [`Tree::rows`] in a range: the `k` points nearest to it, itself
+    /// excepted, by (distance, row).
+    pub fn nearest(
+        &self,
+        range: Range<usize>,
+        k: usize,
+        mut visit: impl FnMut(usize, &mut Vec<Neighbor<T>>),
+    ) {
+        let mut search = Search::new(k);
+        let mut found = Vec::with_capacity(k);
+        for block in range.start / WIDTH..range.end.div_ceil(WIDTH) {
+            self.search(block, &mut search);
+            for at in range.start.max(block * WIDTH)..range.end.min((block + 1) * WIDTH) {
+                found.clear();
+                found.extend(search.found(at % WIDTH));
+                visit(at, &mut found);
+            }
+        }
+    }
+
     #[inline]
-    pub fn nearest(&self, at: usize, k: usize, found: &mut Vec<Neighbor<T>>) {
+    fn search(&self, block: usize, search: &mut Search<T>) {
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") {
             // SAFETY: the processor has AVX2.
-            return unsafe { self.nearest_avx2(at, k, found) };
+            return unsafe { self.search_avx2(block, search) };
         }
-        self.search(at, k, found);
+        self.search_block(block, search);
     }
 
     /// The same code with wider registers; no fused operations, so the same bits.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
-    fn nearest_avx2(&self, at: usize, k: usize, found: &mut Vec<Neighbor<T>>) {
-        self.search(at, k, found);
+    fn search_avx2(&self, block: usize, search: &mut Search<T>) {
+        self.search_block(block, search);
     }
 
+    /// Finds the nearest of every point of a block.
     #[inline(always)]
-    fn search(&self, at: usize, k: usize, found: &mut Vec<Neighbor<T>>) {
-        found.clear();
-        if k == 0 {
+    fn search_block(&self, own: usize, search: &mut Search<T>) {
+        search.begin(&self.blocks[own]);
+        if search.k == 0 {
             return;
         }
-        let own = at / WIDTH;
-        let block = &self.blocks[own];
-        let mut search = Search {
-            q: [0, 1, 2].map(|axis| block[axis][at % WIDTH]),
-            itself: self.rows[at],
-            k,
-            found,
-        };
-        // Its own block first: near enough to rule most others out.
-        self.scan(own, &mut search);
+        // Itself and those beside it first: near enough to rule most others out.
+        let beside = own.saturating_sub(1)..(own + 2).min(self.blocks.len());
+        for lane in 0..WIDTH.min(self.rows.len() - own * WIDTH) {
+            self.scan(own, lane, !(1 << lane), search);
+            for block in beside.clone().filter(|&block| block != own) {
+                self.scan(block, lane, !0, search);
+            }
+        }
+        let (low, high) = self.levels[0][own / WIDTH].of(own % WIDTH);
         let mut stack = [(T::default(), 0u32, 0u32); STACK];
         stack[0] = (T::default(), self.levels.len() as u32 - 1, 0);
         let mut depth = 1;
         while depth > 0 {
             depth -= 1;
             let (distance, level, node) = stack[depth];
-            if distance > search.limit() {
+            let limit = search.limit();
+            if distance > limit {
                 continue;
             }
-            let distances = self.levels[level as usize][node as usize].distances(search.q);
-            let limit = search.limit();
+            let boxes = &self.levels[level as usize][node as usize];
+            let gaps = boxes.gaps(low, high);
+            let near = within(&gaps, &[limit; WIDTH]);
             if level == 0 {
-                for (i, &d) in distances.iter().enumerate() {
+                for i in ones(near) {
                     let block = node as usize * WIDTH + i;
-                    if d <= limit && d < T::INFINITY && block != own && d <= search.limit() {
-                        self.scan(block, &mut search);
+                    if !beside.contains(&block) {
+                        let distances = boxes.distances(i, &search.points);
+                        for lane in ones(within(&distances, &search.limits)) {
+                            self.scan(block, lane, !0, search);
+                        }
                     }
                 }
                 continue;
             }
             // Nearest on top: insertion from the bottom of this node's share of the stack.
             let base = depth;
-            for (i, &d) in distances.iter().enumerate() {
-                if d <= limit && d < T::INFINITY {
-                    let mut at = depth;
-                    while at > base && stack[at - 1].0 < d {
-                        stack[at] = stack[at - 1];
-                        at -= 1;
-                    }
-                    stack[at] = (d, level - 1, node * WIDTH as u32 + i as u32);
-                    depth += 1;
+            for i in ones(near) {
+                let mut at = depth;
+                while at > base && stack[at - 1].0 < gaps[i] {
+                    stack[at] = stack[at - 1];
+                    at -= 1;
                 }
+                stack[at] = (gaps[i], level - 1, node * WIDTH as u32 + i as u32);
+                depth += 1;
             }
         }
     }
 
+    /// Offers those points of a block that `mask` names to the search of one point.
     #[inline(always)]
-    fn scan(&self, block: usize, search: &mut Search<T>) {
+    fn scan(&self, block: usize, lane: usize, mask: u32, search: &mut Search<T>) {
         let points = &self.blocks[block];
         let mut sum = [T::default(); WIDTH];
         for k in 0..3 {
+            let q = search.points[k][lane];
             for i in 0..WIDTH {
-                let d = points[k][i] - search.q[k];
+                let d = points[k][i] - q;
                 sum[i] += d * d;
             }
         }
-        let limit = search.limit();
-        for (i, &d) in sum.iter().enumerate() {
-            if d <= limit && d < T::INFINITY {
-                search.offer((d, self.rows[block * WIDTH + i]));
-            }
+        for i in ones(mask & within(&sum, &[search.limits[lane]; WIDTH])) {
+            search.offer(lane, sum[i].key(self.rows[block * WIDTH + i]));
         }
     }
+}
+
+/// Bit `i` is whether the `i`-th value is at most its limit.
+#[inline(always)]
+fn within<T: Coordinate>(values: &Lanes<T>, limits: &Lanes<T>) -> u32 {
+    let mut bits = 0;
+    for i in 0..WIDTH {
+        bits |= u32::from(values[i] <= limits[i]) << i;
+    }
+    bits
+}
+
+/// The numbers of the bits that are set, ascending.
+#[inline(always)]
+fn ones(mut bits: u32) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        (bits != 0).then(|| {
+            let i = bits.trailing_zeros() as usize % WIDTH;
+            bits &= bits - 1;
+            i
+        })
+    })
 }
 
 /// Eleven levels hold 2³² points; each leaves at most eight nodes on the stack.
 const STACK: usize = 11 * WIDTH;
 
-fn pack<T: Real>(bounds: &[([T; 3], [T; 3])]) -> Vec<Boxes<T>> {
+fn pack<T: Coordinate>(bounds: &[([T; 3], [T; 3])]) -> Vec<Boxes<T>> {
     let packed = bounds.chunks(WIDTH).map(|chunk| {
         let mut boxes = Boxes::NOWHERE;
         for (i, (low, high)) in chunk.iter().enumerate() {
@@ -247,45 +285,6 @@ fn pack<T: Real>(bounds: &[([T; 3], [T; 3])]) -> Vec<Boxes<T>> {
         vec![Boxes::NOWHERE]
     } else {
         packed
-    }
-}
-
-struct Search<'a, T> {
-    q: [T; 3],
-    itself: u32,
-    k: usize,
-    found: &'a mut Vec<Neighbor<T>>,
-}
-
-impl<T: Real> Search<'_, T> {
-    /// Nothing farther than this can still get in.
-    #[inline(always)]
-    fn limit(&self) -> T {
-        if self.found.len() < self.k {
-            T::INFINITY
-        } else {
-            self.found[self.k - 1].0
-        }
-    }
-
-    #[inline(always)]
-    fn offer(&mut self, new: Neighbor<T>) {
-        if new.1 == self.itself {
-            return;
-        }
-        if self.found.len() < self.k {
-            self.found.push(new);
-        } else if new < self.found[self.k - 1] {
-            self.found[self.k - 1] = new;
-        } else {
-            return;
-        }
-        let mut at = self.found.len() - 1;
-        while at > 0 && new < self.found[at - 1] {
-            self.found[at] = self.found[at - 1];
-            at -= 1;
-        }
-        self.found[at] = new;
     }
 }
 
@@ -309,11 +308,9 @@ mod tests {
 
     fn check(points: &[[f64; 3]], k: usize) {
         let tree = Tree::build(points);
-        let mut found = Vec::new();
-        for (at, &row) in tree.rows().iter().enumerate() {
-            tree.nearest(at, k, &mut found);
-            assert_eq!(found, brute(points, row as usize, k));
-        }
+        tree.nearest(0..points.len(), k, |at, found| {
+            assert_eq!(*found, brute(points, tree.rows()[at] as usize, k));
+        });
     }
 
     #[test]
