@@ -37,12 +37,7 @@ impl<'a> Frustum<'a> {
     /// can touch the image: the first and the last row of tiles that they can.
     pub fn tile_rows(&self, centre: [f32; 3], half: [f32; 3], scale: f32) -> Option<[u16; 2]> {
         let c = self.camera;
-        let middle = c.in_camera(centre.map(f64::from));
-        let reach = [0, 1, 2].map(|r: usize| {
-            let row = &c.viewmat[r];
-            let side = |k: usize| row[k].abs() * f64::from(half[k]);
-            side(0) + side(1) + side(2) + 1e-5 * middle[r].abs()
-        });
+        let (middle, reach) = self.in_camera(centre, half);
         let far = middle[2] + reach[2];
         if far < self.near {
             return None;
@@ -61,5 +56,24 @@ impl<'a> Frustum<'a> {
         let last = ((c.height - 1) / TILE) as f64;
         let rows = touched(1, c.fy, c.cy, c.height)?;
         Some(rows.map(|y| (y / TILE as f64).clamp(0.0, last) as u16))
+    }
+
+    /// The least depth of a point in a box, or less.
+    pub fn depth(&self, centre: [f32; 3], half: [f32; 3]) -> f64 {
+        let (middle, reach) = self.in_camera(centre, half);
+        middle[2] - reach[2]
+    }
+
+    /// A box in camera coordinates, along their axes: its middle and half its sides, with slack.
+    #[inline]
+    fn in_camera(&self, centre: [f32; 3], half: [f32; 3]) -> ([f64; 3], [f64; 3]) {
+        let c = self.camera;
+        let middle = c.in_camera(centre.map(f64::from));
+        let reach = [0, 1, 2].map(|r: usize| {
+            let row = &c.viewmat[r];
+            let side = |k: usize| row[k].abs() * f64::from(half[k]);
+            side(0) + side(1) + side(2) + 1e-5 * middle[r].abs()
+        });
+        (middle, reach)
     }
 }

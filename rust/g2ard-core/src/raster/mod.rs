@@ -108,11 +108,17 @@ impl Camera {
             .map(|r| r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + r[3])
     }
 
+    /// The size of a pixel at a depth, scene units; it grows with the depth.
+    #[inline]
+    pub(crate) fn pixel_size(&self, depth: f64) -> f32 {
+        (depth / self.fx.max(self.fy)) as f32
+    }
+
     /// Lowers `size` to that of a pixel at a point, depth / focal length in scene units, if the image contains the point.
     #[inline]
     pub(crate) fn lower_pixel_size(&self, point: [f64; 3], size: &mut f32) {
         let p = self.in_camera(point);
-        let here = (p[2] / self.fx.max(self.fy)) as f32;
+        let here = self.pixel_size(p[2]);
         // Most points are already smaller in an earlier view: that is one division instead of three.
         if !(p[2] >= f64::from(self.near) && here < *size) {
             return;

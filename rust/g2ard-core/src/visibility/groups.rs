@@ -5,19 +5,64 @@ use crate::raster::params::Source;
 use crate::raster::simd::{LANES, Lanes, Lanes16};
 use crate::scene::{SceneRef, limits};
 
-/// Sixteen rows, and what bounds them.
-pub struct Group {
-    /// Mean, quaternion, scales (linear, so that a unit twice as long rounds alike), logit; the last row again in lanes past the end.
-    values: [Lanes16; 11],
+/// What bounds some rows: apart from their values, for a view reads the bounds of all.
+#[derive(Debug, Clone, Copy)]
+pub struct Bounds {
+    /// Of the means' box.
     centre: [f32; 3],
-    /// Half the sides of the means' box.
+    /// Half the sides of that box.
     half: [f32; 3],
     /// The largest scale.
     scale: f32,
 }
 
+impl Bounds {
+    fn of_box(low: [f32; 3], high: [f32; 3], scale: f32) -> Self {
+        let centre = [0, 1, 2].map(|k| 0.5 * low[k] + 0.5 * high[k]);
+        Self {
+            centre,
+            half: [0, 1, 2].map(|k| (high[k] - centre[k]).max(centre[k] - low[k])),
+            scale,
+        }
+    }
+
+    /// What bounds all of them, wide enough that a view which refuses it refuses each of them.
+    pub fn around(parts: &[Self]) -> Self {
+        let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
+        for part in parts {
+            for k in 0..3 {
+                low[k] = low[k].min(part.centre[k] - part.half[k]);
+                high[k] = high[k].max(part.centre[k] + part.half[k]);
+            }
+        }
+        let scale = parts.iter().fold(0f32, |s, part| s.max(part.scale));
+        let mut all = Self::of_box(low, high, scale);
+        all.half = all.half.map(|h| h * WIDER);
+        all
+    }
+
+    /// The first and the last row of the image's tiles that any of the rows can touch.
+    pub fn tile_rows(&self, frustum: &Frustum) -> Option<[u16; 2]> {
+        frustum.tile_rows(self.centre, self.half, self.scale)
+    }
+
+    /// The least depth of a mean.
+    pub fn depth(&self, frustum: &Frustum) -> f64 {
+        frustum.depth(self.centre, self.half)
+    }
+}
+
+/// Covers the slack of [`Frustum`], which is a share of its box's own distance, and rounding.
+const WIDER: f32 = 1.0001;
+
+/// The values of sixteen rows.
+pub struct Group {
+    /// Mean, quaternion, scales (linear, so that a unit twice as long rounds alike), logit; the last row again in lanes past the end.
+    values: [Lanes16; 11],
+}
+
 impl Group {
-    pub fn of(scene: &SceneRef, rows: &[u32], shift: [f64; 3]) -> Self {
+    pub fn of(scene: &SceneRef, rows: &[u32], shift: [f64; 3]) -> (Self, Bounds) {
         let mut values = [Lanes16::default(); 11];
         let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
         let mut scale = 0f32;
@@ -38,23 +83,12 @@ impl Group {
             values[10].0[l] =
                 scene.logit_opacities[row].clamp(limits::DRAWN_LOGITS.0, limits::DRAWN_LOGITS.1);
         }
-        let centre = [0, 1, 2].map(|k| 0.5 * low[k] + 0.5 * high[k]);
-        Self {
-            values,
-            centre,
-            half: [0, 1, 2].map(|k| (high[k] - centre[k]).max(centre[k] - low[k])),
-            scale,
-        }
+        (Self { values }, Bounds::of_box(low, high, scale))
     }
 
     /// The mean of a row.
     pub fn mean(&self, lane: usize) -> [f64; 3] {
         [0, 1, 2].map(|k| f64::from(self.values[k].0[lane]))
-    }
-
-    /// The first and the last row of the image's tiles that any of the rows can touch.
-    pub fn tile_rows(&self, frustum: &Frustum) -> Option<[u16; 2]> {
-        frustum.tile_rows(self.centre, self.half, self.scale)
     }
 }
 

@@ -14,17 +14,22 @@ use crate::raster::params::check_count;
 use crate::raster::simd::LANES;
 use crate::raster::{Camera, Frustum, Rasterizer, Settings, TileGrid};
 use crate::scene::{Means, Ordered, SceneRef};
-use groups::{CulledGroups, Group, LiveGroup};
+use groups::{Bounds, CulledGroups, Group, LiveGroup};
 
 /// Σ αT and the smallest pixel of each of N Gaussians over the views added so far. The result depends neither on the
 /// order of the rows nor on the number of threads: equal depths are drawn in the order of the scene's content.
 pub struct VisibilityAccumulator {
     groups: Vec<Group>,
+    bounds: Vec<Bounds>,
+    /// Around [`BLOCK`] groups each.
+    blocks: Vec<Bounds>,
     ordered: Arc<Ordered>,
     /// What f64 means are taken relative to; f32 means stay as they are.
     shift: [f64; 3],
     weight: Vec<f64>,
     pixel_size: Vec<f32>,
+    /// The largest pixel size of each group: a view from farther away lowers none.
+    largest: Vec<f32>,
     rasterizer: Rasterizer,
     /// Groups that a band of the image may meet.
     band: usize,
@@ -38,8 +43,11 @@ impl VisibilityAccumulator {
             Means::F64(_) => ordered.bounds.origin,
         };
         let rows = ordered.rows.par_chunks(LANES);
-        let groups = rows.map(|r| Group::of(scene, r, shift)).collect();
+        let (groups, bounds): (Vec<_>, Vec<_>) = rows.map(|r| Group::of(scene, r, shift)).unzip();
         Ok(Self {
+            largest: vec![f32::INFINITY; groups.len()],
+            blocks: bounds.par_chunks(BLOCK).map(Bounds::around).collect(),
+            bounds,
             groups,
             weight: vec![0.0; scene.len()],
             pixel_size: vec![f32::INFINITY; scene.len()],
@@ -59,15 +67,8 @@ impl VisibilityAccumulator {
             r[3] += r[0] * self.shift[0] + r[1] * self.shift[1] + r[2] * self.shift[2];
         }
         let frustum = Frustum::of(&camera);
-        let groups = self.groups.par_iter().enumerate();
-        let live: Vec<LiveGroup> = groups
-            .filter_map(|(g, group)| {
-                let tile_rows = group.tile_rows(&frustum)?;
-                let number = g as u32;
-                Some(LiveGroup { number, tile_rows })
-            })
-            .collect();
-        self.find_pixels(&camera, &live);
+        let live = self.live(&frustum);
+        self.find_pixels(&camera, &frustum, &live);
         let grid = TileGrid::of(&camera);
         for rows in bands(&live, grid.rows, self.band) {
             let [first, last] = [rows.start as u16, rows.end as u16 - 1];
@@ -77,6 +78,22 @@ impl VisibilityAccumulator {
             self.add_band(&camera, settings, grid.with_rows(rows), &here);
         }
         Ok(())
+    }
+
+    /// The groups that a view can see, ascending.
+    fn live(&self, frustum: &Frustum) -> Vec<LiveGroup> {
+        let blocks = self.blocks.par_iter().zip(self.bounds.par_chunks(BLOCK));
+        blocks
+            .enumerate()
+            .filter(|(_, (block, _))| block.tile_rows(frustum).is_some())
+            .flat_map_iter(|(block, (_, groups))| {
+                groups.iter().enumerate().filter_map(move |(at, group)| {
+                    let tile_rows = group.tile_rows(frustum)?;
+                    let number = (block * BLOCK + at) as u32;
+                    Some(LiveGroup { number, tile_rows })
+                })
+            })
+            .collect()
     }
 
     /// Adds what some rows of the image's tiles show of the groups `live`, ascending.
@@ -115,19 +132,34 @@ impl VisibilityAccumulator {
     }
 
     /// Lowers each live row's pixel size to that of this view.
-    fn find_pixels(&mut self, camera: &Camera, live: &[LiveGroup]) {
+    fn find_pixels(&mut self, camera: &Camera, frustum: &Frustum, live: &[LiveGroup]) {
         let count = self.pixel_size.len();
         let pixel_size = DisjointSlice::new(&mut self.pixel_size);
+        let largest = DisjointSlice::new(&mut self.largest);
         live.par_iter().for_each(|g| {
-            let first = g.number as usize * LANES;
-            // SAFETY: no two groups share rows.
-            let sizes = unsafe { pixel_size.slice(first, LANES.min(count - first)) };
-            for (lane, size) in sizes.iter_mut().enumerate() {
-                camera.lower_pixel_size(self.groups[g.number as usize].mean(lane), size);
+            let (number, first) = (g.number as usize, g.number as usize * LANES);
+            // SAFETY: no two groups share rows, and each is there once.
+            let (sizes, largest) = unsafe {
+                let rows = LANES.min(count - first);
+                (
+                    pixel_size.slice(first, rows),
+                    &mut largest.slice(number, 1)[0],
+                )
+            };
+            let nearest = self.bounds[number].depth(frustum);
+            if camera.pixel_size(nearest) >= *largest {
+                return;
             }
+            for (lane, size) in sizes.iter_mut().enumerate() {
+                camera.lower_pixel_size(self.groups[number].mean(lane), size);
+            }
+            *largest = sizes.iter().fold(0.0, |a, &b| b.max(a));
         });
     }
 }
+
+/// Groups that are tested together before each is.
+const BLOCK: usize = 16;
 
 /// Groups that are drawn together where a row of tiles does not meet more: projections, lists of tiles and keys take
 /// about 130 bytes a row while they are.
@@ -238,8 +270,11 @@ mod tests {
                 .accumulate(&params, &camera, &settings, &mut whole)
                 .unwrap();
             let frustum = Frustum::of(&camera);
-            let groups = views.groups.iter();
-            met += groups.filter(|g| g.tile_rows(&frustum).is_some()).count();
+            let alone = views.bounds.iter().map(|b| b.tile_rows(&frustum).is_some());
+            let live: Vec<usize> = (0..).zip(alone).filter(|g| g.1).map(|g| g.0).collect();
+            let found = views.live(&frustum);
+            assert!(found.iter().map(|g| g.number as usize).eq(live));
+            met += found.len();
         }
         let (weight, pixel_size) = views.by_row();
         assert_eq!(pixel_size, whole.pixel_size);
