@@ -22,22 +22,23 @@ from g2ard.splats import Splats
 __all__ = ["plan_auto"]
 
 _STREET = 0.25
-"""Share of a landscape's poses that stand in it, where there is room."""
+"""Share of a landscape's poses that stand on its ground, where there is room."""
 
 _SHARP = 0.04
-"""Radians: the 90th percentile of what a pose from around or above shows, at most. Measured: objects
-.007–.01, a park .012, an open scene seen through its own sky .1 and more."""
+"""Radians: a pose from around or above is in focus while `Focus.coarse`, the 90th percentile of the angular
+standard deviations it sees, is below. Measured: objects .007–.01, a park .012, an open scene seen through its
+own sky .1 and more."""
 
-_OWN = 12.0
-"""A scene of few Gaussians is as sharp as they are large: this many times their median is sharp as well.
-Measured without fog: 4 in an object, 9 and 12 in its thinnings to 12,500 and 3,000 Gaussians."""
+_SHARP_IN_SCALES = 12.0
+"""The same limit as a multiple of the median Gaussian's angular standard deviation, if that is larger: few
+Gaussians are large ones. Measured without fog: 4 in an object, 9 and 12 in it at 12,500 and 3,000 rows."""
 
 _SAMPLED = 16
-"""Poses from around or above that are looked through first."""
+"""Poses from around or above that are rendered first."""
 
 _FEW, _MOST = 0.5, 0.9
-"""If fewer of those than the first share are sharp, none is taken, if more than the second, all; else each is
-looked through."""
+"""Of those poses that are in focus: below the first share none from there is taken, above the second all are;
+between them each is rendered and decided on."""
 
 
 def plan_auto(
@@ -128,6 +129,6 @@ def _sharp(
     """Whether poses see the scene in focus; what stands behind all of it does not count."""
     away = norms(poses.eyes - site.box.mean(axis=0))
     reach = away + norms(site.box[1:] - site.box[:1]) / 2
-    own = middle(site.grid.scale_at(site.points))  # by count: a sky is few rows and much area
+    usual = middle(site.grid.scale_at(site.points))  # by count: a sky is few rows and much area
     coarse = glance.of(poses.cameras(site, lens), tell, site.size * reach).coarse
-    return coarse < np.maximum(_SHARP, _OWN * own / np.maximum(away, np.finfo(float).tiny))
+    return coarse < np.maximum(_SHARP, _SHARP_IN_SCALES * usual / np.maximum(away, np.finfo(float).tiny))

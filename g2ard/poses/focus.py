@@ -41,6 +41,9 @@ _GOOD = ((0.8, 0.3), (0.7, 0.2), (0.5, 0.1))
 """Least share of the image that the scene covers, and that something fine does: of good poses first, then of
 worse ones where those are too few."""
 
+_COARSEST = 0.9
+"""Quantile of the angular sizes of what is seen that `Focus.coarse` is: one part in ten may be fog."""
+
 _PITCHES = (-35.0, 20.0)
 """Degrees above the horizon of the gazes tried."""
 
@@ -111,7 +114,7 @@ class Glance:
             if seen.any():
                 angle = self._sigma[seen] / np.maximum(depth[seen], np.finfo(float).tiny)
                 fine = weight[seen][angle < _FINE].sum() / pixels
-                figures[1:, i] = fine, quantile(angle, weight[seen], 0.9)
+                figures[1:, i] = fine, quantile(angle, weight[seen], _COARSEST)
             tell(i + 1, len(here))
         return Focus(*figures)
 

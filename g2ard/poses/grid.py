@@ -28,6 +28,15 @@ _OPAQUE = 0.3
 _MURKY = 0.04
 """Above it a cell has something in it: leaves, glass, haze. No place for a camera."""
 
+_LEAST_SIDE = 1 / 256
+"""Of the box, over its longest side: a sheet is no thinner."""
+
+_HALF_WIDTH = 1.6
+"""Standard deviations to either side of its middle in which a Gaussian fills cells, 89 % of it."""
+
+_PARTS = 9
+"""Most places along an axis that stand for a Gaussian wider than a cell."""
+
 _BATCH = 2_000_000
 """Points counted at once."""
 
@@ -60,7 +69,7 @@ class Grid:
         if volume.represents > 1:
             cells = cells or _CELLS_A_ROW * len(volume.points)
         cells = cells or int(np.clip(len(volume.points), *_CELLS))
-        sides = np.maximum(high - low, np.max(high - low) / 256)
+        sides = np.maximum(high - low, np.max(high - low) * _LEAST_SIDE)
         cell = float(np.cbrt(np.prod(sides) / cells))
         shape = np.maximum(1, np.ceil(sides / cell)).astype(int)
         points = turned(volume.points, axes)
@@ -68,7 +77,7 @@ class Grid:
         sizes = 0.5 * np.log(np.maximum(volume.scales[:, 1] * volume.scales[:, 2], np.finfo(float).tiny))
         faces = 2 * np.pi * volume.scales[:, 1] * volume.scales[:, 2] / cell**2
         optical = volume.represents * volume.opacities * faces
-        parts = np.clip(np.ceil(1.6 * volume.scales[:, 2] / cell), 1, 9).astype(np.int8)
+        parts = np.clip(np.ceil(_HALF_WIDTH * volume.scales[:, 2] / cell), 1, _PARTS).astype(np.int8)
         for count in np.unique(parts):
             rows, offsets = np.flatnonzero(parts == count), _lattice(int(count))
             spans = turned(volume.spans(rows).reshape(-1, 3), axes).reshape(-1, 2, 3) if count > 1 else None
@@ -119,7 +128,7 @@ class Grid:
 
 def _lattice(count: int) -> Floats:
     """(count², 2) offsets in standard deviations that stand for a Gaussian too wide for one cell."""
-    line = 1.6 * ((np.arange(count) + 0.5) / count * 2 - 1)
+    line = _HALF_WIDTH * ((np.arange(count) + 0.5) / count * 2 - 1)
     return np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
 
 

@@ -35,6 +35,12 @@ _SOME_INSIDE, _ALL_INSIDE = 0.005, 0.025
 """Share of the box that lies within rooms: below the first no pose stands inside, from the second on all do.
 Measured: showroom .026–.079, objects and open scenes 0.000."""
 
+_MOSTLY = 0.75
+"""The share of what is seen that has to be below that."""
+
+_COVERED, _CLEAR_CELLS = 0.8, 4
+"""A gaze is as good as any where matter fills this share of its frame and begins so many cells away."""
+
 _SHELL = 0.5
 """At most so much of a pool stands within what has no ground."""
 
@@ -78,7 +84,7 @@ def find_inside(site: Site, seed: int) -> Inside:
     sharp = np.zeros(len(hit), bool)
     sharp[hit] = grid.scale_at(met) < _SHARP * distances[hit]
     around = hit.reshape(-1, _DIRECTIONS).mean(axis=1)
-    sharply = sharp.reshape(-1, _DIRECTIONS).mean(axis=1) > 0.75 * around
+    sharply = sharp.reshape(-1, _DIRECTIONS).mean(axis=1) > _MOSTLY * around
     rows = np.flatnonzero((around > _ENCLOSED) & sharply)
     rows = rows[np.argsort(-clearance[rows], kind="stable")]
     return Inside(points[rows], len(rows) / _TRIES, site.up.grounded)
@@ -107,6 +113,6 @@ def plan_inside(
 
     def judge(poses: Poses) -> Floats:
         seen = view_statistics(site, poses, lens)
-        return np.minimum(seen.covered / 0.8, seen.close / (4 * site.grid.cell))
+        return np.minimum(seen.covered / _COVERED, seen.close / (_CLEAR_CELLS * site.grid.cell))
 
     return gather(count, propose, judge, tell)

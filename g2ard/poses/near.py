@@ -22,6 +22,12 @@ _POINTS = 512
 _PIXELS = 1.5
 """A near pose shows what it aims at with this standard deviation."""
 
+_JITTER = 0.2
+"""By how much gazes miss the point they aim at, as a tangent: not every image has its point in the middle."""
+
+_ABOVE = 0.01
+"""Least height of a pose over the ground, in sizes of the scene."""
+
 _STEP = (0.25, 0.6)
 """Share of the way that is left, at least and at most."""
 
@@ -90,9 +96,9 @@ def plan_near(site: Site, poses: Poses, reach: Reach, count: int, lens: Lens, se
     share = np.clip(wanted / reach.distance[rows], *_STEP)
     eyes = points + share[:, None] * (eyes - points)
     gazes = (points - eyes) / np.maximum(norms(points - eyes), np.finfo(float).tiny)[:, None]
-    gazes += 0.2 * np.stack([turn - 0.5, rise - 0.5, turn - rise], axis=1)
+    gazes += _JITTER * np.stack([turn - 0.5, rise - 0.5, turn - rise], axis=1)
     gazes /= norms(gazes)[:, None]
-    free = (site.grid.distance(eyes) > 2 * site.grid.cell) & (site.above_ground(eyes) > 0.01)
+    free = (site.grid.distance(eyes) > 2 * site.grid.cell) & (site.above_ground(eyes) > _ABOVE)
     near = Poses(eyes[free], gazes[free])
     clear = clearance(site, near, lens) > 2 * site.grid.cell
     return near.take(clear).take(slice(count))

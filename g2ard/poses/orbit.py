@@ -23,6 +23,15 @@ _ELEVATIONS = (-5.0, 50.0)
 _DISTANCES = (0.9, 1.25)
 """Each pose's own share of the distance at which the thing just fits."""
 
+_FITTING = 0.97
+"""Share of the matter that is in frame where the thing just fits."""
+
+_OUTSIDE = 1.2
+"""Least distance from the middle: everything lies within about 1 of it."""
+
+_ABOVE, _CLEAR_CELLS = 0.02, 4
+"""Height over the ground of a pose, in sizes of the scene, and free cells before it, at least."""
+
 _OUTLINE = 8_000
 """Points that stand for the thing's outline."""
 
@@ -54,18 +63,20 @@ def plan_orbit(
         return Poses(target + distances[:, None] * outward, -outward)
 
     def judge(poses: Poses) -> Floats:
-        free = (site.grid.distance(poses.eyes) > 2 * site.grid.cell) & (site.above_ground(poses.eyes) > 0.02)
-        return (view_statistics(site, poses, lens, free).close > 4 * site.grid.cell).astype(float)
+        free = (site.grid.distance(poses.eyes) > 2 * site.grid.cell) & (
+            site.above_ground(poses.eyes) > _ABOVE
+        )
+        return (view_statistics(site, poses, lens, free).close > _CLEAR_CELLS * site.grid.cell).astype(float)
 
     return gather(count if first is None else min(first, count), propose, judge, tell)
 
 
 def _fitting(site: Site, target: Floats, outward: Floats, lens: Lens) -> Floats:
-    """(P,) distances at which 97 % of the matter is in frame, and all of it ahead."""
+    """(P,) distances at which `_FITTING` of the matter is in frame, and all of it ahead."""
     points, weights = site.points[:_OUTLINE] - target, site.weights[:_OUTLINE]
     wide, tall = lens.tangents
     distances = np.empty(len(outward))
     for i, frame in enumerate(Poses(outward, -outward).frames()):
         x, y, z = turned(points, frame).T
-        distances[i] = quantile(np.maximum(np.abs(x) / wide, np.abs(y) / tall) - z, weights, 0.97)
-    return np.maximum(distances, 1.2)  # everything lies within about 1 of the middle
+        distances[i] = quantile(np.maximum(np.abs(x) / wide, np.abs(y) / tall) - z, weights, _FITTING)
+    return np.maximum(distances, _OUTSIDE)

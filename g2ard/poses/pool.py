@@ -43,6 +43,9 @@ _POINTS = 4096
 _FOV, _FOV_INSIDE = 50.0, 70.0
 """Degrees: within rooms people take wider lenses."""
 
+_MOSTLY_INSIDE = 0.5
+"""Share of a pool within rooms above which all of it has that lens."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pool:
@@ -105,7 +108,7 @@ def plan_pool(
     progress("scene", 1, 1)
     tell = counter(progress, "poses")
     inside = find_inside(site, seed) if kind == "auto" else None
-    if inside is not None and fov is None and inside.weight > 0.5:
+    if inside is not None and fov is None and inside.weight > _MOSTLY_INSIDE:
         lens = _lens(size, _FOV_INSIDE)
 
     def plan(count: int) -> tuple[Poses, list[str], str]:

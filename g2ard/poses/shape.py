@@ -11,6 +11,14 @@ from g2ard.poses.walk import enclosed
 __all__ = ["shape_of"]
 
 _TRIES = 400
+"""Places tried."""
+
+_ROOM = (0.5, 0.75)
+"""Share of the box that is free and enclosed, above which a scene is a room: with a ground, and without one,
+where a hollow object encloses much as well."""
+
+_ENCLOSED = 0.8
+"""Share of the directions below and around a place that meet matter, above which it is enclosed."""
 
 _FLAT = 0.25
 """Height over width below which a scene with a ground is a landscape."""
@@ -23,7 +31,7 @@ def shape_of(site: Site) -> tuple[str, str]:
     on its own or on a piece of ground.
     """
     inside = _surrounded(site)
-    if inside > (0.5 if site.terrain is not None else 0.75):
+    if inside > _ROOM[site.terrain is None]:
         return "room", f"{inside:.0%} of its box is free and enclosed"
     sides = site.box[1] - site.box[0]
     flat = float(sides[2] / max(np.sqrt(sides[0] * sides[1]), np.finfo(float).tiny))
@@ -38,4 +46,4 @@ def _surrounded(site: Site) -> float:
     free = site.grid.distance(points) > site.grid.cell
     if not free.any():
         return 0.0
-    return float((enclosed(site, points[free]) > 0.8).sum() / _TRIES)
+    return float((enclosed(site, points[free]) > _ENCLOSED).sum() / _TRIES)

@@ -19,6 +19,24 @@ __all__ = ["Site"]
 
 Floats = NDArray[np.float64]
 
+_EXTENT = (0.01, 0.99)
+"""Quantiles of the matter along each axis that bound the scene: floaters lie outside."""
+
+_BODY = 1.5
+"""Standard deviations of a usual Gaussian that the box has to each side at least: some scenes are one."""
+
+_ROOM = (0.1, 0.02)
+"""Room around the box in the grid: share of its sides, and sizes of the scene."""
+
+_FACING = np.cos(np.radians(35))
+"""Least cosine between the normals of what may be ground and the vertical."""
+
+_TALL = 0.98
+"""Quantile of the heights over the ground that is the height of what stands there."""
+
+_LONG = 1.5
+"""Ratio of the variances along and across above which a scene has a direction of its own."""
+
 
 @dataclass(frozen=True, eq=False)
 class Site:
@@ -57,12 +75,12 @@ class Site:
         found = estimate_up(some) if up is None else given_up(some, up)
         axes = _axes(some, found.axis)
         points = turned(some.points, axes)
-        box = np.array([quantile(points[:, a], some.weights, [0.01, 0.99]) for a in range(3)]).T
-        body = 1.5 * middle(volume.scales[:, 2])  # of a scene no larger than its Gaussians
+        box = np.array([quantile(points[:, a], some.weights, _EXTENT) for a in range(3)]).T
+        body = _BODY * middle(volume.scales[:, 2])  # of a scene no larger than its Gaussians
         box += np.maximum(0, body - (box[1] - box[0]) / 2) * np.array([[-1.0], [1.0]])
-        room = 0.1 * (box[1] - box[0]) + 0.02
+        room = _ROOM[0] * (box[1] - box[0]) + _ROOM[1]
         grid = Grid.of(box[0] - room, box[1] + room, volume, axes)
-        facing = np.abs(along(some.normals, found.axis)) > np.cos(np.radians(35))
+        facing = np.abs(along(some.normals, found.axis)) > _FACING
         terrain = Terrain.of(points[facing], some.weights[facing], box) if found.grounded else None
         origin = splats.offset + volume.origin
         return cls(points, some.weights, box, terrain, grid, axes, origin, volume.size, found)
@@ -79,8 +97,8 @@ class Site:
 
     @cached_property
     def tallness(self) -> float:
-        """How high things stand over the ground: 98 % of the matter is lower."""
-        return max(float(quantile(self.points[:, 2] - self.ground(self.points), self.weights, 0.98)), 0.0)
+        """How high things stand over the ground: `_TALL` of the matter is lower."""
+        return max(float(quantile(self.points[:, 2] - self.ground(self.points), self.weights, _TALL)), 0.0)
 
 
 def _axes(some: Sample, up: Floats) -> Floats:
@@ -93,7 +111,7 @@ def _axes(some: Sample, up: Floats) -> Floats:
     flat = np.stack([along(some.points, ahead), along(some.points, left)], axis=1)
     flat -= (weights[:, None] * flat).sum(axis=0)
     values, vectors = np.linalg.eigh(moments(flat, weights))
-    if values[1] > 1.5 * values[0]:
+    if values[1] > _LONG * values[0]:
         x, y = vectors[:, 1] * np.copysign(1.0, vectors[np.argmax(np.abs(vectors[:, 1])), 1])
         ahead = x * ahead + y * left
     return np.stack([ahead, np.cross(up, ahead), up])

@@ -14,6 +14,9 @@ Floats = NDArray[np.float64]
 _BLOCKS = 24
 """Blocks along the longer side; each knows one height."""
 
+_LOW = 0.25
+"""Quantile of the heights in a block that is its ground: plants stand on it, noise lies below."""
+
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
@@ -67,7 +70,7 @@ def _low(cell: NDArray[np.int64], heights: Floats, weights: Floats, count: int) 
     passed = np.cumsum(weights)
     before = np.concatenate([[0.0], np.cumsum(total)[:-1]])
     found = np.full(count, np.nan)
-    at = np.flatnonzero(passed - before[cell] >= 0.25 * total[cell])
+    at = np.flatnonzero(passed - before[cell] >= _LOW * total[cell])
     found[cell[at[::-1]]] = heights[at[::-1]]  # the first of each cell is written last
     return found
 

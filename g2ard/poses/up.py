@@ -18,6 +18,21 @@ __all__ = ["Up", "estimate_up", "given_up"]
 Floats = NDArray[np.float64]
 
 _FACING = np.cos(np.radians(20))
+"""Least cosine between a normal and an axis that it faces."""
+
+_TILTED = np.cos(np.radians(35))
+"""The same of the ground of a flat scene, which may have slopes."""
+
+_SHEET = 0.08
+"""Smallest over middle eigenvalue of the scene's covariance below which it is flat: as terrain is."""
+
+_ROD = 3
+"""Largest over middle eigenvalue above which a scene is long."""
+
+_GROUND_GIVEN, _GROUND = 0.1, 0.12
+"""Share of all matter in a layer above which it is the ground, along an axis that is given, or found; then
+what lies on its other side counts against it (`_edge`)."""
+
 _SLAB = 0.04
 """Half the thickness of a layer that counts as a plane, in sizes of the scene."""
 
@@ -49,25 +64,25 @@ def given_up(sample: Sample, up: ArrayLike) -> Up:
         raise InputError(f"up: expected three finite numbers, not all zero, got {up!r}")
     axis = axis / np.linalg.norm(axis)
     layer, _ = _layer(sample, axis)
-    return Up(axis, _is_flat(sample)[0] or layer > 0.1, "up as given")
+    return Up(axis, _is_flat(sample)[0] or layer > _GROUND_GIVEN, "up as given")
 
 
 def estimate_up(sample: Sample) -> Up:
     """The axis from planes or the scene's shape, its sign from where the matter lies.
 
     In turn: a scene much flatter than wide lies on its ground; else the strongest plane at the edge of the
-    matter is the ground; else (an object cut out of its surroundings) the long axis of matterthing long, or
+    matter is the ground; else (an object cut out of its surroundings) the axis of something long, or
     the axis that capture software usually calls up.
     """
     flat, thin, long = _is_flat(sample)
     if flat:
-        axis = _mean_normal(sample, thin, np.abs(along(sample.normals, thin)) > np.cos(np.radians(35)))
+        axis = _mean_normal(sample, thin, np.abs(along(sample.normals, thin)) > _TILTED)
         return _signed(sample, axis, True, "the scene is flat")
     few = sample.take(slice(_SEARCHED))
     directions = np.concatenate([np.eye(3), fibonacci(600)[:300]])
     layers = [_layer(few, axis) for axis in directions]
     axis, strength = _best_plane(sample, few, directions, layers)
-    if strength > 0.12:
+    if strength > _GROUND:
         return _signed(sample, axis, True, "a ground plane")
     axis, contrast = _layered(sample, directions, np.array([share for share, _ in layers]))
     if contrast > _LAYERED and _habit(axis) > 1:
@@ -82,8 +97,8 @@ def _is_flat(sample: Sample) -> tuple[bool, Floats, Floats | None]:
     w = sample.weights / sample.weights.sum()
     centred = sample.points - (w[:, None] * sample.points).sum(axis=0)
     values, vectors = np.linalg.eigh(moments(centred, w))
-    long = vectors[:, 2] if values[2] > 3 * values[1] else None
-    return bool(values[0] < 0.08 * values[1]), vectors[:, 0], long
+    long = vectors[:, 2] if values[2] > _ROD * values[1] else None
+    return bool(values[0] < _SHEET * values[1]), vectors[:, 0], long
 
 
 def _layer(sample: Sample, axis: Floats) -> tuple[float, float]:

@@ -334,5 +334,6 @@ fn merge(nodes: &mut Nodes, pairs: &[(u32, u32)]) -> Vec<u32> {
     map
 }
 
-/// Where the lattice lies, in shares of the frame's radius.
+/// By how much the Morton lattice is shifted in each step, along x, y and z, in shares of the bounds' radius: any
+/// numbers without a common measure, so that no plane that parts cells in one step does so in the next.
 const LATTICES: [[f64; 3]; 3] = [[0.0; 3], [0.31, 0.17, 0.43], [0.13, 0.41, 0.23]];
