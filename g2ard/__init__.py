@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from g2ard.pipeline import DistillConfig, Distilled
     from g2ard.pipeline import distill as distill_against
     from g2ard.policy.distill import distill
+    from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.levels import lod
     from g2ard.policy.simplify import simplify
     from g2ard.poses import make_pool
@@ -76,6 +77,7 @@ __all__ = [
     "Cameras",
     "CoverageOptions",
     "DistillConfig",
+    "DistillOptions",
     "Distilled",
     "Evaluation",
     "G2ardError",
@@ -127,6 +129,7 @@ _HOMES = {
     "pipeline": ("DistillConfig", "Distilled"),
     "levels": ("save_levels",),
     "policy.distill": ("distill",),
+    "policy.distill_options": ("DistillOptions",),
     "policy.levels": ("lod",),
     "policy.simplify": ("simplify",),
     "poses": ("make_pool",),

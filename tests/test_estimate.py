@@ -17,6 +17,7 @@ import g2ard
 from g2ard.memory import peak_rss
 from g2ard.policy.budget import Budget
 from g2ard.policy.distill import prepare
+from g2ard.policy.distill_options import DistillOptions
 from g2ard.policy.estimate import estimate, total
 
 CommandLine = Callable[..., tuple[int, str, str]]
@@ -60,7 +61,7 @@ def test_several_budgets_have_a_total(tmp_path: Path, command_line: CommandLine)
 def test_memory_grows_by_views_and_gaussians_and_a_recovery_time_is_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    job = prepare(ball(), [Budget(90, None)], steps=3, size=48, recovery_time=7.0)
+    job = prepare(ball(), [Budget(90, None)], DistillOptions(steps=3, size=48, recovery_time=7.0))
     monkeypatch.setattr("g2ard.policy.estimate.peak_rss", lambda: 10**9)
     few, many = estimate(job, 90), estimate(job, 450)
     assert few.bytes > 10**9 + 12 * few.views * few.pixels

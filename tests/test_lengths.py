@@ -19,7 +19,6 @@ REASONS: dict[str, str] = {
     "g2ard/cli/commands/simplify.py: simplify": "a command's parameters are its options",
     "g2ard/cli/commands/bench/recover.py: recover": "a command's parameters are its options",
     "g2ard/cli/commands/bench/run.py: run_": "a command's parameters are its options",
-    "g2ard/policy/distill.py: prepare": "half of it is its signature",
 }
 """What may be longer, and why."""
 

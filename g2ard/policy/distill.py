@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from g2ard.choices import Engine
 from g2ard.errors import InputError
 from g2ard.policy.budget import Budget
+from g2ard.policy.distill_options import DistillOptions, takes_options
 from g2ard.policy.inputs import load_scene
 from g2ard.policy.job import DistillJob
 from g2ard.policy.views import is_made, views_of
@@ -18,32 +18,16 @@ from g2ard.splats import Splats
 
 if TYPE_CHECKING:
     from g2ard.io.types import Points
-    from g2ard.pipeline import Distilled
-    from g2ard.policy.inputs import Views
+    from g2ard.pipeline import DistillConfig, Distilled
     from g2ard.stages.lift import LiftConfig
+    from g2ard.stages.recover.anchors import Regularizers
 
     Scene = Splats | Points | str | Path | None
-    Colour = tuple[float, float, float]
 
 __all__ = ["distill", "prepare"]
 
-_DEFAULT: dict[str, Any] = {
-    "method": "default",
-    "schedule": "default",
-    "policy": "auto",
-    "views_count": None,
-    "weighted": True,
-}
-_PAPER: dict[str, Any] = {
-    "method": "paper",
-    "schedule": "paper",
-    "policy": "directional",
-    "views_count": 0.5,
-    "weighted": False,
-}
-"""What an option that is not given means, under the paper's presets and else."""
 
-
+@takes_options
 def distill(
     scene: Scene,
     *,
@@ -52,31 +36,10 @@ def distill(
     fit: str | None = None,
     min_psnr: float | None = None,
     min_ssim: float | None = None,
-    format: str = "ply",
-    clean: bool = False,
-    views: Views | None = None,
-    photos: bool | None = None,
-    held_out: Views | None = None,
-    views_count: int | float | Literal["auto"] | None = None,
-    policy: str | None = None,
-    weighted: bool | None = None,
-    reselect: bool = False,
-    method: str | None = None,
-    preset: str = "auto",
-    schedule: str | None = None,
-    steps: int | None = None,
-    recovery_time: float | None = None,
-    sh_degree: int | None = None,
-    size: int | None = None,
-    background: Colour = (0.0, 0.0, 0.0),
-    constants: Mapping[str, Any] | None = None,
-    beside: str | Path | None = None,
-    up: Sequence[float] | None = None,
-    seed: int = 0,
-    engine: Engine = "fused",
     work: Path | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
+    **options: Any,
 ) -> Distilled:
     """Distil a dense scene, or a coloured cloud with photos, as `g2ard distill` does, to the bit.
 
@@ -95,37 +58,10 @@ def distill(
         min_psnr: instead, about the fewest that simplification alone keeps this PSNR with, dB, against the
             scene in views of its own.
         min_ssim: the same of SSIM; with `min_psnr` both hold. `say` tells what the result has.
-        format: of the file that `fit` speaks of: ply, compressed.ply, sog, spz, glb or splat.
-        clean: first take out what no picture of the scene needs (`g2ard.clean`).
-        views: cameras in world coordinates, or where they lie; None takes those beside the scene, else makes
-            a pool of poses; "made" always makes one. Their test split is held out.
-        photos: True for the views' photos as targets, and no view without one; False for the scene's renders;
-            None for the photo of each view that has one, and the scene's render of the others (sec. 3.1). A
-            cloud has no renders to learn from: its lift is no picture of the place.
-        held_out: views to score on instead.
-        views_count: how many views recovery looks at: a count, a share in (0, 1] or "auto"; None for all, or
-            for what the preset says.
-        policy: how those are chosen, see `g2ard.select`; "auto" if None.
-        weighted: draw views by weights, their own or the selection's; True if None.
-        reselect: choose views again from every round's scene.
-        method: of simplification: default, fast or paper; "default" if None.
-        preset: which regularisers hold the geometry: auto (measured), trained, lift, noisy; paper,
-            paper-trained, paper-lift and paper-noisy are the paper's, and turn all that is None here to
-            what the paper has.
-        schedule: of recovery: fast, default, best or paper; "default" if None.
-        steps: the final horizon.
-        recovery_time: seconds that all recovery is fitted into; the result then depends on the machine.
-        sh_degree: of the result; None keeps the scene's, and takes 3 from a cloud or for the paper's.
-        size: pixels that the longer side of views is shrunk to.
-        background: RGB in [0, 1] behind the scene.
-        constants: by full name, as `--set` has them, such as {"rates.means": 1e-3}.
-        beside: where to look for cameras, if `scene` is no path.
-        up: (3,) away from the ground, for poses that are made; None to estimate it.
-        seed: of all that is random.
-        engine: what takes recovery's steps, see `RecoverConfig`.
         work: a folder for finished rounds and checkpoints; the same call goes on there after a Ctrl-C.
         progress: told of all stages.
         say: told in lines what was noticed and decided.
+        options: all else, see `g2ard.DistillOptions`.
 
     Returns:
         The compact scene, the same before recovery, a report, and the targets that were held out.
@@ -143,34 +79,8 @@ def distill(
     >>> len(small.splats), len(small.simplified), len(small.report.rounds)
     (90, 90, 1)
     """
-    job = prepare(
-        scene,
-        [Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)],
-        format=format,
-        clean=clean,
-        views=views,
-        photos=photos,
-        held_out=held_out,
-        views_count=views_count,
-        policy=policy,
-        weighted=weighted,
-        reselect=reselect,
-        method=method,
-        preset=preset,
-        schedule=schedule,
-        steps=steps,
-        recovery_time=recovery_time,
-        sh_degree=sh_degree,
-        size=size,
-        background=background,
-        constants=constants,
-        beside=beside,
-        up=up,
-        seed=seed,
-        engine=engine,
-        progress=progress,
-        say=say,
-    )
+    budget = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
+    job = prepare(scene, [budget], DistillOptions(**options), progress=progress, say=say)
     done = job.run(work=work)
     if judgement := job.aims[0].judge(done.splats):
         say(judgement[1])
@@ -180,34 +90,13 @@ def distill(
 def prepare(
     scene: Scene,
     budgets: Sequence[Budget],
+    options: DistillOptions,
     *,
-    format: str = "ply",
-    clean: bool = False,
-    views: Views | None = None,
-    photos: bool | None = None,
-    held_out: Views | None = None,
-    views_count: int | float | Literal["auto"] | None = None,
-    policy: str | None = None,
-    weighted: bool | None = None,
-    reselect: bool = False,
-    method: str | None = None,
-    preset: str = "auto",
-    schedule: str | None = None,
-    steps: int | None = None,
-    recovery_time: float | None = None,
-    sh_degree: int | None = None,
-    size: int | None = None,
-    background: Colour = (0.0, 0.0, 0.0),
-    constants: Mapping[str, Any] | None = None,
-    beside: str | Path | None = None,
-    up: Sequence[float] | None = None,
-    seed: int = 0,
-    engine: Engine = "fused",
     counted: Callable[[int], object] | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> DistillJob:
-    """Read and decide all that a distillation needs, at one budget or several; arguments as for `distill`.
+    """Read and decide all that a distillation needs, at one budget or several; else as `distill`.
 
     `counted` is told how many Gaussians the dense scene has before anything else is done with it; what it
     raises ends the preparation.
@@ -221,93 +110,116 @@ def prepare(
     from g2ard.policy.fit import aim_of
     from g2ard.stages.lift import LiftConfig
     from g2ard.stages.recover.presets import preset_for
-    from g2ard.stages.recover.schedule import schedule_named
     from g2ard.targets import kinds_told
 
-    usual = _PAPER if preset.startswith("paper") else _DEFAULT
-    schedule, method = schedule or usual["schedule"], method or usual["method"]
-    weighted = usual["weighted"] if weighted is None else weighted
-    paper = schedule == "paper"
-    values = full_names(constants or {}, {"recover": DistillConfig(), "lift": LiftConfig()})
+    chosen = options.by_preset()
+    values = full_names(options.constants or {}, {"recover": DistillConfig(), "lift": LiftConfig()})
     lifting = changed(LiftConfig(), "lift", values)
     if scene is None:
-        if views is None or is_made(views):
-            raise InputError("scene: without one, photos with poses are needed as views")
-        from g2ard.policy.photos import points_of_photos
-
-        wanted = max((budget.count for budget in budgets if budget.count is not None), default=None)
-        scene = points_of_photos(
-            views, held_out, wanted, background=background, seed=seed, progress=progress, say=say
-        )
-    prior, lifted, beside, name = _prior(scene, beside, lifting, progress, say)
-    if lifted and (views is None or is_made(views)):
+        scene = _points(budgets, options, progress, say)
+    prior, lifted, beside, name = _prior(scene, options.beside, lifting, progress, say)
+    if lifted and (options.views is None or is_made(options.views)):
         raise InputError(f"{name}: a cloud is no teacher: its photos are needed as views")
-    cleaned = None
-    if clean:
+    cleaned, seed = None, options.seed
+    if options.clean:
         found, _ = clutter_seen(prior, seed=seed, progress=progress, say=say)
         prior, cleaned = prior.take(found.keep), found.counts
     if counted is not None:
         counted(len(prior))
-    file = f"scene.{format}"
+    file = f"scene.{options.format}"
     aims = tuple(
         aim_of(budget, prior, name, file=file, seed=seed, progress=progress, say=say) for budget in budgets
     )
     looks = views_of(
         prior,
-        views,
-        held_out,
+        options.views,
+        options.held_out,
         beside=beside,
-        size=size,
-        up=up,
+        size=options.size,
+        up=options.up,
         seed=seed,
-        teach=not lifted and photos is not True,
+        teach=not lifted and options.photos is not True,
         progress=progress,
         say=say,
     )
     train = looks.train.cameras
     pictured = [path is not None for path in (*train.image_paths, *looks.test.image_paths)]
-    use_photos = lifted or (any(pictured) if photos is None else photos)
-    taught = not (lifted or photos or (use_photos and all(pictured)))
-    if (lifted or photos) and not all(pictured):
-        bare = (*train.names, *looks.test.names)[pictured.index(False)]
-        instead = (
-            "give views with photos, or a trained scene" if lifted else "photos=None takes renders there"
-        )
-        raise InputError(f"view {bare} has no photo; {instead}")
-    kind = "paper-lift" if lifted and preset == "paper" else preset
-    regularizers, why, measured = preset_for(kind, prior, train if use_photos else None, paper=paper)
+    if lifted or options.photos:
+        _all_pictured(pictured, (*train.names, *looks.test.names), lifted)
+    use_photos = lifted or (any(pictured) if options.photos is None else options.photos)
+    taught = not (lifted or options.photos or (use_photos and all(pictured)))
+    kind = "paper-lift" if lifted and options.preset == "paper" else options.preset
+    photographed = train if use_photos else None
+    regularizers, why, measured = preset_for(kind, prior, photographed, paper=chosen["schedule"] == "paper")
     counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
     shown = len(train) if not taught else sum(pictured[: len(train)]) if use_photos else 0
     against = kinds_told(shown, len(train) - shown)
     say(f"{len(prior):,} → {counts}; {plural(len(train), 'view')} against {against}")
     say(f"regularisers: {why}")
-    config = DistillConfig(
-        method=method,
-        schedule=schedule_named(schedule, steps),
-        steps=steps,
-        recovery_time=recovery_time,
-        regularizers=regularizers,
-        sh_degree=3 if sh_degree is None and (lifted or paper or usual is _PAPER) else sh_degree,
-        background=background,
-        views=usual["views_count"] if views_count is None else views_count,
-        policy=policy or usual["policy"],
-        weighted=weighted,
-        reselect=reselect,
-        seed=seed,
-        engine=engine,
-    )
     return DistillJob(
         prior=prior,
         aims=aims,
         views=replace(looks, apart=None) if use_photos else looks,  # photos are only where they were taken
         teacher=prior if taught else None,
         photos=use_photos and taught,
-        config=changed(config, "recover", values),
-        weights=looks.train.weights if weighted else None,
+        config=changed(_config(options, chosen, lifted, regularizers), "recover", values),
+        weights=looks.train.weights if chosen["weighted"] else None,
         lifting=lifting if lifted else None,
         preset=why,
         measured=measured,
         cleaned=cleaned,
+        progress=progress,
+        say=say,
+    )
+
+
+def _all_pictured(pictured: Sequence[bool], names: Sequence[str], lifted: bool) -> None:
+    """Refuse a view without a photo where only photos can be targets."""
+    if not all(pictured):
+        instead = (
+            "give views with photos, or a trained scene" if lifted else "photos=None takes renders there"
+        )
+        raise InputError(f"view {names[list(pictured).index(False)]} has no photo; {instead}")
+
+
+def _config(
+    options: DistillOptions, chosen: dict[str, Any], lifted: bool, regularizers: Regularizers
+) -> DistillConfig:
+    """The pipeline's; `chosen` is what the preset had to decide."""
+    from g2ard.pipeline import DistillConfig
+    from g2ard.stages.recover.schedule import schedule_named
+
+    whole = lifted or chosen["schedule"] == "paper" or options.preset.startswith("paper")
+    return DistillConfig(
+        method=chosen["method"],
+        schedule=schedule_named(chosen["schedule"], options.steps),
+        steps=options.steps,
+        recovery_time=options.recovery_time,
+        regularizers=regularizers,
+        sh_degree=3 if options.sh_degree is None and whole else options.sh_degree,
+        background=options.background,
+        views=chosen["views_count"],
+        policy=chosen["policy"],
+        weighted=chosen["weighted"],
+        reselect=options.reselect,
+        seed=options.seed,
+        engine=options.engine,
+    )
+
+
+def _points(budgets: Sequence[Budget], options: DistillOptions, progress: Progress, say: Say) -> Points:
+    """A start from photos alone."""
+    if options.views is None or is_made(options.views):
+        raise InputError("scene: without one, photos with poses are needed as views")
+    from g2ard.policy.photos import points_of_photos
+
+    wanted = max((budget.count for budget in budgets if budget.count is not None), default=None)
+    return points_of_photos(
+        options.views,
+        options.held_out,
+        wanted,
+        background=options.background,
+        seed=options.seed,
         progress=progress,
         say=say,
     )

@@ -114,19 +114,22 @@ def lod(
     [800, 200, 100]
     """
     from g2ard.policy.distill import prepare
+    from g2ard.policy.distill_options import DistillOptions
 
     _check(ratios)
     job = prepare(
         scene,
         [Budget(ratio=ratio) for ratio in ratios],
-        views=views,
-        photos=photos,
-        steps=steps,
-        size=size,
-        background=background,
-        beside=beside,
-        up=up,
-        seed=seed,
+        DistillOptions(
+            views=views,
+            photos=photos,
+            steps=steps,
+            size=size,
+            background=background,
+            beside=beside,
+            up=up,
+            seed=seed,
+        ),
         progress=progress,
         say=say,
     )

@@ -166,6 +166,7 @@ def distill(
         raise typer.BadParameter("--photos: views that are made have none")
     from g2ard.io import kind
     from g2ard.policy.distill import prepare
+    from g2ard.policy.distill_options import DistillOptions
     from g2ard.report.distilled import check_crops
 
     began = time.monotonic()
@@ -189,9 +190,7 @@ def distill(
         )
     if scene is not None and kind(scene) != "splats" and not given:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
-    job = prepare(
-        scene,
-        budgets,
+    options = DistillOptions(
         format=format,
         clean=clean,
         views=views,
@@ -213,6 +212,11 @@ def distill(
         up=up,
         seed=run.seed,
         engine=engine,
+    )
+    job = prepare(
+        scene,
+        budgets,
+        options,
         counted=lambda total: outputs.check(check, total),
         progress=run.progress,
         say=run.say,
