@@ -14,6 +14,7 @@ __all__ = [
     "LPIPS_INPUTS",
     "METHODS",
     "POLICIES",
+    "POOL_KINDS",
     "REFINEMENTS",
     "SCHEDULE_NAMES",
     "UNMEASURED",
@@ -25,6 +26,7 @@ __all__ = [
     "Method",
     "PaperPresetName",
     "Policy",
+    "PoolKind",
     "PresetName",
     "Refinement",
     "ScheduleName",
@@ -40,6 +42,10 @@ POLICIES: tuple[Policy, ...] = get_args(Policy)
 
 UNMEASURED: tuple[Policy, ...] = ("random", "uniform")
 """Policies that measure nothing, and so cannot say how many views are enough."""
+
+PoolKind = Literal["auto", "orbit", "walk", "aerial", "inside", "focus"]
+"""Poses that are made (`g2ard.poses.make_pool`)."""
+POOL_KINDS: tuple[PoolKind, ...] = get_args(PoolKind)
 
 ScheduleName = Literal["fast", "default", "best", "paper"]
 """Schedules of recovery (`g2ard.stages.recover.schedule`)."""

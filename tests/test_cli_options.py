@@ -88,6 +88,8 @@ def test_a_scene_that_lies_down_is_seen_upright_if_told(folder: Path, command_li
             "made",
             "--steps",
             1,
+            "--size",
+            48,
             "--up",
             up,
             "-o",

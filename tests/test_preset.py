@@ -54,6 +54,7 @@ def run(command_line: CommandLine, folder: Path, *arguments: object) -> dict[str
 
 
 DISTILL = ("distill", "ball.ply", "-r", 3, "--views", "v.json", "-o", "run", "--steps", 75)
+SHORT = (*DISTILL, "--steps", 8)
 
 
 def test_distill_does_all_that_the_paper_says(folder: Path, command_line: CommandLine) -> None:
@@ -86,13 +87,13 @@ def test_rounds_without_regularisers_are_named_once(folder: Path, command_line: 
 def test_what_is_said_beside_the_preset_stands(folder: Path, command_line: CommandLine) -> None:
     (folder / "c.toml").write_text('[distill]\npolicy = "pose-diverse"\nmethod = "default"\n')
     said = ("--config", "c.toml", "--method", "fast", "-k", 4, "--set", "regularizers.anchor=0.3")
-    report = run(command_line, folder, *DISTILL, "--preset", "paper", *said, "--sh-degree", 1)
+    report = run(command_line, folder, *SHORT, "--preset", "paper", *said, "--sh-degree", 1)
     assert (report["views"]["policy"], len(report["views"]["chosen"])) == ("pose-diverse", 4)
     assert (report["config"]["method"], report["config"]["schedule"]) == ("fast", "paper")
     assert report["constants"]["regularizers"]["anchor"] == 0.3
     assert read_splats(folder / "run" / "scene.ply").sh_degree == 1
     (folder / "c.toml").write_text('[distill]\npreset = "paper-noisy"\n[distill.set]\nperiod = 7\n')
-    report = run(command_line, folder, *DISTILL, "--config", "c.toml", "--weights")
+    report = run(command_line, folder, *SHORT, "--config", "c.toml", "--weights")
     assert (report["config"]["method"], report["views"]["weighted"]) == ("paper", True)
     regularizers = report["constants"]["regularizers"]
     assert (regularizers["shape"], regularizers["period"]) == (1e-3, 7)
@@ -279,5 +280,5 @@ def test_what_was_kept_gives_the_drift_again(folder: Path, command_line: Command
         "g2ard: ball.ply: 3,000 Gaussians, the student has 1,000; anchors are the student as it was "
         "simplified, before any recovery",
     )
-    run(command_line, folder, *DISTILL, "--schedule", "fast")
+    run(command_line, folder, *SHORT, "--schedule", "fast")
     assert not kept.exists()  # it would not be of this run

@@ -144,14 +144,10 @@ def prepare(
     )
     train = looks.train.cameras
     pictured = [path is not None for path in (*train.image_paths, *looks.test.image_paths)]
+    if lifted or options.photos:
+        _all_pictured(pictured, (*train.names, *looks.test.names), lifted)
     use_photos = lifted or (any(pictured) if options.photos is None else options.photos)
     taught = not (lifted or options.photos or (use_photos and all(pictured)))
-    if (lifted or options.photos) and not all(pictured):
-        bare = (*train.names, *looks.test.names)[pictured.index(False)]
-        instead = (
-            "give views with photos, or a trained scene" if lifted else "photos=None takes renders there"
-        )
-        raise InputError(f"view {bare} has no photo; {instead}")
     kind = "paper-lift" if lifted and options.preset == "paper" else options.preset
     photographed = train if use_photos else None
     regularizers, why, measured = preset_for(kind, prior, photographed, paper=chosen["schedule"] == "paper")
@@ -175,6 +171,15 @@ def prepare(
         progress=progress,
         say=say,
     )
+
+
+def _all_pictured(pictured: Sequence[bool], names: Sequence[str], lifted: bool) -> None:
+    """Refuse a view without a photo where only photos can be targets."""
+    if not all(pictured):
+        instead = (
+            "give views with photos, or a trained scene" if lifted else "photos=None takes renders there"
+        )
+        raise InputError(f"view {names[list(pictured).index(False)]} has no photo; {instead}")
 
 
 def _config(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.cameras import Cameras
+from g2ard.choices import POOL_KINDS
 from g2ard.errors import InputError
 from g2ard.poses.aerial import plan_aerial
 from g2ard.poses.auto import plan_auto
@@ -26,9 +27,7 @@ from g2ard.progress import Progress, counter, silent
 from g2ard.splats import Splats
 from g2ard.splits import HOLD_OUT
 
-__all__ = ["KINDS", "Pool", "plan_pool"]
-
-KINDS = ("auto", "orbit", "walk", "aerial", "inside", "focus")
+__all__ = ["Pool", "plan_pool"]
 
 _WORTH = 1.1
 """Times as many poses for which planning begins anew."""
@@ -103,8 +102,8 @@ def plan_pool(
         raise InputError(f"count: expected at least 1 pose, got {count}")
     if rows is not None and rows < 1:
         raise InputError(f"rows: expected at least 1, got {rows}")
-    if kind not in KINDS:
-        raise InputError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
+    if kind not in POOL_KINDS:
+        raise InputError(f"kind: expected one of {', '.join(POOL_KINDS)}, got {kind!r}")
     progress("scene", 0, 1)
     site = Site.of(splats, up, rows, represents)
     progress("scene", 1, 1)

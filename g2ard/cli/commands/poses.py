@@ -7,11 +7,10 @@ from typing import Annotated
 
 import typer
 
+from g2ard.choices import PoolKind
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import OutputOption, SceneArgument, UpOption
 from g2ard.progress import plural
-
-_KINDS = ("auto", "orbit", "walk", "aerial", "inside", "focus")
 
 
 class _Size(tuple[int, int]):
@@ -28,23 +27,15 @@ def _size(text: str) -> _Size:
     return _Size((int(match[1]), int(match[2])))
 
 
-def _kind(text: str) -> str:
-    if text not in _KINDS:
-        raise typer.BadParameter(f"one of {', '.join(_KINDS)}, not {text!r}")
-    return text
-
-
 @command("poses", example="g2ard poses scene.ply --count 128 -o poses.json")
 def poses(
     run: Run,
     scene: SceneArgument,
     output: OutputOption,
     kind: Annotated[
-        str,
+        PoolKind,
         typer.Option(
-            parser=_kind,
-            metavar="|".join(_KINDS),
-            help="Around, through rooms and streets, from the air, within rooms, where it is sharp.",
+            help="Around, through rooms and streets, from the air, within rooms, where it is sharp."
         ),
     ] = "auto",
     count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many poses.")] = 128,
