@@ -7,6 +7,14 @@ use super::{GONE, Step};
 use crate::scene::{Gaussian, Ordered, SceneRef};
 use crate::{Control, Result, Splats};
 
+/// Two rows that merge, the lower index first, and what that costs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pair {
+    pub a: u32,
+    pub b: u32,
+    pub cost: f32,
+}
+
 /// Which cluster each ordered row belongs to ([`GONE`] for none).
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Partition {

@@ -6,6 +6,7 @@ use std::collections::BinaryHeap;
 use rayon::prelude::*;
 
 use super::GONE;
+use super::clusters::Pair;
 use super::cost::{Node, color_distance};
 use crate::raster::simd::{Isa, Kernel, LANES, Lanes, Lanes16, dispatch};
 use crate::spatial::{RobustBounds, Tree, codes, order};
@@ -210,14 +211,6 @@ fn spread_duplicates(i: usize, k: usize, n: usize, near: &mut Vec<(f32, u32)>) {
             .take(k)
             .map(|j| (0.0, j as u32)),
     );
-}
-
-/// Two rows that merge, the lower index first, and what that costs.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Pair {
-    pub a: u32,
-    pub b: u32,
-    pub cost: f32,
 }
 
 /// Up to `merges` disjoint pairs, cheapest first, between equals the lower index.

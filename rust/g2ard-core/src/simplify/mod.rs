@@ -20,10 +20,10 @@ mod rows;
 mod tile;
 mod trim;
 
+pub use clusters::Pair;
 pub use guards::{coverage, disc};
 pub use importance::Importance;
 pub use kernels::{Group, GroupKernels, means_of};
-pub use matching::Pair;
 pub use moments::{MAX_OPACITY, Merged, merge, optical_mass, pool, weights};
 pub use outcome::Outcome;
 pub use pairwise::{Pairwise, PairwiseRound, Visibility};

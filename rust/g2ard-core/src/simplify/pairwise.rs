@@ -6,10 +6,10 @@
 
 use rayon::prelude::*;
 
-use super::clusters::Partition;
+use super::clusters::{Pair, Partition};
 use super::importance::median;
 use super::leaves::Leaves;
-use super::matching::{Nodes, Pair, candidates, matched};
+use super::matching::{Nodes, candidates, matched};
 use super::moments::sigmoid;
 use super::morton_tree::{cut, merge_costs};
 use super::rows::{Rows, Shuffled};

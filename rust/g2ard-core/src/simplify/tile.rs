@@ -6,10 +6,10 @@
 //! farther than any budget asks for and tells the order of the merges and their costs; once it is decided how
 //! many of those a tile does, [`Tile::assemble`] makes its Gaussians.
 
-use super::clusters::Partition;
+use super::clusters::{Pair, Partition};
 use super::importance::Importance;
 use super::leaves::{Leaves, floor, typical_size};
-use super::matching::{Pair, candidates, matched};
+use super::matching::{candidates, matched};
 use super::morton_tree::{cut, merge_costs};
 use super::pairwise::{PairwiseRound, merge};
 use super::rows::{Rows, Shuffled};
