@@ -333,14 +333,9 @@ mod tests {
         };
         let (first, k) = (7, 3);
         for isa in Isa::available() {
-            let mut lists: Vec<Candidate> = (0..k * (nodes.len() - first))
-                .map(|at| {
-                    (
-                        NONE.0,
-                        [(at * 31 % nodes.len()) as u32, GONE][usize::from(at == 4)],
-                    )
-                })
-                .collect();
+            let partner = |at: usize| [(at * 31 % nodes.len()) as u32, GONE][usize::from(at == 4)];
+            let count = k * (nodes.len() - first);
+            let mut lists: Vec<Candidate> = (0..count).map(|at| (NONE.0, partner(at))).collect();
             let costs = PairCosts {
                 nodes: &nodes,
                 first,
