@@ -325,7 +325,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
             fn(run, **options)
     except KeyboardInterrupt:
         run.console.error(f"interrupted; {'; '.join(run.kept) or 'nothing was written'}")
-        raise typer.Exit(130) from None
+        raise typer.Exit(interrupt.STATUS) from None
     except (G2ardError, OSError, MemoryError) as e:
         run.console.error(_one_line(e))
         raise typer.Exit(1) from None

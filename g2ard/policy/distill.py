@@ -130,7 +130,7 @@ def prepare(
     aims = tuple(
         aim_of(budget, prior, name, file=file, seed=seed, progress=progress, say=say) for budget in budgets
     )
-    looks = views_of(
+    views = views_of(
         prior,
         options.views,
         options.held_out,
@@ -142,28 +142,28 @@ def prepare(
         progress=progress,
         say=say,
     )
-    train = looks.train.cameras
-    pictured = [path is not None for path in (*train.image_paths, *looks.test.image_paths)]
+    train = views.train.cameras
+    pictured = [path is not None for path in (*train.image_paths, *views.test.image_paths)]
     if lifted or options.photos:
-        _all_pictured(pictured, (*train.names, *looks.test.names), lifted)
+        _all_pictured(pictured, (*train.names, *views.test.names), lifted)
     use_photos = lifted or (any(pictured) if options.photos is None else options.photos)
-    taught = not (lifted or options.photos or (use_photos and all(pictured)))
+    needs_teacher = not (lifted or options.photos or (use_photos and all(pictured)))
     kind = "paper-lift" if lifted and options.preset == "paper" else options.preset
     photographed = train if use_photos else None
     regularizers, why, measured = preset_for(kind, prior, photographed, paper=chosen["schedule"] == "paper")
     counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
-    shown = len(train) if not taught else sum(pictured[: len(train)]) if use_photos else 0
+    shown = len(train) if not needs_teacher else sum(pictured[: len(train)]) if use_photos else 0
     against = kinds_told(shown, len(train) - shown)
     say(f"{len(prior):,} → {counts}; {plural(len(train), 'view')} against {against}")
     say(f"regularisers: {why}")
     return DistillJob(
         prior=prior,
         aims=aims,
-        views=replace(looks, apart=None) if use_photos else looks,  # photos are only where they were taken
-        teacher=prior if taught else None,
-        photos=use_photos and taught,
+        views=replace(views, apart=None) if use_photos else views,  # photos are only where they were taken
+        teacher=prior if needs_teacher else None,
+        photos=use_photos and needs_teacher,  # beside the teacher's renders
         config=changed(_config(options, chosen, lifted, regularizers), "recover", values),
-        weights=looks.train.weights if chosen["weighted"] else None,
+        weights=views.train.weights if chosen["weighted"] else None,
         lifting=lifting if lifted else None,
         preset=why,
         measured=measured,

@@ -88,11 +88,17 @@ def plan_pool(
 ) -> Pool:
     """As `make_pool` (see there for all but the result), and what was found out about the scene.
 
-    `apart` asks for so many views of another kind, at most. `count` is for views that hold the whole scene:
-    where they hold a share h of it there are 1/√h times as many, at most `grow` times. A part of them, at
-    most `near`, steps nearer to what the others see, as far as those show matter under a pixel only; in a
-    pool for `looks`, which weigh and do not teach, near·(1 − h) of them do. `splats` may be a fair sample of
-    the scene, of which every row `represents` so many.
+    Args:
+        splats: as `make_pool`, which has what is not here; or a fair sample of the scene, see `represents`.
+        count: poses, where a view holds the whole scene.
+        apart: views of another kind to make beside, nearer ones; at most so many.
+        grow: where a view holds a share h of the scene there are 1/√h times as many poses, at most this
+            many times.
+        near: share of the poses, at most, that step nearer to what the others see: near·max(s, 1 − h), where
+            s rises from 0 to 1 with the share of the matter that is only seen under a pixel. 1 − h counts in
+            pools for `looks` alone.
+        looks: a pool to weigh Gaussians by, not to learn from.
+        represents: how many of the scene's Gaussians a row of `splats` stands for.
 
     Raises:
         InputError: as `make_pool`.

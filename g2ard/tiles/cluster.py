@@ -12,8 +12,8 @@ from g2ard.tiles.task import Task, run_task
 
 __all__ = ["DaskExecutor"]
 
-_RETRIES = 20
-"""How many workers may die on one task."""
+_TRIES = 5
+"""How often in a row Dask may give up a task, on which four workers died, with none done between."""
 
 
 class DaskExecutor:
@@ -63,13 +63,33 @@ class DaskExecutor:
 
     def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
         """As `Executor.run`; a worker's death costs a retry."""
+        from distributed import KilledWorker
+
+        deaths = 0
+        while todo := {task.key: task for task in tasks if not task.output.exists()}:
+            before = len(todo)
+            try:
+                self._round(todo, sum(task.cost for task in tasks), stage, progress)
+            except KilledWorker:
+                left = sum(not task.output.exists() for task in tasks)
+                deaths = deaths + 1 if left == before else 0
+                if deaths == _TRIES:
+                    raise InputError(
+                        f"{stage}: workers die before they finish anything; give them memory"
+                    ) from None
+                continue
+            if missing := [task.output for task in tasks if not task.output.exists()]:
+                raise InputError(
+                    f"{missing[0]}: a worker made it, but it is not here; share that folder with all workers"
+                )
+        return [task.output for task in tasks]
+
+    def _round(self, todo: dict[str, Task], total: int, stage: str, progress: Progress) -> None:
         from distributed import as_completed
 
-        todo = {task.key: task for task in tasks if not task.output.exists()}
-        total = sum(task.cost for task in tasks)
         done = total - sum(task.cost for task in todo.values())
         futures = [
-            self.client.submit(_work, task, self._threads, key=f"g2ard-{key}", retries=_RETRIES, pure=True)
+            self.client.submit(_work, task, self._threads, key=f"g2ard-{key}", pure=True)
             for key, task in todo.items()
         ]
         try:
@@ -81,12 +101,6 @@ class DaskExecutor:
         except BaseException:
             self.client.cancel(futures, force=True)
             raise
-        missing = [task.output for task in tasks if not task.output.exists()]
-        if missing:
-            raise InputError(
-                f"{missing[0]}: a worker made it, but it is not here; share that folder with all"
-            )
-        return [task.output for task in tasks]
 
 
 def _work(task: Task, threads: int) -> str:

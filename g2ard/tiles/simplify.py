@@ -104,7 +104,8 @@ def simplify_tiles(
         config: constants; None means the method's own.
         views: cameras to look from; None takes those that `beside` finds for a fair sample of the scene, else
             plans a pool.
-        beside: finds cameras.
+        beside: finds the cameras that lie beside the scene, given a fair sample of it; None where there are
+            none.
         blind: use no cameras at all.
         up: (3,) away from the ground, for poses that are made; None to estimate it.
         seed: of poses that are made.
@@ -127,18 +128,18 @@ def simplify_tiles(
         sights = None if cameras is None else Sights(run, coarse, cameras, frame)
         frame = frame if sights is None else sights.frame
     costs = run.each("run_costs", "costs", frame=frame, **_look_of(sights))
-    runs = _runs(run, costs, budget)
-    of_all = budget / sum(runs)
+    runs_left = _runs(run, costs, budget)
+    share_kept = budget / sum(runs_left)
     plans = run.each(
         "pair_plan",
         "plans",
         frame=frame,
-        per_tile=[{"runs": n, "expected": of_all * n} for n in runs],
+        per_tile=[{"runs": n, "expected": share_kept * n} for n in runs_left],
         **_look_of(sights),
     )
-    merges = cheapest([_reader(path) for path in plans], sum(runs) - budget)
-    _check_reached(sum(runs) - sum(merges), budget)
-    per_tile = [{"runs": n, "merges": m} for n, m in zip(runs, merges, strict=True)]
+    merges = cheapest([_costs_of(path) for path in plans], sum(runs_left) - budget)
+    _check_reached(sum(runs_left) - sum(merges), budget)
+    per_tile = [{"runs": n, "merges": m} for n, m in zip(runs_left, merges, strict=True)]
     merged = run.each(
         "merge",
         "merge",
@@ -149,7 +150,7 @@ def simplify_tiles(
             for tile, plan in enumerate(plans)
         ],
     )
-    counts = tuple(n - m for n, m in zip(runs, merges, strict=True))
+    counts = tuple(n - m for n, m in zip(runs_left, merges, strict=True))
     if sights is None:
         return _scene(store, counts, [{"merged": path} for path in merged], None)
     around = sights.surroundings(merged, sum(counts))
@@ -217,7 +218,7 @@ def _runs(run: TiledRun, costs: list[Path], budget: int) -> list[int]:
             f"budget: expected at most the {sum(kept):,} Gaussians that a renderer draws, got {budget:,}"
         )
     target = min(sum(kept), int(run.config["morton_premerge_ratio"] * budget))
-    closed = cheapest([_reader(path) for path in costs], sum(kept) - max(target, len(kept)))
+    closed = cheapest([_costs_of(path) for path in costs], sum(kept) - max(target, len(kept)))
     return [n - c for n, c in zip(kept, closed, strict=True)]
 
 
@@ -225,7 +226,7 @@ def _length(path: Path) -> int:
     return len(load(path, "costs")[0])
 
 
-def _reader(path: Path) -> Callable[[], NDArray[np.float32]]:
+def _costs_of(path: Path) -> Callable[[], NDArray[np.float32]]:
     return lambda: load(path, "costs")[0]
 
 

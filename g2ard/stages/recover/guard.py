@@ -130,10 +130,12 @@ class Guard:
         return best, chosen
 
     def judge(self, result: Splats) -> tuple[Splats, float, float]:
-        """The best of the result, what was seen before it, and where it lost, of blends with the start.
+        """The best of three: the result; the best scene looked at before it; and where both are worse than
+        the start, the first blend of start and result that is not, or the start.
 
         Returns:
-            The scene, its score, and the result's weight in it: 1, or 0 for the start.
+            The scene, its score, and the weight of where steps ended in it: 1, also for an earlier best
+            scene; ½ or ¼ in a blend; 0 for the start.
         """
         value = self.score(result)
         if value >= self.best_score or not self.active:

@@ -111,8 +111,8 @@ def recover(
     often = checked_weights(weights, len(targets.cameras))
     others = None if validation is None else Probe(validation, config.background).all_of
     guard = Guard(probe.all_of, student, before, others, config.schedule.guarded)
-    held = None if validation is None else fingerprint_of(validation)
-    loop = Loop(student, targets, config, often, anchors, probe, guard, held, frozen)
+    judged_by = None if validation is None else fingerprint_of(validation)
+    loop = Loop(student, targets, config, often, anchors, probe, guard, judged_by, frozen)
     if checkpoint is None or not checkpoint.exists():
         loop.choose_rates(before)
     loop.run(checkpoint, progress, stage, watch)

@@ -130,10 +130,10 @@ def merge_and_fit(
 def fit_opacities(
     scene: Splats, members: NDArray[Any], wanted: NDArray[Any], now: NDArray[Any], mean: float
 ) -> Splats:
-    """The scene with opacities by which the views see of each row about what they saw of its members.
+    """The scene with opacities by which views see about as much of each row as they saw of its members.
 
-    α is multiplied by the fourth root of the ratio, within 0.84–1.19: neighbours share what is missing, and
-    other views than these want less of it. What α ≤ 0.99 cannot hold goes to the area of the two longer axes.
+    α is multiplied by ratio^¼, the ratio cut to 0.5–2: neighbours share what is missing, and other views than
+    these want less of it. What α ≤ 0.99 cannot hold goes to the area of the two longer axes.
     A floor of 5 % of the mean keeps what is hardly seen as it is.
 
     Args:
@@ -150,15 +150,15 @@ def fit_opacities(
     held = np.minimum(alpha * factor, np.maximum(alpha, MAX_OPACITY))
     faint = (held < DRAWN_OPACITY) & (alpha >= DRAWN_OPACITY)  # what was drawn still is
     held = np.where(faint | (alpha <= 0) | alone, alpha, held)
-    area = np.where(alone | faint | (held <= 0), 1.0, alpha * factor / np.maximum(held, 1e-30))
+    growth = np.where(alone | faint | (held <= 0), 1.0, alpha * factor / np.maximum(held, 1e-30))
     changed = held != alpha
     logits = np.log(np.maximum(held, 1e-30)) - np.log1p(-np.minimum(held, 1 - 1e-9))
     shortest = np.arange(3) == np.argmin(scene.scales, axis=1)[:, None]
-    grown = (area > 1)[:, None] & ~shortest
+    grown = (growth > 1)[:, None] & ~shortest
     return replace(
         scene,
         logit_opacities=np.where(changed, logits, scene.logit_opacities).astype(np.float32),
-        scales=np.where(grown, scene.scales * np.sqrt(area)[:, None], scene.scales).astype(np.float32),
+        scales=np.where(grown, scene.scales * np.sqrt(growth)[:, None], scene.scales).astype(np.float32),
     )
 
 

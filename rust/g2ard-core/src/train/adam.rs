@@ -10,6 +10,7 @@ use crate::raster::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
 
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
+/// Under the root of the second moment; `selective_adam.py` has the same.
 const EPSILON: f32 = 1e-15;
 /// Beyond this the square of a gradient leaves f32: such a row is skipped as not finite.
 const GRADIENT_MAX: f32 = 1e18;
@@ -52,6 +53,7 @@ impl Kernel for Update<'_> {
         let sums = self.sums;
         let (mut next, mut updated, mut skipped) = (0, 0, 0);
         for group in sums.first_group..sums.last_group {
+            // A bit for each row of the group; lanes of others hold meaningless values.
             let (mut active, screen) =
                 collect::<F>(sums.splats, &mut next, group, sums.slots, sums.written);
             let free = self.free.map_or(u16::MAX, |free| free[group]);
@@ -59,7 +61,7 @@ impl Kernel for Update<'_> {
             if free == 0 || (active == 0 && self.regularize.is_none()) {
                 continue;
             }
-            // SAFETY: a group belongs to one chunk, a chunk to one thread, and the last group's block is gone.
+            // SAFETY: a group belongs to one chunk, a chunk to one thread, and the block of the group before was dropped.
             let mut block = unsafe { self.blocks.block(group) };
             let mut g = unproject(sums.view, &block.parameters(), group, &screen);
             if let Some((weights, anchors)) = self.regularize {
