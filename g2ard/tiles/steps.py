@@ -76,7 +76,7 @@ _FIELDS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset"
 
 def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """A tile merged to a few Gaussians, near and far, and a fair sample of its rows."""
-    scene = tile_of(arguments, places)
+    scene = tile_of(arguments, places, check=True)
     config = _config(arguments)
     some = _widened(scene.take(scene.core.order[::_THINNED]), _THINNED)
     near = simplify(some, max(1, len(scene) // COARSE[0]), method="fast", config=config).splats
@@ -238,9 +238,10 @@ def cameras_of(path: Path) -> Cameras:
     return Cameras(viewmats, Ks, widths, heights, tuple(str(i) for i in range(len(viewmats))))
 
 
-def tile_of(arguments: Arguments, places: Places, sh: bool = True) -> PreparedScene:
-    scene = TileStore.open(places["store"]).read(arguments["tile"])
-    return finite_rows_of(scene if sh else scene.with_sh_degree(0))[0]
+def tile_of(arguments: Arguments, places: Places, *, sh: bool = True, check: bool = False) -> PreparedScene:
+    """A tile's Gaussians, with all bands or band 0; the first step checks the contents for all others."""
+    scene = TileStore.open(places["store"]).read(arguments["tile"], sh=sh, check=check)
+    return finite_rows_of(scene)[0]
 
 
 def _config(arguments: Arguments) -> SimplifyConfig:
@@ -279,7 +280,7 @@ def _seen_tile(scene: PreparedScene, arguments: Arguments, inputs: Inputs) -> _c
 def _with_surroundings(core: Splats, arguments: Arguments, inputs: Inputs, places: Places) -> PreparedScene:
     """A tile's Gaussians first, then its halo, then coarse ones of all other tiles outside of that."""
     store = TileStore.open(places["store"])
-    halo = store.read_halo(arguments["tile"])
+    halo = store.read_halo(arguments["tile"], sh=False)
     parts = [core, halo, *far_around(store, arguments, inputs)]
     return as_prepared(joined([part.with_sh_degree(0) for part in parts if len(part)]))
 
