@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +25,7 @@ from g2ard.targets import TeacherRenders
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.store import TileStore
 
+ROOT = Path(__file__).resolve().parents[1]
 CommandLine = Callable[..., tuple[int, str, str]]
 
 
@@ -92,6 +97,33 @@ def test_a_folder_of_tiles_is_a_scene(command_line: CommandLine, folder: Path, t
     )
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
     assert (tmp_path / "work" / "steps").is_dir()  # named by the user, so it stays
+
+
+def test_a_killed_command_leaves_no_workers_and_goes_on(folder: Path, tmp_path: Path) -> None:
+    words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
+    command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
+    env = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])),
+    }
+    steps = tmp_path / ".x.ply.tiles" / "steps"
+    with subprocess.Popen(command, env=env, stderr=subprocess.PIPE) as running:
+        children: list[int] = []
+        until = time.monotonic() + 120
+        while running.poll() is None and time.monotonic() < until and len(list(steps.glob("*.npz"))) < 3:
+            time.sleep(0.01)
+        listed = Path(f"/proc/{running.pid}/task/{running.pid}/children")
+        children = [int(pid) for pid in listed.read_text().split()] if listed.exists() else []
+        running.kill()
+    done = {path.name: path.stat().st_mtime_ns for path in steps.glob("*.npz")}
+    assert done
+    until = time.monotonic() + 30
+    while any(Path(f"/proc/{pid}").exists() for pid in children) and time.monotonic() < until:
+        time.sleep(0.1)
+    assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]
+    assert subprocess.run([*command, "--work", str(steps.parent)], env=env, check=False).returncode == 0
+    assert len(read_splats(tmp_path / "x.ply")) == 900
+    assert all((steps / name).stat().st_mtime_ns == at for name, at in done.items())
 
 
 def test_what_tiles_do_not_have_is_refused(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -20,6 +22,9 @@ __all__ = ["Executor", "executor"]
 
 _TRIES = 5
 """How often in a row workers may die with no task done between, before it is no accident."""
+
+_GLANCE = 1.0
+"""Seconds between a worker's looks whether its parent is there."""
 
 
 class Executor(Protocol):
@@ -129,8 +134,16 @@ class _Processes:
 
 
 def _begin(threads: int) -> None:
-    """A worker's start: Ctrl-C is its parent's to act on."""
+    """A worker's start: Ctrl-C is its parent's to act on, and without its parent it ends."""
     from g2ard import _core
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     _core.set_num_threads(threads)
+
+
+def _end_with(parent: int) -> None:
+    """A parent that was killed tells its workers nothing: they would wait for it for ever."""
+    while os.getppid() == parent:
+        time.sleep(_GLANCE)
+    os._exit(1)
