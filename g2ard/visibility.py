@@ -17,7 +17,7 @@ from g2ard.progress import Progress, counter, silent
 from g2ard.splats import Splats
 from g2ard.stages.render import RasterSettings, arrays_of, centred, settings_for, view_of
 
-__all__ = ["SampledVisibility", "Visibility", "visibility", "visibility_source"]
+__all__ = ["SampledVisibility", "Visibility", "spread", "visibility", "visibility_source"]
 
 _Floats = NDArray[np.float32]
 
@@ -111,7 +111,7 @@ def visibility_source(
     small = full.resized(longest)
     factor = np.float32((small.widths / full.widths).mean())
     apart = max(1, math.ceil(len(small) / _ROUND))
-    rounds = [range(first, len(small), apart) for first in _spread(apart)]
+    rounds = [range(first, len(small), apart) for first in spread(apart)]
     enough, settings = 0, RasterSettings()
 
     def find(scene: Splats) -> SampledVisibility:
@@ -150,10 +150,10 @@ _CONVERGED = 0.01
 """A round that finds a smaller share of the Gaussians for the first time is the last."""
 
 
-def _spread(count: int) -> list[int]:
+def spread(count: int) -> list[int]:
     """0 … count − 1, each far from those before.
 
-    >>> _spread(6)
+    >>> spread(6)
     [0, 3, 1, 4, 2, 5]
     """
     half = (count + 1) // 2

@@ -161,6 +161,15 @@ def test_an_exact_count_about_as_good_as_in_one_piece(
     assert tiled_db > whole_db - 0.4  # tiles of 2,300 rows have many borders
 
 
+def test_tiles_that_no_view_sees_keep_their_share(store: TileStore, tmp_path: Path) -> None:
+    K = [[300, 0, 40], [0, 300, 30], [0, 0, 1]]
+    corner = Cameras.from_lists([look_at([-7.5, -3.5, 1.5], [-7.6, -3.4, 0])], [K], [(80, 60)], ["corner"])
+    small = reduced(store, tmp_path, views=corner)
+    assert len(small) == 900
+    rows = [len(core) for core, _ in store.cells.route(small.means)]
+    assert min(rows) > 20
+
+
 def test_neither_workers_nor_the_order_of_rows_change_a_bit(
     store: TileStore, scene: Path, tmp_path: Path
 ) -> None:

@@ -24,6 +24,7 @@ from g2ard.stages.simplify import SimplifyConfig, schedule, simplify
 from g2ard.stages.simplify.pairs import fit_opacities
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.task import Arrays, load
+from g2ard.visibility import spread
 
 __all__ = [
     "COARSE",
@@ -115,7 +116,7 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     sums = _core.VisibilityAccumulator(_with_surroundings(core, arguments, inputs, places).core)
     apart = max(1, math.ceil(len(here) / _ROUND))
     light, used, seen = np.asarray(arguments["light"]), [], 0
-    for first in _spread(apart):
+    for first in spread(apart):
         some = range(first, len(here), apart)
         sums.add([view_of(here, i, settings) for i in some], settings, None)
         used += list(some)
@@ -319,7 +320,7 @@ def cropped(
         low = np.clip(np.floor([u.min(), v.min()]) - beside, 0, size - 1)
         high = np.clip(np.ceil([u.max(), v.max()]) + beside, low + 1, size)
         boxes.append((*low, *high))
-    left, top, right, bottom = np.array(boxes, np.int64).T
+    left, top, right, bottom = np.array(boxes, np.int64).reshape(-1, 4).T
     Ks = cameras.Ks.copy()
     Ks[:, 0, 2] -= left
     Ks[:, 1, 2] -= top
@@ -331,12 +332,6 @@ def _widened(scene: Splats, times: int) -> Splats:
     longer = np.arange(3) != np.argmin(scene.scales, axis=1)[:, None]
     factor = np.where(longer, np.float32(math.sqrt(times)), np.float32(1))
     return replace(scene, scales=scene.scales * factor)
-
-
-def _spread(count: int) -> list[int]:
-    from g2ard.visibility import _spread as spread
-
-    return spread(count)
 
 
 def _arrays(scene: Splats, name: str) -> Arrays:
