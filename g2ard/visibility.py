@@ -92,7 +92,7 @@ def visibility_source(
     """A function that finds what a few small renders see of a scene, as `simplify` takes it.
 
     It renders sixteen views at a time until the next sixteen find under 1 % more of the Gaussians: an object
-    of half a million takes 32 views, a small one 80, a room all (`docs/decisions.md`). The first scene
+    of half a million takes 32 views, a small one 80, a room all (decision 0007). The first scene
     decides how many; for the later ones the views stay the same, so that the sums compare. The result
     depends on the scene's content alone, not on the order of its rows.
 

@@ -147,12 +147,12 @@ def prepare(
     if lifted or options.photos:
         _all_pictured(pictured, (*train.names, *views.test.names), lifted)
     use_photos = lifted or (any(pictured) if options.photos is None else options.photos)
-    needs_teacher = not (lifted or options.photos or (use_photos and all(pictured)))
+    needs_teacher = not (use_photos and all(pictured))
     kind = "paper-lift" if lifted and options.preset == "paper" else options.preset
     photographed = train if use_photos else None
     regularizers, why, measured = preset_for(kind, prior, photographed, paper=chosen["schedule"] == "paper")
     counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
-    shown = len(train) if not needs_teacher else sum(pictured[: len(train)]) if use_photos else 0
+    shown = sum(pictured[: len(train)]) if use_photos else 0
     against = kinds_told(shown, len(train) - shown)
     say(f"{len(prior):,} → {counts}; {plural(len(train), 'view')} against {against}")
     say(f"regularisers: {why}")

@@ -98,11 +98,21 @@ def _masks(scene: Splats, own: int, cameras: Cameras) -> list[NDArray[np.bool_]]
 
 
 def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
-    """A tile's Gaussians after recovery, and squared errors in held-out views before it and after."""
+    """A tile's Gaussians after recovery; (2, 2) squared error in held-out views and the number of values,
+    before it and after.
+
+    Args:
+        arguments: the tile, its `levels`, the `mean` of the fit, `steps`, recovery's `config`; which views of
+            `train`, `test` and `apart` have it in sight.
+        inputs: `coarse` of all tiles; `merged` and `again` of this one, and of those `beside` it; the cameras
+            of `train`, `test` and `apart`.
+        places: `store`.
+    """
     from g2ard.stages.recover import recover
 
     store = TileStore.open(places["store"])
     core, far = tile_of(arguments, places), far_around(store, arguments, inputs)
+    # The tile's own Gaussians first, in teacher and student: masks and `frozen` count on it.
     teacher = joined([part for part in (core, store.read_halo(arguments["tile"]), *far) if len(part)])
     files = {"merged": inputs["merged"], "again": inputs["again"]}
     small = small_scene(files, arguments["mean"])
@@ -123,8 +133,9 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
         return found if len(found.cameras) else None
 
     train, held_out, apart = targets("train"), targets("test"), targets("apart")
+    before = _errors(student, held_out, background)
     if train is None or not arguments["steps"]:
-        return {**_arrays(small), "errors": np.zeros((2, 2)), "steps": np.array(0)}
+        return {**_arrays(small), "errors": np.array([before, before]), "steps": np.array(0)}
     done = recover(
         student,
         train,
@@ -134,9 +145,8 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
         frozen=frozen,
     )
     result = done.splats.take(slice(len(small)))
-    whole = joined([result, student.take(frozen)])
-    errors = [_errors(scene, held_out, background) for scene in (student, whole)]
-    return {**_arrays(result), "errors": np.array(errors), "steps": np.array(done.report.steps)}
+    after = _errors(joined([result, student.take(frozen)]), held_out, background)
+    return {**_arrays(result), "errors": np.array([before, after]), "steps": np.array(done.report.steps)}
 
 
 def _errors(

@@ -107,30 +107,32 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     The views that have it in sight look sixteen at a time until the next sixteen find few Gaussians that were
     not seen before; their sums are raised to stand for all that have it in sight.
     """
-    core = tile_of(arguments, places, sh=False)
-    cameras = cameras_of(inputs["views"]).recentred(core.offset)
+    own = tile_of(arguments, places, sh=False)
+    cameras = cameras_of(inputs["views"]).recentred(own.offset)
     here = cameras.take(arguments["views"])
-    distance = np.median(np.linalg.norm(here.positions - core.core.origin, axis=1)) if len(here) else 0.0
+    distance = np.median(np.linalg.norm(here.positions - own.core.origin, axis=1)) if len(here) else 0.0
     settings = RasterSettings(near=_NEAR * float(distance) or None)
-    here = cropped(here, core, settings)
-    sums = _core.VisibilityAccumulator(_with_surroundings(core, arguments, inputs, places).core)
-    apart = max(1, math.ceil(len(here) / _ROUND))
+    here = cropped(here, own, settings)
+    sums = _core.VisibilityAccumulator(_with_surroundings(own, arguments, inputs, places).core)
+    stride = max(1, math.ceil(len(here) / _ROUND))
     light, used, seen = np.asarray(arguments["light"]), [], 0
-    for first in spread(apart):
-        some = range(first, len(here), apart)
+    for first in spread(stride):
+        some = range(first, len(here), stride)
         sums.add([view_of(here, i, settings) for i in some], settings, None)
         used += list(some)
-        before, seen = seen, int(np.count_nonzero(sums.by_row()[0][: len(core)]))
-        if len(used) > _ROUND and seen - before < _CONVERGED * len(core):
+        before, seen = seen, int(np.count_nonzero(sums.by_row()[0][: len(own)]))
+        if len(used) > _ROUND and seen - before < _CONVERGED * len(own):
             break
     share = light[used].sum() / arguments["all_light"] if used else 1.0
-    weight, pixel_size = (values[: len(core)] for values in sums.by_row())
+    weight, pixel_size = (values[: len(own)] for values in sums.by_row())
     weight = weight / np.float32(share or 1.0)
     pixel_size = pixel_size * np.float32(arguments["shrunk"])  # of a full image
     finite = pixel_size[np.isfinite(pixel_size) & (pixel_size > 0)]
     pixel = float(np.partition(finite, len(finite) // 2)[len(finite) // 2]) if len(finite) else math.nan
-    frame = _core.TileFrame(*arguments["frame"]).with_views(pixel if finite.size else 1.0, 1.0, 1.0)
-    tile = _merging(core, _config(arguments), frame, weight, pixel_size)
+    frame = _core.TileFrame(*arguments["frame"]).with_views(
+        pixel if finite.size else 1.0, 1.0, 1.0
+    )  # sums read no floor
+    tile = _merging(own, _config(arguments), frame, weight, pixel_size)
     return {
         "weight": weight,
         "pixel_size": pixel_size,

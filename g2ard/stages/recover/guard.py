@@ -131,7 +131,7 @@ class Guard:
 
     def judge(self, result: Splats) -> tuple[Splats, float, float]:
         """The best of three: the result; the best scene looked at before it; and where both are worse than
-        the start, the first blend of start and result that is not, or the start.
+        the start, the first blend of start and result that is better than it, or the start.
 
         Returns:
             The scene, its score, and the weight of where steps ended in it: 1, also for an earlier best

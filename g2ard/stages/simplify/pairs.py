@@ -29,7 +29,13 @@ __all__ = [
 
 _FIT = 1 / 4
 """Exponent of the ratio of what views saw to what they see: ½ fits the views looked from by up to 0.1 dB
-better, and others by up to 0.7 dB worse (`docs/decisions.md`)."""
+better, and others by up to 0.7 dB worse (decision 0009)."""
+
+_RATIO = (0.5, 2.0)
+"""What that ratio is cut to."""
+
+_FLOOR = 0.05
+"""Share of the mean that is added to both: what is hardly seen stays as it is."""
 
 MAX_OPACITY = 0.99
 """α never exceeds it: renderers clip there."""
@@ -143,8 +149,8 @@ def fit_opacities(
         now: (M,) Σ αT of the M.
         mean: of `wanted`; over all tiles, where these are one's.
     """
-    floor = 0.05 * mean
-    factor = np.clip((wanted + floor) / np.maximum(now + floor, np.finfo(float).tiny), 0.5, 2.0) ** _FIT
+    floor = _FLOOR * mean
+    factor = np.clip((wanted + floor) / np.maximum(now + floor, np.finfo(float).tiny), *_RATIO) ** _FIT
     alone = (members < 2) | ~np.isfinite(factor)
     alpha = scene.opacities.astype(np.float64)
     held = np.minimum(alpha * factor, np.maximum(alpha, MAX_OPACITY))

@@ -109,6 +109,7 @@ impl Tile<'_> {
             let costs = merge_costs(&leaves.codes(), &leaves, self.geometric());
             let parts = cut(&costs, runs);
             let merged = leaves.merged(&parts);
+            // Runs in Morton order anew, and each kept row's run there.
             let every: Vec<u32> = (0..runs as u32).collect();
             let (from, map, _) = merged.morton(&every, [0.0; 3]);
             let of = parts.of.iter().map(|&run| map[run as usize]);
@@ -134,10 +135,10 @@ impl Tile<'_> {
                     b: names[p.b as usize],
                     cost: p.cost,
                 }));
-                let kept: Vec<bool> = left(before, &pairs);
+                let survives = left(before, &pairs);
                 let map = merge(&mut nodes, &pairs);
                 let mut next = vec![0; nodes.len()];
-                for i in (0..before).filter(|&i| kept[i]) {
+                for i in (0..before).filter(|&i| survives[i]) {
                     next[map[i] as usize] = names[i];
                 }
                 names = next;
