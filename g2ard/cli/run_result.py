@@ -48,7 +48,11 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
             *["PSNR near", "SSIM near"][: 2 * (len(kinds) - 1)],
         ],
         [
-            row("dense", report["input_count"], size["input"]),
+            row(
+                "start" if run.config.get("scene", "") is None else "dense",
+                report["input_count"],
+                size["input"],
+            ),
             row("simplified", report["output_count"], size["output"]),
             row("recovered", report["output_count"], size["output"]),
         ],
@@ -83,7 +87,7 @@ def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
             found.append(
                 f"{lost} of {len(report[kind]['recovered']['views'])} {what} lost, though all together gained"
             )
-    if report["unseen"] and report["unseen"] >= _FEW:
+    if report["unseen"] and report["unseen"] > _FEW:
         found.append(f"no view sees {report['unseen']:.0%} of the scene: that is simplified, not recovered")
     return found
 
