@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from scenes import around, checkered_ball
 
@@ -68,3 +71,45 @@ def test_a_budget_is_one_number(name: str, value: object) -> None:
     words = f"{name}: expected a number, got 'high'" if value == "high" else f"{name}: one a call, got "
     with pytest.raises(InputError, match=f"^{words}"):
         g2ard.distill(BALL, **{name: value})  # type: ignore[arg-type]
+
+
+def test_views_of_another_world_are_told(command_line: CommandLine, folder: Path) -> None:
+    cameras = around(16, (48, 36))
+    far = np.where(np.arange(16)[:, None] < 10, [[1e3, 0, 0]], 0)
+    for count, name in ((10, "some.json"), (16, "none.json")):
+        viewmats = cameras.viewmats.copy()
+        viewmats[:count, :3, 3] += 1e3 if count == 16 else far[:count]
+        write_views(folder / name, replace(cameras, viewmats=viewmats))
+    for ask in (("distill", "-n", 9, "-o", "run", "--dry-run"), ("evaluate", "--teacher", "ball.ply")):
+        split = ("--split", "all") if ask[0] == "evaluate" else ()
+        for name, status, words in (
+            ("some.json", 0, "views have anything of the scene in sight"),
+            ("none.json", int(not split), "0 of 16 views" if split else "the scene must be of one world"),
+            ("views.json", 0, ""),
+        ):
+            call = (ask[0], "ball.ply", *ask[1:], "--views", name, "--size", 32, *split)
+            found, _, error = command_line(*call, cwd=folder)
+            assert (found, words in error) == (status, True), error
+            assert ("of one world" in error or "in sight" in error) == bool(words)
+
+
+def test_a_letter_in_a_config_is_told_its_long_name(command_line: CommandLine, folder: Path) -> None:
+    for text in ("n = 9", "[distill]\nn = 9", "[distill]\nn = 9\n[poses]\ncount = 4"):
+        (folder / "c.toml").write_text(text)
+        status, _, error = command_line("distill", "ball.ply", "--config", "c.toml", "-o", "r", cwd=folder)
+        assert (status, "no option of `distill` is called n (write count)" in error) == (2, True), error
+
+
+@pytest.mark.parametrize("inputs", [("distill", "ball.ply"), ("info", "ball.ply", "views.json")])
+def test_a_printed_config_has_the_inputs(
+    inputs: tuple[str, ...], command_line: CommandLine, folder: Path
+) -> None:
+    command, *paths = inputs
+    options = ("-r", 5, "-o", "run") if command == "distill" else ()
+    status, out, error = command_line(command, *paths, *options, "--print-config", cwd=folder)
+    assert status == 0, error
+    table = tomllib.loads(out)[command]
+    assert table.get("scene", table.get("paths")) == (paths[0] if command == "distill" else paths)
+    (folder / "c.toml").write_text(out)
+    again = command_line(command, "--config", "c.toml", "--print-config", cwd=folder)
+    assert again == (0, out, "")

@@ -32,6 +32,7 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
             figures += [f"{score['psnr']:.2f}", f"{score['ssim']:.4f}"] if score else ["–", "–"]
         return [name, f"{count:,}", f"{size / 1e6:.2f}", f"{size / count:.0f}", *figures]
 
+    given = "start" if run.config.get("scene", "") is None else "dense"  # of photos alone there is no scene
     size = report["bytes"]
     times = ", ".join(f"{name} {value:.1f} s" for name, value in report["seconds"].items())
     counts = [len(scores["recovered"]["views"]) for scores in kinds]
@@ -48,11 +49,7 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
             *["PSNR near", "SSIM near"][: 2 * (len(kinds) - 1)],
         ],
         [
-            row(
-                "start" if run.config.get("scene", "") is None else "dense",
-                report["input_count"],
-                size["input"],
-            ),
+            row(given, report["input_count"], size["input"]),
             row("simplified", report["output_count"], size["output"]),
             row("recovered", report["output_count"], size["output"]),
         ],

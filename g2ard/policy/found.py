@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.splats import Splats
 
-__all__ = ["as_pool", "found_views"]
+__all__ = ["as_pool", "check_sight", "found_views", "warn_of_sight"]
 
 _SIDE = 800
 """Pixels of the longer side, as a pool has."""
@@ -59,6 +59,30 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
     cameras = plural(count, "camera")
     say(f"views: {cameras} of {path} (found beside the scene; --views made for a pool of its own)")
     return path
+
+
+def warn_of_sight(splats: Splats, cameras: Cameras, say: Say) -> None:
+    """Say in one line that fewer than half of the views given for a scene have anything of it in sight."""
+    count, seeing = len(cameras), int(cameras.facing(_opaque(splats)).sum())
+    if seeing < _SEEING * count:
+        say(
+            f"warning: {seeing} of {plural(count, 'view')} have anything of the scene in sight: both may not "
+            "be of one world (`g2ard info` shows the extent of each)"
+        )
+
+
+def check_sight(splats: Splats, cameras: Cameras, say: Say = unsaid) -> None:
+    """Refuse views of which none holds the middle of any Gaussian; else as `warn_of_sight`.
+
+    Raises:
+        InputError: with what to look at.
+    """
+    from g2ard.cameras import unseeing
+    from g2ard.errors import InputError
+
+    if not cameras.facing(splats.means + splats.offset).any():
+        raise InputError(unseeing(cameras, "the scene"))
+    warn_of_sight(splats, cameras, say)
 
 
 def as_pool(cameras: Cameras) -> Cameras:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g2ard.policy.found import as_pool, found_views
+from g2ard.policy.found import as_pool, check_sight, found_views
 from g2ard.policy.inputs import drop_held_out, load_for_training, load_held_out, load_view_sets, load_views
 from g2ard.progress import Progress, Say, silent, unsaid
 
@@ -112,6 +112,8 @@ def views_of(
             train = load_for_training(views, size, say, unpictured=teach)
             test = load_held_out(held_out, size, say, unpictured=teach)
             train = drop_held_out(train, test.cameras, say)
+        if not found:
+            check_sight(prior, train.cameras, say)
         if found and not size:
             train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
         apart = _near(prior, size, up, seed, progress, represents) if teach else None

@@ -58,6 +58,7 @@ def evaluate(
     from g2ard.errors import InputError
     from g2ard.io.describe import bytes_of
     from g2ard.lpips import load_lpips
+    from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import load_scene, load_views, make_targets
     from g2ard.stages.evaluate import evaluate as score
     from g2ard.stages.recover.anchors import Anchors, drift95, needle
@@ -80,6 +81,7 @@ def evaluate(
     rows: list[dict[str, Any]] = []
     for path in scenes:
         splats = load_scene(path, run.say)
+        warn_of_sight(splats, cameras, run.say)
         scored = score(
             splats,
             targets,
