@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scenes import around, checkered_ball
 
 import g2ard
@@ -55,6 +57,11 @@ def folder(tmp_path: Path) -> Path:
             2,
             "--teacher is missing: views that are made have no photos",
         ),
+        (
+            ("simplify", "ball.ply", "-ratio", 5, "-o", "o.ply"),
+            2,
+            "-ratio: long options have two dashes: ",
+        ),
     ],
 )
 def test_what_is_missing_is_named_before_any_work(
@@ -83,14 +90,14 @@ def test_views_of_another_world_are_told(command_line: CommandLine, folder: Path
     for ask in (("distill", "-n", 9, "-o", "run", "--dry-run"), ("evaluate", "--teacher", "ball.ply")):
         split = ("--split", "all") if ask[0] == "evaluate" else ()
         for name, status, words in (
-            ("some.json", 0, "views have anything of the scene in sight"),
-            ("none.json", int(not split), "0 of 16 views" if split else "the scene must be of one world"),
+            ("some.json", 0, "views have nothing of the scene in sight"),
+            ("none.json", int(not split), "16 of 16 views" if split else "the scene must be of one world"),
             ("views.json", 0, ""),
         ):
             call = (ask[0], "ball.ply", *ask[1:], "--views", name, "--size", 32, *split)
             found, _, error = command_line(*call, cwd=folder)
             assert (found, words in error) == (status, True), error
-            assert ("of one world" in error or "in sight" in error) == bool(words)
+            assert ("of one world" in error or "warning" in error) == bool(words)
 
 
 def test_a_letter_in_a_config_is_told_its_long_name(command_line: CommandLine, folder: Path) -> None:
@@ -113,3 +120,35 @@ def test_a_printed_config_has_the_inputs(
     (folder / "c.toml").write_text(out)
     again = command_line(command, "--config", "c.toml", "--print-config", cwd=folder)
     assert again == (0, out, "")
+
+
+def test_photos_below_their_poses_are_told_of_them(folder: Path) -> None:
+    (folder / "scan" / "shots").mkdir(parents=True)
+    Image.new("RGB", (8, 8)).save(folder / "scan" / "shots" / "a.png")
+    shots = folder / "scan" / "shots"
+    with pytest.raises(InputError, match="COLMAP finds them"):
+        g2ard.load_views(shots)
+    (folder / "scan" / "transforms.json").write_text("{}")
+    with pytest.raises(InputError, match=r"their poses lie in .*scan/transforms\.json: give that$"):
+        g2ard.load_views(shots)
+    (folder / "scan" / "transforms.json").unlink()
+    (folder / "scan" / "sparse" / "0").mkdir(parents=True)
+    for name in ("cameras.bin", "images.bin"):
+        (folder / "scan" / "sparse" / "0" / name).touch()
+    with pytest.raises(InputError, match=r"their poses lie in .*scan: give that$"):
+        g2ard.load_views(shots)
+
+
+def test_info_goes_on_after_what_it_cannot_read(command_line: CommandLine, folder: Path) -> None:
+    (folder / "text.ply").write_text("hello")
+    ask = ("info", "ball.ply", "gone.ply", "text.ply", "views.json")
+    status, out, error = command_line(*ask, cwd=folder)
+    assert (status, error.count("\n")) == (1, 2), error
+    assert "gone.ply: no such file" in error
+    assert "give the file the suffix of what it is" in error
+    assert "ball.ply" in out
+    assert "views.json" in out
+    status, out, _ = command_line(*ask, "--json", "-", cwd=folder)
+    told = json.loads(out)
+    assert (status, told["failed"]) == (1, ["gone.ply", "text.ply"])
+    assert [figures["kind"] for figures in told["files"]] == ["splats", "views"]

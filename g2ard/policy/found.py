@@ -23,6 +23,8 @@ _SIDE = 800
 _SAMPLE = 4096
 _SEEING = 0.5
 """Share of the cameras that must see something of the scene, or they are another's."""
+_BLIND = 0.1
+"""Share of views given for a scene that may see nothing of it untold."""
 
 
 def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: Say = unsaid) -> Path | None:
@@ -62,12 +64,12 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
 
 
 def warn_of_sight(splats: Splats, cameras: Cameras, say: Say) -> None:
-    """Say in one line that fewer than half of the views given for a scene have anything of it in sight."""
-    count, seeing = len(cameras), int(cameras.facing(_opaque(splats)).sum())
-    if seeing < _SEEING * count:
+    """Say in one line that more than a tenth of the views given for a scene have nothing of it in sight."""
+    blind = int((~cameras.facing(_opaque(splats))).sum())
+    if blind > _BLIND * len(cameras):
         say(
-            f"warning: {seeing} of {plural(count, 'view')} have anything of the scene in sight: both may not "
-            "be of one world (`g2ard info` shows the extent of each)"
+            f"warning: {blind} of {plural(len(cameras), 'view')} have nothing of the scene in sight: are "
+            "both of one world? (`g2ard info` shows the extent of each)"
         )
 
 

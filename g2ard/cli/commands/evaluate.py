@@ -96,9 +96,7 @@ def evaluate(
         row["file_bytes"] = bytes_of(path)
         if frozen is not None:
             if len(frozen) != len(splats):
-                raise InputError(
-                    f"{anchors}: not the Gaussians of {path} before recovery: their counts differ"
-                )
+                raise InputError(f"{anchors}: not {path} before recovery: their counts differ")
             row["drift95"] = drift95(Anchors.of(frozen), splats.means)
         rows.append(row)
     against = _against(rows[0]["views"])
