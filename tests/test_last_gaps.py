@@ -7,6 +7,8 @@ import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
@@ -14,8 +16,12 @@ from PIL import Image
 from scenes import around, checkered_ball
 
 import g2ard
+from g2ard.cli.run_result import told, write_table
 from g2ard.errors import InputError
 from g2ard.io import write_views
+
+if TYPE_CHECKING:
+    from g2ard.cli.frame import Run
 
 CommandLine = Callable[..., tuple[int, str, str]]
 BALL = checkered_ball(400)
@@ -149,6 +155,30 @@ def test_info_goes_on_after_what_it_cannot_read(command_line: CommandLine, folde
     assert "ball.ply" in out
     assert "views.json" in out
     status, out, _ = command_line(*ask, "--json", "-", cwd=folder)
-    told = json.loads(out)
-    assert (status, told["failed"]) == (1, ["gone.ply", "text.ply"])
-    assert [figures["kind"] for figures in told["files"]] == ["splats", "views"]
+    result = json.loads(out)
+    assert (status, result["failed"]) == (1, ["gone.ply", "text.ply"])
+    assert [figures["kind"] for figures in result["files"]] == ["splats", "views"]
+
+
+def test_the_table_has_a_start_where_there_are_photos_alone() -> None:
+    rows: list[list[str]] = []
+    report: dict[str, Any] = {
+        "scores": {"recovered": {"views": [], "psnr": 30.0, "ssim": 0.9}},
+        "apart": None,
+        "bytes": {"input": 9, "output": 9},
+        "seconds": {},
+        "input_count": 9,
+        "output_count": 9,
+        "against": "photos",
+    }
+    console = SimpleNamespace(table=lambda title, head, found: rows.extend(found))
+    for scene in (None, Path("a.ply")):
+        write_table(cast("Run", SimpleNamespace(config={"scene": scene}, console=console)), report)
+    others = ["simplified", "recovered"]
+    assert [row[0] for row in rows] == ["start", *others, "dense", *others]
+
+
+@pytest.mark.parametrize(("unseen", "lines"), [(0.004, 0), (0.005, 0), (0.02, 1)])
+def test_what_no_view_sees_is_told_if_it_is_not_nothing(unseen: float, lines: int) -> None:
+    found = told({"rounds": [], "scores": None, "apart": None, "unseen": unseen})
+    assert (len(found), any("0%" in line for line in found)) == (lines, False)
