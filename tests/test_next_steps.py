@@ -199,7 +199,7 @@ def test_render_tells_what_its_count_is(command_line: CommandLine, folder: Path)
     shown = " ".join(command_line("render", "--help", cwd=folder)[1].replace("│", " ").split())
     assert "How many views to make of the scene; with --color flags, cells or parents the budget" in shown
     ask = ("render", "ball.ply", "-n", 2, "--views", "views.json", "-o", "out")
-    assert "a number of views to make, where none are given" in refused(command_line, folder, *ask)
+    assert "leave -n out" in refused(command_line, folder, *ask)
 
 
 def test_a_folder_that_is_nothing_says_what_in_it_would_do(command_line: CommandLine, folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +31,11 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     table = {_dashed(key).replace("-", "_"): value for key, value in table.items()}
     unknown = {_dashed(key) for key in table if key not in params or len(key) == 1}
     if unknown:
-        near = meant(unknown, _options(ctx.command))
+        near = _meant(unknown, ctx.command)
         raise typer.BadParameter(f"{path}: no option of `{ctx.info_name}` is called {near}")
     found: dict[str, Any] = {}
     for key, value in table.items():
-        many = getattr(params[key], "multiple", False)
+        many = getattr(params[key], "multiple", False) or params[key].nargs == -1
         found[str(params[key].name)] = _several(value) if many else _as_typed(value)
     if constants:
         found["set"] = [f"{name}={_as_typed(value)}" for name, value in constants.items()]
@@ -106,6 +107,15 @@ def _options(command: Any) -> set[str]:
     return {_dashed(flag.lstrip("-")) for p in command.params for flag in (*p.opts, str(p.name))}
 
 
+def _meant(keys: Iterable[str], command: Any) -> str:
+    """Keys that are none, each with the long names near to it: of a letter, that of the flag."""
+    flags = ((flag, max(p.opts, key=len)) for p in command.params for flag in p.opts)
+    long = {flag[1:]: name.lstrip("-") for flag, name in flags if len(flag) == 2}
+    known = {name for name in _options(command) if len(name) > 1}
+    told = [f"{key} (write {long[key]})" if key in long else meant([key], known) for key in sorted(keys)]
+    return ", ".join(told)
+
+
 def _dashed(key: str) -> str:
     """A key as the flag of that name has it today."""
     return present_name(key.replace("_", "-"))
@@ -134,18 +144,19 @@ def _several(value: Any) -> list[str]:
 
 
 def printed(ctx: typer.Context, values: dict[str, Any]) -> str:
-    """The options of a call, defaults included, as `load_config` reads them; what is None is left out."""
+    """A call's inputs and options, defaults included, as `load_config` reads them; None is left out."""
     lines = [f"[{ctx.info_name}]"]
     constants: list[str] = []
     for parameter in ctx.command.params:
         name, value = str(parameter.name), values.get(str(parameter.name))
-        if name in _NOT_KEPT or parameter.param_type_name == "argument" or value in (None, [], ()):
+        if name in _NOT_KEPT or value in (None, [], ()):
             continue
         if name == "set":
             constants = list(value)
             continue
+        many = parameter.nargs == -1
         flag = max((opt for opt in parameter.opts if opt.startswith("--")), key=len, default=f"--{name}")
-        lines.append(f"{flag[2:]} = {_toml(_plain(value))}")
+        lines.append(f"{flag[2:]} = {_toml([str(item) for item in value] if many else _plain(value))}")
     if constants:
         lines.append(f"[{ctx.info_name}.set]")
         pairs = (text.partition("=") for text in constants)

@@ -25,7 +25,7 @@ from g2ard.cli.usage import in_flags, present_name, typed
 from g2ard.errors import G2ardError
 from g2ard.progress import plural
 
-__all__ = ["Run", "app", "command", "group"]
+__all__ = ["Run", "app", "command", "group", "one_line"]
 
 app = typer.Typer(
     help="Distil a dense 3D Gaussian scene into a compact, standard 3DGS model at an exact budget.",
@@ -327,7 +327,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
         run.console.error(f"interrupted; {'; '.join(run.kept) or 'nothing was written'}")
         raise typer.Exit(interrupt.STATUS) from None
     except (G2ardError, OSError, MemoryError) as e:
-        run.console.error(_one_line(e))
+        run.console.error(one_line(e))
         raise typer.Exit(1) from None
     except (typer.Exit, typer.BadParameter):
         raise
@@ -362,7 +362,8 @@ def _device(run: Run) -> Iterator[None]:
             run.say(f"GPU: {plural(state.served, 'kernel')} on {state.adapter}{took}")
 
 
-def _one_line(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
+    """An error in the words of the command line."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, MemoryError):

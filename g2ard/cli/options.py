@@ -284,7 +284,9 @@ def trained_on(split: str) -> str:
 
 def can_be_made(views: Path | None, teacher: Path | None) -> None:
     """Usage check: where no views are given, a teacher is there to be looked at."""
-    if teacher is None and (views is None or is_made(views)):
+    if teacher is None and is_made(views):
+        raise typer.BadParameter("--teacher is missing: views that are made have no photos; name a scene")
+    if teacher is None and views is None:
         raise typer.BadParameter("give --views, or a --teacher to make views of")
 
 

@@ -32,6 +32,7 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
             figures += [f"{score['psnr']:.2f}", f"{score['ssim']:.4f}"] if score else ["–", "–"]
         return [name, f"{count:,}", f"{size / 1e6:.2f}", f"{size / count:.0f}", *figures]
 
+    given = "start" if run.config.get("scene", "") is None else "dense"  # of photos alone there is no scene
     size = report["bytes"]
     times = ", ".join(f"{name} {value:.1f} s" for name, value in report["seconds"].items())
     counts = [len(scores["recovered"]["views"]) for scores in kinds]
@@ -48,7 +49,7 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
             *["PSNR near", "SSIM near"][: 2 * (len(kinds) - 1)],
         ],
         [
-            row("dense", report["input_count"], size["input"]),
+            row(given, report["input_count"], size["input"]),
             row("simplified", report["output_count"], size["output"]),
             row("recovered", report["output_count"], size["output"]),
         ],
@@ -83,7 +84,7 @@ def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
             found.append(
                 f"{lost} of {len(report[kind]['recovered']['views'])} {what} lost, though all together gained"
             )
-    if report["unseen"] and report["unseen"] >= _FEW:
+    if report["unseen"] and report["unseen"] > _FEW:
         found.append(f"no view sees {report['unseen']:.0%} of the scene: that is simplified, not recovered")
     return found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Iterable
 from typing import Any
 
@@ -17,6 +18,10 @@ _FLAGS = {
     "engine 'fused' needs none": "--device cpu needs none",
     "count, ratio:": "-n, -r:",
     "to take a ratio of: give a count": "to take a ratio of: give a count, -n COUNT",
+    "that fit could be measured on: give a count": "that --fit could be measured on: give -n COUNT",
+    "that min_psnr could be measured on: give a count": "that --min-psnr could be measured on: give -n COUNT",
+    "that min_ssim could be measured on: give a count": "that --min-ssim could be measured on: give -n COUNT",
+    "photos=True: a pool": "--photos: a pool",
     "its photos are needed as views": "give its photos with --views",
     "TeacherRenders of a scene can stand in": "--teacher SCENE stands in with its renders",
     "views that hold them, or focal=PIXELS": "--intrinsics VIEWS or --focal PIXELS",
@@ -76,6 +81,8 @@ def usage_line(error: typer.TyperException) -> str:
     """Typer's message for a usage error; where it quotes the library that checks values, ours."""
     refused = getattr(error.__cause__, "errors", None)
     parameter: Any = getattr(error, "param", None)
+    if (long := _of_one_dash(error)) is not None:
+        return f"{long[1:]}: long options have two dashes: {long}"
     if isinstance(error, typer.BadParameter) and parameter is None:  # a check of several options at once
         return error.message
     if refused is None or parameter is None:
@@ -83,6 +90,14 @@ def usage_line(error: typer.TyperException) -> str:
     given = refused()[0]["input"]
     source = _config_of(error, parameter.name)
     return f"Invalid value for {parameter.get_error_hint()}: {_allowed(parameter)}, not {given!r}{source}"
+
+
+def _of_one_dash(error: typer.TyperException) -> str | None:
+    """The long option that stands on the command line with one dash, which reads as several letters."""
+    command: Any = getattr(getattr(error, "ctx", None), "command", None)
+    long = {flag for parameter in getattr(command, "params", ()) for flag in parameter.opts}
+    words = (f"-{word.partition('=')[0]}" for word in sys.argv[1:] if len(word) > 2)
+    return next((word for word in words if re.match(r"--\w", word) and word in long), None)
 
 
 def typed(ctx: typer.Context, name: str) -> bool:

@@ -156,6 +156,8 @@ def _instead(path: Path) -> str:
         (p for p in (path, path / "images") if p.is_dir() and any(map(is_photo, p.iterdir()))), None
     )
     if photos is not None:
+        if (poses := _poses_above(path)) is not None:
+            return f": photos; their poses lie in {poses}: give that"
         return (
             ": photos, without their poses; COLMAP finds them: colmap automatic_reconstructor "
             f"--workspace_path project --image_path {photos}, then give project"
@@ -164,6 +166,16 @@ def _instead(path: Path) -> str:
         " (looked for SOG's meta.json, a COLMAP sparse/0, transforms.json, cameras.json, nerfstudio's and "
         "gsplat's runs, Cambridge's dataset_train.txt)"
     )
+
+
+def _poses_above(path: Path) -> Path | None:
+    """The transforms.json, or the folder of a COLMAP model, beside a folder of photos."""
+    from g2ard.io.colmap import model_folder
+    from g2ard.io.transforms import files_of
+
+    above = path.parent
+    files = files_of(above)
+    return (next(iter(files)) if len(files) == 1 else above) if files or model_folder(above) else None
 
 
 def _ply_format(path: Path) -> Format:

@@ -47,7 +47,10 @@ def read_header(path: Path) -> PlyHeader:
     if not head:
         raise InputError(f"{path}: the file is empty")
     if head[:3] != b"ply" or head[3:4] not in b"\r\n":
-        raise InputError(f"{path}: not a PLY file (begins with {head[:8]!r}, expected 'ply')")
+        raise InputError(
+            f"{path}: not a PLY file (begins with {head[:8]!r}, expected 'ply'); export the scene as .ply "
+            "again, or give the file the suffix of what it is"
+        )
     end = _END.search(head)  # a line of its own: comments may hold the word
     if end is None:
         raise InputError(f"{path}: broken PLY: its header has no end_header line")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from numbers import Real
 
 from g2ard.errors import InputError
 from g2ard.progress import plural
@@ -33,7 +34,7 @@ class Budget:
         min_ssim: about the fewest that keep this SSIM; beside `min_psnr` both hold.
 
     Raises:
-        InputError: not exactly one kind of them, or one out of its range.
+        InputError: not exactly one kind of them, several of a kind, or one out of its range.
 
     >>> Budget(ratio=3).of(1000), Budget(count=10).of(1000), Budget(share=0.25).of(10)
     (333, 10, 3)
@@ -49,6 +50,11 @@ class Budget:
     min_ssim: float | None = None
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, list | tuple):
+                raise InputError(f"{name}: one a call, got {value!r}; several take a call each, in a loop")
+            if name != "fit" and value is not None and not isinstance(value, Real):
+                raise InputError(f"{name}: expected a number, got {value!r}")
         quality = self.min_psnr if self.min_ssim is None else self.min_ssim
         if (self.count, self.ratio, self.share, self.fit, quality).count(None) != 4:
             raise InputError("count, ratio, fit, min_psnr or min_ssim: expected exactly one kind of budget")
@@ -66,6 +72,11 @@ class Budget:
             raise InputError(
                 f"fit: expected bytes such as 5MB or 800kB, or {', '.join(DEVICES)}, got {self.fit!r}"
             )
+
+    @property
+    def kind(self) -> str:
+        """The first of the names above that is given."""
+        return next(name for name, value in vars(self).items() if value is not None)
 
     @property
     def bytes(self) -> int | None:

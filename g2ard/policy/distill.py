@@ -218,6 +218,7 @@ def _points(budgets: Sequence[Budget], options: DistillOptions, progress: Progre
         options.views,
         options.held_out,
         wanted,
+        asked=budgets[0].kind,
         background=options.background,
         seed=options.seed,
         progress=progress,

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.splats import Splats
 
-__all__ = ["as_pool", "found_views"]
+__all__ = ["as_pool", "check_sight", "found_views", "warn_of_sight"]
 
 _SIDE = 800
 """Pixels of the longer side, as a pool has."""
@@ -23,6 +23,8 @@ _SIDE = 800
 _SAMPLE = 4096
 _SEEING = 0.5
 """Share of the cameras that must see something of the scene, or they are another's."""
+_BLIND = 0.1
+"""Share of views given for a scene that may see nothing of it untold."""
 
 
 def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: Say = unsaid) -> Path | None:
@@ -59,6 +61,30 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
     cameras = plural(count, "camera")
     say(f"views: {cameras} of {path} (found beside the scene; --views made for a pool of its own)")
     return path
+
+
+def warn_of_sight(splats: Splats, cameras: Cameras, say: Say) -> None:
+    """Say in one line that more than a tenth of the views given for a scene have nothing of it in sight."""
+    blind = int((~cameras.facing(_opaque(splats))).sum())
+    if blind > _BLIND * len(cameras):
+        say(
+            f"warning: {blind} of {plural(len(cameras), 'view')} have nothing of the scene in sight: are "
+            "both of one world? (`g2ard info` shows the extent of each)"
+        )
+
+
+def check_sight(splats: Splats, cameras: Cameras, say: Say = unsaid) -> None:
+    """Refuse views of which none holds the middle of any Gaussian; else as `warn_of_sight`.
+
+    Raises:
+        InputError: with what to look at.
+    """
+    from g2ard.cameras import unseeing
+    from g2ard.errors import InputError
+
+    if not cameras.facing(splats.means + splats.offset).any():
+        raise InputError(unseeing(cameras, "the scene"))
+    warn_of_sight(splats, cameras, say)
 
 
 def as_pool(cameras: Cameras) -> Cameras:

@@ -46,6 +46,7 @@ def points_of_photos(
     held_out: Views | None,
     count: int | None,
     *,
+    asked: str = "ratio",
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     seed: int = 0,
     progress: Progress = silent,
@@ -58,6 +59,7 @@ def points_of_photos(
         views: cameras with photos, or where they lie; only those for training are looked at.
         held_out: views to score on, if they are given apart: all of `views` are then for training.
         count: points, at least; None where the sparse points decide.
+        asked: the kind of budget, where it is no count: ratio, share, fit, min_psnr or min_ssim.
         background: RGB of pixels that show nothing.
         seed: of the rays.
         progress: told of rays.
@@ -69,7 +71,8 @@ def points_of_photos(
     sparse = None if not isinstance(views, str | Path) else sparse_points(Path(views))
     found = len(sparse) if sparse is not None else 0
     if count is None and sparse is None:
-        raise InputError(f"{views}: no sparse points to take a ratio of: give a count")
+        what = "to take a ratio of" if asked in ("ratio", "share") else f"that {asked} could be measured on"
+        raise InputError(f"{views}: no sparse points {what}: give a count")
     wanting = max(0, (count or 0) - found)
     parts = [] if sparse is None else [sparse]
     if wanting:

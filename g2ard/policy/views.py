@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g2ard.policy.found import as_pool, found_views
+from g2ard.policy.found import as_pool, check_sight, found_views
 from g2ard.policy.inputs import drop_held_out, load_for_training, load_held_out, load_view_sets, load_views
 from g2ard.progress import Progress, Say, silent, unsaid
 
@@ -94,8 +94,10 @@ def views_of(
         say: told what is looked at, and why.
 
     Raises:
-        InputError: a file without views, an empty split, or a scene with no room for poses.
+        InputError: a file without views, an empty split, views that see nothing of the scene, a scene with
+            no room for poses, or a pool where the targets are photos.
     """
+    from g2ard.errors import InputError
     from g2ard.io import ViewSet
     from g2ard.splits import split_mask, splits_of
 
@@ -110,10 +112,14 @@ def views_of(
             train = load_for_training(views, size, say, unpictured=teach)
             test = load_held_out(held_out, size, say, unpictured=teach)
             train = drop_held_out(train, test.cameras, say)
+        if not found:
+            check_sight(prior, train.cameras, say)
         if found and not size:
             train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
         apart = _near(prior, size, up, seed, progress, represents) if teach else None
         return RunViews(train, test.cameras, apart)
+    if not teach:
+        raise InputError("photos=True: a pool of made views has no photos; give views that have them")
     held = None if held_out is None else load_held_out(held_out, size, say, unpictured=teach)
     planned = _planned(prior, _POOL, up, seed, progress, _GROW, represents)
     apart = planned.apart and planned.apart.resized(size)

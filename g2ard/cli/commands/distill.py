@@ -179,6 +179,8 @@ def distill(
         raise typer.BadParameter("give a SCENE, or photos with their poses as --views")
     if photos and is_made(views):
         raise typer.BadParameter("--photos: views that are made have none")
+    if scene is None and photos is False:
+        raise typer.BadParameter("--renders: there is no scene to render; leave it out, or give a SCENE")
     from g2ard.io import kind
     from g2ard.policy.distill import prepare
     from g2ard.policy.distill_options import DistillOptions

@@ -58,6 +58,7 @@ def evaluate(
     from g2ard.errors import InputError
     from g2ard.io.describe import bytes_of
     from g2ard.lpips import load_lpips
+    from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import load_scene, load_views, make_targets
     from g2ard.stages.evaluate import evaluate as score
     from g2ard.stages.recover.anchors import Anchors, drift95, needle
@@ -80,6 +81,7 @@ def evaluate(
     rows: list[dict[str, Any]] = []
     for path in scenes:
         splats = load_scene(path, run.say)
+        warn_of_sight(splats, cameras, run.say)
         scored = score(
             splats,
             targets,
@@ -94,9 +96,7 @@ def evaluate(
         row["file_bytes"] = bytes_of(path)
         if frozen is not None:
             if len(frozen) != len(splats):
-                raise InputError(
-                    f"{anchors}: not the Gaussians of {path} before recovery: their counts differ"
-                )
+                raise InputError(f"{anchors}: not {path} before recovery: their counts differ")
             row["drift95"] = drift95(Anchors.of(frozen), splats.means)
         rows.append(row)
     against = _against(rows[0]["views"])

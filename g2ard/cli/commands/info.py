@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from g2ard.cli.frame import Run, command
+from g2ard.cli.frame import Run, command, one_line
+from g2ard.errors import InputError
 from g2ard.progress import plural
 
 
@@ -25,18 +26,30 @@ def info(
         bool, typer.Option("--devices", help="List the GPUs, and which one --device would use.")
     ] = False,
 ) -> None:
-    """Show what is in a file: counts, extents, SH degree, opacities, scales, odd values."""
+    """Show what is in a file: counts, extents, SH degree, opacities, scales, odd values.
+
+    Of several the others are shown where one cannot be read; the exit status is then 1.
+    """
     if bool(paths) == devices:
         raise typer.BadParameter("give a file, or --devices")
     if not paths:
         _devices(run)
         return
-    found = []
+    found, failed = [], []
     for path in paths:
-        figures, rows = _described(path)
+        try:
+            figures, rows = _described(path)
+        except (InputError, OSError) as error:
+            if len(paths) == 1:
+                raise
+            run.console.error(one_line(error))
+            failed.append(str(path))
+            continue
         _show(run, str(path), rows)
         found.append(figures)
-    run.result(found[0] if len(found) == 1 else {"files": found})
+    run.result(found[0] if len(paths) == 1 else {"files": found, "failed": failed})
+    if failed:
+        raise typer.Exit(1)
 
 
 def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:

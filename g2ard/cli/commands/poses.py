@@ -12,6 +12,9 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.options import OutputOption, SceneArgument, UpOption
 from g2ard.progress import plural
 
+_FEW = 0.005
+"""Share of the scene that rounds to nothing."""
+
 
 class _Size(tuple[int, int]):
     """Width and height in one argument (see `g2ard.cli.options.Triple`)."""
@@ -71,7 +74,9 @@ def poses(
     write_views(output, pool.cameras, splits=splits, overwrite=run.overwrite)
     direction = ", ".join(f"{v:.2f}" for v in pool.up)
     run.say(f"{output}: {plural(count, 'pose')}, {pool.kind} ({pool.why}; up is {direction})")
-    run.say(f"no pose sees {pool.unseen:.0%} of the scene's matter; {pool.coarse:.0%} only under a pixel")
+    shares = (("no pose sees", pool.unseen), ("poses see only under a pixel", pool.coarse))
+    if told := [f"{what} {share:.0%} of the scene's matter" for what, share in shares if share > _FEW]:
+        run.say("; ".join(told))
     run.result(
         {
             "count": count,

@@ -144,7 +144,9 @@ def _looks(
     if color != "scene" or ratio is not None or count is None:
         _check(color, count, ratio, parents)
         return None
-    if parents is not None or count.is_share or (views is not None and not is_made(views)):
+    if views is not None and not is_made(views):
+        raise typer.BadParameter("-n makes views, and --views gives them: leave -n out")
+    if parents is not None or count.is_share:
         raise typer.BadParameter(
             "-n: a number of views to make, where none are given; a budget goes with --color flags or cells"
         )
