@@ -50,7 +50,7 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
 
     out, err = io.StringIO(), io.StringIO()
     status: object = 0
-    before = Path.cwd()
+    before, known = Path.cwd(), set(sys.modules)
     with (
         patch.dict(os.environ, env),
         patch.object(sys, "argv", ["g2ard", *words]),
@@ -65,4 +65,7 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
         finally:
             os.chdir(before)
             gc.unfreeze()  # `main` takes it that the program ends
+            for name in set(sys.modules) - known:  # a user's module of that name may be another's next time
+                if str(getattr(sys.modules[name], "__file__", None)).startswith(str(cwd)):
+                    del sys.modules[name]
     return int(status or 0) if isinstance(status, int | None) else 1, out.getvalue(), err.getvalue()

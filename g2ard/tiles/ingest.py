@@ -102,6 +102,7 @@ def ingest(
         OutputError: the folder holds something else, or the disk has too little room.
 
     >>> import tempfile
+    >>> import numpy as np
     >>> from g2ard.io import write_splats
     >>> from g2ard.splats import Splats
     >>> work = Path(tempfile.mkdtemp())

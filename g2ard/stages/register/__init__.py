@@ -94,7 +94,7 @@ def register(
     >>> view = Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0], name="a.png")])
     >>> report = register(dot, view, starts={"a.png": view.viewmats[0]}).report
     >>> report.photos[0].status, report.photos[0].reason
-    ('refused', 'view 0 (a.png) has no photo: its views name no image for it')
+    ('refused', 'view 0 (a.png) has no photo: its views name no image for it; give views with photos')
     """
     config = config or RegisterConfig()
     if not len(photos):
