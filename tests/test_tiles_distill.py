@@ -110,12 +110,12 @@ def test_a_killed_command_leaves_no_workers_and_goes_on(folder: Path, tmp_path: 
     with subprocess.Popen(command, env=env, stderr=subprocess.PIPE) as running:
         children: list[int] = []
         until = time.monotonic() + 120
-        while running.poll() is None and time.monotonic() < until and len(list(steps.glob("*.npz"))) < 3:
+        while running.poll() is None and time.monotonic() < until and len(list(steps.glob("[!.]*.npz"))) < 3:
             time.sleep(0.01)
         listed = Path(f"/proc/{running.pid}/task/{running.pid}/children")
         children = [int(pid) for pid in listed.read_text().split()] if listed.exists() else []
         running.kill()
-    done = {path.name: path.stat().st_mtime_ns for path in steps.glob("*.npz")}
+    done = {path.name: path.stat().st_mtime_ns for path in steps.glob("[!.]*.npz")}
     assert done
     until = time.monotonic() + 30
     while any(Path(f"/proc/{pid}").exists() for pid in children) and time.monotonic() < until:

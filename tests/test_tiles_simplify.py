@@ -202,7 +202,7 @@ def test_workers_killed_at_random_cost_time_alone(
         done = 0
         while not stop.is_set() and len(killed) < 5:
             time.sleep(0.02)
-            files = len(list(work.glob("*.npz")))
+            files = len(list(work.glob("[!.]*.npz")))
             if files >= done + 3 and (children := _children()):
                 time.sleep(draw.uniform(0, 0.05))
                 os.kill(draw.choice(children), signal.SIGKILL)
@@ -218,7 +218,7 @@ def test_workers_killed_at_random_cost_time_alone(
         killer.join()
     assert len(killed) >= 3
     assert small.fingerprint() == here.fingerprint()
-    assert len(list(work.glob("*.npz"))) == len(list((tmp_path / "here").glob("*.npz")))
+    assert len(list(work.glob("[!.]*.npz"))) == len(list((tmp_path / "here").glob("[!.]*.npz")))
 
 
 def _children() -> list[int]:

@@ -90,12 +90,14 @@ class _Processes:
 
     def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
         total, failures = sum(task.cost for task in tasks), 0
+        _sweep(tasks)
         while todo := [task for task in tasks if not task.output.exists()]:
             before = len(todo)
             try:
                 self._round(todo, total, stage, progress)
             except BrokenProcessPool:
                 self._stop(at_once=True)
+                _sweep(tasks)
                 left = sum(not task.output.exists() for task in tasks)
                 failures = failures + 1 if left == before else 0
                 if failures == _TRIES:
@@ -131,6 +133,13 @@ class _Processes:
             for process in processes:
                 process.join()
         self._pool = None
+
+
+def _sweep(tasks: Sequence[Task]) -> None:
+    """Remove what workers that were killed had begun to write."""
+    for task in tasks:
+        for begun in task.folder.glob(f".{task.output.stem}.*"):
+            begun.unlink(missing_ok=True)
 
 
 def _begin(threads: int) -> None:
