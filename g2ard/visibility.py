@@ -17,7 +17,33 @@ from g2ard.progress import Progress, counter, silent
 from g2ard.splats import Splats
 from g2ard.stages.render import RasterSettings, arrays_of, centred, settings_for, view_of
 
-__all__ = ["SampledVisibility", "Visibility", "spread", "visibility", "visibility_source"]
+__all__ = [
+    "CONVERGED",
+    "LONGEST",
+    "MOST_LOOKS",
+    "NEAR",
+    "ROUND",
+    "SampledVisibility",
+    "Visibility",
+    "spread",
+    "visibility",
+    "visibility_source",
+]
+
+MOST_LOOKS, LONGEST = 96, 300
+"""The most views that look at a scene or a tile, and the longer side of their renders, pixels."""
+
+ROUND = 16
+"""Views at a time."""
+
+_CHEAP = 6_000_000
+"""Gaussians times views up to which another round costs next to nothing."""
+
+NEAR = 1e-3
+"""Nearest depth that counts, over the median distance of the cameras from the scene's middle."""
+
+CONVERGED = 0.01
+"""A round that finds a smaller share of the Gaussians for the first time is the last."""
 
 _Floats = NDArray[np.float32]
 
@@ -87,7 +113,7 @@ class SampledVisibility:
 
 
 def visibility_source(
-    cameras: Cameras, *, views: int = 96, longest: int = 300, progress: Progress = silent
+    cameras: Cameras, *, views: int = MOST_LOOKS, longest: int = LONGEST, progress: Progress = silent
 ) -> Callable[[Splats], SampledVisibility]:
     """A function that finds what a few small renders see of a scene, as `simplify` takes it.
 
@@ -110,7 +136,7 @@ def visibility_source(
     full = cameras.take(sample)
     small = full.resized(longest)
     factor = np.float32((small.widths / full.widths).mean())
-    apart = max(1, math.ceil(len(small) / _ROUND))
+    apart = max(1, math.ceil(len(small) / ROUND))
     rounds = [range(first, len(small), apart) for first in spread(apart)]
     enough, settings = 0, RasterSettings()
 
@@ -121,13 +147,13 @@ def visibility_source(
         here = small.recentred(scene.offset)
         if not enough:  # a near plane in the scene's own unit
             distance = np.median(np.linalg.norm(here.positions - core.origin, axis=1))
-            settings = RasterSettings(near=_NEAR * float(distance) or None)
+            settings = RasterSettings(near=NEAR * float(distance) or None)
         seen = 0
         for number, some in enumerate(rounds, 1):
             views = [view_of(here, i, settings) for i in some]
             before, seen = seen, sums.add(views, settings, counter(progress, "visibility"))
-            converged = number > 1 and seen - before < _CONVERGED * len(scene)
-            cheap = number * _ROUND * len(scene) < _CHEAP
+            converged = number > 1 and seen - before < CONVERGED * len(scene)
+            cheap = number * ROUND * len(scene) < _CHEAP
             if number == enough or (not enough and converged and not cheap):
                 break
         enough = number
@@ -135,19 +161,6 @@ def visibility_source(
         return SampledVisibility(weight, pixel_size * factor)
 
     return find
-
-
-_ROUND = 16
-"""Views at a time."""
-
-_CHEAP = 6_000_000
-"""Gaussians times views up to which another round costs next to nothing."""
-
-_NEAR = 1e-3
-"""Nearest depth that counts, over the median distance of the cameras from the scene's middle."""
-
-_CONVERGED = 0.01
-"""A round that finds a smaller share of the Gaussians for the first time is the last."""
 
 
 def spread(count: int) -> list[int]:

@@ -38,9 +38,10 @@ __all__ = [
 _SMALLEST_ROW = 4
 """Bytes of a Gaussian in a file, at least: a smaller file need not be opened to know that it is small."""
 
-_TASK_BYTES, _ROW_BYTES, _ROW_TIMES = 200_000_000, 170, 2.2
-"""Of a task at its peak, measured (`docs/benchmarks.md`): of the program, and of a tile's Gaussians, so many
-and so many times what their arrays take."""
+_TASK_BYTES, _ROW_BYTES, _ROW_TIMES = 200_000_000, 200, 2.2
+"""Of a task at its peak: of the program, and of a tile's Gaussians, halo included, so many and so many times
+what their arrays take. Together they are the 1.95 GB measured for 5.5 million of SH 0
+(`benches/record/tiles.md`); what higher bands add is not measured."""
 
 _WHOLE_TIMES = 3.6
 """Memory of a simplification in one piece, over the scene's arrays."""
@@ -137,7 +138,10 @@ def check_memory(scene: Splats, tiling: Tiling, name: str) -> None:
 def tiles_of(
     scene: Path, tiling: Tiling, progress: Progress = silent, say: Say = unsaid
 ) -> Iterator[TileStore]:
-    """The tiles of a scene: the folder itself, or tiles streamed into `tiling.folder`."""
+    """The tiles of a scene: the folder itself, or tiles streamed into `tiling.folder`.
+
+    Tiles of another size that an earlier command left there go, unless the user named the folder.
+    """
     from g2ard.tiles.ingest import ingest
     from g2ard.tiles.store import MANIFEST, TileStore
 
@@ -145,7 +149,14 @@ def tiles_of(
         yield TileStore.open(scene)
         return
     assert tiling.folder is not None
-    yield ingest(scene, tiling.folder / "tiles", tile_rows=tiling.most_rows, progress=progress, say=say)
+    yield ingest(
+        scene,
+        tiling.folder / "tiles",
+        tile_rows=tiling.most_rows,
+        overwrite=not tiling.keep,
+        progress=progress,
+        say=say,
+    )
 
 
 def simplify_in_tiles(

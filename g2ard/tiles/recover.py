@@ -14,7 +14,7 @@ from g2ard.cameras import Cameras
 from g2ard.constants import changed, listed
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
-from g2ard.splats import Splats
+from g2ard.splats import SH_C0, Splats
 from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.anchors import Anchors
 from g2ard.stages.render import RasterSettings, Renderer, settings_for
@@ -26,6 +26,7 @@ from g2ard.tiles.steps import (
     Arguments,
     Inputs,
     Places,
+    arrays_of,
     cameras_of,
     cropped,
     far_around,
@@ -51,8 +52,6 @@ _OWN = 0.5
 
 _FEWEST = 256
 """Pixels that count in a view, at least: fewer teach nothing."""
-
-_SH0 = 0.28209479177387814
 
 
 @dataclass(frozen=True)
@@ -90,8 +89,8 @@ class TileTargets(TeacherRenders):
 
 def _masks(scene: Splats, own: int, cameras: Cameras) -> list[NDArray[np.bool_]]:
     """(H, W) of each view, where the first `own` Gaussians give most of the alpha."""
-    white = np.full((len(scene), 1, 3), -0.5 / _SH0, np.float32)
-    white[:own] = 0.5 / _SH0
+    white = np.full((len(scene), 1, 3), -0.5 / SH_C0, np.float32)
+    white[:own] = 0.5 / SH_C0
     renderer = Renderer(replace(scene, sh0=white, shN=np.zeros((len(scene), 0, 3), np.float32)))
     drawn = (renderer.render(camera) for camera in cameras)
     return [image.image[..., 0] >= _OWN * image.alpha for image in drawn]
@@ -135,7 +134,7 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
     train, held_out, apart = targets("train"), targets("test"), targets("apart")
     before = _errors(student, held_out, background)
     if train is None or not arguments["steps"]:
-        return {**_arrays(small), "errors": np.array([before, before]), "steps": np.array(0)}
+        return {**arrays_of(small, "scene"), "errors": np.array([before, before]), "steps": np.array(0)}
     done = recover(
         student,
         train,
@@ -146,7 +145,11 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
     )
     result = done.splats.take(slice(len(small)))
     after = _errors(joined([result, student.take(frozen)]), held_out, background)
-    return {**_arrays(result), "errors": np.array([before, after]), "steps": np.array(done.report.steps)}
+    return {
+        **arrays_of(result, "scene"),
+        "errors": np.array([before, after]),
+        "steps": np.array(done.report.steps),
+    }
 
 
 def _errors(
@@ -162,11 +165,6 @@ def _errors(
         total += float(np.sum(np.square(lost, dtype=np.float64)))
         count += lost.size
     return total, count
-
-
-def _arrays(scene: Splats) -> Arrays:
-    names = ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset")
-    return {f"scene_{name}": getattr(scene, name) for name in names}
 
 
 def recover_tiles(

@@ -20,14 +20,9 @@ from g2ard.tiles.run import TiledRun
 from g2ard.tiles.steps import COARSE, scene_of
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.task import Task, load
+from g2ard.visibility import LONGEST, MOST_LOOKS, NEAR
 
 __all__ = ["Sights", "Surroundings", "in_sight", "light_of", "written"]
-
-_LOOKS = 96
-"""The most views that look at one tile."""
-
-_LONGEST = 300
-"""Longer side of what they render, pixels."""
 
 _IN_SIGHT = 0.01
 """Share of a view's light that comes from a tile that it has in sight."""
@@ -63,7 +58,7 @@ class Sights:
     """Which views have which tile in sight, and what they see of it."""
 
     def __init__(self, run: TiledRun, coarse: list[Path], cameras: Cameras, frame: tuple[float, ...]):
-        self.run, self.coarse, self.cameras = run, coarse, cameras.resized(_LONGEST)
+        self.run, self.coarse, self.cameras = run, coarse, cameras.resized(LONGEST)
         self.shrunk = float((self.cameras.widths / cameras.widths).mean())
         self.views = written(run.work, self.cameras)
         self.boxes = boxes_of(coarse)
@@ -108,7 +103,9 @@ class Sights:
     def _chosen(self, light: NDArray[np.float64], tile: int) -> dict[str, Any]:
         """The views that look at a tile: evenly spaced among those that have it in sight."""
         sight = in_sight(light, tile)
-        some = sight[np.unique(np.linspace(0, len(sight) - 1, min(_LOOKS, len(sight))).round().astype(int))]
+        some = sight[
+            np.unique(np.linspace(0, len(sight) - 1, min(MOST_LOOKS, len(sight))).round().astype(int))
+        ]
         return {
             "views": some.tolist(),
             "light": light[some, tile].tolist(),
@@ -139,8 +136,8 @@ def in_sight(light: NDArray[np.float64], tile: int) -> NDArray[np.intp]:
     """
     own = light[:, tile]
     sight = np.flatnonzero(own > _IN_SIGHT * light.sum(axis=1))
-    if len(sight) < _LOOKS:
-        best = np.argsort(-own, kind="stable")[:_LOOKS]
+    if len(sight) < MOST_LOOKS:
+        best = np.argsort(-own, kind="stable")[:MOST_LOOKS]
         sight = np.sort(best[own[best] > 0])
     return sight
 
@@ -166,12 +163,12 @@ def light_of(
 ) -> NDArray[np.float64]:
     """(V, T) Σ αT that each view gets from each tile, of the tiles' coarse Gaussians, in small renders."""
     level = "near" if store.count // COARSE[0] <= _GLANCED else "far"
-    small = cameras.resized(_LONGEST)
+    small = cameras.resized(LONGEST)
     views = written(work, small)
     here = small.recentred(store.offset)
     middles = boxes_of(coarse).mean(axis=1)
     away = np.linalg.norm(here.positions[:, None] - middles, axis=2).min(axis=1)
-    near = 1e-3 * float(np.median(away)) or None
+    near = NEAR * float(np.median(away)) or None
     chunks = [range(i, min(i + _CHUNK, len(here))) for i in range(0, len(here), _CHUNK)]
     tasks = [
         Task(

@@ -24,10 +24,11 @@ from g2ard.stages.simplify import SimplifyConfig, schedule, simplify
 from g2ard.stages.simplify.pairs import fit_opacities
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.task import Arrays, load
-from g2ard.visibility import spread
+from g2ard.visibility import CONVERGED, NEAR, ROUND, spread
 
 __all__ = [
     "COARSE",
+    "arrays_of",
     "coarse",
     "cropped",
     "far_around",
@@ -49,15 +50,6 @@ COARSE = (32, 512)
 
 _DEEPER = 0.6
 """Share of the Gaussians that a tile is expected to keep down to which its merges are planned."""
-
-_ROUND = 16
-"""Views at a time."""
-
-_CONVERGED = 0.01
-"""A round that finds a smaller share of the tile's Gaussians for the first time is the last."""
-
-_NEAR = 1e-3
-"""Nearest depth that counts, over the median distance of the cameras from the tile's middle."""
 
 _OUTLINE, _BESIDE = 20_000, 8
 """Gaussians of a tile by whose means its images are cropped, and pixels left around them."""
@@ -83,7 +75,7 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     near = simplify(some, max(1, len(scene) // COARSE[0]), method="fast", config=config).splats
     far = simplify(near, max(1, len(scene) // COARSE[1]), method="fast", config=config).splats
     rows = scene.core.order[:: COARSE[0]]
-    return {**_arrays(near, "near"), **_arrays(far, "far"), **_arrays(scene.take(rows), "sample")}
+    return {**arrays_of(near, "near"), **arrays_of(far, "far"), **arrays_of(scene.take(rows), "sample")}
 
 
 def glance(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
@@ -111,17 +103,17 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     cameras = cameras_of(inputs["views"]).recentred(own.offset)
     here = cameras.take(arguments["views"])
     distance = np.median(np.linalg.norm(here.positions - own.core.origin, axis=1)) if len(here) else 0.0
-    settings = RasterSettings(near=_NEAR * float(distance) or None)
+    settings = RasterSettings(near=NEAR * float(distance) or None)
     here = cropped(here, own, settings)
     sums = _core.VisibilityAccumulator(_with_surroundings(own, arguments, inputs, places).core)
-    stride = max(1, math.ceil(len(here) / _ROUND))
+    stride = max(1, math.ceil(len(here) / ROUND))
     light, used, seen = np.asarray(arguments["light"]), [], 0
     for first in spread(stride):
         some = range(first, len(here), stride)
         sums.add([view_of(here, i, settings) for i in some], settings, None)
         used += list(some)
         before, seen = seen, int(np.count_nonzero(sums.by_row()[0][: len(own)]))
-        if len(used) > _ROUND and seen - before < _CONVERGED * len(own):
+        if len(used) > ROUND and seen - before < CONVERGED * len(own):
             break
     share = light[used].sum() / arguments["all_light"] if used else 1.0
     weight, pixel_size = (values[: len(own)] for values in sums.by_row())
@@ -186,7 +178,7 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         shN=np.ascontiguousarray(out["sh"][:, 1:]),
         offset=scene.offset,
     )
-    kept, made = ~dropped, _arrays(small, "scene")
+    kept, made = ~dropped, arrays_of(small, "scene")
     made["members"] = np.bincount(of[kept], minlength=len(small))
     if "look" in inputs:
         (weight,) = load(inputs["look"], "weight")
@@ -336,5 +328,5 @@ def _widened(scene: Splats, times: int) -> Splats:
     return replace(scene, scales=scene.scales * factor)
 
 
-def _arrays(scene: Splats, name: str) -> Arrays:
+def arrays_of(scene: Splats, name: str) -> Arrays:
     return {f"{name}_{field}": getattr(scene, field) for field in _FIELDS}
