@@ -153,7 +153,8 @@ def _steps(job: DistillJob, student: Splats) -> int:
     from g2ard.stages.simplify import schedule as counts_of
 
     config = job.config
-    last = final_steps(config, student, job.views.train.cameras, photos=job.photos or job.teacher is None)
+    photos = job.photos_over_renders or job.teacher is None
+    last = final_steps(config, student, job.views.train.cameras, photos=photos)
     if not config.schedule.round_steps:
         return last
     kept, fold = config.simplify.retention or 0.75, config.simplify.fold
