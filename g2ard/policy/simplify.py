@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from g2ard.policy.budget import Budget
-from g2ard.policy.inputs import load_scene
+from g2ard.policy.inputs import load_scene, say_regions
 from g2ard.policy.views import cameras_for_looks
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.splats import Splats
@@ -31,6 +32,7 @@ def simplify(
     views: Views | None = None,
     blind: bool = False,
     method: str = "default",
+    keep_region: Sequence[Sequence[float]] = (),
     config: SimplifyConfig | None = None,
     constants: Mapping[str, Any] | None = None,
     beside: str | Path | None = None,
@@ -57,6 +59,8 @@ def simplify(
             "made" makes a pool even if cameras lie beside the scene.
         blind: use no cameras at all.
         method: default, fast or paper; `g2ard.stages.simplify.simplify` says what they do.
+        keep_region: spheres (x, y, z, r) and boxes (x, y, z, x, y, z), world coordinates, which get more of
+            the budget, as if views stood √keep_times times as near.
         config: constants; None means the method's own.
         constants: by full name, as `--set` has them, such as {"simplify.max_energy": 0.02}; they win over
             `config`'s.
@@ -87,6 +91,8 @@ def simplify(
     if constants:
         values = full_names(constants, {"simplify": SimplifyConfig()})
         config = changed(config or SimplifyConfig(), "simplify", values)
+    if keep_region:
+        config = replace(config or SimplifyConfig(), keep_region=tuple(map(tuple, keep_region)))
     wanted = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     splats, beside, name = _scene(scene, beside, say)
     aim = aim_of(wanted, splats, name, file=f"scene.{format}", seed=seed, progress=progress, say=say)
@@ -135,6 +141,8 @@ def simplify_each(
 
     if views is not None and blind:
         raise InputError("views, blind: blind uses no views")
+    if config is not None:
+        say_regions(splats, config, "the scene", say)
     look = None
     if not blind and any(budget < len(splats) for budget in budgets):
         cameras = cameras_for_looks(

@@ -27,6 +27,7 @@ from g2ard.prepared import PreparedScene, as_prepared
 from g2ard.splats import Splats
 from g2ard.stages.render import RasterSettings, view_of
 from g2ard.stages.simplify import SimplifyConfig, schedule, simplify
+from g2ard.stages.simplify.pairs import emphasised
 from g2ard.tiles.scenes import (
     Arguments,
     Inputs,
@@ -69,7 +70,7 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         Three scenes (`scene_of`): `near`, `far`, `sample`.
     """
     scene = tile_of(arguments, places, check=True)
-    config = _config(arguments)
+    config = replace(_config(arguments), keep_region=())  # for what other tiles see of this one
     some = _widened(scene.take(scene.core.order[::_THINNED]), _THINNED)
     near = simplify(some, max(1, len(scene) // COARSE[0]), method="fast", config=config).splats
     far = simplify(near, max(1, len(scene) // COARSE[1]), method="fast", config=config).splats
@@ -118,9 +119,9 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     Returns:
         `weight`, (N,) float32 Σ αT over all views; `pixel_size`, (N,) float32 of a full image there, scene
         units, infinite where no view shows the row; `pixel`, the median of those that are known, NaN where
-        none is; `sums`, (2,) weight and mass of what is kept, for the frame's floor; `used`, numbers of the
-        views that looked; `share`, the part of `all_light` that they have, which `weight` was divided by;
-        `near`, their near plane.
+        none is; `sums`, (2,) `emphasised` weight and mass of what is kept, for the frame's floor; `used`,
+        numbers of the views that looked; `share`, the part of `all_light` that they have, which `weight` was
+        divided by; `near`, their near plane.
     """
     own = tile_of(arguments, places, sh=False)
     cameras = cameras_of(inputs["views"]).recentred(own.offset)
@@ -271,6 +272,8 @@ def _merging(
     pixel_size: NDArray[np.float32] | None,
 ) -> _core.TileMerging:
     config = config.resolved("default")
+    if weight is not None and pixel_size is not None:
+        weight, pixel_size = emphasised(scene, weight, pixel_size, config)
     return _core.TileMerging(
         scene.core,
         frame,
