@@ -41,8 +41,8 @@ def save(path: Path, *scenes: Splats, camera: Camera = FRONT, up: tuple[float, .
     return path
 
 
-def show(browser: Browser, page: Path) -> None:
-    browser.open(page.absolute().as_uri())
+def show(browser: Browser, page: Path | str) -> None:
+    browser.open(page if isinstance(page, str) else page.absolute().as_uri())
     browser.run(
         "new Promise(done => { const look = () => window.g2ard ? done() : setTimeout(look, 20); look(); })"
     )
