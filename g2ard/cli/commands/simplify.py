@@ -90,7 +90,7 @@ def simplify(
     from g2ard.constants import changed
     from g2ard.policy.fit import aim_of
     from g2ard.policy.inputs import say_notes
-    from g2ard.policy.simplify import simplify_each
+    from g2ard.policy.simplify import Reduction
     from g2ard.policy.tiled import check_memory, is_tiled
 
     config = SimplifyConfig(retention=retention, keep_region=tuple(keep_region or ()))
@@ -112,21 +112,8 @@ def simplify(
     total = len(found.splats)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite), total)
     clock.append(time.perf_counter())
-    aims = [
-        aim_of(
-            budget,
-            found.splats,
-            str(scene),
-            file=output.name,
-            seed=run.seed,
-            progress=run.progress,
-            say=run.say,
-        )
-        for budget in budgets
-    ]
-    made = simplify_each(
+    reduce = Reduction(
         found.splats,
-        [aim.count for aim in aims],
         views=views,
         blind=no_views,
         method=method,
@@ -137,10 +124,23 @@ def simplify(
         progress=run.progress,
         say=run.say,
     )
+    aims = [
+        aim_of(
+            budget,
+            found.splats,
+            str(scene),
+            file=output.name,
+            reduce=reduce,
+            seed=run.seed,
+            progress=run.progress,
+            say=run.say,
+        )
+        for budget in budgets
+    ]
     reports = []
     places = zip(outputs.paths(total), maps.paths(total) if maps else [None] * len(aims), strict=True)
-    for reduced, aim, (place, rows) in zip(made, aims, places, strict=True):
-        small = aim.shrink_simplified(reduced, run.say)
+    for aim, (place, rows) in zip(aims, places, strict=True):
+        small = aim.shrink_simplified(reduce(aim.count), run.say)
         clock.append(time.perf_counter())
         io.write_splats(place, small.splats, overwrite=run.overwrite)
         if rows is not None:
