@@ -127,8 +127,20 @@ def prepare(
     if counted is not None:
         counted(len(prior))
     file = f"scene.{options.format}"
+    sized = (
+        prior if options.sh_degree is None else prior.with_sh_degree(options.sh_degree)
+    )  # as it is written
     aims = tuple(
-        aim_of(budget, prior, name, file=file, seed=seed, progress=progress, say=say) for budget in budgets
+        aim_of(
+            budget,
+            prior if budget.bytes is None else sized,
+            name,
+            file=file,
+            seed=seed,
+            progress=progress,
+            say=say,
+        )
+        for budget in budgets
     )
     views = views_of(
         prior,

@@ -6,6 +6,7 @@ import math
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,10 +32,10 @@ _ROWS = 100_000
 """Gaussians that those are planned on."""
 _SAMPLE = 4096
 """Gaussians of the first probe, a file of which tells about what each takes."""
+_PROBES, _FULL, _AIM = 6, 0.97, 0.985
+"""Files written to find a count of bytes at the most, the share of the bytes that is enough, and that aimed at."""
 _MARGIN = 0.985
-"""Of the bytes asked for: merged scenes pack a little better or worse than the probe."""
-_PROBES, _CLOSE = 2, 0.05
-"""Further files written to find a count of bytes, and the share of the bytes that is close enough to stop."""
+"""Of the bytes asked for, where the result is not what the files were written of: recovery is to come."""
 _LOOKS = 8
 """Counts that the quality is looked at for, at the most."""
 _CLOSE_ENOUGH = 0.25
@@ -63,10 +64,6 @@ class Quality:
         return min(self.psnr - wanted.psnr if wanted.psnr > 0 else math.inf, of_ssim)
 
 
-Reduce = Callable[[Splats, int], Splats]
-"""A scene and a count → a scene of that count."""
-
-
 def file_bytes(splats: Splats, name: str, **options: Any) -> int:
     """Bytes of the scene as `write_splats` writes it under `name`."""
     from g2ard.io import write_splats
@@ -80,44 +77,45 @@ def file_bytes(splats: Splats, name: str, **options: Any) -> int:
         return sum(file.stat().st_size for file in Path(folder).rglob("*") if file.is_file())
 
 
-def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Reduce) -> int:
+def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[int], Splats]) -> int:
     """About the most Gaussians whose file has at most `wanted` bytes.
 
-    A sample's bytes per Gaussian give a first count, a real write of the scene reduced to it a better one; a
-    second write follows only where that is far off.
+    A sample's bytes per Gaussian give a first count, files of the scene reduced to it and to further counts
+    better ones, between the last that fits and the last that does not, until one fills 97 %.
 
     Args:
         splats: the dense scene.
         wanted: bytes.
         name: of the file; its suffix is the format.
-        reduce: a fast way to reduce it, for the probe.
+        reduce: count → scene.
 
     Raises:
         InputError: not even a few Gaussians fit.
     """
-    sample = splats.take(np.unique(np.linspace(0, len(splats) - 1, min(len(splats), _SAMPLE)).astype(int)))
-    before = (len(sample), file_bytes(sample, name))
-    count = _count(before, (0, 0), wanted)
+    fewest, most = min(_FEWEST, len(splats)), len(splats)
+    sample = splats.take(np.unique(np.linspace(0, most - 1, min(most, _SAMPLE)).astype(int)))
+    count = int(len(sample) * wanted / file_bytes(sample, name))
+    fits, over = (0, 0), (most + 1, 0)
     for _ in range(_PROBES):
-        count = min(max(count, min(_FEWEST, len(splats))), len(splats))
-        probe = (count, file_bytes(reduce(splats, count) if count < len(splats) else splats, name))
-        if count == len(splats) and probe[1] <= wanted:
-            return count
-        count = _count(probe, before, wanted)
-        before = probe
-        if abs(count / probe[0] - 1) < _CLOSE:
+        count = min(max(count, fits[0] + 1, fewest), over[0] - 1, most)
+        size = file_bytes(reduce(count) if count < most else splats, name)
+        if size > wanted:
+            over = (count, size)
+        else:
+            fits = (count, size)
+        full = size <= wanted and (size >= _FULL * wanted or count == most)
+        if full or (count == fewest and size > wanted) or over[0] - fits[0] <= 1:
             break
-    if count < min(_FEWEST, len(splats)):
-        raise InputError(f"{name}: {wanted:,} bytes hold hardly a Gaussian; {probe[1]:,} hold {probe[0]:,}")
-    return min(count, len(splats))
-
-
-def _count(a: tuple[int, int], b: tuple[int, int], wanted: int) -> int:
-    """Where the line through two (count, bytes) reaches the bytes, with a margin; through one and the origin
-    where two are no line upwards."""
-    rises = (a[0] - b[0]) * (a[1] - b[1]) > 0 and not 0.8 < a[0] / max(b[0], 1) < 1.25
-    slope = (a[1] - b[1]) / (a[0] - b[0]) if rises else a[1] / a[0]
-    return int(a[0] + (wanted * _MARGIN - a[1]) / slope)
+        if fits[0] and over[1]:  # files grow in steps, so that not all of the way is trusted
+            share = (_AIM * wanted - fits[1]) / (over[1] - fits[1])
+            count = round(fits[0] + min(max(share, 0.1), 0.9) * (over[0] - fits[0]))
+        else:
+            count = int(count * _AIM * wanted / size)
+    if fits[0]:
+        return fits[0]
+    if over[0] <= fewest:
+        raise InputError(f"{name}: {wanted:,} bytes hold hardly a Gaussian; {over[1]:,} hold {over[0]:,}")
+    return max(fewest, int(over[0] * _AIM * wanted / over[1]))
 
 
 def _images(splats: Splats, cameras: Cameras) -> list[NDArray[Any]]:
@@ -270,7 +268,8 @@ def aim_of(
         splats: the scene.
         name: what errors call the scene.
         file: a name whose suffix is the format of the file that `Budget.fit` speaks of.
-        reduce: the reduction that a quality is to be kept by; None for `default` with a pool of its own.
+        reduce: what the result will be made with, where nothing follows; None if recovery does. A quality is then
+            looked for with `default` and a pool of its own, bytes with `fast`.
         seed: of the views that quality is measured in.
         progress: told of planning.
         say: told what was found.
@@ -283,7 +282,10 @@ def aim_of(
         wanted = Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0)
         return _by_quality(splats, wanted, reduce, seed, progress, say)
     if budget.bytes is not None:
-        found = count_for_bytes(splats, budget.bytes, file, _fast)
+        if reduce is None:
+            found = count_for_bytes(splats, int(budget.bytes * _MARGIN), file, partial(_fast, splats))
+        else:
+            found = count_for_bytes(splats, budget.bytes, file, lambda count: reduce(count).splats)
         say(f"{budget.fit}: about {plural(found, 'Gaussian')}")
         return Aim(found, bytes=budget.bytes, file=file)
     found = budget.of(len(splats), name)
