@@ -127,13 +127,11 @@ def prepare(
     if counted is not None:
         counted(len(prior))
     file = f"scene.{options.format}"
-    sized = (
-        prior if options.sh_degree is None else prior.with_sh_degree(options.sh_degree)
-    )  # as it is written
+    as_written = prior if options.sh_degree is None else prior.with_sh_degree(options.sh_degree)
     aims = tuple(
         aim_of(
             budget,
-            prior if budget.bytes is None else sized,
+            prior if budget.bytes is None else as_written,
             name,
             file=file,
             seed=seed,

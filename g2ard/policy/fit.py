@@ -32,8 +32,8 @@ _ROWS = 100_000
 """Gaussians that those are planned on."""
 _SAMPLE = 4096
 """Gaussians of the first probe, a file of which tells about what each takes."""
-_PROBES, _FULL, _AIM = 6, 0.97, 0.985
-"""Files written to find a count of bytes at the most, the share of the bytes that is enough, and that aimed at."""
+_PROBES, _FULL, _AIM = 6, 0.99, 0.995
+"""The most files written to find a count of bytes; shares of the bytes that are enough, and aimed at."""
 _MARGIN = 0.985
 """Of the bytes asked for, where the result is not what the files were written of: recovery is to come."""
 _LOOKS = 8
@@ -81,7 +81,7 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
     """About the most Gaussians whose file has at most `wanted` bytes.
 
     A sample's bytes per Gaussian give a first count, files of the scene reduced to it and to further counts
-    better ones, between the last that fits and the last that does not, until one fills 97 %.
+    better ones, between the last that fits and the last that does not, until one fills 99 %.
 
     Args:
         splats: the dense scene.
@@ -268,8 +268,8 @@ def aim_of(
         splats: the scene.
         name: what errors call the scene.
         file: a name whose suffix is the format of the file that `Budget.fit` speaks of.
-        reduce: what the result will be made with, where nothing follows; None if recovery does. A quality is then
-            looked for with `default` and a pool of its own, bytes with `fast`.
+        reduce: what the result will be made with, where nothing follows; None if recovery does. A quality is
+            then looked for with `default` and a pool of its own, bytes with `fast`.
         seed: of the views that quality is measured in.
         progress: told of planning.
         say: told what was found.
