@@ -32,7 +32,7 @@ _ROWS = 100_000
 """Gaussians that those are planned on."""
 _SAMPLE = 4096
 """Gaussians of the first probe, a file of which tells about what each takes."""
-_PROBES, _FULL, _AIM = 6, 0.99, 0.995
+_PROBES, _FULL, _AIM = 6, 0.98, 0.99
 """The most files written to find a count of bytes; shares of the bytes that are enough, and aimed at."""
 _MARGIN = 0.985
 """Of the bytes asked for, where the result is not what the files were written of: recovery is to come."""
@@ -81,7 +81,7 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
     """About the most Gaussians whose file has at most `wanted` bytes.
 
     A sample's bytes per Gaussian give a first count, files of the scene reduced to it and to further counts
-    better ones, between the last that fits and the last that does not, until one fills 99 %.
+    better ones, between the last that fits and the last that does not, until one fills 98 %.
 
     Args:
         splats: the dense scene.
