@@ -71,6 +71,34 @@ function asTrained(gsplat) {
   gsplat.material.update();
 }
 
+// The engine drops a request to sort that comes while a sort is under way, and a camera that rests before it ends would
+// keep the order of where it was: the request is made again when the sort ends. What was dropped before a sorter is
+// first seen is not known, so that it sorts once more.
+function sortToTheEnd(app) {
+  const dropped = new Map();
+  const look = () => {
+    for (const { layersMap } of app.renderer.gsplatDirector.camerasMap.values()) {
+      for (const { gsplatManager: manager } of layersMap.values()) {
+        const sorter = manager?.cpuSorter;
+        if (!sorter) continue;
+        if (!dropped.has(sorter)) {
+          const send = sorter.setSortParams;
+          sorter.setSortParams = (...request) => {
+            dropped.set(sorter, sorter.jobsInFlight > 0 && !sorter.hasNewVersion);
+            send.apply(sorter, request);
+          };
+          dropped.set(sorter, true);
+        }
+        if (!dropped.get(sorter)) continue;
+        manager.sortNeeded = true;
+        app.renderNextFrame = true;
+      }
+    }
+  };
+  app.scene.on('gsplat:sorted', look);
+  look();
+}
+
 async function viewer(createViewer, index, container) {
   const handle = await createViewer({
     container,
@@ -82,6 +110,7 @@ async function viewer(createViewer, index, container) {
     noanim: true
   });
   asTrained(handle.app.scene.gsplat);
+  sortToTheEnd(handle.app);
   const drawn = new Promise(resolve => {
     if (handle.state.loaded) resolve();
     else handle.events.once('loaded:changed', resolve);
