@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -112,6 +113,7 @@ def prepare(
     from g2ard.stages.recover.presets import preset_for
     from g2ard.targets import kinds_told
 
+    began = time.monotonic()
     chosen = options.by_preset()
     values = full_names(options.constants or {}, {"recover": DistillConfig(), "lift": LiftConfig()})
     lifting = changed(LiftConfig(), "lift", values)
@@ -167,6 +169,7 @@ def prepare(
         lifting=lifting if lifted else None,
         preset=why,
         measured=measured,
+        seconds=time.monotonic() - began,
         cleaned=cleaned,
         progress=progress,
         say=say,
