@@ -212,7 +212,9 @@ class Run:
 
     def spare_inputs(self, *outputs: Path) -> None:
         """Usage check: nothing is written over what is read, not even under --overwrite."""
-        taken = {path.resolve() for path in self._inputs}
+        from g2ard.io.detect import run_scene
+
+        taken = {place.resolve() for path in self._inputs for place in (path, run_scene(path))}
         for output in outputs:
             if output.resolve() in taken:
                 raise typer.BadParameter(
