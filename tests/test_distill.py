@@ -70,6 +70,12 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(targets: TeacherRenders, tm
     with pytest.raises(KeyboardInterrupt):
         distill(PRIOR, 1000, targets, config, work=tmp_path, progress=stop)
     resumed = distill(PRIOR, 1000, targets, config, work=tmp_path)
+    kept = resumed.report.rounds[:3]
+    earlier = [entry.recover[0].seconds for entry in kept[:2]] + [
+        entry.simplify.seconds or 0 for entry in kept
+    ]
+    assert whole.report.seconds.resumed is None
+    assert resumed.report.seconds.resumed == pytest.approx(sum(earlier))
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(whole.splats, name), getattr(resumed.splats, name))
     with pytest.raises(InputError, match="belongs to a run with another scene"):

@@ -34,7 +34,8 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
 
     given = "start" if run.config.get("scene", "") is None else "dense"  # of photos alone there is no scene
     size = report["bytes"]
-    times = ", ".join(f"{name} {value:.1f} s" for name, value in report["seconds"].items())
+    seconds = {name: value for name, value in report["seconds"].items() if name != "resumed"}
+    times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
     counts = [len(scores["recovered"]["views"]) for scores in kinds]
     apart = f" and {counts[1]:,} of another kind (nearer)" if len(kinds) > 1 else ""
     run.console.table(

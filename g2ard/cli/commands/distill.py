@@ -326,7 +326,7 @@ def _distil(
     with work_folder(run, output, resume, (len(job.prior), budget)) as work:
         result = job.run(budget, work=work)
         report = report_of(job, result, run.config)
-        report["seconds"] = {**report["seconds"], "total": time.monotonic() - began}
+        report["seconds"]["total"] = time.monotonic() - began + report["seconds"].get("resumed", 0.0)
         distill_report(
             output / "report.html",
             f"{source.name}: {len(job.prior):,} → {len(result.splats):,}",
