@@ -8,12 +8,12 @@ import sys
 
 import typer
 
+from g2ard import interrupt
 from g2ard.cli.commands import register_commands
 from g2ard.cli.frame import app
 from g2ard.cli.lazy_rich import defer_rich
 from g2ard.cli.pipes import outlive_readers
 from g2ard.cli.usage import usage_line
-from g2ard.interrupt import STATUS
 
 __all__ = ["main"]
 
@@ -29,7 +29,7 @@ def main() -> None:
     try:
         status = app(prog_name="g2ard", standalone_mode=False)
     except typer.Abort:
-        status = STATUS
+        status = interrupt.status()
     except typer.TyperException as e:
         message = usage_line(e)
         where = getattr(getattr(e, "ctx", None), "command_path", "g2ard")
