@@ -245,6 +245,19 @@ def test_version_has_a_letter(command_line: CommandLine, folder: Path) -> None:
     assert "--install-completion" in command_line("--help", cwd=folder)[1]
 
 
+def test_completion_is_of_the_shell_that_is_named(command_line: CommandLine, folder: Path) -> None:
+    for shell, words in (
+        ("zsh", "#compdef g2ard"),
+        ("fish", "complete --command g2ard"),
+        ("bash", "complete -o"),
+    ):
+        status, out, error = command_line("--show-completion", shell, cwd=folder, apart=True)
+        assert (status, error) == (0, "")
+        assert words in out
+    status, _, error = command_line("--show-completion", "tcsh", cwd=folder, apart=True)
+    assert (status, error.count("\n"), "zsh" in error) == (2, 1, True), error
+
+
 def photos_of(folder: Path, points: bool = False) -> None:
     """Photos of the ball with a transforms.json, and COLMAP-like points beside them if asked for."""
     views = around(24)

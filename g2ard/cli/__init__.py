@@ -17,6 +17,8 @@ from g2ard.cli.usage import usage_line
 
 __all__ = ["main"]
 
+_COMPLETION = ("--show-completion", "--install-completion")
+
 
 def main() -> None:
     """Entry point of the `g2ard` program: usage errors are one line and exit status 2, as all errors are."""
@@ -25,6 +27,7 @@ def main() -> None:
     outlive_readers()
     defer_rich()
     gc.set_threshold(50_000)  # importing makes many objects and no garbage: looking for it took a twentieth
+    _name_shell(sys.argv[1:])
     register_commands(next(iter(sys.argv[1:]), None))  # the others would only take time
     try:
         status = app(prog_name="g2ard", standalone_mode=False)
@@ -39,3 +42,9 @@ def main() -> None:
     gc.freeze()  # nor is there any to look for at the end
     sys.stdout.flush()
     sys.exit(status)
+
+
+def _name_shell(words: list[str]) -> None:
+    """`--show-completion zsh`: typer takes a shell's name, or it looks for the shell, by the environment."""
+    if len(words) > 1 and words[0] in _COMPLETION and not words[1].startswith("-"):
+        os.environ["_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION"] = "1"
