@@ -106,6 +106,28 @@ def test_views_of_another_world_are_told(command_line: CommandLine, folder: Path
             assert ("of one world" in error or "warning" in error) == bool(words)
 
 
+@pytest.mark.parametrize(
+    "ask",
+    [
+        ("simplify", "ball.ply", "-r", 4, "-o", "s.ply"),
+        ("recover", "ball.ply", "--teacher", "ball.ply", "--steps", 2, "-o", "r.ply"),
+        ("adapt", "ball.ply", "--teacher", "ball.ply", "--steps", 2, "-o", "a.ply"),
+        ("select", "ball.ply", "-k", 3, "-o", "v.json"),
+        ("render", "ball.ply", "-o", "looks"),
+    ],
+)
+def test_every_command_tells_of_views_of_another_world(
+    ask: tuple[object, ...], command_line: CommandLine, folder: Path
+) -> None:
+    viewmats = around(16, (48, 36)).viewmats.copy()
+    viewmats[1:9, :3, 3] += 1e3
+    write_views(folder / "some.json", replace(around(16, (48, 36)), viewmats=viewmats))
+    for views, warned in (("some.json", True), ("views.json", False)):
+        status, _, error = command_line(*ask, "--views", views, "-w", cwd=folder)
+        assert status == 0, error
+        assert ("views have nothing of the scene in sight: are both of one world?" in error) == warned, error
+
+
 def test_a_letter_in_a_config_is_told_its_long_name(command_line: CommandLine, folder: Path) -> None:
     for text in ("n = 9", "[distill]\nn = 9", "[distill]\nn = 9\n[poses]\ncount = 4"):
         (folder / "c.toml").write_text(text)
