@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from g2ard.errors import InputError
 
-__all__ = ["changed", "full_names", "listed", "parsed"]
+__all__ = ["changed", "full_names", "listed", "parsed", "values_of"]
 
 Config = TypeVar("Config")
 _UNIONS = (Union, types.UnionType)
@@ -120,12 +120,22 @@ def listed(configs: Mapping[str, Any], without: Iterable[str] = ()) -> dict[str,
     """
     left_out = {f"{root}.{name}" for root in configs for name in without}
     out: dict[str, dict[str, Any]] = {}
-    for name, _, value in _all(configs):
+    for name, value in values_of(configs).items():
         if name not in left_out:
             prefix, _, key = name.rpartition(".")
             infinite = isinstance(value, float) and math.isinf(value)
             out.setdefault(prefix, {})[key] = str(value) if infinite else value
     return out
+
+
+def values_of(configs: Mapping[str, Any]) -> dict[str, Any]:
+    """Every constant of configs by full name: `changed` makes the same of other configs with it.
+
+    >>> from g2ard.stages.recover.schedule import PAPER, TUNED
+    >>> changed(TUNED, "schedule", values_of({"schedule": PAPER})) == PAPER
+    True
+    """
+    return {name: value for name, _, value in _all(configs)}
 
 
 def _all(configs: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:

@@ -1,7 +1,7 @@
 """A headless Chromium for tests, over its DevTools pipe: no driver and no further package is needed.
 
 Looked for in $G2ARD_CHROMIUM, then among what is installed (Debian's chromium, Chrome, playwright's own);
-tests that need one skip where there is none. It draws on the CPU (SwiftShader) and finds no host.
+tests that need one skip where there is none. It draws on the CPU (SwiftShader) and finds no other host.
 """
 
 from __future__ import annotations
@@ -27,7 +27,11 @@ _PLAYWRIGHT = ("chromium*/chrome-linux*/chrome", "chromium*/chrome-linux*/headle
 _FLAGS = [
     *("--headless=new", "--no-sandbox", "--remote-debugging-pipe", "--no-first-run", "--mute-audio"),
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-    *("--disable-dev-shm-usage", "--disable-background-networking", "--host-resolver-rules=MAP * ~NOTFOUND"),
+    *(
+        "--disable-dev-shm-usage",
+        "--disable-background-networking",
+        "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
+    ),
     *("--force-device-scale-factor=1", "--force-color-profile=srgb"),
 ]
 _SECONDS = 240

@@ -38,14 +38,23 @@ def test_the_count_fills_the_bytes(name: str) -> None:
 
 def test_the_count_keeps_the_quality() -> None:
     scene, views = checkered_ball(4000), around(6)
-    counts = []
-    for wanted in (Quality(22, 0), Quality(26, 0), Quality(0, 0.9)):
-        count, found = count_for_quality(scene, wanted, views, fast)
+    counts, looked = [], []
+
+    def reduce(count: int) -> Splats:
+        looked.append(count)
+        return fast(scene, count)
+
+    for wanted in (Quality(22, 0), Quality(26, 0), Quality(0, 0.9), Quality(22, 0.9)):
+        looked.clear()
+        count, found = count_for_quality(scene, wanted, views, reduce)
         assert found.meets(wanted)
-        assert count < 4000
+        assert found.over(wanted) < 0.3
+        assert len(looked) <= 8
         counts.append(count)
     assert counts[0] < counts[1]
-    assert count_for_quality(scene, Quality(200, 0), views, fast)[0] == 4000
+    assert counts[3] == max(counts[0], counts[2])
+    assert count_for_quality(scene, Quality(200, 0), views, reduce)[0] == 4000
+    assert count_for_quality(scene, Quality(1, 0), views, reduce)[0] == 64
 
 
 def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:

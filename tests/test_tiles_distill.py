@@ -17,6 +17,7 @@ from test_tiles_simplify import ring, town
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.policy.tiled import Tiling, bytes_of, check_memory, is_tiled, workers_for
+from g2ard.splats import Splats
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.schedule import schedule_named
@@ -181,3 +182,26 @@ def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_
     held_out = TeacherRenders(read_splats(folder / "town.ply"), ring(8).take([6, 7]))
     assert evaluate(small, held_out).psnr > report["scores"]["simplified"]
     assert not list(tmp_path.glob("run/.*"))
+
+
+def test_recovery_in_tiles_takes_its_options(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    def distilled(name: str, *options: object) -> Splats:
+        args = ("distill", folder / "town.ply", "-r", 10, "-o", tmp_path / name, "--steps", 30)
+        tiled = ("--views", folder / "views.json", "--tile-rows", 4000, "--workers", 1)
+        good(command_line, tmp_path, *args, *tiled, *options)
+        return read_splats(tmp_path / name / "scene.ply")
+
+    usual = distilled("usual")
+    assert distilled("again").fingerprint() == usual.fingerprint()
+    others = (
+        ("--background", "1,1,1"),
+        ("--set", "rates.means=0.01"),
+        ("--set", "regularizers.shape=1", "--set", "regularizers.period=1"),
+        ("--seed", 3),
+    )
+    for number, options in enumerate(others):
+        changed = distilled(f"other{number}", *options)
+        assert changed.fingerprint() != usual.fingerprint(), options
+    wider = distilled("wider", "--sh-degree", 1)
+    assert wider.sh_degree == 1
+    assert np.abs(wider.shN).max() > 0

@@ -41,8 +41,8 @@ def save(path: Path, *scenes: Splats, camera: Camera = FRONT, up: tuple[float, .
     return path
 
 
-def show(browser: Browser, page: Path) -> None:
-    browser.open(page.absolute().as_uri())
+def show(browser: Browser, page: Path | str) -> None:
+    browser.open(page if isinstance(page, str) else page.absolute().as_uri())
     browser.run(
         "new Promise(done => { const look = () => window.g2ard ? done() : setTimeout(look, 20); look(); })"
     )
@@ -50,8 +50,8 @@ def show(browser: Browser, page: Path) -> None:
 
 
 def drawn(browser: Browser, accept: Callable[[np.ndarray], bool], index: int = 0) -> np.ndarray:
-    """(H, W, 3) in [0, 1]: what a viewer draws, without the controls above it. Sorting runs beside drawing, in
-    its own time: frames are asked for until one is accepted, and the last one is given after a minute."""
+    """(H, W, 3) in [0, 1]: what a viewer draws, without the controls above it. Sorting runs beside drawing:
+    frames are asked for until one is accepted; the last one is given after a minute."""
     size = f"{{width: {WIDTH}, height: {HEIGHT}, supersample: 1}}"
     until = time.monotonic() + 60
     while True:

@@ -22,6 +22,7 @@ __all__ = [
     "ConventionOption",
     "CropOption",
     "FormatOption",
+    "KeepRegionOption",
     "LookOption",
     "OutputOption",
     "PaperOption",
@@ -126,6 +127,36 @@ UpOption = Annotated[
         parser=_direction,
         metavar="X,Y,Z",
         help="Away from the ground, for poses that are made; estimated unless given.",
+    ),
+]
+
+
+class Spot(tuple[float, ...]):
+    """A region as typed."""
+
+    def __str__(self) -> str:
+        return ",".join(f"{number:.17g}" for number in self)
+
+
+def _spot(text: str) -> Spot:
+    from g2ard.cli.lists import numbers
+    from g2ard.errors import InputError
+    from g2ard.regions import check_region
+
+    try:
+        return Spot(check_region(numbers("--keep-region", text, 4 if text.count(",") == 3 else 6)))
+    except InputError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
+KeepRegionOption = Annotated[
+    list[Spot] | None,
+    typer.Option(
+        "--keep-region",
+        parser=_spot,
+        metavar="X,Y,Z,R|X,Y,Z,X,Y,Z",
+        help="More of the budget for a sphere or a box, scene units, as if views stood twice as near "
+        "(--set keep_times=4); may be repeated.",
     ),
 ]
 SplitOption = Annotated[

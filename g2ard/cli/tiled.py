@@ -66,6 +66,7 @@ class TiledCommand:
                     "unseen": small.unseen,
                     "method": "default",
                     "constants": listed({"simplify": config.resolved("default")}),
+                    "keep_region": config.keep_region,
                     "notes": {note.code: note.count for note in store.notes},
                     "seconds": {"total": seconds},
                     "peak_rss_bytes": peak_rss(),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from g2ard.errors import InputError
 from g2ard.policy.budget import Budget
 from g2ard.policy.distill_options import DistillOptions, takes_options
-from g2ard.policy.inputs import load_scene
+from g2ard.policy.inputs import load_scene, say_regions
 from g2ard.policy.job import DistillJob
 from g2ard.policy.views import is_made, views_of
 from g2ard.progress import Progress, Say, plural, silent, unsaid
@@ -158,13 +158,15 @@ def prepare(
     against = kinds_told(shown, len(train) - shown)
     say(f"{len(prior):,} → {counts}; {plural(len(train), 'view')} against {against}")
     say(f"regularisers: {why}")
+    config = changed(_config(options, chosen, lifted, regularizers), "recover", values)
+    say_regions(prior, config.simplify, name, say)
     return DistillJob(
         prior=prior,
         aims=aims,
         views=replace(views, apart=None) if use_photos else views,  # photos are only where they were taken
         teacher=prior if needs_teacher else None,
         photos=use_photos and needs_teacher,  # beside the teacher's renders
-        config=changed(_config(options, chosen, lifted, regularizers), "recover", values),
+        config=config,
         weights=views.train.weights if chosen["weighted"] else None,
         lifting=lifting if lifted else None,
         preset=why,
@@ -191,6 +193,7 @@ def _config(
     """The pipeline's; `chosen` is what the preset had to decide."""
     from g2ard.pipeline import DistillConfig
     from g2ard.stages.recover.schedule import schedule_named
+    from g2ard.stages.simplify.config import SimplifyConfig
 
     whole = lifted or chosen["schedule"] == "paper" or options.preset.startswith("paper")
     return DistillConfig(
@@ -203,6 +206,7 @@ def _config(
         background=options.background,
         views=chosen["views_count"],
         policy=chosen["policy"],
+        simplify=SimplifyConfig(keep_region=tuple(map(tuple, options.keep_region))),
         weighted=chosen["weighted"],
         reselect=options.reselect,
         seed=options.seed,

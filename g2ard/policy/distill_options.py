@@ -38,6 +38,8 @@ class DistillOptions:
         weighted: draw views by weights, their own or the selection's; True if None.
         reselect: choose views again from every round's scene.
         method: of simplification: default, fast or paper; "default" if None.
+        keep_region: spheres (x, y, z, r) and boxes (x, y, z, x, y, z), world coordinates, which get more of
+            the budget, as if views stood √keep_times times as near.
         preset: which regularisers hold the geometry: auto (measured), trained, lift, noisy; paper,
             paper-trained, paper-lift and paper-noisy are the paper's, and turn all that is None here to
             what the paper has.
@@ -64,6 +66,7 @@ class DistillOptions:
     weighted: bool | None = None
     reselect: bool = False
     method: str | None = None
+    keep_region: Sequence[Sequence[float]] = ()
     preset: str = "auto"
     schedule: str | None = None
     steps: int | None = None

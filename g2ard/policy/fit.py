@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,8 +35,12 @@ _MARGIN = 0.985
 """Of the bytes asked for: merged scenes pack a little better or worse than the probe."""
 _PROBES, _CLOSE = 2, 0.05
 """Further files written to find a count of bytes, and the share of the bytes that is close enough to stop."""
-_STEP = 0.65
-"""Share of the Gaussians between looks at the quality."""
+_LOOKS = 8
+"""Counts that the quality is looked at for, at the most."""
+_CLOSE_ENOUGH = 0.25
+"""Decibels above what is wanted that are close enough to stop."""
+_SLOPE = 4.0
+"""Decibels for twice the Gaussians, until two counts tell."""
 _FEWEST = 64
 """Gaussians that the search for a quality stops at."""
 
@@ -50,6 +55,12 @@ class Quality:
     def meets(self, wanted: Quality) -> bool:
         """Whether both are reached."""
         return self.psnr >= wanted.psnr and self.ssim >= wanted.ssim
+
+    def over(self, wanted: Quality) -> float:
+        """Decibels above what is wanted, the less of PSNR's and −10 log₁₀(1 − SSIM)'s; ∞ where nothing is."""
+        ssims = (max(1 - value, 1e-9) for value in (wanted.ssim, self.ssim))
+        of_ssim = 10 * math.log10(next(ssims) / next(ssims)) if wanted.ssim > 0 else math.inf
+        return min(self.psnr - wanted.psnr if wanted.psnr > 0 else math.inf, of_ssim)
 
 
 Reduce = Callable[[Splats, int], Splats]
@@ -124,52 +135,51 @@ def quality(renders: list[Any], splats: Splats, cameras: Cameras) -> Quality:
 
 
 def count_for_quality(
-    splats: Splats, wanted: Quality, cameras: Cameras, reduce: Reduce
+    splats: Splats, wanted: Quality, cameras: Cameras, reduce: Callable[[int], Splats]
 ) -> tuple[int, Quality]:
     """About the fewest Gaussians that keep a quality in these views, and the quality there.
 
-    One scene shrinks on and on by 0.65, each step from the last, until it falls short; between the last two
-    counts PSNR is taken as linear in the logarithm of the count, which one more look checks.
+    The excess of a quality over what is wanted, dB, is nearly linear in the logarithm of the count: from a
+    quarter of the scene the counts looked at follow its slope, then the line between the last that keeps the
+    quality and the last that does not, until one keeps it by at most 0.25 dB.
+
+    Args:
+        splats: the dense scene, N Gaussians.
+        wanted: mean PSNR and SSIM; 0 asks for nothing.
+        cameras: where they are measured.
+        reduce: the method that the result will be made with: count → scene.
 
     Returns:
-        The count, at most the scene's own, and what the scene of the shrinking had at or just above it.
+        The count, N where nothing less keeps the quality.
     """
     renders = _images(splats, cameras)
-    above, scene, good = len(splats), splats, Quality(float("inf"), 1.0)
-    while above > _FEWEST:
-        below = max(int(above * _STEP), _FEWEST)
-        smaller = reduce(scene, below)
-        found = quality(renders, smaller, cameras)
-        if not found.meets(wanted):
-            return _between(scene, above, good, below, found, wanted, renders, cameras, reduce)
-        scene, above, good = smaller, below, found
-    return above, good
+    met, good, missed = len(splats), Quality(float("inf"), 1.0), 0
+    excesses: dict[int, float] = {}
+    count = max(_FEWEST, len(splats) // 4)
+    while len(excesses) < _LOOKS and missed < count < met:
+        found = quality(renders, reduce(count), cameras)
+        excesses[count] = excess = found.over(wanted)
+        if excess >= 0:
+            met, good = count, found
+        else:
+            missed = count
+        if 0 <= excess <= _CLOSE_ENOUGH or met <= _FEWEST:
+            break
+        count = _next_count(excesses, met, missed, len(splats))
+    return met, good
 
 
-def _between(
-    scene: Splats,
-    above: int,
-    good: Quality,
-    below: int,
-    bad: Quality,
-    wanted: Quality,
-    renders: list[Any],
-    cameras: Cameras,
-    reduce: Reduce,
-) -> tuple[int, Quality]:
-    """The count between one that meets the quality and one that does not."""
-    share = 1.0
-    for name in ("psnr", "ssim"):
-        low, high, need = getattr(bad, name), getattr(good, name), getattr(wanted, name)
-        if np.isfinite(high) and need > low:
-            share = min(share, (high - need) / max(high - low, 1e-12))
-        elif need > low:
-            share = min(share, 0.5)
-    count = round(above * (below / above) ** max(share, 0.0))
-    if count >= above:
-        return above, good
-    found = quality(renders, reduce(scene, count), cameras)
-    return (count, found) if found.meets(wanted) else (above, good)
+def _next_count(excesses: Mapping[int, float], met: int, missed: int, most: int) -> int:
+    """Where the excess is expected to be half of what is close enough."""
+    aim = _CLOSE_ENOUGH / 2
+    if missed and met < most:
+        share = (aim - excesses[missed]) / max(excesses[met] - excesses[missed], 1e-12)
+        return round(missed * (met / missed) ** min(max(share, 0.05), 0.95))
+    near = met if met < most else missed
+    (a, at_a), (b, at_b) = min(excesses.items()), max(excesses.items())
+    slope = (at_b - at_a) / math.log2(b / a) if b > a else _SLOPE
+    steps = (aim - excesses[near]) / max(slope, _SLOPE / 4)
+    return min(most, max(_FEWEST, round(near * 2 ** min(max(steps, -3.0), 3.0))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,6 +258,7 @@ def aim_of(
     name: str = "scene",
     *,
     file: str = "scene.ply",
+    reduce: Callable[[int], Simplified] | None = None,
     seed: int = 0,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -259,6 +270,7 @@ def aim_of(
         splats: the scene.
         name: what errors call the scene.
         file: a name whose suffix is the format of the file that `Budget.fit` speaks of.
+        reduce: the reduction that a quality is to be kept by; None for `default` with a pool of its own.
         seed: of the views that quality is measured in.
         progress: told of planning.
         say: told what was found.
@@ -269,7 +281,7 @@ def aim_of(
     """
     if budget.min_psnr is not None or budget.min_ssim is not None:
         wanted = Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0)
-        return _by_quality(splats, wanted, seed, progress, say)
+        return _by_quality(splats, wanted, reduce, seed, progress, say)
     if budget.bytes is not None:
         found = count_for_bytes(splats, budget.bytes, file, _fast)
         say(f"{budget.fit}: about {plural(found, 'Gaussian')}")
@@ -280,12 +292,21 @@ def aim_of(
     return Aim(found)
 
 
-def _by_quality(splats: Splats, wanted: Quality, seed: int, progress: Progress, say: Say) -> Aim:
+def _by_quality(
+    splats: Splats,
+    wanted: Quality,
+    reduce: Callable[[int], Simplified] | None,
+    seed: int,
+    progress: Progress,
+    say: Say,
+) -> Aim:
+    from g2ard.policy.simplify import Reduction
     from g2ard.poses import plan_pool
 
     pool = plan_pool(splats, _VIEWS, seed=seed, rows=_ROWS, looks=True, progress=progress)
     cameras = pool.cameras.resized(_SIDE)
-    found, near = count_for_quality(splats, wanted, cameras, _fast)
+    reduce = reduce or Reduction(splats, seed=seed)
+    found, near = count_for_quality(splats, wanted, cameras, lambda count: reduce(count).splats)
     say(f"{plural(found, 'Gaussian')} should keep {near.psnr:.2f} dB, SSIM {near.ssim:.4f}")
     return Aim(found, wanted=wanted, dense=splats, cameras=cameras)
 

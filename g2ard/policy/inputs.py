@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from g2ard.io import Note, ViewSet
     from g2ard.splats import Splats
     from g2ard.stages.render import RasterSettings
+    from g2ard.stages.simplify import SimplifyConfig
     from g2ard.targets import Targets
 
     Views = Cameras | ViewSet | str | Path  # read already, or where they lie
@@ -32,6 +33,7 @@ __all__ = [
     "load_views",
     "make_targets",
     "say_notes",
+    "say_regions",
 ]
 
 
@@ -50,6 +52,27 @@ def say_notes(path: str | Path, notes: Sequence[Note], say: Say) -> None:
     for note in notes:
         if note.code not in _HARMLESS:
             say(f"{path}: {note}")
+
+
+def say_regions(splats: Splats, config: SimplifyConfig, name: str, say: Say) -> None:
+    """Say how many Gaussians lie in the regions to keep.
+
+    Raises:
+        InputError: none.
+    """
+    from g2ard.errors import InputError
+    from g2ard.regions import in_any
+
+    if config.keep_region:
+        inside = int(in_any(splats, config.keep_region).sum())
+        if not inside:
+            raise InputError(
+                f"keep_region: none of the {len(splats):,} Gaussians of {name} lies there; "
+                "`g2ard info` tells where they are"
+            )
+        share = inside / len(splats)
+        times = f"{config.keep_times:g} times"
+        say(f"{plural(inside, 'Gaussian')} in the regions to keep ({share:.1%}) count {times}")
 
 
 _HARMLESS = ("clamped_logits",)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from g2ard.policy.budget import Budget
-from g2ard.policy.inputs import load_scene
+from g2ard.policy.inputs import load_scene, say_regions
 from g2ard.policy.views import cameras_for_looks
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.splats import Splats
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
     from g2ard.policy.inputs import Views
     from g2ard.stages.simplify import Simplified, SimplifyConfig, Visibility, VisibilitySource
 
-__all__ = ["simplify", "simplify_each"]
+__all__ = ["Reduction", "simplify"]
 
 
 def simplify(
@@ -31,6 +33,7 @@ def simplify(
     views: Views | None = None,
     blind: bool = False,
     method: str = "default",
+    keep_region: Sequence[Sequence[float]] = (),
     config: SimplifyConfig | None = None,
     constants: Mapping[str, Any] | None = None,
     beside: str | Path | None = None,
@@ -57,6 +60,8 @@ def simplify(
             "made" makes a pool even if cameras lie beside the scene.
         blind: use no cameras at all.
         method: default, fast or paper; `g2ard.stages.simplify.simplify` says what they do.
+        keep_region: spheres (x, y, z, r) and boxes (x, y, z, x, y, z), world coordinates, which get more of
+            the budget, as if views stood √keep_times times as near.
         config: constants; None means the method's own.
         constants: by full name, as `--set` has them, such as {"simplify.max_energy": 0.02}; they win over
             `config`'s.
@@ -87,12 +92,12 @@ def simplify(
     if constants:
         values = full_names(constants, {"simplify": SimplifyConfig()})
         config = changed(config or SimplifyConfig(), "simplify", values)
+    if keep_region:
+        config = replace(config or SimplifyConfig(), keep_region=tuple(map(tuple, keep_region)))
     wanted = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     splats, beside, name = _scene(scene, beside, say)
-    aim = aim_of(wanted, splats, name, file=f"scene.{format}", seed=seed, progress=progress, say=say)
-    made = simplify_each(
+    reduce = Reduction(
         splats,
-        [aim.count],
         views=views,
         blind=blind,
         method=method,
@@ -103,53 +108,87 @@ def simplify(
         progress=progress,
         say=say,
     )
-    small = aim.shrink_simplified(next(made), say)
+    file = f"scene.{format}"
+    aim = aim_of(wanted, splats, name, file=file, reduce=reduce, seed=seed, progress=progress, say=say)
+    small = aim.shrink_simplified(reduce(aim.count), say)
     if judgement := aim.judge(small.splats):
         say(judgement[1])
     return small
 
 
-def simplify_each(
-    splats: Splats,
-    budgets: Sequence[int],
-    *,
-    views: Views | None = None,
-    blind: bool = False,
-    method: str = "default",
-    config: SimplifyConfig | None = None,
-    beside: str | Path | None = None,
-    up: Sequence[float] | None = None,
-    seed: int = 0,
-    progress: Progress = silent,
-    say: Say = unsaid,
-) -> Iterator[Simplified]:
-    """The same scene at several budgets, each as `simplify` gives it; poses and visibility are shared.
+class Reduction:
+    """A scene's reductions to any budget, each as `simplify` gives it: count → `Simplified`.
+
+    Poses and what they see of the scene are found once, and the last two results stay.
+
+    Args:
+        splats: the dense scene.
+        progress: told of planning, visibility and Gaussians shed.
+        say: told in lines what was noticed and which views are used.
+
+    The others are as for `simplify`.
 
     Raises:
         InputError: as `simplify`.
     """
-    from g2ard.errors import InputError
-    from g2ard.stages.simplify import SimplifyConfig
-    from g2ard.stages.simplify import simplify as reduce
-    from g2ard.visibility import visibility_source
 
-    if views is not None and blind:
-        raise InputError("views, blind: blind uses no views")
-    look = None
-    if not blind and any(budget < len(splats) for budget in budgets):
-        cameras = cameras_for_looks(
-            splats, views, method, beside=beside, up=up, seed=seed, progress=progress, say=say
-        )
-        look = None if cameras is None else _remembering(visibility_source(cameras, progress=progress))
-    for budget in budgets:
-        yield reduce(
+    def __init__(
+        self,
+        splats: Splats,
+        *,
+        views: Views | None = None,
+        blind: bool = False,
+        method: str = "default",
+        config: SimplifyConfig | None = None,
+        beside: str | Path | None = None,
+        up: Sequence[float] | None = None,
+        seed: int = 0,
+        progress: Progress = silent,
+        say: Say = unsaid,
+    ) -> None:
+        from g2ard.errors import InputError
+        from g2ard.stages.simplify import SimplifyConfig
+
+        if views is not None and blind:
+            raise InputError("views, blind: blind uses no views")
+        self.splats, self.blind, self.method = splats, blind, method
+        self.config, self.progress = config or SimplifyConfig(), progress
+        say_regions(splats, self.config, "the scene", say)
+        self._plan = partial(
+            cameras_for_looks,
             splats,
-            budget,
-            method=method,
-            visibility=look if budget < len(splats) else None,
-            config=config or SimplifyConfig(),
+            views,
+            method,
+            beside=beside,
+            up=up,
+            seed=seed,
             progress=progress,
+            say=say,
         )
+        self._made: dict[int, Simplified] = {}
+
+    def __call__(self, count: int) -> Simplified:
+        """The scene at a budget."""
+        from g2ard.stages.simplify import simplify as reduce
+
+        if count not in self._made:
+            made = reduce(
+                self.splats,
+                count,
+                method=self.method,
+                visibility=self._look if count < len(self.splats) else None,
+                config=self.config,
+                progress=self.progress,
+            )
+            self._made = dict([*self._made.items(), (count, made)][-2:])
+        return self._made[count]
+
+    @cached_property
+    def _look(self) -> VisibilitySource | None:
+        from g2ard.visibility import visibility_source
+
+        cameras = None if self.blind else self._plan()
+        return None if cameras is None else _remembering(visibility_source(cameras, progress=self.progress))
 
 
 def _scene(

@@ -54,6 +54,7 @@ def distill_in_tiles(
     from g2ard.stages.recover.need import steps_for
     from g2ard.stages.recover.presets import preset_for
     from g2ard.stages.recover.schedule import schedule_named
+    from g2ard.stages.simplify import SimplifyConfig
     from g2ard.tiles.executor import executor
     from g2ard.tiles.recover import recover_tiles
     from g2ard.tiles.simplify import sample_of, simplify_tiles
@@ -89,7 +90,9 @@ def distill_in_tiles(
                 sh_degree=options.sh_degree,
                 seed=options.seed,
             )
-            config = changed(config, "recover", full_names(options.constants or {}, {"recover": config}))
+            merging = SimplifyConfig(keep_region=tuple(map(tuple, options.keep_region)))
+            constants = full_names(options.constants or {}, {"recover": config, "simplify": merging})
+            config, merging = changed(config, "recover", constants), changed(merging, "simplify", constants)
             train = views.train.cameras
             steps = options.steps or round(steps_for(sample, train, schedule.steps) * pool_times(store.count))
             for budget in budgets:
@@ -98,6 +101,7 @@ def distill_in_tiles(
                     budget.of(store.count, str(scene)),
                     executor=runs,
                     work=work,
+                    config=merging,
                     views=train,
                     seed=options.seed,
                     progress=progress,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.cameras import Cameras
-from g2ard.constants import changed, listed
+from g2ard.constants import changed, values_of
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.splats import SH_C0, Splats
@@ -217,9 +217,9 @@ def recover_tiles(
     errors = np.sum([load(path, "errors")[0] for path in paths], axis=0)
     taken = sum(int(load(path, "steps")[0]) for path in paths)
     psnr = [float(-10 * math.log10(max(e, 1e-12) / max(n, 1))) for e, n in errors]
+    degree = small.sh_degree if config.sh_degree is None else config.sh_degree
     scene = replace(
-        small,
-        tiles=lambda tile: finished(scene_of(paths[tile], "scene"), small.sh_degree),
+        small, sh_degree=degree, tiles=lambda tile: finished(scene_of(paths[tile], "scene"), degree)
     )
     return scene, TiledScores(psnr[0], psnr[1], int(errors[0][1]) // 3, taken)
 
@@ -260,7 +260,7 @@ def _task(
             "levels": around.levels[tile],
             "mean": around.mean,
             "steps": round(steps_a_view * len(views["train"])),
-            "config": listed({"recover": config}),
+            "config": values_of({"recover": config}),
             **views,
         },
         {

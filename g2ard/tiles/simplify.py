@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.regions import Region, in_any
 from g2ard.splats import Splats, unit_quats
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.cut import cheapest
@@ -124,6 +125,7 @@ def simplify_tiles(
     sights: Sights | None = None
     if not blind:
         sample = joined([scene_of(path, "sample") for path in coarse])
+        _check_regions(sample, run.config["keep_region"])
         cameras = views or beside(sample) or _planned(run, sample, up, seed, say)
         sights = None if cameras is None else Sights(run, coarse, cameras, frame)
         frame = frame if sights is None else sights.frame
@@ -180,6 +182,13 @@ def _scene(
 def finished(small: Splats, sh_degree: int) -> Splats:
     """A tile's Gaussians as they are written."""
     return replace(small.with_sh_degree(sh_degree), quats=unit_quats(small.quats))
+
+
+def _check_regions(sample: Splats, regions: Sequence[Region]) -> None:
+    if regions and not in_any(sample, regions).any():
+        raise InputError(
+            f"keep_region: none of {len(sample):,} Gaussians, a fair sample of the scene, lies there"
+        )
 
 
 def _look_of(sights: Sights | None) -> dict[str, Any]:

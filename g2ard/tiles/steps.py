@@ -21,7 +21,7 @@ from g2ard.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.splats import Splats
 from g2ard.stages.render import RasterSettings, view_of
 from g2ard.stages.simplify import SimplifyConfig, schedule, simplify
-from g2ard.stages.simplify.pairs import fit_opacities
+from g2ard.stages.simplify.pairs import emphasised, fit_opacities
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.task import Arrays, load
 from g2ard.visibility import CONVERGED, NEAR, ROUND, spread
@@ -70,7 +70,7 @@ _FIELDS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset"
 def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """A tile merged to a few Gaussians, near and far, and a fair sample of its rows."""
     scene = tile_of(arguments, places, check=True)
-    config = _config(arguments)
+    config = replace(_config(arguments), keep_region=())  # for what other tiles see of this one
     some = _widened(scene.take(scene.core.order[::_THINNED]), _THINNED)
     near = simplify(some, max(1, len(scene) // COARSE[0]), method="fast", config=config).splats
     far = simplify(near, max(1, len(scene) // COARSE[1]), method="fast", config=config).splats
@@ -251,6 +251,8 @@ def _merging(
     pixel_size: NDArray[np.float32] | None,
 ) -> _core.TileMerging:
     config = config.resolved("default")
+    if weight is not None and pixel_size is not None:
+        weight, pixel_size = emphasised(scene, weight, pixel_size, config)
     return _core.TileMerging(
         scene.core,
         frame,

@@ -24,6 +24,7 @@ from g2ard.cli.options import (
     BackgroundOption,
     CropOption,
     FormatOption,
+    KeepRegionOption,
     PolicyOption,
     PresetOption,
     RecoveryTimeOption,
@@ -123,6 +124,7 @@ def distill(
         typer.Option("--reselect", help="Choose views again from every round's scene, not just the first."),
     ] = False,
     method: Annotated[Method, typer.Option(help="How to simplify.")] = "default",
+    keep_region: KeepRegionOption = None,
     preset: PresetOption = "auto",
     schedule: Annotated[
         ScheduleName, typer.Option(help="Recovery; paper also goes round by round.")
@@ -219,6 +221,7 @@ def distill(
         weighted=weighted,
         reselect=reselect,
         method=method,
+        keep_region=keep_region or (),
         preset=preset,
         schedule=schedule,
         steps=steps,

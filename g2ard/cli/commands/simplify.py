@@ -12,6 +12,7 @@ from g2ard.choices import Method
 from g2ard.cli.budget_options import CountsOption, FitOption, MinPsnrOption, MinSsimOption, RatiosOption
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
+    KeepRegionOption,
     OutputOption,
     PaperOption,
     SceneArgument,
@@ -62,6 +63,7 @@ def simplify(
         float | None,
         typer.Option(help="Share of the Gaussians that a round keeps; the method's own if absent."),
     ] = None,
+    keep_region: KeepRegionOption = None,
     up: UpOption = None,
     tile_rows: TileRowsOption = None,
     memory: MemoryOption = None,
@@ -81,15 +83,18 @@ def simplify(
     budgets = budgets_of(count, ratio, fit, min_psnr, min_ssim)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other; give one")
+    if keep_region and (no_views or method == "paper"):
+        raise typer.BadParameter("--keep-region: needs views, which --no-views and --method paper do without")
     tiling = tiling_of(run, output, tile_rows, memory, workers, scheduler, work)
     from g2ard import io
     from g2ard.constants import changed
     from g2ard.policy.fit import aim_of
     from g2ard.policy.inputs import say_notes
-    from g2ard.policy.simplify import simplify_each
+    from g2ard.policy.simplify import Reduction
     from g2ard.policy.tiled import check_memory, is_tiled
 
-    config = changed(SimplifyConfig(retention=retention), "simplify", values)
+    config = SimplifyConfig(retention=retention, keep_region=tuple(keep_region or ()))
+    config = changed(config, "simplify", values)
     outputs = Outputs(run, output, budgets)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite))
     if is_tiled(scene, tiling):
@@ -107,21 +112,8 @@ def simplify(
     total = len(found.splats)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite), total)
     clock.append(time.perf_counter())
-    aims = [
-        aim_of(
-            budget,
-            found.splats,
-            str(scene),
-            file=output.name,
-            seed=run.seed,
-            progress=run.progress,
-            say=run.say,
-        )
-        for budget in budgets
-    ]
-    made = simplify_each(
+    reduce = Reduction(
         found.splats,
-        [aim.count for aim in aims],
         views=views,
         blind=no_views,
         method=method,
@@ -132,10 +124,23 @@ def simplify(
         progress=run.progress,
         say=run.say,
     )
+    aims = [
+        aim_of(
+            budget,
+            found.splats,
+            str(scene),
+            file=output.name,
+            reduce=reduce,
+            seed=run.seed,
+            progress=run.progress,
+            say=run.say,
+        )
+        for budget in budgets
+    ]
     reports = []
     places = zip(outputs.paths(total), maps.paths(total) if maps else [None] * len(aims), strict=True)
-    for reduced, aim, (place, rows) in zip(made, aims, places, strict=True):
-        small = aim.shrink_simplified(reduced, run.say)
+    for aim, (place, rows) in zip(aims, places, strict=True):
+        small = aim.shrink_simplified(reduce(aim.count), run.say)
         clock.append(time.perf_counter())
         io.write_splats(place, small.splats, overwrite=run.overwrite)
         if rows is not None:
@@ -168,6 +173,7 @@ def _report(
         **small.report.as_dict(),
         "method": method,
         "constants": listed({"simplify": config}),
+        "keep_region": config.keep_region,
         "notes": {note.code: note.count for note in found.notes},
         "seconds": {
             "read": read - began,

@@ -166,6 +166,8 @@ def simplify(
         flags = np.ascontiguousarray(flags[finite])
     if not (scene.opacities >= config.min_opacity_of(method)).any():
         scene, config = with_some_opacity(scene), replace(config, min_opacity=0.0)
+    if config.keep_region and (method == "paper" or visibility is None):
+        raise InputError("keep_region: needs views; `paper` looks from none, `fast` from given ones alone")
     if method == "paper":
         out = _paper(scene, budget, flags, final_budget or budget, config, progress)
     else:

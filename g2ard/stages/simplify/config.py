@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from g2ard import _core
 from g2ard.choices import METHODS
 from g2ard.errors import InputError
+from g2ard.regions import Region, check_region
 
 __all__ = ["METHODS", "SimplifyConfig", "schedule"]
 
@@ -50,6 +51,10 @@ class SimplifyConfig:
         max_growth: of `default` and `fast`: how many times the area that its moments say a cluster may take,
             along its two longer axes, where α ≤ 0.99 alone cannot hold its mass. At 1 opaque surfaces show
             gaps.
+        keep_region: of `default` and `fast` with views: spheres (x, y, z, r) and boxes (x, y, z, x, y, z), in
+            world coordinates, which get more of the budget.
+        keep_times: views count in them as if they stood √keep_times times as near: each Gaussian covers
+            keep_times as many pixels.
         color_bin: `paper`: edge of the colour bins that part [0, 1] within a cell, in colour units
             (`tab:s_config`).
         max_energy: `paper`: largest affine energy of a merged group, summed over channels, colour units
@@ -76,6 +81,8 @@ class SimplifyConfig:
     dilation: float = _PAIRWISE["dilation"]
     pixel_scale: float = _PAIRWISE["pixel_scale"]
     max_growth: float = _PAIRWISE["max_growth"]
+    keep_region: tuple[Region, ...] = field(default=(), metadata={"constant": False})
+    keep_times: float = 4.0
     color_bin: float = _PAPER["color_bin"]
     max_energy: float = _PAPER["max_energy"]
     min_coverage: float = _PAPER["min_coverage"]
@@ -97,7 +104,8 @@ class SimplifyConfig:
             raise InputError(f"morton_premerge_steps: expected at least 1, got {self.morton_premerge_steps}")
         if self.neighbors < 1:
             raise InputError(f"neighbors: expected at least 1, got {self.neighbors}")
-        for name in ("color_bin", "pixel_scale", "support"):
+        object.__setattr__(self, "keep_region", tuple(check_region(region) for region in self.keep_region))
+        for name in ("color_bin", "pixel_scale", "support", "keep_times"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise InputError(f"{name}: expected a positive number, got {value}")

@@ -14,12 +14,14 @@ from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.prepared import PreparedScene
 from g2ard.progress import Progress, counter
+from g2ard.regions import in_any
 from g2ard.splats import DRAWN_LOGIT, Splats
 from g2ard.stages.simplify.config import SimplifyConfig, schedule
 
 __all__ = [
     "Visibility",
     "VisibilitySource",
+    "emphasised",
     "fit_opacities",
     "merge",
     "merge_and_fit",
@@ -76,6 +78,25 @@ def rows_of(visibility: Visibility, count: int, finite: NDArray[np.bool_] | slic
     return _RowVisibility(np.ascontiguousarray(weight), np.ascontiguousarray(pixel))
 
 
+def emphasised(
+    scene: Splats, weight: NDArray[np.float32], pixel_size: NDArray[np.float32], config: SimplifyConfig
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What views would see that stood √t times as near to what lies in the regions to keep, t = keep_times: a
+    Gaussian covers t times as many pixels, which are 1/√t as wide there.
+
+    Args:
+        scene: N Gaussians.
+        weight: (N,) Σ αT of them.
+        pixel_size: (N,) the size of a pixel there.
+        config: `keep_region` and `keep_times` are read.
+    """
+    if not config.keep_region:
+        return weight, pixel_size
+    inside = in_any(scene, config.keep_region)
+    times = np.where(inside, np.float32(config.keep_times), np.float32(1))
+    return weight * times, (pixel_size / np.sqrt(times)).astype(np.float32)
+
+
 def merge(
     scene: PreparedScene,
     budget: int,
@@ -87,12 +108,15 @@ def merge(
 ) -> dict[str, Any]:
     """`default` or `fast`; `visibility` has a row for each of the scene's."""
     config = config.resolved(method)
+    weight = pixel_size = None
+    if visibility is not None:
+        weight, pixel_size = emphasised(scene, visibility.weight, visibility.pixel_size, config)
     return _core.simplify_pairwise(
         scene.core,
         schedule(len(scene), budget, config.retention_of(method), config.fold),
         protected=flags,
-        weight=None if visibility is None else visibility.weight,
-        pixel_size=None if visibility is None else visibility.pixel_size,
+        weight=weight,
+        pixel_size=pixel_size,
         min_opacity=config.min_opacity_of(method),
         morton_premerge_ratio=config.morton_premerge_ratio,
         morton_premerge_steps=config.morton_premerge_steps,
