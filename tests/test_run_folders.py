@@ -72,7 +72,7 @@ def test_a_runs_scene_is_not_written_over(home: Path, command_line: CommandLine)
 
 
 def test_a_folder_of_runs_names_them(home: Path) -> None:
-    with pytest.raises(InputError, match="runs: nothing known in this folder; name one of its runs: a, b$"):
+    with pytest.raises(InputError, match=r"runs: nothing known in this folder; name one of its runs: a, b$"):
         g2ard.load(home / "runs")
 
 
