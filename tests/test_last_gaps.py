@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from scenes import around, checkered_ball
+from test_first_hour import photos_of
 
 import g2ard
 from g2ard.cli.run_result import told, write_table
@@ -126,6 +127,19 @@ def test_every_command_tells_of_views_of_another_world(
         status, _, error = command_line(*ask, "--views", views, "-w", cwd=folder)
         assert status == 0, error
         assert ("views have nothing of the scene in sight: are both of one world?" in error) == warned, error
+
+
+def test_photos_of_another_world_are_told(command_line: CommandLine, folder: Path) -> None:
+    """Whose views may see much of the scene: both stand about the origin."""
+    photos_of(folder / "photos")
+    ask = ("-n", 50, "--views", "photos", "--steps", 2, "--dry-run")
+    own = checkered_ball(1200)
+    g2ard.save(folder / "own.ply", own)
+    g2ard.save(folder / "other.ply", replace(own, means=6 * own.means, scales=6 * own.scales))
+    for scene, warned in (("other.ply", True), ("own.ply", False)):
+        status, _, error = command_line("distill", scene, *ask, "-o", "run", cwd=folder)
+        assert status == 0, error
+        assert ("warning: the scene looks like none of the photos (correlation" in error) == warned, error
 
 
 def test_a_letter_in_a_config_is_told_its_long_name(command_line: CommandLine, folder: Path) -> None:
