@@ -18,9 +18,10 @@ from g2ard.pipeline_report import DistillReport, RoundReport, StageSeconds, View
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
 from g2ard.stages.recover import checkpoint as checkpoints
-from g2ard.stages.recover.anchors import PRESETS, Anchors, Regularizers
+from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import checked_weights
-from g2ard.stages.recover.schedule import TUNED, Schedule
+from g2ard.stages.recover.schedule import Schedule
 from g2ard.stages.select.surfaces import CoverageOptions
 from g2ard.stages.simplify.config import SimplifyConfig
 from g2ard.targets import Photos, PhotosOrRenders, Subset, Targets, fingerprint_of
@@ -37,6 +38,8 @@ _ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 @dataclass(frozen=True)
 class DistillConfig:
     """How a scene is distilled; the paper's way is `g2ard.preset("paper").distill`.
+
+    What recovery has too has its default from `RecoverConfig`.
 
     Args:
         method: simplification's: default, fast or paper.
@@ -63,19 +66,19 @@ class DistillConfig:
     """
 
     method: str = "default"
-    schedule: Schedule = TUNED
+    schedule: Schedule = RecoverConfig.schedule
     steps: int | None = None
     recovery_time: float | None = None
-    regularizers: Regularizers = PRESETS["trained"]
+    regularizers: Regularizers = RecoverConfig.regularizers
     sh_degree: int | None = None
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: tuple[float, float, float] = RecoverConfig.background
     views: int | float | Literal["auto"] | None = None
     policy: str = "auto"
     weighted: bool = True
     reselect: bool = False
     seed: int = 0
-    engine: Engine = "fused"
-    ssim_weight: float = 0.2
+    engine: Engine = RecoverConfig.engine
+    ssim_weight: float = RecoverConfig.ssim_weight
     simplify: SimplifyConfig = field(default_factory=SimplifyConfig)
     select: CoverageOptions = field(default_factory=CoverageOptions)
 
@@ -302,7 +305,7 @@ class _Rounds:
         self.simplified = self.state
 
     def _recover(self, name: str, entry: dict[str, Any], *, final: bool) -> None:
-        from g2ard.stages.recover import RecoverConfig, recover
+        from g2ard.stages.recover import recover
 
         if self._restore(name, entry):
             self._resumed(entry["recover"][-1]["seconds"])

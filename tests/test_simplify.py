@@ -154,6 +154,16 @@ def test_the_paper_says_what_it_skipped():
 
 
 @pytest.mark.parametrize("method", METHODS)
+def test_what_is_dropped_is_told_where_nothing_merges(method):
+    faint = replace(scene(1000), logit_opacities=np.where(np.arange(1000) < 300, -9, 3).astype(np.float32))
+    out = simplify(faint, 700, method=method)
+    assert (out.parents == -1).tolist() == [True] * 300 + [False] * 700
+    rounds = out.report.rounds
+    assert (rounds[0].before, rounds[-1].after) == (1000, 700)
+    assert (sum(r.dropped for r in rounds), sum(r.merged for r in rounds)) == (300, 0)
+
+
+@pytest.mark.parametrize("method", METHODS)
 def test_identical_gaussians_keep_their_shape(method):
     prior = scene(500).take(np.zeros(1000, int))
     out = simplify(prior, 1, method=method, config=SimplifyConfig(max_growth=1)).splats

@@ -9,11 +9,11 @@ from g2ard.choices import METHODS as SIMPLIFIERS
 from g2ard.choices import POLICIES, SCHEDULE_NAMES
 from g2ard.errors import InputError
 
-__all__ = ["FINAL_STEPS", "METHODS", "ROUND_STEPS", "Leg", "Matched", "MethodSpec"]
+__all__ = ["FINAL_STEPS", "METHODS", "REDUCERS", "ROUND_STEPS", "Leg", "Matched", "MethodSpec"]
 
-_OURS = (*SIMPLIFIERS, "no-views")
 _RIVALS = ("splat-transform", "splat-transform-adaptive")
-_REDUCERS = (*_OURS, *baselines.METHODS, *_RIVALS, "none")
+REDUCERS = (*SIMPLIFIERS, "no-views", *_RIVALS, *baselines.METHODS)
+"""What reduces a scene: g2ard's methods, other programs, baselines."""
 
 ROUND_STEPS, FINAL_STEPS = 8_000, 30_000
 """Of the paper's recoveries (`tab:s_config`): after each round, and once more at the target count."""
@@ -100,7 +100,7 @@ class MethodSpec:
 
     def __post_init__(self) -> None:
         for key, known in (
-            ("reduce", _REDUCERS),
+            ("reduce", (*REDUCERS, "none")),
             ("rounds", ("one", "paper", "pup")),
             ("prior", (None, "lift", "trained", "given")),
             ("policy", (None, *POLICIES)),

@@ -17,10 +17,10 @@ import numpy as np
 
 from g2ard import __version__, baselines, io
 from g2ard.bench import rows as table
+from g2ard.bench.methods import REDUCERS
 from g2ard.bench.process import measured
 from g2ard.bench.raster import cpu_name
 from g2ard.bench.standing import check_protocol, standing_targets
-from g2ard.choices import METHODS as SIMPLIFIERS
 from g2ard.errors import InputError
 from g2ard.poses import make_pool
 from g2ard.progress import Progress, silent
@@ -30,7 +30,6 @@ from g2ard.stages.evaluate import evaluate
 from g2ard.targets import TeacherRenders
 
 __all__ = [
-    "METHODS",
     "Cell",
     "bench_simplify",
     "find_splat_transform",
@@ -38,13 +37,6 @@ __all__ = [
     "scene_label",
 ]
 
-METHODS = (
-    *SIMPLIFIERS,
-    "no-views",
-    "splat-transform",
-    "splat-transform-adaptive",
-    *baselines.METHODS,
-)
 _POOL = 128
 _MAX_LOGIT = 20.0
 """An opacity of exactly 1 has no finite logit; here it is 1 − 2e-9, which every peer can read."""
@@ -113,7 +105,7 @@ def bench_simplify(
     csv_path: Path,
     *,
     ratios: Sequence[float] = (5, 10, 20, 30),
-    methods: Sequence[str] = METHODS,
+    methods: Sequence[str] = REDUCERS,
     views: Path | None = None,
     splat_transform: Path | None = None,
     seed: int = 0,
@@ -132,7 +124,7 @@ def bench_simplify(
         scenes: anything `g2ard.io.read_scene` reads.
         csv_path: where the rows go. Rows without an error are kept and not measured again; failed ones are.
         ratios: the budget is round(N / ratio).
-        methods: of `METHODS`; leave out peers that are not installed.
+        methods: of `g2ard.bench.methods.REDUCERS`; leave out peers that are not installed.
         views: to train and score on; None makes a pool for each scene.
         splat_transform: its program; needed for its two methods.
         seed: of the pool.
@@ -146,9 +138,9 @@ def bench_simplify(
         InputError: a scene, the views or the CSV cannot be read, an unknown method or protocol.
     """
     kinds = check_protocol(protocol)
-    unknown = [m for m in methods if m not in METHODS]
+    unknown = [m for m in methods if m not in REDUCERS]
     if unknown:
-        raise InputError(f"methods: expected some of {', '.join(METHODS)}, got {', '.join(unknown)}")
+        raise InputError(f"methods: expected some of {', '.join(REDUCERS)}, got {', '.join(unknown)}")
     done = {cell.key: cell for cell in table.read(csv_path, Cell) if not cell.error}
     table.rewrite(csv_path, done.values(), Cell)
     wanted = [

@@ -166,7 +166,7 @@ def prepare(
         aims=aims,
         views=replace(views, apart=None) if use_photos else views,  # photos are only where they were taken
         teacher=prior if needs_teacher else None,
-        photos=use_photos and needs_teacher,  # beside the teacher's renders
+        photos_over_renders=use_photos and needs_teacher,
         config=config,
         weights=views.train.weights if chosen["weighted"] else None,
         lifting=lifting if lifted else None,

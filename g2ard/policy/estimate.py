@@ -257,7 +257,8 @@ def _steps(job: DistillJob, student: Splats) -> int:
     from g2ard.pipeline import final_steps
 
     config = job.config
-    last = final_steps(config, student, job.views.train.cameras, photos=job.photos or job.teacher is None)
+    photos = job.photos_over_renders or job.teacher is None
+    last = final_steps(config, student, job.views.train.cameras, photos=photos)
     return last + config.schedule.round_steps * _rounds(job, student)
 
 

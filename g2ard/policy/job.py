@@ -32,8 +32,9 @@ class DistillJob:
         prior: the dense scene, or the lift of a cloud.
         aims: what one or more budgets came to; what they share is made once.
         views: what is looked at.
-        teacher: whose renders the targets are; None where they are photos.
-        photos: with a teacher, the target of a view that has a photo is the photo.
+        teacher: whose renders the targets are; None where all of them are photos.
+        photos_over_renders: of a view that has a photo the target is the photo, the teacher's render of the
+            others; always False without a teacher.
         config: of the pipeline.
         weights: (C,) how often each view is drawn, where the views say so.
         lifting: constants of the lift; None where nothing was lifted.
@@ -49,7 +50,7 @@ class DistillJob:
     aims: tuple[Aim, ...]
     views: RunViews
     teacher: Splats | None
-    photos: bool
+    photos_over_renders: bool
     config: DistillConfig
     weights: Any
     lifting: LiftConfig | None
@@ -104,7 +105,7 @@ class DistillJob:
             self.teacher,
             self.config.background,
             lazy=lazy,
-            photos=self.photos,
+            photos=self.photos_over_renders,
             progress=self.progress,
             say=self.say,
         )

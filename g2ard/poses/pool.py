@@ -118,10 +118,13 @@ def plan_pool(
     if inside is not None and fov is None and inside.weight > _MOSTLY_INSIDE:
         lens = _lens(size, _FOV_INSIDE)
 
+    def glance() -> Glance:
+        return Glance(splats, represents)
+
     def plan(count: int) -> tuple[Poses, list[str], str]:
         if inside is not None:
-            return plan_auto(site, lambda: Glance(splats, represents), inside, count, lens, seed, tell)
-        return _planned(site, splats, kind, count, lens, seed, tell), [kind], "as asked"
+            return plan_auto(site, glance, inside, count, lens, seed, tell)
+        return _planned(site, glance, kind, count, lens, seed, tell), [kind], "as asked"
 
     poses, used, why = plan(count)
     held = _held(site, poses, lens)
@@ -134,13 +137,14 @@ def plan_pool(
             f"ask for {'fewer, or for ' if len(poses) else ''}another kind"
         )
     reach = reach_of(site, poses, lens)
-    others = _apart(site, poses, reach, apart, lens, seed)
+    # Of the pool as planned, before any of its poses steps nearer, and with another seed than those.
+    apart_views = _apart(site, poses, reach, apart, lens, seed)
     coarse = float(reach.coarse(lens).mean())
     need = max(float(np.interp(coarse, _COARSE, (0, 1))), 1 - held if looks else 0.0)
-    close = plan_near(site, poses, reach, int(near * need * len(poses)), lens, seed + 1)
-    if len(close):
-        kept = np.linspace(0, len(poses) - 1, len(poses) - len(close)).round().astype(int)
-        poses, used = Poses.joined([poses.take(kept), close]), [*used, "near"]
+    near_poses = plan_near(site, poses, reach, int(near * need * len(poses)), lens, seed + 1)
+    if len(near_poses):
+        kept = np.linspace(0, len(poses) - 1, len(poses) - len(near_poses)).round().astype(int)
+        poses, used = Poses.joined([poses.take(kept), near_poses]), [*used, "near"]
         reach = reach_of(site, poses, lens)
     order = strata(_features(poses), HOLD_OUT, seed)
     return Pool(
@@ -150,7 +154,7 @@ def plan_pool(
         site.up.axis,
         unseen=reach.unseen(),
         coarse=float(reach.coarse(lens).mean()),
-        apart=others,
+        apart=apart_views,
     )
 
 
@@ -163,17 +167,17 @@ def _held(site: Site, poses: Poses, lens: Lens) -> float:
 
 
 def _apart(site: Site, poses: Poses, reach: Reach, count: int, lens: Lens, seed: int) -> Cameras | None:
-    """Near views; None where none is asked for or has room."""
-    near = plan_near(site, poses, reach, count, lens, seed)
-    if not len(near):
+    """Views of another kind; None where none is asked for or has room."""
+    nearer = plan_near(site, poses, reach, count, lens, seed)
+    if not len(nearer):
         return None
-    cameras = near.cameras(site, lens)
+    cameras = nearer.cameras(site, lens)
     return replace(cameras, names=tuple(name.replace("pose", "near") for name in cameras.names))
 
 
 def _planned(
     site: Site,
-    splats: Splats,
+    glance: Callable[[], Glance],
     kind: str,
     count: int,
     lens: Lens,
@@ -184,7 +188,7 @@ def _planned(
     if kind == "inside":
         return plan_inside(site, find_inside(site, seed), count, lens, seed, tell)
     if kind == "focus":
-        return plan_focus(site, Glance(splats), count, lens, seed, tell)
+        return plan_focus(site, glance(), count, lens, seed, tell)
     if kind == "walk":
         return plan_walk(site, count, lens, seed, tell, indoors=shape_of(site)[0] == "room")
     return {"orbit": plan_orbit, "aerial": plan_aerial}[kind](site, count, lens, seed, tell)

@@ -57,11 +57,11 @@ class AdaptConfig:
     schedule: AdaptSchedule = "default"
     prior_views: float = 1.0
     sh_degree: int | None = None
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: tuple[float, float, float] = RecoverConfig.background
     seed: int = 0
     first_stretch: int = 500
     colour_worth: float = 0.3
-    ssim_weight: float = 0.2
+    ssim_weight: float = RecoverConfig.ssim_weight
     recovery: Schedule | None = field(default=None, metadata={"prefix": "schedule"})
 
     def __post_init__(self) -> None:

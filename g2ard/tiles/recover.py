@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from g2ard.cameras import Cameras
 from g2ard.constants import changed, values_of
 from g2ard.errors import InputError
+from g2ard.prepared import PreparedScene
 from g2ard.progress import Progress, silent
 from g2ard.splats import SH_C0, Splats
 from g2ard.stages.recover import RecoverConfig
@@ -20,9 +21,7 @@ from g2ard.stages.recover.anchors import Anchors
 from g2ard.stages.render import RasterSettings, Renderer, settings_for
 from g2ard.targets import TeacherRenders
 from g2ard.tiles.executor import Executor
-from g2ard.tiles.sights import Surroundings, in_sight, light_of, written
-from g2ard.tiles.simplify import TiledScene, finished
-from g2ard.tiles.steps import (
+from g2ard.tiles.scenes import (
     Arguments,
     Inputs,
     Places,
@@ -36,6 +35,8 @@ from g2ard.tiles.steps import (
     tile_of,
     within_halo,
 )
+from g2ard.tiles.sights import Surroundings, in_sight, light_of, written
+from g2ard.tiles.simplify import TiledScene, finished
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.task import Arrays, Task, load
 
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 
 __all__ = ["TiledScores", "recover_tile", "recover_tiles"]
 
-_BESIDE = 16
+_MARGIN = 16
 """Pixels around a tile that its images show too: SSIM's windows reach over its edge."""
 
 _OWN = 0.5
@@ -97,15 +98,20 @@ def _masks(scene: Splats, own: int, cameras: Cameras) -> list[NDArray[np.bool_]]
 
 
 def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
-    """A tile's Gaussians after recovery; (2, 2) squared error in held-out views and the number of values,
-    before it and after.
+    """A tile's Gaussians after recovery, and what held-out views say of it.
 
     Args:
-        arguments: the tile, its `levels`, the `mean` of the fit, `steps`, recovery's `config`; which views of
-            `train`, `test` and `apart` have it in sight.
-        inputs: `coarse` of all tiles; `merged` and `again` of this one, and of those `beside` it; the cameras
-            of `train`, `test` and `apart`.
-        places: `store`.
+        arguments: `tile`; `levels`, see `g2ard.tiles.steps`; `mean`, see `small_scene`; `steps` to take;
+            `config`, recovery's constants by full name; `train`, `test` and `apart`: which views of these
+            inputs have the tile in sight.
+        inputs: `coarse`, what `coarse` made of each tile; `merged` and `again`, what `merge` and `look_again`
+            made of this one; `beside_merged` and `beside_again`, the same of each tile near it, in one order;
+            `train`, `test` and `apart`, cameras in world coordinates.
+        places: `store`, the folder of the dense scene in tiles.
+
+    Returns:
+        `scene` (`scene_of`), the tile's Gaussians; `errors`, (2, 2) before and after: the squared error in
+        the held-out views and the number of values it sums; `steps` that were taken.
     """
     from g2ard.stages.recover import recover
 
@@ -113,22 +119,16 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
     core, far = tile_of(arguments, places), far_around(store, arguments, inputs)
     # The tile's own Gaussians first, in teacher and student: masks and `frozen` count on it.
     teacher = joined([part for part in (core, store.read_halo(arguments["tile"]), *far) if len(part)])
-    files = {"merged": inputs["merged"], "again": inputs["again"]}
-    small = small_scene(files, arguments["mean"])
-    beside = []
-    for merged, again in zip(inputs["beside"], inputs["beside_again"], strict=True):
-        other = small_scene({"merged": merged, "again": again}, arguments["mean"])
-        beside.append(other.take(within_halo(store, arguments["tile"], other.means)))
+    small = small_scene(inputs, arguments["mean"])
+    beside = _beside(store, arguments, inputs)
     student = joined([part for part in (small, *beside, *far) if len(part)])
     frozen = np.arange(len(student)) >= len(small)
     config = changed(RecoverConfig(), "recover", arguments["config"])
     background = config.background
 
     def targets(name: str) -> TileTargets | None:
-        cameras = cameras_of(inputs[name]).take(arguments[name])
-        settings = settings_for(core.means, RasterSettings())
-        here = cropped(cameras.recentred(store.offset), core, settings, _BESIDE)
-        found = TileTargets(teacher, len(core), here.recentred(-store.offset), background)
+        cameras = _cropped(cameras_of(inputs[name]).take(arguments[name]), core, store.offset)
+        found = TileTargets(teacher, len(core), cameras, background)
         return found if len(found.cameras) else None
 
     train, held_out, apart = targets("train"), targets("test"), targets("apart")
@@ -150,6 +150,22 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
         "errors": np.array([before, after]),
         "steps": np.array(done.report.steps),
     }
+
+
+def _beside(store: TileStore, arguments: Arguments, inputs: Inputs) -> list[Splats]:
+    """What the tiles near this one were merged to, of each the part within this one's margin."""
+    parts = []
+    for merged, again in zip(inputs["beside_merged"], inputs["beside_again"], strict=True):
+        other = small_scene({"merged": merged, "again": again}, arguments["mean"])
+        parts.append(other.take(within_halo(store, arguments["tile"], other.means)))
+    return parts
+
+
+def _cropped(cameras: Cameras, core: PreparedScene, offset: NDArray[np.float64]) -> Cameras:
+    """The parts of the images that show a tile."""
+    settings = settings_for(core.means, RasterSettings())
+    # Means lie in the store's coordinates, about `offset`; the cameras of targets in the world's.
+    return cropped(cameras.recentred(offset), core, settings, _MARGIN).recentred(-offset)
 
 
 def _errors(
@@ -266,7 +282,7 @@ def _task(
         {
             "coarse": around.coarse,
             **around.files[tile],
-            "beside": [around.files[other]["merged"] for other in near],
+            "beside_merged": [around.files[other]["merged"] for other in near],
             "beside_again": [around.files[other]["again"] for other in near],
             **{name: path for name, (path, _) in sight.items()},
         },

@@ -11,7 +11,7 @@ from g2ard.prepared import finite_rows_of
 from g2ard.progress import Progress
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.executor import Executor
-from g2ard.tiles.steps import joined, scene_of
+from g2ard.tiles.scenes import joined, scene_of
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.task import Task
 

@@ -17,7 +17,8 @@ from g2ard.io.atomic import atomic_output
 from g2ard.progress import Progress
 from g2ard.tiles.executor import Executor
 from g2ard.tiles.run import TiledRun
-from g2ard.tiles.steps import COARSE, scene_of
+from g2ard.tiles.scenes import scene_of
+from g2ard.tiles.steps import COARSE
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.task import Task, load
 from g2ard.visibility import LONGEST, MOST_LOOKS, NEAR
@@ -44,7 +45,7 @@ class Surroundings:
     Args:
         coarse: each tile's file of coarse Gaussians.
         levels: for each tile, by which of them every other stands beside it; None is itself.
-        files: each tile's, as `g2ard.tiles.steps.small_scene` reads them.
+        files: each tile's, as `g2ard.tiles.scenes.small_scene` reads them.
         mean: as it takes it.
     """
 

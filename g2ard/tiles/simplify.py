@@ -18,8 +18,8 @@ from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.cut import cheapest
 from g2ard.tiles.executor import Executor
 from g2ard.tiles.run import TiledRun
+from g2ard.tiles.scenes import joined, scene_of, small_scene
 from g2ard.tiles.sights import Sights, Surroundings
-from g2ard.tiles.steps import joined, scene_of, small_scene
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.task import load
 

@@ -120,24 +120,24 @@ def select(
     coarse = surface(splats, min(_COARSE, max(1, len(splats))))
     depths, shares = poses.outlooks(coarse, cameras)
     alike = poses.pose_kernel(cameras, depths)
-    wanted = poses.inverse_density(alike)
+    pose_weights = poses.inverse_density(alike)
     usable = (depths > 0) & ~poses.inside_geometry(splats, cameras, depths, progress)
     if not usable.any():
         raise InputError(unseeing(cameras, "the scene"))
     seconds["poses"] = time.perf_counter() - began
-    evaluations = 0
+    evaluations, refused = 0, ~usable
     if policy in ("directional", "coverage"):
         rows = np.flatnonzero(usable)
         order, gains, evaluations = greedy(splats, cameras.take(rows), policy, options, progress, seconds)
         order = rows[order]
-        usable = np.isin(np.arange(len(cameras)), order)
+        refused = ~np.isin(np.arange(len(cameras)), order)  # also what sees no cell: greedy leaves it out
     elif policy == "pose-diverse":
         order, gains = poses.farthest(alike, usable)
     elif policy == "auto":
-        order, gains = poses.facility_location(alike, wanted, usable, shares)
+        order, gains = poses.facility_location(alike, pose_weights, usable, shares)
     else:
         order = _blind(policy, np.flatnonzero(usable), k, seed)
-        gains = poses.gains_of(order, alike, wanted)
+        gains = poses.gains_of(order, alike, pose_weights)
     if not len(order):
         raise InputError(unseeing(cameras, "a cell of the surface"))
     count = _knee(gains) if k == "auto" else min(k, len(order))
@@ -147,10 +147,10 @@ def select(
         policy=policy,
         order=order[:count],
         gains=share[:count],
-        weights=poses.draw_weights(order[:count], alike, wanted),
+        weights=poses.draw_weights(order[:count], alike, pose_weights),
         left_out=float(share[count:].sum()),
         curve=np.cumsum(share),
-        refused=np.flatnonzero(~usable),
+        refused=np.flatnonzero(refused),
         evaluations=evaluations,
         seconds=seconds,
     )

@@ -125,7 +125,7 @@ def inverse_density(alike: Float) -> Float:
 
 
 def facility_location(
-    alike: Float, wanted: Float, usable: NDArray[np.bool_], shares: Float
+    alike: Float, pose_weights: Float, usable: NDArray[np.bool_], shares: Float
 ) -> tuple[Order, Float]:
     """Views that represent all candidates: first within reach of every pose, then by facility location.
 
@@ -135,28 +135,28 @@ def facility_location(
 
     Args:
         alike: (C, C) see `pose_kernel`.
-        wanted: (C,) see `inverse_density`.
+        pose_weights: (C,) see `inverse_density`.
         usable: (C,) which may be chosen; the others weigh nothing.
         shares: (C,) see `outlooks`.
 
     Returns:
         The usable views in order, and what each adds to Σ_u w_u max_{v∈S} alike_uv.
     """
-    wanted, away, worth = np.where(usable, wanted, 0.0), _bandwidths_apart(alike), shares**_WORTH
+    pose_weights, away, worth = np.where(usable, pose_weights, 0.0), _bandwidths_apart(alike), shares**_WORTH
     best, left = np.zeros(len(alike)), usable.copy()
     nearest = np.where(usable, np.inf, -np.inf)
     order: list[int] = []
     gains: list[float] = []
     for _ in range(int(usable.sum())):
         if not order:
-            view = int(np.argmax(np.where(left, worth / np.maximum(wanted @ away, 1e-12), -1.0)))
+            view = int(np.argmax(np.where(left, worth / np.maximum(pose_weights @ away, 1e-12), -1.0)))
         elif nearest.max() > _REACH:
             view = int(np.argmax(worth * np.where(nearest > _REACH, nearest, 0.0)))
         else:
-            added = wanted @ np.maximum(alike - best[:, None], 0.0)
+            added = pose_weights @ np.maximum(alike - best[:, None], 0.0)
             view = int(np.argmax(np.where(left, worth * added, -1.0)))
         order.append(view)
-        gains.append(float(wanted @ np.maximum(alike[:, view] - best, 0.0)))
+        gains.append(float(pose_weights @ np.maximum(alike[:, view] - best, 0.0)))
         best = np.maximum(best, alike[:, view])
         nearest = np.minimum(nearest, away[view])
         left[view] = False
@@ -168,11 +168,11 @@ def _bandwidths_apart(alike: Float) -> Float:
     return np.asarray(np.sqrt(-np.log(np.maximum(alike, np.finfo(np.float64).tiny))))
 
 
-def gains_of(order: Order, alike: Float, wanted: Float) -> Float:
+def gains_of(order: Order, alike: Float, pose_weights: Float) -> Float:
     """What each view of a given order adds to the facility location."""
     best, gains = np.zeros(len(alike)), []
     for view in order:
-        gains.append(float(wanted @ np.maximum(alike[:, view] - best, 0.0)))
+        gains.append(float(pose_weights @ np.maximum(alike[:, view] - best, 0.0)))
         best = np.maximum(best, alike[:, view])
     return np.array(gains)
 
@@ -195,9 +195,9 @@ def farthest(alike: Float, usable: NDArray[np.bool_]) -> tuple[Order, Float]:
     return np.array(order, np.int64), np.array(gains)
 
 
-def draw_weights(order: Order, alike: Float, wanted: Float) -> Float:
+def draw_weights(order: Order, alike: Float, pose_weights: Float) -> Float:
     """(K,) the summed weights of the poses that each chosen view is nearest to, mean 1."""
     nearest = order[np.argmax(alike[:, order], axis=1)]
     nearest[order] = order  # each is nearest to itself, equals included
-    weights = np.bincount(nearest, wanted, len(alike))[order]
+    weights = np.bincount(nearest, pose_weights, len(alike))[order]
     return weights / weights.mean()

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from g2ard.bench.methods import REDUCERS
 from g2ard.cli.budget_options import parse_ratio
 from g2ard.cli.commands.bench.group import bench
 from g2ard.cli.frame import Run, command
@@ -25,10 +26,7 @@ def simplify(
     ratios: Annotated[str, typer.Option(help="Comma-separated.")] = "5,10,20,30",
     methods: Annotated[
         str | None,
-        typer.Option(
-            help="Some of default, no-views, fast, paper, splat-transform, splat-transform-adaptive, "
-            "random, opacity-area, lightgaussian, pup, mini-splatting, nanogs."
-        ),
+        typer.Option(help=f"Some of {', '.join(REDUCERS)}."),
     ] = None,
     views: ViewsOption = None,
     protocol: ProtocolOption = "pool",
@@ -45,10 +43,10 @@ def simplify(
     With --protocol standing every method runs as its user runs it, and is scored from near and from where
     people stand: on the views of a standing.json beside the scene, else on made ones that no method sees.
     """
-    from g2ard.bench.simplify import METHODS, bench_simplify, find_splat_transform, machine
+    from g2ard.bench.simplify import bench_simplify, find_splat_transform, machine
 
     program = find_splat_transform(splat_transform)
-    chosen = [m.strip() for m in methods.split(",")] if methods else list(METHODS)
+    chosen = [m.strip() for m in methods.split(",")] if methods else list(REDUCERS)
     if program is None and any(m.startswith("splat-transform") for m in chosen):
         run.say("splat-transform is not on PATH (--splat-transform PROGRAM): left out")
         chosen = [m for m in chosen if not m.startswith("splat-transform")]

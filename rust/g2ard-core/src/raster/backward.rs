@@ -165,11 +165,13 @@ type Item = u16;
 #[inline(always)]
 fn split(item: Item) -> (usize, usize) {
     let pair = item as usize / BLOCKS;
-    // The list ends with the rect for nothing; the minimum tells the compiler that no other lies past it.
+    // A list ends with item BATCH·BLOCKS, whose pair BATCH is the splat that reaches nothing. No item lies past it:
+    // `min` shows the compiler that no index does.
     (pair.min(BATCH), item as usize % BLOCKS)
 }
 
-/// The items of a batch from its last pair to its first, and one past the end that evaluates nothing. Returns how many.
+/// The items of a batch from its last pair to its first, then BATCH·BLOCKS, which hits nothing. Returns how many without
+/// that.
 #[inline(always)]
 fn list_items(block_masks: &[u64; BLOCKS], list: &mut [Item; BATCH * BLOCKS + 1]) -> usize {
     const PAIRS: usize = u64::BITS as usize / BLOCKS;
@@ -198,13 +200,16 @@ struct Evaluator<'a, F: Lanes> {
     clip: F,
 }
 
-/// An item's α and 1/(1 − α), and where α follows its arguments.
+/// What an item is at its block's pixels.
 #[derive(Clone, Copy)]
 struct Evaluated<F: Lanes> {
     u: F,
     v: F,
+    /// α.
     a: F,
-    rest: F,
+    /// 1/(1 − α).
+    inverse_rest: F,
+    /// Where α is not clipped, and so follows its arguments.
     free: F::Mask,
 }
 
@@ -213,18 +218,18 @@ impl<F: Lanes> Evaluator<'_, F> {
     fn at(&self, item: Item, state: &[Block; BLOCKS]) -> Evaluated<F> {
         let (p, block) = split(item);
         let (x, y) = block_coordinates::<F>(block);
-        let near = &self.batch[p];
-        let (u, v, log2) = log2_alpha(near, x, y);
+        let splat = &self.batch[p];
+        let (u, v, log2) = log2_alpha(splat, x, y);
         let hit = log2
             .ge(self.minimum)
-            .and(F::load(&state[block].last).ge(F::splat(near.number)));
+            .and(F::load(&state[block].last).ge(F::splat(splat.number)));
         let raw = alpha(log2);
         let a = raw.min(self.clip).only(hit);
         Evaluated {
             u,
             v,
             a,
-            rest: (F::splat(1.0) - a).recip(),
+            inverse_rest: (F::splat(1.0) - a).recip(),
             free: self.clip.ge(raw),
         }
     }
@@ -234,7 +239,7 @@ impl<F: Lanes> Evaluated<F> {
     /// Steps the block's state to before the pair, and adds to the pair's sums.
     #[inline(always)]
     fn blend<const WITH_DEPTH: bool>(self, s: &TileSplat, g: &mut Block, sums: &mut [F; SUMS]) {
-        let t = F::load(&g.transmittance) * self.rest;
+        let t = F::load(&g.transmittance) * self.inverse_rest;
         t.store(&mut g.transmittance);
         let w = self.a * t;
         let mut seen = F::load(&g.given[ALPHA]);

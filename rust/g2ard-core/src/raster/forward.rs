@@ -74,25 +74,25 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
                 while todo != 0 && light {
                     let p = todo.trailing_zeros() as usize;
                     todo &= todo - 1;
-                    let near = &s.splats[p];
-                    let (_, _, log2) = log2_alpha(near, x, y);
+                    let splat = &s.splats[p];
+                    let (_, _, log2) = log2_alpha(splat, x, y);
                     let hit = log2.ge(minimum);
                     let a = alpha(log2).min(clip).only(hit);
                     let next = a.fnma(t, t);
                     let going = next.gt(stop);
                     let w = (a * t).only(going);
                     for c in 0..3 {
-                        rgb[c] = F::splat(near.rgb[c]).fma(w, rgb[c]);
+                        rgb[c] = F::splat(splat.rgb[c]).fma(w, rgb[c]);
                     }
                     let go = hit.and(going);
                     if DEPTH {
-                        let z = F::splat(near.depth);
+                        let z = F::splat(splat.depth);
                         depth = z.fma(w, depth);
                         median = F::select(go.and(t.ge(half)).and(half.gt(next)), z, median);
                     }
                     t = next;
                     left = F::select(going, next, left);
-                    last = F::select(go, F::splat(near.number), last);
+                    last = F::select(go, F::splat(splat.number), last);
                     kept |= u64::from(go.any()) << p;
                     light = going.any();
                 }

@@ -183,11 +183,11 @@ pub fn load_batch(
     rect: &TileRect,
 ) {
     let places = batch.iter_mut().take(BATCH);
-    for (i, (near, pair)) in (first..).zip(places.zip(&pairs[first..])) {
+    for (i, (place, pair)) in (first..).zip(places.zip(&pairs[first..])) {
         if let Some(ahead) = pairs.get(i + AHEAD) {
             prefetch(&splats[ahead.splat as usize]);
         }
-        *near = TileSplat::new(&splats[pair.splat as usize], rect, i);
+        *place = TileSplat::new(&splats[pair.splat as usize], rect, i);
     }
 }
 

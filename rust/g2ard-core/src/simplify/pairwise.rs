@@ -118,6 +118,7 @@ impl Pairwise {
         let geometric = self.geometric(visibility);
         let mut rounds = Vec::new();
         let mut nodes = self.premerge(leaves, geometric, &mut partition, budget, &mut rounds);
+        // The loop of `Tile::plan` too: change both.
         for &target in schedule {
             while nodes.len() > target {
                 let before = nodes.len();
@@ -130,6 +131,9 @@ impl Pairwise {
                 rounds.push(PairwiseRound::merging(before, nodes.len()));
                 control.advance(pairs.len() as u64);
             }
+        }
+        if rounds.is_empty() && dropped > 0 {
+            rounds.push(PairwiseRound::merging(nodes.len(), nodes.len()));
         }
         if let Some(first) = rounds.first_mut() {
             first.before += dropped;

@@ -122,6 +122,7 @@ impl Tile<'_> {
         for (&row, &run) in kept.iter().zip(&at) {
             run_of[row as usize] = run;
         }
+        // The loop of `Pairwise::run`, which keeps a partition where this keeps names and merges: change both.
         let mut names: Vec<u32> = (0..runs as u32).collect();
         let mut merges = Vec::new();
         for &target in schedule {
