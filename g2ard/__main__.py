@@ -13,7 +13,7 @@ def main() -> None:
     try:
         command_line()
     except SystemExit as end:
-        if end.code == interrupt.STATUS:
+        if end.code in interrupt.STATUSES:
             interrupt.leave()
         raise
 

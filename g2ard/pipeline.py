@@ -251,7 +251,7 @@ class _Rounds:
         self.state = self.simplified = prior
         self.protected: Any = None
         self.log: list[dict[str, Any]] = []
-        self.seconds = {"select": 0.0, "simplify": 0.0, "recover": 0.0}
+        self.seconds: dict[str, float] = {"select": 0.0, "simplify": 0.0, "recover": 0.0}
         self.weights = checked_weights(weights, len(targets.cameras))
         self.key = _fingerprint(prior, budget, targets, config, self.weights, validation)
         self._select(prior)
@@ -280,7 +280,9 @@ class _Rounds:
         from g2ard.visibility import visibility_source
 
         name = f"simplified-{number}"
-        if not self._restore(name, entry):
+        if self._restore(name, entry):
+            self._resumed(entry["simplify"]["seconds"])
+        else:
             began = time.monotonic()
             done = simplify(
                 self.state,
@@ -305,7 +307,9 @@ class _Rounds:
     def _recover(self, name: str, entry: dict[str, Any], *, final: bool) -> None:
         from g2ard.stages.recover import recover
 
-        if not self._restore(name, entry):
+        if self._restore(name, entry):
+            self._resumed(entry["recover"][-1]["seconds"])
+        else:
             config = RecoverConfig(
                 schedule=self.config.schedule,
                 steps=self._steps() if final else None,
@@ -332,6 +336,8 @@ class _Rounds:
             )
             self.state = done.splats
             entry.setdefault("recover", []).append(done.report.as_dict())
+            if done.report.resumed is not None:
+                self._resumed(done.report.resumed)
             self._save(name, entry)
             if checkpoint is not None:
                 checkpoint.unlink(missing_ok=True)
@@ -350,6 +356,9 @@ class _Rounds:
         last = schedule.steps if self.config.steps is None else self.config.steps
         whole = last + self.count * schedule.round_steps
         return self.config.recovery_time * (last if final else schedule.round_steps) / whole
+
+    def _resumed(self, seconds: float) -> None:
+        self.seconds["resumed"] = self.seconds.get("resumed", 0.0) + seconds
 
     def _save(self, name: str, entry: dict[str, Any]) -> None:
         if self.work is None:

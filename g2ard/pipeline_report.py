@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from g2ard.reports import Report
+from g2ard.reports import LEFT_OUT, Report
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.simplify.report import SimplifyReport
 
@@ -44,11 +44,19 @@ class RoundReport(Report):
 
 @dataclass(frozen=True)
 class StageSeconds(Report):
-    """Wall seconds of each stage."""
+    """Wall seconds of each stage.
+
+    Args:
+        select: of choosing or weighing views.
+        simplify: of all rounds.
+        recover: of all rounds.
+        resumed: of these, what calls before this one had taken; None where none had.
+    """
 
     select: float
     simplify: float
     recover: float
+    resumed: float | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True)

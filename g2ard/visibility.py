@@ -25,6 +25,7 @@ __all__ = [
     "ROUND",
     "SampledVisibility",
     "Visibility",
+    "fewest_looks",
     "spread",
     "visibility",
     "visibility_source",
@@ -161,6 +162,16 @@ def visibility_source(
         return SampledVisibility(weight, pixel_size * factor)
 
     return find
+
+
+def fewest_looks(gaussians: int) -> int:
+    """Looks that `visibility_source` takes of a scene of so many Gaussians where it has the views, at least.
+
+    >>> fewest_looks(90_854), fewest_looks(500_000)
+    (80, 32)
+    """
+    rounds = max(2, math.ceil(_CHEAP / (ROUND * max(1, gaussians))))
+    return min(ROUND * rounds, MOST_LOOKS)
 
 
 def spread(count: int) -> list[int]:

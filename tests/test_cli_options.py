@@ -187,11 +187,13 @@ def test_the_folder_one_is_in_can_be_an_output(folder: Path, command_line: Comma
         "typer.main.get_group = lambda *a: os.kill(os.getpid(), signal.SIGINT)\n",
     ],
 )
-def test_ctrl_c_before_a_command_is_one_line(moment: str) -> None:
+@pytest.mark.parametrize(("by", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_a_signal_before_a_command_is_one_line(moment: str, by: str, status: int) -> None:
     unignored = "signal.signal(signal.SIGINT, signal.default_int_handler)"  # ignored in background jobs
+    moment = moment.replace("SIGINT", by)
     code = f"import os, signal, sys\n{unignored}\n{moment}from g2ard.__main__ import main\nmain()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (130, "g2ard: interrupted\n")
+    assert (done.returncode, done.stderr) == (status, "g2ard: interrupted\n")
 
 
 def test_recover_says_what_became_of_steps_that_lost(tmp_path: Path, command_line: CommandLine) -> None:

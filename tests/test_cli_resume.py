@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +18,8 @@ from g2ard.cli.resume import stoppable
 from g2ard.cli.run_folder import work_folder
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
+from g2ard.pipeline import Distilled
+from g2ard.policy.job import DistillJob
 from g2ard.stages.recover import checkpoint
 
 CommandLine = Callable[..., tuple[int, str, str]]
@@ -132,3 +137,22 @@ def test_distill_stopped_before_its_first_checkpoint_leaves_nothing(
         stopped_later()
     assert run.kept == [f"the same command with --resume goes on in {output}"]
     assert saved.exists()
+
+
+def test_the_total_of_a_resumed_run_holds_what_was_done_before(
+    folder: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = DistillJob.run
+
+    def resumed(self: DistillJob, *given: Any, **named: Any) -> Distilled:
+        done = real(self, *given, **named)
+        seconds = replace(done.report.seconds, recover=60.0, resumed=50.0)
+        return replace(done, report=replace(done.report, seconds=seconds))
+
+    monkeypatch.setattr(DistillJob, "run", resumed)
+    ask = ("distill", "a.ply", "-r", 2, "--steps", 2, "--size", 32, "--no-view", "-o", "run", "--json", "-")
+    status, out, error = command_line(*ask, cwd=folder)
+    assert status == 0, error
+    seconds = json.loads(out)["seconds"]
+    assert seconds["total"] > seconds["resumed"] == 50.0
+    assert f"recover 60.0 s, total {seconds['total']:.1f} s" in " ".join((out + error).split())

@@ -70,6 +70,12 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(targets: TeacherRenders, tm
     with pytest.raises(KeyboardInterrupt):
         distill(PRIOR, 1000, targets, config, work=tmp_path, progress=stop)
     resumed = distill(PRIOR, 1000, targets, config, work=tmp_path)
+    kept = resumed.report.rounds[:3]
+    earlier = [entry.recover[0].seconds for entry in kept[:2]] + [
+        entry.simplify.seconds or 0 for entry in kept
+    ]
+    assert whole.report.seconds.resumed is None
+    assert resumed.report.seconds.resumed == pytest.approx(sum(earlier))
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(whole.splats, name), getattr(resumed.splats, name))
     with pytest.raises(InputError, match="belongs to a run with another scene"):
@@ -135,7 +141,9 @@ def test_a_loss_in_any_kind_of_views_is_told() -> None:
     assert said(0.02, 0.02, 0.0) == []
     line = said(0.02, -0.5, 0.0)[0]
     assert "lost 0.50 dB in views of another kind" in line
-    assert "lost 0.004 of SSIM in unseen views" in said(0.3, 0.3, 0.0, ssim=-0.004)[0]
+    mixed = said(0.3, 0.3, 0.0, ssim=-0.004)[0]
+    assert mixed == "recovery lost 0.004 of SSIM in unseen views, and gained 0.30 dB"
+    assert said(0.0, None, 0.0, ssim=-0.004)[0].startswith("warning: recovery lost 0.004 of SSIM")
     lines = said(-0.2, -0.3, 0.25)
     assert "lost 0.20 dB in unseen views" in lines[0]
     assert "no view sees 25% of the scene" in lines[2]

@@ -7,7 +7,10 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,10 +71,51 @@ def test_memory_grows_by_views_and_gaussians_and_a_recovery_time_is_kept(
     assert few.seconds["recover"] == 7.0
     seconds, size = total([few, many])
     assert size == many.bytes > few.bytes
-    assert seconds == pytest.approx(few.total + many.total - many.seconds["targets"])
+    assert few.seconds["prepare"] == job.seconds > 0
+    assert seconds == pytest.approx(
+        few.total + many.total - many.seconds["prepare"] - many.seconds["targets"]
+    )
     monkeypatch.setattr("g2ard.policy.estimate.peak_rss", lambda: None)  # a system that does not tell
     few, many = estimate(job, 90), estimate(job, 900)
     assert many.bytes - few.bytes >= (983 - 192) * 900
+
+
+def test_every_stage_is_estimated_from_a_few_of_its_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that only the stages move: what they take by themselves, and for each view."""
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    job = prepare(ball(), [Budget(90, None)], DistillOptions(steps=3, size=48))
+    job = replace(job, seconds=4.0)
+
+    def slow(name: str, seconds: Callable[..., float]) -> None:
+        module, _, function = name.rpartition(".")
+        real = getattr(import_module(module), function)
+
+        def timed(*given: Any, **named: Any) -> Any:
+            now[0] += seconds(*given)
+            return real(*given, **named)
+
+        monkeypatch.setattr(name, timed)
+
+    slow("g2ard.stages.select.select", lambda splats, cameras, *_: 3 + 0.5 * len(cameras))
+    slow("g2ard.stages.evaluate.evaluate", lambda splats, targets: 0.25 * len(targets.cameras))
+    slow("g2ard.io.sog_write.sog_bytes", lambda path, splats: 7.0)
+    told = estimate(job, 90)
+    scored = len(job.views.test) + len(job.views.apart or ()) // 2
+    assert told.seconds["prepare"] == 4.0
+    assert told.seconds["select"] == pytest.approx(3 + 0.5 * len(job.views.train.cameras))
+    assert told.seconds["score"] == pytest.approx(2 * 0.25 * scored)
+    assert told.seconds["write"] - estimate(job, 90, page=False).seconds["write"] == pytest.approx(7.0)
+    assert told.total == sum(told.seconds.values())
+
+
+def test_a_dry_run_says_which_file_it_writes(tmp_path: Path, command_line: CommandLine) -> None:
+    g2ard.save(tmp_path / "ball.ply", ball())
+    ask = ("distill", "ball.ply", "-r", "10", "-o", "run", "--steps", "4", "--size", "48", "--dry-run")
+    status, _, error = command_line(*ask, "--json", "told.json", cwd=tmp_path)
+    assert status == 0, error
+    assert error.endswith("nothing is written but told.json\n"), error
+    assert {path.name for path in tmp_path.iterdir()} == {"ball.ply", "told.json"}
 
 
 @pytest.mark.skipif(peak_rss() is None, reason="the system tells no memory")

@@ -185,13 +185,15 @@ def program(*arguments: object, folder: Path, **pipes: int) -> subprocess.Popen[
     )
 
 
-def interrupt_at_checkpoint(running: subprocess.Popen[bytes], folder: Path) -> Path:
-    """Ctrl-C as soon as a run in `folder`/run has kept something; where that lies."""
+def interrupt_at_checkpoint(
+    running: subprocess.Popen[bytes], folder: Path, by: signal.Signals = signal.SIGINT
+) -> Path:
+    """A signal as soon as a run in `folder`/run has kept something; where that lies."""
     work = folder / "run" / ".unfinished"
     until = time.monotonic() + 120
     while not list(work.glob("[!.]*.npz")) and time.monotonic() < until:
         time.sleep(0.05)
-    running.send_signal(signal.SIGINT)
+    running.send_signal(by)
     return work
 
 
@@ -211,18 +213,49 @@ def test_a_closed_pipe_loses_no_result(stream: str, folder: Path) -> None:
     assert len(g2ard.load(folder / "s.ply")) == 240
 
 
-def test_an_interrupt_says_what_was_kept(folder: Path) -> None:
+@pytest.mark.parametrize(("by", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupt_says_what_was_kept(by: signal.Signals, status: int, folder: Path) -> None:
     ask = ("distill", "ball.ply", "-r", 4, "-o", "run", "--size", 48, "--steps", 100_000)
     running = program(*ask, folder=folder, stderr=subprocess.PIPE)
-    interrupt_at_checkpoint(running, folder)
+    interrupt_at_checkpoint(running, folder, by)
     _, error = running.communicate(timeout=120)
-    assert running.returncode == 130
+    assert running.returncode == status, error
     assert b"g2ard: interrupted; the same command with --resume goes on in run" in error
+
+
+def test_stopped_workers_leave_one_line(folder: Path) -> None:
+    """Semaphores among them, which Python would tell of when the program is gone."""
+    g2ard.save(folder / "large.ply", checkered_ball(20_000))
+    ask = ("simplify", "large.ply", "-r", 4, "--tile-rows", "3k", "--workers", 2, "-o", "s.ply")
+    running = program(*ask, folder=folder, stderr=subprocess.PIPE)
+    assert running.stderr is not None
+    while not (line := running.stderr.readline()).startswith(b"poses: "):  # workers begin to look
+        assert line
+    time.sleep(0.3)
+    running.send_signal(signal.SIGTERM)
+    error = running.stderr.read()
+    assert running.wait(timeout=120) == 143, error
+    assert error.endswith(
+        b"g2ard: interrupted; what is done stands in .s.ply.tiles, and the same command goes on\n"
+    )
 
 
 def test_version_has_a_letter(command_line: CommandLine, folder: Path) -> None:
     assert command_line("-V", cwd=folder) == command_line("--version", cwd=folder)
     assert "--install-completion" in command_line("--help", cwd=folder)[1]
+
+
+def test_completion_is_of_the_shell_that_is_named(command_line: CommandLine, folder: Path) -> None:
+    for shell, words in (
+        ("zsh", "#compdef g2ard"),
+        ("fish", "complete --command g2ard"),
+        ("bash", "complete -o"),
+    ):
+        status, out, error = command_line("--show-completion", shell, cwd=folder, apart=True)
+        assert (status, error) == (0, "")
+        assert words in out
+    status, _, error = command_line("--show-completion", "tcsh", cwd=folder, apart=True)
+    assert (status, error.count("\n"), "zsh" in error) == (2, 1, True), error
 
 
 def photos_of(folder: Path, points: bool = False) -> None:

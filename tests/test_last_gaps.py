@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from scenes import around, checkered_ball
+from test_first_hour import photos_of
 
 import g2ard
 from g2ard.cli.run_result import told, write_table
@@ -104,6 +105,41 @@ def test_views_of_another_world_are_told(command_line: CommandLine, folder: Path
             found, _, error = command_line(*call, cwd=folder)
             assert (found, words in error) == (status, True), error
             assert ("of one world" in error or "warning" in error) == bool(words)
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        ("simplify", "ball.ply", "-r", 4, "-o", "s.ply"),
+        ("recover", "ball.ply", "--teacher", "ball.ply", "--steps", 2, "-o", "r.ply"),
+        ("adapt", "ball.ply", "--teacher", "ball.ply", "--steps", 2, "-o", "a.ply"),
+        ("select", "ball.ply", "-k", 3, "-o", "v.json"),
+        ("render", "ball.ply", "-o", "looks"),
+    ],
+)
+def test_every_command_tells_of_views_of_another_world(
+    ask: tuple[object, ...], command_line: CommandLine, folder: Path
+) -> None:
+    viewmats = around(16, (48, 36)).viewmats.copy()
+    viewmats[1:9, :3, 3] += 1e3
+    write_views(folder / "some.json", replace(around(16, (48, 36)), viewmats=viewmats))
+    for views, warned in (("some.json", True), ("views.json", False)):
+        status, _, error = command_line(*ask, "--views", views, "-w", cwd=folder)
+        assert status == 0, error
+        assert ("views have nothing of the scene in sight: are both of one world?" in error) == warned, error
+
+
+def test_photos_of_another_world_are_told(command_line: CommandLine, folder: Path) -> None:
+    """Whose views may see much of the scene: both stand about the origin."""
+    photos_of(folder / "photos")
+    ask = ("-n", 50, "--views", "photos", "--steps", 2, "--dry-run")
+    own = checkered_ball(1200)
+    g2ard.save(folder / "own.ply", own)
+    g2ard.save(folder / "other.ply", replace(own, means=6 * own.means, scales=6 * own.scales))
+    for scene, warned in (("other.ply", True), ("own.ply", False)):
+        status, _, error = command_line("distill", scene, *ask, "-o", "run", cwd=folder)
+        assert status == 0, error
+        assert ("warning: the scene looks like none of the photos (correlation" in error) == warned, error
 
 
 def test_a_letter_in_a_config_is_told_its_long_name(command_line: CommandLine, folder: Path) -> None:

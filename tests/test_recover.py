@@ -113,6 +113,9 @@ def test_ctrl_c_then_resume_is_never_having_stopped(
     resumed = recover(student, targets, config, checkpoint=checkpoint)
     assert_same_bits(whole.splats, resumed.splats)
     assert whole.report.loss == resumed.report.loss
+    assert whole.report.resumed is None
+    assert resumed.report.resumed is not None
+    assert 0 < resumed.report.resumed < resumed.report.seconds
     assert whole.report.trials == resumed.report.trials
     assert whole.report.regularizers.steps == resumed.report.regularizers.steps
     assert bool(whole.report.trials) == (steps >= 100)

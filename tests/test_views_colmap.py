@@ -76,8 +76,29 @@ def test_fisheye_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="names camera 7, which is absent"):
         read_views(folder)
     cameras.write_text("7 PINHOLE 8 six 500 500 4 3\n")
-    with pytest.raises(InputError, match=r"cameras\.txt: malformed"):
+    with pytest.raises(InputError, match=r"cameras\.txt: malformed camera 0: HEIGHT is 'six'$"):
         read_views(folder)
+    cameras.write_text("7 PINHOLE 8 6 500 x 4 3\n")
+    with pytest.raises(InputError, match=r"cameras\.txt: malformed camera 0: PARAMS\[1\] is 'x'$"):
+        read_views(folder)
+    cameras.write_text("7 PINHOLE 8\n")
+    with pytest.raises(InputError, match=r"cameras\.txt: malformed camera 0: lacks HEIGHT$"):
+        read_views(folder)
+
+
+def test_a_bad_row_of_a_text_table_is_named(tmp_path: Path) -> None:
+    folder = colmap(tmp_path / "project", orbit(2), text=True)
+    images = folder / "sparse" / "0" / "images.txt"
+    images.write_text("1 1 0 0 0 0 0 4 7 a.png\n\n2 1 0 0 0 0 deep 4 7 b.png\n\n")
+    with pytest.raises(InputError, match=r"images\.txt: malformed image 1: TY is 'deep'$"):
+        read_views(folder)
+    images.write_text("1 1 0 0 0 0 0 4 7\n\n")
+    with pytest.raises(InputError, match=r"images\.txt: malformed image 0: lacks NAME$"):
+        read_views(folder)
+    points = folder / "sparse" / "0" / "points3D.txt"
+    points.write_text("1 0 0 0 9 9 9 0.1\n2 0 0 0 9 nine 9 0.1\n")
+    with pytest.raises(InputError, match=r"points3D\.txt: malformed point 1: G is 'nine'$"):
+        read_points(points)
 
 
 def test_caliterra() -> None:

@@ -8,14 +8,16 @@ import sys
 
 import typer
 
+from g2ard import interrupt
 from g2ard.cli.commands import register_commands
 from g2ard.cli.frame import app
 from g2ard.cli.lazy_rich import defer_rich
 from g2ard.cli.pipes import outlive_readers
 from g2ard.cli.usage import usage_line
-from g2ard.interrupt import STATUS
 
 __all__ = ["main"]
+
+_COMPLETION = ("--show-completion", "--install-completion")
 
 
 def main() -> None:
@@ -25,11 +27,12 @@ def main() -> None:
     outlive_readers()
     defer_rich()
     gc.set_threshold(50_000)  # importing makes many objects and no garbage: looking for it took a twentieth
+    _name_shell(sys.argv[1:])
     register_commands(next(iter(sys.argv[1:]), None))  # the others would only take time
     try:
         status = app(prog_name="g2ard", standalone_mode=False)
     except typer.Abort:
-        status = STATUS
+        status = interrupt.status()
     except typer.TyperException as e:
         message = usage_line(e)
         where = getattr(getattr(e, "ctx", None), "command_path", "g2ard")
@@ -39,3 +42,9 @@ def main() -> None:
     gc.freeze()  # nor is there any to look for at the end
     sys.stdout.flush()
     sys.exit(status)
+
+
+def _name_shell(words: list[str]) -> None:
+    """`--show-completion zsh`: typer takes a shell's name, or it looks for the shell, by the environment."""
+    if len(words) > 1 and words[0] in _COMPLETION and not words[1].startswith("-"):
+        os.environ["_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION"] = "1"

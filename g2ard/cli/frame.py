@@ -1,7 +1,8 @@
 """What every command shares: common options, one-line errors, exit statuses, the JSON result.
 
 A command is a function `fn(run: Run, ...)`; `@command` adds the common options to its signature.
-Exit status: 0 done · 1 failed · 2 usage · 3 a stated requirement was not met · 130 interrupted.
+Exit status: 0 done · 1 failed · 2 usage · 3 a stated requirement was not met · 130 interrupted,
+143 by SIGTERM.
 """
 
 from __future__ import annotations
@@ -212,7 +213,9 @@ class Run:
 
     def spare_inputs(self, *outputs: Path) -> None:
         """Usage check: nothing is written over what is read, not even under --overwrite."""
-        taken = {path.resolve() for path in self._inputs}
+        from g2ard.io.detect import run_scene
+
+        taken = {place.resolve() for path in self._inputs for place in (path, run_scene(path))}
         for output in outputs:
             if output.resolve() in taken:
                 raise typer.BadParameter(
@@ -325,7 +328,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
             fn(run, **options)
     except KeyboardInterrupt:
         run.console.error(f"interrupted; {'; '.join(run.kept) or 'nothing was written'}")
-        raise typer.Exit(interrupt.STATUS) from None
+        raise typer.Exit(interrupt.status()) from None
     except (G2ardError, OSError, MemoryError) as e:
         run.console.error(one_line(e))
         raise typer.Exit(1) from None

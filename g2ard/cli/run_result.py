@@ -34,7 +34,8 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
 
     given = "start" if run.config.get("scene", "") is None else "dense"  # of photos alone there is no scene
     size = report["bytes"]
-    times = ", ".join(f"{name} {value:.1f} s" for name, value in report["seconds"].items())
+    seconds = {name: value for name, value in report["seconds"].items() if name != "resumed"}
+    times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
     counts = [len(scores["recovered"]["views"]) for scores in kinds]
     apart = f" and {counts[1]:,} of another kind (nearer)" if len(kinds) > 1 else ""
     run.console.table(
@@ -71,6 +72,9 @@ def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
             continue
         before, after = (report[kind][name] for name in ("simplified", "recovered"))
         lost_db, lost_ssim = before["psnr"] - after["psnr"], before["ssim"] - after["ssim"]
+        if lost_ssim > _SSIM_LOSS and lost_db < 0:  # neither scene is the better one
+            found.append(f"recovery lost {lost_ssim:.3f} of SSIM in {what}, and gained {-lost_db:.2f} dB")
+            continue
         if lost_db > _LOSS or lost_ssim > _SSIM_LOSS:
             how = f"{lost_db:.2f} dB" if lost_db > _LOSS else f"{lost_ssim:.3f} of SSIM"
             found.append(

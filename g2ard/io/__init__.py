@@ -39,6 +39,7 @@ __all__ = [
     "atomic_folder",
     "atomic_output",
     "check_output",
+    "check_scene",
     "check_scene_output",
     "check_views_output",
     "find_views",
@@ -67,7 +68,8 @@ def read_splats(path: str | Path) -> Splats:
     """Read a Gaussian scene; `read_scene` also says what was noticed.
 
     Args:
-        path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .glb, .splat.
+        path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .glb, .splat; or a folder that
+            `distill` wrote.
 
     Returns:
         The scene: linear scales, logit opacities, means relative to `offset`.
@@ -100,10 +102,24 @@ def read_scene(path: str | Path) -> Scene:
     """
     from importlib import import_module
 
-    from g2ard.errors import InputError
-    from g2ard.io.detect import file_format
+    path, found = check_scene(path)
+    return import_module(f"g2ard.io.{found}").read(path)
 
-    path, found = Path(path), file_format(path)
+
+def check_scene(path: str | Path) -> tuple[Path, str]:
+    """Refuse what `read_scene` would refuse for its kind, before any work; damage is found by reading.
+
+    Returns:
+        The scene's file or folder, and its format.
+
+    Raises:
+        InputError: nothing is there, or it is no Gaussian scene.
+    """
+    from g2ard.errors import InputError
+    from g2ard.io.detect import file_format, run_scene
+
+    path = run_scene(path)
+    found = file_format(path)
     if found not in ("ply", "compressed_ply", "sog", "spz", "glb", "splat"):
         words = {
             "cloud_ply": "a point cloud (no f_dc, scale, rot)",
@@ -117,7 +133,7 @@ def read_scene(path: str | Path) -> Scene:
         }
         hint = hints.get(kind(path), "")
         raise InputError(f"{path}: a Gaussian scene is needed, this is {what}{hint}")
-    return import_module(f"g2ard.io.{found}").read(path)
+    return path, found
 
 
 def _named(path: str | Path, suffixes: tuple[str, ...], rule: str) -> Path:
@@ -286,11 +302,12 @@ def read_view_set(
     from importlib import import_module
 
     from g2ard.errors import InputError
-    from g2ard.io.detect import KINDS, file_format
+    from g2ard.io.detect import KINDS, file_format, run_views
     from g2ard.io.photos import pictured
     from g2ard.splits import split_mask
 
-    path, found = Path(path), file_format(path)
+    path = run_views(path)
+    found = file_format(path)
     if KINDS[found] != "views":
         what = "a Gaussian scene" if KINDS[found] == "splats" else "a cloud"
         raise InputError(

@@ -6,7 +6,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from g2ard.errors import InputError
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from g2ard.io.photos import Frame
     from g2ard.io.types import ViewSet
 
-__all__ = ["frames", "model_folder", "parsing", "photos_beside", "read", "text_lines"]
+__all__ = ["frames", "model_folder", "number", "parsing", "photos_beside", "read", "text_lines"]
 
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
@@ -211,6 +211,10 @@ def _images_bin(path: Path) -> list[_Image]:
     return images
 
 
+_CAMERA_COLUMNS = (("CAMERA_ID", 0), ("WIDTH", 2), ("HEIGHT", 3))
+_POSE_COLUMNS = tuple((name, at) for at, name in enumerate(("QW", "QX", "QY", "QZ", "TX", "TY", "TZ"), 1))
+
+
 def text_lines(path: Path) -> list[str]:
     """The lines of a COLMAP text table that are no comments; empty ones stay, they may be a row."""
     return [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
@@ -218,11 +222,26 @@ def text_lines(path: Path) -> list[str]:
 
 def _cameras_txt(path: Path) -> dict[int, _Camera]:
     cameras = {}
-    for line in text_lines(path):
-        if words := line.split():
-            size = (int(words[2]), int(words[3]))
-            cameras[int(words[0])] = _camera(path, words[1], size, tuple(map(float, words[4:])))
+    rows = [words for line in text_lines(path) if (words := line.split())]
+    for i, words in enumerate(rows):
+        key, width, height = (number(path, f"camera {i}", words, name, at) for name, at in _CAMERA_COLUMNS)
+        params = tuple(
+            number(path, f"camera {i}", words, f"PARAMS[{at - 4}]", at, float) for at in range(4, len(words))
+        )
+        cameras[int(key)] = _camera(path, words[1], (int(width), int(height)), params)
     return cameras
+
+
+def number(
+    path: Path, entry: str, words: list[str], name: str, at: int, kind: type[int] | type[float] = int
+) -> float:
+    """A column of a text table."""
+    if at >= len(words):
+        raise InputError(f"{path}: malformed {entry}: lacks {name}")
+    try:
+        return kind(words[at])
+    except ValueError:
+        raise InputError(f"{path}: malformed {entry}: {name} is {words[at]!r}") from None
 
 
 def _images_txt(path: Path) -> list[_Image]:
@@ -230,9 +249,12 @@ def _images_txt(path: Path) -> list[_Image]:
     while lines and not lines[0].strip():
         lines.pop(0)
     images = []
-    for line in lines[::2]:  # each second line lists the image's points, and may be empty
-        words: list[Any] = line.split(maxsplit=9)
-        if words:
-            pose = tuple(map(float, words[1:8]))
-            images.append(_Image(words[9].strip(), int(words[8]), pose[:4], pose[4:]))
+    for i, line in enumerate(lines[::2]):  # each second lists the image's points, and may be empty
+        if words := line.split(maxsplit=9):
+            where = f"image {i}"
+            pose = tuple(number(path, where, words, name, at, float) for name, at in _POSE_COLUMNS)
+            camera = int(number(path, where, words, "CAMERA_ID", 8))
+            if len(words) < 10:
+                raise InputError(f"{path}: malformed {where}: lacks NAME")
+            images.append(_Image(words[9].strip(), camera, pose[:4], pose[4:]))
     return images

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard.cameras import Cameras
 from g2ard.io import kind, read_cloud, read_scene, read_view_set
-from g2ard.io.detect import file_format
+from g2ard.io.detect import file_format, run_scene
 from g2ard.io.sog import chunks_of
 from g2ard.io.types import Points, ViewSet
 from g2ard.splats import Splats
@@ -57,7 +57,8 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 
 def bytes_of(path: Path) -> int:
-    """Size on disk; of a SOG folder only the chunks that are read."""
+    """Size on disk; of a SOG folder only the chunks that are read, of a run's only the scene."""
+    path = run_scene(path)
     folders = chunks_of(path) or [path]
     files = [file for folder in folders for file in (folder.rglob("*") if folder.is_dir() else [folder])]
     return sum(file.stat().st_size for file in files if file.is_file())

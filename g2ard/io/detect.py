@@ -10,7 +10,7 @@ from typing import Literal
 
 from g2ard.errors import InputError
 
-__all__ = ["KINDS", "Format", "Kind", "file_format", "is_photo", "kind"]
+__all__ = ["KINDS", "Format", "Kind", "file_format", "is_photo", "kind", "run_scene", "run_views"]
 
 Format = Literal[
     "ply",
@@ -63,7 +63,7 @@ def file_format(path: str | Path) -> Format:
     Raises:
         InputError: nothing is there, or it is nothing g2ard reads.
     """
-    path = Path(path)
+    path = run_scene(path)
     if path.is_dir():
         return _folder_format(path)
     if not path.exists():
@@ -95,6 +95,24 @@ def file_format(path: str | Path) -> Format:
         f"{path}: unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .splat; clouds: .ply .las "
         ".laz; views: a COLMAP folder, a .json, or a trainer's run)"
     )
+
+
+def run_scene(path: str | Path) -> Path:
+    """The scene's file in a folder that `distill` wrote; any other path as it is."""
+    path = Path(path)
+    if not (path / "report.json").is_file():
+        return path
+    from g2ard.io.scene_formats import FORMATS
+
+    files = (path / f"scene{known.suffix}" for known in FORMATS.values())
+    return next((file for file in files if file.is_file()), path)
+
+
+def run_views(path: str | Path) -> Path:
+    """The views that `distill` made, where `path` is its folder; any other path as it is."""
+    path = Path(path)
+    made = path / "views.json"
+    return made if run_scene(path) != path and made.is_file() else path
 
 
 def is_photo(path: Path) -> bool:
@@ -152,6 +170,8 @@ def _instead(path: Path) -> str:
     found = [f"{', '.join(names[:5])} ({words[what]})" for what, names in held.items() if names]
     if found:
         return f"; name what is meant of its files: {', '.join(found)}"
+    if runs := [folder.name for folder in sorted(path.iterdir()) if run_scene(folder) != folder]:
+        return f"; name one of its runs: {', '.join(runs[:5])}"
     photos = next(
         (p for p in (path, path / "images") if p.is_dir() and any(map(is_photo, p.iterdir()))), None
     )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.clean import Raw, cleaned
+from g2ard.io.jsonfile import Fields
 from g2ard.io.packing import unit_quats, writable
 from g2ard.io.types import Note, Scene
 from g2ard.splats import Splats
@@ -151,10 +152,11 @@ def read(path: Path) -> Scene:
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: malformed glTF ({error!r})") from error
+        why = f"lacks {error}" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
+        raise InputError(f"{path}: malformed glTF ({document.last!r}: {why})") from error
 
 
-def _chunks(path: Path) -> tuple[dict[str, Any], bytes]:
+def _chunks(path: Path) -> tuple[Fields, bytes]:
     data = path.read_bytes()
     if len(data) < 20 or struct.unpack_from("<II", data) != (_MAGIC, 2):
         raise InputError(f"{path}: not a .glb of glTF 2.0 (begins with {data[:4]!r})")
@@ -172,7 +174,7 @@ def _chunks(path: Path) -> tuple[dict[str, Any], bytes]:
         raise InputError(f"{path}: its JSON is absent or broken") from error
     if not isinstance(document, dict):
         raise InputError(f"{path}: its JSON is no object")
-    return document, found.get(_BIN, b"")
+    return Fields(document), found.get(_BIN, b"")
 
 
 def _scene(path: Path, document: dict[str, Any], binary: bytes) -> Scene:

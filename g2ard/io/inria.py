@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from g2ard.errors import InputError
-from g2ard.io.jsonfile import read_json_list
+from g2ard.io.jsonfile import fields_of, read_json_list
 from g2ard.io.photos import Frame, find_photo, inverse, pixels, rigid, view_set
 from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
@@ -58,9 +57,9 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     return replace(found, notes=(*found.notes, Note("repeated_names", count, text)))
 
 
-def _frame(path: Path, index: int, camera: Any, images: Path | None) -> Frame:
+def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
     where = f"{path}: camera {index}"
-    try:
+    with fields_of(where, entry) as camera:
         name = str(camera["img_name"])
         world_from_camera = np.eye(4)
         world_from_camera[:3, :3] = np.array(camera["rotation"], np.float64)
@@ -74,9 +73,3 @@ def _frame(path: Path, index: int, camera: Any, images: Path | None) -> Frame:
             size=(width, height),
             photo=find_photo(images / Path(name).name) if images else None,
         )
-    except KeyError as error:
-        raise InputError(f"{where}: lacks {error}") from error
-    except (TypeError, ValueError, AttributeError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{where}: malformed ({error})") from error

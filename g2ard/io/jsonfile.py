@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from g2ard.errors import InputError
 
-__all__ = ["parse_json", "read_any_json", "read_json", "read_json_list"]
+__all__ = ["Fields", "fields_of", "parse_json", "read_any_json", "read_json", "read_json_list"]
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -64,3 +66,41 @@ def parse_json(where: str, data: bytes) -> Any:
         raise InputError(f"{where}: JSON nested too deeply") from error
     except ValueError as error:  # an integer of thousands of digits
         raise InputError(f"{where}: not JSON: {error}") from error
+
+
+class Fields(dict[str, Any]):
+    """A JSON object that knows which of its properties was asked for last, for what is said of a bad one."""
+
+    last = ""
+
+    def __getitem__(self, key: str) -> Any:
+        self.last = key
+        return super().__getitem__(key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        self.last = key
+        return super().get(key, default)
+
+
+@contextmanager
+def fields_of(where: str, entry: Any) -> Iterator[Fields]:
+    """An object's properties; what parsing them raises becomes one line that names the last that was read.
+
+    Args:
+        where: the file, and which of its entries this is.
+        entry: what stands there.
+
+    Raises:
+        InputError: `entry` is no object, or a property is absent or is not what it should be.
+    """
+    if not isinstance(entry, dict):
+        raise InputError(f"{where}: malformed (a {type(entry).__name__}, not an object)")
+    fields = Fields(entry)
+    try:
+        yield fields
+    except InputError:
+        raise
+    except KeyError as error:
+        raise InputError(f"{where}: lacks {error}") from error
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise InputError(f"{where}: malformed {fields.last!r} ({error})") from error

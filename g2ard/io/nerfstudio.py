@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io import colmap, transforms
-from g2ard.io.jsonfile import read_json
+from g2ard.io.jsonfile import fields_of, read_json
 from g2ard.io.photos import Frame, inverse, rigid, view_set
 from g2ard.io.settings import Settings, below, read_settings
 from g2ard.io.types import Note, ViewSet
@@ -47,15 +47,9 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     folder = path if path.is_dir() else path.parent
     file = folder / NAME
     content = read_json(file)
-    try:
-        D = _affine(file, "transform", content["transform"])
-        scale = float(content["scale"])
-    except KeyError as error:
-        raise InputError(f"{file}: lacks {error}") from error
-    except (TypeError, ValueError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{file}: malformed ({error})") from error
+    with fields_of(str(file), content) as fields:
+        D = _affine(file, "transform", fields["transform"])
+        scale = float(fields["scale"])
     settings = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else None
     frames, A, applied_scale = _data(folder, settings, images)
     if not (math.isfinite(scale) and scale > 0):

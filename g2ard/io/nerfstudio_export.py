@@ -9,7 +9,7 @@ import numpy as np
 
 from g2ard.errors import InputError
 from g2ard.io import colmap, transforms
-from g2ard.io.jsonfile import read_any_json, read_json_list
+from g2ard.io.jsonfile import fields_of, read_any_json, read_json_list
 from g2ard.io.photos import Frame, photo_size, rigid, view_set
 from g2ard.io.settings import below
 from g2ard.io.types import ViewSet
@@ -67,15 +67,9 @@ def _frame(
     path: Path, index: int, entry: Any, images: Path | None, lenses: dict[Path, dict[str, _Lens]]
 ) -> Frame:
     where = f"{path}: camera {index}"
-    try:
-        file_path = Path(str(entry["file_path"]))
-        viewmat = transforms.opencv_view(rigid(where, np.array(entry["transform"], np.float64)))
-    except KeyError as error:
-        raise InputError(f"{where}: lacks {error}") from error
-    except (TypeError, ValueError, AttributeError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{where}: malformed ({error})") from error
+    with fields_of(where, entry) as camera:
+        file_path = Path(str(camera["file_path"]))
+        viewmat = transforms.opencv_view(rigid(where, np.array(camera["transform"], np.float64)))
     there = below(path, file_path)
     ups = (below(path, up) for up in file_path.parents[:3] if up.parts)
     lens = _lens(where, file_path, there or next(filter(None, ups), None), lenses)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.cloud_ply import finite_cloud
-from g2ard.io.colmap import model_folder, parsing, text_lines
+from g2ard.io.colmap import model_folder, number, parsing, text_lines
 from g2ard.io.types import Cloud
 
 __all__ = ["read"]
@@ -51,6 +51,12 @@ def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
 
 
 def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    rows = [line.split(maxsplit=7)[1:7] for line in text_lines(path) if line.strip()]
-    values = np.array(rows, np.float64).reshape(-1, 6)
+    rows = [line.split(maxsplit=7) for line in text_lines(path) if line.strip()]
+    try:
+        values = np.array([words[1:7] for words in rows], np.float64).reshape(-1, 6)
+    except ValueError:
+        for i, words in enumerate(rows):
+            for at, name in enumerate(("X", "Y", "Z", "R", "G", "B"), 1):
+                number(path, f"point {i}", words, name, at, float)
+        raise
     return values[:, :3], values[:, 3:].astype(np.uint8)

@@ -142,10 +142,10 @@ def _left_out(path: Path, read_count: int) -> list[Note]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[list[Chunk]]:
-    from g2ard.io.jsonfile import parse_json, read_json
+    from g2ard.io.jsonfile import Fields, parse_json, read_json
 
     if path.suffix.lower() != ".sog":
-        yield [Chunk(str(f), read_json(f / "meta.json"), _folder_loader(f)) for f in chunks_of(path)]
+        yield [Chunk(str(f), Fields(read_json(f / "meta.json")), _folder_loader(f)) for f in chunks_of(path)]
         return
     try:
         with zipfile.ZipFile(path) as bundle:
@@ -155,7 +155,9 @@ def _opened(path: Path) -> Iterator[list[Chunk]]:
             prefix = min(inside, key=len).removesuffix("meta.json")
             load = _bundle_loader(path, bundle, prefix)
             meta = parse_json(f"{path}: meta.json", load("meta.json"))
-            yield [Chunk(str(path), meta, load)]
+            if not isinstance(meta, dict):
+                raise InputError(f"{path}: meta.json: expected a JSON object")
+            yield [Chunk(str(path), Fields(meta), load)]
     except InputError:
         raise
     except (zipfile.BadZipFile, EOFError, OSError, ValueError, struct.error, OverflowError) as error:

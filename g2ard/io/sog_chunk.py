@@ -39,7 +39,9 @@ def meta_errors(chunk: Chunk) -> Iterator[None]:
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{chunk.name}: malformed meta.json ({error!r})") from error
+        what = f"{last!r}: " if (last := getattr(chunk.meta, "last", "")) else ""
+        why = f"lacks {error}" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
+        raise InputError(f"{chunk.name}: malformed meta.json ({what}{why})") from error
 
 
 def count_of(chunk: Chunk) -> int:

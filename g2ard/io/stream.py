@@ -100,14 +100,15 @@ def open_stream(path: str | Path | Sequence[str | Path]) -> SceneStream:
     Raises:
         InputError: nothing is there, or it is broken as far as its header tells.
     """
-    from g2ard.io.detect import file_format, kind
+    from g2ard.io.detect import file_format, kind, run_scene
 
     if not isinstance(path, str | Path):
         streams = [open_stream(part) for part in path]
         if not streams:
             raise InputError("no scene was given")
         return streams[0] if len(streams) == 1 else _Joined(streams)
-    path, found = Path(path), file_format(path)
+    path = run_scene(path)
+    found = file_format(path)
     if found in _STREAMED:
         stream: SceneStream = import_module(f"g2ard.io.{_STREAMED[found]}").stream(path)
         return stream

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.io.jsonfile import read_json
+from g2ard.io.jsonfile import fields_of, read_json
 from g2ard.io.photos import Frame, find_photo, inverse, photo_size, pixels, rigid, view_set
 from g2ard.io.types import ViewSet
 
@@ -88,28 +88,23 @@ def _stated(path: Path, content: dict[str, Any]) -> dict[str, str]:
     return stated
 
 
-def _frame(path: Path, index: int, content: dict[str, Any], frame: Any, images: Path | None) -> Frame:
+def _frame(path: Path, index: int, content: dict[str, Any], entry: Any, images: Path | None) -> Frame:
     where = f"{path}: frame {index}"
-    try:
+    shared = content if isinstance(entry, dict) else {}
+    with fields_of(where, {**shared, **entry} if shared else entry) as frame:
         if "rot_mat" in frame:
-            frame = _from_matrix_city(path, frame)
+            frame.update(_from_matrix_city(path, frame))
         file_path = str(frame["file_path"])
-        world_from_camera = np.array(frame["transform_matrix"], np.float64)
         mask = frame.get("mask_path")
+        world_from_camera = np.array(frame["transform_matrix"], np.float64)
         photo = find_photo(images / Path(file_path).name if images else path.parent / file_path)
         return Frame(
             name=file_path.removeprefix("./").removeprefix("images/"),
             viewmat=opencv_view(rigid(where, world_from_camera)),
             photo=photo,
             mask=None if mask is None else _there(where, path.parent / str(mask)),
-            **_intrinsics(where, {**content, **frame}, photo),
+            **_intrinsics(where, frame, photo),
         )
-    except KeyError as error:
-        raise InputError(f"{where}: lacks {error}") from error
-    except (TypeError, ValueError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{where}: malformed ({error})") from error
 
 
 def _from_matrix_city(path: Path, frame: dict[str, Any]) -> dict[str, Any]:
@@ -119,7 +114,7 @@ def _from_matrix_city(path: Path, frame: dict[str, Any]) -> dict[str, Any]:
     """
     name = f"{int(frame['frame_index']):04d}.png"
     places = [folder for folder in ("", "rgb/", "input/") if (path.parent / folder / name).is_file()]
-    return {**frame, "file_path": (places or [""])[0] + name, "transform_matrix": frame["rot_mat"]}
+    return {"file_path": (places or [""])[0] + name, "transform_matrix": frame["rot_mat"]}
 
 
 def _there(where: str, mask: Path) -> Path:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
-from g2ard.io.jsonfile import read_json
+from g2ard.io.jsonfile import fields_of, read_json
 from g2ard.io.photos import Frame, pixels, rigid, view_set
 from g2ard.io.types import ViewSet
 from g2ard.progress import plural
@@ -46,9 +46,9 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     return view_set(path, [_frame(path, i, view, images) for i, view in enumerate(views)])
 
 
-def _frame(path: Path, index: int, view: Any, images: Path | None) -> Frame:
+def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
     where = f"{path}: view {index}"
-    try:
+    with fields_of(where, entry) as view:
         photo = view.get("image")
         if photo is not None:
             photo = images / Path(photo).name if images else path.parent / photo
@@ -67,12 +67,6 @@ def _frame(path: Path, index: int, view: Any, images: Path | None) -> Frame:
             split=view.get("split"),
             weight=weight,
         )
-    except KeyError as error:
-        raise InputError(f"{where}: lacks {error}") from error
-    except (TypeError, ValueError, AttributeError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{where}: malformed ({error})") from error
 
 
 def _exact(where: str, matrix: Any) -> Any:

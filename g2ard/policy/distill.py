@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from g2ard.errors import InputError
 from g2ard.policy.budget import Budget
 from g2ard.policy.distill_options import DistillOptions, takes_options
+from g2ard.policy.found import warn_of_photos
 from g2ard.policy.inputs import load_scene, say_regions
 from g2ard.policy.job import DistillJob
 from g2ard.policy.views import is_made, views_of
@@ -19,6 +21,7 @@ from g2ard.splats import Splats
 if TYPE_CHECKING:
     from g2ard.io.types import Points
     from g2ard.pipeline import DistillConfig, Distilled
+    from g2ard.policy.fit import Aim
     from g2ard.stages.lift import LiftConfig
     from g2ard.stages.recover.anchors import Regularizers
 
@@ -110,8 +113,8 @@ def prepare(
     from g2ard.policy.fit import aim_of
     from g2ard.stages.lift import LiftConfig
     from g2ard.stages.recover.presets import preset_for
-    from g2ard.targets import kinds_told
 
+    began = time.monotonic()
     chosen = options.by_preset()
     values = full_names(options.constants or {}, {"recover": DistillConfig(), "lift": LiftConfig()})
     lifting = changed(LiftConfig(), "lift", values)
@@ -161,10 +164,10 @@ def prepare(
     kind = "paper-lift" if lifted and options.preset == "paper" else options.preset
     photographed = train if use_photos else None
     regularizers, why, measured = preset_for(kind, prior, photographed, paper=chosen["schedule"] == "paper")
-    counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
+    if use_photos and not lifted:
+        warn_of_photos(prior, train, options.background, say)
     shown = sum(pictured[: len(train)]) if use_photos else 0
-    against = kinds_told(shown, len(train) - shown)
-    say(f"{len(prior):,} → {counts}; {plural(len(train), 'view')} against {against}")
+    say(_task(prior, aims, shown, len(train) - shown))
     say(f"regularisers: {why}")
     config = changed(_config(options, chosen, lifted, regularizers), "recover", values)
     say_regions(prior, config.simplify, name, say)
@@ -179,10 +182,20 @@ def prepare(
         lifting=lifting if lifted else None,
         preset=why,
         measured=measured,
+        seconds=time.monotonic() - began,
         cleaned=cleaned,
         progress=progress,
         say=say,
     )
+
+
+def _task(prior: Splats, aims: Sequence[Aim], photos: int, renders: int) -> str:
+    """What is to be made of what, in words."""
+    from g2ard.targets import kinds_told
+
+    counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
+    views = plural(photos + renders, "view")
+    return f"{len(prior):,} → {counts}; {views} against {kinds_told(photos, renders)}"
 
 
 def _all_pictured(pictured: Sequence[bool], names: Sequence[str], lifted: bool) -> None:

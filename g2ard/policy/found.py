@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from g2ard.cameras import Cameras
     from g2ard.splats import Splats
 
-__all__ = ["as_pool", "check_sight", "found_views", "warn_of_sight"]
+__all__ = ["as_pool", "check_sight", "found_views", "warn_of_photos", "warn_of_sight"]
 
 _SIDE = 800
 """Pixels of the longer side, as a pool has."""
@@ -23,6 +23,11 @@ _SIDE = 800
 _SAMPLE = 4096
 _SEEING = 0.5
 """Share of the cameras that must see something of the scene, or they are another's."""
+_LOOKED_AT, _SMALL = 5, 160
+"""Photos that the scene is compared with, and their longer side, pixels."""
+_ALIKE = 0.2
+"""Correlation of a photo and a render under which they show different things. Median of five: fox and
+caliterra with scenes of their own, 2,000 Gaussians after 20 steps, 0.86 and 0.50; others -0.26 to 0.06."""
 _BLIND = 0.1
 """Share of views given for a scene that may see nothing of it untold."""
 
@@ -85,6 +90,35 @@ def check_sight(splats: Splats, cameras: Cameras, say: Say = unsaid) -> None:
     if not cameras.facing(splats.means + splats.offset).any():
         raise InputError(unseeing(cameras, "the scene"))
     warn_of_sight(splats, cameras, say)
+
+
+def warn_of_photos(
+    splats: Splats, cameras: Cameras, background: tuple[float, float, float], say: Say
+) -> None:
+    """Say in one line that the scene's renders have nothing in common with its photos: the correlation of the
+    brightness of their pixels, in the median of a few small photos, is next to none."""
+    import numpy as np
+
+    from g2ard.stages.render import Renderer
+    from g2ard.targets import Photos, mask_of
+
+    pictured = np.flatnonzero([path is not None for path in cameras.image_paths])
+    tried = np.unique(np.linspace(0, len(pictured) - 1, min(_LOOKED_AT, len(pictured))).astype(int))
+    photos = Photos(cameras.take(pictured[tried]).resized(_SMALL))
+    renderer = Renderer(splats, background=background)
+    alike = []
+    for view in range(len(tried)):
+        mask = mask_of(photos, view)
+        counted = np.ones(photos[view].shape[:2], bool) if mask is None else mask
+        pair = renderer.render(photos.cameras[view]).image[counted], photos[view][counted]
+        centred = [image.mean(axis=1) - image.mean() for image in pair]
+        scale = np.linalg.norm(centred[0]) * np.linalg.norm(centred[1])
+        alike.append(float(centred[0] @ centred[1] / scale) if scale > 0 else 0.0)
+    if alike and np.median(alike) < _ALIKE:
+        say(
+            f"warning: the scene looks like none of the photos (correlation {np.median(alike):.2f}): are "
+            "both of one world? (`g2ard render --views` shows what views see; --renders leaves photos out)"
+        )
 
 
 def as_pool(cameras: Cameras) -> Cameras:

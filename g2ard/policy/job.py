@@ -40,6 +40,7 @@ class DistillJob:
         lifting: constants of the lift; None where nothing was lifted.
         preset: which regularisers, and why.
         measured: what decided it.
+        seconds: that preparing it took, reading included.
         cleaned: how many Gaussians of each kind were taken out first; None where nothing was looked for.
         progress: told of all stages.
         say: told in lines what was noticed.
@@ -55,6 +56,7 @@ class DistillJob:
     lifting: LiftConfig | None
     preset: str
     measured: PriorMeasures
+    seconds: float = 0.0
     cleaned: dict[str, int] | None = None
     progress: Progress = silent
     say: Say = unsaid

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g2ard.policy.found import as_pool, check_sight, found_views
+from g2ard.policy.found import as_pool, check_sight, found_views, warn_of_sight
 from g2ard.policy.inputs import drop_held_out, load_for_training, load_held_out, load_view_sets, load_views
 from g2ard.progress import Progress, Say, silent, unsaid
 
@@ -224,7 +224,9 @@ def cameras_for_looks(
         if found:
             return as_pool(load_views(found, "train", None, say))
     if views is not None and not made:
-        return load_views(views, "train", None, say)
+        given = load_views(views, "train", None, say)
+        warn_of_sight(scene, given, say)
+        return given
     if method != "default" and not made:
         return None
     try:

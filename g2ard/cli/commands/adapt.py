@@ -53,6 +53,7 @@ def adapt(
     from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
+    from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import load_scene, load_trained, make_targets
     from g2ard.stages.adapt import AdaptConfig, appearance_only
     from g2ard.stages.adapt import adapt as refit
@@ -81,6 +82,7 @@ def adapt(
     splats = load_scene(compact, run.say)
     dense = load_scene(teacher, run.say) if teacher else None
     cameras = load_trained(views, split, size, run.say, unpictured=dense is not None).cameras
+    warn_of_sight(splats, cameras, run.say)
     targets = make_targets(cameras, dense, config.background, progress=run.progress, say=run.say)
     with stoppable(run, work, resume):
         work.mkdir(parents=True, exist_ok=True)

@@ -155,7 +155,7 @@ def distill(
     up: UpOption = None,
     dry_run: Annotated[
         bool,
-        typer.Option("--dry-run", help="Tell about how long it will take, and what memory; write nothing."),
+        typer.Option("--dry-run", help="Only tell about how long it will take, and what memory."),
     ] = False,
     tile_rows: TileRowsOption = None,
     memory: MemoryOption = None,
@@ -251,7 +251,7 @@ def distill(
     check_crops(crop or [], job.views.test.names)
     places = [folder / name for folder in outputs.paths(len(job.prior))]
     if dry_run:
-        _tell_estimates(run, job, [place.parent for place in places])
+        _tell_estimates(run, job, [place.parent for place in places], page=view)
         return
     finished = {place: tell_finished(run, place) for place in places if is_done(run, place, resume)}
     if len(finished) < len(places):
@@ -278,7 +278,7 @@ def _tell_all(run: Run, reports: list[dict[str, Any]]) -> None:
     run.result(reports[0] if len(reports) == 1 else {"runs": reports})
 
 
-def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[Path]) -> None:
+def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[Path], *, page: bool) -> None:
     """About how long each budget takes, and what memory; of several, all together too."""
     from dataclasses import asdict
 
@@ -286,11 +286,12 @@ def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[Path]) -> None:
 
     found, told = [], []
     for folder, budget in zip(folders, job.budgets, strict=True):
-        one = estimate(job, budget)
-        parts = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in one.seconds.items())
+        one = estimate(job, budget, page=page)
+        parts = ", ".join(f"{stage} {_rounded(seconds)} s" for stage, seconds in one.seconds.items())
+        about = f"about {max(1, one.total):.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
         run.say(
             f"{folder}: {plural(budget, 'Gaussian')}, {plural(one.views, 'view')} of {one.pixels:,} pixels, "
-            f"{plural(one.steps, 'step')}: about {one.total:.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
+            f"{plural(one.steps, 'step')}: {about}"
         )
         found.append(one)
         told.append({"output": str(folder), "count": budget, **asdict(one), "total_seconds": one.total})
@@ -299,8 +300,13 @@ def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[Path]) -> None:
         run.say(
             f"all {len(found)}, which share their targets: about {seconds:.0f} s and {size / 1e6:,.0f} MB"
         )
-    run.say("nothing is written")
+    to_file = run.json not in (None, "-")
+    run.say(f"nothing is written but {run.json}" if to_file else "nothing is written")
     run.result({"runs": told, "total": {"seconds": seconds, "bytes": size}})
+
+
+def _rounded(seconds: float) -> str:
+    return f"{seconds:.1f}" if seconds < 10 else f"{seconds:.0f}"
 
 
 def _distil(
@@ -323,7 +329,7 @@ def _distil(
     with work_folder(run, output, resume, (len(job.prior), budget)) as work:
         result = job.run(budget, work=work)
         report = report_of(job, result, run.config)
-        report["seconds"] = {**report["seconds"], "total": time.monotonic() - began}
+        report["seconds"]["total"] = time.monotonic() - began + report["seconds"].get("resumed", 0.0)
         distill_report(
             output / "report.html",
             f"{source.name}: {len(job.prior):,} → {len(result.splats):,}",

@@ -56,6 +56,7 @@ def evaluate(
     3DGS's own evaluation is --convention inria --8bit --lpips-input unscaled.
     """
     from g2ard.errors import InputError
+    from g2ard.io import check_scene
     from g2ard.io.describe import bytes_of
     from g2ard.lpips import load_lpips
     from g2ard.policy.found import warn_of_sight
@@ -69,6 +70,8 @@ def evaluate(
     if lpips_input != "scaled" and lpips is None:
         raise typer.BadParameter("--lpips-input goes with --lpips: without weights there is no LPIPS")
     can_be_made(views, teacher)
+    for path in scenes:
+        check_scene(path)
     colour, settings = background or (0.0, 0.0, 0.0), RasterSettings(convention=convention)
     dense = load_scene(teacher, run.say) if teacher else None
     frozen = load_scene(anchors, run.say) if anchors else None
@@ -103,9 +106,7 @@ def evaluate(
     said = f"{plural(len(cameras), 'view')}, against {_named(against)}; {_protocol(convention, eight_bit)}"
     _table(run, said, rows)
     protocol = {"convention": convention, "8bit": eight_bit, "lpips_input": lpips_input if lpips else None}
-    single = {"photo": "photos", "teacher": "teacher"}
-    kind = single[next(iter(against))] if len(against) == 1 else against
-    run.result({"against": kind, "protocol": protocol, "scenes": rows})
+    run.result({"against": _kind(against), "protocol": protocol, "scenes": rows})
 
 
 def _against(views: list[dict[str, Any]]) -> dict[str, int]:
@@ -114,6 +115,11 @@ def _against(views: list[dict[str, Any]]) -> dict[str, int]:
     for view in views:
         counts[view["against"]] = counts.get(view["against"], 0) + 1
     return counts
+
+
+def _kind(against: dict[str, int]) -> str | dict[str, int]:
+    single = {"photo": "photos", "teacher": "teacher"}
+    return single[next(iter(against))] if len(against) == 1 else against
 
 
 def _named(against: dict[str, int]) -> str:

@@ -56,18 +56,16 @@ def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
     """Figures of a file, or of a run's scene with its scores, and the rows that show them."""
     from g2ard.cli.run_folder import stopped_run
     from g2ard.io.describe import describe
+    from g2ard.io.detect import run_scene
     from g2ard.io.jsonfile import read_json
-    from g2ard.io.scene_formats import FORMATS
 
     if (stopped := stopped_run(path)) is not None:
         return stopped, _rows_of_stopped(path, stopped)
-    told = path / "report.json"
-    scenes = [path / f"scene.{name}" for name in FORMATS]
-    scene = next((place for place in scenes if place.is_file()), None)
-    if scene is None or not told.is_file():
+    scene = run_scene(path)
+    if scene == path:
         figures = describe(path)
         return figures, _rows(figures)
-    figures, report = describe(scene), read_json(told)
+    figures, report = describe(scene), read_json(path / "report.json")
     scores = {name: {k: found[k] for k in ("psnr", "ssim")} for name, found in report["scores"].items()}
     figures["run"] = {"input_count": report["input_count"], "against": report["against"], "scores": scores}
     rows = [["made from", plural(report["input_count"], "Gaussian")]]

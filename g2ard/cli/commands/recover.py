@@ -74,6 +74,7 @@ def recover(
     from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
+    from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import (
         load_scene,
         load_trained,
@@ -101,6 +102,7 @@ def recover(
     dense = load_scene(teacher, run.say) if teacher else None
     views = views_or_teacher(run, views, teacher, dense)
     chosen = load_trained(views, split, size, run.say, unpictured=dense is not None)
+    warn_of_sight(splats, chosen.cameras, run.say)
     targets = make_targets(chosen.cameras, dense, colour, photos=photos, progress=run.progress, say=run.say)
     run.say(f"{plural(len(chosen.cameras), 'view')} against {kinds_of(targets)}")
     weights = chosen.weights if weighted else None

@@ -67,6 +67,7 @@ def render(
 
     from g2ard.images import write_png
     from g2ard.io.atomic import check_output
+    from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import load_scene, load_views
     from g2ard.policy.views import views_or_pool
     from g2ard.stages.render import RasterSettings, Renderer
@@ -92,6 +93,7 @@ def render(
         say=run.say,
     )
     cameras = load_views(found, split, size, run.say)
+    warn_of_sight(splats, cameras, run.say)
     shown: list[NDArray[np.float32]] = []
     renderer = Renderer(splats, background=background or (0.0, 0.0, 0.0), settings=settings)
     with _folder(output, run.overwrite) as folder:

@@ -48,6 +48,7 @@ def select(
     """
     from g2ard.constants import changed, listed
     from g2ard.io import check_views_output
+    from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import load_scene, load_split_views
     from g2ard.stages.select import CoverageOptions
     from g2ard.stages.select import select as choose
@@ -61,6 +62,7 @@ def select(
     splats = load_scene(scene, run.say)
     pool, candidates = load_split_views(views, split, run.say)
     cameras = pool.cameras.take(candidates)
+    warn_of_sight(splats, cameras, run.say)
     chosen = choose(
         splats,
         cameras,

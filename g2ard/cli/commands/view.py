@@ -35,12 +35,13 @@ def view(
     up: UpOption = None,
 ) -> None:
     """Write a page that shows a scene, or two under one camera, in any browser, offline."""
+    from g2ard.io.detect import run_scene
     from g2ard.policy.inputs import load_scene
     from g2ard.policy.view import stand_of
     from g2ard.viewer import check_page_output, write_page
 
     check_page_output(output, run.overwrite)
-    paths = [_scene_of(path) for path in (scene, other) if path is not None]
+    paths = [run_scene(path) for path in (scene, other) if path is not None]
     run.spare_inputs(output)
     loaded = [load_scene(path, run.say) for path in paths]
     if views is None and scene.is_dir() and (scene / "views.json").is_file():
@@ -82,16 +83,6 @@ def _told(paths: list[Path], scenes: list[Splats], sizes: tuple[int, ...]) -> li
         {"scene": str(path), "count": len(splats), "bytes": size}
         for path, splats, size in zip(paths, scenes, sizes, strict=True)
     ]
-
-
-def _scene_of(path: Path) -> Path:
-    """The scene of a run's folder; other paths, a SOG folder among them, are scenes themselves."""
-    from g2ard.io.scene_formats import FORMATS
-
-    if not (path / "report.json").is_file():
-        return path
-    found = [path / f"scene{form.suffix}" for form in FORMATS.values()]
-    return next((file for file in found if file.is_file()), path)
 
 
 def _names(paths: list[Path]) -> list[str]:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard import interrupt
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 
@@ -57,17 +58,23 @@ def _plain(value: Any) -> Any:
 
 @contextmanager
 def deferred_interrupt() -> Iterator[threading.Event]:
-    """Within it Ctrl-C sets the event instead of breaking into a step; the loop looks at it and raises."""
+    """Within it Ctrl-C, and SIGTERM in the program, set the event instead of breaking into a step; the loop
+    looks at it and raises."""
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield asked
         return
 
     def note(number: int, frame: FrameType | None) -> None:
+        interrupt.asked_by(number)
         asked.set()
 
-    before = signal.signal(signal.SIGINT, note)
+    numbers = [signal.SIGINT]
+    if signal.getsignal(signal.SIGTERM) is interrupt.terminate:  # else it is the caller's own
+        numbers.append(signal.SIGTERM)
+    before = [(number, signal.signal(number, note)) for number in numbers]
     try:
         yield asked
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before:
+            signal.signal(number, handler)

@@ -72,6 +72,7 @@ class Loop:
         self._skipped = 0  # by engines before this one
         self.done = 0
         self.seconds = 0.0
+        self.resumed: float | None = None
         self.losses: list[float] = []
         self.geometry: list[dict[str, float]] = []
         self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised? → steps, seconds
@@ -283,6 +284,7 @@ class Loop:
         self._skipped = int(meta["skipped"])
         self.engine.load(arrays)
         self.done, self.seconds = int(meta["done"]), float(meta["seconds"])
+        self.resumed = self.seconds
         self.multiplier = float(meta["multiplier"])
         self.reach = math.inf if meta["reach"] is None else float(meta["reach"])
         self.trials, self.geometry = list(meta["trials"]), list(meta["geometry"])

@@ -148,5 +148,6 @@ def recover(
                 tuple(map(Look.of, guard.validation)), None if prior_views is None else finite(prior_views)
             ),
             skipped={"non_finite": loop.skipped},
+            resumed=loop.resumed,
         ),
     )

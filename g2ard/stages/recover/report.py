@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from g2ard.reports import Report
+from g2ard.reports import LEFT_OUT, Report
 
 __all__ = ["Gain", "Geometry", "Look", "RecoverReport", "Regularized", "Trial", "Validation"]
 
@@ -91,6 +91,7 @@ class RecoverReport(Report):
         kept_start: the student was better than all that came of it, and is the result.
         validation: None without such views.
         skipped: `non_finite`: steps of single Gaussians whose gradient was not finite.
+        resumed: of `seconds`, those before this call, which went on from a checkpoint; None where it did not.
     """
 
     steps: int
@@ -111,3 +112,4 @@ class RecoverReport(Report):
     kept_start: bool
     validation: Validation | None
     skipped: dict[str, int]
+    resumed: float | None = field(default=None, metadata=LEFT_OUT)
