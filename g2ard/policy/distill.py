@@ -110,7 +110,6 @@ def prepare(
     from g2ard.constants import changed, full_names
     from g2ard.pipeline import DistillConfig
     from g2ard.policy.clean import clutter_seen
-    from g2ard.policy.fit import aim_of
     from g2ard.stages.lift import LiftConfig
     from g2ard.stages.recover.presets import preset_for
 
@@ -129,20 +128,7 @@ def prepare(
         prior, cleaned = prior.take(found.keep), found.counts
     if counted is not None:
         counted(len(prior))
-    file = f"scene.{options.format}"
-    as_written = prior if options.sh_degree is None else prior.with_sh_degree(options.sh_degree)
-    aims = tuple(
-        aim_of(
-            budget,
-            prior if budget.bytes is None else as_written,
-            name,
-            file=file,
-            seed=seed,
-            progress=progress,
-            say=say,
-        )
-        for budget in budgets
-    )
+    aims = _aims(prior, budgets, options, name, progress, say)
     views = views_of(
         prior,
         options.views,
@@ -196,6 +182,27 @@ def _task(prior: Splats, aims: Sequence[Aim], photos: int, renders: int) -> str:
     counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
     views = plural(photos + renders, "view")
     return f"{len(prior):,} → {counts}; {views} against {kinds_told(photos, renders)}"
+
+
+def _aims(
+    prior: Splats, budgets: Sequence[Budget], options: DistillOptions, name: str, progress: Progress, say: Say
+) -> tuple[Aim, ...]:
+    """What the budgets come to; bytes are of the scene at the degree that the result is written in."""
+    from g2ard.policy.fit import aim_of
+
+    written = prior if options.sh_degree is None else prior.with_sh_degree(options.sh_degree)
+    return tuple(
+        aim_of(
+            budget,
+            prior if budget.bytes is None else written,
+            name,
+            file=f"scene.{options.format}",
+            seed=options.seed,
+            progress=progress,
+            say=say,
+        )
+        for budget in budgets
+    )
 
 
 def _all_pictured(pictured: Sequence[bool], names: Sequence[str], lifted: bool) -> None:
