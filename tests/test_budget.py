@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scenes import around, checkered_ball
 
+import g2ard
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.policy.budget import DEVICES
@@ -55,6 +56,10 @@ def test_the_count_keeps_the_quality() -> None:
     assert counts[0] < counts[1]
     assert counts[3] == max(counts[0], counts[2])
     assert count_for_quality(scene, Quality(200, 0), views, reduce)[0] == 4000
+    looked.clear()
+    count, found = count_for_quality(scene, Quality(41, 0), views, reduce)  # far above what a quarter keeps
+    assert 2000 < count < 4000
+    assert found.psnr >= 41
     assert count_for_quality(scene, Quality(1, 0), views, reduce)[0] == 64
 
 
@@ -111,3 +116,13 @@ def test_what_is_merged_on_keeps_its_parents() -> None:
 
 def flags(small: Simplified) -> np.ndarray:
     return np.arange(len(small.splats)) % 3 == 0
+
+
+def test_bytes_are_of_the_degree_that_is_written() -> None:
+    scene, said = checkered_ball(3000), []
+    small = g2ard.distill(
+        scene, fit="300kB", format="ply", sh_degree=3, steps=3, size=64, say=lambda line: said.append(line)
+    )
+    assert small.splats.sh_degree == 3
+    assert not [line for line in said if "merged on" in line]
+    assert 0.95 * 300_000 < file_bytes(small.splats, "a.ply") <= 300_000

@@ -101,7 +101,7 @@ def prepare(
 ) -> DistillJob:
     """Read and decide all that a distillation needs, at one budget or several; else as `distill`.
 
-    `counted` is told how many Gaussians the dense scene has before anything else is done with it; what it
+    `counted` is told how many Gaussians there are to reduce, before budgets and views are worked out; what it
     raises ends the preparation.
 
     Raises:
@@ -128,7 +128,8 @@ def prepare(
         prior, cleaned = prior.take(found.keep), found.counts
     if counted is not None:
         counted(len(prior))
-    aims = _aims(prior, budgets, options, name, progress, say)
+    degree = _sh_degree(options, chosen, lifted)
+    aims = _aims(prior, budgets, options, degree, name, progress, say)
     views = views_of(
         prior,
         options.views,
@@ -155,7 +156,7 @@ def prepare(
     shown = sum(pictured[: len(train)]) if use_photos else 0
     say(_task(prior, aims, shown, len(train) - shown))
     say(f"regularisers: {why}")
-    config = changed(_config(options, chosen, lifted, regularizers), "recover", values)
+    config = changed(_config(options, chosen, degree, regularizers), "recover", values)
     say_regions(prior, config.simplify, name, say)
     return DistillJob(
         prior=prior,
@@ -184,13 +185,25 @@ def _task(prior: Splats, aims: Sequence[Aim], photos: int, renders: int) -> str:
     return f"{len(prior):,} → {counts}; {views} against {kinds_told(photos, renders)}"
 
 
+def _sh_degree(options: DistillOptions, chosen: dict[str, Any], lifted: bool) -> int | None:
+    """Of the result: 3 from a cloud or for the paper's if none is asked for; None is the scene's own."""
+    whole = lifted or chosen["schedule"] == "paper" or options.preset.startswith("paper")
+    return 3 if options.sh_degree is None and whole else options.sh_degree
+
+
 def _aims(
-    prior: Splats, budgets: Sequence[Budget], options: DistillOptions, name: str, progress: Progress, say: Say
+    prior: Splats,
+    budgets: Sequence[Budget],
+    options: DistillOptions,
+    degree: int | None,
+    name: str,
+    progress: Progress,
+    say: Say,
 ) -> tuple[Aim, ...]:
     """What the budgets come to; bytes are of the scene at the degree that the result is written in."""
     from g2ard.policy.fit import aim_of
 
-    written = prior if options.sh_degree is None else prior.with_sh_degree(options.sh_degree)
+    written = prior if degree is None else prior.with_sh_degree(degree)
     return tuple(
         aim_of(
             budget,
@@ -215,21 +228,20 @@ def _all_pictured(pictured: Sequence[bool], names: Sequence[str], lifted: bool) 
 
 
 def _config(
-    options: DistillOptions, chosen: dict[str, Any], lifted: bool, regularizers: Regularizers
+    options: DistillOptions, chosen: dict[str, Any], degree: int | None, regularizers: Regularizers
 ) -> DistillConfig:
     """The pipeline's; `chosen` is what the preset had to decide."""
     from g2ard.pipeline import DistillConfig
     from g2ard.stages.recover.schedule import schedule_named
     from g2ard.stages.simplify.config import SimplifyConfig
 
-    whole = lifted or chosen["schedule"] == "paper" or options.preset.startswith("paper")
     return DistillConfig(
         method=chosen["method"],
         schedule=schedule_named(chosen["schedule"], options.steps),
         steps=options.steps,
         recovery_time=options.recovery_time,
         regularizers=regularizers,
-        sh_degree=3 if options.sh_degree is None and whole else options.sh_degree,
+        sh_degree=degree,
         background=options.background,
         views=chosen["views_count"],
         policy=chosen["policy"],

@@ -43,7 +43,7 @@ _CLOSE_ENOUGH = 0.25
 _SLOPE = 4.0
 """Decibels for twice the Gaussians, until two counts tell."""
 _FEWEST = 64
-"""Gaussians that the search for a quality stops at."""
+"""Gaussians that a search for bytes or a quality stops at."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
     fewest, most = min(_FEWEST, len(splats)), len(splats)
     sample = splats.take(np.unique(np.linspace(0, most - 1, min(most, _SAMPLE)).astype(int)))
     count = int(len(sample) * wanted / file_bytes(sample, name))
-    fits, over = (0, 0), (most + 1, 0)
+    fits, over = (0, 0), (most + 1, 0)  # (count, bytes); 0 bytes until there is such a file
     for _ in range(_PROBES):
         count = min(max(count, fits[0] + 1, fewest), over[0] - 1, most)
         size = file_bytes(reduce(count) if count < most else splats, name)
@@ -148,7 +148,7 @@ def count_for_quality(
         reduce: the method that the result will be made with: count → scene.
 
     Returns:
-        The count, N where nothing less keeps the quality.
+        The count, N where nothing less that was looked at keeps the quality.
     """
     renders = _images(splats, cameras)
     met, good, missed = len(splats), Quality(float("inf"), 1.0), 0
@@ -177,7 +177,9 @@ def _next_count(excesses: Mapping[int, float], met: int, missed: int, most: int)
     (a, at_a), (b, at_b) = min(excesses.items()), max(excesses.items())
     slope = (at_b - at_a) / math.log2(b / a) if b > a else _SLOPE
     steps = (aim - excesses[near]) / max(slope, _SLOPE / 4)
-    return min(most, max(_FEWEST, round(near * 2 ** min(max(steps, -3.0), 3.0))))
+    # Beyond what was looked at the line is a guess, and towards N the excess grows faster than it.
+    highest = math.sqrt(near * most) if met == most else most
+    return max(_FEWEST, round(min(near * 2 ** min(max(steps, -3.0), 3.0), highest)))
 
 
 @dataclass(frozen=True, eq=False)

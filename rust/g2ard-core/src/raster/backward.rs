@@ -86,11 +86,15 @@ pub struct Backward<'a, const WITH_DEPTH: bool> {
     pub background: [f32; 3],
     /// From the forward pass: one entry per batch it processed.
     pub block_masks: &'a [[u64; BLOCKS]],
+    /// Light left at each pixel.
     pub transmittance: &'a [Lanes16; BLOCKS],
+    /// Number of each pixel's last pair, −1 for none.
     pub last: &'a [Lanes16; BLOCKS],
     pub incoming: &'a mut Incoming,
     pub batch: &'a mut TileSplats,
+    /// Sums of each pair.
     pub slots: DisjointSlice<[f32; SUMS]>,
+    /// 1 where a slot was written; the others hold what was there before.
     pub written: DisjointSlice<u8>,
 }
 
