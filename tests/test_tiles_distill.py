@@ -185,14 +185,15 @@ def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_
 
 
 def test_recovery_in_tiles_takes_its_options(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    write_splats(tmp_path / "town.ply", town(1500))
+
     def distilled(name: str, *options: object) -> Splats:
-        args = ("distill", folder / "town.ply", "-r", 10, "-o", tmp_path / name, "--steps", 30)
-        tiled = ("--views", folder / "views.json", "--tile-rows", 4000, "--workers", 1)
+        args = ("distill", tmp_path / "town.ply", "-r", 10, "-o", tmp_path / name, "--steps", 12)
+        tiled = ("--views", folder / "views.json", "--tile-rows", 800, "--workers", 1)
         good(command_line, tmp_path, *args, *tiled, *options)
         return read_splats(tmp_path / name / "scene.ply")
 
     usual = distilled("usual")
-    assert distilled("again").fingerprint() == usual.fingerprint()
     others = (
         ("--background", "1,1,1"),
         ("--set", "rates.means=0.01"),
