@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from g2ard.errors import InputError
 from g2ard.splats import Splats
 from g2ard.transform import in_box, in_sphere
 
-__all__ = ["Region", "check_region", "in_any"]
+__all__ = ["Region", "as_regions", "check_region", "in_any"]
 
 Region = tuple[float, ...]
 """(x, y, z, r), a sphere, or (x, y, z, x, y, z), the lower and the upper corner of a box."""
@@ -37,6 +38,22 @@ def check_region(region: Sequence[float]) -> Region:
     if len(numbers) == 6 and not all(low < high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
         raise InputError("region: a box with nothing in it; the lower corner comes first")
     return numbers
+
+
+def as_regions(given: Sequence[Any]) -> tuple[Region, ...]:
+    """Regions, or one alone, as plain numbers.
+
+    Raises:
+        InputError: as `check_region`, or no numbers.
+
+    >>> as_regions((0, 0, 0, 2)), as_regions([[0, 0, 0, 2]])
+    (((0.0, 0.0, 0.0, 2.0),), ((0.0, 0.0, 0.0, 2.0),))
+    """
+    try:
+        alone = len(given) > 0 and not np.ndim(given[0])
+        return tuple(check_region(region) for region in ([given] if alone else given))
+    except (TypeError, ValueError):
+        raise InputError(f"keep_region: expected (x, y, z, r) or (x, y, z, x, y, z), got {given!r}") from None
 
 
 def in_any(splats: Splats, regions: Sequence[Region]) -> NDArray[np.bool_]:

@@ -68,6 +68,7 @@ def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
     code, _, told = command_line("simplify", "a.ply", "--fit", "60kB", "-o", "b.sog", cwd=tmp_path)
     assert code == 0, told
     assert "60kB: about" in told
+    assert f"b.sog: {(tmp_path / 'b.sog').stat().st_size:,} of 60,000 bytes" in told
     assert 50_000 < (tmp_path / "b.sog").stat().st_size <= 60_000
     assert command_line("simplify", "a.ply", "--fit", "quest3", "-o", "c.ply", cwd=tmp_path)[0] == 0
     assert len(read_splats(tmp_path / "c.ply")) == 6000 < DEVICES["quest3"]
@@ -126,3 +127,18 @@ def test_bytes_are_of_the_degree_that_is_written() -> None:
     assert small.splats.sh_degree == 3
     assert not [line for line in said if "merged on" in line]
     assert 0.95 * 300_000 < file_bytes(small.splats, "a.ply") <= 300_000
+
+
+def test_decibels_are_of_the_file(tmp_path: Path, command_line: CommandLine) -> None:
+    scene = checkered_ball(3000)
+    write_splats(tmp_path / "a.ply", replace(scene, shN=4 * scene.shN))
+    counts = {}
+    for name in ("b.ply", "b.splat"):
+        code, _, told = command_line("simplify", "a.ply", "--min-psnr", "26", "-o", name, cwd=tmp_path)
+        assert code == 0, told
+        counts[name] = len(read_splats(tmp_path / name))
+    assert counts["b.splat"] > counts["b.ply"]
+    code, _, told = command_line("simplify", "a.ply", "--min-psnr", "90", "-o", "c.splat", cwd=tmp_path)
+    assert code == 3
+    assert "nothing less than all 3,000 Gaussians was found to keep what was asked" in told
+    assert ".splat keeps no more" in told.splitlines()[-1]

@@ -174,6 +174,11 @@ def test_a_folder_has_one_scene(command_line: CommandLine, folder: Path) -> None
     assert (status, "run/scene.sog would be written over, and is an input" in error) == (2, True), error
 
 
+def _heed_interrupts() -> None:
+    """Shells have what they start in the background ignore them, tests too."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def program(*arguments: object, folder: Path, **pipes: int) -> subprocess.Popen[bytes]:
     root = Path(__file__).resolve().parents[1]
     path = os.pathsep.join(filter(None, [str(root), os.environ.get("PYTHONPATH")]))
@@ -181,6 +186,7 @@ def program(*arguments: object, folder: Path, **pipes: int) -> subprocess.Popen[
         [sys.executable, "-m", "g2ard", *map(str, arguments)],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": path},
+        preexec_fn=_heed_interrupts,
         **pipes,  # type: ignore[arg-type]
     )
 

@@ -139,14 +139,15 @@ class Spot(tuple[float, ...]):
 
 
 def _spot(text: str) -> Spot:
-    from g2ard.cli.lists import numbers
     from g2ard.errors import InputError
     from g2ard.regions import check_region
 
     try:
-        return Spot(check_region(numbers("--keep-region", text, 4 if text.count(",") == 3 else 6)))
+        return Spot(check_region([float(word) for word in text.replace(",", " ").split()]))
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
+    except ValueError:
+        raise typer.BadParameter(f"expected X,Y,Z,R or X,Y,Z,X,Y,Z, not {text!r}") from None
 
 
 KeepRegionOption = Annotated[

@@ -16,6 +16,7 @@ from g2ard.policy.inputs import load_scene, say_regions
 from g2ard.policy.job import DistillJob
 from g2ard.policy.views import is_made, views_of
 from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.regions import as_regions
 from g2ard.splats import Splats
 
 if TYPE_CHECKING:
@@ -245,7 +246,7 @@ def _config(
         background=options.background,
         views=chosen["views_count"],
         policy=chosen["policy"],
-        simplify=SimplifyConfig(keep_region=tuple(map(tuple, options.keep_region))),
+        simplify=SimplifyConfig(keep_region=as_regions(options.keep_region)),
         weighted=chosen["weighted"],
         reselect=options.reselect,
         seed=options.seed,

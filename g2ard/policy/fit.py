@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +25,16 @@ from g2ard.stages.render import Renderer
 if TYPE_CHECKING:
     from g2ard.stages.simplify import Simplified
 
-__all__ = ["Aim", "Quality", "aim_of", "count_for_bytes", "count_for_quality", "file_bytes", "quality"]
+__all__ = [
+    "Aim",
+    "Quality",
+    "aim_of",
+    "as_file",
+    "count_for_bytes",
+    "count_for_quality",
+    "file_bytes",
+    "quality",
+]
 
 _VIEWS, _SIDE = 12, 400
 """Views that a quality is measured in, and their longer side, pixels."""
@@ -66,6 +76,26 @@ class Quality:
 
 def file_bytes(splats: Splats, name: str, **options: Any) -> int:
     """Bytes of the scene as `write_splats` writes it under `name`."""
+    with _written(splats, name, **options) as path:
+        folder = path.parent if path.name == "meta.json" else path
+        files = folder.iterdir() if folder.is_dir() else [folder]
+        return sum(file.stat().st_size for file in files)
+
+
+def as_file(splats: Splats, name: str) -> Splats:
+    """The scene as it is read again from the format of `name`: quantised, without what that does not hold."""
+    from g2ard.io import read_splats
+    from g2ard.io.scene_formats import scene_format
+
+    if scene_format(name).suffix == ".ply":
+        return splats
+    with _written(splats, name) as path:
+        return read_splats(path)
+
+
+@contextmanager
+def _written(splats: Splats, name: str, **options: Any) -> Iterator[Path]:
+    """A file of the scene in the format of `name`, while it lasts."""
     from g2ard.io import write_splats
     from g2ard.io.scene_formats import scene_format
 
@@ -74,7 +104,7 @@ def file_bytes(splats: Splats, name: str, **options: Any) -> int:
         if scene_format(name).function == "write":
             path = Path(folder) / f"scene{scene_format(name).suffix}"
         write_splats(path, splats, **options)
-        return sum(file.stat().st_size for file in Path(folder).rglob("*") if file.is_file())
+        yield path
 
 
 def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[int], Splats]) -> int:
@@ -242,14 +272,19 @@ class Aim:
         """Whether a result keeps the quality, and a line of it; None where no quality is asked."""
         if self.wanted is None:
             return None
+        from g2ard.io.scene_formats import scene_format
+
         assert self.dense is not None
         assert self.cameras is not None
-        got = quality(_images(self.dense, self.cameras), splats, self.cameras)
+        got = quality(_images(self.dense, self.cameras), as_file(splats, self.file), self.cameras)
         count, views = plural(len(splats), "Gaussian"), plural(len(self.cameras), "view")
         line = f"{count}: {got.psnr:.2f} dB, SSIM {got.ssim:.4f} in {views}"
         if got.meets(self.wanted):
             return True, line
-        return False, f"{line}, which is less than was asked; ask for a count above {len(splats):,}"
+        more = f"ask for a count above {len(splats):,}"
+        if len(splats) >= len(self.dense):
+            more = f"{scene_format(self.file).suffix} keeps no more"
+        return False, f"{line}, which is less than was asked; {more}"
 
 
 def aim_of(
@@ -282,7 +317,7 @@ def aim_of(
     """
     if budget.min_psnr is not None or budget.min_ssim is not None:
         wanted = Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0)
-        return _by_quality(splats, wanted, reduce, seed, progress, say)
+        return _by_quality(splats, wanted, file, reduce, seed, progress, say)
     if budget.bytes is not None:
         if reduce is None:
             found = count_for_bytes(splats, int(budget.bytes * _MARGIN), file, partial(_fast, splats))
@@ -299,6 +334,7 @@ def aim_of(
 def _by_quality(
     splats: Splats,
     wanted: Quality,
+    file: str,
     reduce: Callable[[int], Simplified] | None,
     seed: int,
     progress: Progress,
@@ -310,9 +346,16 @@ def _by_quality(
     pool = plan_pool(splats, _VIEWS, seed=seed, rows=_ROWS, looks=True, progress=progress)
     cameras = pool.cameras.resized(_SIDE)
     reduce = reduce or Reduction(splats, seed=seed)
-    found, near = count_for_quality(splats, wanted, cameras, lambda count: reduce(count).splats)
-    say(f"{plural(found, 'Gaussian')} should keep {near.psnr:.2f} dB, SSIM {near.ssim:.4f}")
-    return Aim(found, wanted=wanted, dense=splats, cameras=cameras)
+
+    def written(count: int) -> Splats:
+        return as_file(reduce(count).splats, file)
+
+    found, near = count_for_quality(splats, wanted, cameras, written)
+    if found == len(splats):
+        say(f"nothing less than all {found:,} Gaussians was found to keep what was asked")
+    else:
+        say(f"{plural(found, 'Gaussian')} should keep {near.psnr:.2f} dB, SSIM {near.ssim:.4f}")
+    return Aim(found, file=file, wanted=wanted, dense=splats, cameras=cameras)
 
 
 def _fast(splats: Splats, count: int) -> Splats:

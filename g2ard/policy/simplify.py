@@ -12,6 +12,7 @@ from g2ard.policy.budget import Budget
 from g2ard.policy.inputs import load_scene, say_regions
 from g2ard.policy.views import cameras_for_looks
 from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.regions import as_regions
 from g2ard.splats import Splats
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def simplify(
         values = full_names(constants, {"simplify": SimplifyConfig()})
         config = changed(config or SimplifyConfig(), "simplify", values)
     if keep_region:
-        config = replace(config or SimplifyConfig(), keep_region=tuple(map(tuple, keep_region)))
+        config = replace(config or SimplifyConfig(), keep_region=as_regions(keep_region))
     wanted = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     splats, beside, name = _scene(scene, beside, say)
     reduce = Reduction(

@@ -50,6 +50,7 @@ def distill_in_tiles(
     """
     from g2ard.constants import changed, full_names
     from g2ard.policy.views import pool_times, views_of
+    from g2ard.regions import as_regions
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover.need import steps_for
     from g2ard.stages.recover.presets import preset_for
@@ -90,7 +91,7 @@ def distill_in_tiles(
                 sh_degree=options.sh_degree,
                 seed=options.seed,
             )
-            merging = SimplifyConfig(keep_region=tuple(map(tuple, options.keep_region)))
+            merging = SimplifyConfig(keep_region=as_regions(options.keep_region))
             constants = full_names(options.constants or {}, {"recover": config, "simplify": merging})
             config, merging = changed(config, "recover", constants), changed(merging, "simplify", constants)
             train = views.train.cameras

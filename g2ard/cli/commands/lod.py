@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -75,6 +76,8 @@ def lod(
     run.spare_inputs(meta)
     if left_at(work) or not (resume and meta.exists()):
         check_output(output, run.overwrite, folder=True)
+    if resume and meta.exists() and not left_at(work) and not run.overwrite:
+        _check_same(meta, ratios)
     check_stopped(run, work, resume, meta)
     rule = Cut(most * 1024, extent, least * 1024)
     with stoppable(run, work, resume):
@@ -96,6 +99,19 @@ def lod(
             output, levels.splats, cut=rule, errors=errors, overwrite=run.overwrite, progress=run.progress
         )
     _tell(run, output, levels, size_of_all)
+
+
+def _check_same(meta: Path, ratios: Sequence[float]) -> None:
+    """Refuse to call a folder finished that holds levels of other ratios."""
+    import json
+
+    from g2ard.errors import OutputError
+
+    counts = json.loads(meta.read_text(encoding="utf-8")).get("counts") or [0]
+    wanted = [counts[0] * ratios[0] / ratio for ratio in ratios]
+    if len(counts) != len(wanted) or any(abs(c - w) > ratios[0] for c, w in zip(counts, wanted, strict=True)):
+        levels = ", ".join(f"{count:,}" for count in counts)
+        raise OutputError(f"{meta}: levels of {levels} Gaussians, made with other -r; -w makes them anew")
 
 
 def _tell(run: Run, output: Path, levels: Levels, size: int) -> None:

@@ -148,10 +148,18 @@ def simplify(
         clock.append(time.perf_counter())
         reports.append(_report(run, found, small, config.resolved(method), method, clock))
         _tell(run, scene, small, place, total, clock[-1] - clock[0])
+        if aim.bytes is not None:
+            run.say(f"{place}: {_bytes_of(place):,} of {aim.bytes:,} bytes")
         run.kept.append(f"{place} is written")
         clock = [clock[-1] - (clock[1] - clock[0]), clock[-1]]  # reading is shared
     run.result(reports[0] if len(reports) == 1 else {"runs": reports})
     tell_quality(run, aims[0], small.splats)
+
+
+def _bytes_of(place: Path) -> int:
+    """Bytes of what was written; all files of a SOG folder."""
+    files = place.parent.iterdir() if place.name == "meta.json" else [place]
+    return sum(file.stat().st_size for file in files)
 
 
 def _refuse_whole(method: str, parents: Path | None) -> None:
