@@ -1,4 +1,4 @@
-"""What tests of several stages share: the program as a user types it."""
+"""What tests of several stages share: the program as a user types it, and a folder to type it in."""
 
 from __future__ import annotations
 
@@ -13,6 +13,10 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
+from scenes import around, checkered_ball
+
+import g2ard
+from g2ard.io import write_views
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -69,3 +73,11 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
                 if str(getattr(sys.modules[name], "__file__", None)).startswith(str(cwd)):
                     del sys.modules[name]
     return int(status or 0) if isinstance(status, int | None) else 1, out.getvalue(), err.getvalue()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """ball.ply of 400 Gaussians and views.json of 16 views; files of tests with others have their own."""
+    g2ard.save(tmp_path / "ball.ply", checkered_ball(400))
+    write_views(tmp_path / "views.json", around(16, (48, 36)))
+    return tmp_path

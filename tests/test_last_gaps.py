@@ -28,13 +28,6 @@ CommandLine = Callable[..., tuple[int, str, str]]
 BALL = checkered_ball(400)
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    g2ard.save(tmp_path / "ball.ply", BALL)
-    write_views(tmp_path / "views.json", around(16, (48, 36)))
-    return tmp_path
-
-
 @pytest.mark.parametrize(
     ("arguments", "status", "words"),
     [

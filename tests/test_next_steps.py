@@ -20,19 +20,12 @@ from g2ard.cli.budget_options import Count, Counts
 from g2ard.cli.frame import Run
 from g2ard.cli.resume import rows_kept
 from g2ard.errors import InputError
-from g2ard.io import Points, write_points, write_views
+from g2ard.io import Points, write_points
 from g2ard.report.window import Crop
 from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS
 
 CommandLine = Callable[..., tuple[int, str, str]]
 BALL = checkered_ball(400)
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    g2ard.save(tmp_path / "ball.ply", BALL)
-    write_views(tmp_path / "views.json", around(16, (48, 36)))
-    return tmp_path
 
 
 def refused(command_line: CommandLine, folder: Path, *arguments: object, status: int = 2) -> str:

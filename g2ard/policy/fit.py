@@ -345,7 +345,7 @@ def _by_quality(
 
     pool = plan_pool(splats, _VIEWS, seed=seed, rows=_ROWS, looks=True, progress=progress)
     cameras = pool.cameras.resized(_SIDE)
-    reduce = reduce or Reduction(splats, seed=seed)
+    reduce = reduce or Reduction(splats, seed=seed, progress=progress)
 
     def written(count: int) -> Splats:
         return as_file(reduce(count).splats, file)
