@@ -22,6 +22,7 @@ __all__ = [
     "Convention",
     "Engine",
     "FormatName",
+    "Keep",
     "LpipsInput",
     "Method",
     "PaperPresetName",
@@ -64,9 +65,12 @@ AdaptSchedule = Literal["default", "paper"]
 """Schedules of adaptation (`g2ard.stages.adapt`)."""
 ADAPT_SCHEDULES: tuple[AdaptSchedule, ...] = get_args(AdaptSchedule)
 
-Refinement = Literal["auto", "none", "photometric"]
+Refinement = Literal["auto", "none", "photometric", "exact"]
 """What follows a photo's pose from features (`g2ard.stages.register`)."""
 REFINEMENTS: tuple[Refinement, ...] = get_args(Refinement)
+
+Keep = Literal["registered", "uncertain", "all"]
+"""Which photos' poses registration keeps."""
 
 Convention = Literal["gsplat", "inria"]
 """Whose renderer is followed where renderers differ (`g2ard.stages.render`)."""

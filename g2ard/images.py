@@ -172,7 +172,7 @@ def _lookup(width: int, height: int, K: tuple[float, ...], distortion: tuple[flo
 
 
 def resized(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """An image (H, W, 3) float32 at another (width, height): each pixel the mean of the area it covers;
+    """An image (H, W, C) float32 at another (width, height): each pixel the mean of the area it covers;
     bilinear along an axis that grows.
 
     >>> resized(np.full((4, 8, 3), 0.5, np.float32), (2, 1)).tolist()
@@ -183,7 +183,7 @@ def resized(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.flo
             image = _averaged(image, length, axis)
     height, width = image.shape[:2]
     if (width, height) != size:
-        planes = [Image.fromarray(np.ascontiguousarray(image[..., c])) for c in range(3)]
+        planes = [Image.fromarray(np.ascontiguousarray(image[..., c])) for c in range(image.shape[2])]
         grown = [np.asarray(plane.resize(size, Image.Resampling.BILINEAR), np.float32) for plane in planes]
         image = np.stack(grown, axis=2)
     return np.ascontiguousarray(image)

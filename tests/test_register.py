@@ -218,7 +218,9 @@ def test_the_command_writes_views_and_says_how_good_they_are(
         ("--photos views.json --truth other.txt", 1, "other.txt: names none of the photos"),
         ("--photos views.json --focal 100", 1, "these views state their intrinsics"),
         ("--photos views.json --metres-per-unit 2", 2, "goes with --truth"),
-        ("--photos views.json --keep all", 2, "keep"),
+        ("--photos views.json --keep some", 2, "keep"),
+        ("--photos views.json --protocol gs-cpr --passes 2", 2, "gs-cpr decides --passes"),
+        ("--photos views.json --protocol gs-cpr --matcher direct", 2, "gs-cpr decides --matcher"),
         ("--photos views.json --report scene.ply -w", 2, "would be written over"),
         ("--photos views.json --pool absent.json", 1, "absent.json"),
         ("--photos views.json --poses away.txt", 1, "none of 4 photos was registered"),
@@ -283,3 +285,34 @@ def test_photos_to_poses_to_an_adapted_scene(site: Path, command_line: CommandLi
         for path in (site / "scene.ply", tmp_path / "adapted.ply")
     )
     assert after > before + 3
+
+
+def test_all_keeps_the_start_of_what_has_no_pose(site: Path) -> None:
+    """As GS-CPR does; the scores count it."""
+    pytest.importorskip("pycolmap")
+    photos = photos_of(site / "views.json")
+    starts = {name: off(pose, 0.05, 1, 3) for name, pose in read_poses(site / "views.json").items()}
+    none = RegisterConfig(size=128, matcher="sift", min_inliers=10_000, fallback=False)
+    found = register(
+        g2ard.io.read_splats(site / "scene.ply"), photos, starts=starts, truth=starts, config=none, keep="all"
+    )
+    assert found.report.count("refused") == 4
+    assert "fewer than 10000 matches" in str(found.report.photos[0].reason)
+    np.testing.assert_array_equal(found.cameras.viewmats, np.stack([starts[n] for n in photos.names]))
+    scored = summarize(found.report.photos, keep="all", true=4).found
+    assert scored is not None
+    assert scored.photos == 4
+
+
+def test_the_protocol_of_gs_cpr(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    arguments = (*("--photos", site / "views.json", "--size", "128", "--protocol", "gs-cpr"),)
+    arguments = (*arguments, "--poses", site / "coarse.txt", "--report", "page.html", "-o", "poses.json")
+    status, out, err = command_line("register", site / "scene.ply", *arguments, "--json", "-", cwd=tmp_path)
+    assert status == 0, err
+    rows = json.loads(out)["photos"]
+    assert all(row["passes"] <= 1 and row["camera_from_world"] for row in rows)
+    assert len(read_views(tmp_path / "poses.json")) == 4
+    assert (tmp_path / "page.html").read_text().count('<figure class="wide">') == sum(
+        row["inliers"] > 0 for row in rows
+    )

@@ -179,6 +179,12 @@ BackgroundOption = Annotated[
     Triple | None,
     typer.Option(parser=_colour, metavar="COLOUR", help="black (the default), white or R,G,B in [0, 1]."),
 ]
+SkyOption = Annotated[
+    Triple | None,
+    typer.Option(
+        parser=_colour, metavar="COLOUR", help="black, white or R,G,B in [0, 1]; 0.6,0.8,1 if not given."
+    ),
+]
 TeacherOption = Annotated[
     Path | None,
     typer.Option("--teacher", metavar="SCENE", help="Its renders are the targets; without it, the photos."),

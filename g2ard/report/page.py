@@ -127,6 +127,14 @@ class Page:
         ]
         self._parts.append(f'<div class="row">{"".join(figures)}</div>')
 
+    def figure(self, image: NDArray[np.uint8], caption: str) -> None:
+        """Add a picture, up to twice as wide as others: it is of two."""
+        number, text = self._image(image, 2 * _LONGEST), escape(caption)
+        self._parts.append(
+            f'<figure class="wide"><img data-i="{number}" alt="{text}">'
+            f"<figcaption>{text}</figcaption></figure>"
+        )
+
     def comparison(self, view: Comparison) -> None:
         """Add a view: a slider between target and any rendering, and the same crops of each, magnified.
 
@@ -169,11 +177,11 @@ class Page:
             f"<figcaption>{escape(shown.name)}{whole}</figcaption></figure>"
         )
 
-    def _image(self, image: NDArray[np.uint8]) -> int:
+    def _image(self, image: NDArray[np.uint8], longest: int = _LONGEST) -> int:
         from PIL import Image
 
         picture = Image.fromarray(to_bytes(image))
-        picture.thumbnail((_LONGEST, _LONGEST))
+        picture.thumbnail((longest, longest))
         buffer = BytesIO()
         picture.save(buffer, "JPEG", quality=_QUALITY)
         self._images.append(base64.b64encode(buffer.getvalue()).decode())
@@ -243,6 +251,7 @@ select{font:inherit;max-width:100%}
 .r0{--roi:#2563eb}.r1{--roi:#d97706}
 .roi{position:absolute;box-sizing:border-box;border:2px solid var(--roi);pointer-events:none}
 .crops{display:flex;flex-wrap:wrap;gap:10px;margin-top:10px}.crop{margin:0;width:190px}
+.wide{margin:8px 0}.wide img{display:block;max-width:100%}
 .crop img{display:block;width:100%;box-sizing:border-box;border:2px solid var(--roi)}
 @media(max-width:600px){.row figure{flex-basis:100%}}
 """

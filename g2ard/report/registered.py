@@ -31,6 +31,8 @@ def registration_report(
     rows: Sequence[Any],
     starts: Mapping[str, NDArray[np.float64]],
     *,
+    matches: Mapping[str, NDArray[np.float64]] | None = None,
+    side: int = 1000,
     told: Sequence[str] = (),
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     size: int = 640,
@@ -44,6 +46,8 @@ def registration_report(
         photos: C views with photos.
         rows: C `PhotoReport`s, in the same order.
         starts: name → (4, 4) camera_from_world, shown beside what was found.
+        matches: name → (M, 4) of `Registered`, drawn between photo and render.
+        side: pixels of the longer side that they count.
         told: what the command says of the run.
         background: RGB behind the scene.
         size: pixels of the longer side of the pictures.
@@ -70,7 +74,35 @@ def registration_report(
         if row.name in starts:
             shown.append(Shown("start", to_bytes(renderer.image(replace(one[0], viewmat=starts[row.name])))))
         page.comparison(Comparison(f"{row.name}: {row.status}", photo, shown))
+        if matches and row.name in matches:
+            scale = photo.shape[1] / photos.take([i]).resized(side)[0].width
+            drawn = matches_drawn(photo, to_bytes(found), matches[row.name] * scale)
+            page.figure(drawn, f"{plural(len(matches[row.name]), 'match', 'matches')} that the pose explains")
     page.write(path)
+
+
+def matches_drawn(
+    photo: NDArray[np.uint8], render: NDArray[np.uint8], matches: NDArray[np.float64], most: int = 80
+) -> NDArray[np.uint8]:
+    """Photo and render side by side, (H, 2 W, 3), and a line from each pixel to the one it matches.
+
+    Args:
+        photo: (H, W, 3).
+        render: likewise.
+        matches: (M, 4) pixels of both.
+        most: lines, evenly among the matches.
+    """
+    from PIL import Image, ImageDraw
+
+    pair = Image.fromarray(np.concatenate([photo, render], 1))
+    pen, width = ImageDraw.Draw(pair), photo.shape[1]
+    every = max(1, -(-len(matches) // most))
+    for k, (u, v, u_seen, v_seen) in enumerate(matches[::every].tolist()):
+        colour = f"hsl({137 * k % 360}, 90%, 55%)"  # turned by the golden angle: neighbours differ
+        pen.line((u, v, width + u_seen, v_seen), fill=colour)
+        for x, y in ((u, v), (width + u_seen, v_seen)):
+            pen.ellipse((x - 2, y - 2, x + 2, y + 2), outline=colour)
+    return np.asarray(pair)
 
 
 def _cells(row: Any) -> list[str]:

@@ -215,6 +215,18 @@ class Renderer:
         assert depth is not None
         return Rendered(image, alpha, depth, middle)
 
+    def pose_gradient(self, gradient: _Floats) -> NDArray[np.float64]:
+        """(6,) dL/d(v, ω) of the last render's pose T, T ← exp(v, ω)·T in the camera's axes.
+
+        g_v = Σ W·dL/dμ and g_ω = Σ X × dL/dX + Σᵢ W·(dL/djwᵢ × jwᵢ), with X = Wμ + t, dL/dX without the
+        colour's direction and jw the rows of the projection's J·W. Where a Gaussian enters or leaves at
+        α = 1/255 there is no gradient.
+
+        Args:
+            gradient: (H, W, 3) float32 dL/d(image).
+        """
+        return np.array(self._rasterizer.pose_gradient(self._arrays, np.ascontiguousarray(gradient)))
+
     def _forward(
         self, camera: Camera, *, depth: bool, median: bool
     ) -> tuple[_Floats, _Floats, _Floats | None, _Floats | None]:

@@ -18,6 +18,38 @@ def pixel_row(u, v, depth, K, gradient):  # type: ignore[no-untyped-def]
     return np.asarray(gradient) @ projection @ motion
 
 
+def image_rows(depth, K, gradients):  # type: ignore[no-untyped-def]
+    """(6, H, W) of `pixel_row` for an image and its gradients (right, down)."""
+    out = np.zeros((6, *depth.shape))
+    for i, j in np.ndindex(*depth.shape):
+        out[:, i, j] = pixel_row(j + 0.5, i + 0.5, depth[i, j], K, [g[i, j] for g in gradients])
+    return out
+
+
+def flow(depth, mask, K, xi):  # type: ignore[no-untyped-def]
+    """Root of the mean square of how far ξ moves pixels."""
+    one, none = np.ones(depth.shape), np.zeros(depth.shape)
+    moves = [np.tensordot(xi, image_rows(depth, K, g), 1)[mask] for g in ((one, none), (none, one))]
+    return float(np.sqrt((moves[0] ** 2 + moves[1] ** 2).mean()))
+
+
+def shot(image, alpha, depth, min_alpha, max_edge):  # type: ignore[no-untyped-def]
+    """(grey, depth, mask) of a render, pixel by pixel."""
+    height, width = alpha.shape
+    opaque = alpha >= min_alpha
+    z = np.where(opaque, depth.astype(float) / np.maximum(alpha, 1e-6), 1.0)
+    mask = opaque & (z > 0)
+    for i, j in np.argwhere(mask):
+        for y, x in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
+            if 0 <= y < height and 0 <= x < width:
+                mask[i, j] &= abs(z[i, j] - z[y, x]) <= max_edge * min(z[i, j], z[y, x])
+    grey = np.clip(image.astype(float), 0, 1) @ [0.299, 0.587, 0.114]
+    taps = np.outer([1, 4, 6, 4, 1], [1, 4, 6, 4, 1]) / 256
+    pad = np.pad(grey, 2, mode="edge")
+    soft = [[(pad[i : i + 5, j : j + 5] * taps).sum() for j in range(width)] for i in range(height)]
+    return np.array(soft), np.where(mask, z, 1.0), mask
+
+
 def normal_equations(photo, shot, K, gain, bias, scale, tukey=4.685):  # type: ignore[no-untyped-def]
     """Sums over pixels: matrix (8, 8), right side (8,), mean cost and the sum of weights."""
     matrix, right, costs, weights = np.zeros((8, 8)), np.zeros(8), [], 0.0

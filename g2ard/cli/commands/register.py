@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from g2ard.choices import Refinement
+from g2ard.choices import Keep, Refinement
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import BackgroundOption, OutputOption, SceneArgument
 from g2ard.progress import plural
@@ -64,15 +64,28 @@ def register(
     ] = "auto",
     refine: Annotated[
         Refinement,
-        typer.Option(help="A pose from features as it is, aligned, or the mean of both by information."),
+        typer.Option(
+            help="A pose from features as it is, aligned, the mean of both by information, or that polished "
+            "by the exact gradient."
+        ),
     ] = "auto",
     passes: Annotated[int, typer.Option(min=1, help="Renders to match with, at most.")] = 3,
     accept: Annotated[
         float, typer.Option(min=0.01, max=1, help="ZNCC from which a photo counts as registered.")
     ] = 0.6,
     keep: Annotated[
-        Literal["registered", "uncertain"], typer.Option(help="Write those that are uncertain as well.")
+        Keep,
+        typer.Option(
+            help="Write those that are uncertain as well, or all: what has no pose keeps its start."
+        ),
     ] = "registered",
+    protocol: Annotated[
+        Literal["gs-cpr"] | None,
+        typer.Option(
+            help="gs-cpr: one pass of matches, no refinement, no fallback, and every photo kept: without a "
+            "pose from 6 matches at least, where it started."
+        ),
+    ] = None,
     truth: Annotated[
         Path | None,
         typer.Option(metavar="VIEWS", help="True poses, to score with: as --poses. They decide nothing."),
@@ -91,6 +104,8 @@ def register(
 
     Each photo is registered, uncertain or refused; OUT holds the registered ones as views.
     """
+    from dataclasses import replace
+
     from g2ard.constants import changed, listed
     from g2ard.errors import InputError
     from g2ard.io import write_views
@@ -102,6 +117,13 @@ def register(
     from g2ard.stages.register.score import summarize
 
     config = RegisterConfig(size=size, accept=accept, matcher=matcher, refine=refine, passes=passes)
+    if protocol == "gs-cpr":
+        given = {"--passes": passes != 3, "--refine": refine != "auto", "--keep": keep != "registered"}
+        if contradicted := [name for name, said in given.items() if said] + ["--matcher"] * (
+            matcher == "direct"
+        ):
+            raise typer.BadParameter(f"--protocol gs-cpr decides {contradicted[0]}; leave that out")
+        config, keep = replace(config, passes=1, refine="none", fallback=False, min_inliers=6), "all"
     config = changed(config, "register", run.constants(register=config))
     if metres_per_unit is not None and truth is None:
         raise typer.BadParameter("--metres-per-unit goes with --truth")
@@ -147,7 +169,16 @@ def register(
 
         colour = background or (0.0, 0.0, 0.0)
         registration_report(
-            report, f"Photos in {scene.name}", splats, taken, rows, starts, told=lines, background=colour
+            report,
+            f"Photos in {scene.name}",
+            splats,
+            taken,
+            found.report.photos,
+            starts,
+            matches=found.matches,
+            side=config.size,
+            told=lines,
+            background=colour,
         )
     constants = listed({"register": config}, run.config)
     written = str(output) if len(found.cameras) else None

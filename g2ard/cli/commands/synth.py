@@ -10,7 +10,7 @@ import typer
 
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command, group
-from g2ard.cli.options import BackgroundOption, Triple
+from g2ard.cli.options import SkyOption, Triple
 from g2ard.progress import plural
 
 synth = group("synth", "Make data where none is at hand.\n\nExample: g2ard synth city -o city/")
@@ -71,7 +71,7 @@ def city(
     fov: Annotated[float, typer.Option(min=1, max=170, help="Horizontal field of view, degrees.")] = 65.0,
     noise: Annotated[float, typer.Option(min=0, help="Noise of the laser's range, metres.")] = 0.015,
     supersample: Annotated[int, typer.Option(min=1, max=8, help="Samples a pixel along each axis.")] = 2,
-    sky: BackgroundOption = None,
+    sky: SkyOption = None,
     offset: Annotated[
         Triple | None,
         typer.Option(parser=_offset, metavar="X,Y,Z", help="World coordinates of the middle, as maps have."),

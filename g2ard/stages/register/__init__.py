@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.cameras import Cameras
+from g2ard.choices import Keep
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.splats import Splats
@@ -18,6 +19,7 @@ from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import band_passed
 from g2ard.stages.register.matchers import matcher_named
 from g2ard.stages.register.outcome import (
+    KEPT,
     PhotoReport,
     PoseError,
     Registered,
@@ -39,9 +41,6 @@ __all__ = [
 ]
 
 Float = NDArray[np.float64]
-_KEPT = {"registered": ("registered",), "uncertain": ("registered", "uncertain")}
-
-
 _FEATURES_COUNT = 0.05
 """By how much less alike a pose that features bear out may be than one that they do not: likeness tells poses
 that are wrong by metres, features those that are wrong by decimetres."""
@@ -55,7 +54,7 @@ def register(
     pool: Cameras | None = None,
     truth: Mapping[str, ArrayLike] | None = None,
     config: RegisterConfig | None = None,
-    keep: str = "registered",
+    keep: Keep = "registered",
     background: Sequence[float] = (0.0, 0.0, 0.0),
     progress: Progress = silent,
 ) -> Registered:
@@ -77,7 +76,8 @@ def register(
         pool: poses to start from where `starts` has none.
         truth: name → (4, 4) camera_from_world, to score with; it decides nothing.
         config: see `RegisterConfig`.
-        keep: "registered", or "uncertain" to keep those as well.
+        keep: "registered", "uncertain" to keep those as well, or "all", where a photo without a pose found
+            keeps its starting pose.
         background: RGB behind the scene.
         progress: told of every photo.
 
@@ -99,8 +99,8 @@ def register(
     config = config or RegisterConfig()
     if not len(photos):
         raise InputError("photos: there are none")
-    if keep not in _KEPT:
-        raise InputError(f"keep: expected registered or uncertain, got {keep!r}")
+    if keep not in KEPT:
+        raise InputError(f"keep: expected {', '.join(KEPT)}, got {keep!r}")
     given = _poses("starts", starts, photos)
     true = _poses("truth", truth, photos)
     if not given and pool is None:
@@ -108,20 +108,28 @@ def register(
     renderer = Renderer(scene, background=background)
     renders = None if pool is None else PoolRenders(renderer, pool, config)
     search = Search(renderer, config, matcher_named(config.matcher, config.ratio, config.features))
-    rows, kept, poses = [], [], []
+    rows, kept, poses, matches = [], [], [], {}
     for i, name in enumerate(photos.names):
         began = time.perf_counter()
         start = Start(given[name], name) if name in given else None
-        row, pose = _one(search, photos, i, start, renders, true.get(name))
+        row, best = _one(search, photos, i, start, renders, true.get(name))
+        if best is not None and best.solved is not None:
+            matches[name] = np.concatenate([best.solved.pixels, best.solved.seen], 1)
+        if best is None and keep == "all" and start is not None:
+            row = replace(row, camera_from_world=_rows(start.pose), error=row.start_error)
         rows.append(replace(row, seconds=time.perf_counter() - began))
-        if pose is not None and row.status in _KEPT[keep]:
+        if row.camera_from_world is not None and row.status in KEPT[keep]:
             kept.append(i)
-            poses.append(pose)
+            poses.append(np.array(row.camera_from_world))
         progress("register", i + 1, len(photos))
     cameras = photos.take(np.array(kept, int))
     if kept:
         cameras = replace(cameras, viewmats=np.stack(poses))
-    return Registered(cameras, RegisterReport(tuple(rows)))
+    return Registered(cameras, RegisterReport(tuple(rows)), matches)
+
+
+def _rows(matrix: Float) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, matrix.tolist()))
 
 
 def _poses(what: str, poses: Mapping[str, ArrayLike] | None, photos: Cameras) -> dict[str, Float]:
@@ -144,7 +152,7 @@ def _one(
     given: Start | None,
     pool: PoolRenders | None,
     true: Float | None,
-) -> tuple[PhotoReport, Float | None]:
+) -> tuple[PhotoReport, Candidate | None]:
     """One photo from whatever it can start from."""
     name = photos.names[index]
     start_error = None if given is None or true is None else PoseError(*pose_error(given.pose, true))
@@ -163,14 +171,17 @@ def _one(
         candidates = _from_pool(search, pool, photo)
     renders = search.renders
     if not candidates:
-        return replace(refused, reason="the scene is out of the starting pose's sight", renders=renders), None
+        why = "the scene is out of the starting pose's sight"
+        if not search.config.fallback:
+            why = f"fewer than {search.config.min_inliers} matches bear a pose out"
+        return replace(refused, reason=why, renders=renders), None
     best = max(candidates, key=lambda c: c.zncc + (_FEATURES_COUNT if c.solved else 0))
     row = _reported(name, best, search.config, renders)
     if true is not None:
         start_error = PoseError(*pose_error(best.start.pose, true))
         end_error = PoseError(*pose_error(best.found.viewmat, true))
         row = replace(row, start_error=start_error, error=end_error)
-    return row, best.found.viewmat
+    return row, best
 
 
 def _from_pose(search: Search, given: Start, photo: Photo) -> list[Candidate]:
@@ -181,7 +192,7 @@ def _from_pose(search: Search, given: Start, photo: Photo) -> list[Candidate]:
         return any(c.zncc >= config.accept for c in found)
 
     out = [c] if (c := search.by_features(given, photo)) else []
-    if accepted(out):
+    if accepted(out) or not config.fallback:
         return out
     aligned = [c] if (c := search.by_alignment(given, photo)) else []
     if not accepted(aligned):
@@ -208,6 +219,8 @@ def _from_pool(search: Search, pool: PoolRenders, photo: Photo) -> list[Candidat
         solved, start = max(first, key=lambda each: each[0].inliers)
         if c := search.by_features(replace(start, turned=solved.viewmat), photo):
             return [c]
+    if not search.config.fallback:
+        return []
     aligned = [c for start in starts if (c := search.by_alignment(start, photo))]
     return aligned + _featured(search, aligned, photo)
 
@@ -243,10 +256,10 @@ def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) 
         gain=found.gain,
         bias=found.bias,
         overlap=found.overlap,
-        covariance=None if found.covariance is None else tuple(map(tuple, found.covariance.tolist())),
+        covariance=None if found.covariance is None else _rows(found.covariance),
         sigma=sigma,
         renders=renders,
-        camera_from_world=tuple(map(tuple, found.viewmat.tolist())),
+        camera_from_world=_rows(found.viewmat),
     )
 
 

@@ -14,23 +14,30 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard import _core
 from g2ard.cameras import Camera
 from g2ard.stages.register.config import RegisterConfig
-from g2ard.stages.register.grey import blurred, gradient, grey_of
+from g2ard.stages.register.grey import blurred, gradient
 from g2ard.stages.register.pose import moved
-from g2ard.stages.render import Renderer
+from g2ard.stages.render import Rendered, Renderer
 
-__all__ = ["Aligned", "Level", "Normal", "Shot", "align", "jacobian", "level_of", "normal_equations", "shoot"]
+__all__ = [
+    "Aligned",
+    "Level",
+    "Normal",
+    "Shot",
+    "align",
+    "inverse",
+    "level_of",
+    "moves",
+    "normal_equations",
+    "shoot",
+    "shot_of",
+]
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_TUKEY = 4.685
-"""Residuals of more standard deviations than this count nothing: 95 % as efficient as least squares."""
-_SIGMAS = 1.4826
-"""Standard deviations of a normal distribution in its median absolute deviation."""
-_LEAST_SCALE = 1e-3
-"""Of residuals: a quarter of an 8-bit step."""
 _DAMPING = 1e-6
 """Added to the normal equations' diagonal, relatively."""
 _HALVINGS = 3
@@ -112,33 +119,12 @@ def level_of(grey: Float, mask: Mask | None = None) -> Level:
 
 def shoot(renderer: Renderer, camera: Camera, config: RegisterConfig) -> Shot:
     """Render one view for alignment; see `Shot`."""
-    out = renderer.render(camera)
-    alpha = out.alpha.astype(np.float64)
-    mask = alpha >= config.min_alpha
-    depth = np.where(mask, out.depth.astype(np.float64) / np.maximum(alpha, 1e-6), 1.0)
-    for axis in (0, 1):
-        jump = np.abs(np.diff(depth, axis=axis)) > config.max_edge * np.minimum(
-            *(np.delete(depth, end, axis) for end in (0, -1))
-        )
-        sides = [(1, 0) if i == axis else (0, 0) for i in (0, 1)]
-        mask &= ~(np.pad(jump, sides) | np.pad(jump, [side[::-1] for side in sides]))
-    mask &= depth > 0
-    return Shot(blurred(grey_of(np.clip(out.image, 0, 1))), np.where(mask, depth, 1.0), mask)
+    return shot_of(renderer.render(camera), config)
 
 
-def jacobian(depth: Float, K: Float, right: Float, down: Float) -> Float:
-    """(6, N) of ∇I · ∂π/∂X · [I | −[X]ₓ] for the pixels of an (H, W) image, row by row.
-
-    With x = X/Z and y = Y/Z, and image gradients times focal lengths p = f_x·∂I/∂u, q = f_y·∂I/∂v:
-    (p/Z, q/Z, −(px + qy)/Z, −pxy − q(1 + y²), p(1 + x²) + qxy, −py + qx).
-    """
-    height, width = depth.shape
-    x = ((np.arange(width) + 0.5 - K[0, 2]) / K[0, 0])[None, :]
-    y = ((np.arange(height) + 0.5 - K[1, 2]) / K[1, 1])[:, None]
-    p, q = K[0, 0] * right, K[1, 1] * down
-    along = p * x + q * y
-    rows = (p / depth, q / depth, -along / depth, -along * y - q, along * x + p, q * x - p * y)
-    return np.stack([row.ravel() for row in rows])
+def shot_of(out: Rendered, config: RegisterConfig) -> Shot:
+    """A render for alignment; see `Shot`."""
+    return Shot(*_core.shot(out.image, out.alpha, out.depth, config.min_alpha, config.max_edge))
 
 
 def normal_equations(
@@ -154,29 +140,24 @@ def normal_equations(
         bias: added to it.
         scale: σ of the residuals; None finds it.
 
-    Sums run over pixels in order, without BLAS: they do not depend on the number of threads.
+    Sums run over pixels in an order of their own: they do not depend on the number of threads.
     """
-    mask = (photo.mask & shot.mask).ravel()
-    residual = (photo.grey - gain * shot.grey - bias).ravel()[mask]
-    if scale is None:
-        scale = max(_LEAST_SCALE, _SIGMAS * float(np.median(np.abs(residual - np.median(residual)))))
-    inlying = np.maximum(0.0, 1 - (residual / (_TUKEY * scale)) ** 2)
-    weight = inlying**2
-    right, down = gradient(shot.grey)
-    mean = (gain * right + photo.right) / 2, (gain * down + photo.down) / 2
-    # the render that is sought moves with the points: its grey at a pixel changes by −∇I·flow
-    J = np.concatenate(
-        [
-            -jacobian(shot.depth, K, *mean)[:, mask],
-            shot.grey.ravel()[None, mask],
-            np.ones((1, int(mask.sum()))),
-        ]
-    )
-    weighted = J * weight
-    matrix = np.einsum("in,jn->ij", weighted, J, optimize=False)
-    target = np.einsum("in,n->i", weighted, residual, optimize=False)
-    cost = float((1 - inlying**3).mean())
-    return Normal(matrix, target, scale, cost, float(weight.sum()))
+    of_photo = photo.grey, photo.right, photo.down, photo.mask
+    matrix, target, *rest = _core.normal_equations(of_photo, _parts(shot), _lens(K), (gain, bias), scale)
+    return Normal(np.array(matrix), np.array(target), *rest)
+
+
+def moves(shot: Shot, K: Float, xi: Float) -> float:
+    """Root of the mean square, in pixels, of how far ξ moves the pixels that count."""
+    return _core.flow(_parts(shot), _lens(K), xi.tolist())
+
+
+def _parts(shot: Shot) -> tuple[Float, Float, Mask]:
+    return shot.grey, shot.depth, shot.mask
+
+
+def _lens(K: Float) -> tuple[float, float, float, float]:
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
 def align(
@@ -249,7 +230,7 @@ def _level(
             step = step / 2
         if not better or step is None:
             break
-        still = _flow(shot, camera.K, step[:6]) < config.still
+        still = moves(shot, camera.K, step[:6]) < config.still
         pose, shot, normal, (gain, bias) = trial, seen, after, light
         if still:
             break
@@ -286,23 +267,17 @@ def _solved(normal: Normal) -> Float | None:
 
 
 def _covariance(normal: Normal, correlated: float) -> Float | None:
-    diagonal = np.diag(normal.matrix)
-    if not (np.isfinite(normal.matrix).all() and (diagonal > 0).all()):
+    found = inverse(normal.matrix)
+    return None if found is None else found[:6, :6] * (normal.scale**2 * correlated)
+
+
+def inverse(matrix: Float) -> Float | None:
+    """Of a symmetric matrix, its unknowns scaled to a unit diagonal; None where it has none."""
+    diagonal = np.diag(matrix)
+    if not (np.isfinite(matrix).all() and (diagonal > 0).all()):
         return None
     unit = 1 / np.sqrt(diagonal)
-    scaled = normal.matrix * unit[:, None] * unit[None, :]
+    scaled = matrix * unit[:, None] * unit[None, :]
     if np.linalg.eigvalsh(scaled)[0] < 1e-12:
         return None
-    inverse = np.linalg.inv(scaled) * unit[:, None] * unit[None, :]
-    return inverse[:6, :6] * (normal.scale**2 * correlated)
-
-
-def _flow(shot: Shot, K: Float, xi: Float) -> float:
-    """Root of the mean square, in pixels, of how far ξ moves the pixels that count."""
-    mask = shot.mask.ravel()
-    one, none = np.ones(shot.depth.shape), np.zeros(shot.depth.shape)
-    square = 0.0
-    for right, down in ((one, none), (none, one)):
-        moves = np.einsum("in,i->n", jacobian(shot.depth, K, right, down)[:, mask], xi, optimize=False)
-        square += float((moves**2).mean())
-    return float(np.sqrt(square))
+    return np.asarray(np.linalg.inv(scaled) * unit[:, None] * unit[None, :])

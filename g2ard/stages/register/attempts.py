@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from g2ard.cameras import Camera, Cameras
 from g2ard.images import load_image, load_mask, resized
-from g2ard.stages.register.align import Aligned, Level, align, level_of
+from g2ard.stages.register.align import Aligned, Level, align, inverse, level_of
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import grey_of, local_zncc
 from g2ard.stages.register.matchers import Matcher
+from g2ard.stages.register.polish import Prior, polish
 from g2ard.stages.register.pose import motion_between, moved
 from g2ard.stages.register.solve import Solved, solve
 from g2ard.stages.render import Renderer
@@ -86,21 +87,21 @@ def loaded(photos: Cameras, index: int, config: RegisterConfig) -> Photo:
     sizes = config.levels()
     one = photos.take([index]).resized(max(config.size, sizes[-1]))
     image, mask = load_image(one, 0), load_mask(one, 0)
-
-    def shrunk(side: int) -> tuple[Camera, Float, NDArray[np.bool_] | None]:
-        camera = one.resized(side)[0]
-        size = camera.width, camera.height
-        grey = grey_of(resized(image, size))
-        if mask is None:
-            return camera, grey, None
-        share = resized(np.repeat(mask[..., None].astype(np.float32), 3, 2), size)[..., 0]
-        return camera, grey, share > 0.999
-
-    levels = [shrunk(side) for side in sizes]
-    small = shrunk(config.pool_size)
-    pyramid = [(camera, level_of(grey, counts)) for camera, grey, counts in levels]
     everywhere = np.ones(image.shape[:2], bool) if mask is None else mask
-    return Photo(one[0], image, everywhere, pyramid, small[:2], levels[-1][1])
+    planes = np.stack([grey_of(image), everywhere], 2).astype(np.float32)
+
+    def shrunk(side: int) -> tuple[Camera, Float, NDArray[np.bool_]]:
+        nonlocal planes
+        camera = one.resized(side)[0]
+        planes = resized(planes, (camera.width, camera.height))
+        return camera, planes[..., 0].astype(np.float64), np.ascontiguousarray(planes[..., 1] > 0.999)
+
+    levels = [shrunk(side) for side in reversed(sizes)]
+    whole = levels[0][1]
+    planes = np.stack([whole, levels[0][2]], 2).astype(np.float32)
+    small = shrunk(config.pool_size)
+    pyramid = [(camera, level_of(grey, counts)) for camera, grey, counts in reversed(levels)]
+    return Photo(one[0], image, everywhere, pyramid, small[:2], whole)
 
 
 class Search:
@@ -119,6 +120,8 @@ class Search:
     def by_alignment(self, start: Start, photo: Photo) -> Candidate | None:
         """Direct alignment, coarse to fine; None where the scene is out of the start's sight."""
         found = self._aligned(start.begins, photo, photo.pyramid)
+        if found is not None and self.config.refine == "exact":
+            found = self._polished(found, photo, None)
         return None if found is None else Candidate(start, found, self._likeness(found.viewmat, photo))
 
     def by_features(self, start: Start, photo: Photo, passes: int | None = None) -> Candidate | None:
@@ -139,22 +142,30 @@ class Search:
     def _refined(self, start: Start, solved: Solved, photo: Photo) -> Candidate:
         """Without refinement, the features' pose; with the photometric one, what alignment makes of it; and
         with both, the mean of the two weighted by their information: ξ = (Λ_f + Λ_p)⁻¹ Λ_p ξ_p, ξ_p from the
-        first to the second."""
+        first to the second; the exact one polishes that."""
         refine = self.config.refine
         near = self._aligned(solved.viewmat, photo, photo.pyramid[-_FINEST:])
-        plain = Aligned(solved.viewmat, 1.0, 0.0, _inverse(solved.information), 0.0, 0, solved.depth)
+        plain = Aligned(solved.viewmat, 1.0, 0.0, inverse(solved.information), 0.0, 0, solved.depth)
         if near is None:
             return Candidate(start, plain, self._likeness(solved.viewmat, photo), solved)
         found = near
         if refine != "photometric":
             found = replace(near, viewmat=solved.viewmat, covariance=plain.covariance, depth=solved.depth)
-        if refine == "auto" and near.covariance is not None:
+        if refine in ("auto", "exact") and near.covariance is not None:
             of_light = np.linalg.inv(near.covariance)
-            both = _inverse(solved.information + of_light)
+            both = inverse(solved.information + of_light)
             if both is not None:
                 xi = motion_between(solved.viewmat, near.viewmat)
                 found = replace(found, viewmat=moved(solved.viewmat, both @ of_light @ xi), covariance=both)
+        if refine == "exact":
+            found = self._polished(found, photo, Prior(solved.viewmat, solved.information))
         return Candidate(start, found, self._likeness(found.viewmat, photo), solved)
+
+    def _polished(self, start: Aligned, photo: Photo, prior: Prior | None) -> Aligned:
+        """By the exact gradient, at the finest level; the start where that fails."""
+        found = polish(self.renderer, start, *photo.pyramid[-1], prior, self.config)
+        self.renders += 1 if found is None else found.steps
+        return start if found is None else found
 
     def _aligned(self, pose: Float, photo: Photo, levels: list[tuple[Camera, Level]]) -> Aligned | None:
         found = align(self.renderer, pose, levels, self.config)
@@ -168,15 +179,3 @@ class Search:
         self.renders += 1
         mask = level.mask & (out.alpha >= self.config.min_alpha)
         return local_zncc(grey_of(np.clip(out.image, 0, 1)), photo.whole, mask, self.config.window)
-
-
-def _inverse(matrix: Float) -> Float | None:
-    """Of a symmetric matrix, its unknowns scaled to a unit diagonal; None where it has none."""
-    diagonal = np.diag(matrix)
-    if not (np.isfinite(matrix).all() and (diagonal > 0).all()):
-        return None
-    unit = 1 / np.sqrt(diagonal)
-    scaled = matrix * unit[:, None] * unit[None, :]
-    if np.linalg.eigvalsh(scaled)[0] < 1e-12:
-        return None
-    return np.asarray(np.linalg.inv(scaled) * unit[:, None] * unit[None, :])

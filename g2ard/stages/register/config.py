@@ -23,7 +23,8 @@ class RegisterConfig:
         matcher: "auto" (SIFT where the extra `register` is installed, else direct), "sift", "direct", or
             "MODULE:FUNCTION".
         refine: what follows features: "auto" joins their pose and that of direct alignment, "photometric"
-            takes the second, "none" the first.
+            takes the second, "none" the first; "exact" goes on from "auto", or from alignment where there
+            are no features, by the exact gradient of renders (`g2ard.stages.register.polish`).
         passes: of rendering, matching and solving, at most.
         coarsest: pixels of the longer side that alignment begins at; it doubles from level to level.
         iterations: at most, at each level.
@@ -39,11 +40,12 @@ class RegisterConfig:
         candidates: the best poses of a pool, by renders of `pool_size` pixels, that are aligned.
         pool_size: pixels of the longer side of those renders.
         correlated: what variances are multiplied by, for neighbouring residuals err alike: set so that
-            errors at 500 pixels on caliterra's held-out photos are about as large as their σ says.
+            errors at 500 pixels are about as large as their σ says, on photos of caliterra and of the city.
         features: of an image, at most, for SIFT.
         ratio: SIFT's nearest feature is nearer than this share of the distance to the second nearest.
         max_reprojection: pixels within which PnP explains a match.
         min_inliers: matches that PnP must explain for a pose from features to count.
+        fallback: whether alignment is tried where features fail.
         alike: what the variances of features' poses are multiplied by, as `correlated`.
 
     Raises:
@@ -68,12 +70,13 @@ class RegisterConfig:
     window: int = 15
     candidates: int = 5
     pool_size: int = 64
-    correlated: float = 1000.0
+    correlated: float = 2000.0
     features: int = 4096
     ratio: float = 0.85
     max_reprojection: float = 3.0
     min_inliers: int = 30
-    alike: float = 30.0
+    fallback: bool = True
+    alike: float = 10.0
 
     def __post_init__(self) -> None:
         require("size", self.size, self.size >= 32, "at least 32 pixels")

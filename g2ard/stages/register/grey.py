@@ -7,19 +7,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["band_passed", "blurred", "box_mean", "gradient", "grey_of", "local_zncc", "shift_between", "zncc"]
+from g2ard import _core
+
+__all__ = [
+    "LUMA",
+    "band_passed",
+    "blurred",
+    "blurred_back",
+    "box_mean",
+    "gradient",
+    "grey_of",
+    "local_zncc",
+    "shift_between",
+    "zncc",
+]
 
 Float = NDArray[np.float64]
 
-_LUMA = np.array([0.299, 0.587, 0.114])
-_FLAT = 1e-4
-"""Variance of grey in a window, in [0, 1]², below which there is nothing to compare: 1 % of contrast."""
+LUMA = np.array([0.299, 0.587, 0.114])
 
 
 def grey_of(image: NDArray[Any]) -> Float:
     """(H, W) float64 luma of an (H, W, 3) image, .299 R + .587 G + .114 B."""
     rgb = np.asarray(image, np.float64)
-    return rgb[..., 0] * _LUMA[0] + rgb[..., 1] * _LUMA[1] + rgb[..., 2] * _LUMA[2]
+    return rgb[..., 0] * LUMA[0] + rgb[..., 1] * LUMA[1] + rgb[..., 2] * LUMA[2]
 
 
 def blurred(image: Float) -> Float:
@@ -30,6 +41,20 @@ def blurred(image: Float) -> Float:
         a, b, c, d, e = (pad.take(np.arange(k, k + n), axis) for k in range(5))
         image = ((a + e) + 4 * (b + d) + 6 * c) / 16
     return image
+
+
+def blurred_back(slope: Float) -> Float:
+    """dL/d(image) from dL/d(`blurred`), each (H, W): the blur's transpose."""
+    for axis in (0, 1):
+        slope = np.moveaxis(slope, axis, 0)
+        n = len(slope)
+        wide = np.zeros((n + 4, *slope.shape[1:]))
+        for k, tap in enumerate((1, 4, 6, 4, 1)):
+            wide[k : k + n] += tap / 16 * slope
+        wide[2] += wide[0] + wide[1]
+        wide[n + 1] += wide[n + 2] + wide[n + 3]
+        slope = np.moveaxis(wide[2 : n + 2], 0, axis)
+    return slope
 
 
 def gradient(image: Float) -> tuple[Float, Float]:
@@ -104,15 +129,5 @@ def local_zncc(a: Float, b: Float, mask: NDArray[np.bool_], side: int) -> float:
     """
     if min(a.shape) < side:
         return zncc(a, b, mask)
-    # sums of squares about the images' middles: less is lost to rounding than about 0
-    a, b = a - a.mean(), b - b.mean()
-    mean_a, mean_b = box_mean(a, side), box_mean(b, side)
-    var_a = np.maximum(box_mean(a * a, side) - mean_a**2, 0)
-    var_b = np.maximum(box_mean(b * b, side) - mean_b**2, 0)
-    both = box_mean(a * b, side) - mean_a * mean_b
-    tells = (box_mean(mask.astype(np.float64), side) > 1 - 1e-9) & (var_b > _FLAT)
-    if not tells.any():
-        return 0.0
-    scale = np.sqrt(var_a * var_b)
-    values = np.where(scale > 1e-9, both / np.maximum(scale, 1e-9), 0.0)[tells]
-    return float(np.median(np.clip(values, -1, 1)))
+    a, b = np.ascontiguousarray(a), np.ascontiguousarray(b)
+    return _core.local_zncc(a, b, np.ascontiguousarray(mask), side)

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from g2ard.cameras import Cameras
+from g2ard.choices import Keep
 from g2ard.reports import Report
 
-__all__ = ["PhotoReport", "PoseError", "RegisterReport", "Registered", "Status"]
+__all__ = ["KEPT", "PhotoReport", "PoseError", "RegisterReport", "Registered", "Status"]
 
 Status = Literal["registered", "uncertain", "refused"]
+KEPT: dict[Keep, tuple[Status, ...]] = {
+    "registered": ("registered",),
+    "uncertain": ("registered", "uncertain"),
+    "all": ("registered", "uncertain", "refused"),
+}
+"""The photos whose poses are kept; with "all" one that has none keeps the pose it started from."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +101,10 @@ class Registered:
     Args:
         cameras: the photos that are kept, with the poses found.
         report: about every photo, kept or not.
+        matches: name → (M, 4) pixels (u, v) of the photo and of its last render that features matched and the
+            pose explains, at `size`.
     """
 
     cameras: Cameras
     report: RegisterReport
+    matches: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from g2ard.choices import Keep
 from g2ard.errors import require
 from g2ard.reports import Report
-from g2ard.stages.register.outcome import PhotoReport, PoseError
+from g2ard.stages.register.outcome import KEPT, PhotoReport, PoseError
 
 __all__ = ["RECALLS", "Accuracy", "Summary", "summarize"]
 
@@ -70,7 +71,7 @@ class Summary(Report):
 def summarize(
     photos: Sequence[PhotoReport],
     *,
-    keep: str = "registered",
+    keep: Keep = "registered",
     true: int = 0,
     metres_per_unit: float | None = None,
 ) -> Summary:
@@ -78,7 +79,7 @@ def summarize(
 
     Args:
         photos: of a `RegisterReport`.
-        keep: "registered", or "uncertain" where those are kept as well.
+        keep: see `KEPT`.
         true: how many photos have a true pose.
         metres_per_unit: of the scene; None where it is not known.
 
@@ -94,7 +95,7 @@ def summarize(
     if metres_per_unit is not None:
         fits = 0 < metres_per_unit < float("inf")
         require("metres_per_unit", metres_per_unit, fits, "a positive number")
-    kept = ("registered", "uncertain") if keep == "uncertain" else ("registered",)
+    kept = KEPT[keep]
     counts = [sum(p.status == status for p in photos) for status in ("registered", "uncertain", "refused")]
     start = found = None
     if true:

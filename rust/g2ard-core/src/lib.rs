@@ -1,7 +1,7 @@
 //! Geometry kernels of g2ard, in pure Rust.
 //!
 //! Data flows one way: points → [`lift`] → [`splats`] → [`scene`] → [`raster`] → [`visibility`] → [`simplify`], [`select`]
-//! and [`train`]; [`quantize`] serves file formats. [`backend`] alone knows the stages whose kernels a device may run.
+//! and [`train`]; [`quantize`] serves file formats, [`register`] photos. [`backend`] alone knows the stages whose kernels a device may run.
 //! Results never depend on the number of threads: every reduction has a fixed order.
 
 pub mod backend;
@@ -14,6 +14,7 @@ pub mod quantize;
 #[doc(hidden)]
 pub mod random;
 pub mod raster;
+pub mod register;
 pub mod scene;
 pub mod select;
 pub mod simplify;

@@ -9,6 +9,7 @@ mod error;
 mod lift;
 mod quantize;
 mod raster;
+mod register;
 mod scene;
 mod select;
 mod simplify;
@@ -33,6 +34,7 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     spatial::register(m)?;
     quantize::register(m)?;
     raster::register(m)?;
+    register::register(m)?;
     select::register(m)?;
     ssim::register(m)?;
     tile::register(m)?;

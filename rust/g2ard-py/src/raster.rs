@@ -3,7 +3,8 @@
 use g2ard_core::raster::limits::measure;
 use g2ard_core::raster::simd::Isa;
 use g2ard_core::raster::{
-    Accumulated, Gradients, Image, ImageGradients, Params, Passes, Rasterizer, SENSITIVITY_TRIANGLE,
+    Accumulated, Gradients, Image, ImageGradients, Params, Passes, PoseGradient, Rasterizer,
+    SENSITIVITY_TRIANGLE,
 };
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
@@ -213,6 +214,23 @@ impl PyRasterizer {
             .zip(shapes)
             .map(|(values, like)| PyArray1::from_vec(py, values).reshape(like.shape().to_vec()))
             .collect()
+    }
+
+    /// dL/d(v, ω) of the last forward pass's pose T, T ← exp(v, ω)·T, from dL/d(image).
+    fn pose_gradient<'py>(
+        &mut self,
+        py: Python<'py>,
+        arrays: Arrays<'py>,
+        image: Floats<'py>,
+    ) -> PyResult<PoseGradient> {
+        let params = arrays.params()?;
+        let gradients = ImageGradients {
+            rgb: slice("image gradient", &image)?,
+            alpha: None,
+            depth: None,
+        };
+        let inner = &mut self.inner;
+        work::quick(py, || inner.pose_gradient(&params, &gradients))
     }
 
     /// Seconds the passes of the last calls took.

@@ -3,7 +3,7 @@
 //! [`project`] turns 16 Gaussians at a time into screen splats, and [`tile_lists`] lists the 16×16 tiles that each one's
 //! ellipse at α = 1/255 meets; [`depth_sort`] sorts them by depth once; [`tiles`] scatters them stably into their tiles;
 //! [`tile_batch`] holds a tile's pairs in the tile's coordinates; [`forward`] blends each tile, 4×4 pixels to a register; [`backward`] walks the same pairs from back to front, each pair summing into its own slot; [`gradients`]
-//! adds a Gaussian's slots in order and goes back through the projection. No atomics: the bits do not depend on threads.
+//! adds a Gaussian's slots in order and goes back through the projection, [`pose`] to the camera. No atomics: the bits do not depend on threads.
 //!
 //! Conventions (gsplat's by default): pixel centres at +0.5; 0.3 px² dilation; α = min(0.99, opacity·exp(−q)); α < 1/255
 //! is skipped; a pixel stops before its transmittance would fall to 1e-4; colour = max(0, 0.5 + SH).
@@ -19,6 +19,7 @@ pub(crate) mod grid;
 pub mod limits;
 pub(crate) mod memory;
 pub(crate) mod params;
+mod pose;
 pub(crate) mod project;
 pub(crate) mod rasterizer;
 mod sensitivity;
@@ -33,6 +34,7 @@ pub(crate) use frustum::Frustum;
 pub use gradients::Gradients;
 pub(crate) use grid::TileGrid;
 pub use params::Params;
+pub use pose::PoseGradient;
 pub use rasterizer::{Counts, Image, ImageGradients, Memory, Passes, Rasterizer};
 pub use sensitivity::TRIANGLE as SENSITIVITY_TRIANGLE;
 pub use simd::Isa;

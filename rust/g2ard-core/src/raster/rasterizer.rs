@@ -1,6 +1,7 @@
 //! The passes in order, and the buffers they share: those of one view, reused from call to call.
 
 mod accumulated;
+mod posed;
 mod sensitive;
 mod tiled;
 mod views;

@@ -1,6 +1,6 @@
 //! Back through the projection: from a splat's gradient to the stored parameters'.
 
-use super::{HALF_LOG2_E, INRIA_FLOOR, Projected, View, colour, direction, dot, project};
+use super::{HALF_LOG2_E, INRIA_FLOOR, Projected, View, colour, cross, direction, dot, project};
 use crate::raster::params::Source;
 use crate::raster::simd::Lanes;
 use crate::raster::{Convention, DILATION, sh};
@@ -47,14 +47,25 @@ impl<F: Lanes> Extent<F> {
     }
 }
 
-/// Back through the projection of one group. Lanes with zero `moments`, `rgb` and `depth` get zeros.
+/// dL/d of what lies between the stored parameters and the screen, all but colour.
+struct Geometry<F: Lanes> {
+    p: Projected<F>,
+    log_scale: [F; 3],
+    /// Of the Gaussian's rotation.
+    dr: [[F; 3]; 3],
+    /// Of J·W.
+    djw: [[F; 3]; 2],
+    /// Of the mean, in the camera's axes.
+    camera: [F; 3],
+}
+
 #[inline(always)]
-pub fn unproject<F: Lanes, S: Source>(
+fn geometry<F: Lanes, S: Source>(
     view: &View,
     source: &S,
     group: usize,
     g: &ScreenGradients<F>,
-) -> RowGradients<F> {
+) -> Geometry<F> {
     let p = project::<F, S>(view, source, group);
     let zero = F::zero();
     let two = F::splat(2.0);
@@ -98,20 +109,70 @@ pub fn unproject<F: Lanes, S: Source>(
             }
         }
     }
+    let camera = through_camera(view, &p, [grad_x, grad_y], g.depth, &djw);
+    Geometry {
+        p,
+        log_scale,
+        dr,
+        djw,
+        camera,
+    }
+}
+
+/// Back through the projection of one group. Lanes with zero `moments`, `rgb` and `depth` get zeros.
+#[inline(always)]
+pub fn unproject<F: Lanes, S: Source>(
+    view: &View,
+    source: &S,
+    group: usize,
+    g: &ScreenGradients<F>,
+) -> RowGradients<F> {
+    let Geometry {
+        p,
+        log_scale,
+        dr,
+        camera,
+        ..
+    } = geometry(view, source, group, g);
     let quat = quaternion_gradient(&p.q, p.rq, &dr);
-
-    let mut mean = through_camera(view, &p, [grad_x, grad_y], g.depth, &djw);
-
+    let mut mean = [F::zero(); 3];
+    for k in 0..3 {
+        mean[k] = camera[0] * p.w[0][k] + camera[1] * p.w[1][k] + camera[2] * p.w[2][k];
+    }
     let (basis, rgb) = through_colour(view, source, group, g.rgb, &mut mean);
     RowGradients {
         mean,
         quat,
         log_scale,
-        logit_opacity: h * p.rest_opacity,
+        logit_opacity: g.moments[0] * p.rest_opacity,
         basis,
         rgb,
         extent: Extent::of(&p.m, p.depth.ge(F::splat(view.near))),
     }
+}
+
+/// One group's share of dL/dξ, ξ = (v, ω) and T ← exp(ξ)·T for the camera_from_world T = [W | t]:
+/// v moves the mean as seen from the camera, and the direction it is seen from; ω turns mean and covariance about the
+/// camera, X × dL/dX + Σᵢ W·(dL/djwᵢ × jwᵢ) with jw the rows of J·W, and leaves that direction as it is.
+#[inline(always)]
+pub fn unproject_to_pose<F: Lanes, S: Source>(
+    view: &View,
+    source: &S,
+    group: usize,
+    g: &ScreenGradients<F>,
+) -> [F; 6] {
+    let Geometry { p, djw, camera, .. } = geometry(view, source, group, g);
+    let mut seen = [F::zero(); 3];
+    through_colour(view, source, group, g.rgb, &mut seen);
+    let at = [p.ray[0] * p.depth, p.ray[1] * p.depth, p.depth];
+    let turn = cross(&at, &camera);
+    let rows = [cross(&djw[0], &p.jw[0]), cross(&djw[1], &p.jw[1])];
+    let mut out = [F::zero(); 6];
+    for k in 0..3 {
+        out[k] = camera[k] + dot(&p.w[k], &seen);
+        out[k + 3] = turn[k] + dot(&p.w[k], &rows[0]) + dot(&p.w[k], &rows[1]);
+    }
+    out
 }
 
 /// Adds to dL/d(mean) what the colour's direction gives. Returns the SH basis and dL/d(colour) where the colour was not
@@ -168,8 +229,8 @@ fn add_antialiasing<F: Lanes>(view: &View, p: &Projected<F>, h: F, dm: &mut [[F;
     }
 }
 
-/// dL/d(mean) from the gradients of the centre on screen, of the depth and of J·W = (f/z)·(Wᵢ − t·W₂): through the 1/z
-/// in front, and through t where it was not clamped.
+/// dL/d(mean), in the camera's axes, from the gradients of the centre on screen, of the depth and of
+/// J·W = (f/z)·(Wᵢ − t·W₂): through the 1/z in front, and through t where it was not clamped.
 #[inline(always)]
 fn through_camera<F: Lanes>(
     view: &View,
@@ -193,11 +254,7 @@ fn through_camera<F: Lanes>(
         camera[i] = through_t + through_ray;
         camera[2] = camera[2] - through_t * p.t[i] - through_ray * p.ray[i] - along * p.rz;
     }
-    let mut mean = [F::zero(); 3];
-    for k in 0..3 {
-        mean[k] = camera[0] * p.w[0][k] + camera[1] * p.w[1][k] + camera[2] * p.w[2][k];
-    }
-    mean
+    camera
 }
 
 /// dL/dR → dL/dq for R(q/|q|), from the unit quaternion and 1/|q|.

@@ -1,0 +1,173 @@
+"""Polishing: the pose that photo and features together bear out, by the exact gradient of renders.
+
+    E(T, g, b) = Σ ρ((P − g·R(T) − b)/σ)/κ + ½ ξᵀ Λ ξ,   T = exp(ξ) T_f
+
+ρ is Tukey's, P and R the blurred grey of photo and render, κ the `correlated` of `RegisterConfig`, and Λ the
+information of the features' pose T_f (none without features). Direct alignment follows a gradient in which a
+pixel shows one surface; this one goes through the rasteriser (`Renderer.pose_gradient`). Steps are
+Levenberg–Marquardt's with alignment's matrix as the Hessian.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.cameras import Camera
+from g2ard.stages.register.align import (
+    Aligned,
+    Level,
+    Normal,
+    Shot,
+    inverse,
+    moves,
+    normal_equations,
+    shot_of,
+)
+from g2ard.stages.register.config import RegisterConfig
+from g2ard.stages.register.grey import LUMA, blurred_back
+from g2ard.stages.register.pose import motion_between, moved
+from g2ard.stages.render import Renderer
+
+__all__ = ["Energy", "Point", "Prior", "polish"]
+
+Float = NDArray[np.float64]
+
+_TUKEY = 4.685
+"""As the normal equations' weights."""
+_DAMPING = 1e-3, 10.0
+"""At first, and what it is multiplied by after a step that costs more; divided by after one that does not."""
+_LEAST_DAMPING = 1e-6
+_MOST_DAMPING = 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What features say: (4, 4) camera_from_world, and the (6, 6) inverse covariance about it."""
+
+    viewmat: Float
+    information: Float
+
+    def at(self, viewmat: Float) -> tuple[float, Float]:
+        """½ ξᵀ Λ ξ and Λ ξ, for small ξ."""
+        xi = motion_between(self.viewmat, viewmat)
+        slope = self.information @ xi
+        return float(xi @ slope) / 2, slope
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """E at one pose and light, its gradient and its Hessian over (v, ω, g, b)."""
+
+    viewmat: Float
+    gain: float
+    bias: float
+    energy: float
+    slope: Float
+    hessian: Float
+    shot: Shot
+    overlap: float
+    depth: float
+
+
+class Energy:
+    """E of one photo; σ and the number of pixels are those of the first pose asked for."""
+
+    def __init__(
+        self, renderer: Renderer, camera: Camera, photo: Level, prior: Prior | None, config: RegisterConfig
+    ) -> None:
+        self._renderer, self._camera, self._photo = renderer, camera, photo
+        self._prior, self._config = prior, config
+        self._scale: float | None = None
+        self._pixels = 0
+        self.renders = 0
+
+    def at(self, viewmat: Float, gain: float, bias: float) -> Point | None:
+        """None where too few pixels count."""
+        camera, photo, config = replace(self._camera, viewmat=viewmat), self._photo, self._config
+        out = self._renderer.render(camera)
+        self.renders += 1
+        shot = shot_of(out, config)
+        counted = photo.mask & shot.mask
+        if counted.mean() < config.min_overlap:
+            return None
+        normal = normal_equations(photo, shot, camera.K, gain, bias, self._scale)
+        if self._scale is None:
+            self._scale, self._pixels = normal.scale, int(counted.sum())
+        pull = self._pull(photo.grey - gain * shot.grey - bias, counted)
+        grey = blurred_back(-gain * pull)
+        inside = (out.image > 0) & (out.image < 1)
+        by_colour = np.where(inside, grey[..., None] * LUMA, 0.0).astype(np.float32)
+        slope = np.concatenate([self._renderer.pose_gradient(by_colour), self._by_light(normal)])
+        hessian = normal.matrix / (normal.scale**2 * config.correlated)
+        energy = normal.cost * self._pixels * _TUKEY**2 / 6 / config.correlated
+        if self._prior is not None:
+            more, by_motion = self._prior.at(viewmat)
+            energy, slope[:6] = energy + more, slope[:6] + by_motion
+            hessian[:6, :6] += self._prior.information
+        depth = float(np.median(shot.depth[counted]))
+        return Point(viewmat, gain, bias, energy, slope, hessian, shot, float(counted.mean()), depth)
+
+    def _pull(self, residual: Float, counted: NDArray[np.bool_]) -> Float:
+        """(H, W) dE/dr."""
+        assert self._scale is not None
+        share = residual / self._scale
+        weight = np.maximum(0.0, 1 - (share / _TUKEY) ** 2) ** 2
+        return np.where(counted, weight * share, 0.0) / (self._scale * self._config.correlated)
+
+    def _by_light(self, normal: Normal) -> Float:
+        return -normal.right[6:] / (normal.scale**2 * self._config.correlated)
+
+
+def polish(
+    renderer: Renderer,
+    start: Aligned,
+    camera: Camera,
+    photo: Level,
+    prior: Prior | None,
+    config: RegisterConfig,
+) -> Aligned | None:
+    """Minimise E from a pose and its light.
+
+    Args:
+        renderer: of the scene.
+        start: of alignment or of what was joined.
+        camera: the photo's size and K; its pose does not count.
+        photo: at that size.
+        prior: of features; None without.
+        config: see `RegisterConfig`; `iterations` and `still` end it.
+
+    Returns:
+        An `Aligned`, `steps` its renders; None where too few pixels count or nothing determines the pose.
+    """
+    energy = Energy(renderer, camera, photo, prior, config)
+    here = energy.at(start.viewmat, start.gain, start.bias)
+    damping = _DAMPING[0]
+    for _ in range(config.iterations):
+        if here is None:
+            return None
+        unit = 1 / np.sqrt(np.maximum(np.diag(here.hessian), 1e-30))
+        scaled = here.hessian * unit[:, None] * unit[None, :] + damping * np.eye(8)
+        step = -unit * np.linalg.solve(scaled, unit * here.slope)
+        after = energy.at(moved(here.viewmat, step[:6]), here.gain + step[6], here.bias + step[7])
+        still = moves(here.shot, camera.K, step[:6]) < config.still
+        if after is not None and after.gain > 0 and after.energy < here.energy:
+            here, damping = after, max(damping / _DAMPING[1], _LEAST_DAMPING)
+        else:
+            damping *= _DAMPING[1]
+        if still or damping > _MOST_DAMPING:
+            break
+    if here is None:
+        return None
+    covariance = inverse(here.hessian)
+    return Aligned(
+        here.viewmat,
+        here.gain,
+        here.bias,
+        None if covariance is None else covariance[:6, :6],
+        here.overlap,
+        energy.renders,
+        here.depth,
+    )

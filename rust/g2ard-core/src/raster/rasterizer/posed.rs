@@ -1,0 +1,56 @@
+//! How an image changes with the pose it is seen from.
+
+use super::{ChunkSums, ImageGradients, Rasterizer};
+use crate::raster::params::Params;
+use crate::raster::pose::{GatherPose, PoseGradient};
+use crate::raster::simd::dispatch;
+use crate::{Error, Result};
+
+impl Rasterizer {
+    /// dL/dξ of the last forward pass's pose T, where T ← exp(ξ)·T with ξ = (v, ω) in the camera's axes. `params` must be
+    /// the ones it rendered, and the gradient of depth is not followed. Summed in f64, chunk by chunk of rows: the bits do
+    /// not depend on threads.
+    pub fn pose_gradient(
+        &mut self,
+        params: &Params,
+        image: &ImageGradients,
+    ) -> Result<PoseGradient> {
+        params.validate()?;
+        let Some(state) = &self.state else {
+            return Err(Error::invalid(
+                "pose gradient",
+                "a forward pass before it",
+                "none",
+            ));
+        };
+        if params.len() != state.rows {
+            return Err(Error::invalid("rows", state.rows.to_string(), params.len()));
+        }
+        image.validate(&state.camera)?;
+        if image.depth.is_some() {
+            return Err(Error::invalid(
+                "pose gradient",
+                "no gradient of depth",
+                "one",
+            ));
+        }
+        let isa = self.isa;
+        let parts = self.backward_by_chunk(image, |chunk: &ChunkSums| {
+            let gather = GatherPose {
+                view: chunk.view,
+                source: *params,
+                splats: chunk.splats,
+                slots: chunk.slots,
+                written: chunk.written,
+            };
+            dispatch(isa, gather)
+        });
+        let mut sum = [0.0; 6];
+        for part in parts {
+            for (sum, value) in sum.iter_mut().zip(part) {
+                *sum += value;
+            }
+        }
+        Ok(sum)
+    }
+}

@@ -1,0 +1,152 @@
+//! `_core.shot`, `_core.normal_equations`, `_core.flow`, `_core.local_zncc`: registration's images.
+
+use g2ard_core::Error;
+use g2ard_core::register::{self, Lens, Light, Photo, Render, Size};
+use numpy::ndarray::Ix2;
+use numpy::{
+    Element, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray, PyReadonlyArray2,
+    PyReadonlyArray3, PyUntypedArrayMethods,
+};
+use pyo3::prelude::*;
+
+use crate::arrays::flat;
+use crate::error::to_py;
+use crate::work;
+
+type Grey<'py> = PyReadonlyArray2<'py, f64>;
+type Mask<'py> = PyReadonlyArray2<'py, bool>;
+
+fn size(image: &Grey<'_>) -> Size {
+    Size {
+        height: image.shape()[0],
+        width: image.shape()[1],
+    }
+}
+
+/// The values of an (H, W) image of that size.
+fn plane<'a, T: Element>(
+    name: &'static str,
+    image: &'a PyReadonlyArray<'_, T, Ix2>,
+    size: Size,
+) -> PyResult<&'a [T]> {
+    if image.shape() != [size.height, size.width] {
+        let expected = format!("({}, {})", size.height, size.width);
+        let got = format!("{:?}", image.shape());
+        return Err(to_py(Error::invalid(name, expected, got)));
+    }
+    flat(name, image)
+}
+
+fn lens([fx, fy, cx, cy]: [f64; 4]) -> Lens {
+    Lens { fx, fy, cx, cy }
+}
+
+type Planes<'py> = (
+    Bound<'py, PyArray2<f64>>,
+    Bound<'py, PyArray2<f64>>,
+    Bound<'py, PyArray2<bool>>,
+);
+
+/// (grey, depth, mask) of a render; see `g2ard_core::register::shot`.
+#[pyfunction]
+fn shot<'py>(
+    py: Python<'py>,
+    image: PyReadonlyArray3<'py, f32>,
+    alpha: PyReadonlyArray2<'py, f32>,
+    depth: PyReadonlyArray2<'py, f32>,
+    min_alpha: f64,
+    max_edge: f64,
+) -> PyResult<Planes<'py>> {
+    let size = Size {
+        height: alpha.shape()[0],
+        width: alpha.shape()[1],
+    };
+    let (rgb, alpha) = (flat("image", &image)?, flat("alpha", &alpha)?);
+    let depth = flat("depth", &depth)?;
+    let found = work::quick(py, || {
+        register::shot(rgb, alpha, depth, size, min_alpha, max_edge)
+    })?;
+    let shape = [size.height, size.width];
+    Ok((
+        PyArray1::from_vec(py, found.grey).reshape(shape)?,
+        PyArray1::from_vec(py, found.depth).reshape(shape)?,
+        PyArray1::from_vec(py, found.mask).reshape(shape)?,
+    ))
+}
+
+type Normal = ([[f64; 8]; 8], [f64; 8], f64, f64, f64);
+
+/// (matrix, right, scale, cost, weights) of one step. `photo` is (grey, right, down, mask), `shot` as `shot` returns it,
+/// `lens` (fx, fy, cx, cy) and `light` (gain, bias).
+#[pyfunction]
+#[pyo3(signature = (photo, shot, lens, light, scale = None))]
+fn normal_equations<'py>(
+    py: Python<'py>,
+    photo: (Grey<'py>, Grey<'py>, Grey<'py>, Mask<'py>),
+    shot: (Grey<'py>, Grey<'py>, Mask<'py>),
+    lens: [f64; 4],
+    light: (f64, f64),
+    scale: Option<f64>,
+) -> PyResult<Normal> {
+    let size = size(&photo.0);
+    let photo = Photo {
+        grey: plane("photo", &photo.0, size)?,
+        right: plane("photo's gradient", &photo.1, size)?,
+        down: plane("photo's gradient", &photo.2, size)?,
+        mask: plane("photo's mask", &photo.3, size)?,
+    };
+    let shot = render(&shot, size)?;
+    let light = Light {
+        gain: light.0,
+        bias: light.1,
+    };
+    let lens = self::lens(lens);
+    let n = work::quick(py, || {
+        register::normal_equations(&photo, &shot, size, &lens, light, scale)
+    })?;
+    Ok((n.matrix, n.right, n.scale, n.cost, n.weights))
+}
+
+fn render<'a>(shot: &'a (Grey<'_>, Grey<'_>, Mask<'_>), size: Size) -> PyResult<Render<'a>> {
+    Ok(Render {
+        grey: plane("shot", &shot.0, size)?,
+        depth: plane("shot's depth", &shot.1, size)?,
+        mask: plane("shot's mask", &shot.2, size)?,
+    })
+}
+
+/// Root of the mean square, in pixels, of how far ξ moves the pixels that count.
+#[pyfunction]
+fn flow<'py>(
+    py: Python<'py>,
+    shot: (Grey<'py>, Grey<'py>, Mask<'py>),
+    lens: [f64; 4],
+    xi: [f64; 6],
+) -> PyResult<f64> {
+    let size = size(&shot.0);
+    let shot = render(&shot, size)?;
+    let lens = self::lens(lens);
+    work::quick(py, || register::flow(&shot, size, &lens, &xi))
+}
+
+/// Median ZNCC over windows; see `g2ard_core::register::local_zncc`.
+#[pyfunction]
+fn local_zncc(
+    py: Python<'_>,
+    a: Grey<'_>,
+    b: Grey<'_>,
+    mask: Mask<'_>,
+    side: usize,
+) -> PyResult<f64> {
+    let size = size(&a);
+    let (a, b) = (plane("a", &a, size)?, plane("b", &b, size)?);
+    let mask = plane("mask", &mask, size)?;
+    work::quick(py, || register::local_zncc(a, b, mask, size, side))
+}
+
+pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_function(wrap_pyfunction!(shot, m)?)?;
+    m.add_function(wrap_pyfunction!(normal_equations, m)?)?;
+    m.add_function(wrap_pyfunction!(flow, m)?)?;
+    m.add_function(wrap_pyfunction!(local_zncc, m)?)
+}
