@@ -51,7 +51,7 @@ def test_its_slope_is_how_the_energy_changes() -> None:
 
 @pytest.mark.parametrize("view", range(3))
 def test_it_ends_at_the_pose(view: int) -> None:
-    """Less exactly than alignment does: α's cut at 1/255 has no gradient, and the energy no slope to follow."""
+    """Less exactly than alignment does: the cut of α at 1/255 has no gradient to follow."""
     camera, renderer = around(5, (160, 120), 2.5)[view], Renderer(BALL)
     level = pyramid_of(camera, np.clip(0.7 * renderer.image(camera) + 0.1, 0, 1), CONFIG)[-1][1]
     start = Aligned(off(camera.viewmat, 0.01, 0.3, view), 0.7, 0.1, None, 0.0, 0, 0.0)
