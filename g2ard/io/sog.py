@@ -55,10 +55,9 @@ def chunks_of(path: Path) -> list[Path]:
 
 def _listed(index: Path) -> list[Path]:
     """The chunks that lod-meta.json's tree uses at level 0, in the order of its list."""
-    from g2ard.io.jsonfile import read_json
+    from g2ard.io.jsonfile import fields_of, read_json
 
-    content = read_json(index)
-    try:
+    with fields_of(str(index), read_json(index)) as content:
         files = [index.parent / Path(name).parent for name in content["filenames"]]
         used: set[int] = set()
         nodes = [content["tree"]]
@@ -68,8 +67,6 @@ def _listed(index: Path) -> list[Path]:
             if "0" in node.get("lods", {}):
                 used.add(int(node["lods"]["0"]["file"]))
         chunks = [files[i] for i in sorted(used)]
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
-        raise InputError(f"{index}: not a valid lod-meta.json ({error!r})") from error
     for chunk in chunks:
         if not (chunk / "meta.json").is_file():
             raise InputError(f"{index}: names {chunk.name}/meta.json, which is absent")
