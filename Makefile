@@ -79,10 +79,12 @@ $(VENV)/.zig:
 	$(BIN)/pip install --quiet "maturin[zig]>=1.12,<2"
 	touch $@
 
-# What Miri can run of the core in minutes: every module that holds unsafe code but intrinsics.
-MIRI ?= raster:: ssim:: train:: spatial::
+# Unsafe code of the core under Miri, on the portable lanes, in minutes. Needs a nightly toolchain with miri. Tree Borrows, for
+# rayon's own crates break Stacked Borrows; rayon's threads never end.
+MIRI ?= raster::depth_sort raster::rasterizer train::
 miri:
-	MIRIFLAGS="-Zmiri-disable-isolation" RAYON_NUM_THREADS=2 cargo +nightly miri test -p g2ard-core --lib -- $(MIRI)
+	MIRIFLAGS="-Zmiri-disable-isolation -Zmiri-tree-borrows -Zmiri-permissive-provenance -Zmiri-ignore-leaks" \
+		RAYON_NUM_THREADS=2 cargo +nightly miri test -p g2ard-core --lib -- $(MIRI)
 
 clean:
 	rm -rf $(VENV) target dist demo site bench bench.csv

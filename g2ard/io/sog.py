@@ -58,7 +58,9 @@ def _listed(index: Path) -> list[Path]:
     from g2ard.io.jsonfile import fields_of, read_json
 
     with fields_of(str(index), read_json(index)) as content:
-        files = [index.parent / Path(name).parent for name in content["filenames"]]
+        if not isinstance(names := content["filenames"], list):
+            raise TypeError("not a list")
+        files = [index.parent / Path(name).parent for name in names]
         used: set[int] = set()
         nodes = [content["tree"]]
         while nodes:
@@ -66,11 +68,10 @@ def _listed(index: Path) -> list[Path]:
             nodes.extend(node.get("children", ()))
             if "0" in node.get("lods", {}):
                 used.add(int(node["lods"]["0"]["file"]))
-        chunks = [files[i] for i in sorted(used)]
-    for chunk in chunks:
-        if not (chunk / "meta.json").is_file():
-            raise InputError(f"{index}: names {chunk.name}/meta.json, which is absent")
-    return chunks
+        for i in sorted(used):
+            if not (files[i] / "meta.json").is_file():
+                raise InputError(f"{index}: names {names[i]}, which is absent")
+        return [files[i] for i in sorted(used)]
 
 
 def read(path: Path) -> Scene:
