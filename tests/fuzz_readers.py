@@ -137,7 +137,7 @@ def fuzz(
     seed: int,
     seconds: float = float("inf"),
 ) -> Counter[str]:
-    """Mutate one case `runs` times, or for so long: how many files were read, refused, and what else came of any.
+    """Mutate one case `runs` times, or for so long: how many files were read or refused, and what else came.
 
     What was answered otherwise than with data or one line is a key of its own; its first file is kept.
     """

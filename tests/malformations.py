@@ -1,7 +1,7 @@
 """Malformed files by rule: each differs from a valid one in one place, and no two are alike.
 
-JSON: every property absent or of another kind. Text: every word and line wrong, absent or twice. Binary: every
-word of the head at an extreme. All: cut short.
+JSON: every property absent or of another kind. Text: every word and line wrong, absent or twice. Binary:
+every word of the head at an extreme. All: cut short.
 """
 
 from __future__ import annotations

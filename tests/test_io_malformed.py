@@ -35,7 +35,7 @@ NAMED = ["transforms", "cameras.json", "views", "ns-export", "meta.json", "lod-m
 
 @pytest.mark.parametrize("what", NAMED)
 def test_a_property_of_another_kind_is_named(tmp_path: Path, what: str) -> None:
-    """Where a property becomes the word x, the line has its name, or its holder's, or the x that is not there."""
+    """Where a property becomes the word x, the line has its name, or its holder's, or the absent x's."""
     path = MAKERS[what](tmp_path)
     for how, data in malformed(path.read_bytes()):
         name, is_word, _ = how.partition(" is 'x'")
