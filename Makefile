@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 RUST := $(shell find rust -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml) Cargo.toml Cargo.lock
 
-.PHONY: demo test lint docs stress fuzz bench bench-kernels wheel setup clean
+.PHONY: demo test lint docs stress fuzz miri bench bench-kernels wheel wheel-linux setup clean
 
 setup: $(VENV)/.built
 
@@ -67,6 +67,24 @@ bench-kernels:
 
 wheel: setup
 	$(BIN)/maturin build --release --out dist
+
+# A wheel for a Linux of any kind, linked by zig against the C library that TAG names. TARGET is Rust's name
+# (first: rustup target add $TARGET): {x86_64,aarch64}-unknown-linux-{gnu,musl}, TAG musllinux_1_2 for musl.
+TARGET ?= x86_64-unknown-linux-gnu
+TAG ?= manylinux_2_28
+wheel-linux: $(VENV)/.zig
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/maturin build --release --locked --zig --target $(TARGET) --compatibility $(TAG) --out dist
+$(VENV)/.zig:
+	test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet "maturin[zig]>=1.12,<2"
+	touch $@
+
+# Unsafe code of the core under Miri, on the portable lanes, in minutes. Needs a nightly toolchain with miri. Tree Borrows, for
+# rayon's own crates break Stacked Borrows; rayon's threads never end.
+MIRI ?= raster::depth_sort raster::rasterizer train::
+miri:
+	MIRIFLAGS="-Zmiri-disable-isolation -Zmiri-tree-borrows -Zmiri-permissive-provenance -Zmiri-ignore-leaks" \
+		RAYON_NUM_THREADS=2 cargo +nightly miri test -p g2ard-core --lib -- $(MIRI)
 
 clean:
 	rm -rf $(VENV) target dist demo site bench bench.csv

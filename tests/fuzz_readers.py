@@ -1,6 +1,9 @@
 """Mutates small valid files and holds every reader to its word: data that make sense, or one InputError line.
 
     python tests/fuzz_readers.py --runs 2000 --seed 1
+    python tests/fuzz_readers.py --seconds 60 --seed 2     # as many as come in a minute, of each case
+
+Files lie in memory where the system has a folder for that.
 
 A mutation changes, cuts or doubles stretches of bytes, writes extreme integers and floats over them, or
 changes numbers and words in text. Packed files are unpacked, mutated and packed again, so that the decoders
@@ -13,9 +16,11 @@ import argparse
 import gzip
 import io
 import re
+import shutil
 import struct
 import sys
 import tempfile
+import time
 import traceback
 import warnings
 import zipfile
@@ -124,8 +129,15 @@ def read_checked(path: Path) -> str | None:
     return None
 
 
-def fuzz(what: str, make: Callable[[Path], Path], folder: Path, runs: int, seed: int) -> Counter[str]:
-    """Mutate one case `runs` times: how many files were read, how many refused, and what else came of any.
+def fuzz(
+    what: str,
+    make: Callable[[Path], Path],
+    folder: Path,
+    runs: int,
+    seed: int,
+    seconds: float = float("inf"),
+) -> Counter[str]:
+    """Mutate one case `runs` times, or for so long: how many files were read or refused, and what else came.
 
     What was answered otherwise than with data or one line is a key of its own; its first file is kept.
     """
@@ -134,7 +146,10 @@ def fuzz(what: str, make: Callable[[Path], Path], folder: Path, runs: int, seed:
     asked = folder / READ[what] if what in READ else path
     rng = np.random.default_rng([seed, *what.encode()])
     tally: Counter[str] = Counter()
+    end = time.monotonic() + seconds
     for _ in range(runs):
+        if time.monotonic() > end:
+            break
         data = repacked(content, rng)
         path.write_bytes(data)
         try:
@@ -155,19 +170,26 @@ def fuzz(what: str, make: Callable[[Path], Path], folder: Path, runs: int, seed:
 def main() -> None:
     """Fuzz every case of the corpus; exit 1 where a reader broke."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=2000, help="mutations of each case")
+    parser.add_argument("--runs", type=int, help="mutations of each case (2000)")
+    parser.add_argument("--seconds", type=float, help="stop with each case after so long")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="", help="cases whose name holds this")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
+    runs = options.runs or (2000 if options.seconds is None else sys.maxsize)
+    memory = Path("/dev/shm")
     total, broken = 0, 0
     for what, make in MAKERS.items():
         if options.only not in what:
             continue
-        folder = Path(tempfile.mkdtemp(prefix="g2ard-fuzz-"))
-        tally = fuzz(what, make, folder, options.runs, options.seed)
+        folder = Path(tempfile.mkdtemp(prefix="g2ard-fuzz-", dir=memory if memory.is_dir() else None))
+        start = time.process_time()
+        tally = fuzz(what, make, folder, runs, options.seed, options.seconds or float("inf"))
+        rate = tally.total() / (time.process_time() - start)
         read, refused = tally.pop("read", 0), tally.pop("refused", 0)
-        print(f"{what:28} read {read:7,}  refused {refused:7,}", flush=True)
+        print(f"{what:28} read {read:9,}  refused {refused:9,}  {rate:6,.0f} a CPU second", flush=True)
+        if not tally:
+            shutil.rmtree(folder)
         for found, times in tally.items():
             print(f"    {times} × {found}  (kept in {folder})", flush=True)
         total, broken = total + read + refused + tally.total(), broken + tally.total()

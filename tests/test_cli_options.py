@@ -77,6 +77,12 @@ def test_what_cannot_go_together_is_told_before_any_work(
     assert sorted(path.name for path in folder.iterdir()) == before
 
 
+def test_a_format_is_named_in_any_case(folder: Path, command_line: CommandLine) -> None:
+    said = command_line("distill", "none.ply", "-n", "9", "--format", "SOG", "-o", "run", cwd=folder)
+    assert said[0] == 1
+    assert "none.ply: no such file" in said[2]
+
+
 def test_a_scene_that_lies_down_is_seen_upright_if_told(folder: Path, command_line: CommandLine) -> None:
     for up in ("0,0,1", "1,0,0"):
         status, _, error = command_line(

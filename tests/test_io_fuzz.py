@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_io_clouds import columns, las, ply
+from test_io_datasets import cambridge
 from test_io_packed import compressed, save_spz, truth
 from test_io_sog import parts
 from test_views_trainers import data_of, export, inria, result_of, run_of
@@ -49,6 +51,29 @@ def run_file(folder: Path, name: str) -> Path:
     return data if name == "transforms.json" else run / name
 
 
+def landmarks(folder: Path, name: str) -> Path:
+    """A file of a scene of Cambridge Landmarks."""
+    cambridge(folder / "college")
+    return folder / "college" / name
+
+
+def chunks(folder: Path) -> Path:
+    """The meta.json of a SOG folder."""
+    for name, content in parts().items():
+        (folder / name).write_bytes(content)
+    return folder / "meta.json"
+
+
+def levels(folder: Path) -> Path:
+    """The lod-meta.json of a folder of SOG chunks."""
+    (folder / "0_0").mkdir()
+    chunks(folder / "0_0")
+    tree = {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 10}}}]}
+    path = folder / "lod-meta.json"
+    path.write_text(json.dumps({"lodLevels": 1, "filenames": ["0_0/meta.json"], "tree": tree}))
+    return path
+
+
 def exports(folder: Path) -> Path:
     data_of(folder)
     return export(folder / "exports", Path("data/poster/images"), "transforms_train.json", range(3))
@@ -66,13 +91,21 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "spz 4": lambda f: save_spz(f / "a.spz", truth(9, 1), 4),
     "splat": lambda f: saved(f / "a.splat", write_splats, truth(9, 0)),
     "sog": lambda f: bundle(f / "a.sog"),
+    "meta.json": chunks,
+    "lod-meta.json": levels,
+    "glb": lambda f: saved(f / "a.glb", write_splats, truth(9, 1)),
     "cloud": lambda f: ply(f / "a.ply", columns("f4", "u1"), np.arange(36.0).reshape(6, 6), faces=3),
     "ascii cloud": lambda f: ascii_cloud(f / "a.ply"),
     "las": lambda f: las(f / "a.las", np.arange(30.0).reshape(10, 3), np.ones((10, 3), int)),
+    "laz": lambda f: las(f / "a.laz", np.arange(30.0).reshape(10, 3), np.ones((10, 3), int)),
     "cameras.bin": lambda f: table(f, "cameras.bin"),
     "images.bin": lambda f: table(f, "images.bin"),
     "points3D.bin": lambda f: table(f, "points3D.bin"),
+    "cameras.txt": lambda f: table(f, "cameras.txt", text=True),
     "images.txt": lambda f: table(f, "images.txt", text=True),
+    "points3D.txt": lambda f: table(f, "points3D.txt", text=True),
+    "dataset_train.txt": lambda f: landmarks(f, "dataset_train.txt"),
+    "reconstruction.nvm": lambda f: landmarks(f, "reconstruction.nvm"),
     "transforms": lambda f: transforms(f / "a.json", orbit(2)),
     "cameras.json": lambda f: inria(f / "cameras.json", orbit(3)),
     "dataparser_transforms.json": lambda f: run_file(f, "dataparser_transforms.json"),
@@ -83,7 +116,11 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "views": lambda f: saved(f / "a.json", write_views, views(2)),
 }
 
-READ = {"transforms of a run": "outputs/poster/splatfacto/today"}
+READ = {
+    "transforms of a run": "outputs/poster/splatfacto/today",
+    "dataset_train.txt": "college",
+    "reconstruction.nvm": "college",
+}
 """What to read instead of the damaged file, in the test's folder."""
 
 
@@ -137,3 +174,19 @@ def test_readers_keep_their_word_on_mutated_files(tmp_path: Path, what: str) -> 
 
     tally = fuzz(what, MAKERS[what], tmp_path, runs=40, seed=0)
     assert set(tally) <= {"read", "refused"}, tally
+
+
+ONCE_BROKEN = sorted((Path(__file__).parent / "fuzz_corpus").iterdir())
+"""Files that a reader once answered otherwise, as CASE--WHAT."""
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("file", ONCE_BROKEN, ids=lambda file: file.name)
+def test_files_that_once_broke_a_reader_end_in_one_line(tmp_path: Path, file: Path) -> None:
+    what = file.name.partition("--")[0]
+    path = MAKERS[what](tmp_path)
+    path.write_bytes(file.read_bytes())
+    line = attempt(tmp_path / READ[what] if what in READ else path)
+    assert line is not None
+    assert "\n" not in line
+    assert str(tmp_path) in line

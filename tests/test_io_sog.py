@@ -192,10 +192,10 @@ def edit(files: dict[str, bytes], **changes: Any) -> dict[str, bytes]:
         (lambda f: edit(f, version=3), "version 3"),
         (lambda f: edit(f, count=17), "16 pixels for 17 Gaussians"),
         (lambda f: edit(f, count="ten"), "malformed"),
-        (lambda f: edit(f, means={}), r"malformed meta\.json \('means': lacks 'files'"),
+        (lambda f: edit(f, means={}), r"meta\.json: lacks 'means\.files'"),
         (
             lambda f: edit(f, scales={"codebook": [1.0], "files": ["scales.webp"]}),
-            r"malformed meta\.json \('scales': IndexError",
+            r"meta\.json: malformed 'scales\.",
         ),
         (lambda f: edit(f, count=0), "holds no Gaussians"),
         (lambda f: f | {"meta.json": b"{"}, "not JSON"),

@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 SceneArgument = Annotated[
-    Path, typer.Argument(metavar="SCENE", help="A .ply (3DGS), SOG, .spz, .splat or .compressed.ply.")
+    Path, typer.Argument(metavar="SCENE", help="A .ply (3DGS), SOG, .spz, .glb, .splat or .compressed.ply.")
 ]
 Protocol = Literal["pool", "standing", "both"]
 ProtocolOption = Annotated[
@@ -169,7 +169,7 @@ ShDegreeOption = Annotated[
 ]
 FormatOption = Annotated[
     FormatName,
-    typer.Option("--format", help="Of the scene's file in RUN."),
+    typer.Option("--format", case_sensitive=False, help="Of the scene's file in RUN."),
 ]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on with a stopped run.")]
 SizeOption = Annotated[

@@ -85,7 +85,9 @@ def _lenses(path: Path) -> dict[str, _Lens]:
         lines = path.read_text(encoding="utf-8").splitlines()
         if not lines or not lines[0].startswith("NVM_V3"):
             raise InputError(f"{path}: not VisualSFM's NVM_V3")
-        at = next(i for i, line in enumerate(lines[1:], 1) if line.strip())
+        at = next((i for i, line in enumerate(lines[1:], 1) if line.strip()), None)
+        if at is None:
+            raise InputError(f"{path}: truncated: nothing follows its first line")
         rows = [line.replace("\t", " ").split() for line in lines[at + 1 : at + 1 + int(lines[at])]]
         lenses = {_stem(row[0]): _Lens(float(row[1]), float(row[9])) for row in rows}
     if not lenses:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.clean import Raw, cleaned
-from g2ard.io.jsonfile import Fields
+from g2ard.io.jsonfile import Fields, fields_of, parse_json
 from g2ard.io.packing import unit_quats, writable
 from g2ard.io.types import Note, Scene
 from g2ard.splats import Splats
@@ -146,17 +146,13 @@ def read(path: Path) -> Scene:
     Raises:
         InputError: not a .glb, no splat primitive or several, packed, turned or scaled by a node, or broken.
     """
-    document, binary = _chunks(path)
-    try:
+    content, binary = _chunks(path)
+    with fields_of(f"{path}: glTF", content) as document:
         return _scene(path, document, binary)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        if isinstance(error, InputError):
-            raise
-        why = f"lacks {error}" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
-        raise InputError(f"{path}: malformed glTF ({document.last!r}: {why})") from error
 
 
-def _chunks(path: Path) -> tuple[Fields, bytes]:
+def _chunks(path: Path) -> tuple[Any, bytes]:
+    """The document, which should be an object, and the binary chunk."""
     data = path.read_bytes()
     if len(data) < 20 or struct.unpack_from("<II", data) != (_MAGIC, 2):
         raise InputError(f"{path}: not a .glb of glTF 2.0 (begins with {data[:4]!r})")
@@ -168,16 +164,12 @@ def _chunks(path: Path) -> tuple[Fields, bytes]:
             raise InputError(f"{path}: truncated: a chunk of {size:,} bytes is cut off")
         found.setdefault(kind, data[at + 8 : at + 8 + size])
         at += 8 + size
-    try:
-        document = json.loads(found[_JSON])
-    except (KeyError, ValueError) as error:
-        raise InputError(f"{path}: its JSON is absent or broken") from error
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: its JSON is no object")
-    return Fields(document), found.get(_BIN, b"")
+    if _JSON not in found:
+        raise InputError(f"{path}: holds no JSON chunk")
+    return parse_json(f"{path}: glTF", found[_JSON]), found.get(_BIN, b"")
 
 
-def _scene(path: Path, document: dict[str, Any], binary: bytes) -> Scene:
+def _scene(path: Path, document: Fields, binary: bytes) -> Scene:
     meshes = document.get("meshes", [])
     splatting = [
         (at, p) for at, mesh in enumerate(meshes) for p in mesh["primitives"] if EXTENSION in _extensions(p)
@@ -220,7 +212,7 @@ def _extensions(of: dict[str, Any]) -> dict[str, Any]:
 
 
 def _accessor(
-    path: Path, document: dict[str, Any], binary: bytes, index: int, name: str, width: int
+    path: Path, document: Fields, binary: bytes, index: int, name: str, width: int
 ) -> NDArray[np.float32]:
     """(count, width) of an accessor; normalised integers become fractions."""
     accessor = document["accessors"][index]
@@ -233,7 +225,9 @@ def _accessor(
     dtype, count = np.dtype(_DTYPES[kind]), int(accessor["count"])
     step = int(view.get("byteStride", width * dtype.itemsize))
     start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
-    if start + step * (count - 1) + width * dtype.itemsize > len(binary) or min(start, count) < 0:
+    if count < 0 or start < 0 or step < width * dtype.itemsize:
+        raise ValueError(f"{count} elements from byte {start}, {step} bytes each")
+    if count and start + step * (count - 1) + width * dtype.itemsize > len(binary):
         raise InputError(f"{path}: truncated: attribute {name!r} ends past the file")
     rows = np.ndarray((count, width), dtype, binary, start, (step, dtype.itemsize))
     if not accessor.get("normalized"):
@@ -242,18 +236,22 @@ def _accessor(
     return np.maximum(rows.astype(np.float32) / np.float32(top), np.float32(-1))
 
 
-def _translation(path: Path, document: dict[str, Any], mesh: int) -> NDArray[np.float64]:
+def _translation(path: Path, document: Fields, mesh: int) -> NDArray[np.float64]:
     """(3,) where the mesh's one node puts it.
 
     Raises:
-        InputError: several nodes, or one that does more than translate.
+        InputError: several nodes, one that does more than translate, or one that is its own ancestor.
     """
     nodes = document.get("nodes", [])
     at = [i for i, node in enumerate(nodes) if node.get("mesh") == mesh]
     if len(at) > 1:
         raise InputError(f"{path}: {len(at)} nodes show its splats; one is read")
     total = np.zeros(3)
+    seen: set[int] = set()
     while at:
+        if at[0] in seen:
+            raise InputError(f"{path}: node {at[0]} is its own ancestor")
+        seen.add(at[0])
         node = nodes[at[0]]
         moved = np.array(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
         matrix = np.array(node.get("matrix", np.eye(4).ravel()), np.float64).reshape(4, 4).T
@@ -264,4 +262,6 @@ def _translation(path: Path, document: dict[str, Any], mesh: int) -> NDArray[np.
         at = [i for i, parent in enumerate(nodes) if at[0] in parent.get("children", ())]
         if len(at) > 1:
             raise InputError(f"{path}: a node has {len(at)} parents")
+    if not np.isfinite(total).all():
+        raise InputError(f"{path}: its nodes move it by {tuple(total.tolist())}")
     return total * _TURN

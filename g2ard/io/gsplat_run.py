@@ -50,7 +50,10 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
         raise InputError(f"{file}: its data_dir {named and named.as_posix()} is not there")
     smaller = data / f"images_{settings.word('data_factor')}"
     photos = images or (smaller if smaller.is_dir() else None)
-    model, frames = colmap.frames(data, photos)
+    try:
+        model, frames = colmap.frames(data, photos)
+    except InputError as error:
+        raise InputError(f"{file}: its data_dir: {error}") from error
     every = _whole(file, "test_every", settings.word("test_every") or "8")
     words = ["train" if i % every else "test" for i in range(len(frames))]
     found = view_set(model, [f._replace(split=word) for f, word in zip(frames, words, strict=True)])

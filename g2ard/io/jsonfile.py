@@ -68,18 +68,71 @@ def parse_json(where: str, data: bytes) -> Any:
         raise InputError(f"{where}: not JSON: {error}") from error
 
 
-class Fields(dict[str, Any]):
-    """A JSON object that knows which of its properties was asked for last, for what is said of a bad one."""
+class _Asked:
+    """Which property of a JSON document was asked for last."""
 
-    last = ""
+    name = ""
+
+
+class _AbsentError(KeyError):
+    """A property is absent; any other KeyError is of a table that a value was looked up in."""
+
+
+class Fields(dict[str, Any]):
+    """A JSON object that knows which property was asked for last, in it or in what it holds.
+
+    >>> fields = Fields({"means": {"shape": [3, "four"]}})
+    >>> fields["means"]["shape"][1]
+    'four'
+    >>> fields.last
+    'means.shape[1]'
+    """
+
+    def __init__(self, entry: dict[str, Any], inside: str = "", asked: _Asked | None = None) -> None:
+        super().__init__(entry)
+        self._inside, self._asked = inside, asked or _Asked()
+
+    @property
+    def last(self) -> str:
+        """The property asked for last, as a.b[2]; "" before any was."""
+        return self._asked.name
 
     def __getitem__(self, key: str) -> Any:
-        self.last = key
-        return super().__getitem__(key)
+        self._ask(key)
+        if key not in self:
+            raise _AbsentError(key)
+        return _within(super().__getitem__(key), self)
 
     def get(self, key: str, default: Any = None) -> Any:
-        self.last = key
-        return super().get(key, default)
+        self._ask(key)
+        return _within(super().get(key, default), self)
+
+    def _ask(self, key: str) -> None:
+        self._asked.name = f"{self._inside}.{key}" if self._inside else key
+
+
+class _Items(list[Any]):
+    """A JSON list inside `Fields`."""
+
+    def __init__(self, entries: list[Any], inside: str, asked: _Asked) -> None:
+        super().__init__(entries)
+        self._inside, self._asked = inside, asked
+
+    def __getitem__(self, at: Any) -> Any:
+        self._asked.name = f"{self._inside}[{at}]" if isinstance(at, int) else self._inside
+        return _within(super().__getitem__(at), self)
+
+    def __iter__(self) -> Iterator[Any]:
+        return (self[at] for at in range(len(self)))
+
+
+def _within(value: Any, holder: Fields | _Items) -> Any:
+    """A value just asked for, knowing what is asked of it in turn."""
+    if isinstance(value, dict):
+        return Fields(value, holder._asked.name, holder._asked)
+    if isinstance(value, list):
+        return _Items(value, holder._asked.name, holder._asked)
+    return value
 
 
 @contextmanager
@@ -95,12 +148,18 @@ def fields_of(where: str, entry: Any) -> Iterator[Fields]:
     """
     if not isinstance(entry, dict):
         raise InputError(f"{where}: malformed (a {type(entry).__name__}, not an object)")
-    fields = Fields(entry)
+    fields = entry if isinstance(entry, Fields) else Fields(entry)
     try:
         yield fields
     except InputError:
         raise
-    except KeyError as error:
-        raise InputError(f"{where}: lacks {error}") from error
-    except (TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise InputError(f"{where}: malformed {fields.last!r} ({error})") from error
+    except _AbsentError as error:
+        raise InputError(f"{where}: lacks {fields.last!r}") from error
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise InputError(f"{where}: malformed {fields.last!r} ({_reason(error)})") from error
+
+
+def _reason(error: Exception) -> str:
+    """An exception's words on one line, or its name where it has none to say."""
+    words = " ".join(str(error).split())
+    return f"{words} is unknown" if isinstance(error, KeyError) else words or type(error).__name__

@@ -129,7 +129,10 @@ def _check_records(path: Path) -> None:
         raise InputError(f"{path}: cannot be read as LAS (begins with {head[:4]!r})")
     points_at, records = struct.unpack_from("<II", head, 96)
     (extended,) = struct.unpack_from("<I", head, 243) if head[25] >= 4 else (0,)
-    if records * 54 > points_at or extended * 60 > path.stat().st_size:
+    size = path.stat().st_size
+    if points_at > size:
+        raise InputError(f"{path}: truncated: its points begin at byte {points_at:,} of {size:,}")
+    if records * 54 > points_at or extended * 60 > size:
         raise InputError(f"{path}: broken header: {records + extended:,} variable-length records")
 
 

@@ -55,11 +55,12 @@ def chunks_of(path: Path) -> list[Path]:
 
 def _listed(index: Path) -> list[Path]:
     """The chunks that lod-meta.json's tree uses at level 0, in the order of its list."""
-    from g2ard.io.jsonfile import read_json
+    from g2ard.io.jsonfile import fields_of, read_json
 
-    content = read_json(index)
-    try:
-        files = [index.parent / Path(name).parent for name in content["filenames"]]
+    with fields_of(str(index), read_json(index)) as content:
+        if not isinstance(names := content["filenames"], list):
+            raise TypeError("not a list")
+        files = [index.parent / Path(name).parent for name in names]
         used: set[int] = set()
         nodes = [content["tree"]]
         while nodes:
@@ -67,13 +68,10 @@ def _listed(index: Path) -> list[Path]:
             nodes.extend(node.get("children", ()))
             if "0" in node.get("lods", {}):
                 used.add(int(node["lods"]["0"]["file"]))
-        chunks = [files[i] for i in sorted(used)]
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
-        raise InputError(f"{index}: not a valid lod-meta.json ({error!r})") from error
-    for chunk in chunks:
-        if not (chunk / "meta.json").is_file():
-            raise InputError(f"{index}: names {chunk.name}/meta.json, which is absent")
-    return chunks
+        for i in sorted(used):
+            if not (files[i] / "meta.json").is_file():
+                raise InputError(f"{index}: names {names[i]}, which is absent")
+        return [files[i] for i in sorted(used)]
 
 
 def read(path: Path) -> Scene:

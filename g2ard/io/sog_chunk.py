@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from g2ard.errors import InputError
+from g2ard.io.jsonfile import Fields, fields_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,21 +28,13 @@ class Chunk(NamedTuple):
     """One meta.json, and how to get at the files beside it."""
 
     name: str
-    meta: dict[str, Any]
+    meta: Fields
     load: Callable[[str], bytes]
 
 
-@contextmanager
-def meta_errors(chunk: Chunk) -> Iterator[None]:
-    """Turn what a malformed meta.json causes into one line that names it."""
-    try:
-        yield
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
-        what = f"{last!r}: " if (last := getattr(chunk.meta, "last", "")) else ""
-        why = f"lacks {error}" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
-        raise InputError(f"{chunk.name}: malformed meta.json ({what}{why})") from error
+def meta_errors(chunk: Chunk) -> AbstractContextManager[Fields]:
+    """Turn what a malformed meta.json causes into one line that names the property."""
+    return fields_of(f"{chunk.name}: meta.json", chunk.meta)
 
 
 def count_of(chunk: Chunk) -> int:
@@ -51,7 +44,7 @@ def count_of(chunk: Chunk) -> int:
             raise InputError(f"{chunk.name}: SOG version {version!r} is not known (1 and 2 are)")
         count = chunk.meta["count"] if version == 2 else chunk.meta["means"]["shape"][0]
         if not isinstance(count, int) or count < 0:
-            raise InputError(f"{chunk.name}: malformed meta.json (count is {count!r})")
+            raise ValueError(f"is {count!r}")
         first = chunk.meta["means"]["files"][0]
     with _opened_image(chunk, first) as image:  # before room is made for them
         if image.width * image.height < count:
@@ -216,12 +209,19 @@ def _values(part: dict[str, Any], codes: NDArray[np.uint8], channels: slice) -> 
 
 
 def _lerp(part: dict[str, Any], t: NDArray[Any], channels: slice | int) -> NDArray[Any]:
+
+    low, high = _bound(part["mins"], channels), _bound(part["maxs"], channels)
+    return low + (high - low) * t
+
+
+def _bound(values: Any, channels: slice | int) -> NDArray[Any]:
+    """One number for all channels, or a list of one each."""
     import numpy as np
 
-    low, high = np.asarray(part["mins"], np.float64), np.asarray(part["maxs"], np.float64)
-    if low.ndim:
-        low, high = low[channels], high[channels]
-    return low + (high - low) * t
+    bound = np.asarray(values, np.float64)
+    if bound.ndim and isinstance(channels, slice) and bound.shape != (3,) and bound.shape != (4,):
+        raise ValueError(f"numbers of shape {bound.shape}, not 3")
+    return bound[channels] if bound.ndim else bound
 
 
 def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:

@@ -46,7 +46,9 @@ def read(path: Path) -> Scene:
     data = path.read_bytes()
     if data[:2] == b"\x1f\x8b":
         data = _gunzip(path, data)
-    if data[:4] != MAGIC or len(data) < _HEADER:
+    if data[:4] == MAGIC and len(data) < _HEADER:
+        raise InputError(f"{path}: truncated: its header has {_HEADER} bytes, {len(data)} are there")
+    if data[:4] != MAGIC:
         raise InputError(f"{path}: not an SPZ file (begins with {data[:4]!r})")
     sizes = _sizes(path, data)
     version, count, degree, fraction_bits, flags, stream_count = struct.unpack_from("<IIBBBB", data, 4)

@@ -25,6 +25,8 @@ pub(crate) mod rasterizer;
 mod sensitivity;
 mod sh;
 pub mod simd;
+#[cfg(test)]
+pub(crate) mod small;
 mod tile_batch;
 mod tile_lists;
 mod tiles;

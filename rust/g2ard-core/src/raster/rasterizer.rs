@@ -3,6 +3,8 @@
 mod accumulated;
 mod posed;
 mod sensitive;
+#[cfg(test)]
+mod tests;
 mod tiled;
 mod views;
 
@@ -30,8 +32,8 @@ pub use views::{Counts, Image, ImageGradients, Memory, Passes};
 
 use views::lap;
 
-/// Groups of sixteen rows projected as one piece of work.
-const CHUNK: usize = 64;
+/// Groups of sixteen rows projected as one piece of work; one under Miri, which runs few rows.
+const CHUNK: usize = if cfg!(miri) { 1 } else { 64 };
 
 /// One chunk of rows after the backward pass: its visible splats and where their sums lie.
 pub(crate) struct ChunkSums<'a> {

@@ -319,6 +319,10 @@ mod tests {
     }
 
     #[test]
+    #[cfg_attr(
+        miri,
+        ignore = "tens of millions of points; holds no unsafe code of its own"
+    )]
     fn block_masks_miss_no_pixel_and_little_else() {
         let mut source = Lcg(3);
         let mut random = || source.uniform_f32();

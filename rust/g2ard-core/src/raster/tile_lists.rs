@@ -303,7 +303,8 @@ mod tests {
             rows: 5,
         };
         let (mut met, mut extra) = (0, 0);
-        for _ in 0..200 {
+        let draws = if cfg!(miri) { 4 } else { 200 };
+        for _ in 0..draws {
             let a = 0.02 * 60f32.powf(random());
             let splat = Splat {
                 x: f64::from(random() * 140.0 - 20.0),
@@ -333,7 +334,13 @@ mod tests {
             met += expected.len();
             extra += got.len() - expected.len();
         }
-        assert!(met > 500, "only {met} tiles: the test draws too little");
-        assert!(extra * 50 < met, "{extra} tiles too many of {met}");
+        assert!(
+            met > draws * 5 / 2,
+            "only {met} tiles: the test draws too little"
+        );
+        assert!(
+            extra * 50 < met || cfg!(miri),
+            "{extra} tiles too many of {met}"
+        );
     }
 }

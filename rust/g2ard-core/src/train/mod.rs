@@ -9,6 +9,8 @@ mod adam;
 mod anchors;
 mod mask;
 mod store;
+#[cfg(test)]
+mod tests;
 
 pub use anchors::{Anchors, Regularizers};
 pub use store::{Exported, Store};

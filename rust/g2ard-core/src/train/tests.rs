@@ -1,0 +1,46 @@
+use super::*;
+use crate::raster::small::{Small, camera, noise, on_any_threads};
+
+#[test]
+fn steps_give_the_same_bits_on_any_number_of_threads_and_learn() {
+    let losses = on_any_threads(|| {
+        let (scene, camera) = (Small::new(), camera());
+        let target = noise(3 * camera.width * camera.height, 9);
+        let mut trainer = Trainer::new(&scene.params(), None, Isa::detect()).unwrap();
+        let input = StepInput {
+            camera: &camera,
+            settings: &Settings::default(),
+            background: [0.0; 3],
+            target: &target,
+            mask: None,
+            ssim_weight: 0.2,
+            rates: Rates {
+                means: 1e-3,
+                quats: 1e-3,
+                log_scales: 5e-3,
+                logit_opacities: 0.02,
+                sh0: 0.02,
+                sh_n: 1e-3,
+            },
+            reach: None,
+            regularizers: None,
+        };
+        let steps = if cfg!(miri) { 2 } else { 8 };
+        let losses: Vec<u64> = (0..steps)
+            .map(|_| trainer.step(&input).unwrap().loss.to_bits())
+            .collect();
+        let values = trainer.store().export().values;
+        (
+            losses,
+            values.iter().map(|v| v.to_bits()).collect::<Vec<_>>(),
+        )
+    })
+    .0;
+    let loss = |at: usize| f64::from_bits(losses[at]);
+    assert!(
+        loss(losses.len() - 1) < loss(0),
+        "{} to {}",
+        loss(0),
+        loss(losses.len() - 1)
+    );
+}
