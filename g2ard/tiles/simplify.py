@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.io.stream import PartsStream
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.regions import Region, in_any
 from g2ard.splats import Splats, unit_quats
@@ -26,7 +29,7 @@ from g2ard.tiles.task import load
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
 
-__all__ = ["TiledScene", "finished", "sample_of", "simplify_tiles"]
+__all__ = ["TiledScene", "finished", "key_of", "sample_of", "simplify_tiles"]
 
 _POOL, _POOL_ROWS = 96, 4_000_000
 """Poses to look from for so many Gaussians; more of these, more of those."""
@@ -44,6 +47,7 @@ class TiledScene:
         tiles: reads the Gaussians of a tile, opacities fitted.
         sh_degree: of all.
         offset: (3,) float64.
+        key: tells it from others: a hash of the names of its files.
         views: that the tiles were looked at from; 0 without views.
         unseen: Gaussians of the dense scene that no view sees; None without views.
         surroundings: what recovery needs beside; None without views.
@@ -53,6 +57,7 @@ class TiledScene:
     tiles: Callable[[int], Splats]
     sh_degree: int
     offset: NDArray[np.float64]
+    key: str
     views: int = 0
     unseen: int | None = None
     surroundings: Surroundings | None = None
@@ -62,6 +67,11 @@ class TiledScene:
 
     def __iter__(self) -> Iterator[Splats]:
         return (self.tiles(tile) for tile in range(len(self.counts)))
+
+    def stream(self) -> PartsStream:
+        """The scene to be read tile by tile, as `g2ard.tiles.ingest.ingest` takes it."""
+        name = Path(f"simplified-{self.key}")
+        return PartsStream(name, self.counts, self.tiles, self.sh_degree, self.offset, [self.key])
 
     def whole(self) -> Splats:
         """All tiles as one scene in memory."""
@@ -155,10 +165,12 @@ def simplify_tiles(
     counts = tuple(n - m for n, m in zip(runs_left, merges, strict=True))
     if sights is None:
         return _scene(store, counts, [{"merged": path} for path in merged], None)
-    around = sights.surroundings(merged, sum(counts))
+    again = sights.again(merged)
+    mean = sum(float(load(path, "wanted")[0].sum()) for path in merged) / sum(counts)
+    files = [{"merged": one, "again": other} for one, other in zip(merged, again, strict=True)]
     unseen = sum(int(load(path, "unseen")[0]) for path in merged)
-    scene = _scene(store, counts, around.files, around.mean)
-    return replace(scene, views=len(sights.cameras), unseen=unseen, surroundings=around)
+    scene = _scene(store, counts, files, mean)
+    return replace(scene, views=len(sights.cameras), unseen=unseen, surroundings=sights.surroundings)
 
 
 def sample_of(store: TileStore, executor: Executor, work: Path, progress: Progress = silent) -> Splats:
@@ -176,7 +188,13 @@ def _scene(
     def tile(i: int) -> Splats:
         return finished(small_scene(files[i], mean), store.sh_degree)
 
-    return TiledScene(counts, tile, store.sh_degree, store.offset)
+    return TiledScene(counts, tile, store.sh_degree, store.offset, key_of(files))
+
+
+def key_of(files: Any) -> str:
+    """16 hexadecimal digits of the names of files, which hold the hashes of what decides their content."""
+    names = json.dumps(files, default=lambda path: path.name)
+    return hashlib.sha256(names.encode()).hexdigest()[:16]
 
 
 def finished(small: Splats, sh_degree: int) -> Splats:
