@@ -71,6 +71,31 @@ def test_simplify_works_in_tiles_and_forgets_them(
     assert {path.name for path in tmp_path.iterdir()} == {"small_10x.ply", "small_20x.ply", "told.json"}
 
 
+def test_what_lies_hidden_beside_the_output_of_another_run_is_replaced(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
+    args = ["-n", "300", "--no-views", "--workers", "1", "--tile-rows", "700"]
+    write_splats(tmp_path / "other.ply", town(1500, seed=4))
+    write_splats(tmp_path / "own.ply", town(1600))
+    good(command_line, tmp_path, "simplify", "own.ply", "-o", "clean.ply", *args)
+    stale = tmp_path / ".x.ply.tiles"
+    ingest(tmp_path / "other.ply", stale / "tiles", tile_rows=700)
+    (stale / "steps").mkdir()
+    (stale / "steps" / "coarse-00000-0123456789abcdef.npz").write_bytes(b"of another run")
+    (stale / "steps" / ".coarse-00000.0123.npz").write_bytes(b"begun")
+    good(command_line, tmp_path, "simplify", "own.ply", "-o", "x.ply", *args)
+    assert (tmp_path / "x.ply").read_bytes() == (tmp_path / "clean.ply").read_bytes()
+    assert not stale.exists()
+
+
+def test_a_device_that_all_fit_takes_them_all(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
+    args = ["simplify", folder / "town.ply", "--fit", "web", "-o", "all.ply", "--tile-rows", "2500"]
+    good(command_line, tmp_path, *args, "--workers", "1")
+    assert len(read_splats(tmp_path / "all.ply")) == 9000
+
+
 def test_a_folder_of_tiles_is_a_scene(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
     store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
     common = ["-n", "900", "--no-views", "--workers", "1"]
@@ -181,6 +206,12 @@ def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_
     assert len(small) == 900
     held_out = TeacherRenders(read_splats(folder / "town.ply"), ring(8).take([6, 7]))
     assert evaluate(small, held_out).psnr > report["scores"]["simplified"]
+    tiles = report["scores"]["tiles"]
+    assert [tile["count"] for tile in tiles] == report["tiles"]
+    assert sum(tile["pixels"] for tile in tiles) == report["scores"]["pixels"]
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "town.ply: 9,000 → 900" in page
+    assert all(f"{tile['recovered']:.2f}" in page for tile in tiles)
     assert not list(tmp_path.glob("run/.*"))
 
 

@@ -40,7 +40,7 @@ from g2ard.tiles.task import Arrays, Task, load
 if TYPE_CHECKING:
     from g2ard.policy.views import RunViews
 
-__all__ = ["TiledScores", "recover_tile", "recover_tiles"]
+__all__ = ["TileScore", "TiledScores", "recover_tile", "recover_tiles"]
 
 _MARGIN = 16
 """Pixels around a tile that its images show too: SSIM's windows reach over its edge."""
@@ -53,6 +53,24 @@ _FEWEST = 256
 
 
 @dataclass(frozen=True)
+class TileScore:
+    """A tile's part of `TiledScores`.
+
+    Args:
+        tile: its number.
+        count: its Gaussians.
+        simplified, recovered, pixels, steps: as there; PSNR means nothing without pixels.
+    """
+
+    tile: int
+    count: int
+    simplified: float
+    recovered: float
+    pixels: int
+    steps: int
+
+
+@dataclass(frozen=True)
 class TiledScores:
     """Held-out views, over all pixels that tiles own in them.
 
@@ -61,12 +79,14 @@ class TiledScores:
         recovered: and after it.
         pixels: that it is taken over.
         steps: of all tiles together.
+        tiles: each one's part.
     """
 
     simplified: float
     recovered: float
     pixels: int
     steps: int
+    tiles: tuple[TileScore, ...]
 
 
 class TileTargets(TeacherRenders):
@@ -101,8 +121,8 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
         arguments: `tile`; `levels`, see `g2ard.tiles.steps`; `steps` to take, 0 to be scored alone; `config`,
             recovery's constants by full name; `train`, `test` and `apart`: which views of these inputs have
             the tile in sight.
-        inputs: `coarse`, what `coarse` made of each tile; `train`, `test` and `apart`, cameras in world
-            coordinates.
+        inputs: `coarse`, what `coarse` made of each tile, `own`, of this one; `train`, `test` and `apart`,
+            cameras in world coordinates.
         places: `store`, the folder of the dense scene in tiles; `student`, of the scene to recover in the
             same cells.
 
@@ -113,7 +133,7 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
     from g2ard.stages.recover import recover
 
     store = TileStore.open(places["store"])
-    core, far = tile_of(arguments, places), far_around(store, arguments, inputs)
+    core, far = tile_of(arguments, inputs, places), far_around(store, arguments, inputs)
     # The tile's own Gaussians first, in teacher and student: masks and `frozen` count on it.
     teacher = joined([part for part in (core, store.read_halo(arguments["tile"]), *far) if len(part)])
     smaller = TileStore.open(places["student"])
@@ -215,9 +235,14 @@ def recover_tiles(
         for tile in range(len(store.tiles))
     ]
     paths = executor.run(tasks, "recover", progress)
-    errors = np.sum([load(path, "errors")[0] for path in paths], axis=0)
-    taken = sum(int(load(path, "steps")[0]) for path in paths)
-    psnr = [float(-10 * math.log10(max(e, 1e-12) / max(n, 1))) for e, n in errors]
+    errors = [load(path, "errors")[0] for path in paths]
+    taken = [int(load(path, "steps")[0]) for path in paths]
+    parts = tuple(
+        TileScore(tile.index, tile.rows, *_psnr(lost), int(lost[0][1]) // 3, steps)
+        for tile, lost, steps in zip(student.tiles, errors, taken, strict=True)
+    )
+    lost = np.sum(errors, axis=0)
+    scores = TiledScores(*_psnr(lost), int(lost[0][1]) // 3, sum(taken), parts)
     degree = student.sh_degree if config.sh_degree is None else config.sh_degree
     scene = TiledScene(
         tuple(tile.rows for tile in student.tiles),
@@ -227,7 +252,13 @@ def recover_tiles(
         key_of([paths, degree]),
         surroundings=around,
     )
-    return scene, TiledScores(psnr[0], psnr[1], int(errors[0][1]) // 3, taken)
+    return scene, scores
+
+
+def _psnr(errors: NDArray[np.float64]) -> tuple[float, float]:
+    """Before and after, of the (2, 2) `errors` of `recover_tile`."""
+    before, after = (float(-10 * math.log10(max(e, 1e-12) / max(n, 1))) for e, n in errors)
+    return before, after
 
 
 def _seen(
@@ -269,7 +300,11 @@ def _task(
             "config": values_of({"recover": config}),
             **views,
         },
-        {"coarse": around.coarse, **{name: path for name, (path, _) in sight.items()}},
+        {
+            "own": around.coarse[tile],
+            "coarse": around.coarse,
+            **{name: path for name, (path, _) in sight.items()},
+        },
         {"store": store.folder, "student": student.folder},
         store.tiles[tile].rows,
     )

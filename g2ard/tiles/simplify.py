@@ -93,7 +93,8 @@ def simplify_tiles(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> TiledScene:
-    """Reduce a scene in tiles to exactly `budget` Gaussians with the method `default`.
+    """Reduce a scene in tiles to exactly `budget` Gaussians with the method `default`; all there are stay as
+    they are.
 
     1. Each tile is merged to a few coarse Gaussians, which stand for it where others are looked at.
     2. Poses are planned on those; each tile is looked at, by the views that have it in sight, where it stands
@@ -130,16 +131,22 @@ def simplify_tiles(
         raise InputError(f"budget: expected 1 to the {store.count:,} Gaussians there are, got {budget:,}")
     work.mkdir(parents=True, exist_ok=True)
     run = TiledRun(store, executor, work, config or SimplifyConfig(), progress)
-    coarse = run.each("coarse", "coarse")
-    frame = run.sampled_frame(coarse)
+    coarse = run.begin()
+    frame = run.sampled_frame()
+    everything = budget == store.count
     sights: Sights | None = None
-    if not blind:
+    if not (blind or (everything and views is None)):
         sample = joined([scene_of(path, "sample") for path in coarse])
         _check_regions(sample, run.config["keep_region"])
         cameras = views or beside(sample) or _planned(run, sample, up, seed, say)
         sights = None if cameras is None else Sights(run, coarse, cameras, frame)
         frame = frame if sights is None else sights.frame
-    costs = run.each("run_costs", "costs", frame=frame, **_look_of(sights))
+    if everything:
+        return _as_it_is(store, sights)
+    looks: list[dict[str, Any]] = (
+        [{"look": path} for path in sights.looks] if sights else [{} for _ in coarse]
+    )
+    costs = run.each("run_costs", "costs", frame=frame, inputs=looks)
     runs_left = _runs(run, costs, budget)
     share_kept = budget / sum(runs_left)
     plans = run.each(
@@ -147,7 +154,7 @@ def simplify_tiles(
         "plans",
         frame=frame,
         per_tile=[{"runs": n, "expected": share_kept * n} for n in runs_left],
-        **_look_of(sights),
+        inputs=[{"costs": path, **seen} for path, seen in zip(costs, looks, strict=True)],
     )
     merges = cheapest([_costs_of(path) for path in plans], sum(runs_left) - budget)
     _check_reached(sum(runs_left) - sum(merges), budget)
@@ -157,10 +164,7 @@ def simplify_tiles(
         "merge",
         frame=frame,
         per_tile=per_tile,
-        inputs=[
-            {"plan": plan, **({"look": sights.looks[tile]} if sights else {})}
-            for tile, plan in enumerate(plans)
-        ],
+        inputs=[{"plan": path, **seen} for path, seen in zip(plans, looks, strict=True)],
     )
     counts = tuple(n - m for n, m in zip(runs_left, merges, strict=True))
     if sights is None:
@@ -177,7 +181,7 @@ def sample_of(store: TileStore, executor: Executor, work: Path, progress: Progre
     """A fair sample of a scene in tiles; its task is one of `simplify_tiles`, which does not do it again."""
     work.mkdir(parents=True, exist_ok=True)
     run = TiledRun(store, executor, work, SimplifyConfig(), progress)
-    return joined([scene_of(path, "sample") for path in run.each("coarse", "coarse")])
+    return joined([scene_of(path, "sample") for path in run.begin()])
 
 
 def _scene(
@@ -189,6 +193,18 @@ def _scene(
         return finished(small_scene(files[i], mean), store.sh_degree)
 
     return TiledScene(counts, tile, store.sh_degree, store.offset, key_of(files))
+
+
+def _as_it_is(store: TileStore, sights: Sights | None) -> TiledScene:
+    return TiledScene(
+        tuple(tile.rows for tile in store.tiles),
+        lambda tile: store.read(tile, check=False),
+        store.sh_degree,
+        store.offset,
+        key_of(store.key),
+        0 if sights is None else len(sights.cameras),
+        surroundings=None if sights is None else sights.surroundings,
+    )
 
 
 def key_of(files: Any) -> str:
@@ -207,10 +223,6 @@ def _check_regions(sample: Splats, regions: Sequence[Region]) -> None:
         raise InputError(
             f"keep_region: none of {len(sample):,} Gaussians, a fair sample of the scene, lies there"
         )
-
-
-def _look_of(sights: Sights | None) -> dict[str, Any]:
-    return {} if sights is None else {"inputs": [{"look": path} for path in sights.looks]}
 
 
 def _planned(run: TiledRun, sample: Splats, up: Any, seed: int, say: Say) -> Cameras | None:
