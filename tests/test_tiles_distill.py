@@ -125,6 +125,23 @@ def test_a_folder_of_tiles_is_a_scene(command_line: CommandLine, folder: Path, t
     assert (tmp_path / "work" / "steps").is_dir()  # named by the user, so it stays
 
 
+def test_tiles_are_read_as_one_scene(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    dense = read_splats(folder / "town.ply")
+    for rows in (9000, 2500):
+        store = ingest(folder / "town.ply", tmp_path / f"{rows}", tile_rows=rows)
+        back = read_splats(store.folder)
+        for name in ("means", "scales", "logit_opacities"):
+            got, wanted = (np.sort(getattr(scene, name), axis=0) for scene in (back, dense))
+            np.testing.assert_array_equal(got, wanted)
+    again = ingest(tmp_path / "2500", tmp_path / "again", tile_rows=4000)
+    whole = ingest(folder / "town.ply", tmp_path / "whole", tile_rows=4000)
+    assert [tile.rows for tile in again.tiles] == [tile.rows for tile in whole.tiles]
+    args = ("simplify", tmp_path / "9000", "-n", 300, "--no-views", "-o", "one.ply")
+    good(command_line, tmp_path, *args)
+    good(command_line, tmp_path, "simplify", folder / "town.ply", *args[2:-1], "two.ply")
+    assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "two.ply").read_bytes()
+
+
 def test_a_killed_command_leaves_no_workers_and_goes_on(folder: Path, tmp_path: Path) -> None:
     words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
     command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
@@ -183,10 +200,10 @@ def test_memory_decides_how_many_work_and_nothing_else(folder: Path, tmp_path: P
         InputError, match=r"--workers 9 take about .* GB, more than --memory .*; --workers \d fit"
     ):
         workers_for(store, Tiling(memory=need, workers=9))
-    scene = town(100)
-    check_memory(scene, Tiling(), "scene")
-    with pytest.raises(InputError, match="scene: 100 Gaussians in one piece take about"):
-        check_memory(scene, Tiling(memory=1_000_000), "scene")
+    check_memory(folder / "town.ply", Tiling(), 7)
+    check_memory(folder / "town.ply", Tiling(memory=300_000_000), 7)
+    with pytest.raises(InputError, match=r"town.ply: 9,000 Gaussians in one piece take about"):
+        check_memory(folder / "town.ply", Tiling(memory=1_000_000), 7)
     assert bytes_of("4GB") == 4 * 10**9
     assert not is_tiled(folder / "town.ply", Tiling())
     assert is_tiled(folder / "town.ply", Tiling(tile_rows=8999))

@@ -20,7 +20,13 @@ from g2ard.splats import Splats
 
 __all__ = ["PartsStream", "SceneStream", "file_identity", "open_stream"]
 
-_STREAMED = {"ply": "ply", "compressed_ply": "compressed_ply", "sog": "sog", "splat": "splat"}
+_STREAMED = {
+    "ply": "ply",
+    "compressed_ply": "compressed_ply",
+    "sog": "sog",
+    "splat": "splat",
+    "tiles": "tiles",
+}
 """Format → the module with its `stream(path)`; scenes of other formats are held as a whole."""
 
 _ENDS = 1 << 16
@@ -94,8 +100,8 @@ def open_stream(path: str | Path | Sequence[str | Path]) -> SceneStream:
 
     Args:
         path: a scene in any format that `g2ard.io.read_scene` reads, or several. Of .ply, .compressed.ply,
-            .splat and SOG a block at a time is held (of SOG also the images of one chunk), of others all.
-            Several take the offset of the first and the highest of their SH degrees.
+            .splat, SOG and tiles a block at a time is held (of SOG also the images of one chunk, of tiles one
+            tile), of others all. Several take the offset of the first and the highest of their SH degrees.
 
     Raises:
         InputError: nothing is there, or it is broken as far as its header tells.

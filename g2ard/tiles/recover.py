@@ -234,7 +234,7 @@ def recover_tiles(
         _task(store, student, around, tile, sight, steps / max(1, len(views.train.cameras)), config, work)
         for tile in range(len(store.tiles))
     ]
-    paths = executor.run(tasks, "recover", progress)
+    paths = executor.run(tasks, "recover" if steps else "score", progress)
     errors = [load(path, "errors")[0] for path in paths]
     taken = [int(load(path, "steps")[0]) for path in paths]
     parts = tuple(
