@@ -244,6 +244,8 @@ def workers_for(store: TileStore, tiling: Tiling, times: float = 1.0) -> int:
     largest = max(tile.rows + tile.halo for tile in store.tiles)
     need = _TASK_BYTES + int(times * largest * (_ROW_BYTES + _ROW_TIMES * store.row_bytes))
     fit = memory // need
+    if fit > 1:  # several are processes beside this one
+        fit = max(1, (memory - _TASK_BYTES) // need)
     if fit < 1:
         raise InputError(
             f"a tile of {largest:,} Gaussians takes about {need / 1e9:.1f} GB, more than --memory "

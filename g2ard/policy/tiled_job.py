@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["TiledJob", "refuse_whole", "resized", "tiled_job"]
 
 _RECOVERY_TIMES = 1.5
-"""Memory of a tile's recovery, renders included, over that of merging it."""
+"""Memory of a tile's recovery or scores, renders included, over that of merging it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ def tiled_job(
         scene: its file, or a folder of tiles.
         tiling: how; `folder` keeps what is done, so that the same call goes on.
         options: as for `g2ard.distill`, those that take the scene in one piece refused (`refuse_whole`).
-        learn: whether anything is recovered, which takes memory.
+        learn: whether anything is recovered, not just scored.
         progress: told of tasks.
         say: told in lines what was decided.
 
@@ -145,7 +145,7 @@ def tiled_job(
 
     assert tiling.folder is not None
     with tiles_of(scene, tiling, progress, say) as store:
-        workers = workers_for(store, tiling, _RECOVERY_TIMES if learn else 1.0)
+        workers = workers_for(store, tiling, _RECOVERY_TIMES)
         threads = max(1, cores_of(tiling) // workers)
         say(f"{len(store.tiles):,} tiles of {store.count:,} Gaussians, {workers} at a time")
         with executor(workers, threads, tiling.scheduler) as runs:
