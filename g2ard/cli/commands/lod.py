@@ -97,14 +97,16 @@ def lod(
         )
     meta, stopped = output / "lod-meta.json", output.with_name(f".{output.name}.unfinished")
     run.spare_inputs(meta)
-    if left_at(stopped) or not (resume and meta.exists()):
-        check_output(output, run.overwrite, folder=True)
-    if resume and meta.exists() and not left_at(stopped) and not run.overwrite:
-        _check_same(meta, ratios)
-    going_on = check_stopped(run, stopped, resume, meta)
-    rule = Cut(most * 1024, extent, least * 1024)
     tiling = tiling_of(run, output, tile_rows, memory, workers, scheduler, work)
-    if is_tiled(scene, tiling):
+    tiled = is_tiled(scene, tiling)
+    finished = resume and meta.exists() and not run.overwrite and (tiled or not left_at(stopped))
+    if finished:
+        _check_same(meta, ratios)
+    else:
+        check_output(output, run.overwrite, folder=True)
+    going_on = (finished or not tiled) and check_stopped(run, stopped, resume, meta)
+    rule = Cut(most * 1024, extent, least * 1024)
+    if tiled:
         options = DistillOptions(
             views=views,
             steps=steps,
