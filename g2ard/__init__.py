@@ -6,6 +6,7 @@
 | `load_views`, `save_views`, `load_points` | cameras, and coloured clouds |
 | `distill` | the whole job, as `g2ard distill` does it |
 | `distill_against` | the same on a scene, against targets of one's own |
+| `ingest` | a scene or cloud of any size → tiles in a folder |
 | `lift` | coloured points → surface-aligned discs |
 | `simplify` | fewer Gaussians, at an exact count, as `g2ard simplify` does it |
 | `make_pool`, `select` | views for a scene that has none; the views worth having |
@@ -67,6 +68,8 @@ if TYPE_CHECKING:
     from g2ard.stages.select import CoverageOptions, Selection, select
     from g2ard.stages.simplify import Simplified, SimplifyConfig
     from g2ard.targets import Photos, TeacherRenders
+    from g2ard.tiles.ingest import ingest
+    from g2ard.tiles.store import TileStore
 
 __version__ = "0.1.0"
 
@@ -99,11 +102,13 @@ __all__ = [
     "SimplifyConfig",
     "Splats",
     "TeacherRenders",
+    "TileStore",
     "__version__",
     "adapt",
     "distill",
     "distill_against",
     "evaluate",
+    "ingest",
     "lift",
     "load",
     "load_points",
@@ -145,6 +150,8 @@ _HOMES = {
     "stages.select": ("CoverageOptions", "Selection", "select"),
     "stages.simplify": ("Simplified", "SimplifyConfig"),
     "targets": ("Photos", "TeacherRenders"),
+    "tiles.ingest": ("ingest",),
+    "tiles.store": ("TileStore",),
 }
 """Module → what it gives under its own name."""
 

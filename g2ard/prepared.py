@@ -49,6 +49,14 @@ class PreparedScene(Splats):
         """The scene's arrays and their order."""
         return _core.Scene(self)
 
+    def restore(self, order: NDArray[np.uint32], bounds: NDArray[np.float64]) -> None:
+        """Take what `core.order` and `core.bounds` were found to be of the same scene before.
+
+        Raises:
+            InputError: not each row once.
+        """
+        vars(self)["core"] = _core.Scene(self, (order, bounds.tolist()))
+
 
 def as_prepared(splats: Splats) -> PreparedScene:
     """The same object where it is prepared, else one of its arrays, which must be C-contiguous and finite."""

@@ -180,6 +180,6 @@ def test_the_readme_names_every_command_and_scene_format() -> None:
     table = "\n".join(line for line in text.splitlines() if line.startswith("| `"))
     assert [name for name in COMMANDS if f"`{name}`" not in table] == []
     (scenes,) = re.findall(r"Scenes: ([^:]*)\. Clouds:", text)
-    names = {"sog": "SOG", "compressed_ply": ".compressed.ply"}
+    names = {"sog": "SOG", "compressed_ply": ".compressed.ply", "tiles": "folders of tiles"}
     kinds = [name for name, kind in KINDS.items() if kind == "splats"]
     assert [name for name in kinds if names.get(name, f".{name}") not in scenes] == []

@@ -171,3 +171,24 @@ def test_the_command(tmp_path: Path, command_line) -> None:
     status, _, said = command_line("lod", "ball.ply", "-o", "x", "-r", "4,2", cwd=tmp_path)
     assert (status, "ratios: expected rising numbers" in said) == (1, True)
     assert not (tmp_path / "x").exists()
+
+
+def test_a_stopped_run_with_other_options_is_told(
+    tmp_path: Path, command_line, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    io.write_splats(tmp_path / "ball.ply", checkered_ball(800))
+    given = ("lod", "ball.ply", "-o", "out", "-r", "1,4", "--steps", "3", "--size", "48")
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("g2ard.levels.save_levels", stop)
+        status, _, said = command_line(*given, cwd=tmp_path)
+    assert (status, "--resume goes on from" in said) == (130, True)
+    status, _, said = command_line(*given[:-1], "64", "--resume", cwd=tmp_path)
+    assert (status, "begun with other options (size); -w without --resume starts anew" in said) == (1, True)
+    assert not (tmp_path / "out").exists()
+    status, _, said = command_line(*given, "--resume", "--no-errors", cwd=tmp_path)
+    assert status == 0, said
+    assert {path.name for path in tmp_path.iterdir()} == {"ball.ply", "out"}

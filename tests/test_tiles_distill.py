@@ -71,6 +71,31 @@ def test_simplify_works_in_tiles_and_forgets_them(
     assert {path.name for path in tmp_path.iterdir()} == {"small_10x.ply", "small_20x.ply", "told.json"}
 
 
+def test_what_lies_hidden_beside_the_output_of_another_run_is_replaced(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
+    args = ["-n", "300", "--no-views", "--workers", "1", "--tile-rows", "700"]
+    write_splats(tmp_path / "other.ply", town(1500, seed=4))
+    write_splats(tmp_path / "own.ply", town(1600))
+    good(command_line, tmp_path, "simplify", "own.ply", "-o", "clean.ply", *args)
+    stale = tmp_path / ".x.ply.tiles"
+    ingest(tmp_path / "other.ply", stale / "tiles", tile_rows=700)
+    (stale / "steps").mkdir()
+    (stale / "steps" / "coarse-00000-0123456789abcdef.npz").write_bytes(b"of another run")
+    (stale / "steps" / ".coarse-00000.0123.npz").write_bytes(b"begun")
+    good(command_line, tmp_path, "simplify", "own.ply", "-o", "x.ply", *args)
+    assert (tmp_path / "x.ply").read_bytes() == (tmp_path / "clean.ply").read_bytes()
+    assert not stale.exists()
+
+
+def test_a_device_that_all_fit_takes_them_all(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
+    args = ["simplify", folder / "town.ply", "--fit", "web", "-o", "all.ply", "--tile-rows", "2500"]
+    good(command_line, tmp_path, *args, "--workers", "1")
+    assert len(read_splats(tmp_path / "all.ply")) == 9000
+
+
 def test_a_folder_of_tiles_is_a_scene(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
     store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
     common = ["-n", "900", "--no-views", "--workers", "1"]
@@ -98,6 +123,23 @@ def test_a_folder_of_tiles_is_a_scene(command_line: CommandLine, folder: Path, t
     )
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
     assert (tmp_path / "work" / "steps").is_dir()  # named by the user, so it stays
+
+
+def test_tiles_are_read_as_one_scene(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    dense = read_splats(folder / "town.ply")
+    for rows in (9000, 2500):
+        store = ingest(folder / "town.ply", tmp_path / f"{rows}", tile_rows=rows)
+        back = read_splats(store.folder)
+        for name in ("means", "scales", "logit_opacities"):
+            got, wanted = (np.sort(getattr(scene, name), axis=0) for scene in (back, dense))
+            np.testing.assert_array_equal(got, wanted)
+    again = ingest(tmp_path / "2500", tmp_path / "again", tile_rows=4000)
+    whole = ingest(folder / "town.ply", tmp_path / "whole", tile_rows=4000)
+    assert [tile.rows for tile in again.tiles] == [tile.rows for tile in whole.tiles]
+    args = ("simplify", tmp_path / "9000", "-n", 300, "--no-views", "-o", "one.ply")
+    good(command_line, tmp_path, *args)
+    good(command_line, tmp_path, "simplify", folder / "town.ply", *args[2:-1], "two.ply")
+    assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "two.ply").read_bytes()
 
 
 def test_a_killed_command_leaves_no_workers_and_goes_on(folder: Path, tmp_path: Path) -> None:
@@ -158,10 +200,10 @@ def test_memory_decides_how_many_work_and_nothing_else(folder: Path, tmp_path: P
         InputError, match=r"--workers 9 take about .* GB, more than --memory .*; --workers \d fit"
     ):
         workers_for(store, Tiling(memory=need, workers=9))
-    scene = town(100)
-    check_memory(scene, Tiling(), "scene")
-    with pytest.raises(InputError, match="scene: 100 Gaussians in one piece take about"):
-        check_memory(scene, Tiling(memory=1_000_000), "scene")
+    check_memory(folder / "town.ply", Tiling(), 7)
+    check_memory(folder / "town.ply", Tiling(memory=300_000_000), 7)
+    with pytest.raises(InputError, match=r"town.ply: 9,000 Gaussians in one piece take about"):
+        check_memory(folder / "town.ply", Tiling(memory=1_000_000), 7)
     assert bytes_of("4GB") == 4 * 10**9
     assert not is_tiled(folder / "town.ply", Tiling())
     assert is_tiled(folder / "town.ply", Tiling(tile_rows=8999))
@@ -181,6 +223,12 @@ def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_
     assert len(small) == 900
     held_out = TeacherRenders(read_splats(folder / "town.ply"), ring(8).take([6, 7]))
     assert evaluate(small, held_out).psnr > report["scores"]["simplified"]
+    tiles = report["scores"]["tiles"]
+    assert [tile["count"] for tile in tiles] == report["tiles"]
+    assert sum(tile["pixels"] for tile in tiles) == report["scores"]["pixels"]
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "town.ply: 9,000 → 900" in page
+    assert all(f"{tile['recovered']:.2f}" in page for tile in tiles)
     assert not list(tmp_path.glob("run/.*"))
 
 

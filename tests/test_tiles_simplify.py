@@ -121,7 +121,7 @@ def test_one_tile_is_the_whole_to_the_bit(seen: bool) -> None:
     assert len(here.run_costs()) < len(prepared)  # the transparent are not among them
     rounds = schedule(len(prepared), budget, config.retention_of("default"))
     counts = [n for n in rounds if n < 3 * budget]
-    of, a, b, costs = here.plan(3 * budget, counts)
+    of, a, b, costs = here.plan(3 * budget, counts, here.run_costs())
     assert len(a) == 2 * budget
     assert (costs >= 0).all()
     out = here.assemble(clusters(of, a, b, 3 * budget), budget)
@@ -254,10 +254,32 @@ def test_what_is_done_is_not_done_again(store: TileStore, tmp_path: Path) -> Non
     assert looks == {path for path in tmp_path.iterdir() if path.name.startswith("look-")}
 
 
+def test_all_there_are_stay_as_they_are(store: TileStore, scene: Path, tmp_path: Path) -> None:
+    dense = read_splats(scene)
+    every = [np.sort(s.means, axis=0) for s in (dense, reduced(store, tmp_path, budget=9000))]
+    np.testing.assert_array_equal(*every)
+
+
+def test_an_order_found_before_is_checked(scene: Path) -> None:
+    dense = finite_rows_of(read_splats(scene))[0]
+    order, bounds = dense.core.order, np.array(dense.core.bounds)
+    again = finite_rows_of(read_splats(scene))[0]
+    again.restore(order, bounds)
+    np.testing.assert_array_equal(again.core.order, order)
+    assert again.core.origin == dense.core.origin
+    for broken in (order[:-1], np.where(order == 7, 8, order).astype(np.uint32), order + np.uint32(1)):
+        with pytest.raises(InputError, match="order: expected each of 9000 rows once"):
+            again.restore(broken, bounds)
+
+
 def test_budgets_out_of_reach_are_refused(store: TileStore, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"expected 1 to the 9,000 Gaussians"):
         reduced(store, tmp_path, budget=9001, blind=True)
-    with pytest.raises(InputError, match="that a renderer draws, got 9,000"):
-        reduced(store, tmp_path, budget=9000, blind=True)
+    faint = town(600)
+    faint.logit_opacities[::6] = -9
+    write_splats(tmp_path / "faint.ply", faint)
+    some = ingest(tmp_path / "faint.ply", tmp_path / "faint", tile_rows=250)
+    with pytest.raises(InputError, match="at most the 500 Gaussians that a renderer draws, got 550"):
+        reduced(some, tmp_path, budget=550, blind=True)
     with pytest.raises(InputError, match="is the fewest that the tiles come to, not 2"):
         reduced(store, tmp_path, budget=2, blind=True)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from g2ard.cli.frame import Run
@@ -20,8 +21,10 @@ __all__ = [
     "REPORT",
     "WORK",
     "check_place",
+    "check_same_options",
     "drop_older",
     "is_done",
+    "note_options",
     "stopped_run",
     "tell_anew",
     "tell_finished",
@@ -118,9 +121,7 @@ def work_folder(run: Run, output: Path, resume: bool, counts: tuple[int, int] = 
     if not resume:
         shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True, exist_ok=True)
-    begun = {"input_count": counts[0], "output_count": counts[1], "config": run.config}
-    if not left_at(work):
-        (work / OPTIONS).write_text(json.dumps(begun, default=str))
+    note_options(run, work, {"input_count": counts[0], "output_count": counts[1]})
     try:
         yield work
     except (Exception, KeyboardInterrupt) as error:
@@ -131,6 +132,22 @@ def work_folder(run: Run, output: Path, resume: bool, counts: tuple[int, int] = 
         else:
             shutil.rmtree(output if made else work, ignore_errors=True)
         raise
+
+
+def note_options(run: Run, work: Path, told: Mapping[str, Any] = MappingProxyType({})) -> None:
+    """Write beside what will wait for --resume which options it belongs to, unless it waits already."""
+    work.mkdir(parents=True, exist_ok=True)
+    if not left_at(work):
+        (work / OPTIONS).write_text(json.dumps({**told, "config": run.config}, default=str))
+
+
+def check_same_options(run: Run, work: Path, besides: Sequence[str] = ()) -> None:
+    """Refuse to go on from a stopped run with other options, those `besides` excepted.
+
+    Raises:
+        OutputError: it had others.
+    """
+    _check_same(run, work, work / OPTIONS, None, "begun", besides)
 
 
 def stopped_run(folder: Path) -> dict[str, Any] | None:
@@ -169,7 +186,9 @@ def _is_bare(folder: Path) -> bool:
     return folder.is_dir() and [path.name for path in folder.iterdir()] == [WORK]
 
 
-def _check_same(run: Run, folder: Path, told: Path, budget: Budget, how: str) -> None:
+def _check_same(
+    run: Run, folder: Path, told: Path, budget: Budget | None, how: str, besides: Sequence[str] = ()
+) -> None:
     """Refuse to go on from a run with other options, as far as what it wrote of them tells.
 
     Raises:
@@ -181,13 +200,13 @@ def _check_same(run: Run, folder: Path, told: Path, budget: Budget, how: str) ->
     if not told.exists():
         return
     before = read_json(told)
-    if other := _others(run, before, budget):
+    if other := [name for name in _others(run, before, budget) if name not in besides]:
         raise OutputError(
             f"{folder}: {how} with other options ({', '.join(other)}); -w without --resume starts anew"
         )
 
 
-def _others(run: Run, before: Mapping[str, Any], budget: Budget) -> list[str]:
+def _others(run: Run, before: Mapping[str, Any], budget: Budget | None) -> list[str]:
     """Names of the options whose values differ."""
     then = before.get("config", {})
     now = json.loads(json.dumps(run.config, default=str))
@@ -195,7 +214,7 @@ def _others(run: Run, before: Mapping[str, Any], budget: Budget) -> list[str]:
     found = [name.replace("_", "-") for name in names if now[name] != then[name]]
     if "cuda" in (now["device"], then.get("device")) and now["device"] != then.get("device"):
         found.append("device")
-    return found if _is_budget(budget, before) else ["budget", *found]
+    return found if budget is None or _is_budget(budget, before) else ["budget", *found]
 
 
 def _is_budget(budget: Budget, before: Mapping[str, Any]) -> bool:

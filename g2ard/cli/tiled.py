@@ -83,6 +83,7 @@ class TiledCommand:
         from g2ard.memory import peak_rss
         from g2ard.policy.tiled import forget
         from g2ard.policy.tiled_distill import distill_in_tiles
+        from g2ard.report.tiled import tiled_report
 
         run, began, reports = self.run, time.perf_counter(), []
         made = distill_in_tiles(
@@ -104,6 +105,8 @@ class TiledCommand:
             if (pool := views.pool) is not None:
                 io.write_views(folder / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
             self._write(folder / name, store, small)
+            title = f"{self.scene.name}: {store.count:,} → {len(small):,}"
+            tiled_report(folder / "report.html", title, report)
             write_report(folder, report)
             run.say(
                 f"{folder}: {len(small):,} of {store.count:,} Gaussians; held-out views "

@@ -69,7 +69,7 @@ def read_splats(path: str | Path) -> Splats:
 
     Args:
         path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .glb, .splat; or a folder that
-            `distill` wrote.
+            `distill` or `ingest` wrote.
 
     Returns:
         The scene: linear scales, logit opacities, means relative to `offset`.
@@ -116,11 +116,11 @@ def check_scene(path: str | Path) -> tuple[Path, str]:
         InputError: nothing is there, or it is no Gaussian scene.
     """
     from g2ard.errors import InputError
-    from g2ard.io.detect import file_format, run_scene
+    from g2ard.io.detect import KINDS, file_format, run_scene
 
     path = run_scene(path)
     found = file_format(path)
-    if found not in ("ply", "compressed_ply", "sog", "spz", "glb", "splat"):
+    if KINDS[found] != "splats":
         words = {
             "cloud_ply": "a point cloud (no f_dc, scale, rot)",
             "las": "a point cloud",

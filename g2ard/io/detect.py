@@ -19,6 +19,7 @@ Format = Literal[
     "spz",
     "glb",
     "splat",
+    "tiles",
     "cloud_ply",
     "las",
     "points3d",
@@ -34,7 +35,7 @@ Format = Literal[
 Kind = Literal["splats", "points", "views"]
 
 KINDS: dict[str, Kind] = {
-    **dict.fromkeys(("ply", "compressed_ply", "sog", "spz", "glb", "splat"), "splats"),
+    **dict.fromkeys(("ply", "compressed_ply", "sog", "spz", "glb", "splat", "tiles"), "splats"),
     **dict.fromkeys(("cloud_ply", "las", "points3d"), "points"),
     **dict.fromkeys(("colmap", "transforms", "cambridge", "views"), "views"),
     **dict.fromkeys(("inria", "nerfstudio", "nerfstudio_export", "gsplat_run"), "views"),
@@ -123,6 +124,8 @@ def is_photo(path: Path) -> bool:
 def _folder_format(path: Path) -> Format:
     from g2ard.io.sog import chunks_of
 
+    if (path / "tiles.json").is_file():
+        return "tiles"
     if chunks_of(path):
         return "sog"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -18,9 +18,15 @@ from g2ard.io.clean import BLOCK, Raw, Tally
 from g2ard.io.types import Note
 from g2ard.splats import Splats
 
-__all__ = ["SceneStream", "file_identity", "open_stream"]
+__all__ = ["PartsStream", "SceneStream", "file_identity", "open_stream"]
 
-_STREAMED = {"ply": "ply", "compressed_ply": "compressed_ply", "sog": "sog", "splat": "splat"}
+_STREAMED = {
+    "ply": "ply",
+    "compressed_ply": "compressed_ply",
+    "sog": "sog",
+    "splat": "splat",
+    "tiles": "tiles",
+}
 """Format → the module with its `stream(path)`; scenes of other formats are held as a whole."""
 
 _ENDS = 1 << 16
@@ -94,8 +100,8 @@ def open_stream(path: str | Path | Sequence[str | Path]) -> SceneStream:
 
     Args:
         path: a scene in any format that `g2ard.io.read_scene` reads, or several. Of .ply, .compressed.ply,
-            .splat and SOG a block at a time is held (of SOG also the images of one chunk), of others all.
-            Several take the offset of the first and the highest of their SH degrees.
+            .splat, SOG and tiles a block at a time is held (of SOG also the images of one chunk, of tiles one
+            tile), of others all. Several take the offset of the first and the highest of their SH degrees.
 
     Raises:
         InputError: nothing is there, or it is broken as far as its header tells.
@@ -114,26 +120,43 @@ def open_stream(path: str | Path | Sequence[str | Path]) -> SceneStream:
         return stream
     if kind(path) != "splats":
         raise InputError(f"{path}: a Gaussian scene is needed, this is {kind(path)}")
-    return _Whole(path)
+    return _whole(path)
 
 
-class _Whole(SceneStream):
-    """A scene that is held as a whole."""
+class PartsStream(SceneStream):
+    """A scene of parts that are there as a whole when they are asked for, clean already.
 
-    def __init__(self, path: Path) -> None:
-        from g2ard.io import read_scene
+    Args:
+        path: names the scene in messages.
+        counts: Gaussians of each part.
+        part: gives one by its number.
+        sh_degree: of all.
+        offset: (3,) float64 of all.
+        identity: what tells this scene from another, as JSON.
+        notes: what was noticed.
+    """
 
-        scene = read_scene(path)
-        self._splats = scene.splats
-        rest = scene.splats.shN.shape[1]
-        super().__init__(path, len(scene.splats), rest, scene.splats.offset, scene.notes)
+    def __init__(
+        self,
+        path: Path,
+        counts: Sequence[int],
+        part: Callable[[int], Splats],
+        sh_degree: int,
+        offset: NDArray[np.float64],
+        identity: list[Any],
+        notes: tuple[Note, ...] = (),
+    ) -> None:
+        super().__init__(path, sum(counts), (sh_degree + 1) ** 2 - 1, offset, notes)
+        self._counts, self._part, self._identity = counts, part, identity
 
     def identity(self) -> list[Any]:
-        return file_identity([self.path])
+        return self._identity
+
+    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+        return (self._part(number).means for number in range(len(self._counts)))
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
-        for first in range(start, self.count, rows):
-            part = self._splats.take(slice(first, first + rows))
+        for part in self._pieces(rows, start):
             raw = Raw.empty(len(part), part.shN.shape[1])
             raw.means[:], raw.quats[:], raw.log_scales[:] = part.means, part.quats, np.log(part.scales)
             raw.logit_opacities[:], raw.sh0[:], raw.shN[:] = part.logit_opacities, part.sh0, part.shN
@@ -141,13 +164,34 @@ class _Whole(SceneStream):
             yield raw
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
-        for first in range(start, self.count, rows):
-            part = self._splats.take(slice(first, first + rows))
-            self.tally.rows = first + len(part)
+        done = start
+        for part in self._pieces(rows, start):
+            done += len(part)
+            self.tally.rows = done
             yield part
+
+    def _pieces(self, rows: int, start: int) -> Iterator[Splats]:
+        for number, count in enumerate(self._counts):
+            if start < count:
+                part = self._part(number)
+                for first in range(start, count, rows):
+                    yield part.take(slice(first, first + rows))
+            start = max(0, start - count)
 
     def all_notes(self) -> tuple[Note, ...]:
         return self.notes
+
+
+def _whole(path: Path) -> SceneStream:
+    """A scene that is held as a whole."""
+    from g2ard.io import read_scene
+
+    scene = read_scene(path)
+    splats = scene.splats
+    identity = file_identity([path])
+    return PartsStream(
+        path, [len(splats)], lambda _: splats, splats.sh_degree, splats.offset, identity, scene.notes
+    )
 
 
 class _Joined(SceneStream):

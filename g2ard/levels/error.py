@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,9 @@ from numpy.typing import NDArray
 from g2ard.cameras import Camera
 from g2ard.levels.tree import Leaf
 from g2ard.splats import Splats
+
+if TYPE_CHECKING:
+    from g2ard.levels.tree import Level
 
 __all__ = ["leaf_errors"]
 
@@ -26,7 +30,7 @@ _TURN = np.radians((40.0, 25.0, 10.0))
 """Axes are turned by these angles about x, y and z: along bare axes half of the harmonics are zero."""
 
 
-def leaf_errors(leaf: Leaf, levels: Sequence[Splats]) -> list[float]:
+def leaf_errors(leaf: Leaf, levels: Sequence[Level]) -> list[float]:
     """Of each level Σ‖RGBA − RGBA_f‖² / Σ‖RGBA_f‖² over six views of the leaf's Gaussians alone.
 
     f is the finest level that has any there. Errors never fall from a level to the next coarser, for a viewer

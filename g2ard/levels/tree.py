@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +15,19 @@ from g2ard.errors import InputError, require
 from g2ard.splats import Splats
 from g2ard.stages.recover.anchors import rotation_matrices
 
+if TYPE_CHECKING:
+    from g2ard.tiles.stored import StoredScene
+
+    Level = Splats | StoredScene
+    """A level of detail: a scene in memory, or rows on disk."""
+
 __all__ = ["Cut", "Leaf", "Node", "cut"]
 
 Float = NDArray[np.float64]
 Rows = NDArray[np.int64]
+
+_BLOCK = 1 << 20
+"""Rows that are looked at together."""
 
 
 @dataclass(frozen=True)
@@ -73,18 +85,20 @@ class Node:
                 yield from child.leaves()
 
 
-def cut(levels: Sequence[Splats], rule: Cut | None = None) -> Node | Leaf:
+def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None = None) -> Node | Leaf:
     """Cut space at medians of the means of all levels, along the longer side of their box.
 
     Args:
         levels: the same scene, the finest first, all of one offset.
         rule: when to split; None means `Cut()`.
+        scratch: a folder on whose disk positions and row numbers lie, in files without a name, so that memory
+            holds 4 bytes a row beside the rows of a leaf; None keeps all in memory.
 
     Returns:
         The tree; a leaf alone where nothing is split.
 
     Raises:
-        InputError: no level, an empty one, or offsets that differ.
+        InputError: no level, an empty one, offsets that differ, or a mean that is not finite.
 
     >>> fine = Splats.create([[0, 0, 0], [9, 0, 0]], scales=[[1, 1, 2]] * 2)
     >>> tree = cut([fine, fine.take([0])], Cut(most=2))
@@ -95,10 +109,15 @@ def cut(levels: Sequence[Splats], rule: Cut | None = None) -> Node | Leaf:
         raise InputError("levels: expected at least one, and none of them empty")
     if any((level.offset != levels[0].offset).any() for level in levels):
         raise InputError("levels: their offsets differ")
-    means = np.concatenate([level.means for level in levels]).astype(np.float64)
-    reach = np.concatenate([_reach(level) for level in levels])
-    starts = np.cumsum([0, *(len(level) for level in levels)])
-    return _Tree(means, means - reach, means + reach, starts, rule or Cut()).of(np.arange(len(means)))
+    tree = _Tree(levels, rule or Cut(), scratch)
+    rows = tree.room(len(tree.means))
+    for at in _blocks(len(rows)):
+        rows[at] = np.arange(at.start, at.stop)
+    return tree.of(rows, ())
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    return (slice(start, min(start + _BLOCK, count)) for start in range(0, count, _BLOCK))
 
 
 def _reach(splats: Splats) -> Float:
@@ -107,26 +126,97 @@ def _reach(splats: Splats) -> Float:
     return np.einsum("nij,nj->ni", np.abs(frames), splats.scales.astype(np.float64))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _Tree:
-    means: Float
-    lows: Float
-    highs: Float
-    starts: Rows
-    rule: Cut
+    """All levels' rows, numbered one level after the other; those of a node are in ascending order."""
 
-    def of(self, rows: Rows) -> Node | Leaf:
-        means = self.means[rows]
-        sides = np.ptp(means, axis=0)
+    levels: Sequence[Level]
+    rule: Cut
+    scratch: Path | None
+    starts: Rows = field(init=False)
+    means: NDArray[Any] = field(init=False)
+    kept: Rows = field(init=False)
+    filled: int = 0
+
+    def __post_init__(self) -> None:
+        self.starts = np.cumsum([0, *(len(level) for level in self.levels)])
+        count, at = int(self.starts[-1]), 0
+        self.kept = self.room(count)
+        wide = any(isinstance(level, Splats) and level.means.dtype == np.float64 for level in self.levels)
+        self.means = self.room((count, 3), np.float64 if wide else np.float32)
+        for number, level in enumerate(self.levels):
+            for block in [level.means] if isinstance(level, Splats) else level.positions():
+                if not np.isfinite(block).all():
+                    raise InputError(f"levels: a mean of level {number} is not finite")
+                self.means[at : at + len(block)] = block
+                at += len(block)
+
+    def room(self, shape: int | tuple[int, int], dtype: type[Any] = np.int64) -> NDArray[Any]:
+        """An array in memory, or of a file that goes with it."""
+        if self.scratch is None or np.prod(shape) < _BLOCK:
+            return np.empty(shape, dtype)
+        with TemporaryFile(dir=self.scratch) as file:
+            return np.memmap(file, dtype, "w+", shape=shape)
+
+    def of(self, rows: Rows, axes: tuple[int, ...]) -> Node | Leaf:
+        """The node of these rows, its parents cut along `axes`, the last one last."""
+        low, high = self._box(rows)
+        sides = high - low
         wide = sides.max() > self.rule.extent and len(rows) > self.rule.least
         if len(rows) < 2 or not (wide or len(rows) > self.rule.most):
-            return self._leaf(np.sort(rows))
-        order = rows[np.argsort(means[:, sides.argmax()], kind="stable")]
-        middle = len(order) // 2
-        one, other = self.of(order[:middle]), self.of(order[middle:])
+            return self._leaf(rows)
+        axis = int(sides.argmax())
+        below, above = self._halves(rows, axis, axes)
+        one, other = self.of(below, (*axes, axis)), self.of(above, (*axes, axis))
         return Node(np.minimum(one.low, other.low), np.maximum(one.high, other.high), (one, other))
 
+    def _box(self, rows: Rows) -> tuple[Float, Float]:
+        boxes = [
+            (part.min(axis=0), part.max(axis=0))
+            for part in (self.means[rows[at]] for at in _blocks(len(rows)))
+        ]
+        low, high = np.array(boxes, np.float64).swapaxes(0, 1)
+        return low.min(axis=0), high.max(axis=0)
+
+    def _halves(self, rows: Rows, axis: int, axes: tuple[int, ...]) -> tuple[Rows, Rows]:
+        """The lower half along `axis`, ties by the last cut's axis, then by those before it, then by row."""
+        middle = len(rows) // 2
+        values = np.empty(len(rows), self.means.dtype)
+        for at in _blocks(len(rows)):
+            values[at] = self.means[rows[at], axis]
+        values.partition(middle)
+        limit = values[middle]
+        short = middle - int(np.count_nonzero(values < limit))
+        del values
+        tied = np.concatenate(
+            [part[self.means[part, axis] == limit] for part in map(rows.__getitem__, _blocks(len(rows)))]
+        )
+        if axes:
+            tied = tied[np.lexsort([self.means[tied, a] for a in axes])]
+        lower = np.sort(tied[:short])
+        below, above, done = self.room(middle), self.room(len(rows) - middle), 0
+        for at in _blocks(len(rows)):
+            part = rows[at]
+            inside = (self.means[part, axis] < limit) | np.isin(part, lower, assume_unique=True)
+            some, rest = part[inside], part[~inside]
+            below[done : done + len(some)] = some
+            above[at.start - done : at.start - done + len(rest)] = rest
+            done += len(some)
+        return below, above
+
     def _leaf(self, rows: Rows) -> Leaf:
-        ends = np.searchsorted(rows, self.starts)
-        parts = [rows[a:b] - start for a, b, start in zip(ends, ends[1:], self.starts, strict=False)]
-        return Leaf(self.lows[rows].min(axis=0), self.highs[rows].max(axis=0), tuple(parts))
+        ends, parts = np.searchsorted(rows, self.starts), []
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        for level, start, a, b in zip(self.levels, self.starts, ends, ends[1:], strict=False):
+            part = self.kept[self.filled : self.filled + b - a]
+            part[:] = rows[a:b] - start
+            parts.append(part)
+            self.filled += b - a
+            if a < b:
+                some = level.take(part)
+                means, reach = some.means.astype(np.float64), _reach(some)
+                low, high = (
+                    np.minimum(low, (means - reach).min(axis=0)),
+                    np.maximum(high, (means + reach).max(axis=0)),
+                )
+        return Leaf(low, high, tuple(parts))

@@ -7,8 +7,10 @@ has Gaussians there the file, the offset of the first of its rows and their coun
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,29 +23,37 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from g2ard.levels.tree import Level
     from g2ard.splats import Splats
 
 __all__ = ["save_levels"]
 
+_ERRORS = "errors.jsonl"
+"""In the folder of what is done: a leaf's errors a line, in one order of leaves."""
+
 
 def save_levels(
     path: str | Path,
-    levels: Sequence[Splats],
+    levels: Sequence[Level],
     *,
     cut: Cut | None = None,
     errors: bool = True,
     overwrite: bool = False,
+    work: Path | None = None,
     progress: Progress = silent,
 ) -> int:
     """Write levels of detail as a folder of streamed SOG, `lod-meta.json` and `LEVEL_N/meta.json`.
 
     Args:
         path: the folder.
-        levels: the same scene, the finest first, of one offset.
+        levels: the same scene, the finest first, of one offset; scenes, or `StoredScene`s whose rows are read
+            a leaf or a file at a time.
         cut: how the tree is cut; None means `Cut()`.
         errors: measure what each leaf's levels lose (`g2ard.levels.leaf_errors`), which tells viewers what to
             load; without them they go by counts.
         overwrite: whether files in the folder may be replaced.
+        work: a folder for what is done so far, which the same call on the same levels goes on from, and for
+            what memory need not hold.
         progress: told of leaves measured and files written.
 
     Returns:
@@ -57,11 +67,11 @@ def save_levels(
     from g2ard.io.atomic import atomic_folder
 
     rule = cut or Cut()
-    tree = cut_tree(levels, rule)
+    tree = cut_tree(levels, rule, work)
     files = _Files(levels, rule.most, {})
     root = _node(tree, files)
     if errors:
-        _measure(tree, root, levels, progress)
+        _measure(tree, root, levels, work, progress)
     counts = [len(level) for level in levels]
     meta: dict[str, Any] = {
         "version": 1,
@@ -79,7 +89,10 @@ def save_levels(
         "tree": root,
     }
     with atomic_folder(path, overwrite) as folder:
-        files.write(folder, Path(path), progress)
+        files.write(work or folder, Path(path), progress)
+        if work is not None:
+            for name in files.parts:
+                shutil.move((work / name).parent, folder)
         (folder / "lod-meta.json").write_text(json.dumps(meta, separators=(",", ":")))
         return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
 
@@ -88,7 +101,7 @@ def save_levels(
 class _Files:
     """What goes where: a level's leaves fill a file until it holds more than `most`."""
 
-    levels: Sequence[Splats]
+    levels: Sequence[Level]
     most: int
     parts: dict[str, list[NDArray[np.int64]]]
     level_of: dict[str, int] = field(default_factory=dict)
@@ -105,19 +118,28 @@ class _Files:
         return {"file": list(self.parts).index(name), "offset": filled, "count": len(rows)}
 
     def write(self, folder: Path, path: Path, progress: Progress) -> None:
-        """All files; the rows of each leaf in Morton order."""
-        import numpy as np
-
-        from g2ard.io.packing import morton_order, writable
+        """All files that are not there yet, one whole after the other; `path` names them in messages."""
+        from g2ard.io.atomic import atomic_folder
         from g2ard.io.sog_write import sog_files
 
-        for number, (name, leaves) in enumerate(self.parts.items(), start=1):
-            level = writable(path / name, self.levels[self.level_of[name]])
-            rows = np.concatenate([rows[morton_order(level.means[rows])] for rows in leaves])
-            (folder / name).parent.mkdir()
-            for file, content in sog_files(path / name, level.take(rows), ordered=True).items():
-                (folder / name).with_name(file).write_bytes(content)
+        for number, name in enumerate(self.parts, start=1):
+            if not (folder / name).exists():
+                with atomic_folder((folder / name).parent) as begun:
+                    for file, content in sog_files(path / name, self._rows(name), ordered=True).items():
+                        (begun / file).write_bytes(content)
             progress("write", number, len(self.parts))
+
+    def _rows(self, name: str) -> Splats:
+        """The rows of a file's leaves, those of each in Morton order."""
+        import numpy as np
+
+        from g2ard.io.packing import morton_order
+
+        leaves = self.parts[name]
+        splats = self.levels[self.level_of[name]].take(np.concatenate(leaves))
+        starts = np.cumsum([0, *map(len, leaves)])
+        order = [a + morton_order(splats.means[a:b]) for a, b in pairwise(starts)]
+        return splats.take(np.concatenate(order))
 
 
 def _node(tree: Node | Leaf, files: _Files) -> dict[str, Any]:
@@ -128,7 +150,9 @@ def _node(tree: Node | Leaf, files: _Files) -> dict[str, Any]:
     return {**node, "children": [_node(child, files) for child in tree.children]}
 
 
-def _measure(tree: Node | Leaf, root: dict[str, Any], levels: Sequence[Splats], progress: Progress) -> None:
+def _measure(
+    tree: Node | Leaf, root: dict[str, Any], levels: Sequence[Level], work: Path | None, progress: Progress
+) -> None:
     """Put `errors` into the leaves of the tree as it is written."""
     pairs = [(tree, root)]
     leaves: list[tuple[Leaf, dict[str, Any]]] = []
@@ -138,9 +162,26 @@ def _measure(tree: Node | Leaf, root: dict[str, Any], levels: Sequence[Splats], 
             leaves.append((part, node))
         else:
             pairs.extend(zip(part.children, node["children"], strict=True))
+    table = None if work is None else work / _ERRORS
+    known = [] if table is None or not table.exists() else _lines(table)
     for number, (leaf, node) in enumerate(leaves, start=1):
-        node["errors"] = _rounded(leaf_errors(leaf, levels))
+        if number <= len(known):
+            node["errors"] = known[number - 1]
+        else:
+            node["errors"] = _rounded(leaf_errors(leaf, levels))
+            if table is not None:
+                with table.open("a") as file:
+                    file.write(json.dumps(node["errors"]) + "\n")
         progress("measure", number, len(leaves))
+
+
+def _lines(table: Path) -> list[list[float]]:
+    """The lines that were written whole; one that was not is cut off."""
+    text = table.read_bytes()
+    whole = text[: text.rfind(b"\n") + 1]
+    if whole != text:
+        table.write_bytes(whole)
+    return [json.loads(line) for line in whole.splitlines()]
 
 
 def _rounded(values: Sequence[float] | NDArray[np.float64]) -> list[float]:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from g2ard.policy.job import DistillJob
     from g2ard.targets import Targets
 
-__all__ = ["RATIOS", "LevelReport", "Levels", "lod"]
+__all__ = ["RATIOS", "LevelReport", "Levels", "check_ratios", "level_size", "lod"]
 
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """A level is half of the one before, as viewers' own tools make them."""
@@ -116,7 +116,7 @@ def lod(
     from g2ard.policy.distill import prepare
     from g2ard.policy.distill_options import DistillOptions
 
-    _check(ratios)
+    check_ratios(ratios)
     job = prepare(
         scene,
         [Budget(ratio=ratio) for ratio in ratios],
@@ -139,7 +139,7 @@ def lod(
     for ratio, aim in zip(ratios, job.aims, strict=True):
         if ratio == 1:
             splats.append(job.prior)
-            reports.append(LevelReport(len(job.prior), 1.0, _longest(job.views.train.cameras), 0.0))
+            reports.append(LevelReport(len(job.prior), 1.0, level_size(job.views.train.cameras, 1), 0.0))
             continue
         say(f"level {len(splats)}: {plural(aim.count, 'Gaussian')}")
         place = None if work is None else work / f"level-{len(splats)}"
@@ -149,7 +149,12 @@ def lod(
     return Levels(tuple(splats), tuple(reports))
 
 
-def _check(ratios: Sequence[float]) -> None:
+def check_ratios(ratios: Sequence[float]) -> None:
+    """Refuse ratios that do not rise from 1 or more.
+
+    Raises:
+        InputError: naming them.
+    """
     from g2ard.errors import InputError
 
     rising = all(a < b for a, b in pairwise(ratios))
@@ -165,7 +170,7 @@ def _level(
     from g2ard.stages.evaluate import evaluate
 
     began = time.perf_counter()
-    longest = max(_SMALLEST, round(_longest(job.views.train.cameras) / ratio**0.25))
+    longest = level_size(job.views.train.cameras, ratio)
     held_out = _targets(job, job.views.test, longest)
     if recover:
         apart = None if job.views.apart is None or job.teacher is None else job.views.apart.resized(longest)
@@ -211,5 +216,7 @@ def _targets(job: DistillJob, cameras: Cameras, longest: int) -> Targets:
     )
 
 
-def _longest(cameras: Cameras) -> int:
-    return int(max(cameras.widths.max(), cameras.heights.max()))
+def level_size(cameras: Cameras, ratio: float) -> int:
+    """Pixels of the longer side of a level's views, given the finest level's."""
+    longest = int(max(cameras.widths.max(), cameras.heights.max()))
+    return longest if ratio == 1 else max(_SMALLEST, round(longest / ratio**0.25))

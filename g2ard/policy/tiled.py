@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from g2ard.tiles.store import TileStore
 
 __all__ = [
+    "LEVELS_TIMES",
+    "WHOLE_TIMES",
     "Tiling",
     "bytes_of",
     "check_memory",
@@ -38,13 +40,13 @@ __all__ = [
 _SMALLEST_ROW = 4
 """Bytes of a Gaussian in a file, at least: a smaller file need not be opened to know that it is small."""
 
-_TASK_BYTES, _ROW_BYTES, _ROW_TIMES = 200_000_000, 200, 2.2
+_TASK_BYTES, _ROW_BYTES, _ROW_TIMES = 200_000_000, 290, 0.8
 """Of a task at its peak: of the program, and of a tile's Gaussians, halo included, so many and so many times
-what their arrays take. Together they are the 1.95 GB measured for 5.5 million of SH 0
-(`benches/record/tiles.md`); what higher bands add is not measured."""
+what their arrays take. Measured are 1.95 GB for 5.5 million of SH 0, and 0.98 GB for 1.8 million of SH 3
+(`benches/record/tiles.md`)."""
 
-_WHOLE_TIMES = 3.6
-"""Memory of a simplification in one piece, over the scene's arrays."""
+WHOLE_TIMES, LEVELS_TIMES = 3.6, 7.0
+"""Memory in one piece, over the scene's arrays: of a simplification, and of levels that are merged alone."""
 
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmMgGtT]?)(?:i?[bB])?")
 
@@ -119,18 +121,25 @@ def is_tiled(scene: Path, tiling: Tiling) -> bool:
     return open_stream(scene).count > tiling.most_rows
 
 
-def check_memory(scene: Splats, tiling: Tiling, name: str) -> None:
-    """Refuse a scene in one piece that needs more than `--memory`.
+def check_memory(scene: Path, tiling: Tiling, times: float) -> None:
+    """Refuse a scene that in one piece, at so many times its arrays, takes more than `--memory`.
 
     Raises:
-        InputError: with what would do.
+        InputError: with what would do; or the scene cannot be read.
     """
-    need = _TASK_BYTES + int(_WHOLE_TIMES * scene.nbytes)
-    if tiling.memory is not None and need > tiling.memory:
+    from g2ard.io.stream import open_stream
+    from g2ard.tiles.store import row_width
+
+    if tiling.memory is None:
+        return
+    stream = open_stream(scene)
+    row_bytes = 4 * row_width(stream.sh_degree)
+    need = _TASK_BYTES + int(times * stream.count * row_bytes)
+    if need > tiling.memory:
         raise InputError(
-            f"{name}: {len(scene):,} Gaussians in one piece take about {need / 1e9:.1f} GB, more than "
+            f"{scene}: {stream.count:,} Gaussians in one piece take about {need / 1e9:.1f} GB, more than "
             f"--memory {tiling.memory / 1e9:g}GB; --tile-rows "
-            f"{_rows_within(tiling.memory, scene.nbytes / len(scene)):,} works on tiles that fit"
+            f"{_rows_within(tiling.memory, row_bytes):,} works on tiles that fit"
         )
 
 
@@ -235,6 +244,8 @@ def workers_for(store: TileStore, tiling: Tiling, times: float = 1.0) -> int:
     largest = max(tile.rows + tile.halo for tile in store.tiles)
     need = _TASK_BYTES + int(times * largest * (_ROW_BYTES + _ROW_TIMES * store.row_bytes))
     fit = memory // need
+    if fit > 1:  # several are processes beside this one
+        fit = max(1, (memory - _TASK_BYTES) // need)
     if fit < 1:
         raise InputError(
             f"a tile of {largest:,} Gaussians takes about {need / 1e9:.1f} GB, more than --memory "

@@ -64,12 +64,13 @@ class _SceneFeed:
 
 
 def ingest(
-    source: str | Path | Sequence[str | Path],
+    source: str | Path | Sequence[str | Path] | SceneStream,
     folder: str | Path,
     *,
     tile_rows: int = TILE_ROWS,
     block_rows: int | None = None,
     lift: LiftConfig | None = None,
+    like: TileStore | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -88,11 +89,12 @@ def ingest(
 
     Args:
         source: a scene, or several as one, as `g2ard.io.stream.open_stream` takes them; or coloured clouds,
-            as `g2ard.io.point_stream.open_point_stream` does.
+            as `g2ard.io.point_stream.open_point_stream` does; or a stream of a scene.
         folder: where the tiles go; absent, empty, or holding these tiles in part or whole.
         tile_rows: Gaussians of a tile at the most; only Gaussians of one position are never parted.
         block_rows: rows in memory at a time; None takes 16 MiB of them.
         lift: how points are lifted; None is `LiftConfig()`.
+        like: tiles whose cells and margin are taken, however many rows they come to hold.
         overwrite: whether tiles of another scene, or of other settings, may be replaced.
         progress: told of rows done.
         say: told what was noticed.
@@ -113,11 +115,10 @@ def ingest(
     [(50, 0, 0.0, 50.0), (50, 0, 50.0, 99.0)]
     """
     folder = Path(folder)
-    sources: list[str | Path] = [source] if isinstance(source, str | Path) else list(source)
     if tile_rows < 1 or (block_rows is not None and block_rows < 1):
         raise InputError(f"tile_rows and block_rows: expected at least 1, got {tile_rows}, {block_rows}")
-    feed = _feed(sources, lift or LiftConfig())
-    settings: dict[str, Any] = {"tile_rows": tile_rows}
+    feed, sources = _feed(source, lift or LiftConfig())
+    settings: dict[str, Any] = {"tile_rows": tile_rows} if like is None else {"like": like.key}
     if isinstance(feed, PointFeed):
         settings["lift"] = asdict(feed.config)
     key = _key(feed.identity(), settings)
@@ -131,15 +132,15 @@ def ingest(
         if isinstance(feed, PointFeed):
             journal = lift_tiles(folder, key, feed, tile_rows, rows, progress, say)
         else:
-            journal = pour(folder, key, feed, tile_rows, rows, progress, say)
+            journal = pour(folder, key, feed, tile_rows, rows, progress, say, like)
     except InputError:
         clear(folder)
         raise
-    notes = [*feed.all_notes(), *_overfull_note(journal, tile_rows)]
+    notes = [*feed.all_notes(), *([] if like else _overfull_note(journal, tile_rows))]
     manifest = {
         "sh_degree": feed.sh_degree,
         "offset": feed.offset.tolist(),
-        "source": [str(path) for path in sources],
+        "source": sources,
         "settings": settings,
         "notes": [asdict(note) for note in notes],
     }
@@ -147,10 +148,17 @@ def ingest(
     return TileStore.open(folder)
 
 
-def _feed(sources: list[str | Path], config: LiftConfig) -> _SceneFeed | PointFeed:
+def _feed(
+    source: str | Path | Sequence[str | Path] | SceneStream, config: LiftConfig
+) -> tuple[_SceneFeed | PointFeed, list[str]]:
+    """What is poured, and the names of where it comes from."""
+    if isinstance(source, SceneStream):
+        return _SceneFeed(source), [str(source.path)]
+    sources: list[str | Path] = [source] if isinstance(source, str | Path) else list(source)
+    names = [str(path) for path in sources]
     if sources and all(kind(path) == "points" for path in sources):
-        return PointFeed(open_point_stream(sources), config)
-    return _SceneFeed(open_stream(sources))
+        return PointFeed(open_point_stream(sources), config), names
+    return _SceneFeed(open_stream(sources)), names
 
 
 def _key(identity: list[Any], settings: dict[str, Any]) -> str:

@@ -15,7 +15,7 @@ from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural
 from g2ard.tiles.cells import Cell, Points, Sampler, cut_cells, margin_of
 from g2ard.tiles.journal import Journal, clear
-from g2ard.tiles.store import tile_name
+from g2ard.tiles.store import TileStore, tile_name
 
 __all__ = ["Feed", "pour"]
 
@@ -54,7 +54,14 @@ class Feed(Protocol):
 
 
 def pour(
-    folder: Path, key: str, feed: Feed, tile_rows: int, rows: int, progress: Progress, say: Say
+    folder: Path,
+    key: str,
+    feed: Feed,
+    tile_rows: int,
+    rows: int,
+    progress: Progress,
+    say: Say,
+    like: TileStore | None = None,
 ) -> Journal:
     """Write all tiles and halos of a feed, going on where an earlier call was interrupted.
 
@@ -66,6 +73,7 @@ def pour(
         rows: rows in memory at a time.
         progress: told of rows read.
         say: told what was decided.
+        like: tiles whose cells and margin are taken, however many rows they come to hold.
 
     Raises:
         InputError: the source is broken, or has no row to be kept.
@@ -73,7 +81,7 @@ def pour(
     """
     journal = Journal.open(folder, feed.row_bytes, type(feed.tally))
     if journal is None:
-        journal = _started(folder, key, feed, tile_rows, rows, progress)
+        journal = _started(folder, key, feed, tile_rows, rows, progress, like)
     else:
         journal.cut()
         say(f"{folder}: goes on after row {journal.next_row:,}")
@@ -85,7 +93,7 @@ def pour(
             journal.save()
             progress("tiles", journal.next_row, feed.count)
         feed.all_notes()
-        parts = _overfull(journal, tile_rows)
+        parts = {} if like else _overfull(journal, tile_rows)
         if not parts:
             return journal
         say(f"{plural(len(parts), 'tile')} hold more than {tile_rows:,} rows; cut once more")
@@ -97,13 +105,23 @@ def pour(
         journal.save()
 
 
-def _started(folder: Path, key: str, feed: Feed, tile_rows: int, rows: int, progress: Progress) -> Journal:
+def _started(
+    folder: Path,
+    key: str,
+    feed: Feed,
+    tile_rows: int,
+    rows: int,
+    progress: Progress,
+    like: TileStore | None,
+) -> Journal:
     """Cut the tiles, and see to it that there is room for them."""
-    cells, points, each = Cell(), np.empty((0, 3), np.float32), 1.0
-    if feed.count > tile_rows:
+    cells, points, each = like.cells if like else Cell(), np.empty((0, 3), np.float32), 1.0
+    if like or feed.count > tile_rows:
         points, each = _sampled(feed, rows, progress)
+    if not like:
         cells = cut_cells(points, each, tile_rows)
-    journal = Journal(folder, key, cells, margin_of(cells, points), feed.row_bytes, type(feed.tally)())
+    margin = like.margin if like else margin_of(cells, points)
+    journal = Journal(folder, key, cells, margin, feed.row_bytes, type(feed.tally)())
     around = each * sum(len(halo) for _, halo in cells.route(points, journal.margin))
     needed, free = int((feed.count + around) * feed.room), shutil.disk_usage(folder).free
     if needed > free:

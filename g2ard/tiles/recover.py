@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from g2ard.cameras import Cameras
 from g2ard.constants import changed, values_of
-from g2ard.errors import InputError
 from g2ard.prepared import PreparedScene
 from g2ard.progress import Progress, silent
 from g2ard.splats import SH_C0, Splats
@@ -31,19 +30,17 @@ from g2ard.tiles.scenes import (
     far_around,
     joined,
     scene_of,
-    small_scene,
     tile_of,
-    within_halo,
 )
 from g2ard.tiles.sights import Surroundings, in_sight, light_of, written
-from g2ard.tiles.simplify import TiledScene, finished
+from g2ard.tiles.simplify import TiledScene, finished, key_of
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.task import Arrays, Task, load
 
 if TYPE_CHECKING:
     from g2ard.policy.views import RunViews
 
-__all__ = ["TiledScores", "recover_tile", "recover_tiles"]
+__all__ = ["TileScore", "TiledScores", "recover_tile", "recover_tiles"]
 
 _MARGIN = 16
 """Pixels around a tile that its images show too: SSIM's windows reach over its edge."""
@@ -56,6 +53,24 @@ _FEWEST = 256
 
 
 @dataclass(frozen=True)
+class TileScore:
+    """A tile's part of `TiledScores`.
+
+    Args:
+        tile: its number.
+        count: its Gaussians.
+        simplified, recovered, pixels, steps: as there; PSNR means nothing without pixels.
+    """
+
+    tile: int
+    count: int
+    simplified: float
+    recovered: float
+    pixels: int
+    steps: int
+
+
+@dataclass(frozen=True)
 class TiledScores:
     """Held-out views, over all pixels that tiles own in them.
 
@@ -64,12 +79,14 @@ class TiledScores:
         recovered: and after it.
         pixels: that it is taken over.
         steps: of all tiles together.
+        tiles: each one's part.
     """
 
     simplified: float
     recovered: float
     pixels: int
     steps: int
+    tiles: tuple[TileScore, ...]
 
 
 class TileTargets(TeacherRenders):
@@ -101,13 +118,13 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
     """A tile's Gaussians after recovery, and what held-out views say of it.
 
     Args:
-        arguments: `tile`; `levels`, see `g2ard.tiles.steps`; `mean`, see `small_scene`; `steps` to take;
-            `config`, recovery's constants by full name; `train`, `test` and `apart`: which views of these
-            inputs have the tile in sight.
-        inputs: `coarse`, what `coarse` made of each tile; `merged` and `again`, what `merge` and `look_again`
-            made of this one; `beside_merged` and `beside_again`, the same of each tile near it, in one order;
-            `train`, `test` and `apart`, cameras in world coordinates.
-        places: `store`, the folder of the dense scene in tiles.
+        arguments: `tile`; `levels`, see `g2ard.tiles.steps`; `steps` to take, 0 to be scored alone; `config`,
+            recovery's constants by full name; `train`, `test` and `apart`: which views of these inputs have
+            the tile in sight.
+        inputs: `coarse`, what `coarse` made of each tile, `own`, of this one; `train`, `test` and `apart`,
+            cameras in world coordinates.
+        places: `store`, the folder of the dense scene in tiles; `student`, of the scene to recover in the
+            same cells.
 
     Returns:
         `scene` (`scene_of`), the tile's Gaussians; `errors`, (2, 2) before and after: the squared error in
@@ -116,12 +133,12 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
     from g2ard.stages.recover import recover
 
     store = TileStore.open(places["store"])
-    core, far = tile_of(arguments, places), far_around(store, arguments, inputs)
+    core, far = tile_of(arguments, inputs, places), far_around(store, arguments, inputs)
     # The tile's own Gaussians first, in teacher and student: masks and `frozen` count on it.
     teacher = joined([part for part in (core, store.read_halo(arguments["tile"]), *far) if len(part)])
-    small = small_scene(inputs, arguments["mean"])
-    beside = _beside(store, arguments, inputs)
-    student = joined([part for part in (small, *beside, *far) if len(part)])
+    smaller = TileStore.open(places["student"])
+    small, beside = smaller.read(arguments["tile"]), smaller.read_halo(arguments["tile"])
+    student = joined([part for part in (small, beside, *far) if len(part)])
     frozen = np.arange(len(student)) >= len(small)
     config = changed(RecoverConfig(), "recover", arguments["config"])
     background = config.background
@@ -131,9 +148,10 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
         found = TileTargets(teacher, len(core), cameras, background)
         return found if len(found.cameras) else None
 
-    train, held_out, apart = targets("train"), targets("test"), targets("apart")
+    held_out, idle = targets("test"), not len(small) or not arguments["steps"]
     before = _errors(student, held_out, background)
-    if train is None or not arguments["steps"]:
+    train, apart = (None, None) if idle else (targets("train"), targets("apart"))
+    if train is None:
         return {**arrays_of(small, "scene"), "errors": np.array([before, before]), "steps": np.array(0)}
     done = recover(
         student,
@@ -150,15 +168,6 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
         "errors": np.array([before, after]),
         "steps": np.array(done.report.steps),
     }
-
-
-def _beside(store: TileStore, arguments: Arguments, inputs: Inputs) -> list[Splats]:
-    """What the tiles near this one were merged to, of each the part within this one's margin."""
-    parts = []
-    for merged, again in zip(inputs["beside_merged"], inputs["beside_again"], strict=True):
-        other = small_scene({"merged": merged, "again": again}, arguments["mean"])
-        parts.append(other.take(within_halo(store, arguments["tile"], other.means)))
-    return parts
 
 
 def _cropped(cameras: Cameras, core: PreparedScene, offset: NDArray[np.float64]) -> Cameras:
@@ -185,7 +194,8 @@ def _errors(
 
 def recover_tiles(
     store: TileStore,
-    small: TiledScene,
+    student: TileStore,
+    around: Surroundings,
     views: RunViews,
     config: RecoverConfig,
     steps: int,
@@ -203,20 +213,15 @@ def recover_tiles(
 
     Args:
         store: the dense scene.
-        small: what `simplify_tiles` made of it, with views.
+        student: what is to be recovered, in the same cells (`ingest(…, like=store)`).
+        around: where the dense scene's tiles stand, as `simplify_tiles` with views tells.
         views: to learn from, to score on, and of another kind to judge by.
         config: of recovery; its steps are not read.
-        steps: of a recovery of all.
+        steps: of a recovery of all; 0 only scores.
         executor: runs the tasks.
         work: a folder for their files.
         progress: told of tiles done.
-
-    Raises:
-        InputError: the scene was simplified without views.
     """
-    around = small.surroundings
-    if around is None:
-        raise InputError("recovery in tiles: needs views")
     sight = {
         name: (written(work, cameras), _seen(store, around, cameras, executor, work, progress))
         for name, cameras in (
@@ -226,18 +231,34 @@ def recover_tiles(
         )
     }
     tasks = [
-        _task(store, around, tile, sight, steps / max(1, len(views.train.cameras)), config, work)
+        _task(store, student, around, tile, sight, steps / max(1, len(views.train.cameras)), config, work)
         for tile in range(len(store.tiles))
     ]
-    paths = executor.run(tasks, "recover", progress)
-    errors = np.sum([load(path, "errors")[0] for path in paths], axis=0)
-    taken = sum(int(load(path, "steps")[0]) for path in paths)
-    psnr = [float(-10 * math.log10(max(e, 1e-12) / max(n, 1))) for e, n in errors]
-    degree = small.sh_degree if config.sh_degree is None else config.sh_degree
-    scene = replace(
-        small, sh_degree=degree, tiles=lambda tile: finished(scene_of(paths[tile], "scene"), degree)
+    paths = executor.run(tasks, "recover" if steps else "score", progress)
+    errors = [load(path, "errors")[0] for path in paths]
+    taken = [int(load(path, "steps")[0]) for path in paths]
+    parts = tuple(
+        TileScore(tile.index, tile.rows, *_psnr(lost), int(lost[0][1]) // 3, steps)
+        for tile, lost, steps in zip(student.tiles, errors, taken, strict=True)
     )
-    return scene, TiledScores(psnr[0], psnr[1], int(errors[0][1]) // 3, taken)
+    lost = np.sum(errors, axis=0)
+    scores = TiledScores(*_psnr(lost), int(lost[0][1]) // 3, sum(taken), parts)
+    degree = student.sh_degree if config.sh_degree is None else config.sh_degree
+    scene = TiledScene(
+        tuple(tile.rows for tile in student.tiles),
+        lambda tile: finished(scene_of(paths[tile], "scene"), degree),
+        degree,
+        store.offset,
+        key_of([paths, degree]),
+        surroundings=around,
+    )
+    return scene, scores
+
+
+def _psnr(errors: NDArray[np.float64]) -> tuple[float, float]:
+    """Before and after, of the (2, 2) `errors` of `recover_tile`."""
+    before, after = (float(-10 * math.log10(max(e, 1e-12) / max(n, 1))) for e, n in errors)
+    return before, after
 
 
 def _seen(
@@ -257,6 +278,7 @@ def _seen(
 
 def _task(
     store: TileStore,
+    student: TileStore,
     around: Surroundings,
     tile: int,
     sight: dict[str, tuple[Path, list[list[int]]]],
@@ -264,7 +286,6 @@ def _task(
     config: RecoverConfig,
     work: Path,
 ) -> Task:
-    near = [other for other, level in enumerate(around.levels[tile]) if level == "near"]
     views = {name: seen[tile] for name, (_, seen) in sight.items()}
     return Task(
         "g2ard.tiles.recover:recover_tile",
@@ -272,20 +293,18 @@ def _task(
         work,
         {
             "store": store.key,
+            "student": student.key,
             "tile": tile,
             "levels": around.levels[tile],
-            "mean": around.mean,
             "steps": round(steps_a_view * len(views["train"])),
             "config": values_of({"recover": config}),
             **views,
         },
         {
+            "own": around.coarse[tile],
             "coarse": around.coarse,
-            **around.files[tile],
-            "beside_merged": [around.files[other]["merged"] for other in near],
-            "beside_again": [around.files[other]["again"] for other in near],
             **{name: path for name, (path, _) in sight.items()},
         },
-        {"store": store.folder},
+        {"store": store.folder, "student": student.folder},
         store.tiles[tile].rows,
     )

@@ -32,6 +32,7 @@ class TiledRun:
         self.store, self.executor, self.work, self.progress = store, executor, work, progress
         self.config = asdict(config.resolved("default"))
         self.sizes = [tile.rows for tile in store.tiles]
+        self.coarse: list[Path] = []
 
     def each(
         self,
@@ -42,9 +43,10 @@ class TiledRun:
         per_tile: list[dict[str, Any]] | None = None,
         inputs: list[dict[str, Any]] | None = None,
     ) -> list[Path]:
-        """One task a tile."""
+        """One task a tile, which reads what the first step made of it."""
         tasks = []
         for tile, rows in enumerate(self.sizes):
+            own = {"own": self.coarse[tile]} if self.coarse else {}
             arguments: dict[str, Any] = {"store": self.store.key, "tile": tile, "config": self.config}
             if frame is not None:
                 arguments["frame"] = list(frame)
@@ -55,16 +57,21 @@ class TiledRun:
                     f"{stage}-{tile:05}",
                     self.work,
                     arguments,
-                    inputs[tile] if inputs else {},
+                    {**own, **(inputs[tile] if inputs else {})},
                     {"store": self.store.folder},
                     rows,
                 )
             )
         return self.executor.run(tasks, stage, self.progress)
 
-    def sampled_frame(self, coarse: list[Path]) -> tuple[float, ...]:
+    def begin(self) -> list[Path]:
+        """The first step: what `g2ard.tiles.steps.coarse` makes of each tile."""
+        self.coarse = self.each("coarse", "coarse")
+        return self.coarse
+
+    def sampled_frame(self) -> tuple[float, ...]:
         """The frame of a fair sample of the scene, without views."""
-        sample = joined([scene_of(path, "sample").with_sh_degree(0) for path in coarse])
+        sample = joined([scene_of(path, "sample").with_sh_degree(0) for path in self.coarse])
         every = -(-len(sample) // _SAMPLED)
         scene, _ = finite_rows_of(sample.take(slice(None, None, every)))
         return _core.TileFrame.of_sample(scene.core, self.config["pixel_scale"]).values()

@@ -77,10 +77,15 @@ def cameras_of(path: Path) -> Cameras:
     return Cameras(viewmats, Ks, widths, heights, tuple(str(i) for i in range(len(viewmats))))
 
 
-def tile_of(arguments: Arguments, places: Places, *, sh: bool = True, check: bool = False) -> PreparedScene:
-    """A tile's Gaussians, with all bands or band 0; the first step checks the contents for all others."""
-    scene = TileStore.open(places["store"]).read(arguments["tile"], sh=sh, check=check)
-    return finite_rows_of(scene)[0]
+def tile_of(arguments: Arguments, inputs: Inputs, places: Places, *, sh: bool = True) -> PreparedScene:
+    """A tile's Gaussians, with all bands or band 0; the first step checks the contents for all others, and
+    finds the order that they take."""
+    known = inputs.get("own")
+    scene = TileStore.open(places["store"]).read(arguments["tile"], sh=sh, check=known is None)
+    prepared = finite_rows_of(scene)[0]
+    if known is not None:
+        prepared.restore(*load(known, "order", "bounds"))
+    return prepared
 
 
 def with_surroundings(core: Splats, arguments: Arguments, inputs: Inputs, places: Places) -> PreparedScene:

@@ -45,14 +45,10 @@ class Surroundings:
     Args:
         coarse: each tile's file of coarse Gaussians.
         levels: for each tile, by which of them every other stands beside it; None is itself.
-        files: each tile's, as `g2ard.tiles.scenes.small_scene` reads them.
-        mean: as it takes it.
     """
 
     coarse: list[Path]
     levels: list[list[str | None]]
-    files: list[dict[str, Path]]
-    mean: float
 
 
 class Sights:
@@ -81,22 +77,19 @@ class Sights:
             pixel = _weighted_median(pixels[known], np.array(run.sizes)[known])
             self.frame = _core.TileFrame(*frame).with_views(pixel, *map(float, sums)).values()
 
-    def surroundings(self, merged: list[Path], count: int) -> Surroundings:
-        """Where the merged tiles stand, `count` Gaussians in all, after another look at them."""
-        run = self.run
+    @property
+    def surroundings(self) -> Surroundings:
+        """Where the tiles stand."""
+        return Surroundings(self.coarse, [given["levels"] for given in self.arguments])
+
+    def again(self, merged: list[Path]) -> list[Path]:
+        """What the same views see of the merged tiles."""
         inputs = [
             {**given, "merged": path, "look": look}
             for given, path, look in zip(self._inputs(), merged, self.looks, strict=True)
         ]
-        again = run.each(
-            "look_again",
-            "look again",
-            per_tile=[{"levels": a["levels"]} for a in self.arguments],
-            inputs=inputs,
-        )
-        mean = sum(float(load(path, "wanted")[0].sum()) for path in merged) / count
-        files = [{"merged": one, "again": other} for one, other in zip(merged, again, strict=True)]
-        return Surroundings(self.coarse, [given["levels"] for given in self.arguments], files, mean)
+        levels = [{"levels": given["levels"]} for given in self.arguments]
+        return self.run.each("look_again", "look again", per_tile=levels, inputs=inputs)
 
     def _inputs(self) -> list[dict[str, Any]]:
         return [{"coarse": self.coarse, "views": self.views} for _ in self.coarse]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.io.stream import PartsStream
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.regions import Region, in_any
 from g2ard.splats import Splats, unit_quats
@@ -26,7 +29,7 @@ from g2ard.tiles.task import load
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
 
-__all__ = ["TiledScene", "finished", "sample_of", "simplify_tiles"]
+__all__ = ["TiledScene", "finished", "key_of", "sample_of", "simplify_tiles"]
 
 _POOL, _POOL_ROWS = 96, 4_000_000
 """Poses to look from for so many Gaussians; more of these, more of those."""
@@ -44,6 +47,7 @@ class TiledScene:
         tiles: reads the Gaussians of a tile, opacities fitted.
         sh_degree: of all.
         offset: (3,) float64.
+        key: tells it from others: a hash of the names of its files.
         views: that the tiles were looked at from; 0 without views.
         unseen: Gaussians of the dense scene that no view sees; None without views.
         surroundings: what recovery needs beside; None without views.
@@ -53,6 +57,7 @@ class TiledScene:
     tiles: Callable[[int], Splats]
     sh_degree: int
     offset: NDArray[np.float64]
+    key: str
     views: int = 0
     unseen: int | None = None
     surroundings: Surroundings | None = None
@@ -62,6 +67,11 @@ class TiledScene:
 
     def __iter__(self) -> Iterator[Splats]:
         return (self.tiles(tile) for tile in range(len(self.counts)))
+
+    def stream(self) -> PartsStream:
+        """The scene to be read tile by tile, as `g2ard.tiles.ingest.ingest` takes it."""
+        name = Path(f"simplified-{self.key}")
+        return PartsStream(name, self.counts, self.tiles, self.sh_degree, self.offset, [self.key])
 
     def whole(self) -> Splats:
         """All tiles as one scene in memory."""
@@ -83,7 +93,8 @@ def simplify_tiles(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> TiledScene:
-    """Reduce a scene in tiles to exactly `budget` Gaussians with the method `default`.
+    """Reduce a scene in tiles to exactly `budget` Gaussians with the method `default`; all there are stay as
+    they are.
 
     1. Each tile is merged to a few coarse Gaussians, which stand for it where others are looked at.
     2. Poses are planned on those; each tile is looked at, by the views that have it in sight, where it stands
@@ -120,16 +131,22 @@ def simplify_tiles(
         raise InputError(f"budget: expected 1 to the {store.count:,} Gaussians there are, got {budget:,}")
     work.mkdir(parents=True, exist_ok=True)
     run = TiledRun(store, executor, work, config or SimplifyConfig(), progress)
-    coarse = run.each("coarse", "coarse")
-    frame = run.sampled_frame(coarse)
+    coarse = run.begin()
+    frame = run.sampled_frame()
+    everything = budget == store.count
     sights: Sights | None = None
-    if not blind:
+    if not (blind or (everything and views is None)):
         sample = joined([scene_of(path, "sample") for path in coarse])
         _check_regions(sample, run.config["keep_region"])
         cameras = views or beside(sample) or _planned(run, sample, up, seed, say)
         sights = None if cameras is None else Sights(run, coarse, cameras, frame)
         frame = frame if sights is None else sights.frame
-    costs = run.each("run_costs", "costs", frame=frame, **_look_of(sights))
+    if everything:
+        return _as_it_is(store, sights)
+    looks: list[dict[str, Any]] = (
+        [{"look": path} for path in sights.looks] if sights else [{} for _ in coarse]
+    )
+    costs = run.each("run_costs", "costs", frame=frame, inputs=looks)
     runs_left = _runs(run, costs, budget)
     share_kept = budget / sum(runs_left)
     plans = run.each(
@@ -137,7 +154,7 @@ def simplify_tiles(
         "plans",
         frame=frame,
         per_tile=[{"runs": n, "expected": share_kept * n} for n in runs_left],
-        **_look_of(sights),
+        inputs=[{"costs": path, **seen} for path, seen in zip(costs, looks, strict=True)],
     )
     merges = cheapest([_costs_of(path) for path in plans], sum(runs_left) - budget)
     _check_reached(sum(runs_left) - sum(merges), budget)
@@ -147,25 +164,24 @@ def simplify_tiles(
         "merge",
         frame=frame,
         per_tile=per_tile,
-        inputs=[
-            {"plan": plan, **({"look": sights.looks[tile]} if sights else {})}
-            for tile, plan in enumerate(plans)
-        ],
+        inputs=[{"plan": path, **seen} for path, seen in zip(plans, looks, strict=True)],
     )
     counts = tuple(n - m for n, m in zip(runs_left, merges, strict=True))
     if sights is None:
         return _scene(store, counts, [{"merged": path} for path in merged], None)
-    around = sights.surroundings(merged, sum(counts))
+    again = sights.again(merged)
+    mean = sum(float(load(path, "wanted")[0].sum()) for path in merged) / sum(counts)
+    files = [{"merged": one, "again": other} for one, other in zip(merged, again, strict=True)]
     unseen = sum(int(load(path, "unseen")[0]) for path in merged)
-    scene = _scene(store, counts, around.files, around.mean)
-    return replace(scene, views=len(sights.cameras), unseen=unseen, surroundings=around)
+    scene = _scene(store, counts, files, mean)
+    return replace(scene, views=len(sights.cameras), unseen=unseen, surroundings=sights.surroundings)
 
 
 def sample_of(store: TileStore, executor: Executor, work: Path, progress: Progress = silent) -> Splats:
     """A fair sample of a scene in tiles; its task is one of `simplify_tiles`, which does not do it again."""
     work.mkdir(parents=True, exist_ok=True)
     run = TiledRun(store, executor, work, SimplifyConfig(), progress)
-    return joined([scene_of(path, "sample") for path in run.each("coarse", "coarse")])
+    return joined([scene_of(path, "sample") for path in run.begin()])
 
 
 def _scene(
@@ -176,7 +192,25 @@ def _scene(
     def tile(i: int) -> Splats:
         return finished(small_scene(files[i], mean), store.sh_degree)
 
-    return TiledScene(counts, tile, store.sh_degree, store.offset)
+    return TiledScene(counts, tile, store.sh_degree, store.offset, key_of(files))
+
+
+def _as_it_is(store: TileStore, sights: Sights | None) -> TiledScene:
+    return TiledScene(
+        tuple(tile.rows for tile in store.tiles),
+        lambda tile: store.read(tile, check=False),
+        store.sh_degree,
+        store.offset,
+        key_of(store.key),
+        0 if sights is None else len(sights.cameras),
+        surroundings=None if sights is None else sights.surroundings,
+    )
+
+
+def key_of(files: Any) -> str:
+    """16 hexadecimal digits of the names of files, which hold the hashes of what decides their content."""
+    names = json.dumps(files, default=lambda path: path.name)
+    return hashlib.sha256(names.encode()).hexdigest()[:16]
 
 
 def finished(small: Splats, sh_degree: int) -> Splats:
@@ -189,10 +223,6 @@ def _check_regions(sample: Splats, regions: Sequence[Region]) -> None:
         raise InputError(
             f"keep_region: none of {len(sample):,} Gaussians, a fair sample of the scene, lies there"
         )
-
-
-def _look_of(sights: Sights | None) -> dict[str, Any]:
-    return {} if sights is None else {"inputs": [{"look": path} for path in sights.looks]}
 
 
 def _planned(run: TiledRun, sample: Splats, up: Any, seed: int, say: Say) -> Cameras | None:

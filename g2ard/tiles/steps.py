@@ -6,8 +6,8 @@ Between the steps tiles agree on a frame that costs are measured in, and on what
 - arguments: `tile`, its number; `config`, the fields of a `SimplifyConfig`; `frame`, the values of the
   `_core.TileFrame` of all tiles; `levels`, for each tile by which of its coarse scenes ("near", "far") it
   stands beside this one, None for this one itself.
-- inputs: `coarse`, what `coarse` made of each tile; `views`, cameras in world coordinates; `look`, what
-  `look` made of this tile, not there without views.
+- inputs: `own`, what `coarse` made of this tile, for all steps but that one; `coarse`, the same of each tile;
+  `views`, cameras in world coordinates; `look`, what `look` made of this tile, not there without views.
 - places: `store`, the folder of the scene in tiles.
 
 N rows are those of the tile with finite values, ordered rows the same in Morton order.
@@ -67,15 +67,22 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         places: `store`.
 
     Returns:
-        Three scenes (`scene_of`): `near`, `far`, `sample`.
+        Three scenes (`scene_of`): `near`, `far`, `sample`; `order`, (N,) the tile's rows in Morton order, and
+        `bounds` that it is found in.
     """
-    scene = tile_of(arguments, places, check=True)
+    scene = tile_of(arguments, inputs, places)
     config = replace(_config(arguments), keep_region=())  # for what other tiles see of this one
     some = _widened(scene.take(scene.core.order[::_THINNED]), _THINNED)
     near = simplify(some, max(1, len(scene) // COARSE[0]), method="fast", config=config).splats
     far = simplify(near, max(1, len(scene) // COARSE[1]), method="fast", config=config).splats
     rows = scene.core.order[:: COARSE[0]]
-    return {**arrays_of(near, "near"), **arrays_of(far, "far"), **arrays_of(scene.take(rows), "sample")}
+    return {
+        **arrays_of(near, "near"),
+        **arrays_of(far, "far"),
+        **arrays_of(scene.take(rows), "sample"),
+        "order": scene.core.order,
+        "bounds": np.array(scene.core.bounds),
+    }
 
 
 def glance(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
@@ -123,7 +130,7 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         numbers of the views that looked; `share`, the part of `all_light` that they have, which `weight` was
         divided by; `near`, their near plane.
     """
-    own = tile_of(arguments, places, sh=False)
+    own = tile_of(arguments, inputs, places, sh=False)
     cameras = cameras_of(inputs["views"]).recentred(own.offset)
     here = cameras.take(arguments["views"])
     distance = np.median(np.linalg.norm(here.positions - own.core.origin, axis=1)) if len(here) else 0.0
@@ -169,7 +176,7 @@ def run_costs(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     Returns:
         `costs`, (R − 1,) float32, one for each gap between the R ordered rows that a renderer draws.
     """
-    scene = tile_of(arguments, places, sh=False)
+    scene = tile_of(arguments, inputs, places, sh=False)
     return {"costs": _seen_tile(scene, arguments, inputs).run_costs()}
 
 
@@ -179,7 +186,7 @@ def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     Args:
         arguments: `tile`, `config`, `frame`; `runs`, down to how many; `expected`, how many Gaussians
             of it the budget is expected to leave.
-        inputs: `look`.
+        inputs: `look`; `costs`, what `run_costs` made.
         places: `store`.
 
     Returns:
@@ -187,12 +194,13 @@ def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         joins run a; `costs`, (M,) float32 of each, or of the dearest before it if that is more: no merge may
         be done without those before it.
     """
-    scene = tile_of(arguments, places)
+    scene = tile_of(arguments, inputs, places)
     config = _config(arguments).resolved("default")
     runs, expected = arguments["runs"], arguments["expected"]
     last = max(1, min(runs, round(_DEEPER * expected)))
     counts = schedule(runs, last, config.retention_of("default"), config.fold)
-    of, a, b, costs = _seen_tile(scene, arguments, inputs).plan(runs, counts)
+    tile = _seen_tile(scene, arguments, inputs)
+    of, a, b, costs = tile.plan(runs, counts, load(inputs["costs"], "costs")[0])
     return {"of": of, "a": a, "b": b, "costs": np.maximum.accumulate(costs) if len(costs) else costs}
 
 
@@ -209,7 +217,7 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         each stands for; with views `wanted`, (n,) Σ αT of those, and `unseen`, how many rows no view sees;
         `clamped`, how many opacities were.
     """
-    scene = tile_of(arguments, places)
+    scene = tile_of(arguments, inputs, places)
     runs, merges = arguments["runs"], arguments["merges"]
     of, a, b = load(inputs["plan"], "of", "a", "b")
     into = np.arange(runs)

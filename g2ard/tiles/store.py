@@ -23,7 +23,7 @@ from g2ard.io.types import Note
 from g2ard.splats import Splats
 from g2ard.tiles.cells import Cell
 
-__all__ = ["MANIFEST", "Tile", "TileStore", "halo_name", "packed", "row_width", "tile_name"]
+__all__ = ["MANIFEST", "Tile", "TileStore", "halo_name", "packed", "row_width", "tile_name", "unpacked"]
 
 MANIFEST = "tiles.json"
 FORMAT, VERSION = "g2ard tiles", 1
@@ -57,6 +57,20 @@ def packed(splats: Splats) -> NDArray[np.float32]:
     rows[:, 11:14] = splats.sh0[:, 0]
     rows[:, 14:] = splats.shN.reshape(len(splats), rows.shape[1] - 14)
     return rows
+
+
+def unpacked(rows: NDArray[np.float32], offset: NDArray[np.float64]) -> Splats:
+    """The scene of which `packed` gives these rows."""
+    rest = (rows.shape[1] - 14) // 3
+    return Splats(
+        means=np.ascontiguousarray(rows[:, :3]),
+        quats=np.ascontiguousarray(rows[:, 3:7]),
+        scales=np.ascontiguousarray(rows[:, 7:10]),
+        logit_opacities=np.ascontiguousarray(rows[:, 10]),
+        sh0=np.ascontiguousarray(rows[:, None, 11:14]),
+        shN=np.ascontiguousarray(rows[:, 14:]).reshape(len(rows), rest, 3),
+        offset=offset.copy(),
+    )
 
 
 @dataclass(frozen=True)
@@ -206,15 +220,14 @@ class TileStore:
         tile = self.tiles[index]
         return self._read(halo_name(index), tile.halo, tile.checks[1], sh)
 
-    def means(self, index: int) -> NDArray[np.float32]:
-        """(rows, 3) a view of the mapped file: the means of a tile's own rows, contents not checked."""
+    def rows(self, index: int) -> NDArray[np.float32]:
+        """(rows, 14 + 3K) a view of the mapped file of a tile's own rows, contents not checked."""
         tile = self.tiles[index]
+        shape = (tile.rows, row_width(self.sh_degree))
         if not tile.rows:
-            return np.empty((0, 3), np.float32)
+            return np.empty(shape, np.float32)
         self._check_size(tile_name(index), tile.rows)
-        width = row_width(self.sh_degree)
-        rows = np.memmap(self.folder / tile_name(index), "<f4", "r", shape=(tile.rows, width))
-        return rows[:, :3]
+        return np.memmap(self.folder / tile_name(index), "<f4", "r", shape=shape)
 
     def _read(self, name: str, count: int, check: int | None, sh: bool) -> Splats:
         self._check_size(name, count)

@@ -11,10 +11,22 @@ import typer
 from g2ard.cli.budget_options import Ratios
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import BackgroundOption, ResumeOption, SizeOption, UpOption, ViewsOrMadeOption
+from g2ard.cli.tile_options import (
+    MemoryOption,
+    SchedulerOption,
+    TileRowsOption,
+    WorkersOption,
+    WorkOption,
+    tiling_of,
+)
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    from g2ard.levels import Cut
+    from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.levels import Levels
+    from g2ard.policy.tiled import Tiling
+    from g2ard.policy.tiled_levels import TiledLevels
 
 
 @command("lod", example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/")
@@ -60,27 +72,56 @@ def lod(
     background: BackgroundOption = None,
     up: UpOption = None,
     resume: ResumeOption = False,
+    tile_rows: TileRowsOption = None,
+    memory: MemoryOption = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    work: WorkOption = None,
 ) -> None:
-    """Write levels of detail that viewers stream: each merged from the one before, and recovered."""
+    """Write levels of detail that viewers stream: each merged from the one before, and recovered.
+
+    A scene larger than memory, or a folder of tiles, is worked on tile by tile.
+    """
     from g2ard.cli.resume import check_stopped, left_at, stoppable
+    from g2ard.cli.run_folder import check_same_options, note_options
     from g2ard.io import kind
     from g2ard.io.atomic import check_output
     from g2ard.levels import Cut, save_levels
+    from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.levels import lod as levels_of
+    from g2ard.policy.tiled import LEVELS_TIMES, check_memory, is_tiled
 
     if kind(scene) == "points":
         raise typer.BadParameter(
             "a cloud has no renders to learn from: distil it first, then `lod` its scene"
         )
-    meta, work = output / "lod-meta.json", output.with_name(f".{output.name}.unfinished")
+    meta, stopped = output / "lod-meta.json", output.with_name(f".{output.name}.unfinished")
     run.spare_inputs(meta)
-    if left_at(work) or not (resume and meta.exists()):
-        check_output(output, run.overwrite, folder=True)
-    if resume and meta.exists() and not left_at(work) and not run.overwrite:
+    tiling = tiling_of(run, output, tile_rows, memory, workers, scheduler, work)
+    tiled = is_tiled(scene, tiling)
+    finished = resume and meta.exists() and not run.overwrite and (tiled or not left_at(stopped))
+    if finished:
         _check_same(meta, ratios)
-    check_stopped(run, work, resume, meta)
+    else:
+        check_output(output, run.overwrite, folder=True)
+    going_on = (finished or not tiled) and check_stopped(run, stopped, resume, meta)
     rule = Cut(most * 1024, extent, least * 1024)
-    with stoppable(run, work, resume):
+    if tiled:
+        options = DistillOptions(
+            views=views,
+            steps=steps,
+            size=size,
+            background=background or (0.0, 0.0, 0.0),
+            up=up,
+            seed=run.seed,
+        )
+        _in_tiles(run, scene, output, ratios, tiling, options, recover, rule, errors)
+        return
+    check_memory(scene, tiling, LEVELS_TIMES)
+    if going_on:
+        check_same_options(run, stopped, besides=("errors", "most", "extent", "least"))
+    with stoppable(run, stopped, resume):
+        note_options(run, stopped)
         levels = levels_of(
             scene,
             ratios=ratios,
@@ -91,7 +132,7 @@ def lod(
             background=background or (0.0, 0.0, 0.0),
             up=up,
             seed=run.seed,
-            work=work,
+            work=stopped,
             progress=run.progress,
             say=run.say,
         )
@@ -99,6 +140,41 @@ def lod(
             output, levels.splats, cut=rule, errors=errors, overwrite=run.overwrite, progress=run.progress
         )
     _tell(run, output, levels, size_of_all)
+
+
+def _in_tiles(
+    run: Run,
+    scene: Path,
+    output: Path,
+    ratios: Sequence[float],
+    tiling: Tiling,
+    options: DistillOptions,
+    recover: bool,
+    rule: Cut,
+    errors: bool,
+) -> None:
+    """What is done stays in the tiling's folder until all is, longer where the user named the folder."""
+    from g2ard.levels import save_levels
+    from g2ard.memory import peak_rss
+    from g2ard.policy.tiled import forget
+    from g2ard.policy.tiled_levels import lod_in_tiles
+
+    assert tiling.folder is not None
+    run.kept = [f"what is done stands in {tiling.folder}, and the same command goes on"]
+    levels = lod_in_tiles(scene, ratios, tiling, options, recover=recover, progress=run.progress, say=run.say)
+    begun = tiling.folder / f"written-{levels.key(rule, errors)}"
+    begun.mkdir(exist_ok=True)
+    size = save_levels(
+        output,
+        levels.scenes,
+        cut=rule,
+        errors=errors,
+        overwrite=run.overwrite,
+        work=begun,
+        progress=run.progress,
+    )
+    _tell(run, output, levels, size, peak_rss_bytes=peak_rss())
+    forget(tiling)
 
 
 def _check_same(meta: Path, ratios: Sequence[float]) -> None:
@@ -114,7 +190,7 @@ def _check_same(meta: Path, ratios: Sequence[float]) -> None:
         raise OutputError(f"{meta}: levels of {levels} Gaussians, made with other -r; -w makes them anew")
 
 
-def _tell(run: Run, output: Path, levels: Levels, size: int) -> None:
+def _tell(run: Run, output: Path, levels: Levels | TiledLevels, size: int, **more: Any) -> None:
     for number, report in enumerate(levels.reports):
         figures = [
             f"{psnr:.2f} dB {what}"
@@ -125,4 +201,4 @@ def _tell(run: Run, output: Path, levels: Levels, size: int) -> None:
         run.say(f"level {number}: {plural(report.count, 'Gaussian')}{told}")
     run.say(f"{output}: {plural(len(levels.reports), 'level')}, {size / 1e6:.2f} MB")
     result: dict[str, Any] = {"output": str(output), "bytes": size}
-    run.result({**result, "levels": [report.as_dict() for report in levels.reports]})
+    run.result({**result, "levels": [report.as_dict() for report in levels.reports], **more})

@@ -91,7 +91,7 @@ def simplify(
     from g2ard.policy.fit import aim_of
     from g2ard.policy.inputs import say_notes
     from g2ard.policy.simplify import Reduction
-    from g2ard.policy.tiled import check_memory, is_tiled
+    from g2ard.policy.tiled import WHOLE_TIMES, check_memory, is_tiled
 
     config = SimplifyConfig(retention=retention, keep_region=tuple(keep_region or ()))
     config = changed(config, "simplify", values)
@@ -102,13 +102,13 @@ def simplify(
         tiled = TiledCommand(run, scene, outputs, tiling, budgets)
         tiled.simplify(config, views, no_views, up)
         return
+    check_memory(scene, tiling, WHOLE_TIMES)
     maps = None if parents is None else Outputs(run, parents, budgets, name="--parents")
     if maps is not None:
         maps.check(lambda path, _: _check_parents(run, path, scene, views))
     clock = [time.perf_counter()]
     found = io.read_scene(scene)
     say_notes(scene, found.notes, run.say)
-    check_memory(found.splats, tiling, str(scene))
     total = len(found.splats)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite), total)
     clock.append(time.perf_counter())

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use g2ard_core::scene::{Means, Ordered, SceneRef};
+use g2ard_core::spatial::RobustBounds;
 use numpy::{
     PyArray1, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods,
 };
@@ -64,11 +65,30 @@ impl PyScene {
 
 #[pymethods]
 impl PyScene {
+    /// `known`: the `order` and `bounds` of the same scene, found before.
     #[new]
-    fn new(py: Python<'_>, splats: &Bound<'_, PyAny>) -> PyResult<Self> {
-        let arrays: PySplats<'_> = splats.extract()?;
-        let scene = arrays.borrow()?;
-        let ordered = long(py, None, |_| Ordered::new(&scene))?;
+    #[pyo3(signature = (splats, known = None))]
+    fn new(
+        py: Python<'_>,
+        splats: &Bound<'_, PyAny>,
+        known: Option<(PyReadonlyArray1<'_, u32>, [f64; 4])>,
+    ) -> PyResult<Self> {
+        let rows: PySplats<'_> = splats.extract()?;
+        let scene = rows.borrow()?;
+        let known = match known {
+            Some((order, [x, y, z, radius])) => {
+                let origin = [x, y, z];
+                Some((
+                    arrays::flat("order", &order)?.to_vec(),
+                    RobustBounds { origin, radius },
+                ))
+            }
+            None => None,
+        };
+        let ordered = long(py, None, |_| match known {
+            Some((order, bounds)) => Ordered::restored(&scene, order, bounds),
+            None => Ordered::new(&scene),
+        })?;
         Ok(Self {
             splats: splats.clone().unbind(),
             ordered: Arc::new(ordered),
@@ -84,6 +104,13 @@ impl PyScene {
     #[getter]
     fn origin(&self) -> [f64; 3] {
         self.ordered.bounds.origin
+    }
+
+    /// The median point, and the radius of the cube about it that Morton codes divide.
+    #[getter]
+    fn bounds(&self) -> [f64; 4] {
+        let [x, y, z] = self.ordered.bounds.origin;
+        [x, y, z, self.ordered.bounds.radius]
     }
 
     /// (N,) the rows in the order that only the scene's content decides.

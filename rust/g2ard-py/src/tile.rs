@@ -138,16 +138,20 @@ impl PyTileMerging {
     }
 
     /// The run of each row in the scene's order, or 2³² − 1, and merges `a`, `b` of runs with their costs.
-    #[pyo3(signature = (runs, schedule, progress=None))]
+    #[pyo3(signature = (runs, schedule, costs, progress=None))]
     fn plan<'py>(
         &self,
         py: Python<'py>,
         runs: usize,
         schedule: Vec<usize>,
+        costs: PyReadonlyArray1<'py, f32>,
         progress: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<(Rows<'py>, Rows<'py>, Rows<'py>, Floats<'py>)> {
+        let costs = arrays::flat("costs", &costs)?;
         let plan = self.with(py, |tile| {
-            long(py, progress, |control| tile.plan(runs, &schedule, control))
+            long(py, progress, |control| {
+                tile.plan(runs, &schedule, costs, control)
+            })
         })?;
         let names =
             |of: fn(&g2ard_core::simplify::Pair) -> u32| plan.merges.iter().map(of).collect();

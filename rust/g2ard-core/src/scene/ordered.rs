@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use super::{Gaussian, SceneRef};
 use crate::linalg::{rotation_from_quat, sub};
 use crate::spatial::{RobustBounds, code, codes, order};
-use crate::{Result, Splats};
+use crate::{Error, Result, Splats};
 
 /// Merged means lie on a grid of this share of the scene's radius (rounded down to a power of two), so
 /// that adding back a dyadic origin rounds nothing.
@@ -35,7 +35,27 @@ impl Ordered {
         for run in ties.filter(|run| run.len() > 1) {
             run.sort_by(|&a, &b| scene.compare(a as usize, b as usize).then(a.cmp(&b)));
         }
-        Ok(Self {
+        Ok(Self::of(scene, rows, bounds))
+    }
+
+    /// An order that `new` found before, of the same scene.
+    pub fn restored(scene: &SceneRef, rows: Vec<u32>, bounds: RobustBounds) -> Result<Self> {
+        scene.validate()?;
+        let mut there = vec![false; scene.len()];
+        for &row in &rows {
+            if let Some(flag) = there.get_mut(row as usize) {
+                *flag = true;
+            }
+        }
+        if rows.len() != scene.len() || there.contains(&false) {
+            let expected = format!("each of {} rows once", scene.len());
+            return Err(Error::invalid("order", expected, rows.len()));
+        }
+        Ok(Self::of(scene, rows, bounds))
+    }
+
+    fn of(scene: &SceneRef, rows: Vec<u32>, bounds: RobustBounds) -> Self {
+        Self {
             rows,
             bounds,
             grid: power_of_two_below(bounds.radius) * MEAN_GRID,
@@ -44,7 +64,7 @@ impl Ordered {
                 .iter()
                 .filter(|v| v.is_infinite())
                 .count(),
-        })
+        }
     }
 
     /// Morton codes in the scene's order, ascending.
@@ -107,7 +127,6 @@ fn power_of_two_below(x: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Error;
     use crate::scene::Means;
 
     #[test]

@@ -92,8 +92,14 @@ impl Tile<'_> {
     }
 
     /// Merges down to `runs` runs along Morton order, then pairs of neighbours in rounds down to each count of
-    /// `schedule`.
-    pub fn plan(&self, runs: usize, schedule: &[usize], control: &Control) -> Result<TilePlan> {
+    /// `schedule`; `costs` are those of [`Tile::run_costs`].
+    pub fn plan(
+        &self,
+        runs: usize,
+        schedule: &[usize],
+        costs: &[f32],
+        control: &Control,
+    ) -> Result<TilePlan> {
         self.policy.check(self.scene, self.visibility, None)?;
         let (blur, kept) = (self.blurs(), self.kept());
         let leaves = self.leaves(kept.clone(), &blur);
@@ -104,10 +110,13 @@ impl Tile<'_> {
                 runs,
             ));
         }
+        if costs.len() + 1 != leaves.len() {
+            let expected = format!("{} gaps", leaves.len() - 1);
+            return Err(Error::invalid("costs", expected, costs.len()));
+        }
         control.begin((runs - schedule.last().map_or(runs, |&last| last.min(runs))) as u64);
         let (mut nodes, at) = if runs < leaves.len() {
-            let costs = merge_costs(&leaves.codes(), &leaves, self.geometric());
-            let parts = cut(&costs, runs);
+            let parts = cut(costs, runs);
             let merged = leaves.merged(&parts);
             // Runs in Morton order anew, and each kept row's run there.
             let every: Vec<u32> = (0..runs as u32).collect();

@@ -1,0 +1,36 @@
+"""Folders of tiles (`g2ard ingest`) as scenes, where a scene is wanted in one piece or in blocks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from g2ard.io.stream import PartsStream
+from g2ard.io.types import Scene
+
+__all__ = ["read", "stream"]
+
+
+def read(path: Path) -> Scene:
+    """All tiles as one scene, tile after tile.
+
+    Raises:
+        InputError: the manifest or a tile is broken.
+    """
+    from g2ard.tiles.scenes import joined
+    from g2ard.tiles.store import TileStore
+
+    store = TileStore.open(path)
+    return Scene(joined([store.read(tile.index) for tile in store.tiles]), store.notes)
+
+
+def stream(path: Path) -> PartsStream:
+    """The same, a tile at a time.
+
+    Raises:
+        InputError: the manifest is broken.
+    """
+    from g2ard.tiles.store import TileStore
+
+    store = TileStore.open(path)
+    counts = [tile.rows for tile in store.tiles]
+    return PartsStream(path, counts, store.read, store.sh_degree, store.offset, [store.key], store.notes)
