@@ -123,7 +123,10 @@ class _Items(list[Any]):
         return _within(super().__getitem__(at), self)
 
     def __iter__(self) -> Iterator[Any]:
-        return (self[at] for at in range(len(self)))
+        """Whoever takes all of them asks for the list: entries are named only while they are held."""
+        for at, value in enumerate(super().__iter__()):
+            yield self[at] if isinstance(value, dict | list) else value
+        self._asked.name = self._inside
 
 
 def _within(value: Any, holder: Fields | _Items) -> Any:
