@@ -14,6 +14,7 @@ FUNCTION, FILE = 80, 400
 
 REASONS: dict[str, str] = {
     "g2ard/cli/commands/distill.py: distill": "a command's parameters are its options",
+    "g2ard/cli/commands/lod.py: lod": "a command's parameters are its options",
     "g2ard/cli/commands/recover.py: recover": "a command's parameters are its options",
     "g2ard/cli/commands/register.py: register": "a command's parameters are its options",
     "g2ard/cli/commands/simplify.py: simplify": "a command's parameters are its options",

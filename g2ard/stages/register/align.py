@@ -41,6 +41,8 @@ Mask = NDArray[np.bool_]
 _DAMPING = 1e-6
 """Added to the normal equations' diagonal, relatively."""
 _HALVINGS = 3
+_COARSER = 10
+"""`still` of every level but the finest: the next one looks more closely."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +182,9 @@ def align(
     """
     state = Aligned(np.asarray(start, np.float64), 1.0, 0.0, None, 0.0, 0, 0.0)
     for number, (camera, photo) in enumerate(pyramid):
-        found = _level(renderer, state, camera, photo, config, fresh=number == 0)
+        last = number == len(pyramid) - 1
+        still = config.still if last else _COARSER * config.still
+        found = _level(renderer, state, camera, photo, config, still, fresh=number == 0)
         if found is None:
             return None
         state = found
@@ -193,10 +197,12 @@ def _level(
     camera: Camera,
     photo: Level,
     config: RegisterConfig,
+    enough: float,
     *,
     fresh: bool,
 ) -> Aligned | None:
-    """Gauss–Newton at one size; a step that costs more is halved; the level ends where that fails."""
+    """Gauss–Newton at one size; a step that costs more is halved; the level ends where that fails, or where a
+    step moves the image by fewer pixels than `enough`."""
 
     def shot_at(viewmat: Float) -> Shot:
         return shoot(renderer, replace(camera, viewmat=viewmat), config)
@@ -230,7 +236,7 @@ def _level(
             step = step / 2
         if not better or step is None:
             break
-        still = moves(shot, camera.K, step[:6]) < config.still
+        still = moves(shot, camera.K, step[:6]) < enough
         pose, shot, normal, (gain, bias) = trial, seen, after, light
         if still:
             break

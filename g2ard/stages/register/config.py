@@ -28,7 +28,8 @@ class RegisterConfig:
         passes: of rendering, matching and solving, at most.
         coarsest: pixels of the longer side that alignment begins at; it doubles from level to level.
         iterations: at most, at each level.
-        still: a level ends when a step moves the image by fewer pixels (root of the mean square).
+        still: the finest level ends when a step moves the image by fewer pixels (root of the mean square), a
+            coarser one at ten times as many.
         accept: median local ZNCC from which a photo counts as registered.
         doubt: the same, from which it counts as uncertain; below, it is refused.
         max_angle_sigma: degrees; a registered photo's rotation is known better than this.
@@ -62,8 +63,8 @@ class RegisterConfig:
     still: float = 0.01
     accept: float = 0.6
     doubt: float = 0.35
-    max_angle_sigma: float = 0.5
-    max_position_sigma: float = 0.02
+    max_angle_sigma: float = 0.7
+    max_position_sigma: float = 0.03
     min_alpha: float = 0.5
     max_edge: float = 0.1
     min_overlap: float = 0.1

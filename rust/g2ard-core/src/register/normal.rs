@@ -61,6 +61,9 @@ pub struct Normal {
     pub weights: f64,
 }
 
+/// Of one row of pixels that count: the unknowns' derivatives, the residuals and their weights.
+type Columns = [Vec<f64>; UNKNOWNS + 2];
+
 /// Sums of one row of pixels.
 struct Sums {
     products: [[f64; UNKNOWNS]; UNKNOWNS],
@@ -119,8 +122,8 @@ pub fn normal_equations(
     if !(scale.is_finite() && scale > 0.0) {
         return Err(Error::invalid("scale", "a positive number", scale));
     }
-    let row = |buffers: &mut [Vec<f64>; UNKNOWNS + 2], y: usize| -> Sums {
-        buffers.iter_mut().for_each(Vec::clear);
+    let row = |columns: &mut Columns, y: usize| -> Sums {
+        columns.iter_mut().for_each(Vec::clear);
         let mut cost = 0.0;
         let ray_y = (y as f64 + 0.5 - lens.cy) / lens.fy;
         for i in counted(y) {
@@ -135,41 +138,43 @@ pub fn normal_equations(
             let q = -lens.fy * (light.gain * down + photo.down[i]) / 2.0;
             let ray_x = (x as f64 + 0.5 - lens.cx) / lens.fx;
             let of_motion = motion(ray_x, ray_y, shot.depth[i], p, q);
-            for (column, value) in buffers.iter_mut().zip(of_motion) {
-                column.push(value);
-            }
             let rest = [shot.grey[i], 1.0, r, inlying * inlying];
-            for (column, value) in buffers[MOTION..].iter_mut().zip(rest) {
+            let values = of_motion.into_iter().chain(rest);
+            for (column, value) in columns.iter_mut().zip(values) {
                 column.push(value);
             }
         }
-        let (columns, rest) = buffers.split_at(UNKNOWNS);
-        let [residuals, weights] = rest else {
-            unreachable!("two follow the unknowns")
-        };
-        let mut out = Sums {
-            products: [[0.0; UNKNOWNS]; UNKNOWNS],
-            right: [0.0; UNKNOWNS],
-            cost,
-            weights: weights.iter().sum(),
-        };
-        let mut weighted = vec![0.0; weights.len()];
-        for (a, column) in columns.iter().enumerate() {
-            for (out, (value, weight)) in weighted.iter_mut().zip(column.iter().zip(weights)) {
-                *out = value * weight;
-            }
-            out.right[a] = dot(&weighted, residuals);
-            for (b, other) in columns.iter().enumerate().skip(a) {
-                out.products[a][b] = dot(&weighted, other);
-            }
-        }
-        out
+        Sums::of(columns, cost)
     };
     let rows: Vec<Sums> = rows
         .into_par_iter()
         .map_init(|| std::array::from_fn(|_| Vec::new()), row)
         .collect();
     Ok(added(&rows, scale, number))
+}
+
+impl Sums {
+    fn of(columns: &Columns, cost: f64) -> Self {
+        let (unknowns, rest) = columns.split_at(UNKNOWNS);
+        let (residuals, weights) = (&rest[0], &rest[1]);
+        let mut out = Self {
+            products: [[0.0; UNKNOWNS]; UNKNOWNS],
+            right: [0.0; UNKNOWNS],
+            cost,
+            weights: weights.iter().sum(),
+        };
+        let mut weighted = vec![0.0; weights.len()];
+        for (a, column) in unknowns.iter().enumerate() {
+            for (out, (value, weight)) in weighted.iter_mut().zip(column.iter().zip(weights)) {
+                *out = value * weight;
+            }
+            out.right[a] = dot(&weighted, residuals);
+            for (b, other) in unknowns.iter().enumerate().skip(a) {
+                out.products[a][b] = dot(&weighted, other);
+            }
+        }
+        out
+    }
 }
 
 fn added(rows: &[Sums], scale: f64, number: usize) -> Normal {
