@@ -220,6 +220,8 @@ def test_the_command_writes_views_and_says_how_good_they_are(
         ("--photos views.json --metres-per-unit 2", 2, "goes with --truth"),
         ("--photos views.json --keep some", 2, "keep"),
         ("--photos views.json --protocol gs-cpr --passes 2", 2, "gs-cpr decides --passes"),
+        ("--photos views.json --report page.txt", 2, "a page is written as .html"),
+        ("--photos empty --focal 128", 1, "neither photos nor views in this folder"),
         ("--photos views.json --protocol gs-cpr --matcher direct", 2, "gs-cpr decides --matcher"),
         ("--photos views.json --report scene.ply -w", 2, "would be written over"),
         ("--photos views.json --pool absent.json", 1, "absent.json"),
@@ -229,6 +231,7 @@ def test_the_command_writes_views_and_says_how_good_they_are(
 def test_errors_are_one_line(
     arguments: str, status: int, words: str, site: Path, command_line: CommandLine, tmp_path: Path
 ) -> None:
+    (site / "empty").mkdir(exist_ok=True)
     (site / "other.txt").write_text("elsewhere.png 1 0 0 0 0 0 0\n")
     (site / "away.txt").write_text("view_000.png 0 1 0 0 0 0 90\n")
     truth = read_views(site / "truth.json")
@@ -316,3 +319,41 @@ def test_the_protocol_of_gs_cpr(site: Path, command_line: CommandLine, tmp_path:
     assert (tmp_path / "page.html").read_text().count('<figure class="wide">') == sum(
         row["inliers"] > 0 for row in rows
     )
+
+
+def test_photos_that_are_all_broken_are_refused_rows(
+    site: Path, command_line: CommandLine, tmp_path: Path
+) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/view_000.png").write_bytes(b"\x89PNG broken")
+    for lens in (("--focal", "128"), ("--intrinsics", site / "truth.json")):
+        status, out, err = command_line(
+            *("register", site / "scene.ply", "--photos", "photos", *lens, "--poses", site / "coarse.txt"),
+            *("-o", "poses.json", "--report", "page.html", "--json", "-", "-w"),
+            cwd=tmp_path,
+        )
+        assert status == 1, err
+        assert "none of 1 photo was registered; view_000.png" in err
+        assert json.loads(out)["photos"][0]["status"] == "refused"
+        assert (tmp_path / "page.html").is_file()
+
+
+def test_what_keeps_its_start_is_in_the_report(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
+    (tmp_path / "wild.py").write_text(
+        "import numpy as np\n"
+        "def match(photo, render):\n"
+        "    a = np.random.default_rng(0).random((40, 2)) * photo.shape[1::-1]\n"
+        "    return a, a[::-1], np.ones(40)\n"
+    )
+    pytest.importorskip("pycolmap")
+    status, out, err = command_line(
+        *("register", site / "scene.ply", "--photos", site / "views.json", "--poses", site / "coarse.txt"),
+        *("--protocol", "gs-cpr", "--matcher", "wild:match", "--size", "128"),
+        *("-o", "poses.json", "--report", "page.html", "--json", "-"),
+        cwd=tmp_path,
+    )
+    assert status == 0, err
+    result = json.loads(out)
+    assert any(row["zncc"] is None for row in result["photos"])
+    assert (result["config"]["passes"], result["config"]["keep"]) == (1, "all")
+    assert "kept where it started" in (tmp_path / "page.html").read_text()

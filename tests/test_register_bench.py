@@ -71,7 +71,7 @@ def test_rows_say_what_was_found_and_from_where(tmp_path: Path) -> None:
 def test_its_command(command_line: CommandLine, tmp_path: Path) -> None:
     write_views(tmp_path / "views.json", _site(tmp_path))
     call = ("bench", "register", "ball.ply", "--photos", "views.json", "--matchers", "direct")
-    options = ("--starts", "A,D", "--size", "128", "--json", "-")
+    options = ("--starts", "A,D", "--ratios", "1", "--seeds", "1", "--size", "128", "--json", "-")
     status, out, err = command_line(*call, *options, cwd=tmp_path)
     assert status == 0, err
     found = json.loads(out)["rows"]

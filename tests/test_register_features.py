@@ -217,6 +217,7 @@ print(row.camera_from_world, row.covariance, row.matches, row.inliers)
         (([[1, np.nan]], [[1, 2]]), "not finite"),
         (("ab", "cd"), "got tuple"),
         (([[1, 2]],), "got tuple"),
+        (([[1e9, 2]], [[1, 2]]), "1 pairs of which none is within the images, 9×9 and 9×9"),
     ],
 )
 def test_nonsense_of_a_matcher_is_told(pairs: object, words: str) -> None:
@@ -232,6 +233,20 @@ def test_without_pycolmap_direct_alignment_is_left(monkeypatch: pytest.MonkeyPat
             matcher_named(name, 0.85, 100)
 
 
+def test_a_pycolmap_that_does_not_load_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pycolmap")
+
+    def broken(name: str) -> None:
+        raise ImportError("libgomp.so.1: cannot open shared object file")
+
+    monkeypatch.setattr(module.importlib, "import_module", broken)
+    assert matcher_named("auto", 0.85, 100) is None
+    with pytest.raises(
+        MissingDependencyError, match="installed and cannot be imported: ImportError: libgomp"
+    ):
+        matcher_named("sift", 0.85, 100)
+
+
 @pytest.mark.parametrize(
     ("source", "words"),
     [
@@ -239,6 +254,7 @@ def test_without_pycolmap_direct_alignment_is_left(monkeypatch: pytest.MonkeyPat
         ("def other(a, b): ...", "plugin has no function match"),
         ("match = 3", "plugin has no function match"),
         ("def match(a, b): return 5", "expected two (M, 2) arrays"),
+        ("def match(a, b): raise SystemExit(3)", "plugin:match: SystemExit: 3"),
         ("def match(a, b): raise ValueError('out\\nof luck')", "plugin:match: ValueError: out of luck"),
     ],
 )

@@ -96,25 +96,28 @@ def _photos_in(path: Path) -> list[Path]:
     try:
         file_format(path)
     except InputError:
-        return sorted(f for f in path.rglob("*") if is_photo(f) and f.is_file())
+        files = sorted(f for f in path.rglob("*") if is_photo(f) and f.is_file())
+        if not files:
+            raise InputError(f"{path}: neither photos nor views in this folder") from None
+        return files
     return []
 
 
 def _sizes(files: list[Path]) -> list[tuple[int, int]]:
-    """Width and height of each; a broken photo, which registration will refuse, takes another's."""
+    """Width and height of each; a broken photo, which registration will refuse, takes another's, or (0, 0)
+    where all are broken."""
     found: list[tuple[int, int] | None] = []
     for file in files:
         try:
             found.append(photo_size(str(file), file))
         except InputError:
             found.append(None)
-    usual = next((size for size in found if size), None)
-    if usual is None:
-        raise InputError(f"{files[0]}: not a whole image, and none of {len(files)} is")
+    usual = next((size for size in found if size), (0, 0))
     return [size or usual for size in found]
 
 
 def _centred(focal: float, size: tuple[int, int]) -> Camera:
+    size = max(size[0], 1), max(size[1], 1)
     K = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
     return Camera(np.eye(4), K, *size)
 
@@ -144,7 +147,7 @@ def _check_aspects(files: list[Path], sizes: list[tuple[int, int]], views: list[
     off = [
         abs(w * v.height - h * v.width) > 0.02 * h * v.width for (w, h), v in zip(sizes, views, strict=True)
     ]
-    if all(off):
+    if all(off) and any(sizes[0]):
         (w, h), view = sizes[0], views[0]
         raise InputError(
             f"{files[0]}: the photo is {w}×{h}, its intrinsics are for {view.width}×{view.height}: "
@@ -198,8 +201,10 @@ def matched(found: Mapping[str, Found], names: Sequence[str]) -> dict[str, Found
     return out
 
 
-def pool_of(scene: Splats, pool: str, seed: int, progress: Progress = silent) -> Cameras:
+def pool_of(scene: Splats, pool: str, seed: int, progress: Progress = silent, say: Say = unsaid) -> Cameras:
     """Poses to look for photos in: of a file of views, or as many as a number says, planned for the scene.
+
+    `say` is told what kind of poses was planned.
 
     Raises:
         InputError: neither, or a scene with no room for poses.
@@ -208,4 +213,9 @@ def pool_of(scene: Splats, pool: str, seed: int, progress: Progress = silent) ->
         return read_view_set(Path(pool), unpictured=True).cameras
     from g2ard.poses import plan_pool
 
-    return plan_pool(scene, int(pool), seed=seed, rows=_ROWS, progress=progress).cameras
+    planned = plan_pool(scene, int(pool), seed=seed, rows=_ROWS, progress=progress)
+    say(
+        f"pool: {len(planned.cameras)} poses, {planned.kind} ({planned.why}); for photos taken otherwise "
+        "make poses like theirs by `g2ard poses --kind` and give --pool that file"
+    )
+    return planned.cameras

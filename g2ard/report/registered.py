@@ -21,6 +21,7 @@ from g2ard.stages.render import Renderer
 __all__ = ["registration_report"]
 
 _VIEWS = 12
+_LINES = 80
 
 
 def registration_report(
@@ -63,26 +64,28 @@ def registration_report(
     page.heading("Least alike first")
     seen = [i for i, row in enumerate(rows) if row.camera_from_world is not None]
     renderer = Renderer(scene, background=background)
-    for i in sorted(seen, key=lambda i: rows[i].zncc)[:_VIEWS]:
+    for i in sorted(seen, key=lambda i: -1.0 if rows[i].zncc is None else rows[i].zncc)[:_VIEWS]:
         row, one = rows[i], photos.take([i]).resized(size)
         try:
             photo = to_bytes(load_image(one, 0))
         except InputError:
             continue  # gone since it was registered
         found = renderer.image(replace(one[0], viewmat=np.array(row.camera_from_world)))
-        shown = [Shown("found", to_bytes(found), f"ZNCC {row.zncc:.2f}")]
+        alike = "kept where it started" if row.zncc is None else f"ZNCC {row.zncc:.2f}"
+        shown = [Shown("found", to_bytes(found), alike)]
         if row.name in starts:
             shown.append(Shown("start", to_bytes(renderer.image(replace(one[0], viewmat=starts[row.name])))))
         page.comparison(Comparison(f"{row.name}: {row.status}", photo, shown))
         if matches and row.name in matches:
             scale = photo.shape[1] / photos.take([i]).resized(side)[0].width
             drawn = matches_drawn(photo, to_bytes(found), matches[row.name] * scale)
-            page.figure(drawn, f"{plural(len(matches[row.name]), 'match', 'matches')} that the pose explains")
+            told_of = plural(len(matches[row.name]), "match", "matches")
+            page.figure(drawn, f"{told_of} that the pose explains; lines of at most {_LINES}")
     page.write(path)
 
 
 def matches_drawn(
-    photo: NDArray[np.uint8], render: NDArray[np.uint8], matches: NDArray[np.float64], most: int = 80
+    photo: NDArray[np.uint8], render: NDArray[np.uint8], matches: NDArray[np.float64], most: int = _LINES
 ) -> NDArray[np.uint8]:
     """Photo and render side by side, (H, 2 W, 3), and a line from each pixel to the one it matches.
 

@@ -83,7 +83,7 @@ def register(
         Literal["gs-cpr"] | None,
         typer.Option(
             help="gs-cpr: one pass of matches, no refinement, no fallback, and every photo kept: without a "
-            "pose from 6 matches at least, where it started."
+            "pose from 6 matches at least, where it started. Needs the extra `register`."
         ),
     ] = None,
     truth: Annotated[
@@ -108,7 +108,7 @@ def register(
 
     from g2ard.constants import changed, listed
     from g2ard.errors import InputError
-    from g2ard.io import write_views
+    from g2ard.io import check_views_output, write_views
     from g2ard.io.atomic import check_output
     from g2ard.policy.inputs import load_scene
     from g2ard.policy.register import photos_of, pool_of, poses_for
@@ -118,21 +118,30 @@ def register(
 
     config = RegisterConfig(size=size, accept=accept, matcher=matcher, refine=refine, passes=passes)
     if protocol == "gs-cpr":
-        given = {"--passes": passes != 3, "--refine": refine != "auto", "--keep": keep != "registered"}
+        given = {
+            "--passes": passes not in (3, 1),
+            "--refine": refine not in ("auto", "none"),
+            "--keep": keep not in ("registered", "all"),
+        }
         if contradicted := [name for name, said in given.items() if said] + ["--matcher"] * (
             matcher == "direct"
         ):
             raise typer.BadParameter(f"--protocol gs-cpr decides {contradicted[0]}; leave that out")
-        config, keep = replace(config, passes=1, refine="none", fallback=False, min_inliers=6), "all"
+        features = "sift" if matcher == "auto" else matcher
+        config = replace(config, passes=1, refine="none", fallback=False, min_inliers=6, matcher=features)
+        keep = "all"
+        run.config |= {"passes": 1, "refine": "none", "keep": keep, "matcher": features}
     config = changed(config, "register", run.constants(register=config))
     if metres_per_unit is not None and truth is None:
         raise typer.BadParameter("--metres-per-unit goes with --truth")
     if intrinsics is not None and focal is not None:
         raise typer.BadParameter("--intrinsics and --focal exclude each other; give one")
-    check_output(output, run.overwrite)
+    check_views_output(output, run.overwrite)
     if report is not None:
         if report.resolve() in {p.resolve() for p in (output, scene, poses, truth, intrinsics, photos) if p}:
             raise typer.BadParameter(f"--report {report} would be written over; name another output")
+        if report.suffix.lower() not in (".html", ".htm"):
+            raise typer.BadParameter(f"--report {report}: a page is written as .html")
         check_output(report, run.overwrite)
     taken = photos_of(photos, split=split, intrinsics=intrinsics, focal=focal, say=run.say)
     folder = photos.is_dir() and (intrinsics is not None or focal is not None)
@@ -145,7 +154,7 @@ def register(
         starts = dict(zip(taken.names, taken.viewmats, strict=True))
     true = {} if truth is None else poses_for(truth, taken.names)
     splats = load_scene(scene, run.say)
-    places = pool_of(splats, pool, run.seed, run.progress) if pool is not None else None
+    places = pool_of(splats, pool, run.seed, run.progress, run.say) if pool is not None else None
     found = find(
         splats,
         taken,
@@ -159,8 +168,6 @@ def register(
     )
     rows = found.report.photos
     summary = summarize(rows, keep=keep, true=len(true), metres_per_unit=metres_per_unit)
-    if len(found.cameras):
-        write_views(output, found.cameras, overwrite=run.overwrite)
     lines = _told(summary)
     for line in lines:
         run.say(line)
@@ -180,6 +187,8 @@ def register(
             told=lines,
             background=colour,
         )
+    if len(found.cameras):
+        write_views(output, found.cameras, overwrite=run.overwrite)
     constants = listed({"register": config}, run.config)
     written = str(output) if len(found.cameras) else None
     run.result(

@@ -49,14 +49,27 @@ def matcher_named(name: str, ratio: float, most: int) -> Matcher | None:
     Traceback (most recent call last):
     g2ard.errors.InputError: matcher: expected auto, sift, direct or MODULE:FUNCTION, got 'some'
     """
-    absent = find_spec("pycolmap") is None
+    absent = "" if name == "direct" else _unusable()
     if name == "direct" or (name == "auto" and absent):
         return None
     if name not in ("auto", "sift") and not all(name.partition(":")):
         raise InputError(f"matcher: expected auto, sift, direct or MODULE:FUNCTION, got {name!r}")
     if absent:
-        raise MissingDependencyError(f"matcher {name}: poses from matches need `pip install g2ard[register]`")
+        raise MissingDependencyError(
+            f"matcher {name}: poses from matches need `pip install g2ard[register]` ({absent})"
+        )
     return Sift(ratio, most) if name in ("auto", "sift") else _plugged(name)
+
+
+def _unusable() -> str:
+    """Why pycolmap cannot be had; nothing where it can."""
+    if sys.modules.get("pycolmap", ...) is None or find_spec("pycolmap") is None:
+        return "pycolmap is not installed"
+    try:
+        importlib.import_module("pycolmap")
+    except Exception as error:
+        return f"pycolmap is installed and cannot be imported: {_told(error)}"
+    return ""
 
 
 def _plugged(name: str) -> Matcher:
@@ -76,27 +89,30 @@ def _plugged(name: str) -> Matcher:
     def match(photo: Image, render: Image) -> Pairs:
         try:
             pairs = found(photo, render)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise InputError(f"matcher {name}: {_told(error)}") from error
         return checked_pairs(f"matcher {name}", pairs, photo.shape, render.shape)
 
     return match
 
 
-def _told(error: Exception) -> str:
+def _told(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def checked_pairs(what: str, pairs: Any, *shapes: tuple[int, ...]) -> Pairs:
-    """Two (M, 2) float64 arrays of what a matcher returned; pairs out of their images are left out.
+    """Two (M, 2) float64 arrays of what a matcher returned; pairs out of their images are left out, and what
+    follows the two arrays: many matchers also say how sure they are.
 
     Raises:
-        InputError: it is something else, or not finite.
+        InputError: it is something else, or not finite, or all pairs are out of their images.
 
     >>> checked_pairs("m", ([[1, 2], [9, 1]], [[3, 1], [0, 0]]), (4, 4, 3), (4, 4, 3))[1].tolist()
     [[3.0, 1.0]]
     """
     expected = f"{what}: expected two (M, 2) arrays of pixel coordinates"
+    if isinstance(pairs, tuple | list) and len(pairs) > 2:
+        pairs = pairs[:2]
     try:
         a, b = (np.asarray(points, np.float64).reshape(-1, 2) if len(points) == 0 else
                 np.asarray(points, np.float64) for points in pairs)  # fmt: skip
@@ -109,6 +125,9 @@ def checked_pairs(what: str, pairs: Any, *shapes: tuple[int, ...]) -> Pairs:
     within = np.ones(len(a), bool)
     for points, (height, width, *_) in zip((a, b), shapes, strict=True):
         within &= ((points >= 0) & (points <= [width, height])).all(1)
+    if len(a) and not within.any():
+        sizes = " and ".join(f"{width}×{height}" for height, width, *_ in shapes)
+        raise InputError(f"{expected}, got {len(a)} pairs of which none is within the images, {sizes}")
     return a[within], b[within]
 
 

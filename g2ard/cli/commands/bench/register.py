@@ -14,7 +14,9 @@ from g2ard.cli.resume import rows_kept
 
 
 @command(
-    "register", parent=bench, example="g2ard bench register scene.ply small.ply --photos views/ --starts B,D"
+    "register",
+    parent=bench,
+    example="g2ard bench register scene.ply --photos views/ --ratios 1,10 --starts B --seeds 1",
 )
 def register(
     run: Run,
@@ -27,7 +29,7 @@ def register(
     ],
     ratios: Annotated[
         str, typer.Option(help="Comma-separated: merged to, not recovered; 1 is the scene as it is.")
-    ] = "1",
+    ] = "1,5,10,20,30",
     matchers: Annotated[
         str, typer.Option(help="Comma-separated: auto, sift, direct, MODULE:FUNCTION.")
     ] = "auto,direct",
@@ -36,8 +38,8 @@ def register(
         typer.Option(
             help="Comma-separated: A (1 % of the depth, .4°), B (5 %, 5°), C (15 %, 15°), D (pool only)."
         ),
-    ] = "A,B",
-    seeds: Annotated[int, typer.Option(min=1, help="Draws of each start.")] = 1,
+    ] = "A,B,C,D",
+    seeds: Annotated[int, typer.Option(min=1, help="Draws of each start.")] = 5,
     size: Annotated[int, typer.Option(min=32, help="Pixels of the photos' longer side.")] = 1000,
     metres_per_unit: Annotated[
         float | None, typer.Option("--metres-per-unit", min=1e-9, help="For centimetres and recalls.")
