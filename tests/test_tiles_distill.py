@@ -190,6 +190,24 @@ def test_what_tiles_do_not_have_is_refused(command_line: CommandLine, folder: Pa
     assert "clean takes the scene in one piece" in told
 
 
+def test_distill_in_one_piece_heeds_memory(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    call = (
+        "distill",
+        folder / "town.ply",
+        "-r",
+        10,
+        "-o",
+        tmp_path / "run",
+        "--views",
+        folder / "views.json",
+    )
+    status, _, said = command_line(*call, "--memory", "120MB", cwd=tmp_path)
+    assert status == 1
+    assert "Gaussians in one piece take about 0." in said
+    assert "more than 0.12 GB; --tile-rows below their count" in " ".join(said.split())
+    assert not list(tmp_path.iterdir())
+
+
 def test_memory_decides_how_many_work_and_nothing_else(folder: Path, tmp_path: Path) -> None:
     store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
     need = 10**9

@@ -255,6 +255,7 @@ def distill(
         return
     finished = {place: tell_finished(run, place) for place in places if is_done(run, place, resume)}
     if len(finished) < len(places):
+        _check_memory(job, tiling.memory, page=view)
         job.render_targets()
     reports = []
     for aim, place in zip(job.aims, places, strict=True):
@@ -272,6 +273,21 @@ def distill(
     _tell_all(run, reports)
     if len(finished) < len(places):
         tell_quality(run, aim, result.splats)
+
+
+def _check_memory(job: DistillJob, most: int | None, *, page: bool) -> None:
+    """Refuse what takes more than --memory in one piece, by the estimate of --dry-run, before it is done."""
+    from g2ard.errors import InputError
+    from g2ard.policy.estimate import estimate
+
+    if most is None:
+        return
+    need = max(estimate(job, budget, page=page).bytes for budget in job.budgets)
+    if need > most:
+        raise InputError(
+            f"--memory: {plural(len(job.prior), 'Gaussian')} in one piece take about {need / 1e9:.1f} GB, "
+            f"more than {most / 1e9:g} GB; --tile-rows below their count works on tiles, --size on smaller views"
+        )
 
 
 def _tell_all(run: Run, reports: list[dict[str, Any]]) -> None:
