@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from g2ard.errors import InputError
 from g2ard.memory import peak_rss
+from g2ard.progress import plural
 from g2ard.targets import CACHE_BYTES, Targets
 from g2ard.visibility import MOST_LOOKS, fewest_looks, visibility_source
 
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
     from g2ard.policy.job import DistillJob
     from g2ard.splats import Splats
 
-__all__ = ["Estimate", "estimate", "total"]
+__all__ = ["Estimate", "check_memory", "estimate", "total"]
 
 _TRIED = 2, 6
 """Views that a stage is tried on: the difference is four views' time, the rest is what it begins with."""
@@ -115,6 +117,24 @@ def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
         + 2 * merged.nbytes  # the recovered scene, and its rows on their way to the file
         + min(CACHE_BYTES, views * pixels * _pixel_bytes(job)),
     )
+
+
+def check_memory(job: DistillJob, most: int | None, *, page: bool = True) -> None:
+    """Refuse a job that takes more memory than `most` bytes by `estimate`, at any of its budgets; None is no
+    limit.
+
+    Raises:
+        InputError: it does.
+    """
+    if most is None:
+        return
+    need = max(estimate(job, budget, page=page).bytes for budget in job.budgets)
+    if need > most:
+        count = plural(len(job.prior), "Gaussian")
+        raise InputError(
+            f"--memory: {count} in one piece take about {need / 1e9:.1f} GB, more than {most / 1e9:g} GB; "
+            "--tile-rows below their count works on tiles, --size on smaller views"
+        )
 
 
 def total(estimates: Sequence[Estimate]) -> tuple[float, int]:

@@ -186,6 +186,7 @@ def distill(
     from g2ard.io import kind
     from g2ard.policy.distill import prepare
     from g2ard.policy.distill_options import DistillOptions
+    from g2ard.policy.estimate import check_memory
     from g2ard.policy.tiled import is_tiled
     from g2ard.report.distilled import check_crops
 
@@ -255,9 +256,9 @@ def distill(
         return
     finished = {place: tell_finished(run, place) for place in places if is_done(run, place, resume)}
     if len(finished) < len(places):
-        _check_memory(job, tiling.memory, page=view)
+        check_memory(job, tiling.memory, page=view)
         job.render_targets()
-    reports = []
+    reports, others = [], " (--resume makes the others)" if len(places) > 1 else ""
     for aim, place in zip(job.aims, places, strict=True):
         if place in finished:
             reports.append(finished[place])
@@ -267,27 +268,11 @@ def distill(
             run, scene or Path(str(views)), job, aim.count, place, resume, keep, view, crop or [], began
         )
         reports.append(report)
-        others = " (--resume makes the others)" if len(places) > 1 else ""
         run.kept.append(f"{place.parent} is finished{others}")
         began = time.monotonic()
     _tell_all(run, reports)
     if len(finished) < len(places):
         tell_quality(run, aim, result.splats)
-
-
-def _check_memory(job: DistillJob, most: int | None, *, page: bool) -> None:
-    """Refuse what takes more than --memory in one piece, by the estimate of --dry-run, before it is done."""
-    from g2ard.errors import InputError
-    from g2ard.policy.estimate import estimate
-
-    if most is None:
-        return
-    need = max(estimate(job, budget, page=page).bytes for budget in job.budgets)
-    if need > most:
-        raise InputError(
-            f"--memory: {plural(len(job.prior), 'Gaussian')} in one piece take about {need / 1e9:.1f} GB, "
-            f"more than {most / 1e9:g} GB; --tile-rows below their count works on tiles, --size on smaller views"
-        )
 
 
 def _tell_all(run: Run, reports: list[dict[str, Any]]) -> None:
@@ -380,7 +365,6 @@ def _write(
     run: Run, place: Path, result: Distilled, unseen: Targets, colour: Colour, report: dict[str, Any]
 ) -> None:
     """The picture, the scene and, last, what is said of both."""
-
     from g2ard.io import write_splats
     from g2ard.preview import preview
 
@@ -400,8 +384,8 @@ def _view(place: Path, scene: Splats | None, job: DistillJob, report: dict[str, 
     if scene is None:
         page.unlink(missing_ok=True)
         return None
-    cameras, colour = job.views.train.cameras, job.config.background
-    report["bytes"]["view"], line = run_view(page, place, scene, cameras, colour)
+    seen = job.views.train.cameras
+    report["bytes"]["view"], line = run_view(page, place, scene, seen, job.config.background)
     return line
 
 
