@@ -76,7 +76,7 @@ def test_blocks_are_the_scene(tmp_path: Path, make: Callable[[Path], Path]) -> N
     try:
         path = make(tmp_path)
     except ImportError as error:
-        pytest.skip(str(error))
+        pytest.skip(f"what writes this format is not installed: {error}")
     whole = read_scene(path)
     for rows in (64, 256, 300, 10_000):
         stream = open_stream(path)

@@ -46,8 +46,8 @@ def save_levels(
 
     Args:
         path: the folder.
-        levels: the same scene, the finest first, of one offset; scenes, or each a `StoredScene`, whose rows are
-            read a leaf or a file at a time.
+        levels: the same scene, the finest first, of one offset; scenes, or each a `StoredScene`, whose rows
+            are read a leaf or a file at a time.
         cut: how the tree is cut; None means `Cut()`.
         errors: measure what each leaf's levels lose (`g2ard.levels.leaf_errors`), which tells viewers what to
             load; without them they go by counts.

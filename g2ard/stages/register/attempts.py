@@ -89,19 +89,33 @@ def loaded(photos: Cameras, index: int, config: RegisterConfig) -> Photo:
     image, mask = load_image(one, 0), load_mask(one, 0)
     everywhere = np.ones(image.shape[:2], bool) if mask is None else mask
     planes = np.stack([grey_of(image), everywhere], 2).astype(np.float32)
+    levels: list[_Planes] = []
+    for side in reversed(sizes):  # each from the one before: that is the quickest
+        levels.insert(0, _shrunk(one, levels[0].planes if levels else planes, side))
+    pyramid = [(level.camera, level_of(level.grey, level.mask)) for level in levels]
+    small = _shrunk(one, levels[-1].planes, config.pool_size)
+    return Photo(one[0], image, everywhere, pyramid, (small.camera, small.grey), levels[-1].grey)
 
-    def shrunk(side: int) -> tuple[Camera, Float, NDArray[np.bool_]]:
-        nonlocal planes
-        camera = one.resized(side)[0]
-        planes = resized(planes, (camera.width, camera.height))
-        return camera, planes[..., 0].astype(np.float64), np.ascontiguousarray(planes[..., 1] > 0.999)
 
-    levels = [shrunk(side) for side in reversed(sizes)]
-    whole = levels[0][1]
-    planes = np.stack([whole, levels[0][2]], 2).astype(np.float32)
-    small = shrunk(config.pool_size)
-    pyramid = [(camera, level_of(grey, counts)) for camera, grey, counts in reversed(levels)]
-    return Photo(one[0], image, everywhere, pyramid, small[:2], whole)
+@dataclass(frozen=True, eq=False)
+class _Planes:
+    """A photo shrunk: (H, W, 2) float32, its grey and the share of each pixel that counts."""
+
+    camera: Camera
+    planes: NDArray[np.float32]
+
+    @property
+    def grey(self) -> Float:
+        return self.planes[..., 0].astype(np.float64)
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        return np.ascontiguousarray(self.planes[..., 1] > 0.999)
+
+
+def _shrunk(one: Cameras, planes: NDArray[np.float32], side: int) -> _Planes:
+    camera = one.resized(side)[0]
+    return _Planes(camera, resized(planes, (camera.width, camera.height)))
 
 
 class Search:
