@@ -5,12 +5,13 @@ use rayon::prelude::*;
 use super::disjoint::DisjointSlice;
 use super::params::Params;
 use super::project::Splat;
-use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
+use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask, Real, Vector};
 use super::tile_batch::{
-    BATCH, TileBatch, TileRect, alpha, block_coordinates, by_pair, log2_alpha,
+    BATCH, MOST_BLOCKS, TileBatch, TileRect, alpha, block_coordinates, blocks, by_pair, log2_alpha,
+    row_and_part,
 };
 use super::tiles::Pair;
-use super::{ALPHA_MIN, BLOCKS, Camera, Settings};
+use super::{ALPHA_MIN, Camera, ROWS, Settings};
 
 /// Per-Gaussian sums over the pixels of the views added so far.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -83,9 +84,9 @@ impl SharedSums {
 pub const WEIGHT: usize = 1;
 pub const ALL: usize = 5;
 
-/// A block's state from front to back; what a pair touches lies side by side.
+/// A row of lanes' state from front to back; what a pair touches lies side by side.
 #[derive(Clone, Copy)]
-struct Block {
+struct Row {
     /// The light that would be left if nothing ever stopped: see the forward kernel.
     unstopped: Lanes16,
     /// The largest αT so far, and the number of its pair, −1 for none.
@@ -109,42 +110,43 @@ impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
 
     #[inline(always)]
     fn run<F: Lanes>(self) {
-        let minimum = F::splat(ALPHA_MIN.log2());
-        let clip = F::splat(self.settings.alpha_max);
-        let stop = F::splat(self.settings.transmittance_min);
-        let mut blocks = [Block {
+        let minimum = F::Block::splat(ALPHA_MIN.log2());
+        let clip = F::Block::splat(self.settings.alpha_max);
+        let stop = F::Block::splat(self.settings.transmittance_min);
+        let mut rows = [Row {
             unstopped: Lanes16::default(),
             most: Lanes16::default(),
             winner: Lanes16([-1.0; LANES]),
-        }; BLOCKS];
-        for (block, light) in blocks.iter_mut().zip(self.rect.light::<F>()) {
-            block.unstopped = light;
+        }; ROWS];
+        for (row, light) in rows.iter_mut().zip(self.rect.light::<F>()) {
+            row.unstopped = light;
         }
-        let mut block_masks = [0; BLOCKS];
-        let mut lit = u16::MAX;
+        let mut block_masks = [0; MOST_BLOCKS];
+        let mut lit = (u64::MAX >> (64 - blocks::<F::Block>())) as u32;
         for first in (0..self.pairs.len()).step_by(BATCH) {
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
             self.tile_batch
                 .load(self.pairs, first, self.splats, &self.rect);
             let s = &*self.tile_batch;
             s.reachable::<F>(pairs.len(), &mut block_masks);
-            let masks = by_pair(&block_masks);
+            let masks = by_pair::<F::Block>(&block_masks);
             for (p, pair) in pairs.iter().enumerate() {
                 let mut todo = masks[p] & lit;
-                let number = F::splat(s.splats[p].number);
-                let [mut weight, mut light, mut peak] = [F::zero(); 3];
+                let number = F::Block::splat(s.splats[p].number);
+                let [mut weight, mut light, mut peak] = [F::Block::zero(); 3];
                 let mut hits = 0;
                 while todo != 0 {
-                    let b = todo.trailing_zeros() as usize % BLOCKS;
+                    let b = todo.trailing_zeros() as usize;
                     todo &= todo - 1;
-                    let block = &mut blocks[b];
-                    let (x, y) = block_coordinates::<F>(b);
+                    let (row, part) = row_and_part::<F::Block>(b);
+                    let row = &mut rows[row];
+                    let (x, y) = block_coordinates::<F::Block>(b);
                     let (_, _, log2) = log2_alpha(&s.splats[p], x, y);
                     let hit = log2.ge(minimum);
                     let a = alpha(log2).min(clip).only(hit);
-                    let t = F::load(&block.unstopped);
+                    let t = F::Block::load_part(&row.unstopped, part);
                     let next = a.fnma(t, t);
-                    next.store(&mut block.unstopped);
+                    next.store_part(&mut row.unstopped, part);
                     let going = next.gt(stop);
                     if !going.any() {
                         lit &= !(1 << b);
@@ -155,10 +157,11 @@ impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
                     weight = weight + w;
                     hits += go.bits().count_ones();
                     if KINDS == ALL {
-                        let most = F::load(&block.most);
-                        let winner = F::load(&block.winner);
-                        F::select(w.gt(most), number, winner).store(&mut block.winner);
-                        most.max(w).store(&mut block.most);
+                        let most = F::Block::load_part(&row.most, part);
+                        let winner = F::Block::load_part(&row.winner, part);
+                        F::Block::select(w.gt(most), number, winner)
+                            .store_part(&mut row.winner, part);
+                        most.max(w).store_part(&mut row.most, part);
                         light = light + t.only(go);
                         peak = peak.max(w);
                     }
@@ -176,7 +179,7 @@ impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
                 break;
             }
         }
-        for number in blocks.iter().flat_map(|block| block.winner.0) {
+        for number in rows.iter().flat_map(|row| row.winner.0) {
             if KINDS == ALL && number >= 0.0 {
                 let slot = self.pairs[number as usize].slot as usize;
                 // SAFETY: as above.
@@ -188,7 +191,7 @@ impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
 
 /// A pair's sums; those of `dominant` come last.
 #[inline(always)]
-fn share<const KINDS: usize, F: Lanes>(weight: F, light: F, hits: u32, peak: F) -> [f32; KINDS] {
+fn share<const KINDS: usize, B: Vector>(weight: B, light: B, hits: u32, peak: B) -> [f32; KINDS] {
     let mut share = [folded(weight, add); KINDS];
     if KINDS == ALL {
         share[1] = folded(light, add);
@@ -211,10 +214,10 @@ fn larger(a: f32, b: f32) -> f32 {
 
 /// All lanes as one value, halves first.
 #[inline(always)]
-fn folded<F: Lanes>(lanes: F, with: impl Fn(f32, f32) -> f32) -> f32 {
+fn folded<B: Vector>(lanes: B, with: impl Fn(f32, f32) -> f32) -> f32 {
     let mut row = Lanes16::default();
-    lanes.store(&mut row);
-    let mut half = LANES / 2;
+    lanes.store_part(&mut row, 0);
+    let mut half = B::COUNT / 2;
     while half > 0 {
         for l in 0..half {
             row.0[l] = with(row.0[l], row.0[l + half]);

@@ -3,24 +3,24 @@
 use super::disjoint::DisjointSlice;
 use super::memory::prefetch;
 use super::project::Splat;
-use super::simd::{Kernel, Lanes, Lanes16, Mask};
+use super::simd::{Kernel, Lanes, Lanes16, Mask, Real, Vector};
 use super::tile_batch::{
-    BATCH, TileRect, TileSplat, TileSplats, alpha, block_coordinates, by_pair, for_stretches,
-    load_batch, log2_alpha,
+    BATCH, BlockMasks, MOST_BLOCKS, TileRect, TileSplat, TileSplats, alpha, block_coordinates,
+    blocks, by_pair, for_stretches, load_batch, log2_alpha, row_and_part,
 };
 use super::tiles::Pair;
-use super::{ALPHA_MIN, BLOCKS, Settings, TILE};
+use super::{ALPHA_MIN, ROWS, Settings, TILE};
 
 /// Sums a pair leaves behind: Σ h·(1, u, v, u², uv, v²), Σ w·(dR, dG, dB), Σ w·dDepth; h = dL/d(ln α), w = αT.
 pub const SUMS: usize = 10;
 
-/// A tile's incoming gradients and the state carried from back to front, block by block: what a block needs lies side
+/// A tile's incoming gradients and the state carried from back to front, row by row of lanes: what a row needs lies side
 /// by side: loads and stores 4 KiB apart would alias.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Incoming([Block; BLOCKS]);
+pub struct Incoming([Row; ROWS]);
 
 #[derive(Debug, Clone, Copy, Default)]
-struct Block {
+struct Row {
     /// Gradients of R, G, B, alpha and depth.
     given: [Lanes16; 5],
     /// Transmittance in front of the pair last done.
@@ -36,7 +36,7 @@ pub const ALPHA: usize = 3;
 pub const DEPTH: usize = 4;
 
 impl Incoming {
-    /// Copies an image of `channels` interleaved values into block order, its first channel as gradient `from`; off
+    /// Copies an image of `channels` interleaved values into the order of lanes, its first channel as gradient `from`; off
     /// the image it is 0.
     pub fn load(
         &mut self,
@@ -47,17 +47,17 @@ impl Incoming {
         rect: &TileRect,
     ) {
         if rect.columns < TILE || rect.rows < TILE {
-            for block in &mut self.0 {
-                block.given[from..from + channels].fill(Lanes16::default());
+            for row in &mut self.0 {
+                row.given[from..from + channels].fill(Lanes16::default());
             }
         }
         for y in 0..rect.rows {
             let first = ((rect.y + y) * width + rect.x) * channels;
-            let row = &image[first..first + rect.columns * channels];
-            for_stretches(y, rect.columns, |x, block, lane, count| {
-                let given = &mut self.0[block].given[from..from + channels];
+            let line = &image[first..first + rect.columns * channels];
+            for_stretches(y, rect.columns, |x, row, lane, count| {
+                let given = &mut self.0[row].given[from..from + channels];
                 if let (Some(values), [r, g, b]) =
-                    (row[x * channels..].first_chunk::<12>(), &mut *given)
+                    (line[x * channels..].first_chunk::<12>(), &mut *given)
                     && count == 4
                 {
                     for i in 0..4 {
@@ -67,10 +67,10 @@ impl Incoming {
                     }
                     return;
                 }
-                let pixels = row[x * channels..].chunks_exact(channels).take(count);
+                let pixels = line[x * channels..].chunks_exact(channels).take(count);
                 for (i, values) in pixels.enumerate() {
-                    for (row, value) in given.iter_mut().zip(values) {
-                        row.0[lane + i] = *value;
+                    for (lanes, value) in given.iter_mut().zip(values) {
+                        lanes.0[lane + i] = *value;
                     }
                 }
             });
@@ -85,11 +85,11 @@ pub struct Backward<'a, const WITH_DEPTH: bool> {
     pub settings: &'a Settings,
     pub background: [f32; 3],
     /// From the forward pass: one entry per batch it processed.
-    pub block_masks: &'a [[u64; BLOCKS]],
+    pub block_masks: &'a [BlockMasks],
     /// Light left at each pixel.
-    pub transmittance: &'a [Lanes16; BLOCKS],
+    pub transmittance: &'a [Lanes16; ROWS],
     /// Number of each pixel's last pair, −1 for none.
-    pub last: &'a [Lanes16; BLOCKS],
+    pub last: &'a [Lanes16; ROWS],
     pub incoming: &'a mut Incoming,
     pub batch: &'a mut TileSplats,
     /// Sums of each pair.
@@ -104,20 +104,21 @@ impl<const WITH_DEPTH: bool> Kernel for Backward<'_, WITH_DEPTH> {
     #[inline(always)]
     fn run<F: Lanes>(self) {
         let state = &mut self.incoming.0;
-        for (block, g) in state.iter_mut().enumerate() {
-            g.transmittance = self.transmittance[block];
-            g.last = self.last[block];
+        for (row, g) in state.iter_mut().enumerate() {
+            g.transmittance = self.transmittance[row];
+            g.last = self.last[row];
             let mut behind = F::zero();
             for c in 0..3 {
                 behind = F::splat(self.background[c]).fma(F::load(&g.given[c]), behind);
             }
             behind.store(&mut g.behind);
         }
-        let minimum = F::splat(ALPHA_MIN.log2());
-        let clip = F::splat(self.settings.alpha_max);
+        let minimum = F::Block::splat(ALPHA_MIN.log2());
+        let clip = F::Block::splat(self.settings.alpha_max);
+        let mut list = [0; BATCH * MOST_BLOCKS + 1];
         for (batch, block_masks) in self.block_masks.iter().enumerate().rev() {
             let mut union = 0;
-            for block in 0..BLOCKS {
+            for block in 0..blocks::<F::Block>() {
                 union |= block_masks[block];
             }
             if union == 0 {
@@ -131,26 +132,26 @@ impl<const WITH_DEPTH: bool> Kernel for Backward<'_, WITH_DEPTH> {
                 unsafe { prefetch(&*self.slots.at(pair.slot as usize)) };
             }
             let s = &*self.batch;
-            let mut list = [0; BATCH * BLOCKS + 1];
-            let count = list_items(block_masks, &mut list);
+            let count = list_items::<F::Block>(block_masks, &mut list);
             let evaluator = Evaluator {
                 batch: s,
                 minimum,
                 clip,
             };
-            let mut sums = [F::zero(); SUMS];
+            let mut sums = [F::Block::zero(); SUMS];
             let mut ahead = evaluator.at(list[0], state);
             for i in 0..count {
                 let (item, next) = (list[i], list[i + 1]);
                 let now = ahead;
                 // Evaluated one item ahead: nothing here depends on the other pairs of its block.
                 ahead = evaluator.at(next, state);
-                let (pair, block) = split(item);
-                now.blend::<WITH_DEPTH>(&s[pair], &mut state[block], &mut sums);
-                if split(next).0 != pair {
+                let (pair, block) = split::<F::Block>(item);
+                let (row, part) = row_and_part::<F::Block>(block);
+                now.blend::<WITH_DEPTH>(&s[pair], &mut state[row], part, &mut sums);
+                if split::<F::Block>(next).0 != pair {
                     let slot = pairs[pair].slot as usize;
-                    let total = F::sums(&sums);
-                    sums = [F::zero(); SUMS];
+                    let total = F::Block::sums(&sums);
+                    sums = [F::Block::zero(); SUMS];
                     // SAFETY: a slot belongs to one pair, and a pair to one tile.
                     unsafe {
                         let out = &mut self.slots.slice(slot, 1)[0];
@@ -163,103 +164,115 @@ impl<const WITH_DEPTH: bool> Kernel for Backward<'_, WITH_DEPTH> {
     }
 }
 
-/// One pair in one block: 16·pair + block.
+/// One pair in one block: pair · blocks + block.
 type Item = u16;
 
 #[inline(always)]
-fn split(item: Item) -> (usize, usize) {
-    let pair = item as usize / BLOCKS;
-    // A list ends with item BATCH·BLOCKS, whose pair BATCH is the splat that reaches nothing. No item lies past it:
-    // `min` shows the compiler that no index does.
-    (pair.min(BATCH), item as usize % BLOCKS)
+fn split<B: Vector>(item: Item) -> (usize, usize) {
+    let pair = item as usize / blocks::<B>();
+    // A list ends with pair BATCH, the splat that reaches nothing. No item lies past it: `min` shows the compiler that
+    // no index does.
+    (pair.min(BATCH), item as usize % blocks::<B>())
 }
 
-/// The items of a batch from its last pair to its first, then BATCH·BLOCKS, which hits nothing. Returns how many without
-/// that.
+/// The items of a batch from its last pair to its first, then one of the pair that reaches nothing. Returns how many
+/// without that.
 #[inline(always)]
-fn list_items(block_masks: &[u64; BLOCKS], list: &mut [Item; BATCH * BLOCKS + 1]) -> usize {
-    const PAIRS: usize = u64::BITS as usize / BLOCKS;
-    let masks = by_pair(block_masks);
+fn list_items<B: Vector>(
+    block_masks: &BlockMasks,
+    list: &mut [Item; BATCH * MOST_BLOCKS + 1],
+) -> usize {
+    let blocks = blocks::<B>();
+    let pairs = u64::BITS as usize / blocks;
+    let masks = by_pair::<B>(block_masks);
     let mut count = 0;
-    for (quad, masks) in masks.as_chunks::<PAIRS>().0.iter().enumerate().rev() {
+    for (word, masks) in masks.chunks_exact(pairs).enumerate().rev() {
         let mut bits = 0;
         for (i, mask) in masks.iter().enumerate() {
-            bits |= u64::from(*mask) << (BLOCKS * i);
+            bits |= u64::from(*mask) << (blocks * i);
         }
         while bits != 0 {
             let top = 63 - bits.leading_zeros();
-            list[count % (BATCH * BLOCKS)] = (u64::BITS as usize * quad + top as usize) as Item;
+            list[count % (BATCH * MOST_BLOCKS)] =
+                (u64::BITS as usize * word + top as usize) as Item;
             count += 1;
             bits ^= 1 << top;
         }
     }
-    list[count.min(BATCH * BLOCKS)] = (BATCH * BLOCKS) as Item;
+    list[count.min(BATCH * MOST_BLOCKS)] = (BATCH * blocks) as Item;
     count
 }
 
 /// What evaluating the items of a batch needs.
-struct Evaluator<'a, F: Lanes> {
+struct Evaluator<'a, B: Vector> {
     batch: &'a TileSplats,
-    minimum: F,
-    clip: F,
+    minimum: B,
+    clip: B,
 }
 
 /// What an item is at its block's pixels.
 #[derive(Clone, Copy)]
-struct Evaluated<F: Lanes> {
-    u: F,
-    v: F,
+struct Evaluated<B: Vector> {
+    u: B,
+    v: B,
     /// α.
-    a: F,
+    a: B,
     /// 1/(1 − α).
-    inverse_rest: F,
+    inverse_rest: B,
     /// Where α is not clipped, and so follows its arguments.
-    free: F::Mask,
+    free: B::Mask,
 }
 
-impl<F: Lanes> Evaluator<'_, F> {
+impl<B: Vector> Evaluator<'_, B> {
     #[inline(always)]
-    fn at(&self, item: Item, state: &[Block; BLOCKS]) -> Evaluated<F> {
-        let (p, block) = split(item);
-        let (x, y) = block_coordinates::<F>(block);
+    fn at(&self, item: Item, state: &[Row; ROWS]) -> Evaluated<B> {
+        let (p, block) = split::<B>(item);
+        let (row, part) = row_and_part::<B>(block);
+        let (x, y) = block_coordinates::<B>(block);
         let splat = &self.batch[p];
         let (u, v, log2) = log2_alpha(splat, x, y);
         let hit = log2
             .ge(self.minimum)
-            .and(F::load(&state[block].last).ge(F::splat(splat.number)));
+            .and(B::load_part(&state[row].last, part).ge(B::splat(splat.number)));
         let raw = alpha(log2);
         let a = raw.min(self.clip).only(hit);
         Evaluated {
             u,
             v,
             a,
-            inverse_rest: (F::splat(1.0) - a).recip(),
+            inverse_rest: (B::splat(1.0) - a).recip(),
             free: self.clip.ge(raw),
         }
     }
 }
 
-impl<F: Lanes> Evaluated<F> {
+impl<B: Vector> Evaluated<B> {
     /// Steps the block's state to before the pair, and adds to the pair's sums.
     #[inline(always)]
-    fn blend<const WITH_DEPTH: bool>(self, s: &TileSplat, g: &mut Block, sums: &mut [F; SUMS]) {
-        let t = F::load(&g.transmittance) * self.inverse_rest;
-        t.store(&mut g.transmittance);
+    fn blend<const WITH_DEPTH: bool>(
+        self,
+        s: &TileSplat,
+        g: &mut Row,
+        part: usize,
+        sums: &mut [B; SUMS],
+    ) {
+        let t = B::load_part(&g.transmittance, part) * self.inverse_rest;
+        t.store_part(&mut g.transmittance, part);
         let w = self.a * t;
-        let mut seen = F::load(&g.given[ALPHA]);
+        let mut seen = B::load_part(&g.given[ALPHA], part);
         for c in 0..3 {
-            let d = F::load(&g.given[c]);
-            seen = F::splat(s.rgb[c]).fma(d, seen);
+            let d = B::load_part(&g.given[c], part);
+            seen = B::splat(s.rgb[c]).fma(d, seen);
             sums[6 + c] = w.fma(d, sums[6 + c]);
         }
         if WITH_DEPTH {
-            let d = F::load(&g.given[DEPTH]);
-            seen = F::splat(s.depth).fma(d, seen);
+            let d = B::load_part(&g.given[DEPTH], part);
+            seen = B::splat(s.depth).fma(d, seen);
             sums[9] = w.fma(d, sums[9]);
         }
-        let behind = F::load(&g.behind);
+        let behind = B::load_part(&g.behind, part);
         let gain = seen - behind;
-        self.a.fma(gain, behind).store(&mut g.behind);
+        self.a.fma(gain, behind).store_part(&mut g.behind, part);
         // Where α is clipped it does not follow its arguments.
         let h = (w * gain).only(self.free);
         let (hu, hv) = (h * self.u, h * self.v);

@@ -1,18 +1,21 @@
-//! Blending one tile from front to back: per batch of 64 pairs, per 4×4 block, the block's state in registers.
+//! Blending one tile from front to back: per batch of 64 pairs, per block of pixels, the block's state in registers.
 
 use super::project::Splat;
-use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
-use super::tile_batch::{BATCH, TileBatch, TileRect, alpha, block_coordinates, log2_alpha};
+use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask, Real, Vector};
+use super::tile_batch::{
+    BATCH, BlockMasks, TileBatch, TileRect, alpha, block_coordinates, blocks, log2_alpha,
+    row_and_part,
+};
 use super::tiles::Pair;
-use super::{ALPHA_MIN, BLOCKS, Settings};
+use super::{ALPHA_MIN, ROWS, Settings};
 
-/// One tile's pixels, a row of 16 lanes per block.
+/// One tile's pixels, a row of 16 lanes for every 4×4 of them.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Pixels {
-    pub rgb: [[Lanes16; BLOCKS]; 3],
-    pub depth: [Lanes16; BLOCKS],
+    pub rgb: [[Lanes16; ROWS]; 3],
+    pub depth: [Lanes16; ROWS],
     /// Depth of the first splat behind which less than half the light is left; 0 if there is none.
-    pub median: [Lanes16; BLOCKS],
+    pub median: [Lanes16; ROWS],
 }
 
 /// Blends a tile. `block_masks` holds the pairs that contributed to each block afterwards.
@@ -21,11 +24,11 @@ pub struct Forward<'a, const DEPTH: bool> {
     pub splats: &'a [Splat],
     pub rect: TileRect,
     pub settings: &'a Settings,
-    /// 16 block_masks for each batch.
-    pub block_masks: &'a mut [[u64; BLOCKS]],
-    pub transmittance: &'a mut [Lanes16; BLOCKS],
+    /// Of each batch.
+    pub block_masks: &'a mut [BlockMasks],
+    pub transmittance: &'a mut [Lanes16; ROWS],
     /// Number within the tile of each pixel's last pair, −1 for none.
-    pub last: &'a mut [Lanes16; BLOCKS],
+    pub last: &'a mut [Lanes16; ROWS],
     pub pixels: &'a mut Pixels,
     pub tile_batch: &'a mut TileBatch,
 }
@@ -37,14 +40,15 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
     #[inline(always)]
     fn run<F: Lanes>(self) -> usize {
         *self.pixels = Pixels::default();
-        *self.transmittance = [Lanes16([1.0; LANES]); BLOCKS];
-        *self.last = [Lanes16([-1.0; LANES]); BLOCKS];
+        *self.transmittance = [Lanes16([1.0; LANES]); ROWS];
+        *self.last = [Lanes16([-1.0; LANES]); ROWS];
         // The light that would be left if nothing ever stopped. A stopped pixel's only falls further below the
         // minimum, so whether it would stop here needs no state, and the loop below depends on one product alone.
         let mut unstopped = self.rect.light::<F>();
-        let minimum = F::splat(ALPHA_MIN.log2());
-        let stop = F::splat(self.settings.transmittance_min);
-        let (clip, half) = (F::splat(self.settings.alpha_max), F::splat(0.5));
+        let minimum = F::Block::splat(ALPHA_MIN.log2());
+        let stop = F::Block::splat(self.settings.transmittance_min);
+        let clip = F::Block::splat(self.settings.alpha_max);
+        let half = F::Block::splat(0.5);
         for (batch, block_masks) in self.block_masks.iter_mut().enumerate() {
             let first = batch * BATCH;
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
@@ -53,23 +57,26 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
             let s = &*self.tile_batch;
             s.reachable::<F>(pairs.len(), block_masks);
             let mut any = false;
-            for block in 0..BLOCKS {
+            for block in 0..blocks::<F::Block>() {
+                let (row, part) = row_and_part::<F::Block>(block);
                 let mut todo = block_masks[block];
-                let mut t = F::load(&unstopped[block]);
+                let mut t = F::Block::load_part(&unstopped[row], part);
                 if todo == 0 || !t.gt(stop).any() {
                     any |= t.gt(stop).any();
                     block_masks[block] = 0;
                     continue;
                 }
                 let mut kept = 0u64;
-                let (x, y) = block_coordinates::<F>(block);
-                let mut left = F::load(&self.transmittance[block]);
-                let mut last = F::load(&self.last[block]);
+                let (x, y) = block_coordinates::<F::Block>(block);
+                let mut left = F::Block::load_part(&self.transmittance[row], part);
+                let mut last = F::Block::load_part(&self.last[row], part);
                 let px = &mut *self.pixels;
-                let [r, g, b] = &px.rgb;
-                let mut rgb = [F::load(&r[block]), F::load(&g[block]), F::load(&b[block])];
-                let mut depth = F::load(&px.depth[block]);
-                let mut median = F::load(&px.median[block]);
+                let mut rgb = [F::Block::zero(); 3];
+                for c in 0..3 {
+                    rgb[c] = F::Block::load_part(&px.rgb[c][row], part);
+                }
+                let mut depth = F::Block::load_part(&px.depth[row], part);
+                let mut median = F::Block::load_part(&px.median[row], part);
                 let mut light = true;
                 while todo != 0 && light {
                     let p = todo.trailing_zeros() as usize;
@@ -82,31 +89,31 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
                     let going = next.gt(stop);
                     let w = (a * t).only(going);
                     for c in 0..3 {
-                        rgb[c] = F::splat(splat.rgb[c]).fma(w, rgb[c]);
+                        rgb[c] = F::Block::splat(splat.rgb[c]).fma(w, rgb[c]);
                     }
                     let go = hit.and(going);
                     if DEPTH {
-                        let z = F::splat(splat.depth);
+                        let z = F::Block::splat(splat.depth);
                         depth = z.fma(w, depth);
-                        median = F::select(go.and(t.ge(half)).and(half.gt(next)), z, median);
+                        median = F::Block::select(go.and(t.ge(half)).and(half.gt(next)), z, median);
                     }
                     t = next;
-                    left = F::select(going, next, left);
-                    last = F::select(go, F::splat(splat.number), last);
+                    left = F::Block::select(going, next, left);
+                    last = F::Block::select(go, F::Block::splat(splat.number), last);
                     kept |= u64::from(go.any()) << p;
                     light = going.any();
                 }
                 block_masks[block] = kept;
                 any |= light;
-                t.store(&mut unstopped[block]);
-                left.store(&mut self.transmittance[block]);
-                last.store(&mut self.last[block]);
+                t.store_part(&mut unstopped[row], part);
+                left.store_part(&mut self.transmittance[row], part);
+                last.store_part(&mut self.last[row], part);
                 for c in 0..3 {
-                    rgb[c].store(&mut px.rgb[c][block]);
+                    rgb[c].store_part(&mut px.rgb[c][row], part);
                 }
                 if DEPTH {
-                    depth.store(&mut px.depth[block]);
-                    median.store(&mut px.median[block]);
+                    depth.store_part(&mut px.depth[row], part);
+                    median.store_part(&mut px.median[row], part);
                 }
             }
             if !any {

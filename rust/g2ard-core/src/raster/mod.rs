@@ -2,7 +2,7 @@
 //!
 //! [`project`] turns 16 Gaussians at a time into screen splats, and [`tile_lists`] lists the 16×16 tiles that each one's
 //! ellipse at α = 1/255 meets; [`depth_sort`] sorts them by depth once; [`tiles`] scatters them stably into their tiles;
-//! [`tile_batch`] holds a tile's pairs in the tile's coordinates; [`forward`] blends each tile, 4×4 pixels to a register; [`backward`] walks the same pairs from back to front, each pair summing into its own slot; [`gradients`]
+//! [`tile_batch`] holds a tile's pairs in the tile's coordinates; [`forward`] blends each tile, 4×4 or 4×2 pixels to a register; [`backward`] walks the same pairs from back to front, each pair summing into its own slot; [`gradients`]
 //! adds a Gaussian's slots in order and goes back through the projection, [`pose`] to the camera. No atomics: the bits do not depend on threads.
 //!
 //! Conventions (gsplat's by default): pixel centres at +0.5; 0.3 px² dilation; α = min(0.99, opacity·exp(−q)); α < 1/255
@@ -45,8 +45,8 @@ use crate::{Error, Result};
 
 /// Pixels on a tile's side.
 pub const TILE: usize = 16;
-/// 4×4-pixel blocks in a tile, and pixels in a block.
-pub(crate) const BLOCKS: usize = 16;
+/// Sixteen-lane rows that hold a value for every pixel of a tile: 4×4 pixels each.
+pub(crate) const ROWS: usize = 16;
 /// Below this a Gaussian does not touch a pixel.
 pub const ALPHA_MIN: f32 = 1.0 / 255.0;
 /// Added to both variances of the projected covariance, px².

@@ -21,11 +21,11 @@ use super::grid::TileGrid;
 use super::memory::bytes;
 use super::params::{Params, Source};
 use super::project::{Project, Splat, View};
-use super::simd::{Isa, LANES, Lanes16, dispatch};
-use super::tile_batch::BATCH;
+use super::simd::{Isa, Kernel, LANES, Lanes, Lanes16, Vector, dispatch};
+use super::tile_batch::{BATCH, BlockMasks, MOST_BLOCKS};
 use super::tile_lists::{TileIntersector, TileList};
 use super::tiles::Bins;
-use super::{BLOCKS, Camera, Settings};
+use super::{Camera, ROWS, Settings};
 use crate::{Error, Result};
 
 pub use views::{Counts, Image, ImageGradients, Memory, Passes};
@@ -68,9 +68,9 @@ pub struct Rasterizer {
     bins: Bins,
     /// First batch of each tile, and how many the forward pass processed.
     batches: Vec<(usize, usize)>,
-    block_masks: Vec<[u64; BLOCKS]>,
-    transmittance: Vec<[Lanes16; BLOCKS]>,
-    last: Vec<[Lanes16; BLOCKS]>,
+    block_masks: Vec<BlockMasks>,
+    transmittance: Vec<[Lanes16; ROWS]>,
+    last: Vec<[Lanes16; ROWS]>,
     slots: Vec<[f32; SUMS]>,
     /// The sums of visibility, one pair's after another's.
     shares: Vec<f32>,
@@ -81,6 +81,18 @@ pub struct Rasterizer {
 impl Default for Rasterizer {
     fn default() -> Self {
         Self::new(Isa::detect())
+    }
+}
+
+/// The lanes of a block of pixels.
+struct BlockLanes;
+
+impl Kernel for BlockLanes {
+    type Output = usize;
+
+    #[inline(always)]
+    fn run<F: Lanes>(self) -> usize {
+        F::Block::COUNT
     }
 }
 
@@ -285,7 +297,7 @@ impl Rasterizer {
         Counts {
             visible: self.order.len(),
             pairs: self.bins.pairs.len(),
-            evaluated: blocks * LANES as u64,
+            evaluated: blocks * dispatch(self.isa, BlockLanes) as u64,
         }
     }
 
@@ -327,7 +339,7 @@ impl Rasterizer {
             self.batches.push((first, 0));
             first += ((tile[1] - tile[0]) as usize).div_ceil(BATCH);
         }
-        self.block_masks.resize(first, [0; BLOCKS]);
+        self.block_masks.resize(first, [0; MOST_BLOCKS]);
     }
 
     fn project<S: Source>(&mut self, view: &View, source: S, grid: TileGrid) {

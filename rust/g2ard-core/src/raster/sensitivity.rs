@@ -7,12 +7,13 @@
 use super::disjoint::DisjointSlice;
 use super::params::Source;
 use super::project::{ScreenGradients, Splat, View, unproject};
-use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
+use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask, Real, Vector};
 use super::tile_batch::{
-    BATCH, TileRect, TileSplats, alpha, block_coordinates, load_batch, log2_alpha,
+    BATCH, BlockMasks, TileRect, TileSplats, alpha, block_coordinates, blocks, load_batch,
+    log2_alpha, row_and_part,
 };
 use super::tiles::Pair;
-use super::{ALPHA_MIN, BLOCKS, Settings};
+use super::{ALPHA_MIN, ROWS, Settings};
 
 /// Values of the upper triangle of a 6×6 matrix.
 pub const TRIANGLE: usize = 21;
@@ -32,7 +33,7 @@ const PRODUCT: [[usize; 5]; 5] = [
 ];
 
 #[derive(Clone, Copy, Default)]
-struct Block {
+struct Row {
     transmittance: Lanes16,
     /// The colour behind, as if unoccluded.
     behind: [Lanes16; 3],
@@ -46,9 +47,9 @@ pub struct Sensitivity<'a> {
     pub rect: TileRect,
     pub settings: &'a Settings,
     /// From the forward pass.
-    pub block_masks: &'a [[u64; BLOCKS]],
-    pub transmittance: &'a [Lanes16; BLOCKS],
-    pub last: &'a [Lanes16; BLOCKS],
+    pub block_masks: &'a [BlockMasks],
+    pub transmittance: &'a [Lanes16; ROWS],
+    pub last: &'a [Lanes16; ROWS],
     pub batch: &'a mut TileSplats,
     pub slots: DisjointSlice<[f32; MOMENTS]>,
     pub written: DisjointSlice<u8>,
@@ -59,15 +60,17 @@ impl Kernel for Sensitivity<'_> {
 
     #[inline(always)]
     fn run<F: Lanes>(self) {
-        let mut state = [Block::default(); BLOCKS];
-        for (block, g) in state.iter_mut().enumerate() {
-            g.transmittance = self.transmittance[block];
-            g.last = self.last[block];
+        let mut state = [Row::default(); ROWS];
+        for (row, g) in state.iter_mut().enumerate() {
+            g.transmittance = self.transmittance[row];
+            g.last = self.last[row];
         }
-        let minimum = F::splat(ALPHA_MIN.log2());
-        let clip = F::splat(self.settings.alpha_max);
+        let minimum = F::Block::splat(ALPHA_MIN.log2());
+        let clip = F::Block::splat(self.settings.alpha_max);
         for (batch, block_masks) in self.block_masks.iter().enumerate().rev() {
-            let mut union = block_masks.iter().fold(0, |all, word| all | word);
+            let mut union = block_masks[..blocks::<F::Block>()]
+                .iter()
+                .fold(0, |all, word| all | word);
             if union == 0 {
                 continue;
             }
@@ -78,30 +81,36 @@ impl Kernel for Sensitivity<'_> {
                 let p = 63 - union.leading_zeros() as usize;
                 union ^= 1 << p;
                 let near = &self.batch[p];
-                let number = F::splat(near.number);
-                let mut sums = [F::zero(); MOMENTS];
-                for (block, g) in state.iter_mut().enumerate() {
+                let number = F::Block::splat(near.number);
+                let mut sums = [F::Block::zero(); MOMENTS];
+                for block in 0..blocks::<F::Block>() {
                     if block_masks[block] >> p & 1 == 0 {
                         continue;
                     }
-                    let on_image = F::Mask::from_bits(self.rect.lanes(block));
-                    let (x, y) = block_coordinates::<F>(block);
+                    let (row, part) = row_and_part::<F::Block>(block);
+                    let g = &mut state[row];
+                    let on_image = self.rect.lanes(row) >> (part * F::Block::COUNT);
+                    let on_image = <F::Block as Real>::Mask::from_bits(on_image);
+                    let (x, y) = block_coordinates::<F::Block>(block);
                     let (u, v, log2) = log2_alpha(near, x, y);
-                    let hit = log2.ge(minimum).and(F::load(&g.last).ge(number));
+                    let hit = log2
+                        .ge(minimum)
+                        .and(F::Block::load_part(&g.last, part).ge(number));
                     let raw = alpha(log2);
                     let a = raw.min(clip).only(hit.and(on_image));
-                    let t = F::load(&g.transmittance) * (F::splat(1.0) - a).recip();
-                    t.store(&mut g.transmittance);
+                    let t = F::Block::load_part(&g.transmittance, part)
+                        * (F::Block::splat(1.0) - a).recip();
+                    t.store_part(&mut g.transmittance, part);
                     let w = a * t;
                     // Where α is clipped it does not follow its arguments.
                     let follows = w.only(clip.ge(raw));
                     let (uu, uv, vv) = (u * u, u * v, v * v);
                     let phi = [u, v, uu, uv, vv];
-                    let mut square = F::zero();
+                    let mut square = F::Block::zero();
                     for c in 0..3 {
-                        let behind = F::load(&g.behind[c]);
-                        let gain = F::splat(near.rgb[c]) - behind;
-                        a.fma(gain, behind).store(&mut g.behind[c]);
+                        let behind = F::Block::load_part(&g.behind[c], part);
+                        let gain = F::Block::splat(near.rgb[c]) - behind;
+                        a.fma(gain, behind).store_part(&mut g.behind[c], part);
                         let h = follows * gain;
                         square = h.fma(h, square);
                         let hw = h * w;
@@ -120,7 +129,7 @@ impl Kernel for Sensitivity<'_> {
                 unsafe {
                     let out = &mut self.slots.slice(slot, 1)[0];
                     for (part, sums) in out.chunks_exact_mut(10).zip(sums.as_chunks::<10>().0) {
-                        part.copy_from_slice(&F::sums(sums).0[..10]);
+                        part.copy_from_slice(&F::Block::sums(sums).0[..10]);
                     }
                     self.written.write(slot, 1);
                 }
@@ -131,7 +140,7 @@ impl Kernel for Sensitivity<'_> {
 
 /// h²·uⁱvʲ, in the order that [`PRODUCT`] names.
 #[inline(always)]
-fn moments<F: Lanes>(square: F, u: F, v: F) -> [F; BY_CHANNEL] {
+fn moments<F: Vector>(square: F, u: F, v: F) -> [F; BY_CHANNEL] {
     let (uu, uv, vv) = (u * u, u * v, v * v);
     let (suu, svv) = (square * u * u, square * v * v);
     [

@@ -1,13 +1,31 @@
-//! Sixty-four of a tile's pairs in the tile's own coordinates, and the 4×4-pixel blocks each of them reaches.
+//! Sixty-four of a tile's pairs in the tile's own coordinates, and the blocks of pixels each of them reaches.
 
 use super::memory::prefetch;
 use super::project::Splat;
-use super::simd::{LANES, Lanes, Lanes16, Mask};
+use super::simd::{LANES, Lanes, Lanes16, Mask, Vector};
 use super::tiles::Pair;
-use super::{ALPHA_MIN, BLOCKS, TILE};
+use super::{ALPHA_MIN, ROWS, TILE};
 
 /// Pairs processed together: a bit each in a block's mask.
 pub const BATCH: usize = 64;
+
+/// Blocks of a tile at most: 4×2 pixels, eight lanes, each.
+pub const MOST_BLOCKS: usize = 2 * ROWS;
+
+/// Bit p of word b: whether pair p of a batch reaches block b.
+pub type BlockMasks = [u64; MOST_BLOCKS];
+
+/// Blocks of a tile for lanes `B`: of its 4×4 pixels, a row of memory, or of either half.
+pub const fn blocks<B: Vector>() -> usize {
+    TILE * TILE / B::COUNT
+}
+
+/// Which row a block's pixels are in, and which part of it they are.
+#[inline(always)]
+pub fn row_and_part<B: Vector>(block: usize) -> (usize, usize) {
+    let parts = LANES / B::COUNT;
+    (block / parts % ROWS, block % parts)
+}
 
 /// A tile's splats lie scattered in memory: each is prefetched this many pairs before it is needed.
 const AHEAD: usize = 24;
@@ -113,52 +131,53 @@ impl TileRect {
         }
     }
 
-    /// The light of every block's pixels before the first splat: 1, but 0 off the image.
+    /// The light of every row's pixels before the first splat: 1, but 0 off the image.
     #[inline(always)]
-    pub fn light<F: Lanes>(&self) -> [Lanes16; BLOCKS] {
-        let mut light = [Lanes16::default(); BLOCKS];
-        for (block, light) in light.iter_mut().enumerate() {
-            let on_image = F::Mask::from_bits(self.lanes(block));
+    pub fn light<F: Lanes>(&self) -> [Lanes16; ROWS] {
+        let mut light = [Lanes16::default(); ROWS];
+        for (row, light) in light.iter_mut().enumerate() {
+            let on_image = F::Mask::from_bits(self.lanes(row));
             F::splat(1.0).only(on_image).store(light);
         }
         light
     }
 
-    /// The lanes of a block that are on the image.
-    pub fn lanes(&self, block: usize) -> u16 {
+    /// The lanes of a row that are on the image.
+    pub fn lanes(&self, row: usize) -> u16 {
         let mut bits = 0;
         for l in 0..LANES {
-            let (x, y) = block_pixel(block, l);
+            let (x, y) = pixel_of(row, l);
             bits |= u16::from(x < self.columns && y < self.rows) << l;
         }
         bits
     }
 }
 
-/// The pixel of a block's lane, relative to the tile.
+/// The pixel of a row's lane, relative to the tile.
 #[inline(always)]
-pub fn block_pixel(block: usize, lane: usize) -> (usize, usize) {
-    (block % 4 * 4 + lane % 4, block / 4 * 4 + lane / 4)
+pub const fn pixel_of(row: usize, lane: usize) -> (usize, usize) {
+    (row % 4 * 4 + lane % 4, row / 4 * 4 + lane / 4)
 }
 
-/// The pixels' coordinates within the tile, block by block.
-static COORDINATES: [[Lanes16; 2]; BLOCKS] = {
-    let mut rows = [[Lanes16([0.0; LANES]); 2]; BLOCKS];
-    let mut block = 0;
-    while block < BLOCKS {
+/// The pixels' coordinates within the tile, row by row.
+static COORDINATES: [[Lanes16; 2]; ROWS] = {
+    let mut rows = [[Lanes16([0.0; LANES]); 2]; ROWS];
+    let mut row = 0;
+    while row < ROWS {
         let mut l = 0;
         while l < LANES {
-            rows[block][0].0[l] = (block % 4 * 4 + l % 4) as f32;
-            rows[block][1].0[l] = (block / 4 * 4 + l / 4) as f32;
+            let (x, y) = pixel_of(row, l);
+            rows[row][0].0[l] = x as f32;
+            rows[row][1].0[l] = y as f32;
             l += 1;
         }
-        block += 1;
+        row += 1;
     }
     rows
 };
 
-/// Calls `visit(pixel, block, lane, how many)` for each stretch of a tile's row that lies in one block: 4 pixels, but
-/// perhaps the last.
+/// Calls `visit(pixel, row, lane, how many)` for each stretch of a tile's line that lies in one row of lanes: 4 pixels,
+/// but perhaps the last.
 #[inline(always)]
 pub fn for_stretches(y: usize, columns: usize, mut visit: impl FnMut(usize, usize, usize, usize)) {
     for x in (0..columns).step_by(4) {
@@ -168,9 +187,10 @@ pub fn for_stretches(y: usize, columns: usize, mut visit: impl FnMut(usize, usiz
 
 /// The lanes' pixel coordinates within the tile.
 #[inline(always)]
-pub fn block_coordinates<F: Lanes>(block: usize) -> (F, F) {
-    let [x, y] = &COORDINATES[block];
-    (F::load(x), F::load(y))
+pub fn block_coordinates<B: Vector>(block: usize) -> (B, B) {
+    let (row, part) = row_and_part::<B>(block);
+    let [x, y] = &COORDINATES[row];
+    (B::load_part(x, part), B::load_part(y, part))
 }
 
 /// Loads a tile's pairs from the `first` on, 64 at most.
@@ -214,8 +234,10 @@ impl TileBatch {
     /// Bit p of mask b: whether pair p reaches α = 1/255 anywhere in block b's rectangle of pixel centres. The minimum
     /// of the quadratic over a rectangle lies on one of the two sides nearest to the centre (or is the centre).
     #[inline(always)]
-    pub fn reachable<F: Lanes>(&self, count: usize, block_masks: &mut [u64; BLOCKS]) {
-        *block_masks = [0; BLOCKS];
+    pub fn reachable<F: Lanes>(&self, count: usize, block_masks: &mut BlockMasks) {
+        block_masks[..blocks::<F::Block>()].fill(0);
+        let height = F::Block::COUNT / 4;
+        let parts = LANES / F::Block::COUNT;
         for first in (0..count).step_by(LANES) {
             // SAFETY: `first` is at most 48 and each array holds 64.
             let [a, b, c, cx, cy, log2_opacity] = unsafe {
@@ -237,9 +259,9 @@ impl TileBatch {
             // For fixed dx the best dy is dx·down; for fixed dy the best dx is dy·across.
             let down = -(a * b) / b.fma(b, c * c);
             let across = -b / a;
-            for row in 0..4 {
-                let top = F::splat((4 * row) as f32) - cy;
-                let bottom = top + F::splat(3.0);
+            for line in 0..TILE / height {
+                let top = F::splat((height * line) as f32) - cy;
+                let bottom = top + F::splat((height - 1) as f32);
                 let near_y = top.max(F::zero().min(bottom));
                 for column in 0..4 {
                     let left = F::splat((4 * column) as f32) - cx;
@@ -251,26 +273,34 @@ impl TileBatch {
                     let (u2, v2) = (a.fma(dx, b * near_y), c * near_y);
                     let least = u1.fma(u1, v1 * v1).min(u2.fma(u2, v2 * v2));
                     let hit = level.ge(least).bits();
-                    block_masks[row * 4 + column] |= u64::from(hit) << first;
+                    let block = (line / parts * 4 + column) * parts + line % parts;
+                    block_masks[block] |= u64::from(hit) << first;
                 }
             }
         }
     }
 }
 
-/// The blocks that each pair reaches, from the pairs that reach each block: four 16×16 bit matrices, transposed by
-/// swapping halves, quarters, …
+/// The blocks that each pair reaches, from the pairs that reach each block: 16×16 bit matrices, transposed by swapping
+/// halves, quarters, …
 #[inline(always)]
-pub fn by_pair(block_masks: &[u64; BLOCKS]) -> [u16; BATCH] {
+pub fn by_pair<B: Vector>(block_masks: &BlockMasks) -> [u32; BATCH] {
+    const SIDE: usize = 16;
     let mut masks = [0; BATCH];
-    for (part, masks) in masks.as_chunks_mut::<BLOCKS>().0.iter_mut().enumerate() {
-        for block in 0..BLOCKS {
-            masks[block] = (block_masks[block] >> (16 * part)) as u16;
+    for (part, masks) in masks.as_chunks_mut::<SIDE>().0.iter_mut().enumerate() {
+        for group in 0..blocks::<B>() / SIDE {
+            let mut square = [0; SIDE];
+            for i in 0..SIDE {
+                square[i] = (block_masks[SIDE * group + i] >> (SIDE * part)) as u16;
+            }
+            swap::<8>(&mut square, 0x00ff);
+            swap::<4>(&mut square, 0x0f0f);
+            swap::<2>(&mut square, 0x3333);
+            swap::<1>(&mut square, 0x5555);
+            for i in 0..SIDE {
+                masks[i] |= u32::from(square[i]) << (SIDE * group);
+            }
         }
-        swap::<8>(masks, 0x00ff);
-        swap::<4>(masks, 0x0f0f);
-        swap::<2>(masks, 0x3333);
-        swap::<1>(masks, 0x5555);
     }
     masks
 }
@@ -288,7 +318,7 @@ fn swap<const BY: usize>(m: &mut [u16; 16], low: u16) {
 
 /// log2 α before clipping, for the pixels (x, y) of a block.
 #[inline(always)]
-pub fn log2_alpha<F: Lanes>(s: &TileSplat, x: F, y: F) -> (F, F, F) {
+pub fn log2_alpha<F: Vector>(s: &TileSplat, x: F, y: F) -> (F, F, F) {
     let u = F::splat(s.a).fma(x, F::splat(s.b).fma(y, F::splat(s.u)));
     let v = F::splat(s.c).fma(y, F::splat(s.v));
     (u, v, u.fnma(u, v.fnma(v, F::splat(s.log2_opacity))))
@@ -296,7 +326,7 @@ pub fn log2_alpha<F: Lanes>(s: &TileSplat, x: F, y: F) -> (F, F, F) {
 
 /// α before clipping, where its log2 is above the minimum; elsewhere anything, even NaN: to be masked.
 #[inline(always)]
-pub fn alpha<F: Lanes>(log2: F) -> F {
+pub fn alpha<F: Vector>(log2: F) -> F {
     log2.exp2()
 }
 
@@ -309,12 +339,13 @@ mod tests {
     struct Reachable<'a>(&'a TileBatch, usize);
 
     impl Kernel for Reachable<'_> {
-        type Output = [u64; BLOCKS];
+        /// The masks, and the lines of a block's pixels.
+        type Output = (BlockMasks, usize);
         #[inline(always)]
-        fn run<F: Lanes>(self) -> [u64; BLOCKS] {
-            let mut block_masks = [0; BLOCKS];
+        fn run<F: Lanes>(self) -> Self::Output {
+            let mut block_masks = [0; MOST_BLOCKS];
             self.0.reachable::<F>(self.1, &mut block_masks);
-            block_masks
+            (block_masks, F::Block::COUNT / 4)
         }
     }
 
@@ -332,49 +363,54 @@ mod tests {
             columns: 16,
             rows: 16,
         };
-        let (mut hit, mut extra) = (0, 0);
-        for _ in 0..100 {
-            let splats: Vec<Splat> = (0..50)
-                .map(|_| {
-                    let a = 0.05 * 30f32.powf(random());
-                    Splat {
-                        x: f64::from(random() * 40.0 + 20.0),
-                        y: f64::from(random() * 40.0 + 4.0),
-                        a,
-                        b: a * (random() - 0.5) * 4.0,
-                        c: 0.05 * 30f32.powf(random()),
-                        log2_opacity: -random() * 7.0,
-                        ..Splat::default()
+        for isa in Isa::available() {
+            let (mut hit, mut extra) = (0, 0);
+            for _ in 0..50 {
+                let splats: Vec<Splat> = (0..50)
+                    .map(|_| {
+                        let a = 0.05 * 30f32.powf(random());
+                        Splat {
+                            x: f64::from(random() * 40.0 + 20.0),
+                            y: f64::from(random() * 40.0 + 4.0),
+                            a,
+                            b: a * (random() - 0.5) * 4.0,
+                            c: 0.05 * 30f32.powf(random()),
+                            log2_opacity: -random() * 7.0,
+                            ..Splat::default()
+                        }
+                    })
+                    .collect();
+                let pairs: Vec<Pair> = (0..50).map(|splat| Pair { splat, slot: 0 }).collect();
+                let mut tile_batch = TileBatch::default();
+                tile_batch.load(&pairs, 0, &splats, &rect);
+                let (masks, height) = dispatch(isa, Reachable(&tile_batch, pairs.len()));
+                let parts = 4 / height;
+                for (p, s) in splats.iter().enumerate() {
+                    for (block, word) in masks.iter().take(ROWS * parts).enumerate() {
+                        let (x, y) = pixel_of(block / parts, block % parts * 4 * height);
+                        // Twenty points to a pixel: the rectangle of pixel centres, not only the centres.
+                        let touched = (0..=60).any(|i| {
+                            (0..=20 * (height - 1)).any(|j| {
+                                let x = 32.5 + x as f64 + 0.05 * f64::from(i);
+                                let y = 16.5 + y as f64 + 0.05 * j as f64;
+                                let u = f64::from(s.a) * (x - s.x) + f64::from(s.b) * (y - s.y);
+                                let v = f64::from(s.c) * (y - s.y);
+                                f64::from(s.log2_opacity) - u * u - v * v
+                                    >= f64::from(ALPHA_MIN.log2())
+                            })
+                        });
+                        let got = word >> p & 1 == 1;
+                        assert!(got || !touched, "{s:?} block {block}");
+                        hit += usize::from(touched);
+                        extra += usize::from(got && !touched);
                     }
-                })
-                .collect();
-            let pairs: Vec<Pair> = (0..50).map(|splat| Pair { splat, slot: 0 }).collect();
-            let mut tile_batch = TileBatch::default();
-            tile_batch.load(&pairs, 0, &splats, &rect);
-            let block_masks = dispatch(Isa::detect(), Reachable(&tile_batch, pairs.len()));
-            for (p, s) in splats.iter().enumerate() {
-                for (block, word) in block_masks.iter().enumerate() {
-                    // Twenty points to a pixel: the rectangle of pixel centres, not only the centres.
-                    let touched = (0..=60).any(|i| {
-                        (0..=60).any(|j| {
-                            let x = 32.5 + (block % 4 * 4) as f64 + 0.05 * f64::from(i);
-                            let y = 16.5 + (block / 4 * 4) as f64 + 0.05 * f64::from(j);
-                            let u = f64::from(s.a) * (x - s.x) + f64::from(s.b) * (y - s.y);
-                            let v = f64::from(s.c) * (y - s.y);
-                            f64::from(s.log2_opacity) - u * u - v * v >= f64::from(ALPHA_MIN.log2())
-                        })
-                    });
-                    let got = word >> p & 1 == 1;
-                    assert!(got || !touched, "{s:?} block {block}");
-                    hit += usize::from(touched);
-                    extra += usize::from(got && !touched);
                 }
+                assert!(masks.iter().all(|w| w >> 50 == 0));
             }
-            assert!(block_masks.iter().all(|w| w >> 50 == 0));
+            assert!(
+                hit > 2_500 && extra * 50 < hit,
+                "{extra} blocks too many of {hit}"
+            );
         }
-        assert!(
-            hit > 5_000 && extra * 50 < hit,
-            "{extra} blocks too many of {hit}"
-        );
     }
 }

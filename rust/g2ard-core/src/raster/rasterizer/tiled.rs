@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use super::{Image, ImageGradients, Rasterizer};
-use crate::raster::BLOCKS;
+use crate::raster::ROWS;
 use crate::raster::backward::{self, Backward, Incoming, SUMS};
 use crate::raster::disjoint::DisjointSlice;
 use crate::raster::forward::{Forward, Pixels};
@@ -24,9 +24,8 @@ impl Rasterizer {
         let (camera, background) = (state.camera, state.background);
         let grid = state.grid;
         let tiles = self.batches.len();
-        self.transmittance
-            .resize(tiles, [Lanes16::default(); BLOCKS]);
-        self.last.resize(tiles, [Lanes16::default(); BLOCKS]);
+        self.transmittance.resize(tiles, [Lanes16::default(); ROWS]);
+        self.last.resize(tiles, [Lanes16::default(); ROWS]);
         let block_masks = DisjointSlice::new(&mut self.block_masks);
         let rgb = DisjointSlice::new(image.rgb);
         let alpha = DisjointSlice::new(image.alpha);

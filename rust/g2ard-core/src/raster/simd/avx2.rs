@@ -1,9 +1,10 @@
-//! Two AVX registers, with FMA.
+//! AVX registers of eight lanes, with FMA.
 
 use std::arch::x86_64::*;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use super::{LANES, Lanes, Lanes16, Mask, Real, TO_NEAREST, Wide, exp2_fraction};
+use super::twice::Twice;
+use super::{Lanes16, Mask, Real, TO_NEAREST, Vector, Wide, exp2_fraction};
 
 /// Intrinsics that touch no memory.
 macro_rules! avx2 {
@@ -14,32 +15,31 @@ macro_rules! avx2 {
     };
 }
 
-#[derive(Clone, Copy)]
-pub struct Avx2(__m256, __m256);
+pub type Avx2 = Twice<Avx>;
 
 #[derive(Clone, Copy)]
-pub struct Avx2Mask(__m256, __m256);
+pub struct Avx(__m256);
 
 #[derive(Clone, Copy)]
-pub struct Avx2Wide([__m256d; 4]);
+pub struct AvxMask(__m256);
+
+#[derive(Clone, Copy)]
+pub struct AvxWide(__m256d, __m256d);
 
 macro_rules! operators {
     ($($trait:ident $name:ident $single:ident $double:ident),*) => {$(
-        impl $trait for Avx2 {
+        impl $trait for Avx {
             type Output = Self;
             #[inline(always)]
             fn $name(self, other: Self) -> Self {
-                avx2!(Self($single(self.0, other.0), $single(self.1, other.1)))
+                avx2!(Self($single(self.0, other.0)))
             }
         }
-        impl $trait for Avx2Wide {
+        impl $trait for AvxWide {
             type Output = Self;
             #[inline(always)]
-            fn $name(mut self, other: Self) -> Self {
-                for k in 0..4 {
-                    self.0[k] = avx2!($double(self.0[k], other.0[k]));
-                }
-                self
+            fn $name(self, other: Self) -> Self {
+                avx2!(Self($double(self.0, other.0), $double(self.1, other.1)))
             }
         }
     )*};
@@ -52,224 +52,155 @@ operators!(
     Div div _mm256_div_ps _mm256_div_pd
 );
 
-impl Neg for Avx2 {
+impl Neg for Avx {
     type Output = Self;
     #[inline(always)]
     fn neg(self) -> Self {
-        avx2!({
-            let sign = _mm256_set1_ps(-0.0);
-            Self(_mm256_xor_ps(self.0, sign), _mm256_xor_ps(self.1, sign))
-        })
+        avx2!(Self(_mm256_xor_ps(self.0, _mm256_set1_ps(-0.0))))
     }
 }
 
-impl Mask for Avx2Mask {
+impl Mask for AvxMask {
     #[inline(always)]
     fn and(self, other: Self) -> Self {
-        avx2!(Self(
-            _mm256_and_ps(self.0, other.0),
-            _mm256_and_ps(self.1, other.1),
-        ))
+        avx2!(Self(_mm256_and_ps(self.0, other.0)))
     }
     #[inline(always)]
     fn or(self, other: Self) -> Self {
-        avx2!(Self(
-            _mm256_or_ps(self.0, other.0),
-            _mm256_or_ps(self.1, other.1)
-        ))
+        avx2!(Self(_mm256_or_ps(self.0, other.0)))
     }
     #[inline(always)]
     fn and_not(self, other: Self) -> Self {
-        avx2!(Self(
-            _mm256_andnot_ps(other.0, self.0),
-            _mm256_andnot_ps(other.1, self.1),
-        ))
+        avx2!(Self(_mm256_andnot_ps(other.0, self.0)))
     }
     #[inline(always)]
     fn bits(self) -> u16 {
-        avx2!((_mm256_movemask_ps(self.0) | _mm256_movemask_ps(self.1) << 8) as u16)
+        avx2!(_mm256_movemask_ps(self.0) as u16)
     }
     #[inline(always)]
     fn from_bits(bits: u16) -> Self {
         avx2!({
             let all = _mm256_set1_epi32(i32::from(bits));
-            let low = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
-            let high = _mm256_slli_epi32::<8>(low);
-            Self(
-                _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(all, low), low)),
-                _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(all, high), high)),
-            )
+            let places = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
+            let held = _mm256_cmpeq_epi32(_mm256_and_si256(all, places), places);
+            Self(_mm256_castsi256_ps(held))
         })
-    }
-    #[inline(always)]
-    fn any(self) -> bool {
-        avx2!(_mm256_movemask_ps(_mm256_or_ps(self.0, self.1)) != 0)
     }
 }
 
-impl Wide for Avx2Wide {
+impl Wide for AvxWide {
     #[inline(always)]
     fn splat(value: f64) -> Self {
-        Self([avx2!(_mm256_set1_pd(value)); 4])
-    }
-    #[inline(always)]
-    fn fma(mut self, factor: Self, addend: Self) -> Self {
-        for k in 0..4 {
-            self.0[k] = avx2!(_mm256_fmadd_pd(self.0[k], factor.0[k], addend.0[k]));
-        }
-        self
-    }
-    #[inline(always)]
-    fn store(self, out: &mut [f64; LANES]) {
-        for k in 0..4 {
-            // SAFETY: `out` holds 16 values; the instructions exist (`avx2!`).
-            unsafe { _mm256_storeu_pd(out.as_mut_ptr().add(4 * k), self.0[k]) };
-        }
-    }
-}
-
-impl Real for Avx2 {
-    type Mask = Avx2Mask;
-
-    #[inline(always)]
-    fn splat(value: f32) -> Self {
-        avx2!(Self(_mm256_set1_ps(value), _mm256_set1_ps(value)))
-    }
-    #[inline(always)]
-    fn min(self, other: Self) -> Self {
-        avx2!(Self(
-            _mm256_min_ps(self.0, other.0),
-            _mm256_min_ps(self.1, other.1),
-        ))
-    }
-    #[inline(always)]
-    fn max(self, other: Self) -> Self {
-        avx2!(Self(
-            _mm256_max_ps(self.0, other.0),
-            _mm256_max_ps(self.1, other.1),
-        ))
-    }
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        avx2!(Self(_mm256_sqrt_ps(self.0), _mm256_sqrt_ps(self.1)))
-    }
-    #[inline(always)]
-    fn ldexp(self, n: Self) -> Self {
-        avx2!({
-            let one = _mm256_set1_epi32(127);
-            let low = _mm256_slli_epi32::<23>(_mm256_add_epi32(_mm256_cvttps_epi32(n.0), one));
-            let high = _mm256_slli_epi32::<23>(_mm256_add_epi32(_mm256_cvttps_epi32(n.1), one));
-            Self(
-                _mm256_mul_ps(self.0, _mm256_castsi256_ps(low)),
-                _mm256_mul_ps(self.1, _mm256_castsi256_ps(high)),
-            )
-        })
-    }
-    #[inline(always)]
-    fn ge(self, other: Self) -> Avx2Mask {
-        avx2!(Avx2Mask(
-            _mm256_cmp_ps::<_CMP_GE_OQ>(self.0, other.0),
-            _mm256_cmp_ps::<_CMP_GE_OQ>(self.1, other.1),
-        ))
-    }
-    #[inline(always)]
-    fn gt(self, other: Self) -> Avx2Mask {
-        avx2!(Avx2Mask(
-            _mm256_cmp_ps::<_CMP_GT_OQ>(self.0, other.0),
-            _mm256_cmp_ps::<_CMP_GT_OQ>(self.1, other.1),
-        ))
-    }
-    #[inline(always)]
-    fn select(mask: Avx2Mask, yes: Self, no: Self) -> Self {
-        avx2!(Self(
-            _mm256_blendv_ps(no.0, yes.0, mask.0),
-            _mm256_blendv_ps(no.1, yes.1, mask.1),
-        ))
-    }
-}
-
-impl Lanes for Avx2 {
-    type Wide = Avx2Wide;
-
-    #[inline(always)]
-    fn load(row: &Lanes16) -> Self {
-        // SAFETY: a row holds 16 values, aligned to 64 bytes; the instructions exist (`avx2!`).
-        unsafe {
-            Self(
-                _mm256_load_ps(row.0.as_ptr()),
-                _mm256_load_ps(row.0.as_ptr().add(8)),
-            )
-        }
-    }
-    #[inline(always)]
-    unsafe fn load_at(at: *const f32) -> Self {
-        // SAFETY: the caller vouches for 16 readable values; the instructions exist (`avx2!`).
-        unsafe { Self(_mm256_loadu_ps(at), _mm256_loadu_ps(at.add(8))) }
-    }
-    #[inline(always)]
-    fn store(self, row: &mut Lanes16) {
-        // SAFETY: a row holds 16 values, aligned to 64 bytes; the instructions exist (`avx2!`).
-        unsafe {
-            _mm256_store_ps(row.0.as_mut_ptr(), self.0);
-            _mm256_store_ps(row.0.as_mut_ptr().add(8), self.1);
-        }
-    }
-    #[inline(always)]
-    unsafe fn store_at(self, at: *mut f32) {
-        // SAFETY: the caller vouches for 16 writable values; the instructions exist (`avx2!`).
-        unsafe {
-            _mm256_storeu_ps(at, self.0);
-            _mm256_storeu_ps(at.add(8), self.1);
-        }
+        avx2!(Self(_mm256_set1_pd(value), _mm256_set1_pd(value)))
     }
     #[inline(always)]
     fn fma(self, factor: Self, addend: Self) -> Self {
         avx2!(Self(
-            _mm256_fmadd_ps(self.0, factor.0, addend.0),
-            _mm256_fmadd_ps(self.1, factor.1, addend.1),
+            _mm256_fmadd_pd(self.0, factor.0, addend.0),
+            _mm256_fmadd_pd(self.1, factor.1, addend.1),
         ))
+    }
+    #[inline(always)]
+    fn store(self, out: &mut [f64]) {
+        let out = &mut out[..8];
+        // SAFETY: `out` holds 8 values; the instructions exist (`avx2!`).
+        unsafe {
+            _mm256_storeu_pd(out.as_mut_ptr(), self.0);
+            _mm256_storeu_pd(out.as_mut_ptr().add(4), self.1);
+        }
+    }
+}
+
+impl Real for Avx {
+    type Mask = AvxMask;
+
+    #[inline(always)]
+    fn splat(value: f32) -> Self {
+        avx2!(Self(_mm256_set1_ps(value)))
+    }
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        avx2!(Self(_mm256_min_ps(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        avx2!(Self(_mm256_max_ps(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        avx2!(Self(_mm256_sqrt_ps(self.0)))
+    }
+    #[inline(always)]
+    fn ldexp(self, n: Self) -> Self {
+        avx2!({
+            let exponent = _mm256_add_epi32(_mm256_cvttps_epi32(n.0), _mm256_set1_epi32(127));
+            let power = _mm256_castsi256_ps(_mm256_slli_epi32::<23>(exponent));
+            Self(_mm256_mul_ps(self.0, power))
+        })
+    }
+    #[inline(always)]
+    fn ge(self, other: Self) -> AvxMask {
+        avx2!(AvxMask(_mm256_cmp_ps::<_CMP_GE_OQ>(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn gt(self, other: Self) -> AvxMask {
+        avx2!(AvxMask(_mm256_cmp_ps::<_CMP_GT_OQ>(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn select(mask: AvxMask, yes: Self, no: Self) -> Self {
+        avx2!(Self(_mm256_blendv_ps(no.0, yes.0, mask.0)))
+    }
+}
+
+impl Vector for Avx {
+    type Wide = AvxWide;
+
+    const COUNT: usize = 8;
+
+    #[inline(always)]
+    unsafe fn load_at(at: *const f32) -> Self {
+        // SAFETY: the caller vouches for 8 readable values; the instructions exist (`avx2!`).
+        Self(unsafe { _mm256_loadu_ps(at) })
+    }
+    #[inline(always)]
+    unsafe fn store_at(self, at: *mut f32) {
+        // SAFETY: the caller vouches for 8 writable values; the instructions exist (`avx2!`).
+        unsafe { _mm256_storeu_ps(at, self.0) }
+    }
+    #[inline(always)]
+    fn fma(self, factor: Self, addend: Self) -> Self {
+        avx2!(Self(_mm256_fmadd_ps(self.0, factor.0, addend.0)))
     }
     #[inline(always)]
     fn fnma(self, factor: Self, addend: Self) -> Self {
-        avx2!(Self(
-            _mm256_fnmadd_ps(self.0, factor.0, addend.0),
-            _mm256_fnmadd_ps(self.1, factor.1, addend.1),
-        ))
+        avx2!(Self(_mm256_fnmadd_ps(self.0, factor.0, addend.0)))
     }
     #[inline(always)]
     fn floor(self) -> Self {
-        avx2!(Self(_mm256_floor_ps(self.0), _mm256_floor_ps(self.1)))
+        avx2!(Self(_mm256_floor_ps(self.0)))
     }
     #[inline(always)]
-    fn only(self, mask: Avx2Mask) -> Self {
-        avx2!(Self(
-            _mm256_and_ps(self.0, mask.0),
-            _mm256_and_ps(self.1, mask.1)
+    fn only(self, mask: AvxMask) -> Self {
+        avx2!(Self(_mm256_and_ps(self.0, mask.0)))
+    }
+    #[inline(always)]
+    fn widen(self) -> AvxWide {
+        avx2!(AvxWide(
+            _mm256_cvtps_pd(_mm256_castps256_ps128(self.0)),
+            _mm256_cvtps_pd(_mm256_extractf128_ps::<1>(self.0)),
         ))
     }
     #[inline(always)]
-    fn widen(self) -> Avx2Wide {
-        avx2!(Avx2Wide([
-            _mm256_cvtps_pd(_mm256_castps256_ps128(self.0)),
-            _mm256_cvtps_pd(_mm256_extractf128_ps::<1>(self.0)),
-            _mm256_cvtps_pd(_mm256_castps256_ps128(self.1)),
-            _mm256_cvtps_pd(_mm256_extractf128_ps::<1>(self.1)),
-        ]))
-    }
-    #[inline(always)]
-    fn narrow(wide: Avx2Wide) -> Self {
-        avx2!({
-            let [a, b, c, d] = wide.0;
-            Self(
-                _mm256_set_m128(_mm256_cvtpd_ps(b), _mm256_cvtpd_ps(a)),
-                _mm256_set_m128(_mm256_cvtpd_ps(d), _mm256_cvtpd_ps(c)),
-            )
-        })
+    fn narrow(wide: AvxWide) -> Self {
+        avx2!(Self(_mm256_set_m128(
+            _mm256_cvtpd_ps(wide.1),
+            _mm256_cvtpd_ps(wide.0)
+        )))
     }
     #[inline(always)]
     fn recip(self) -> Self {
         // 12 bits, then Newton twice: y + y·(1 − x·y).
-        let mut y = avx2!(Self(_mm256_rcp_ps(self.0), _mm256_rcp_ps(self.1)));
+        let mut y = avx2!(Self(_mm256_rcp_ps(self.0)));
         for _ in 0..2 {
             y = y.fma(self.fnma(y, Self::splat(1.0)), y);
         }
@@ -282,12 +213,11 @@ impl Lanes for Avx2 {
         let p = exp2_fraction(self - (n - magic));
         // The fraction's power is normal: its exponent can be raised as an integer.
         avx2!({
-            let low = _mm256_slli_epi32::<23>(_mm256_castps_si256(n.0));
-            let high = _mm256_slli_epi32::<23>(_mm256_castps_si256(n.1));
-            Self(
-                _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p.0), low)),
-                _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p.1), high)),
-            )
+            let raise = _mm256_slli_epi32::<23>(_mm256_castps_si256(n.0));
+            Self(_mm256_castsi256_ps(_mm256_add_epi32(
+                _mm256_castps_si256(p.0),
+                raise,
+            )))
         })
     }
     #[inline(always)]
@@ -297,7 +227,7 @@ impl Lanes for Avx2 {
         unsafe {
             let mut r = [_mm256_setzero_ps(); 12];
             for k in 0..10 {
-                r[k] = _mm256_add_ps(rows[k].0, rows[k].1);
+                r[k] = rows[k].0;
             }
             for k in 0..3 {
                 let (a, b) = (

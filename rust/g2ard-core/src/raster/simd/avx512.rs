@@ -3,7 +3,7 @@
 use std::arch::x86_64::*;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use super::{LANES, Lanes, Lanes16, Mask, Real, TO_NEAREST, Wide, exp2_fraction};
+use super::{LANES, Lanes, Lanes16, Mask, Real, TO_NEAREST, Vector, Wide, exp2_fraction};
 
 /// Intrinsics that touch no memory.
 macro_rules! avx512 {
@@ -93,7 +93,8 @@ impl Wide for Avx512Wide {
         ))
     }
     #[inline(always)]
-    fn store(self, out: &mut [f64; LANES]) {
+    fn store(self, out: &mut [f64]) {
+        let out = &mut out[..LANES];
         // SAFETY: `out` holds 16 values; the instructions exist (`avx512!`).
         unsafe {
             _mm512_storeu_pd(out.as_mut_ptr(), self.0);
@@ -140,22 +141,18 @@ impl Real for Avx512 {
 }
 
 impl Lanes for Avx512 {
+    type Block = Self;
+}
+
+impl Vector for Avx512 {
     type Wide = Avx512Wide;
 
-    #[inline(always)]
-    fn load(row: &Lanes16) -> Self {
-        // SAFETY: a row holds 16 values, aligned to 64 bytes; the instructions exist (`avx512!`).
-        Self(unsafe { _mm512_load_ps(row.0.as_ptr()) })
-    }
+    const COUNT: usize = LANES;
+
     #[inline(always)]
     unsafe fn load_at(at: *const f32) -> Self {
         // SAFETY: the caller vouches for 16 readable values; the instructions exist (`avx512!`).
         Self(unsafe { _mm512_loadu_ps(at) })
-    }
-    #[inline(always)]
-    fn store(self, row: &mut Lanes16) {
-        // SAFETY: a row holds 16 values, aligned to 64 bytes; the instructions exist (`avx512!`).
-        unsafe { _mm512_store_ps(row.0.as_mut_ptr(), self.0) }
     }
     #[inline(always)]
     unsafe fn store_at(self, at: *mut f32) {

@@ -14,6 +14,7 @@ mod avx512;
 mod neon;
 mod portable;
 mod real;
+mod twice;
 
 pub use portable::Portable;
 pub use real::{Real, exp_negative};
@@ -45,26 +46,29 @@ pub trait Mask: Copy {
     }
 }
 
-/// Sixteen f64 lanes: just enough for a rigid transform and a division.
+/// f64 lanes: just enough for a rigid transform and a division.
 pub trait Wide: Copy + Add<Output = Self> + Mul<Output = Self> + Div<Output = Self> {
     fn splat(value: f64) -> Self;
     fn fma(self, factor: Self, addend: Self) -> Self;
-    fn store(self, out: &mut [f64; LANES]);
+    /// # Panics
+    /// `out` does not hold a value per lane.
+    fn store(self, out: &mut [f64]);
 }
 
-/// Sixteen f32 lanes.
-pub trait Lanes: Real<Mask: Mask> {
+/// f32 lanes, 8 or 16.
+pub trait Vector: Real<Mask: Mask> {
     type Wide: Wide;
 
-    fn load(row: &Lanes16) -> Self;
-    /// Sixteen values from `at`, which may be unaligned.
+    /// How many.
+    const COUNT: usize;
+
+    /// `COUNT` values from `at`, which may be unaligned.
     ///
     /// # Safety
-    /// `at` must be readable for 16 values.
+    /// `at` must be readable for `COUNT` values.
     unsafe fn load_at(at: *const f32) -> Self;
-    fn store(self, row: &mut Lanes16);
     /// # Safety
-    /// `at` must be writable for 16 values.
+    /// `at` must be writable for `COUNT` values.
     unsafe fn store_at(self, at: *mut f32);
     /// `self · factor + addend`.
     fn fma(self, factor: Self, addend: Self) -> Self;
@@ -75,6 +79,22 @@ pub trait Lanes: Real<Mask: Mask> {
     fn narrow(wide: Self::Wide) -> Self;
     /// Lane `k` of the result is the sum of `rows[k]`, in one fixed order; lanes past 10 are unspecified.
     fn sums(rows: &[Self; 10]) -> Lanes16;
+
+    /// A row's values from lane `part · COUNT` on, counted modulo 16.
+    #[inline(always)]
+    fn load_part(row: &Lanes16, part: usize) -> Self {
+        let first = part * Self::COUNT % LANES;
+        // SAFETY: COUNT divides 16, so `first` is one of its multiples below 16 and the values lie in the row.
+        unsafe { Self::load_at(row.0.as_ptr().add(first)) }
+    }
+
+    /// To where [`Vector::load_part`] loads from.
+    #[inline(always)]
+    fn store_part(self, row: &mut Lanes16, part: usize) {
+        let first = part * Self::COUNT % LANES;
+        // SAFETY: as in `load_part`.
+        unsafe { self.store_at(row.0.as_mut_ptr().add(first)) }
+    }
 
     #[inline(always)]
     fn zero() -> Self {
@@ -150,9 +170,26 @@ pub trait Lanes: Real<Mask: Mask> {
     }
 }
 
+/// Sixteen f32 lanes.
+pub trait Lanes: Vector {
+    /// What blocks of pixels are worked on with: 16 lanes are 4×4 pixels, 8 are 4×2, of which fewer are evaluated in
+    /// vain.
+    type Block: Vector;
+
+    #[inline(always)]
+    fn load(row: &Lanes16) -> Self {
+        Self::load_part(row, 0)
+    }
+
+    #[inline(always)]
+    fn store(self, row: &mut Lanes16) {
+        self.store_part(row, 0);
+    }
+}
+
 /// 2^f on [0, 1): minimax polynomial of degree 5 in the relative error.
 #[inline(always)]
-pub fn exp2_fraction<F: Lanes>(f: F) -> F {
+pub fn exp2_fraction<F: Vector>(f: F) -> F {
     let mut p = F::splat(EXP2[5]);
     for k in (0..5).rev() {
         p = p.fma(f, F::splat(EXP2[k]));
