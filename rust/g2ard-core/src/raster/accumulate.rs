@@ -2,14 +2,12 @@
 
 use rayon::prelude::*;
 
+use super::blocks::{MOST_BLOCKS, blocks, by_pair, row_and_part};
 use super::disjoint::DisjointSlice;
 use super::params::Params;
 use super::project::Splat;
 use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask, Real, Vector};
-use super::tile_batch::{
-    BATCH, MOST_BLOCKS, TileBatch, TileRect, alpha, block_coordinates, blocks, by_pair, log2_alpha,
-    row_and_part,
-};
+use super::tile_batch::{BATCH, TileBatch, TileRect, alpha, block_coordinates, log2_alpha};
 use super::tiles::Pair;
 use super::{ALPHA_MIN, Camera, ROWS, Settings};
 

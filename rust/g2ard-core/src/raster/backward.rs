@@ -1,12 +1,13 @@
 //! One tile from back to front, Gaussian by Gaussian: every pair's ten sums go to its own slot.
 
+use super::blocks::{BlockMasks, MOST_BLOCKS, blocks, by_pair, row_and_part};
 use super::disjoint::DisjointSlice;
 use super::memory::prefetch;
 use super::project::Splat;
 use super::simd::{Kernel, Lanes, Lanes16, Mask, Real, Vector};
 use super::tile_batch::{
-    BATCH, BlockMasks, MOST_BLOCKS, TileRect, TileSplat, TileSplats, alpha, block_coordinates,
-    blocks, by_pair, for_stretches, load_batch, log2_alpha, row_and_part,
+    BATCH, TileRect, TileSplat, TileSplats, alpha, block_coordinates, for_stretches, load_batch,
+    log2_alpha,
 };
 use super::tiles::Pair;
 use super::{ALPHA_MIN, ROWS, Settings, TILE};

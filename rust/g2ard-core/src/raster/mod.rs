@@ -10,6 +10,7 @@
 
 pub(crate) mod accumulate;
 pub(crate) mod backward;
+mod blocks;
 pub(crate) mod depth_sort;
 pub(crate) mod disjoint;
 mod forward;

@@ -14,6 +14,7 @@ use std::time::Instant;
 use rayon::prelude::*;
 
 use super::backward::SUMS;
+use super::blocks::{BlockMasks, MOST_BLOCKS, block_lanes};
 use super::depth_sort::{self, Key};
 use super::disjoint::DisjointSlice;
 use super::gradients::{Gather, Gradients, Sink};
@@ -21,8 +22,8 @@ use super::grid::TileGrid;
 use super::memory::bytes;
 use super::params::{Params, Source};
 use super::project::{Project, Splat, View};
-use super::simd::{Isa, Kernel, LANES, Lanes, Lanes16, Vector, dispatch};
-use super::tile_batch::{BATCH, BlockMasks, MOST_BLOCKS};
+use super::simd::{Isa, LANES, Lanes16, dispatch};
+use super::tile_batch::BATCH;
 use super::tile_lists::{TileIntersector, TileList};
 use super::tiles::Bins;
 use super::{Camera, ROWS, Settings};
@@ -81,18 +82,6 @@ pub struct Rasterizer {
 impl Default for Rasterizer {
     fn default() -> Self {
         Self::new(Isa::detect())
-    }
-}
-
-/// The lanes of a block of pixels.
-struct BlockLanes;
-
-impl Kernel for BlockLanes {
-    type Output = usize;
-
-    #[inline(always)]
-    fn run<F: Lanes>(self) -> usize {
-        F::Block::COUNT
     }
 }
 
@@ -297,7 +286,7 @@ impl Rasterizer {
         Counts {
             visible: self.order.len(),
             pairs: self.bins.pairs.len(),
-            evaluated: blocks * dispatch(self.isa, BlockLanes) as u64,
+            evaluated: blocks * block_lanes(self.isa) as u64,
         }
     }
 

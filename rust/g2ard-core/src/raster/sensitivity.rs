@@ -4,13 +4,13 @@
 //! Of a pixel, g is linear in φ = (u, v, u², uv, v²): g = L·(h φ) + w·d, with h = ∂C/∂(ln α), w = αT, and L (6×5) and d
 //! (by the viewing direction in SH) the same for every pixel of a view. So a pixel adds to moments of u and v only.
 
+use super::blocks::{BlockMasks, blocks, row_and_part};
 use super::disjoint::DisjointSlice;
 use super::params::Source;
 use super::project::{ScreenGradients, Splat, View, unproject};
 use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask, Real, Vector};
 use super::tile_batch::{
-    BATCH, BlockMasks, TileRect, TileSplats, alpha, block_coordinates, blocks, load_batch,
-    log2_alpha, row_and_part,
+    BATCH, TileRect, TileSplats, alpha, block_coordinates, load_batch, log2_alpha,
 };
 use super::tiles::Pair;
 use super::{ALPHA_MIN, ROWS, Settings};
