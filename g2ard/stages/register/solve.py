@@ -28,8 +28,9 @@ _SIGMAS = 1.4826
 """Standard deviations of a normal distribution in its median absolute deviation."""
 _LEAST_SIGMA = 0.1
 """Pixels that a match is known to at best."""
-_STILL = 0.05
-"""Pixels (root of the mean square over the inliers): what moves the image by less was the last pass."""
+_STILL = 0.3
+"""Pixels (root of the mean square over the inliers): what moves the image by less, about the error of a keypoint's
+place, was the last pass. At 0.05 a third pass followed for nothing: `docs/decisions/0029-registration.md`."""
 
 
 @dataclass(frozen=True, eq=False)

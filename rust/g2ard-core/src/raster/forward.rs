@@ -16,6 +16,18 @@ pub struct Pixels {
     pub median: [Lanes16; ROWS],
 }
 
+impl Pixels {
+    #[inline(always)]
+    fn colours<B: Vector>(&self, row: usize, part: usize) -> [B; 3] {
+        let [r, g, b] = &self.rgb;
+        [
+            B::load_part(&r[row], part),
+            B::load_part(&g[row], part),
+            B::load_part(&b[row], part),
+        ]
+    }
+}
+
 /// Blends a tile. `block_masks` holds the pairs that contributed to each block afterwards.
 pub struct Forward<'a, const DEPTH: bool> {
     pub pairs: &'a [Pair],
@@ -50,9 +62,8 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
         for (batch, block_masks) in self.block_masks.iter_mut().enumerate() {
             let first = batch * BATCH;
             let pairs = &self.pairs[first..self.pairs.len().min(first + BATCH)];
-            self.tile_batch
-                .load(self.pairs, first, self.splats, &self.rect);
-            let s = &*self.tile_batch;
+            let s = &mut *self.tile_batch;
+            s.load(self.pairs, first, self.splats, &self.rect);
             s.reachable::<F>(pairs.len(), block_masks);
             let mut any = false;
             for block in 0..blocks::<F::Block>() {
@@ -69,10 +80,7 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
                 let mut left = F::Block::load_part(&self.transmittance[row], part);
                 let mut last = F::Block::load_part(&self.last[row], part);
                 let px = &mut *self.pixels;
-                let mut rgb = [F::Block::zero(); 3];
-                for c in 0..3 {
-                    rgb[c] = F::Block::load_part(&px.rgb[c][row], part);
-                }
+                let mut rgb = px.colours::<F::Block>(row, part);
                 let mut depth = F::Block::load_part(&px.depth[row], part);
                 let mut median = F::Block::load_part(&px.median[row], part);
                 let mut light = true;
