@@ -70,13 +70,27 @@ def tiling_of(
         raise typer.BadParameter(f"--{error}") from None
     if scheduler is not None and scheduler != "local" and "://" not in scheduler:
         raise typer.BadParameter(f"--scheduler: tcp://HOST:PORT or local, not {scheduler!r}")
-    name = output.name.replace("{", "").replace("}", "")
     return Tiling(
         None if tile_rows is None else tile_rows.of(0),
         size,
         workers,
         run.threads or None,
         scheduler,
-        work or output.with_name(f".{name}.tiles"),
+        work or _beside(output),
         keep=work is not None,
     )
+
+
+def _beside(output: Path) -> Path:
+    """Where tiles and steps lie: beside what is made, never within it, nor in a folder that {ratio} or
+    {count} names.
+
+    >>> [_beside(Path(name)).as_posix() for name in ("a/b.ply", "a/{ratio}x/run", "a/meta.json")]
+    ['a/.b.ply.tiles', 'a/.ratiox.tiles', '.a.tiles']
+    """
+    if output.name == "meta.json":  # of a folder of SOG
+        output = output.parent
+    while "{" in str(output.parent):
+        output = output.parent
+    name = output.name.replace("{", "").replace("}", "")
+    return output.with_name(f".{name}.tiles")

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import typer
+
 from g2ard.cli.frame import Run
 from g2ard.cli.outputs import Outputs
-from g2ard.cli.run_folder import write_report
+from g2ard.cli.run_folder import is_done, tell_finished, write_report
 
 if TYPE_CHECKING:
     from g2ard.policy.budget import Budget
@@ -19,7 +21,14 @@ if TYPE_CHECKING:
     from g2ard.tiles.simplify import TiledScene
     from g2ard.tiles.store import TileStore
 
-__all__ = ["TiledCommand"]
+__all__ = ["TiledCommand", "refuse_in_tiles"]
+
+
+def refuse_in_tiles(options: Mapping[str, object]) -> None:
+    """A usage error for the first option that was given and that takes the scene in one piece."""
+    for name, value in options.items():
+        if value:
+            raise typer.BadParameter(f"{name}: not in tiles; --tile-rows above the count avoids them")
 
 
 class TiledCommand:
@@ -75,8 +84,9 @@ class TiledCommand:
         run.result(reports[0] if len(reports) == 1 else {"runs": reports})
         forget(self.tiling)
 
-    def distill(self, options: DistillOptions, name: str) -> None:
-        """`g2ard distill`: in each run's folder the scene, its views and the report."""
+    def distill(self, options: DistillOptions, name: str, resume: bool) -> None:
+        """`g2ard distill`: in each run's folder the scene, its views and the report; with --resume for those
+        budgets alone that are not finished."""
         from dataclasses import asdict
 
         from g2ard import io
@@ -85,11 +95,21 @@ class TiledCommand:
         from g2ard.policy.tiled_distill import distill_in_tiles
         from g2ard.report.tiled import tiled_report
 
-        run, began, reports = self.run, time.perf_counter(), []
+        run, began = self.run, time.perf_counter()
+        run.kept = [f"what is done stands in {self.tiling.folder}; the same command with --resume goes on"]
+        places = [folder / name for folder in self.outputs.paths()]
+        finished = [at for at, place in enumerate(places) if is_done(run, place, resume)]
+        reports = {at: tell_finished(run, places[at]) for at in finished}
+        left = [at for at in range(len(self.budgets)) if at not in reports]
         made = distill_in_tiles(
-            self.scene, self.budgets, self.tiling, options, progress=run.progress, say=run.say
+            self.scene,
+            [self.budgets[at] for at in left],
+            self.tiling,
+            options,
+            progress=run.progress,
+            say=run.say,
         )
-        for at, (store, small, scores, views) in enumerate(made):
+        for at, (store, small, scores, views) in zip(left, made, strict=True):
             folder = self.outputs.paths(store.count)[at]
             report = {
                 "input_count": store.count,
@@ -113,8 +133,8 @@ class TiledCommand:
                 f"{scores.simplified:.2f} → {scores.recovered:.2f} dB over the pixels that tiles own"
             )
             run.kept.append(f"{folder} is finished")
-            reports.append(report)
-        run.result(reports[0] if len(reports) == 1 else {"runs": reports})
+            reports[at] = report
+        run.result(reports[0] if len(reports) == 1 else {"runs": [reports[at] for at in sorted(reports)]})
         forget(self.tiling)
 
     def _write(self, place: Path, store: TileStore, small: TiledScene) -> None:

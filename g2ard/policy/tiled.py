@@ -101,7 +101,8 @@ def bytes_of(text: str) -> int:
 
 
 def is_tiled(scene: Path, tiling: Tiling) -> bool:
-    """Whether a scene is a folder of several tiles, or has too many Gaussians to be worked on in one piece.
+    """Whether a scene is a folder of several tiles, or has too many Gaussians to be worked on in one piece; a
+    cloud of points never is.
 
     Raises:
         InputError: a scene that cannot be read.
@@ -116,9 +117,10 @@ def is_tiled(scene: Path, tiling: Tiling) -> bool:
         and scene.stat().st_size < _SMALLEST_ROW * tiling.most_rows
     ):
         return False
+    from g2ard.io.detect import kind
     from g2ard.io.stream import open_stream
 
-    return open_stream(scene).count > tiling.most_rows
+    return kind(scene) == "splats" and open_stream(scene).count > tiling.most_rows
 
 
 def check_memory(scene: Path, tiling: Tiling, times: float) -> None:

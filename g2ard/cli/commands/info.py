@@ -66,14 +66,23 @@ def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
         figures = describe(path)
         return figures, _rows(figures)
     figures, report = describe(scene), read_json(path / "report.json")
-    scores = {name: {k: found[k] for k in ("psnr", "ssim")} for name, found in report["scores"].items()}
-    figures["run"] = {"input_count": report["input_count"], "against": report["against"], "scores": scores}
+    against, scores = _scores(report)
+    figures["run"] = {"input_count": report["input_count"], "against": against, "scores": scores}
     rows = [["made from", plural(report["input_count"], "Gaussian")]]
-    rows += [
-        [name, f"{found['psnr']:.2f} dB, SSIM {found['ssim']:.4f} against {report['against']}"]
-        for name, found in scores.items()
-    ]
+    for name, found in scores.items():
+        ssim = f", SSIM {found['ssim']:.4f}" if "ssim" in found else ""
+        rows.append([name, f"{found['psnr']:.2f} dB{ssim} against {against}"])
     return figures, [*_rows(figures), *rows]
+
+
+def _scores(report: dict[str, Any]) -> tuple[str, dict[str, dict[str, float]]]:
+    """What a run was scored against, and its scores; of one in tiles PSNR alone, over the pixels they own."""
+    scores = report["scores"]
+    if "tiles" in report:
+        return "the scene's renders", {name: {"psnr": scores[name]} for name in ("simplified", "recovered")}
+    return report["against"], {
+        name: {k: found[k] for k in ("psnr", "ssim")} for name, found in scores.items()
+    }
 
 
 def _rows_of_stopped(path: Path, stopped: dict[str, Any]) -> list[list[str]]:

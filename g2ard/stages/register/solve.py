@@ -29,8 +29,8 @@ _SIGMAS = 1.4826
 _LEAST_SIGMA = 0.1
 """Pixels that a match is known to at best."""
 _STILL = 0.3
-"""Pixels (root of the mean square over the inliers): what moves the image by less, about the error of a keypoint's
-place, was the last pass. At 0.05 a third pass followed for nothing: `docs/decisions/0029-registration.md`."""
+"""Pixels (root of the mean square over the inliers): what moves the image by less, about the error of a
+keypoint's place, was the last pass."""
 
 
 @dataclass(frozen=True, eq=False)
