@@ -133,7 +133,8 @@ class Run:
         self.kept: list[str] = []  # what a Ctrl-C leaves, in words
         given = (*options.values(), common["config"])
         paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
-        self._inputs = [p for p in paths if isinstance(p, Path) and p is not options.get("output")]
+        written = (options.get("output"), options.get("work"))
+        self._inputs = [p for p in paths if isinstance(p, Path) and all(p is not w for w in written)]
         self.config = {**options, "seed": self.seed, "threads": self.threads, "device": self.device}
         if "set" in common:
             self.config["set"] = common["set"]
@@ -311,6 +312,9 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
     outputs = [Path(o) for o in (options.get("output"), run.json) if o not in (None, "-")]
     if len({output.resolve() for output in outputs}) < len(outputs):
         raise typer.BadParameter(f"--json and --output are both {run.json}; name another file for one")
+    work = options.get("work")
+    if work is not None and work.resolve() in {output.resolve() for output in outputs}:
+        raise typer.BadParameter(f"--work: {work} is an output; name another folder")
     run.spare_inputs(*outputs)
     if run.device == "cuda" and not cuda:
         run.say("--device cuda: this command computes on the CPU only, and does")

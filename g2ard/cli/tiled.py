@@ -43,9 +43,15 @@ class TiledCommand:
 
     def simplify(self, config: SimplifyConfig, views: Any, blind: bool, up: Sequence[float] | None) -> None:
         """`g2ard simplify`."""
+        from g2ard.policy.work import working
+
+        with working(self.tiling, views):
+            self._simplify(config, views, blind, up)
+
+    def _simplify(self, config: SimplifyConfig, views: Any, blind: bool, up: Sequence[float] | None) -> None:
         from g2ard.constants import listed
         from g2ard.memory import peak_rss
-        from g2ard.policy.tiled import forget, simplify_in_tiles
+        from g2ard.policy.tiled import simplify_in_tiles
 
         run, began, reports = self.run, time.perf_counter(), []
         made = simplify_in_tiles(
@@ -82,16 +88,20 @@ class TiledCommand:
                 }
             )
         run.result(reports[0] if len(reports) == 1 else {"runs": reports})
-        forget(self.tiling)
 
     def distill(self, options: DistillOptions, name: str, resume: bool) -> None:
         """`g2ard distill`: in each run's folder the scene, its views and the report; with --resume for those
         budgets alone that are not finished."""
+        from g2ard.policy.work import working
+
+        with working(self.tiling, options.views, options.held_out):
+            self._distill(options, name, resume)
+
+    def _distill(self, options: DistillOptions, name: str, resume: bool) -> None:
         from dataclasses import asdict
 
         from g2ard import io
         from g2ard.memory import peak_rss
-        from g2ard.policy.tiled import forget
         from g2ard.policy.tiled_distill import distill_in_tiles
         from g2ard.report.tiled import tiled_report
 
@@ -135,7 +145,6 @@ class TiledCommand:
             run.kept.append(f"{folder} is finished")
             reports[at] = report
         run.result(reports[0] if len(reports) == 1 else {"runs": [reports[at] for at in sorted(reports)]})
-        forget(self.tiling)
 
     def _write(self, place: Path, store: TileStore, small: TiledScene) -> None:
         from g2ard import io

@@ -11,7 +11,7 @@ from uuid import uuid4
 
 from g2ard.errors import OutputError
 
-__all__ = ["atomic_folder", "atomic_output", "check_output"]
+__all__ = ["atomic_folder", "atomic_output", "check_output", "drop_empty", "parents_made"]
 
 
 def check_output(path: str | Path, overwrite: bool = False, *, folder: bool = False) -> Path:
@@ -88,7 +88,7 @@ def atomic_output(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
     ['a.txt']
     """
     path = check_output(path, overwrite)
-    temporary, made = _beside(path), _parents_made(path)
+    temporary, made = _beside(path), parents_made(path)
     try:
         yield temporary
         os.replace(temporary, path)
@@ -98,7 +98,7 @@ def atomic_output(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
         raise OutputError(f"{path}: cannot write: {error.strerror or error}") from error
     finally:
         temporary.unlink(missing_ok=True)
-        _drop_empty(made)
+        drop_empty(made)
 
 
 @contextmanager
@@ -112,7 +112,7 @@ def atomic_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
         OutputError: see `check_output`; or the disk refuses while writing.
     """
     path = check_output(path, overwrite, folder=True)
-    temporary, made = _beside(path), _parents_made(path)
+    temporary, made = _beside(path), parents_made(path)
     try:
         temporary.mkdir()
         yield temporary
@@ -126,17 +126,17 @@ def atomic_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
         raise OutputError(f"{path}: cannot write: {error.strerror or error}") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-        _drop_empty(made)
+        drop_empty(made)
 
 
-def _parents_made(path: Path) -> list[Path]:
+def parents_made(path: Path) -> list[Path]:
     """Make the folders above `path` that are absent; those made, innermost first."""
     absent = [folder for folder in path.absolute().parents if not folder.exists()]
     path.absolute().parent.mkdir(parents=True, exist_ok=True)
     return absent
 
 
-def _drop_empty(folders: list[Path]) -> None:
+def drop_empty(folders: list[Path]) -> None:
     """Nothing came of an output: the folders made for it go again."""
     for folder in folders:
         with suppress(OSError):

@@ -151,7 +151,16 @@ def _folder_format(path: Path) -> Format:
         return "inria"
     if gsplat_run.is_run(path / gsplat_run.NAME):
         return "gsplat_run"
+    if _is_begun(path):
+        raise InputError(f"{path}: tiles that `ingest` has not finished; the same call of it goes on")
     raise InputError(f"{path}: nothing known in this folder{_instead(path)}")
+
+
+def _is_begun(path: Path) -> bool:
+    """Whether a folder holds tiles that are being written, or were until that was stopped."""
+    from g2ard.tiles.journal import JOURNAL, POINTS
+
+    return any((path / journal).is_file() for journal in (JOURNAL, f"{POINTS}/{JOURNAL}"))
 
 
 def _near(path: Path) -> str:
@@ -186,8 +195,8 @@ def _instead(path: Path) -> str:
             f"--workspace_path project --image_path {photos}, then give project"
         )
     return (
-        " (looked for SOG's meta.json, a COLMAP sparse/0, transforms.json, cameras.json, nerfstudio's and "
-        "gsplat's runs, Cambridge's dataset_train.txt)"
+        " (looked for SOG's meta.json, `ingest`'s tiles.json, a COLMAP sparse/0, transforms.json, "
+        "cameras.json, nerfstudio's and gsplat's runs, Cambridge's dataset_train.txt)"
     )
 
 

@@ -7,6 +7,7 @@ has Gaussians there the file, the offset of the first of its rows and their coun
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -30,6 +31,9 @@ __all__ = ["save_levels"]
 
 _ERRORS = "errors.jsonl"
 """In the folder of what is done: a leaf's errors a line, in one order of leaves."""
+
+_BESIDE = "beside.txt"
+"""There too: the hidden folder that becomes the output, for a killed call leaves it."""
 
 
 def save_levels(
@@ -88,13 +92,41 @@ def save_levels(
         "filenames": list(files.parts),
         "tree": root,
     }
+    if work is not None:
+        _sweep(work)
+        files.write(work, Path(path), progress)
     with atomic_folder(path, overwrite) as folder:
-        files.write(work or folder, Path(path), progress)
-        if work is not None:
-            for name in files.parts:
-                shutil.move((work / name).parent, folder)
+        if work is None:
+            files.write(folder, Path(path), progress)
+        else:
+            (work / _BESIDE).write_text(str(folder))
+            for name in files.parts:  # not moved: after an interruption all are whole here still
+                shutil.copytree((work / name).parent, (folder / name).parent, copy_function=_linked)
         (folder / "lod-meta.json").write_text(json.dumps(meta, separators=(",", ":")))
-        return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    if work is not None:
+        for name in files.parts:
+            shutil.rmtree((work / name).parent, ignore_errors=True)
+        (work / _BESIDE).unlink()
+    return size
+
+
+def _sweep(work: Path) -> None:
+    """Remove what a call that was killed had begun: folders of files here, and the one beside its output."""
+    begun = [path for path in work.iterdir() if path.is_dir() and path.name.startswith(".")]
+    if (note := work / _BESIDE).is_file():
+        beside = Path(note.read_text())
+        begun += [beside] if beside.name.startswith(".") else []
+    for path in begun:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _linked(source: str, target: str) -> None:
+    """The same file under another name, or a copy where the disk is another."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
 
 
 @dataclass
@@ -176,12 +208,20 @@ def _measure(
 
 
 def _lines(table: Path) -> list[list[float]]:
-    """The lines that were written whole; one that was not is cut off."""
-    text = table.read_bytes()
-    whole = text[: text.rfind(b"\n") + 1]
-    if whole != text:
-        table.write_bytes(whole)
-    return [json.loads(line) for line in whole.splitlines()]
+    """The lines up to the first that is not whole, which is cut off with all after it."""
+    text, whole, found = table.read_bytes(), 0, []
+    for line in text.splitlines(keepends=True):
+        try:
+            values = [float(value) for value in json.loads(line)]
+        except (ValueError, TypeError):
+            break
+        if not line.endswith(b"\n"):
+            break
+        found.append(values)
+        whole += len(line)
+    if whole < len(text):
+        table.write_bytes(text[:whole])
+    return found
 
 
 def _rounded(values: Sequence[float] | NDArray[np.float64]) -> list[float]:

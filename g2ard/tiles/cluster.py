@@ -66,19 +66,19 @@ class DaskExecutor:
         from distributed import KilledWorker
 
         deaths = 0
-        while todo := {task.key: task for task in tasks if not task.output.exists()}:
+        while todo := {task.key: task for task in tasks if not task.done}:
             before = len(todo)
             try:
                 self._round(todo, sum(task.cost for task in tasks), stage, progress)
             except KilledWorker:
-                left = sum(not task.output.exists() for task in tasks)
+                left = sum(not task.done for task in tasks)
                 deaths = deaths + 1 if left == before else 0
                 if deaths == _TRIES:
                     raise InputError(
                         f"{stage}: workers die before they finish anything; give them memory"
                     ) from None
                 continue
-            if missing := [task.output for task in tasks if not task.output.exists()]:
+            if missing := [task.output for task in tasks if not task.done]:
                 raise InputError(
                     f"{missing[0]}: a worker made it, but it is not here; share that folder with all workers"
                 )

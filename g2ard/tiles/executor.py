@@ -64,7 +64,7 @@ def executor(
 
 class _Here:
     def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
-        todo = [task for task in tasks if not task.output.exists()]
+        todo = [task for task in tasks if not task.done]
         done = total = sum(task.cost for task in tasks)
         done -= sum(task.cost for task in todo)
         for task in todo:
@@ -91,14 +91,14 @@ class _Processes:
     def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
         total, failures = sum(task.cost for task in tasks), 0
         _sweep(tasks)
-        while todo := [task for task in tasks if not task.output.exists()]:
+        while todo := [task for task in tasks if not task.done]:
             before = len(todo)
             try:
                 self._round(todo, total, stage, progress)
             except BrokenProcessPool:
                 self._stop(at_once=True)
                 _sweep(tasks)
-                left = sum(not task.output.exists() for task in tasks)
+                left = sum(not task.done for task in tasks)
                 failures = failures + 1 if left == before else 0
                 if failures == _TRIES:
                     raise InputError(

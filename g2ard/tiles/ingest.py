@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError, OutputError
 from g2ard.io import kind
 from g2ard.io.clean import Tally
+from g2ard.io.lock import LOCK, locked
 from g2ard.io.point_stream import open_point_stream
 from g2ard.io.stream import SceneStream, open_stream
 from g2ard.io.types import Note
@@ -29,6 +30,9 @@ __all__ = ["TILE_ROWS", "ingest"]
 
 TILE_ROWS = 5_000_000
 """Rows of a tile at the most, unless told otherwise."""
+
+_MOST_TILES = 10_000
+"""Tiles of a scene, about: each is two files, and every step goes over all of them."""
 
 _BLOCK_BYTES = 1 << 24
 """Bytes of rows in memory at a time; some five copies of them are made on the way."""
@@ -100,8 +104,9 @@ def ingest(
         say: told what was noticed.
 
     Raises:
-        InputError: the source cannot be read, or `tile_rows` is less than 1.
-        OutputError: the folder holds something else, or the disk has too little room.
+        InputError: the source cannot be read, or `tile_rows` is less than 1 or a 10,000th of its rows.
+        OutputError: the folder holds something else, another process writes there, or the disk has too
+            little room.
 
     >>> import tempfile
     >>> import numpy as np
@@ -118,6 +123,12 @@ def ingest(
     if tile_rows < 1 or (block_rows is not None and block_rows < 1):
         raise InputError(f"tile_rows and block_rows: expected at least 1, got {tile_rows}, {block_rows}")
     feed, sources = _feed(source, lift or LiftConfig())
+    fewest = -(-feed.count // _MOST_TILES)
+    if like is None and tile_rows < fewest:
+        raise InputError(
+            f"tile_rows: {feed.path} is {feed.count:,} rows, too many tiles of {tile_rows:,}; "
+            f"{fewest:,} are the fewest"
+        )
     settings: dict[str, Any] = {"tile_rows": tile_rows} if like is None else {"like": like.key}
     if isinstance(feed, PointFeed):
         settings["lift"] = asdict(feed.config)
@@ -126,25 +137,29 @@ def ingest(
     if done is not None:
         say(f"{folder}: holds these {plural(done.count, 'Gaussian')} already; skipped")
         return done
-    _check_folder(folder, key, overwrite)
-    rows = block_rows or max(1, _BLOCK_BYTES // feed.row_bytes)
-    try:
-        if isinstance(feed, PointFeed):
-            journal = lift_tiles(folder, key, feed, tile_rows, rows, progress, say)
-        else:
-            journal = pour(folder, key, feed, tile_rows, rows, progress, say, like)
-    except InputError:
-        clear(folder)
-        raise
-    notes = [*feed.all_notes(), *([] if like else _overfull_note(journal, tile_rows))]
-    manifest = {
-        "sh_degree": feed.sh_degree,
-        "offset": feed.offset.tolist(),
-        "source": sources,
-        "settings": settings,
-        "notes": [asdict(note) for note in notes],
-    }
-    journal.finish(manifest)
+    _check_foreign(folder)
+    with locked(folder):
+        if (done := _done(folder, key, overwrite)) is not None:
+            return done  # by another process in the meantime
+        _check_tiles(folder, key, overwrite, say)
+        rows = block_rows or max(1, _BLOCK_BYTES // feed.row_bytes)
+        try:
+            if isinstance(feed, PointFeed):
+                journal = lift_tiles(folder, key, feed, tile_rows, rows, progress, say)
+            else:
+                journal = pour(folder, key, feed, tile_rows, rows, progress, say, like)
+        except InputError:
+            clear(folder)
+            raise
+        notes = [*feed.all_notes(), *([] if like else _overfull_note(journal, tile_rows))]
+        manifest = {
+            "sh_degree": feed.sh_degree,
+            "offset": feed.offset.tolist(),
+            "source": sources,
+            "settings": settings,
+            "notes": [asdict(note) for note in notes],
+        }
+        journal.finish(manifest)
     return TileStore.open(folder)
 
 
@@ -167,20 +182,21 @@ def _key(identity: list[Any], settings: dict[str, Any]) -> str:
 
 
 def _done(folder: Path, key: str, overwrite: bool) -> TileStore | None:
-    """The store, if it is this very one and whole; one that is broken may be replaced under `overwrite`."""
+    """The store, if it is this very one and whole; what is broken may be replaced if it was this one, or
+    under `overwrite`."""
     if not (folder / MANIFEST).is_file():
         return None
     try:
         store = TileStore.open(folder)
     except InputError:
-        if overwrite:
+        if overwrite or _key_in(folder / MANIFEST) == key:
             return None
         raise
     return store if store.key == key else None
 
 
-def _check_folder(folder: Path, key: str, overwrite: bool) -> None:
-    """Make the folder; refuse one that holds anything but the beginnings of these very tiles."""
+def _check_foreign(folder: Path) -> None:
+    """Make the folder; refuse one that holds anything but tiles."""
     if folder.is_file():
         raise OutputError(f"{folder}: is a file; a folder is to be written there")
     try:
@@ -188,30 +204,34 @@ def _check_folder(folder: Path, key: str, overwrite: bool) -> None:
         names = {path.name for path in folder.iterdir()}
     except OSError as error:
         raise OutputError(f"{folder}: cannot write there: {error.strerror}") from error
-    foreign = sorted(name for name in names if not is_ours(name))
+    foreign = sorted(name for name in names if not (is_ours(name) or name == LOCK))
     if foreign:
         raise OutputError(f"{folder}: holds {foreign[0]}, which is no part of tiles; name another folder")
-    begun = _begun(folder)
-    if MANIFEST not in names and begun in (None, key):
-        if begun is None:
-            clear(folder)
-        return
-    if not overwrite:
+
+
+def _check_tiles(folder: Path, key: str, overwrite: bool, say: Say) -> None:
+    """Refuse all but the beginnings of these very tiles, and clear away what is no use to go on from."""
+    found = (folder / MANIFEST, folder / JOURNAL, folder / POINTS / JOURNAL)
+    manifest, *begun = [_key_in(path) for path in found]
+    known = {each for each in (manifest, *begun) if each is not None}
+    if known - {key} and not overwrite:
         raise OutputError(
             f"{folder}: holds tiles of another scene or of other settings; overwrite=True replaces it"
         )
-    clear(folder)
+    if manifest == key:
+        say(f"{folder}: its tiles are damaged; written anew")
+    if manifest is not None or known != {key}:
+        clear(folder)
 
 
-def _begun(folder: Path) -> str | None:
-    """The key in the journal of what was begun; "" where it cannot be read, None where nothing was begun."""
-    for path in (folder / JOURNAL, folder / POINTS / JOURNAL):
-        if path.is_file():
-            try:
-                return str(json.loads(path.read_text())["key"])
-            except (ValueError, KeyError, TypeError):
-                return ""
-    return None
+def _key_in(path: Path) -> str | None:
+    """The key in a manifest or journal; "" where it cannot be read, None where there is none."""
+    if not path.is_file():
+        return None
+    try:
+        return str(json.loads(path.read_text())["key"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return ""
 
 
 def _overfull_note(journal: Journal, tile_rows: int) -> list[Note]:

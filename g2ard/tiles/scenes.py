@@ -78,10 +78,9 @@ def cameras_of(path: Path) -> Cameras:
 
 
 def tile_of(arguments: Arguments, inputs: Inputs, places: Places, *, sh: bool = True) -> PreparedScene:
-    """A tile's Gaussians, with all bands or band 0; the first step checks the contents for all others, and
-    finds the order that they take."""
+    """A tile's Gaussians, with all bands or band 0; the first step finds the order that all others take."""
     known = inputs.get("own")
-    scene = TileStore.open(places["store"]).read(arguments["tile"], sh=sh, check=known is None)
+    scene = TileStore.open(places["store"]).read(arguments["tile"], sh=sh)
     prepared = finite_rows_of(scene)[0]
     if known is not None:
         prepared.restore(*load(known, "order", "bounds"))

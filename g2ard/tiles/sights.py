@@ -20,7 +20,7 @@ from g2ard.tiles.run import TiledRun
 from g2ard.tiles.scenes import scene_of
 from g2ard.tiles.steps import COARSE
 from g2ard.tiles.store import TileStore
-from g2ard.tiles.task import Task, load
+from g2ard.tiles.task import Task, is_whole, load
 from g2ard.visibility import LONGEST, MOST_LOOKS, NEAR
 
 __all__ = ["Sights", "Surroundings", "in_sight", "light_of", "written"]
@@ -141,8 +141,8 @@ def written(work: Path, cameras: Cameras) -> Path:
     arrays = {name: getattr(cameras, name) for name in ("viewmats", "Ks", "widths", "heights")}
     content = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays.values())
     path = work / f"views-{hashlib.sha256(content).hexdigest()[:16]}.npz"
-    if not path.exists():
-        with atomic_output(path) as temporary, temporary.open("wb") as file:
+    if not is_whole(path):
+        with atomic_output(path, overwrite=True) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
     return path
 

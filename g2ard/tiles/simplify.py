@@ -198,7 +198,7 @@ def _scene(
 def _as_it_is(store: TileStore, sights: Sights | None) -> TiledScene:
     return TiledScene(
         tuple(tile.rows for tile in store.tiles),
-        lambda tile: store.read(tile, check=False),
+        store.read,
         store.sh_degree,
         store.offset,
         key_of(store.key),

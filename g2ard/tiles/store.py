@@ -197,19 +197,18 @@ class TileStore:
         """Bytes of all tiles and halos."""
         return self.row_bytes * sum(tile.rows + tile.halo for tile in self.tiles)
 
-    def read(self, index: int, *, sh: bool = True, check: bool = True) -> Splats:
+    def read(self, index: int, *, sh: bool = True) -> Splats:
         """A tile's own rows, in the order of the source.
 
         Args:
             index: which tile.
             sh: the higher bands too; else the result has SH degree 0.
-            check: whether the contents are held to their checksum.
 
         Raises:
             InputError: the file is absent, has another size, or its contents changed.
         """
         tile = self.tiles[index]
-        return self._read(tile_name(index), tile.rows, tile.checks[0] if check else None, sh)
+        return self._read(tile_name(index), tile.rows, tile.checks[0], sh)
 
     def read_halo(self, index: int, *, sh: bool = True) -> Splats:
         """The rows around a tile, in the order of the source; `sh` as for `read`.
@@ -221,7 +220,11 @@ class TileStore:
         return self._read(halo_name(index), tile.halo, tile.checks[1], sh)
 
     def rows(self, index: int) -> NDArray[np.float32]:
-        """(rows, 14 + 3K) a view of the mapped file of a tile's own rows, contents not checked."""
+        """(rows, 14 + 3K) a view of the mapped file of a tile's own rows; `check` checks its contents.
+
+        Raises:
+            InputError: the file is absent or has another size.
+        """
         tile = self.tiles[index]
         shape = (tile.rows, row_width(self.sh_degree))
         if not tile.rows:
@@ -229,7 +232,25 @@ class TileStore:
         self._check_size(tile_name(index), tile.rows)
         return np.memmap(self.folder / tile_name(index), "<f4", "r", shape=shape)
 
-    def _read(self, name: str, count: int, check: int | None, sh: bool) -> Splats:
+    def check(self, index: int) -> None:
+        """Hold the contents of the file of a tile's own rows to their checksum.
+
+        Raises:
+            InputError: as for `read`.
+        """
+        rows, crc = self.rows(index), 0
+        for start in range(0, len(rows), _AT_ONCE):
+            crc = zlib.crc32(rows[start : start + _AT_ONCE].data, crc)
+        self._check_contents(tile_name(index), crc, self.tiles[index].checks[0])
+
+    def _check_contents(self, name: str, crc: int, expected: int) -> None:
+        if crc != expected:
+            raise InputError(
+                f"{self.folder / name}: its contents are not those that were written; once it is removed, "
+                "the command that wrote the tiles writes them again"
+            )
+
+    def _read(self, name: str, count: int, check: int, sh: bool) -> Splats:
         self._check_size(name, count)
         rest = (self.sh_degree + 1) ** 2 - 1 if sh else 0
         means, quats = np.empty((count, 3), np.float32), np.empty((count, 4), np.float32)
@@ -240,11 +261,10 @@ class TileStore:
             for start in range(0, count, _AT_ONCE):
                 at = slice(start, min(start + _AT_ONCE, count))
                 data = file.read(self.row_bytes * (at.stop - start))
-                crc = 0 if check is None else zlib.crc32(data, crc)
+                crc = zlib.crc32(data, crc)
                 rows = np.frombuffer(data, "<f4").reshape(at.stop - start, -1)
                 means[at], quats[at], scales[at] = rows[:, :3], rows[:, 3:7], rows[:, 7:10]
                 logits[at], sh0[at, 0] = rows[:, 10], rows[:, 11:14]
                 shN[at] = rows[:, 14 : 14 + 3 * rest].reshape(len(rows), rest, 3)
-        if crc != (check or 0):
-            raise InputError(f"{self.folder / name}: its contents are not those that were written")
+        self._check_contents(name, crc, check)
         return Splats(means, quats, scales, logits, sh0, shN, self.offset.copy())

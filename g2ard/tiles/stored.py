@@ -14,7 +14,7 @@ __all__ = ["StoredScene"]
 
 
 class StoredScene:
-    """All tiles' own rows, tile after tile, of which `take` reads some; contents are not checked.
+    """All tiles' own rows, tile after tile, of which `take` reads some; `positions` checks the contents.
 
     Args:
         store: the scene in tiles.
@@ -28,8 +28,14 @@ class StoredScene:
         return self.store.count
 
     def positions(self) -> Iterator[NDArray[np.float32]]:
-        """(n, 3) means of each tile in order, views of its file."""
-        return (self.store.rows(tile.index)[:, :3] for tile in self.store.tiles)
+        """(n, 3) means of each tile in order, views of its file.
+
+        Raises:
+            InputError: a file's contents changed.
+        """
+        for tile in self.store.tiles:
+            self.store.check(tile.index)
+            yield self.store.rows(tile.index)[:, :3]
 
     def take(self, index: NDArray[np.integer]) -> Splats:
         """The rows of these numbers, in their order."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 import hashlib
 import json
+import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -14,13 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Arrays", "Task", "load", "run_task"]
+from g2ard.errors import InputError
+
+__all__ = ["Arrays", "Task", "is_whole", "load", "run_task"]
 
 Arrays = dict[str, NDArray[Any]]
 """What a task makes and reads: arrays by name, one .npz file."""
 
 _VERSION = 3
 """Of what the functions make: raised when a change of theirs makes files of before useless."""
+
+_DAMAGED = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, LookupError, RuntimeError)
+"""What readers of arrays raise where a file's bytes are not those that were written."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +71,14 @@ class Task:
         """The file."""
         return self.folder / f"{self.label}-{self.key}.npz"
 
+    @property
+    def done(self) -> bool:
+        """Whether the file is there, and whole as far as its table of contents tells."""
+        return is_whole(self.output)
+
 
 def run_task(task: Task) -> Path:
-    """Run a task unless its file is there; the file appears whole or not at all.
+    """Run a task unless it is done; the file appears whole or not at all.
 
     Raises:
         InputError: of the function.
@@ -74,7 +86,7 @@ def run_task(task: Task) -> Path:
     """
     from g2ard.io.atomic import atomic_output
 
-    if task.output.exists():
+    if task.done:
         return task.output
     module, name = task.function.split(":")
     arrays: Arrays = getattr(import_module(module), name)(task.arguments, task.inputs, task.places)
@@ -85,7 +97,26 @@ def run_task(task: Task) -> Path:
     return task.output
 
 
+def is_whole(path: Path) -> bool:
+    """Whether a file of arrays is there with its end, which holds the table of contents."""
+    try:
+        with zipfile.ZipFile(path):
+            return True
+    except (OSError, ValueError, zipfile.BadZipFile):
+        return False
+
+
 def load(path: Path, *names: str) -> list[NDArray[Any]]:
-    """Some arrays of a task's file."""
-    with np.load(path, allow_pickle=False) as arrays:
-        return [arrays[name] for name in names]
+    """Some arrays of a task's file.
+
+    Raises:
+        InputError: its contents are not those that were written.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return [arrays[name] for name in names]
+    except _DAMAGED as error:
+        raise InputError(
+            f"{path}: its contents are not those that were written; once it is removed, the same command "
+            "makes it again"
+        ) from error

@@ -90,6 +90,7 @@ def lod(
     from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.levels import lod as levels_of
     from g2ard.policy.tiled import LEVELS_TIMES, check_memory, is_tiled
+    from g2ard.policy.work import working
 
     if kind(scene) == "points":
         raise typer.BadParameter(
@@ -115,7 +116,8 @@ def lod(
             up=up,
             seed=run.seed,
         )
-        _in_tiles(run, scene, output, ratios, tiling, options, recover, rule, errors)
+        with working(tiling, views):
+            _in_tiles(run, scene, output, ratios, tiling, options, recover, rule, errors)
         return
     check_memory(scene, tiling, LEVELS_TIMES)
     if going_on:
@@ -156,7 +158,6 @@ def _in_tiles(
     """What is done stays in the tiling's folder until all is, longer where the user named the folder."""
     from g2ard.levels import save_levels
     from g2ard.memory import peak_rss
-    from g2ard.policy.tiled import forget
     from g2ard.policy.tiled_levels import lod_in_tiles
 
     assert tiling.folder is not None
@@ -174,7 +175,6 @@ def _in_tiles(
         progress=run.progress,
     )
     _tell(run, output, levels, size, peak_rss_bytes=peak_rss())
-    forget(tiling)
 
 
 def _check_same(meta: Path, ratios: Sequence[float]) -> None:
