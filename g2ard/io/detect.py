@@ -152,7 +152,7 @@ def _folder_format(path: Path) -> Format:
     if gsplat_run.is_run(path / gsplat_run.NAME):
         return "gsplat_run"
     if _is_begun(path):
-        raise InputError(f"{path}: tiles that `ingest` has not finished; the same call of it goes on")
+        raise InputError(f"{path}: tiles that `g2ard ingest` has not finished; the same call goes on")
     raise InputError(f"{path}: nothing known in this folder{_instead(path)}")
 
 

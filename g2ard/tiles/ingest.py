@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,7 @@ class _SceneFeed:
         self._stream, self.path, self.count = stream, stream.path, stream.count
         self.row_bytes = self.room = 4 * row_width(stream.sh_degree)
         self.sh_degree, self.offset = stream.sh_degree, stream.offset
+        self.settings: dict[str, Any] = {}
 
     @property
     def tally(self) -> Tally:
@@ -126,13 +128,13 @@ def ingest(
     fewest = -(-feed.count // _MOST_TILES)
     if like is None and tile_rows < fewest:
         raise InputError(
-            f"tile_rows: {feed.path} is {feed.count:,} rows, too many tiles of {tile_rows:,}; "
-            f"{fewest:,} are the fewest"
+            f"tile_rows: {feed.path} is {feed.count:,} rows, too many for tiles of {tile_rows:,}; "
+            f"at least {fewest:,} each are needed"
         )
     settings: dict[str, Any] = {"tile_rows": tile_rows} if like is None else {"like": like.key}
     if isinstance(feed, PointFeed):
         settings["lift"] = asdict(feed.config)
-    key = _key(feed.identity(), settings)
+    feed.settings, key = settings, _key(feed.identity(), settings)
     done = _done(folder, key, overwrite)
     if done is not None:
         say(f"{folder}: holds these {plural(done.count, 'Gaussian')} already; skipped")
@@ -141,7 +143,7 @@ def ingest(
     with locked(folder):
         if (done := _done(folder, key, overwrite)) is not None:
             return done  # by another process in the meantime
-        _check_tiles(folder, key, overwrite, say)
+        _check_tiles(folder, key, settings, overwrite, say)
         rows = block_rows or max(1, _BLOCK_BYTES // feed.row_bytes)
         try:
             if isinstance(feed, PointFeed):
@@ -209,19 +211,31 @@ def _check_foreign(folder: Path) -> None:
         raise OutputError(f"{folder}: holds {foreign[0]}, which is no part of tiles; name another folder")
 
 
-def _check_tiles(folder: Path, key: str, overwrite: bool, say: Say) -> None:
+def _check_tiles(folder: Path, key: str, settings: dict[str, Any], overwrite: bool, say: Say) -> None:
     """Refuse all but the beginnings of these very tiles, and clear away what is no use to go on from."""
     found = (folder / MANIFEST, folder / JOURNAL, folder / POINTS / JOURNAL)
     manifest, *begun = [_key_in(path) for path in found]
     known = {each for each in (manifest, *begun) if each is not None}
     if known - {key} and not overwrite:
         raise OutputError(
-            f"{folder}: holds tiles of another scene or of other settings; overwrite=True replaces it"
+            f"{folder}: holds tiles of another scene or of other settings{_differing(found, settings)}; "
+            "overwrite=True replaces it"
         )
     if manifest == key:
         say(f"{folder}: its tiles are damaged; written anew")
     if manifest is not None or known != {key}:
         clear(folder)
+
+
+def _differing(found: Sequence[Path], settings: dict[str, Any]) -> str:
+    """Which settings of a manifest or journal are other ones, in brackets; nothing where none is."""
+    for path in found:
+        with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
+            theirs = dict(json.loads(path.read_text())["settings"])
+            names = [name for name in {**theirs, **settings} if theirs.get(name) != settings.get(name)]
+            told = [f"{name} {theirs.get(name)}, not {settings.get(name)}" for name in names]
+            return f" ({'; '.join(told)})" if told else ""
+    return ""
 
 
 def _key_in(path: Path) -> str | None:

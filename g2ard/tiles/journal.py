@@ -71,6 +71,7 @@ class Journal:
         margin: of halos.
         row_bytes: bytes of a row.
         tally: a dataclass of what the source counts while it is read.
+        settings: that decide the content beside the source, for those who ask for others.
         next_row: the first row of the source that is not in its tile yet.
     """
 
@@ -80,6 +81,7 @@ class Journal:
     margin: float
     row_bytes: int
     tally: Any
+    settings: dict[str, Any]
     next_row: int = 0
     low: list[float] = field(default_factory=lambda: [np.inf] * 3)
     high: list[float] = field(default_factory=lambda: [-np.inf] * 3)
@@ -104,7 +106,8 @@ class Journal:
         try:
             cells = Cell.from_json(content["cells"])
             key, margin = str(content["key"]), float(content["margin"])
-            journal = cls(folder, key, cells, margin, row_bytes, tally(**content["tally"]))
+            journal = cls(folder, key, cells, margin, row_bytes, tally(**content["tally"]), {})
+            journal.settings = dict(content.get("settings", {}))
             journal.next_row = int(content["next_row"])
             journal.low, journal.high = content["low"], content["high"]
             for kind in ("tiles", "halos"):
@@ -172,6 +175,7 @@ class Journal:
         """Tell the disk how far the rows have come."""
         content = {
             "key": self.key,
+            "settings": self.settings,
             "cells": self.cells.to_json(),
             "margin": self.margin,
             "next_row": self.next_row,

@@ -38,6 +38,7 @@ class PointFeed:
         self.path, self.count, self.offset, self.sh_degree = stream.path, stream.count, stream.offset, 0
         self.row_bytes = _ROW.itemsize
         self.room = _ROW.itemsize + 4 * row_width(0)
+        self.settings: dict[str, Any] = {}
 
     @property
     def tally(self) -> PointTally:
@@ -97,7 +98,7 @@ def lift_tiles(
     feed.tally = points.tally
     journal = Journal.open(folder, row_bytes, PointTally)
     if journal is None:
-        journal = Journal(folder, key, points.cells, points.margin, row_bytes, points.tally)
+        journal = Journal(folder, key, points.cells, points.margin, row_bytes, points.tally, feed.settings)
         journal.save()
     else:
         say(f"{folder}: goes on after tile {journal.next_row:,}")

@@ -32,6 +32,7 @@ class Feed(Protocol):
         tally: a dataclass of what was counted while rows were read.
         row: the dtype of a row, whose positions are float32 (x, y, z) or float64 less `offset`.
         room: bytes on disk that a row takes in the end, all copies counted.
+        settings: by which it is poured, beside what `pour` takes.
     """
 
     path: Path
@@ -39,6 +40,7 @@ class Feed(Protocol):
     tally: Any
     row_bytes: int
     room: int
+    settings: dict[str, Any]
 
     def positions(self, rows: int) -> Iterator[Points]:
         """(n, 3) positions of all rows, in blocks."""
@@ -100,7 +102,7 @@ def pour(
         cells = journal.cells.refined(parts)
         points, _ = _sampled(feed, rows, progress)
         clear(folder)
-        journal = Journal(folder, key, cells, margin_of(cells, points), feed.row_bytes, type(feed.tally)())
+        journal = _empty(folder, key, cells, margin_of(cells, points), feed)
         journal.cut()
         journal.save()
 
@@ -121,7 +123,7 @@ def _started(
     if not like:
         cells = cut_cells(points, each, tile_rows)
     margin = like.margin if like else margin_of(cells, points)
-    journal = Journal(folder, key, cells, margin, feed.row_bytes, type(feed.tally)())
+    journal = _empty(folder, key, cells, margin, feed)
     around = each * sum(len(halo) for _, halo in cells.route(points, journal.margin))
     needed, free = int((feed.count + around) * feed.room), shutil.disk_usage(folder).free
     if needed > free:
@@ -131,6 +133,10 @@ def _started(
     journal.cut()
     journal.save()
     return journal
+
+
+def _empty(folder: Path, key: str, cells: Cell, margin: float, feed: Feed) -> Journal:
+    return Journal(folder, key, cells, margin, feed.row_bytes, type(feed.tally)(), feed.settings)
 
 
 def _sampled(feed: Feed, rows: int, progress: Progress) -> tuple[Points, float]:
