@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g2ard.errors import InputError
+from g2ard.policy.tile_memory import RECOVERY_TIMES
 from g2ard.policy.tiled import Tiling, cores_of, tiles_of, workers_for
 from g2ard.progress import Progress, Say, silent, unsaid
 
@@ -27,9 +28,6 @@ if TYPE_CHECKING:
     from g2ard.tiles.store import TileStore
 
 __all__ = ["TiledJob", "refuse_whole", "resized", "tiled_job"]
-
-_RECOVERY_TIMES = 1.5
-"""Memory of a tile's recovery or scores, renders included, over that of merging it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +143,7 @@ def tiled_job(
 
     assert tiling.folder is not None
     with tiles_of(scene, tiling, progress, say) as store:
-        workers = workers_for(store, tiling, _RECOVERY_TIMES)
+        workers = workers_for(store, tiling, RECOVERY_TIMES)
         threads = max(1, cores_of(tiling) // workers)
         say(f"{len(store.tiles):,} tiles of {store.count:,} Gaussians, {workers} at a time")
         with executor(workers, threads, tiling.scheduler) as runs:

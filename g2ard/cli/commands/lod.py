@@ -89,6 +89,7 @@ def lod(
     from g2ard.levels import Cut, save_levels
     from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.levels import lod as levels_of
+    from g2ard.policy.tile_memory import RECOVERY_TIMES
     from g2ard.policy.tiled import LEVELS_TIMES, check_memory, is_tiled
 
     if kind(scene) == "points":
@@ -117,7 +118,7 @@ def lod(
         )
         _in_tiles(run, scene, output, ratios, tiling, options, recover, rule, errors)
         return
-    check_memory(scene, tiling, LEVELS_TIMES)
+    check_memory(scene, tiling, LEVELS_TIMES, RECOVERY_TIMES)
     if going_on:
         check_same_options(run, stopped, besides=("errors", "most", "extent", "least"))
     with stoppable(run, stopped, resume):
