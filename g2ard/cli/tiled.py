@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import typer
 
 from g2ard.cli.frame import Run
 from g2ard.cli.outputs import Outputs
@@ -21,14 +19,7 @@ if TYPE_CHECKING:
     from g2ard.tiles.simplify import TiledScene
     from g2ard.tiles.store import TileStore
 
-__all__ = ["TiledCommand", "refuse_in_tiles"]
-
-
-def refuse_in_tiles(options: Mapping[str, object]) -> None:
-    """A usage error for the first option that was given and that takes the scene in one piece."""
-    for name, value in options.items():
-        if value:
-            raise typer.BadParameter(f"{name}: not in tiles; --tile-rows above the count avoids them")
+__all__ = ["TiledCommand"]
 
 
 class TiledCommand:
@@ -93,8 +84,12 @@ class TiledCommand:
         from g2ard.memory import peak_rss
         from g2ard.policy.tiled import forget
         from g2ard.policy.tiled_distill import distill_in_tiles
+        from g2ard.policy.whole import refuse_whole, whole_budgets, whole_options
         from g2ard.report.tiled import tiled_report
 
+        own = [name for name in ("dry_run", "keep", "crop") if self.run.config[name]]
+        given = [*whole_options(options), *whole_budgets(self.budgets)]
+        refuse_whole(self.scene, given + [f"--{name.replace('_', '-')}" for name in own])
         run, began = self.run, time.perf_counter()
         run.kept = [f"what is done stands in {self.tiling.folder}; the same command with --resume goes on"]
         places = [folder / name for folder in self.outputs.paths()]

@@ -63,7 +63,7 @@ class TileMemory:
 
 
 def cut_into(folder: Path | None, rows: int) -> str:
-    """What the user types for tiles of so many rows: the option, or where a folder holds tiles the command."""
+    """What is typed for tiles of so many rows: the option, or where a folder holds tiles the command."""
     return (
         f"--tile-rows {rows:,}" if folder is None else f"`g2ard ingest {folder} -o DIR --tile-rows {rows:,}`"
     )

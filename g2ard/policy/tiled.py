@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from g2ard.errors import InputError
 from g2ard.policy.tile_memory import TASK_BYTES, TileMemory, amount
+from g2ard.policy.whole import refuse_whole, whole_budgets
 from g2ard.progress import Progress, Say, silent, unsaid
 
 if TYPE_CHECKING:
@@ -205,11 +206,7 @@ def simplify_in_tiles(
     from g2ard.tiles.executor import executor
     from g2ard.tiles.simplify import simplify_tiles
 
-    if any(budget.is_measured for budget in budgets):
-        raise InputError(
-            f"{scene}: a budget in bytes or decibels takes the scene in one piece, not in tiles; give "
-            "-n or -r, or --tile-rows above its count"
-        )
+    refuse_whole(scene, whole_budgets(budgets))
     folder = tiling.folder
     assert folder is not None
     with tiles_of(scene, tiling, progress, say) as store:

@@ -24,7 +24,9 @@ def ingest(
     tile_rows: Annotated[
         Count | None,
         typer.Option(
-            parser=Count.parse, metavar="COUNT", help="Gaussians of a tile at the most; 5M if not given."
+            parser=Count.parse_absolute,
+            metavar="COUNT",
+            help="Gaussians of a tile at the most; 5M if not given.",
         ),
     ] = None,
 ) -> None:
@@ -37,8 +39,6 @@ def ingest(
     from g2ard.tiles.ingest import TILE_ROWS
     from g2ard.tiles.ingest import ingest as into_tiles
 
-    if tile_rows is not None and tile_rows.is_share:
-        raise typer.BadParameter("--tile-rows: a count, not a share")
     config = LiftConfig()
     config = changed(config, "lift", run.constants(lift=config))
     run.kept = [f"what is in {output} stands, and the same command goes on"]

@@ -60,7 +60,7 @@ def lod(
         typer.Option("--chunk-count", min=1, metavar="K", help="About the most thousands of a file, ×1024."),
     ] = 512,
     extent: Annotated[
-        float, typer.Option("--chunk-extent", min=1e-9, metavar="UNITS", help="About the widest leaf.")
+        float, typer.Option("--chunk-extent", metavar="UNITS", help="About the widest leaf.")
     ] = 16.0,
     least: Annotated[
         int,
@@ -84,10 +84,12 @@ def lod(
     """
     from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.cli.run_folder import check_same_options, note_options
+    from g2ard.errors import InputError
     from g2ard.io import kind
     from g2ard.io.atomic import check_output
     from g2ard.levels import Cut, save_levels
     from g2ard.policy.distill_options import DistillOptions
+    from g2ard.policy.levels import check_ratios
     from g2ard.policy.levels import lod as levels_of
     from g2ard.policy.tile_memory import RECOVERY_TIMES
     from g2ard.policy.tiled import LEVELS_TIMES, check_memory, is_tiled
@@ -96,9 +98,15 @@ def lod(
         raise typer.BadParameter(
             "a cloud has no renders to learn from: distil it first, then `lod` its scene"
         )
+    try:
+        check_ratios(ratios)
+        rule = Cut(most * 1024, extent, least * 1024)
+    except InputError as error:
+        told = str(error).replace("extent:", "chunk-extent:", 1)
+        raise typer.BadParameter(f"--{told}") from None
     meta, stopped = output / "lod-meta.json", output.with_name(f".{output.name}.unfinished")
     run.spare_inputs(meta)
-    tiling = tiling_of(run, output, tile_rows, memory, workers, scheduler, work)
+    tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)
     tiled = is_tiled(scene, tiling)
     finished = resume and meta.exists() and not run.overwrite and (tiled or not left_at(stopped))
     if finished:
@@ -106,7 +114,6 @@ def lod(
     else:
         check_output(output, run.overwrite, folder=True)
     going_on = (finished or not tiled) and check_stopped(run, stopped, resume, meta)
-    rule = Cut(most * 1024, extent, least * 1024)
     if tiled:
         options = DistillOptions(
             views=views,
