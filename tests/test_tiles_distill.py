@@ -225,6 +225,7 @@ def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_
     )
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["scores"]["recovered"] > report["scores"]["simplified"] + 0.2
+    assert report["config"]["ratio"] == [10.0]
     small = read_splats(tmp_path / "run" / "scene.ply")
     assert len(small) == 900
     held_out = TeacherRenders(read_splats(folder / "town.ply"), ring(8).take([6, 7]))
@@ -234,6 +235,7 @@ def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_
     assert sum(tile["pixels"] for tile in tiles) == report["scores"]["pixels"]
     page = (tmp_path / "run" / "report.html").read_text()
     assert "town.ply: 9,000 → 900" in page
+    assert f"{sum(tile['steps'] for tile in tiles):,} steps of recovery, those of all tiles summed" in page
     assert all(f"{tile['recovered']:.2f}" in page for tile in tiles)
     assert not list(tmp_path.glob("run/.*"))
 

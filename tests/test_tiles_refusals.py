@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -109,3 +110,22 @@ def test_an_extent_is_finite(
 def test_ratios_that_do_not_rise_are_usage(command_line: CommandLine, folder: Path) -> None:
     told = refused(command_line, folder, 2, "lod", "town.ply", "-o", "x", "-r", "2,1")
     assert "--ratios: expected rising numbers of at least 1, got 2, 1" in told
+
+
+def test_the_fewest_that_tiles_come_to_are_one_each(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
+    words = ("simplify", folder / "town.ply", "-n", "2", "-o", "x.ply", "--no-views", "--workers", "1")
+    told = refused(command_line, tmp_path, 1, *words, "--tile-rows", "500")
+    assert re.search(
+        r"budget: (\d+) Gaussians is the fewest that the \1 tiles come to \(one a tile\), not 2; greater "
+        r"--tile-rows make fewer tiles$",
+        told,
+    )
+
+
+def test_ingest_goes_on_with_resume_too(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    words = ("ingest", folder / "town.ply", "-o", "tiles", "--resume")
+    for said in ("nothing to go on from (tiles): starts anew", "holds these 3,000 Gaussians already"):
+        status, _, told = command_line(*words, cwd=tmp_path)
+        assert (status, said in told) == (0, True), told

@@ -45,7 +45,11 @@ SchedulerOption = Annotated[
 ]
 WorkOption = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="Keep tiles and steps here, for other budgets; else beside the output."),
+    typer.Option(
+        metavar="DIR",
+        help="Keep tiles and steps here, for other budgets; else, until all is done, beside the output "
+        "in .NAME.tiles.",
+    ),
 ]
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from g2ard.cli.frame import Run
 from g2ard.cli.outputs import Outputs
 from g2ard.cli.run_folder import is_done, tell_finished, write_report
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.policy.budget import Budget
@@ -35,7 +36,7 @@ class TiledCommand:
     def simplify(self, config: SimplifyConfig, views: Any, blind: bool, up: Sequence[float] | None) -> None:
         """`g2ard simplify`."""
         from g2ard.constants import listed
-        from g2ard.memory import peak_rss
+        from g2ard.memory import peak_rss_of_all
         from g2ard.policy.tiled import forget, simplify_in_tiles
 
         run, began, reports = self.run, time.perf_counter(), []
@@ -69,7 +70,7 @@ class TiledCommand:
                     "keep_region": config.keep_region,
                     "notes": {note.code: note.count for note in store.notes},
                     "seconds": {"total": seconds},
-                    "peak_rss_bytes": peak_rss(),
+                    "peak_rss_bytes": peak_rss_of_all(),
                 }
             )
         run.result(reports[0] if len(reports) == 1 else {"runs": reports})
@@ -81,7 +82,7 @@ class TiledCommand:
         from dataclasses import asdict
 
         from g2ard import io
-        from g2ard.memory import peak_rss
+        from g2ard.memory import peak_rss_of_all
         from g2ard.policy.tiled import forget
         from g2ard.policy.tiled_distill import distill_in_tiles
         from g2ard.policy.whole import refuse_whole, whole_budgets, whole_options
@@ -115,7 +116,7 @@ class TiledCommand:
                 "notes": {note.code: note.count for note in store.notes},
                 "config": run.config,
                 "seconds": {"total": time.perf_counter() - began},
-                "peak_rss_bytes": peak_rss(),
+                "peak_rss_bytes": peak_rss_of_all(),
             }
             if (pool := views.pool) is not None:
                 io.write_views(folder / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
@@ -125,7 +126,8 @@ class TiledCommand:
             write_report(folder, report)
             run.say(
                 f"{folder}: {len(small):,} of {store.count:,} Gaussians; held-out views "
-                f"{scores.simplified:.2f} → {scores.recovered:.2f} dB over the pixels that tiles own"
+                f"{scores.simplified:.2f} → {scores.recovered:.2f} dB over the pixels that tiles own; "
+                f"{plural(scores.steps, 'step')}, those of all tiles summed"
             )
             run.kept.append(f"{folder} is finished")
             reports[at] = report

@@ -14,6 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from g2ard.levels.earlier import named_in, remove
 from g2ard.levels.error import leaf_errors
 from g2ard.levels.tree import Cut, Leaf, Node
 from g2ard.levels.tree import cut as cut_tree
@@ -51,7 +52,8 @@ def save_levels(
         cut: how the tree is cut; None means `Cut()`.
         errors: measure what each leaf's levels lose (`g2ard.levels.leaf_errors`), which tells viewers what to
             load; without them they go by counts.
-        overwrite: whether files in the folder may be replaced.
+        overwrite: whether files in the folder may be replaced; those that its `lod-meta.json` names and the
+            new one does not go.
         work: a folder for what is done so far, which the same call on the same levels goes on from, and for
             what memory need not hold.
         progress: told of leaves measured and files written.
@@ -88,13 +90,18 @@ def save_levels(
         "filenames": list(files.parts),
         "tree": root,
     }
+    before = named_in(Path(path))
     with atomic_folder(path, overwrite) as folder:
         files.write(work or folder, Path(path), progress)
         if work is not None:
             for name in files.parts:
                 shutil.move((work / name).parent, folder)
         (folder / "lod-meta.json").write_text(json.dumps(meta, separators=(",", ":")))
-        return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        written = {
+            file.relative_to(folder): file.stat().st_size for file in folder.rglob("*") if file.is_file()
+        }
+    remove(Path(path), before - written.keys())
+    return sum(written.values())
 
 
 @dataclass

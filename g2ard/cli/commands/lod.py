@@ -32,7 +32,12 @@ if TYPE_CHECKING:
 @command("lod", example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/")
 def lod(
     run: Run,
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A trained scene.")],
+    scene: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SCENE", help="A trained scene of any format, or a folder of tiles (`g2ard ingest`)."
+        ),
+    ],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of lod-meta.json and its files.")
     ],
@@ -52,19 +57,32 @@ def lod(
     errors: Annotated[
         bool,
         typer.Option(
-            "--errors/--no-errors", help="Measure what each leaf's levels lose: viewers load by it."
+            "--errors/--no-errors",
+            help="Measure what each part of the scene loses at each level: viewers load by it.",
         ),
     ] = True,
     most: Annotated[
         int,
-        typer.Option("--chunk-count", min=1, metavar="K", help="About the most thousands of a file, ×1024."),
+        typer.Option(
+            "--chunk-count", min=1, metavar="K", help="Gaussians of a file, about the most, in units of 1024."
+        ),
     ] = 512,
     extent: Annotated[
-        float, typer.Option("--chunk-extent", metavar="UNITS", help="About the widest leaf.")
+        float,
+        typer.Option(
+            "--chunk-extent",
+            metavar="UNITS",
+            help="Space is parted until no part, which viewers load on its own, is wider.",
+        ),
     ] = 16.0,
     least: Annotated[
         int,
-        typer.Option("--chunk-min", min=1, metavar="K", help="Wide leaves under so many stay whole, ×1024."),
+        typer.Option(
+            "--chunk-min",
+            min=1,
+            metavar="K",
+            help="Wider parts of fewer Gaussians stay whole, in units of 1024.",
+        ),
     ] = 8,
     views: ViewsOrMadeOption = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Of each recovery; by need if not given.")] = None,
@@ -163,7 +181,7 @@ def _in_tiles(
 ) -> None:
     """What is done stays in the tiling's folder until all is, longer where the user named the folder."""
     from g2ard.levels import save_levels
-    from g2ard.memory import peak_rss
+    from g2ard.memory import peak_rss_of_all
     from g2ard.policy.tiled import forget
     from g2ard.policy.tiled_levels import lod_in_tiles
 
@@ -181,7 +199,7 @@ def _in_tiles(
         work=begun,
         progress=run.progress,
     )
-    _tell(run, output, levels, size, peak_rss_bytes=peak_rss())
+    _tell(run, output, levels, size, peak_rss_bytes=peak_rss_of_all())
     forget(tiling)
 
 
