@@ -1,8 +1,11 @@
-"""Memory of this process."""
+"""Memory of this process, and of its workers."""
 
 from __future__ import annotations
 
-__all__ = ["peak_rss"]
+__all__ = ["forget_workers", "note_worker", "peak_rss", "peak_rss_of_all"]
+
+_WORKERS: dict[int, int] = {}
+"""Worker processes → their peaks, in bytes."""
 
 
 def peak_rss() -> int | None:
@@ -19,3 +22,20 @@ def peak_rss() -> int | None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def note_worker(process: int, peak: int | None) -> None:
+    """Note what `peak_rss` says in a worker."""
+    if peak is not None:
+        _WORKERS[process] = max(peak, _WORKERS.get(process, 0))
+
+
+def forget_workers() -> None:
+    """Those of another run."""
+    _WORKERS.clear()
+
+
+def peak_rss_of_all() -> int | None:
+    """The peaks of this process and of each worker here, summed: no less than they held at once."""
+    own = peak_rss()
+    return None if own is None else own + sum(_WORKERS.values())

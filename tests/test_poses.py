@@ -234,7 +234,7 @@ def test_tiny_scenes_are_looked_at_from_outside(splats) -> None:
         ({"fov": float("nan")}, "fov"),
         ({"up": (0, 0, 0)}, "up"),
         ({"up": (0, np.nan, 0)}, "up"),
-        ({"kind": "walk"}, "free place"),
+        ({"kind": "walk"}, "free place .*`g2ard poses --kind`.*give views"),
     ],
 )
 def test_what_cannot_be_is_one_clear_error(change, words) -> None:

@@ -14,6 +14,7 @@ from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io import sog
 from g2ard.levels import Cut, cut, save_levels, tree
+from g2ard.memory import peak_rss
 from g2ard.policy.distill_options import DistillOptions
 from g2ard.policy.tiled import Tiling
 from g2ard.policy.tiled_levels import TiledLevels, lod_in_tiles
@@ -155,6 +156,8 @@ def test_the_command_in_tiles(place: Path, tmp_path: Path, command_line) -> None
     assert status == 0, said
     told = json.loads((tmp_path / "told.json").read_text())
     assert [level["count"] for level in told["levels"]] == [6000, 1500, 375]
+    own = peak_rss()
+    assert own is None or told["peak_rss_bytes"] > own + 2e7  # the workers' too
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     files = [sog.read(tmp_path / "out" / name).splats for name in meta["filenames"]]
     levels = [name.split("_")[0] for name in meta["filenames"]]

@@ -78,13 +78,3 @@ def test_a_cloud_is_never_in_tiles(folder: Path) -> None:
     (folder / "cloud.ply").write_text(header + "\n".join(fields) + "\nend_header\n" + rows)
     assert not is_tiled(folder / "cloud.ply", Tiling(tile_rows=10))
     assert is_tiled(folder / "town.ply", Tiling(tile_rows=10))
-
-
-@pytest.mark.parametrize("option", [("--keep",), ("--dry-run",), ("--crop", "a:0.1,0.1,0.2,0.2")])
-def test_what_tiles_do_not_have_is_told(
-    command_line: CommandLine, folder: Path, option: tuple[str, ...]
-) -> None:
-    call = "distill", "town.ply", "-r", "10", "--views", "views.json", "-o", "run", *QUICK
-    status, _, said = command_line(*call, *option, cwd=folder)
-    assert status == 2
-    assert f"{option[0]}: not in tiles" in " ".join(said.split())

@@ -281,5 +281,5 @@ def test_budgets_out_of_reach_are_refused(store: TileStore, tmp_path: Path) -> N
     some = ingest(tmp_path / "faint.ply", tmp_path / "faint", tile_rows=250)
     with pytest.raises(InputError, match="at most the 500 Gaussians that a renderer draws, got 550"):
         reduced(some, tmp_path, budget=550, blind=True)
-    with pytest.raises(InputError, match="is the fewest that the tiles come to, not 2"):
+    with pytest.raises(InputError, match=r"is the fewest that the 4 tiles come to \(one a tile\), not 2"):
         reduced(store, tmp_path, budget=2, blind=True)

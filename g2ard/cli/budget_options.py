@@ -70,6 +70,22 @@ class Count:
             raise typer.BadParameter(f"a whole number, not {text!r}")
         return cls(round(number), False, text)
 
+    @classmethod
+    def parse_absolute(cls, text: str) -> Count:
+        """Read what `parse` does, but for shares.
+
+        >>> Count.parse_absolute("2M").of(0)
+        2000000
+        """
+        expected = f"a positive count such as 250000, 250k or 1.5M, not {text!r}"
+        try:
+            count = cls.parse(text)
+        except typer.BadParameter as error:
+            raise typer.BadParameter(expected if "%" in error.message else error.message) from None
+        if count.is_share:
+            raise typer.BadParameter(expected)
+        return count
+
     def of(self, total: int) -> int:
         """The count out of `total`; a share is rounded up and at least 1."""
         return max(1, math.ceil(self.value * total - 1e-9)) if self.is_share else int(self.value)

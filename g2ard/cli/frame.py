@@ -20,6 +20,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from g2ard import __version__, interrupt
+from g2ard.cli.budget_options import Counts, Ratios
 from g2ard.cli.config import load_config, printed
 from g2ard.cli.console import Console
 from g2ard.cli.usage import in_flags, present_name, typed
@@ -135,7 +136,8 @@ class Run:
         paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
         written = (options.get("output"), options.get("work"))
         self._inputs = [p for p in paths if isinstance(p, Path) and all(p is not w for w in written)]
-        self.config = {**options, "seed": self.seed, "threads": self.threads, "device": self.device}
+        own = {name: _flat(value) for name, value in options.items()}
+        self.config = {**own, "seed": self.seed, "threads": self.threads, "device": self.device}
         if "set" in common:
             self.config["set"] = common["set"]
 
@@ -233,6 +235,13 @@ class Run:
         """End with status 3: all is written, but a stated requirement was not met."""
         self.console.error(requirement)
         raise typer.Exit(3)
+
+
+def _flat(value: Any) -> Any:
+    """Budgets of an option that takes several at once, and more than once, as one list."""
+    if isinstance(value, list) and value and all(isinstance(one, Counts | Ratios) for one in value):
+        return [budget for several in value for budget in several]
+    return value
 
 
 def _plain(value: Any) -> Any:

@@ -25,7 +25,7 @@ __all__ = [
 TileRowsOption = Annotated[
     Count | None,
     typer.Option(
-        parser=Count.parse,
+        parser=Count.parse_absolute,
         metavar="COUNT",
         help="A scene of more Gaussians is worked on in tiles of at most so many; 5M if not given.",
     ),
@@ -45,12 +45,17 @@ SchedulerOption = Annotated[
 ]
 WorkOption = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="Keep tiles and steps here, for other budgets; else beside the output."),
+    typer.Option(
+        metavar="DIR",
+        help="Keep tiles and steps here, for other budgets; else, until all is done, beside the output "
+        "in .NAME.tiles.",
+    ),
 ]
 
 
 def tiling_of(
     run: Run,
+    scene: Path | None,
     output: Path,
     tile_rows: Count | None,
     memory: str | None,
@@ -62,8 +67,8 @@ def tiling_of(
     from g2ard.errors import InputError
     from g2ard.policy.tiled import Tiling, bytes_of
 
-    if tile_rows is not None and tile_rows.is_share:
-        raise typer.BadParameter("--tile-rows: a count such as 2M, not a share")
+    if tile_rows is not None and scene is not None:
+        _check_rows(scene, tile_rows.of(0))
     try:
         size = None if memory is None else bytes_of(memory)
     except InputError as error:
@@ -94,3 +99,13 @@ def _beside(output: Path) -> Path:
         output = output.parent
     name = output.name.replace("{", "").replace("}", "")
     return output.with_name(f".{name}.tiles")
+
+
+def _check_rows(scene: Path, rows: int) -> None:
+    """Tiles in a folder have the rows they were made with."""
+    from g2ard.policy.tile_memory import cut_into
+    from g2ard.tiles.store import MANIFEST, TileStore
+
+    if (scene / MANIFEST).is_file() and (made := TileStore.open(scene).settings.get("tile_rows")) != rows:
+        held = f"is in tiles of {made:,} already" if made else "is in tiles already"
+        raise typer.BadParameter(f"--tile-rows: {scene} {held}; {cut_into(scene, rows)} makes others")

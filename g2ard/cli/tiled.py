@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import typer
 
 from g2ard.cli.frame import Run
 from g2ard.cli.outputs import Outputs
 from g2ard.cli.run_folder import is_done, tell_finished, write_report
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.policy.budget import Budget
@@ -21,14 +20,7 @@ if TYPE_CHECKING:
     from g2ard.tiles.simplify import TiledScene
     from g2ard.tiles.store import TileStore
 
-__all__ = ["TiledCommand", "refuse_in_tiles"]
-
-
-def refuse_in_tiles(options: Mapping[str, object]) -> None:
-    """A usage error for the first option that was given and that takes the scene in one piece."""
-    for name, value in options.items():
-        if value:
-            raise typer.BadParameter(f"{name}: not in tiles; --tile-rows above the count avoids them")
+__all__ = ["TiledCommand"]
 
 
 class TiledCommand:
@@ -50,7 +42,7 @@ class TiledCommand:
 
     def _simplify(self, config: SimplifyConfig, views: Any, blind: bool, up: Sequence[float] | None) -> None:
         from g2ard.constants import listed
-        from g2ard.memory import peak_rss
+        from g2ard.memory import peak_rss_of_all
         from g2ard.policy.tiled import simplify_in_tiles
 
         run, began, reports = self.run, time.perf_counter(), []
@@ -84,7 +76,7 @@ class TiledCommand:
                     "keep_region": config.keep_region,
                     "notes": {note.code: note.count for note in store.notes},
                     "seconds": {"total": seconds},
-                    "peak_rss_bytes": peak_rss(),
+                    "peak_rss_bytes": peak_rss_of_all(),
                 }
             )
         run.result(reports[0] if len(reports) == 1 else {"runs": reports})
@@ -101,10 +93,14 @@ class TiledCommand:
         from dataclasses import asdict
 
         from g2ard import io
-        from g2ard.memory import peak_rss
+        from g2ard.memory import peak_rss_of_all
         from g2ard.policy.tiled_distill import distill_in_tiles
+        from g2ard.policy.whole import refuse_whole, whole_budgets, whole_options
         from g2ard.report.tiled import tiled_report
 
+        own = [name for name in ("dry_run", "keep", "crop") if self.run.config[name]]
+        given = [*whole_options(options), *whole_budgets(self.budgets)]
+        refuse_whole(self.scene, given + [f"--{name.replace('_', '-')}" for name in own])
         run, began = self.run, time.perf_counter()
         run.kept = [f"what is done stands in {self.tiling.folder}; the same command with --resume goes on"]
         places = [folder / name for folder in self.outputs.paths()]
@@ -130,7 +126,7 @@ class TiledCommand:
                 "notes": {note.code: note.count for note in store.notes},
                 "config": run.config,
                 "seconds": {"total": time.perf_counter() - began},
-                "peak_rss_bytes": peak_rss(),
+                "peak_rss_bytes": peak_rss_of_all(),
             }
             if (pool := views.pool) is not None:
                 io.write_views(folder / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
@@ -140,7 +136,8 @@ class TiledCommand:
             write_report(folder, report)
             run.say(
                 f"{folder}: {len(small):,} of {store.count:,} Gaussians; held-out views "
-                f"{scores.simplified:.2f} → {scores.recovered:.2f} dB over the pixels that tiles own"
+                f"{scores.simplified:.2f} → {scores.recovered:.2f} dB over the pixels that tiles own; "
+                f"{plural(scores.steps, 'step')}, those of all tiles summed"
             )
             run.kept.append(f"{folder} is finished")
             reports[at] = report

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -50,7 +51,7 @@ class Cut:
 
     def __post_init__(self) -> None:
         require("most", self.most, self.most >= 1, "at least 1")
-        require("extent", self.extent, self.extent > 0, "more than 0")
+        require("extent", self.extent, 0 < self.extent < math.inf, "a finite number above 0")
         require("least", self.least, self.least >= 1, "at least 1")
 
 

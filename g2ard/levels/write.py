@@ -15,6 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from g2ard.levels.earlier import named_in, remove
 from g2ard.levels.error import leaf_errors
 from g2ard.levels.tree import Cut, Leaf, Node
 from g2ard.levels.tree import cut as cut_tree
@@ -55,7 +56,8 @@ def save_levels(
         cut: how the tree is cut; None means `Cut()`.
         errors: measure what each leaf's levels lose (`g2ard.levels.leaf_errors`), which tells viewers what to
             load; without them they go by counts.
-        overwrite: whether files in the folder may be replaced.
+        overwrite: whether files in the folder may be replaced; those that its `lod-meta.json` names and the
+            new one does not go.
         work: a folder for what is done so far, which the same call on the same levels goes on from, and for
             what memory need not hold.
         progress: told of leaves measured and files written.
@@ -95,6 +97,7 @@ def save_levels(
     if work is not None:
         _sweep(work)
         files.write(work, Path(path), progress)
+    before = named_in(Path(path))
     with atomic_folder(path, overwrite) as folder:
         if work is None:
             files.write(folder, Path(path), progress)
@@ -103,12 +106,15 @@ def save_levels(
             for name in files.parts:  # not moved: after an interruption all are whole here still
                 shutil.copytree((work / name).parent, (folder / name).parent, copy_function=_linked)
         (folder / "lod-meta.json").write_text(json.dumps(meta, separators=(",", ":")))
-        size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        written = {
+            file.relative_to(folder): file.stat().st_size for file in folder.rglob("*") if file.is_file()
+        }
+    remove(Path(path), before - written.keys())
     if work is not None:
         for name in files.parts:
             shutil.rmtree((work / name).parent, ignore_errors=True)
         (work / _BESIDE).unlink()
-    return size
+    return sum(written.values())
 
 
 def _sweep(work: Path) -> None:

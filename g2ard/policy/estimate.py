@@ -13,8 +13,11 @@ import numpy as np
 
 from g2ard.errors import InputError
 from g2ard.memory import peak_rss
+from g2ard.policy.tile_memory import RECOVERY_TIMES, TileMemory, amount
 from g2ard.progress import plural
 from g2ard.targets import CACHE_BYTES, Targets
+from g2ard.tiles.pour import foretold
+from g2ard.tiles.store import row_width
 from g2ard.visibility import MOST_LOOKS, fewest_looks, visibility_source
 
 if TYPE_CHECKING:
@@ -130,11 +133,13 @@ def check_memory(job: DistillJob, most: int | None, *, page: bool = True) -> Non
         return
     need = max(estimate(job, budget, page=page).bytes for budget in job.budgets)
     if need > most:
-        count = plural(len(job.prior), "Gaussian")
-        raise InputError(
-            f"--memory: {count} in one piece take about {need / 1e9:.1f} GB, more than {most / 1e9:g} GB; "
-            "--tile-rows below their count works on tiles, --size on smaller views"
-        )
+        count = len(job.prior)
+        told = f"--memory: {plural(count, 'Gaussian')} in one piece take about {amount(need, up=True)}, "
+        told += f"more than {amount(most)}; smaller views, --size, take less"
+        if job.teacher is not None and job.lifting is None:  # what tiles can work on
+            tiles = TileMemory(4 * row_width(job.prior.sh_degree), RECOVERY_TIMES)
+            told += f"; in tiles {tiles.advice(most, max(1, count // 2), foretold([job.prior.means], count))}"
+        raise InputError(told)
 
 
 def total(estimates: Sequence[Estimate]) -> tuple[float, int]:

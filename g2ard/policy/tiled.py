@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g2ard.errors import InputError
+from g2ard.policy.tile_memory import TASK_BYTES, TileMemory, amount
+from g2ard.policy.whole import refuse_whole, whole_budgets
 from g2ard.progress import Progress, Say, silent, unsaid
 
 if TYPE_CHECKING:
@@ -40,13 +42,11 @@ __all__ = [
 _SMALLEST_ROW = 4
 """Bytes of a Gaussian in a file, at least: a smaller file need not be opened to know that it is small."""
 
-_TASK_BYTES, _ROW_BYTES, _ROW_TIMES = 200_000_000, 290, 0.8
-"""Of a task at its peak: of the program, and of a tile's Gaussians, halo included, so many and so many times
-what their arrays take. Measured are 1.95 GB for 5.5 million of SH 0, and 0.98 GB for 1.8 million of SH 3
-(`benches/record/tiles.md`)."""
-
 WHOLE_TIMES, LEVELS_TIMES = 3.6, 7.0
 """Memory in one piece, over the scene's arrays: of a simplification, and of levels that are merged alone."""
+
+_READ_ROWS = 1 << 18
+"""Positions that are read at a time."""
 
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmMgGtT]?)(?:i?[bB])?")
 
@@ -123,25 +123,27 @@ def is_tiled(scene: Path, tiling: Tiling) -> bool:
     return kind(scene) == "splats" and open_stream(scene).count > tiling.most_rows
 
 
-def check_memory(scene: Path, tiling: Tiling, times: float) -> None:
+def check_memory(scene: Path, tiling: Tiling, times: float, tile_times: float = 1.0) -> None:
     """Refuse a scene that in one piece, at so many times its arrays, takes more than `--memory`.
 
     Raises:
-        InputError: with what would do; or the scene cannot be read.
+        InputError: with what would do, where a tile takes `tile_times` what merging it takes; or the scene
+            cannot be read.
     """
     from g2ard.io.stream import open_stream
-    from g2ard.tiles.store import row_width
+    from g2ard.tiles.store import MANIFEST, row_width
 
     if tiling.memory is None:
         return
     stream = open_stream(scene)
     row_bytes = 4 * row_width(stream.sh_degree)
-    need = _TASK_BYTES + int(times * stream.count * row_bytes)
+    need = TASK_BYTES + int(times * stream.count * row_bytes)
     if need > tiling.memory:
+        tiles = TileMemory(row_bytes, tile_times, scene if (scene / MANIFEST).is_file() else None)
         raise InputError(
-            f"{scene}: {stream.count:,} Gaussians in one piece take about {need / 1e9:.1f} GB, more than "
-            f"--memory {tiling.memory / 1e9:g}GB; --tile-rows "
-            f"{_rows_within(tiling.memory, row_bytes):,} works on tiles that fit"
+            f"{scene}: {stream.count:,} Gaussians in one piece take about {amount(need, up=True)}, "
+            f"{amount(TASK_BYTES)} of it the program, more than {_allowed(tiling)}; "
+            f"{tiles.advice(tiling.memory, max(1, stream.count // 2), _foretold(scene))}"
         )
 
 
@@ -204,11 +206,7 @@ def simplify_in_tiles(
     from g2ard.tiles.executor import executor
     from g2ard.tiles.simplify import simplify_tiles
 
-    if any(budget.is_measured for budget in budgets):
-        raise InputError(
-            f"{scene}: a budget in bytes or decibels takes the scene in one piece, not in tiles; give "
-            "-n or -r, or --tile-rows above its count"
-        )
+    refuse_whole(scene, whole_budgets(budgets))
     folder = tiling.folder
     assert folder is not None
     with tiles_of(scene, tiling, progress, say) as store:
@@ -242,30 +240,47 @@ def workers_for(store: TileStore, tiling: Tiling, times: float = 1.0) -> int:
     Raises:
         InputError: not even one tile fits.
     """
-    memory = tiling.memory or int(0.8 * _physical_memory())
-    largest = max(tile.rows + tile.halo for tile in store.tiles)
-    need = _TASK_BYTES + int(times * largest * (_ROW_BYTES + _ROW_TIMES * store.row_bytes))
+    memory = _memory_of(tiling)
+    largest = max(store.tiles, key=lambda tile: tile.rows + tile.halo)
+    rows, most = largest.rows + largest.halo, store.settings.get("tile_rows") or largest.rows
+    made_here = tiling.folder is not None and store.folder.parent == tiling.folder
+    tiles = TileMemory(store.row_bytes, times, None if made_here else store.folder)
+    need = tiles.of(rows)
     fit = memory // need
     if fit > 1:  # several are processes beside this one
-        fit = max(1, (memory - _TASK_BYTES) // need)
+        fit = max(1, (memory - TASK_BYTES) // need)
     if fit < 1:
         raise InputError(
-            f"a tile of {largest:,} Gaussians takes about {need / 1e9:.1f} GB, more than --memory "
-            f"{memory / 1e9:.1f}GB; --tile-rows {_rows_within(memory, store.row_bytes):,} makes smaller ones"
+            f"a tile of {largest.rows:,} Gaussians and {largest.halo:,} around it takes about "
+            f"{amount(need, up=True)}, {amount(TASK_BYTES)} of it the program, more than {_allowed(tiling)}; "
+            f"{tiles.advice(memory, most, _foretold(store.folder))}"
         )
     if tiling.workers is not None and tiling.scheduler is None and tiling.workers > fit:
         raise InputError(
-            f"--workers {tiling.workers} take about {tiling.workers * need / 1e9:.1f} GB, more than "
-            f"--memory {memory / 1e9:.1f}GB; --workers {fit} fit"
+            f"--workers {tiling.workers} take about {amount(tiling.workers * need, up=True)}, more than "
+            f"{_allowed(tiling)}; --workers {fit} fit"
         )
     return tiling.workers or max(1, min(fit, cores_of(tiling)))
 
 
-def _rows_within(memory: int, row_bytes: float) -> int:
-    """Rows of a tile that fit, in round numbers."""
-    rows = max(1000.0, (memory - _TASK_BYTES) / (_ROW_BYTES + _ROW_TIMES * row_bytes) / 1.3)  # 1.3: with halo
-    step = 10 ** (len(str(int(rows))) - 1)
-    return int(rows // step * step)
+def _foretold(scene: Path) -> Callable[[int], int]:
+    """Rows of the largest tile, halo included, of any `--tile-rows`."""
+    from g2ard.io.stream import open_stream
+    from g2ard.tiles.pour import foretold
+
+    stream = open_stream(scene)
+    return foretold(stream.positions(_READ_ROWS), stream.count)
+
+
+def _memory_of(tiling: Tiling) -> int:
+    """Bytes that all workers together may take."""
+    return tiling.memory or int(0.8 * _physical_memory())
+
+
+def _allowed(tiling: Tiling) -> str:
+    """That in words, and who says so."""
+    size = amount(_memory_of(tiling))
+    return f"--memory {size}" if tiling.memory else f"the {size} that are taken of the machine's memory"
 
 
 def _given(views: Views | None, say: Say) -> Cameras | None:

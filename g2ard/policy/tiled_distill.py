@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g2ard.policy.tiled import Tiling
-from g2ard.policy.tiled_job import refuse_whole, tiled_job
+from g2ard.policy.tiled_job import tiled_job
+from g2ard.policy.whole import refuse_whole, whole_budgets, whole_options
 from g2ard.progress import Progress, Say, silent, unsaid
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def distill_in_tiles(
     Raises:
         InputError: as `g2ard.policy.tiled.simplify_in_tiles`, or an option that tiles do not have.
     """
-    refuse_whole(scene, budgets, options)
+    refuse_whole(scene, [*whole_options(options), *whole_budgets(budgets)])
     with tiled_job(scene, tiling, options, progress=progress, say=say) as job:
         for budget in budgets:
             count = budget.of(job.store.count, str(scene))

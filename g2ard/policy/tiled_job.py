@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g2ard.errors import InputError
+from g2ard.policy.tile_memory import RECOVERY_TIMES
 from g2ard.policy.tiled import Tiling, cores_of, tiles_of, workers_for
 from g2ard.progress import Progress, Say, silent, unsaid
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
-    from g2ard.policy.budget import Budget
     from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.views import RunViews
     from g2ard.splats import Splats
@@ -26,10 +25,7 @@ if TYPE_CHECKING:
     from g2ard.tiles.simplify import TiledScene
     from g2ard.tiles.store import TileStore
 
-__all__ = ["TiledJob", "refuse_whole", "resized", "tiled_job"]
-
-_RECOVERY_TIMES = 1.5
-"""Memory of a tile's recovery or scores, renders included, over that of merging it."""
+__all__ = ["TiledJob", "resized", "tiled_job"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +121,7 @@ def tiled_job(
     Args:
         scene: its file, or a folder of tiles.
         tiling: how; `folder` keeps what is done, so that the same call goes on.
-        options: as for `g2ard.distill`, those that take the scene in one piece refused (`refuse_whole`).
+        options: as for `g2ard.distill`, those that `g2ard.policy.whole` refuses left out.
         learn: whether anything is recovered, not just scored.
         progress: told of tasks.
         say: told in lines what was decided.
@@ -145,7 +141,7 @@ def tiled_job(
 
     assert tiling.folder is not None
     with tiles_of(scene, tiling, progress, say) as store:
-        workers = workers_for(store, tiling, _RECOVERY_TIMES)
+        workers = workers_for(store, tiling, RECOVERY_TIMES)
         threads = max(1, cores_of(tiling) // workers)
         say(f"{len(store.tiles):,} tiles of {store.count:,} Gaussians, {workers} at a time")
         with executor(workers, threads, tiling.scheduler) as runs:
@@ -188,29 +184,6 @@ def tiled_job(
                 progress=progress,
                 say=say,
             )
-
-
-def refuse_whole(scene: Path, budgets: Sequence[Budget], options: DistillOptions) -> None:
-    """Refuse what tiles do not have.
-
-    Raises:
-        InputError: which option or budget it is.
-    """
-    usual = type(options)()
-    whole = [
-        name
-        for name in ("clean", "photos", "views_count", "reselect", "recovery_time", "engine")
-        if getattr(options, name) != getattr(usual, name)
-    ]
-    whole += ["method"] if options.method not in (None, "default") else []
-    whole += ["preset paper"] if options.preset.startswith("paper") else []
-    whole += ["schedule paper"] if options.schedule == "paper" else []
-    whole += ["a budget in bytes or decibels"] if any(budget.is_measured for budget in budgets) else []
-    if whole:
-        raise InputError(
-            f"{scene}: {whole[0].replace('_', '-')} takes the scene in one piece, not in tiles; --tile-rows "
-            "above its count avoids them"
-        )
 
 
 def resized(views: RunViews, longest: int) -> RunViews:

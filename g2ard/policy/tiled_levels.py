@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 from g2ard.policy.budget import Budget
 from g2ard.policy.levels import LevelReport, check_ratios, level_size
 from g2ard.policy.tiled import Tiling
-from g2ard.policy.tiled_job import TiledJob, refuse_whole, resized, tiled_job
+from g2ard.policy.tiled_job import TiledJob, resized, tiled_job
+from g2ard.policy.whole import refuse_whole, whole_options
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def lod_in_tiles(
     from g2ard.tiles.stored import StoredScene
 
     check_ratios(ratios)
-    refuse_whole(scene, [], options)
+    refuse_whole(scene, whole_options(options))
     levels: list[StoredScene] = []
     reports: list[LevelReport] = []
     around: Surroundings | None = None

@@ -134,7 +134,8 @@ def plan_pool(
     if len(poses) < count:
         raise InputError(
             f"{len(poses)} of {count} poses found a free place with a view ({kind}: {why}): "
-            f"ask for {'fewer, or for ' if len(poses) else ''}another kind"
+            f"ask for {'fewer, or for ' if len(poses) else ''}another kind (`g2ard poses --kind`), "
+            "or give views"
         )
     reach = reach_of(site, poses, lens)
     # Of the pool as planned, before any of its poses steps nearer, and with another seed than those.

@@ -32,8 +32,8 @@ def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:
     )
     page.paragraph(
         f"From {plural(report['input_count'], 'Gaussian')}, in {report['seconds']['total']:,.0f} s and "
-        f"{scores['steps']:,} steps of recovery; {plural(views['train'], 'view')} to learn from. PSNR is "
-        f"over the {scores['pixels']:,} pixels that tiles own."
+        f"{scores['steps']:,} steps of recovery, those of all tiles summed; {plural(views['train'], 'view')} "
+        f"to learn from. PSNR is over the {scores['pixels']:,} pixels that tiles own."
     )
     shown = [tile for tile in scores["tiles"] if tile["pixels"]]
     page.html(legend(_STAGES))

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Protocol
 
 from g2ard.errors import InputError
+from g2ard.memory import forget_workers, note_worker, peak_rss
 from g2ard.progress import Progress, silent
 from g2ard.tiles.task import Task, run_task
 
@@ -49,6 +50,7 @@ def executor(
     Raises:
         InputError: Dask is not installed, or does not answer.
     """
+    forget_workers()
     threads = threads or max(1, (os.cpu_count() or 1) // workers)
     if scheduler:
         from g2ard.tiles.cluster import DaskExecutor
@@ -112,13 +114,15 @@ class _Processes:
         if self._pool is None:
             context = get_context("spawn")
             self._pool = ProcessPoolExecutor(self._workers, context, _begin, (self._threads,))
-        futures: dict[Future[Path], Task] = {self._pool.submit(run_task, task): task for task in todo}
+        futures: dict[Future[tuple[int, int | None]], Task] = {
+            self._pool.submit(_run_noted, task): task for task in todo
+        }
         done, pending = total - sum(task.cost for task in todo), set(futures)
         while pending:
             progress(stage, done, total)
             finished, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)
             for future in finished:
-                future.result()
+                note_worker(*future.result())
                 done += futures[future].cost
 
     def _stop(self, at_once: bool) -> None:
@@ -140,6 +144,12 @@ def _sweep(tasks: Sequence[Task]) -> None:
     for task in tasks:
         for begun in task.folder.glob(f".{task.output.stem}.*"):
             begun.unlink(missing_ok=True)
+
+
+def _run_noted(task: Task) -> tuple[int, int | None]:
+    """Run a task in a worker: the worker, and the most memory that it has come to."""
+    run_task(task)
+    return os.getpid(), peak_rss()
 
 
 def _begin(threads: int) -> None:

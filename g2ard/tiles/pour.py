@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,10 +18,13 @@ from g2ard.tiles.cells import Cell, Points, Sampler, cut_cells, margin_of
 from g2ard.tiles.journal import Journal, clear
 from g2ard.tiles.store import TileStore, tile_name
 
-__all__ = ["Feed", "pour"]
+__all__ = ["Feed", "foretold", "pour"]
 
 _SAMPLE = 1 << 20
 """Positions that tiles are cut by: 12 MB."""
+
+_SIGMAS = 4.0
+"""A tile with its halo may hold more than the sample foretells, by so many standard deviations."""
 
 
 class Feed(Protocol):
@@ -157,3 +161,28 @@ def _overfull(journal: Journal, tile_rows: int) -> dict[int, Cell]:
             if cells.leaves > 1:
                 parts[index] = cells
     return parts
+
+
+def foretold(positions: Iterable[Points], count: int) -> Callable[[int], int]:
+    """About how many rows the largest tile will hold, halo included, as a function of `tile_rows`.
+
+    Args:
+        positions: all of them, in blocks.
+        count: how many there are.
+
+    >>> line = np.stack([np.arange(100.0, dtype=np.float32)] * 3, 1)
+    >>> rows = foretold([line], 100)
+    >>> rows(100), rows(50), rows(25)
+    (100, 52, 26)
+    """
+    sampler = Sampler(count, _SAMPLE)
+    for points in positions:
+        sampler.add(points)
+    sample, each = sampler.result()
+
+    def largest(tile_rows: int) -> int:
+        cells = cut_cells(sample, each, tile_rows) if count > tile_rows else Cell()
+        most = max(len(core) + len(halo) for core, halo in cells.route(sample, margin_of(cells, sample)))
+        return math.ceil((most + (_SIGMAS * math.sqrt(most) if each > 1 else 0)) * each)
+
+    return largest

@@ -157,7 +157,7 @@ def simplify_tiles(
         inputs=[{"costs": path, **seen} for path, seen in zip(costs, looks, strict=True)],
     )
     merges = cheapest([_costs_of(path) for path in plans], sum(runs_left) - budget)
-    _check_reached(sum(runs_left) - sum(merges), budget)
+    _check_reached(sum(runs_left) - sum(merges), budget, len(coarse))
     per_tile = [{"runs": n, "merges": m} for n, m in zip(runs_left, merges, strict=True)]
     merged = run.each(
         "merge",
@@ -269,6 +269,10 @@ def _costs_of(path: Path) -> Callable[[], NDArray[np.float32]]:
     return lambda: load(path, "costs")[0]
 
 
-def _check_reached(count: int, budget: int) -> None:
+def _check_reached(count: int, budget: int, tiles: int) -> None:
     if count != budget:
-        raise InputError(f"budget: {count:,} Gaussians is the fewest that the tiles come to, not {budget:,}")
+        each = "one a tile" if count == tiles else "each keeps one or more"
+        raise InputError(
+            f"budget: {count:,} Gaussians is the fewest that the {tiles:,} tiles come to ({each}), not "
+            f"{budget:,}; greater --tile-rows make fewer tiles"
+        )

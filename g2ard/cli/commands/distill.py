@@ -59,7 +59,7 @@ from g2ard.cli.tile_options import (
     WorkOption,
     tiling_of,
 )
-from g2ard.cli.tiled import TiledCommand, refuse_in_tiles
+from g2ard.cli.tiled import TiledCommand
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -235,9 +235,8 @@ def distill(
         seed=run.seed,
         engine=engine,
     )
-    tiling = tiling_of(run, output, tile_rows, memory, workers, scheduler, work)
+    tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)
     if scene is not None and is_tiled(scene, tiling):
-        refuse_in_tiles({"--dry-run": dry_run, "--keep": keep, "--crop": crop})
         TiledCommand(run, scene, outputs, tiling, budgets).distill(options, name, resume)
         return
     job = prepare(

@@ -9,6 +9,7 @@ import typer
 
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
+from g2ard.cli.options import ResumeOption
 
 
 @command("ingest", example="g2ard ingest city.ply -o tiles/ --tile-rows 2M", constants=True)
@@ -24,11 +25,15 @@ def ingest(
     tile_rows: Annotated[
         Count | None,
         typer.Option(
-            parser=Count.parse, metavar="COUNT", help="Gaussians of a tile at the most; 5M if not given."
+            parser=Count.parse_absolute,
+            metavar="COUNT",
+            help="Gaussians of a tile at the most; 5M if not given.",
         ),
     ] = None,
+    resume: ResumeOption = False,
 ) -> None:
-    """Stream a scene larger than memory into tiles; the same call again goes on where it was stopped."""
+    """Stream a scene larger than memory into tiles; the same call again goes on where it was stopped, with
+    --resume or without."""
     import time
 
     from g2ard.constants import changed
@@ -37,8 +42,8 @@ def ingest(
     from g2ard.tiles.ingest import TILE_ROWS
     from g2ard.tiles.ingest import ingest as into_tiles
 
-    if tile_rows is not None and tile_rows.is_share:
-        raise typer.BadParameter("--tile-rows: a count, not a share")
+    if resume and not (output.is_dir() and any(output.iterdir())):
+        run.say(f"nothing to go on from ({output}): starts anew")
     config = LiftConfig()
     config = changed(config, "lift", run.constants(lift=config))
     run.kept = [f"what is in {output} stands, and the same command goes on"]

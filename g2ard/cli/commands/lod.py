@@ -32,7 +32,12 @@ if TYPE_CHECKING:
 @command("lod", example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/")
 def lod(
     run: Run,
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A trained scene.")],
+    scene: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SCENE", help="A trained scene of any format, or a folder of tiles (`g2ard ingest`)."
+        ),
+    ],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of lod-meta.json and its files.")
     ],
@@ -52,19 +57,32 @@ def lod(
     errors: Annotated[
         bool,
         typer.Option(
-            "--errors/--no-errors", help="Measure what each leaf's levels lose: viewers load by it."
+            "--errors/--no-errors",
+            help="Measure what each part of the scene loses at each level: viewers load by it.",
         ),
     ] = True,
     most: Annotated[
         int,
-        typer.Option("--chunk-count", min=1, metavar="K", help="About the most thousands of a file, ×1024."),
+        typer.Option(
+            "--chunk-count", min=1, metavar="K", help="Gaussians of a file, about the most, in units of 1024."
+        ),
     ] = 512,
     extent: Annotated[
-        float, typer.Option("--chunk-extent", min=1e-9, metavar="UNITS", help="About the widest leaf.")
+        float,
+        typer.Option(
+            "--chunk-extent",
+            metavar="UNITS",
+            help="Space is parted until no part, which viewers load on its own, is wider.",
+        ),
     ] = 16.0,
     least: Annotated[
         int,
-        typer.Option("--chunk-min", min=1, metavar="K", help="Wide leaves under so many stay whole, ×1024."),
+        typer.Option(
+            "--chunk-min",
+            min=1,
+            metavar="K",
+            help="Wider parts of fewer Gaussians stay whole, in units of 1024.",
+        ),
     ] = 8,
     views: ViewsOrMadeOption = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Of each recovery; by need if not given.")] = None,
@@ -84,11 +102,14 @@ def lod(
     """
     from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.cli.run_folder import check_same_options, note_options
+    from g2ard.errors import InputError
     from g2ard.io import kind
     from g2ard.io.atomic import check_output
     from g2ard.levels import Cut, save_levels
     from g2ard.policy.distill_options import DistillOptions
+    from g2ard.policy.levels import check_ratios
     from g2ard.policy.levels import lod as levels_of
+    from g2ard.policy.tile_memory import RECOVERY_TIMES
     from g2ard.policy.tiled import LEVELS_TIMES, check_memory, is_tiled
     from g2ard.policy.work import working
 
@@ -96,9 +117,15 @@ def lod(
         raise typer.BadParameter(
             "a cloud has no renders to learn from: distil it first, then `lod` its scene"
         )
+    try:
+        check_ratios(ratios)
+        rule = Cut(most * 1024, extent, least * 1024)
+    except InputError as error:
+        told = str(error).replace("extent:", "chunk-extent:", 1)
+        raise typer.BadParameter(f"--{told}") from None
     meta, stopped = output / "lod-meta.json", output.with_name(f".{output.name}.unfinished")
     run.spare_inputs(meta)
-    tiling = tiling_of(run, output, tile_rows, memory, workers, scheduler, work)
+    tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)
     tiled = is_tiled(scene, tiling)
     finished = resume and meta.exists() and not run.overwrite and (tiled or not left_at(stopped))
     if finished:
@@ -106,7 +133,6 @@ def lod(
     else:
         check_output(output, run.overwrite, folder=True)
     going_on = (finished or not tiled) and check_stopped(run, stopped, resume, meta)
-    rule = Cut(most * 1024, extent, least * 1024)
     if tiled:
         options = DistillOptions(
             views=views,
@@ -119,7 +145,7 @@ def lod(
         with working(tiling, views):
             _in_tiles(run, scene, output, ratios, tiling, options, recover, rule, errors)
         return
-    check_memory(scene, tiling, LEVELS_TIMES)
+    check_memory(scene, tiling, LEVELS_TIMES, RECOVERY_TIMES)
     if going_on:
         check_same_options(run, stopped, besides=("errors", "most", "extent", "least"))
     with stoppable(run, stopped, resume):
@@ -157,7 +183,7 @@ def _in_tiles(
 ) -> None:
     """What is done stays in the tiling's folder until all is, longer where the user named the folder."""
     from g2ard.levels import save_levels
-    from g2ard.memory import peak_rss
+    from g2ard.memory import peak_rss_of_all
     from g2ard.policy.tiled_levels import lod_in_tiles
 
     assert tiling.folder is not None
@@ -174,7 +200,7 @@ def _in_tiles(
         work=begun,
         progress=run.progress,
     )
-    _tell(run, output, levels, size, peak_rss_bytes=peak_rss())
+    _tell(run, output, levels, size, peak_rss_bytes=peak_rss_of_all())
 
 
 def _check_same(meta: Path, ratios: Sequence[float]) -> None:

@@ -85,20 +85,22 @@ def simplify(
         raise typer.BadParameter("--views and --no-views exclude each other; give one")
     if keep_region and (no_views or method == "paper"):
         raise typer.BadParameter("--keep-region: needs views, which --no-views and --method paper do without")
-    tiling = tiling_of(run, output, tile_rows, memory, workers, scheduler, work)
+    tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)
     from g2ard import io
     from g2ard.constants import changed
     from g2ard.policy.fit import aim_of
     from g2ard.policy.inputs import say_notes
     from g2ard.policy.simplify import Reduction
     from g2ard.policy.tiled import WHOLE_TIMES, check_memory, is_tiled
+    from g2ard.policy.whole import refuse_whole, whole_budgets, whole_method
 
     config = SimplifyConfig(retention=retention, keep_region=tuple(keep_region or ()))
     config = changed(config, "simplify", values)
     outputs = Outputs(run, output, budgets)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite))
     if is_tiled(scene, tiling):
-        _refuse_whole(method, parents)
+        given = [*whole_method(method, preset), *(["--parents"] if parents else []), *whole_budgets(budgets)]
+        refuse_whole(scene, given)
         tiled = TiledCommand(run, scene, outputs, tiling, budgets)
         tiled.simplify(config, views, no_views, up)
         return
@@ -160,14 +162,6 @@ def _bytes_of(place: Path) -> int:
     """Bytes of what was written; all files of a SOG folder."""
     files = place.parent.iterdir() if place.name == "meta.json" else [place]
     return sum(file.stat().st_size for file in files)
-
-
-def _refuse_whole(method: str, parents: Path | None) -> None:
-    """What needs the scene in one piece."""
-    if method != "default":
-        raise typer.BadParameter(f"--method {method}: not in tiles; --tile-rows above the count avoids them")
-    if parents is not None:
-        raise typer.BadParameter("--parents: not in tiles; --tile-rows above the count avoids them")
 
 
 def _report(
