@@ -94,10 +94,10 @@ def save_levels(
         "filenames": list(files.parts),
         "tree": root,
     }
+    before = named_in(Path(path))
     if work is not None:
         _sweep(work)
         files.write(work, Path(path), progress)
-    before = named_in(Path(path))
     with atomic_folder(path, overwrite) as folder:
         if work is None:
             files.write(folder, Path(path), progress)
