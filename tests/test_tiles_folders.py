@@ -255,7 +255,7 @@ def test_an_unfinished_ingest_is_named(command_line: CommandLine, place: Path, t
 
 
 def test_tiles_are_not_too_many(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ingest_module, "_MOST_TILES", 10)
+    monkeypatch.setattr(ingest_module, "MOST_TILES", 10)
     with pytest.raises(InputError, match="1,600 rows, too many for tiles of 159; at least 160 each"):
         ingest(place / "town.ply", tmp_path / "tiles", tile_rows=159)
     assert not (tmp_path / "tiles").exists()

@@ -11,7 +11,7 @@ from test_tiles_simplify import town
 from g2ard.errors import InputError
 from g2ard.io import write_splats
 from g2ard.policy import tiled
-from g2ard.policy.tile_memory import RECOVERY_TIMES
+from g2ard.policy.tile_memory import RECOVERY_TIMES, TileMemory
 from g2ard.policy.tiled import LEVELS_TIMES, Tiling, bytes_of, check_memory, workers_for
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.store import TileStore
@@ -79,3 +79,8 @@ def test_memory_that_nobody_gave_is_the_machine_s(
     told = r"--workers 1000 take about 20\d[\d.]* GB, more than the 3\.2 GB that are taken of the machine's"
     with pytest.raises(InputError, match=told + r" memory; --workers 1\d fit$"):
         workers_for(store, Tiling(folder=tiling.folder, workers=1000))
+
+
+def test_no_more_tiles_are_advised_than_are_made() -> None:
+    told = TileMemory(100_000_000, 56).advice(200_000_000, 50_000_000, lambda rows: 2 * rows)
+    assert told == "the least that tiles take is about 207 MB, with --tile-rows 10,000"

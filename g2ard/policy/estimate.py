@@ -137,7 +137,7 @@ def check_memory(job: DistillJob, most: int | None, *, page: bool = True) -> Non
         told = f"--memory: {plural(count, 'Gaussian')} in one piece take about {amount(need, up=True)}, "
         told += f"more than {amount(most)}; smaller views, --size, take less"
         if job.teacher is not None and job.lifting is None:  # what tiles can work on
-            tiles = TileMemory(4 * row_width(job.prior.sh_degree), RECOVERY_TIMES)
+            tiles = TileMemory(count, 4 * row_width(job.prior.sh_degree), RECOVERY_TIMES)
             told += f"; in tiles {tiles.advice(most, max(1, count // 2), foretold([job.prior.means], count))}"
         raise InputError(told)
 

@@ -26,11 +26,13 @@ class TileMemory:
     """What tiles of a scene take.
 
     Args:
+        count: Gaussians of the scene.
         row_bytes: of a Gaussian's arrays.
         times: over what merging a tile takes.
         folder: of tiles that `--tile-rows` cannot cut anew; None where it can.
     """
 
+    count: int
     row_bytes: float
     times: float = 1.0
     folder: Path | None = None
@@ -47,12 +49,15 @@ class TileMemory:
             most: rows of the largest tiles that would be another answer.
             largest: of `--tile-rows`: rows of the largest tile, halo included (`g2ard.tiles.pour.foretold`).
 
-        >>> TileMemory(56).advice(210_000_000, 30_000, lambda rows: round(1.3 * rows))
+        >>> TileMemory(60_000, 56).advice(210_000_000, 30_000, lambda rows: round(1.3 * rows))
         '--tile-rows 22,000 takes less'
-        >>> TileMemory(56).advice(100_000_000, 30_000, lambda rows: round(1.3 * rows))
+        >>> TileMemory(60_000, 56).advice(100_000_000, 30_000, lambda rows: round(1.3 * rows))
         'the least that tiles take is about 201 MB, with --tile-rows 1,000'
         """
-        a_row, least = self.of(1) - TASK_BYTES, min(_LEAST_ROWS, most)
+        from g2ard.tiles.ingest import MOST_TILES
+
+        a_row = self.of(1) - TASK_BYTES
+        least = min(max(_LEAST_ROWS, -(-self.count // MOST_TILES)), most)
         rows = _rounded_down(min((memory - TASK_BYTES) / a_row, most))
         while rows >= least:
             if self.of(held := largest(rows)) <= memory:

@@ -139,7 +139,9 @@ def check_memory(scene: Path, tiling: Tiling, times: float, tile_times: float = 
     row_bytes = 4 * row_width(stream.sh_degree)
     need = TASK_BYTES + int(times * stream.count * row_bytes)
     if need > tiling.memory:
-        tiles = TileMemory(row_bytes, tile_times, scene if (scene / MANIFEST).is_file() else None)
+        tiles = TileMemory(
+            stream.count, row_bytes, tile_times, scene if (scene / MANIFEST).is_file() else None
+        )
         raise InputError(
             f"{scene}: {stream.count:,} Gaussians in one piece take about {amount(need, up=True)}, "
             f"{amount(TASK_BYTES)} of it the program, more than {_allowed(tiling)}; "
@@ -244,7 +246,7 @@ def workers_for(store: TileStore, tiling: Tiling, times: float = 1.0) -> int:
     largest = max(store.tiles, key=lambda tile: tile.rows + tile.halo)
     rows, most = largest.rows + largest.halo, store.settings.get("tile_rows") or largest.rows
     made_here = tiling.folder is not None and store.folder.parent == tiling.folder
-    tiles = TileMemory(store.row_bytes, times, None if made_here else store.folder)
+    tiles = TileMemory(store.count, store.row_bytes, times, None if made_here else store.folder)
     need = tiles.of(rows)
     fit = memory // need
     if fit > 1:  # several are processes beside this one

@@ -27,12 +27,12 @@ from g2ard.tiles.points import PointFeed, lift_tiles
 from g2ard.tiles.pour import pour
 from g2ard.tiles.store import MANIFEST, VERSION, TileStore, packed, row_width
 
-__all__ = ["TILE_ROWS", "ingest"]
+__all__ = ["MOST_TILES", "TILE_ROWS", "ingest"]
 
 TILE_ROWS = 5_000_000
 """Rows of a tile at the most, unless told otherwise."""
 
-_MOST_TILES = 10_000
+MOST_TILES = 10_000
 """Tiles of a scene, about: each is two files, and every step goes over all of them."""
 
 _BLOCK_BYTES = 1 << 24
@@ -125,7 +125,7 @@ def ingest(
     if tile_rows < 1 or (block_rows is not None and block_rows < 1):
         raise InputError(f"tile_rows and block_rows: expected at least 1, got {tile_rows}, {block_rows}")
     feed, sources = _feed(source, lift or LiftConfig())
-    fewest = -(-feed.count // _MOST_TILES)
+    fewest = -(-feed.count // MOST_TILES)
     if like is None and tile_rows < fewest:
         raise InputError(
             f"tile_rows: {feed.path} is {feed.count:,} rows, too many for tiles of {tile_rows:,}; "
