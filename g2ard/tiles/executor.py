@@ -27,6 +27,10 @@ _TRIES = 5
 _GLANCE = 1.0
 """Seconds between a worker's looks whether its parent is there."""
 
+_MANAGER = 5.0
+"""Seconds for the pool's own thread to end once its workers are dead: it removes semaphores, and Python warns of
+them where the program ends meanwhile."""
+
 
 class Executor(Protocol):
     """Runs tasks that do not read each other's files."""
@@ -129,6 +133,7 @@ class _Processes:
         if self._pool is None:
             return
         processes = list((self._pool._processes or {}).values())
+        manager: threading.Thread | None = getattr(self._pool, "_executor_manager_thread", None)
         self._pool.shutdown(wait=not at_once, cancel_futures=True)
         if at_once:
             for process in processes:
@@ -136,6 +141,8 @@ class _Processes:
                     process.kill()
             for process in processes:
                 process.join()
+            if manager is not None:
+                manager.join(timeout=_MANAGER)
         self._pool = None
 
 
