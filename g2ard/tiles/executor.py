@@ -28,8 +28,8 @@ _GLANCE = 1.0
 """Seconds between a worker's looks whether its parent is there."""
 
 _MANAGER = 5.0
-"""Seconds for the pool's own thread to end once its workers are dead: it removes semaphores, and Python warns of
-them where the program ends meanwhile."""
+"""Seconds for the pool's own thread to end once its workers are dead. It removes semaphores, of which Python
+warns where the program ends meanwhile."""
 
 
 class Executor(Protocol):
