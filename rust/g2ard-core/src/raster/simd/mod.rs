@@ -83,6 +83,7 @@ pub trait Vector: Real<Mask: Mask> {
     /// A row's values from lane `part · COUNT` on, counted modulo 16.
     #[inline(always)]
     fn load_part(row: &Lanes16, part: usize) -> Self {
+        const { assert!(LANES.is_multiple_of(Self::COUNT)) };
         let first = part * Self::COUNT % LANES;
         // SAFETY: COUNT divides 16, so `first` is one of its multiples below 16 and the values lie in the row.
         unsafe { Self::load_at(row.0.as_ptr().add(first)) }
@@ -91,6 +92,7 @@ pub trait Vector: Real<Mask: Mask> {
     /// To where [`Vector::load_part`] loads from.
     #[inline(always)]
     fn store_part(self, row: &mut Lanes16, part: usize) {
+        const { assert!(LANES.is_multiple_of(Self::COUNT)) };
         let first = part * Self::COUNT % LANES;
         // SAFETY: as in `load_part`.
         unsafe { self.store_at(row.0.as_mut_ptr().add(first)) }
