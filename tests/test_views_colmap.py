@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,40 @@ def test_truncated_colmap(tmp_path: Path, name: str, keep: int) -> None:
         (read_points if "points" in name else read_views)(folder)
 
 
+@pytest.mark.parametrize(
+    ("name", "keep", "column"),
+    [
+        ("cameras.bin", 7, r"COUNT of table 0"),
+        ("cameras.bin", 8 + 11, "WIDTH of camera 0"),
+        ("cameras.bin", 8 + 24 + 3 * 8, r"PARAMS\[3\] of camera 0"),
+        ("images.bin", 8 + 4 + 4 * 8 + 7, r"TX of image 0"),
+        ("images.bin", 8 + 64 + 3, r"NAME of image 0"),
+        ("images.bin", 8 + 64 + 12 + 8 + 47, r"POINTS2D of image 0, 'photo 2\.png'"),
+        ("points3D.bin", 109, "B of point 1"),
+    ],
+)
+def test_the_column_that_is_cut_is_named(tmp_path: Path, name: str, keep: int, column: str) -> None:
+    folder = colmap(tmp_path / "project", orbit(3), text=False)
+    path = folder / "sparse" / "0" / name
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(InputError, match=rf"{name}: truncated in ({column})$"):
+        (read_points if "points" in name else read_views)(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "column"),
+    [("cameras.bin", 8 + 24 + 8, r"camera 0: PARAMS\[1\]"), ("images.bin", 8 + 4 + 5 * 8, "image 0: TY")],
+)
+def test_a_binary_value_that_is_not_finite_is_named(tmp_path: Path, name: str, at: int, column: str) -> None:
+    folder = colmap(tmp_path / "project", orbit(3), text=False)
+    path = folder / "sparse" / "0" / name
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<d", data, at, float("nan"))
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=rf"{name}: malformed {column} is nan$"):
+        read_views(folder)
+
+
 def test_fisheye_is_refused(tmp_path: Path) -> None:
     folder = colmap(tmp_path / "project", orbit(2), text=True)
     cameras = folder / "sparse" / "0" / "cameras.txt"
@@ -91,6 +126,9 @@ def test_a_bad_row_of_a_text_table_is_named(tmp_path: Path) -> None:
     images = folder / "sparse" / "0" / "images.txt"
     images.write_text("1 1 0 0 0 0 0 4 7 a.png\n\n2 1 0 0 0 0 deep 4 7 b.png\n\n")
     with pytest.raises(InputError, match=r"images\.txt: malformed image 1: TY is 'deep'$"):
+        read_views(folder)
+    images.write_text("1 1 0 0 0 0 0 inf 7 a.png\n\n")
+    with pytest.raises(InputError, match=r"images\.txt: malformed image 0: TZ is 'inf'$"):
         read_views(folder)
     images.write_text("1 1 0 0 0 0 0 4 7\n\n")
     with pytest.raises(InputError, match=r"images\.txt: malformed image 0: lacks NAME$"):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from g2ard.errors import InputError
+from g2ard.io.records import Record
 
 if TYPE_CHECKING:
     import numpy as np
@@ -83,8 +84,6 @@ def parsing(path: Path) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except struct.error as error:
-        raise InputError(f"{path}: truncated") from error
     except (ValueError, IndexError, KeyError, OverflowError) as error:
         raise InputError(f"{path}: malformed ({error})") from error
     except OSError as error:
@@ -180,39 +179,56 @@ def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...])
     return _Camera(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), (k1, k2, p1, p2, 0.0))
 
 
+_POSE = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
+_COUNT = Record(["COUNT"], "Q")
+_CAMERA = Record(["CAMERA_ID", "MODEL", "WIDTH", "HEIGHT"], "iiQQ")
+_IMAGE = Record(["IMAGE_ID", *_POSE, "CAMERA_ID"], "IdddddddI")
+_POINTS = Record(["POINTS2D"], "Q")
+
+
+def _parameters(count: int) -> Record:
+    return Record([f"PARAMS[{k}]" for k in range(count)], count * "d")
+
+
 def _cameras_bin(path: Path) -> dict[int, _Camera]:
     data = path.read_bytes()
-    (count,) = struct.unpack_from("<Q", data)
-    cameras, at = {}, 8
-    for _ in range(count):
-        key, model, width, height = struct.unpack_from("<iiQQ", data, at)
+    (count,) = _COUNT.read(path, "table", 0, data, 0)
+    cameras, at = {}, _COUNT.size
+    for i in range(count):
+        key, model, width, height = _CAMERA.read(path, "camera", i, data, at)
         name = _MODELS[model] if 0 <= model < len(_MODELS) else f"number {model}"
-        parameters = struct.unpack_from(f"<{_PARAMETERS.get(name, 0)}d", data, at + 24)
-        cameras[key] = _camera(path, name, (width, height), parameters)
-        at += 24 + 8 * len(parameters)
+        layout = _parameters(_PARAMETERS.get(name, 0))
+        values = layout.read_finite(path, "camera", i, data, at + _CAMERA.size)
+        cameras[key] = _camera(path, name, (width, height), values)
+        at += _CAMERA.size + layout.size
     return cameras
 
 
 def _images_bin(path: Path) -> list[_Image]:
     data = path.read_bytes()
-    (count,) = struct.unpack_from("<Q", data)
+    (count,) = _COUNT.read(path, "table", 0, data, 0)
     images: list[_Image] = []
-    at = 8
-    for _ in range(count):
-        _key, *pose, camera = struct.unpack_from("<I7dI", data, at)
-        end = data.find(b"\0", at + 64)
+    at = _COUNT.size
+    for i in range(count):
+        _key, *pose, camera = _IMAGE.read_finite(path, "image", i, data, at)
+        start = at + _IMAGE.size
+        end = data.find(b"\0", start)
         if end < 0:
-            raise InputError(f"{path}: truncated in the name of image {len(images)}")
-        (points,) = struct.unpack_from("<Q", data, end + 1)
-        images.append(_Image(data[at + 64 : end].decode(), camera, tuple(pose[:4]), tuple(pose[4:])))
-        at = end + 9 + 24 * points
+            raise InputError(f"{path}: truncated in NAME of image {i:,}")
+        try:
+            name = data[start:end].decode()
+        except UnicodeDecodeError:
+            raise InputError(f"{path}: malformed image {i:,}: NAME is no UTF-8") from None
+        (points,) = _POINTS.read(path, "image", i, data, end + 1)
+        images.append(_Image(name, camera, tuple(pose[:4]), tuple(pose[4:])))
+        at = end + 1 + _POINTS.size + 24 * points
         if at > len(data):
-            raise InputError(f"{path}: truncated in the points of {images[-1].name!r}")
+            raise InputError(f"{path}: truncated in POINTS2D of image {i:,}, {name!r}")
     return images
 
 
 _CAMERA_COLUMNS = (("CAMERA_ID", 0), ("WIDTH", 2), ("HEIGHT", 3))
-_POSE_COLUMNS = tuple((name, at) for at, name in enumerate(("QW", "QX", "QY", "QZ", "TX", "TY", "TZ"), 1))
+_POSE_COLUMNS = tuple((name, at) for at, name in enumerate(_POSE, 1))
 
 
 def text_lines(path: Path) -> list[str]:
@@ -226,14 +242,15 @@ def _cameras_txt(path: Path) -> dict[int, _Camera]:
     for i, words in enumerate(rows):
         key, width, height = (number(path, f"camera {i}", words, name, at) for name, at in _CAMERA_COLUMNS)
         params = tuple(
-            number(path, f"camera {i}", words, f"PARAMS[{at - 4}]", at, float) for at in range(4, len(words))
+            number(path, f"camera {i}", words, f"PARAMS[{at - 4}]", at, _finite)
+            for at in range(4, len(words))
         )
         cameras[int(key)] = _camera(path, words[1], (int(width), int(height)), params)
     return cameras
 
 
 def number(
-    path: Path, entry: str, words: list[str], name: str, at: int, kind: type[int] | type[float] = int
+    path: Path, entry: str, words: list[str], name: str, at: int, kind: Callable[[str], float] = int
 ) -> float:
     """A column of a text table."""
     if at >= len(words):
@@ -244,6 +261,13 @@ def number(
         raise InputError(f"{path}: malformed {entry}: {name} is {words[at]!r}") from None
 
 
+def _finite(word: str) -> float:
+    value = float(word)
+    if not math.isfinite(value):
+        raise ValueError(word)
+    return value
+
+
 def _images_txt(path: Path) -> list[_Image]:
     lines = text_lines(path)
     while lines and not lines[0].strip():
@@ -252,7 +276,7 @@ def _images_txt(path: Path) -> list[_Image]:
     for i, line in enumerate(lines[::2]):  # each second lists the image's points, and may be empty
         if words := line.split(maxsplit=9):
             where = f"image {i}"
-            pose = tuple(number(path, where, words, name, at, float) for name, at in _POSE_COLUMNS)
+            pose = tuple(number(path, where, words, name, at, _finite) for name, at in _POSE_COLUMNS)
             camera = int(number(path, where, words, "CAMERA_ID", 8))
             if len(words) < 10:
                 raise InputError(f"{path}: malformed {where}: lacks NAME")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +10,13 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.cloud_ply import finite_cloud
 from g2ard.io.colmap import model_folder, number, parsing, text_lines
+from g2ard.io.records import Record
 from g2ard.io.types import Cloud
 
 __all__ = ["read"]
+
+_COUNT = Record(["COUNT"], "Q")
+_POINT = Record(["POINT3D_ID", *"XYZRGB", "ERROR", "TRACK"], "QdddBBBdQ")
 
 
 def read(path: Path) -> Cloud:
@@ -36,17 +39,16 @@ def read(path: Path) -> Cloud:
 def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Rows of id, x y z, r g b, error, and a track of varying length: walked, since no stride is fixed."""
     data = path.read_bytes()
-    (count,) = struct.unpack_from("<Q", data)
-    row = struct.Struct("<Q3d3BdQ")
-    if count * row.size > len(data):
+    (count,) = _COUNT.read(path, "table", 0, data, 0)
+    if count * _POINT.size > len(data):
         raise InputError(f"{path}: truncated: {count:,} points promised")
-    positions, rgb, at = np.empty((count, 3)), np.empty((count, 3), np.uint8), 8
+    positions, rgb, at = np.empty((count, 3)), np.empty((count, 3), np.uint8), _COUNT.size
     for i in range(count):
-        _key, x, y, z, r, g, b, _error, track = row.unpack_from(data, at)
+        _key, x, y, z, r, g, b, _error, track = _POINT.read(path, "point", i, data, at)
         positions[i], rgb[i] = (x, y, z), (r, g, b)
-        at += row.size + 8 * track
+        at += _POINT.size + 8 * track
         if at > len(data):
-            raise InputError(f"{path}: truncated in point {i:,} of {count:,}")
+            raise InputError(f"{path}: truncated in TRACK of point {i:,} of {count:,}")
     return positions, rgb
 
 

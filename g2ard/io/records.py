@@ -1,0 +1,56 @@
+"""Rows of binary tables without a fixed stride, read one at a time: what is cut or not finite is named."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from g2ard.errors import InputError
+
+__all__ = ["Record"]
+
+
+class Record:
+    """Little-endian columns without padding.
+
+    Args:
+        names: of the columns, in the file's order.
+        letters: struct's format of each.
+
+    >>> Record(("ID", "X", "Y"), "Qdd").size
+    24
+    """
+
+    def __init__(self, names: Sequence[str], letters: str) -> None:
+        self._names = tuple(names)
+        self._layout = struct.Struct(f"<{letters}")
+        self._ends = [struct.calcsize(f"<{letters[: i + 1]}") for i in range(len(letters))]
+        self.size = self._layout.size
+
+    def read(self, path: Path, entry: str, i: int, data: bytes, at: int) -> tuple[Any, ...]:
+        """The values of the record at byte `at`; `entry` and `i` say which it is: "camera", 3.
+
+        Raises:
+            InputError: the data end within it; names the column.
+        """
+        try:
+            return self._layout.unpack_from(data, at)
+        except struct.error:
+            ends = zip(self._names, self._ends, strict=True)
+            name = next(name for name, end in ends if at + end > len(data))
+            raise InputError(f"{path}: truncated in {name} of {entry} {i:,}") from None
+
+    def read_finite(self, path: Path, entry: str, i: int, data: bytes, at: int) -> tuple[Any, ...]:
+        """As `read`.
+
+        Raises:
+            InputError: as `read`, and where a value is NaN or infinite; names the column.
+        """
+        values = self.read(path, entry, i, data, at)
+        for name, value in zip(self._names, values, strict=True):
+            if not math.isfinite(value):
+                raise InputError(f"{path}: malformed {entry} {i:,}: {name} is {value}")
+        return values
