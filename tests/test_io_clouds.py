@@ -167,6 +167,21 @@ def test_absurd_chunk_table(tmp_path: Path) -> None:
         read_points(path)
 
 
+def test_more_points_than_its_chunks_hold(tmp_path: Path) -> None:
+    """No room is made for them: free-threaded Python fills it, and 4·10⁹ points would end the process."""
+    path = las(tmp_path / "a.laz", np.arange(30.0).reshape(10, 3), np.ones((10, 3), int))
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, 107, 0xFFFF_FF00)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="4,294,967,040 points promised, at most 50,000 in its chunks"):
+        read_points(path)
+    struct.pack_into("<I", data, 107, 10_000_000)
+    struct.pack_into("<I", data, data.find(b"laszip encoded") - 2 + 54 + 12, 10_000_000)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"bytes would unpack to 260,000,000; at most 67,108,864 are taken"):
+        read_points(path)
+
+
 @pytest.mark.parametrize(
     ("at", "content", "message"),
     [

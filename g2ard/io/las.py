@@ -12,6 +12,7 @@ import numpy as np
 
 from g2ard.errors import InputError, MissingDependencyError
 from g2ard.io.cloud_ply import finite_cloud
+from g2ard.io.limits import check_unpacked
 from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
 from g2ard.io.types import Cloud, Note
 
@@ -176,6 +177,13 @@ def _check_chunks(path: Path, header: Any) -> None:
             raise InputError(f"{path}: broken header: chunks of {chunk:,} points")
     with path.open("rb") as file:
         file.seek(header.offset_to_point_data)
-        taken = [count for _, count in lazrs.read_chunk_table(file, layout)]
-    if min(taken, default=0) < 0 or sum(taken) > path.stat().st_size - header.offset_to_point_data:
-        raise InputError(f"{path}: broken chunk table: chunks of {sum(taken):,} bytes")
+        table = lazrs.read_chunk_table(file, layout)
+    room, taken = (sum(column) for column in zip(*table, strict=True)) if table else (0, 0)
+    there = path.stat().st_size
+    if min((packed for _, packed in table), default=0) < 0 or taken > there - header.offset_to_point_data:
+        raise InputError(f"{path}: broken chunk table: chunks of {taken:,} bytes")
+    if room < header.point_count:
+        raise InputError(
+            f"{path}: truncated: {header.point_count:,} points promised, at most {room:,} in its chunks"
+        )
+    check_unpacked(str(path), there, header.point_count * size)
