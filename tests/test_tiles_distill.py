@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -143,13 +145,16 @@ def test_tiles_are_read_as_one_scene(command_line: CommandLine, folder: Path, tm
     assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "two.ply").read_bytes()
 
 
+def own_path() -> dict[str, str]:
+    """The environment of a process that runs these sources."""
+    paths = filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+
+
 def test_a_killed_command_leaves_no_workers_and_goes_on(folder: Path, tmp_path: Path) -> None:
     words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
     command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
-    env = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])),
-    }
+    env = own_path()
     steps = tmp_path / ".x.ply.tiles" / "steps"
     with subprocess.Popen(command, env=env, stderr=subprocess.PIPE) as running:
         children: list[int] = []
@@ -168,6 +173,43 @@ def test_a_killed_command_leaves_no_workers_and_goes_on(folder: Path, tmp_path: 
     assert subprocess.run([*command, "--work", str(steps.parent)], env=env, check=False).returncode == 0
     assert len(read_splats(tmp_path / "x.ply")) == 900
     assert all((steps / name).stat().st_mtime_ns == at for name, at in done.items())
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="/proc tells whose processes there are")
+@pytest.mark.parametrize("seconds", [0.0, 0.2, 0.5])
+def test_workers_that_have_just_begun_end_with_a_killed_command(
+    folder: Path, tmp_path: Path, seconds: float
+) -> None:
+    words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
+    command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
+    with subprocess.Popen(command, env=own_path(), stderr=subprocess.DEVNULL) as running:
+        until = time.monotonic() + 60
+        while not (workers := _workers(running.pid)) and time.monotonic() < until:
+            time.sleep(0.005)
+        time.sleep(seconds)
+        workers |= _workers(running.pid)
+        running.kill()
+    assert workers
+    until = time.monotonic() + 30
+    while (left := {pid for pid in workers if _is_worker(pid)}) and time.monotonic() < until:
+        time.sleep(0.1)
+    for pid in left:
+        os.kill(pid, signal.SIGKILL)
+    assert not left
+
+
+def _workers(parent: int) -> set[int]:
+    """Its processes that work on tiles."""
+    listed = Path(f"/proc/{parent}/task/{parent}/children")
+    with suppress(OSError):
+        return {int(pid) for pid in listed.read_text().split() if _is_worker(int(pid))}
+    return set()
+
+
+def _is_worker(pid: int) -> bool:
+    with suppress(OSError):
+        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    return False
 
 
 def test_memory_is_a_size(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:

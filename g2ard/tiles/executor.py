@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 import signal
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Protocol
 
@@ -23,9 +22,6 @@ __all__ = ["Executor", "executor"]
 
 _TRIES = 5
 """How often in a row workers may die with no task done between, before it is no accident."""
-
-_GLANCE = 1.0
-"""Seconds between a worker's looks whether its parent is there."""
 
 _MANAGER = 5.0
 """Seconds for the pool's own thread to end once its workers are dead. It removes semaphores, of which Python
@@ -164,12 +160,13 @@ def _begin(threads: int) -> None:
     from g2ard import _core
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     _core.set_num_threads(threads)
 
 
-def _end_with(parent: int) -> None:
+def _end_with_parent() -> None:
     """A parent that was killed tells its workers nothing: they would wait for it for ever."""
-    while os.getppid() == parent:
-        time.sleep(_GLANCE)
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
     os._exit(1)
