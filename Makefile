@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 RUST := $(shell find rust -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml) Cargo.toml Cargo.lock
 
-.PHONY: demo test lint docs stress fuzz miri bench bench-kernels wheel wheel-linux setup clean
+.PHONY: demo test lint docs stress fuzz fuzz-guided miri bench bench-kernels wheel wheel-linux setup clean
 
 setup: $(VENV)/.built
 
@@ -34,6 +34,12 @@ FUZZ_RUNS ?= 2000
 FUZZ_SEED ?= 1
 fuzz: setup
 	$(BIN)/python tests/fuzz_readers.py --runs $(FUZZ_RUNS) --seed $(FUZZ_SEED)
+
+# The same readers, by libFuzzer, which looks for files that reach new lines: FUZZ_SECONDS of each of the corpus.
+FUZZ_SECONDS ?= 60
+fuzz-guided: setup
+	$(BIN)/pip install --quiet atheris
+	$(BIN)/python tests/fuzz_guided.py --seconds $(FUZZ_SECONDS) --seed $(FUZZ_SEED)
 
 lint: setup
 	cargo fmt --all --check

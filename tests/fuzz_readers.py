@@ -129,6 +129,19 @@ def read_checked(path: Path) -> str | None:
     return None
 
 
+def answer(path: Path, folder: Path) -> str:
+    """`read`, `refused`, or what a reader did instead. A refusal is one line, naming a file of `folder`."""
+    try:
+        line = read_checked(path)
+    except Exception as error:
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        return f"{type(error).__name__} in {Path(at.filename).name}:{at.lineno}: {str(error)[:120]}"
+    if line is None:
+        return "read"
+    one_line = "\n" not in line and str(folder) in line
+    return "refused" if one_line else f"not one line that names the file: {line!r}"
+
+
 def fuzz(
     what: str,
     make: Callable[[Path], Path],
@@ -152,14 +165,7 @@ def fuzz(
             break
         data = repacked(content, rng)
         path.write_bytes(data)
-        try:
-            line = read_checked(asked)
-            found = "read" if line is None else "refused"
-            if line is not None and ("\n" in line or str(folder) not in line):
-                found = f"not one line that names the file: {line!r}"
-        except Exception as error:
-            at = traceback.extract_tb(error.__traceback__)[-1]
-            found = f"{type(error).__name__} in {Path(at.filename).name}:{at.lineno}: {str(error)[:120]}"
+        found = answer(asked, folder)
         if found not in ("read", "refused", *tally):
             kept = folder / f"broken_{len(tally)}_{path.name}"
             kept.write_bytes(data)
