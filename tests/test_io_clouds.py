@@ -165,6 +165,10 @@ def test_absurd_chunk_table(tmp_path: Path) -> None:
     path.write_bytes(data)
     with pytest.raises(InputError, match="3,000,000,000 chunks for 10 points"):
         read_points(path)
+    struct.pack_into("<I", data, 107, 4_000_000_000)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=rf"3,000,000,000 chunks in {table - points_at} bytes"):
+        read_points(path)
 
 
 def test_more_points_than_its_chunks_hold(tmp_path: Path) -> None:

@@ -144,7 +144,8 @@ def _check_size(path: Path, points_at: int, promised: int, point_size: int) -> N
 
 
 def _check_chunk_table(path: Path, points_at: int, promised: int) -> None:
-    """Refuse a table of more chunks than points: lazrs would end the whole process for want of memory."""
+    """Refuse a table of more chunks than points, or than bytes they take: lazrs would end the whole process
+    for want of memory."""
     with path.open("rb") as file:
         file.seek(points_at)
         (table,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
@@ -158,6 +159,8 @@ def _check_chunk_table(path: Path, points_at: int, promised: int) -> None:
         _version, chunks = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     if chunks > max(promised, 1):
         raise InputError(f"{path}: broken chunk table: {chunks:,} chunks for {promised:,} points")
+    if chunks > table - points_at:
+        raise InputError(f"{path}: broken chunk table: {chunks:,} chunks in {table - points_at:,} bytes")
 
 
 def _check_chunks(path: Path, header: Any) -> None:
