@@ -1,5 +1,8 @@
 """The program: `g2ard`, or `python -m g2ard`."""
 
+import sys
+import warnings
+
 from g2ard import interrupt
 
 __all__ = ["main"]
@@ -8,6 +11,8 @@ __all__ = ["main"]
 def main() -> None:
     """Entry point."""
     interrupt.ends_the_program()
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # an error is one line; of what is no error we tell in our own words
     from g2ard.cli import main as command_line
 
     try:

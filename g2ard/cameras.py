@@ -16,6 +16,9 @@ from g2ard.progress import plural
 
 __all__ = ["Camera", "Cameras", "look_at"]
 
+_LARGEST = 1e12
+"""Of a pose or intrinsics: more is damage, and overflows where it is squared."""
+
 _MEDIAN_OF = 16
 """Views that stand for all of them."""
 
@@ -143,8 +146,13 @@ class Cameras:
             if len(getattr(self, name)) != n:
                 raise InputError(f"{name}: expected {n}, got {len(getattr(self, name))}")
         for i in range(n):
-            if not (np.isfinite(self.viewmats[i]).all() and np.isfinite(self.Ks[i]).all()):
+            given = (self.viewmats[i], self.Ks[i], self.distortions[i])
+            if not all(np.isfinite(values).all() for values in given):
                 raise InputError(f"view {i} ({self.names[i]}): its pose or intrinsics are not finite")
+            if max(np.abs(values).max() for values in given) > _LARGEST:
+                raise InputError(
+                    f"view {i} ({self.names[i]}): its pose or intrinsics are past {_LARGEST:.0e}"
+                )
             if self.widths[i] < 1 or self.heights[i] < 1:
                 raise InputError(
                     f"view {i} ({self.names[i]}): empty image {self.widths[i]}×{self.heights[i]}"

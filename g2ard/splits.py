@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import read_json
+from g2ard.io.paths import real_path
 
 if TYPE_CHECKING:
     from g2ard.cameras import Cameras
@@ -207,12 +208,12 @@ def not_held_out(cameras: Cameras, held_out: Cameras) -> NDArray[np.bool_]:
     Returns:
         (C,) bool.
     """
-    photos = {path.resolve() for path in held_out.image_paths if path is not None}
+    photos = {real_path(path) for path in held_out.image_paths if path is not None}
     poses = {view.tobytes() for view in np.round(held_out.viewmats, 9) + 0.0}
     mine = np.round(cameras.viewmats, 9) + 0.0
     return np.array(
         [
-            (path is None or path.resolve() not in photos) and view.tobytes() not in poses
+            (path is None or real_path(path) not in photos) and view.tobytes() not in poses
             for path, view in zip(cameras.image_paths, mine, strict=True)
         ],
         bool,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import os
+import re
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -52,6 +53,9 @@ def _root(
 ) -> None:
     pass
 
+
+_LONG_WORD = re.compile(r"(\S{160})\S{160,}(\S{40})")
+"""What no path is: a value of a damaged file. Its ends are enough."""
 
 _RIVALS = (
     *combinations(("count", "ratio", "fit", "min_psnr"), 2),
@@ -217,10 +221,11 @@ class Run:
     def spare_inputs(self, *outputs: Path) -> None:
         """Usage check: nothing is written over what is read, not even under --overwrite."""
         from g2ard.io.detect import run_scene
+        from g2ard.io.paths import real_path
 
-        taken = {place.resolve() for path in self._inputs for place in (path, run_scene(path))}
+        taken = {real_path(place) for path in self._inputs for place in (path, run_scene(path))}
         for output in outputs:
-            if output.resolve() in taken:
+            if real_path(output) in taken:
                 raise typer.BadParameter(
                     f"{output} would be written over, and is an input; name another output"
                 )
@@ -318,11 +323,13 @@ def _check_constants(run: Run, fn: Callable[..., None], options: dict[str, Any])
 def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: bool) -> None:
     if run.device not in ("auto", "cpu", "gpu", "cuda"):
         raise typer.BadParameter(f"--device: auto, cpu, gpu or cuda, not {run.device!r}")
+    from g2ard.io.paths import real_path
+
     outputs = [Path(o) for o in (options.get("output"), run.json) if o not in (None, "-")]
-    if len({output.resolve() for output in outputs}) < len(outputs):
+    if len({real_path(output) for output in outputs}) < len(outputs):
         raise typer.BadParameter(f"--json and --output are both {run.json}; name another file for one")
     work = options.get("work")
-    if work is not None and work.resolve() in {output.resolve() for output in outputs}:
+    if work is not None and real_path(work) in {real_path(output) for output in outputs}:
         raise typer.BadParameter(f"--work: {work} is an output; name another folder")
     run.spare_inputs(*outputs)
     if run.device == "cuda" and not cuda:
@@ -384,4 +391,4 @@ def one_line(error: BaseException) -> str:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, MemoryError):
         return f"out of memory{f': {error}' if str(error) else ''}"
-    return in_flags(" ".join(str(error).split()))
+    return in_flags(_LONG_WORD.sub(r"\1…\2", " ".join(str(error).split())))

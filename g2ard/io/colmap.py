@@ -127,6 +127,8 @@ def frames(path: Path, images: Path | None = None) -> tuple[Path, list[Frame]]:
         cameras = (_cameras_bin if binary else _cameras_txt)(tables[0])
     with parsing(tables[1]):
         found = (_images_bin if binary else _images_txt)(tables[1])
+    if not found:
+        raise InputError(f"{tables[1]}: lists no image")
     photos = images or _photo_folder(path, folder)
     listed = []
     sizes: dict[int, tuple[int, int]] = {}
@@ -155,7 +157,7 @@ def _viewmat(path: Path, image: _Image) -> NDArray[np.float64]:
 
     from g2ard.io.photos import rotation
 
-    if not np.linalg.norm(image.quat) > 0:
+    if not any(image.quat):
         raise InputError(f"{path}: {image.name!r}: its quaternion is zero")
     view = np.eye(4)
     view[:3, :3] = rotation(image.quat)
@@ -175,6 +177,8 @@ def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...])
         raise InputError(f"{path}: {model} takes {_PARAMETERS[model]} parameters, got {len(p)}")
     single_focal = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
     fx, fy, cx, cy, *k = (p[0], *p) if single_focal else p
+    if min(size) < 1 or min(fx, fy) <= 0:
+        raise InputError(f"{path}: a camera of {size[0]:,}×{size[1]:,} pixels and focal lengths {fx}, {fy}")
     k1, k2, p1, p2 = (*k, 0.0, 0.0, 0.0, 0.0)[:4]
     return _Camera(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), (k1, k2, p1, p2, 0.0))
 

@@ -94,6 +94,9 @@ def _layout(path: Path) -> _Layout:
     vertex, chunk, *sh = read_element(path, header, *names)
     if len(chunk) * _CHUNK < len(vertex) or (sh and len(sh[0]) != len(vertex)):
         raise InputError(f"{path}: {len(chunk)} chunks and {plural(len(vertex), 'Gaussian')} do not fit")
+    for name in _PACKED:
+        if vertex.dtype[name] != np.uint32:
+            raise InputError(f"{path}: {name!r} is of {vertex.dtype[name]}, not uint")
     bands, colored = sh[0] if sh else None, "min_r" in chunk_properties
     offset = offset_of(path, header)
     return _Layout(vertex, np.array(chunk), bands, len(rest) // 3, colored, offset)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from g2ard.errors import InputError
+from g2ard.io.paths import check_regular
 
 __all__ = ["KINDS", "Format", "Kind", "file_format", "is_photo", "kind", "run_scene", "run_views"]
 
@@ -68,7 +69,10 @@ def file_format(path: str | Path) -> Format:
     if path.is_dir():
         return _folder_format(path)
     if not path.exists():
+        if path.is_symlink():
+            raise InputError(f"{path}: a link that leads to no file")
         raise InputError(f"{path}: no such file or folder{_near(path)}")
+    check_regular(str(path), path)
     name, suffix = path.name.lower(), path.suffix.lower()
     if name in ("meta.json", "lod-meta.json"):
         return "sog"

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from g2ard.errors import InputError
+from g2ard.io.paths import check_regular
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from PIL.Image import Image
 
 __all__ = ["LARGEST_IMAGE", "check_image", "check_unpacked", "opened_image"]
@@ -71,6 +71,8 @@ def opened_image(where: str, file: Path | IO[bytes]) -> Iterator[Image]:
     """
     from PIL import Image, UnidentifiedImageError
 
+    if not hasattr(file, "read"):
+        check_regular(where, Path(file))
     try:
         with Image.open(file) as image:
             check_image(where, *image.size)

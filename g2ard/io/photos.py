@@ -82,7 +82,8 @@ def pixels(where: str, values: Mapping[str, Any], key: str) -> int:
 
 def rotation(quat: Sequence[float]) -> NDArray[np.float64]:
     """(3, 3) of a wxyz quaternion of any length but 0."""
-    w, x, y, z = np.asarray(quat, np.float64) / np.linalg.norm(quat)
+    q = np.asarray(quat, np.float64) / np.abs(quat).max()  # of 1e308 the norm would be infinite
+    w, x, y, z = q / np.linalg.norm(q)
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -48,7 +48,7 @@ class _Layout:
         header = read_header(path)
         properties = header.properties.get("vertex", [])
         require(path, properties, _NEEDED, "a 3DGS scene")
-        rest = sorted((p for p in properties if re.fullmatch(r"f_rest_\d+", p)), key=lambda p: int(p[7:]))
+        rest = sorted((p for p in properties if re.fullmatch(r"f_rest_\d{1,3}", p)), key=lambda p: int(p[7:]))
         stored, kept = _bands(path, rest)
         (rows,) = read_element(path, header, "vertex")
         shift = _recentre(spread_rows(rows)) if rows.dtype["x"].itemsize == 8 else np.zeros(3)

@@ -84,16 +84,19 @@ def offset_of(path: Path, header: PlyHeader) -> NDArray[np.float64]:
     """(3,) what a comment `g2ard offset X Y Z` says; zeros without one.
 
     Raises:
-        InputError: the comment holds no numbers.
+        InputError: the comment holds no finite numbers.
     """
     import numpy as np
 
     for comment in header.comments:
         if match := _OFFSET.match(comment):
             try:
-                return np.array([float(word) for word in match.groups()])
+                offset = np.array([float(word) for word in match.groups()])
             except ValueError as error:
                 raise InputError(f"{path}: broken comment {comment!r}") from error
+            if not np.isfinite(offset).all():
+                raise InputError(f"{path}: broken comment {comment!r}")
+            return offset
     return np.zeros(3)
 
 

@@ -10,6 +10,7 @@ import re
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from g2ard.errors import InputError
+from g2ard.io.paths import real_path
 
 __all__ = ["Settings", "below", "read_settings"]
 
@@ -107,7 +108,7 @@ def below(start: Path, path: Path) -> Path | None:
     where they ran, mostly a folder above their output."""
     if path.is_absolute():
         return path if path.exists() else None
-    places = (*start.resolve().parents, Path())
+    places = (*real_path(start).parents, Path())
     return next((place / path for place in places if (place / path).exists()), None)
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g2ard.errors import InputError
+from g2ard.io.paths import check_regular
 from g2ard.io.sog_chunk import Chunk, Decoder, count_of, meta_errors, rest_of
 
 if TYPE_CHECKING:
@@ -178,4 +179,8 @@ def _bundle_loader(path: Path, bundle: zipfile.ZipFile, prefix: str) -> Callable
 
 
 def _folder_loader(folder: Path) -> Callable[[str], bytes]:
-    return lambda name: (folder / name).read_bytes()
+    def load(name: str) -> bytes:
+        check_regular(str(folder / name), folder / name)
+        return (folder / name).read_bytes()
+
+    return load

@@ -15,6 +15,7 @@ from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import fields_of, read_json
+from g2ard.io.paths import real_path
 from g2ard.io.photos import Frame, pixels, rigid, view_set
 from g2ard.io.types import ViewSet
 from g2ard.progress import plural
@@ -56,15 +57,20 @@ def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
         weight = view.get("weight")
         if weight is not None and not (np.isfinite(weight) and weight >= 0):
             raise InputError(f"{where}: weight {weight!r} is not a number ≥ 0")
+        split, name = view.get("split"), view["name"]
+        if not isinstance(name, str):
+            raise InputError(f"{where}: name {name!r} is not a string")
+        if split is not None and not isinstance(split, str):
+            raise InputError(f"{where}: split {split!r} is not a string")
         return Frame(
-            name=str(view["name"]),
+            name=name,
             viewmat=_exact(where, np.array(view["camera_from_world"], np.float64)),
             K=np.array(view["K"], np.float64).reshape(3, 3),
             size=(pixels(where, view, "width"), pixels(where, view, "height")),
             photo=photo,
             mask=None if mask is None else path.parent / mask,
             distortion=tuple(map(float, (*view.get("distortion", ()), 0, 0, 0, 0, 0)[:5])),
-            split=view.get("split"),
+            split=split,
             weight=weight,
         )
 
@@ -128,6 +134,6 @@ def _relative(photo: Path | None, path: Path) -> str | None:
     if photo is None:
         return None
     try:
-        return Path(os.path.relpath(photo.resolve(), path.parent.resolve())).as_posix()
+        return Path(os.path.relpath(real_path(photo), real_path(path.parent))).as_posix()
     except ValueError:  # another drive on Windows
-        return photo.resolve().as_posix()
+        return real_path(photo).as_posix()

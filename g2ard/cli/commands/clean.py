@@ -50,7 +50,9 @@ def clean(
     if output is not None and not dry_run:
         io.check_scene_output(output, run.overwrite)
     if preview is not None:
-        if preview.resolve() in {path.resolve() for path in (scene, output) if path}:
+        from g2ard.io.paths import real_path
+
+        if real_path(preview) in {real_path(path) for path in (scene, output) if path}:
             raise typer.BadParameter(f"--preview: {preview} is another file already; name a .png of its own")
         io.check_output(preview, run.overwrite)
     splats = load_scene(scene, run.say)

@@ -138,7 +138,10 @@ def register(
         raise typer.BadParameter("--intrinsics and --focal exclude each other; give one")
     check_views_output(output, run.overwrite)
     if report is not None:
-        if report.resolve() in {p.resolve() for p in (output, scene, poses, truth, intrinsics, photos) if p}:
+        from g2ard.io.paths import real_path
+
+        others = (output, scene, poses, truth, intrinsics, photos)
+        if real_path(report) in {real_path(p) for p in others if p}:
             raise typer.BadParameter(f"--report {report} would be written over; name another output")
         if report.suffix.lower() not in (".html", ".htm"):
             raise typer.BadParameter(f"--report {report}: a page is written as .html")

@@ -67,6 +67,7 @@ def render(
 
     from g2ard.images import write_png
     from g2ard.io.atomic import check_output
+    from g2ard.io.paths import output_names
     from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import load_scene, load_views
     from g2ard.policy.views import views_or_pool
@@ -94,15 +95,16 @@ def render(
     )
     cameras = load_views(found, split, size, run.say)
     warn_of_sight(splats, cameras, run.say)
+    places = output_names(str(cameras.source or views), cameras.names) if output is not None else []
     shown: list[NDArray[np.float32]] = []
     renderer = Renderer(splats, background=background or (0.0, 0.0, 0.0), settings=settings)
     with _folder(output, run.overwrite) as folder:
-        for view, name in enumerate(cameras.names):
+        for view in range(len(cameras)):
             rendered = renderer.render(cameras[view])
             if sheet is not None:
                 shown.append(np.clip(rendered.image, 0, 1))
             if folder is not None:
-                stem = folder / Path(name).with_suffix("")
+                stem = folder / places[view]
                 stem.parent.mkdir(parents=True, exist_ok=True)
                 write_png(stem.with_name(stem.name + ".png"), rendered.image)
                 if depth:

@@ -189,8 +189,9 @@ def _report(
 
 def _check_parents(run: Run, parents: Path, scene: Path, views: Path | None) -> None:
     from g2ard.io.atomic import check_output
+    from g2ard.io.paths import real_path
 
-    if parents.resolve() in {path.resolve() for path in (scene, views) if path and not is_made(path)}:
+    if real_path(parents) in {real_path(path) for path in (scene, views) if path and not is_made(path)}:
         raise typer.BadParameter(f"--parents: {parents} is an input; name another output")
     check_output(parents, run.overwrite)
 

@@ -1,0 +1,68 @@
+"""Paths as users give them: links that go in a circle, files that are none, names that leave their folder."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from g2ard.errors import InputError
+
+__all__ = ["check_regular", "output_names", "real_path"]
+
+_LONGEST = 200
+"""Bytes of a name of a file: systems take 255, of which a suffix and temporary names need some."""
+
+
+def real_path(path: str | Path) -> Path:
+    """The path without links; one whose links go in a circle stays (`Path.resolve` raises there)."""
+    return Path(os.path.realpath(path))
+
+
+def check_regular(where: str, path: Path) -> None:
+    """Refuse a pipe, a device or a socket: reading it could wait for ever, or never end.
+
+    Args:
+        where: names the file in the error.
+        path: a file, a folder, or nothing.
+
+    Raises:
+        InputError: it is something else.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(f"{where}: not a regular file")
+
+
+def output_names(where: str, names: Sequence[str]) -> list[str]:
+    """What views' names become as files of one folder, without suffix: no name leads out of it.
+
+    Roots, drives and `..` go. Where two names differ in their suffix alone, both keep it.
+
+    Args:
+        where: names the file of views in the error.
+        names: of the views.
+
+    Raises:
+        InputError: a name holds no name of a file, one of over 200 bytes, or comes to another's.
+
+    >>> output_names("v.json", ["../images/a.png", "/b/c.jpg", "d.png", "d.jpg"])
+    ['images/a', 'b/c', 'd.png', 'd.jpg']
+    """
+    found = [_inside(where, i, name) for i, name in enumerate(names)]
+    stems = Counter(path.with_suffix("") for path in found)
+    places = [path if stems[path.with_suffix("")] > 1 else path.with_suffix("") for path in found]
+    times = Counter(places)
+    for name, place in zip(names, places, strict=True):
+        if times[place] > 1:
+            raise InputError(f"{where}: {name!r} and another view would both be written as {str(place)!r}")
+    return [str(place) for place in places]
+
+
+def _inside(where: str, i: int, name: str) -> PurePosixPath:
+    parts = PurePosixPath(PureWindowsPath(name.replace("\0", "")).as_posix()).parts
+    kept = [part for part in parts if part not in ("..", "/", "//") and not part.endswith((":", ":/"))]
+    if not kept or "\0" in name or max(len(part.encode(errors="replace")) for part in kept) > _LONGEST:
+        short = name if len(name) <= _LONGEST else f"{name[:_LONGEST]}…"
+        raise InputError(f"{where}: view {i}: {short!r} cannot be a file's name")
+    return PurePosixPath(*kept)
