@@ -113,6 +113,10 @@ def test_fisheye_is_refused(tmp_path: Path) -> None:
     cameras.write_text("7 PINHOLE 8 six 500 500 4 3\n")
     with pytest.raises(InputError, match=r"cameras\.txt: malformed camera 0: HEIGHT is 'six'$"):
         read_views(folder)
+    for word in ("1_0", "٣"):
+        cameras.write_text(f"7 PINHOLE 8 {word} 500 500 4 3\n", encoding="utf-8")
+        with pytest.raises(InputError, match=rf"cameras\.txt: malformed camera 0: HEIGHT is '{word}'$"):
+            read_views(folder)
     cameras.write_text("7 PINHOLE 8 6 500 x 4 3\n")
     with pytest.raises(InputError, match=r"cameras\.txt: malformed camera 0: PARAMS\[1\] is 'x'$"):
         read_views(folder)

@@ -259,10 +259,13 @@ def number(
     """A column of a text table."""
     if at >= len(words):
         raise InputError(f"{path}: malformed {entry}: lacks {name}")
+    word = words[at]
     try:
-        return kind(words[at])
+        if "_" in word or not word.isascii():  # which Python's own numbers may have
+            raise ValueError(word)
+        return kind(word)
     except ValueError:
-        raise InputError(f"{path}: malformed {entry}: {name} is {words[at]!r}") from None
+        raise InputError(f"{path}: malformed {entry}: {name} is {word!r}") from None
 
 
 def _finite(word: str) -> float:

@@ -71,8 +71,8 @@ def _header_line(header: PlyHeader, words: list[str]) -> None:
     if words[0] == "comment":
         header.comments.append(" ".join(words[1:]))
     elif words[0] == "element":
-        if int(words[2]) < 0:
-            raise ValueError("negative count")
+        if not words[2].isdecimal():
+            raise ValueError("no count")
         header.counts[words[1]] = int(words[2])
         header.properties[words[1]], header.lists[words[1]] = [], []
     elif words[0] == "property":
