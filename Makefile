@@ -13,9 +13,12 @@ RUST := $(shell find rust -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml) Ca
 setup: $(VENV)/.built
 
 # One stamp for both halves: Python dependencies by pyproject.toml, the extension by cargo.
-$(VENV)/.built: pyproject.toml $(RUST)
-	test -x $(BIN)/maturin || { $(PYTHON) -m venv $(VENV) && $(BIN)/pip install --quiet "maturin>=1.9,<2"; }
+$(VENV)/.built: pyproject.toml $(RUST) | $(VENV)/.maturin
 	$(BIN)/maturin develop --release --extras dev --quiet
+	touch $@
+
+$(VENV)/.maturin:
+	test -x $(BIN)/maturin || { $(PYTHON) -m venv $(VENV) && $(BIN)/pip install --quiet "maturin>=1.9,<2"; }
 	touch $@
 
 demo: setup
@@ -71,8 +74,9 @@ bench: setup
 bench-kernels:
 	cargo bench --quiet -p g2ard-core
 
-wheel: setup
-	$(BIN)/maturin build --release --out dist
+# A wheel for this system; nothing but maturin is installed for it.
+wheel: $(VENV)/.maturin
+	$(BIN)/maturin build --release --locked --out dist
 
 # A wheel for a Linux of any kind, linked by zig against the C library that TAG names. TARGET is Rust's name
 # (first: rustup target add $TARGET): {x86_64,aarch64}-unknown-linux-{gnu,musl}, TAG musllinux_1_2 for musl.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Callable
 from dataclasses import replace
@@ -74,7 +73,7 @@ def test_ctrl_c_then_resume_is_never_having_stopped(stop: int, tmp_path: Path) -
         nonlocal told
         told += 1
         if told == stop:
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
         adapt(start, targets, config, work=tmp_path, progress=stop_there)

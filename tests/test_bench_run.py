@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scenes import around, checkered_ball
+from systems import needs_processes
 
 from g2ard import io
 from g2ard.bench.definition import METHODS, read_definition
@@ -56,6 +57,7 @@ def study(folder: Path, text: str = STUDY) -> Path:
     return path
 
 
+@needs_processes
 def test_every_cell_gets_the_same_budget_steps_and_views(tmp_path: Path) -> None:
     definition = read_definition(study(tmp_path))
     out = tmp_path / "out"
@@ -134,6 +136,7 @@ def test_the_page_works_in_a_browser(tmp_path: Path) -> None:
     assert dom.count('src="data:image/jpeg;base64,') == 8  # a pair and two crops of three
 
 
+@needs_processes
 def test_stages_survive_an_interruption_and_failures_are_rows(tmp_path: Path) -> None:
     text = STUDY.replace('"pup", "rounds", "nanogs"', '"splat-transform", "random"')
     text = text.replace("seconds = [3]", "")
@@ -162,6 +165,7 @@ def test_stages_survive_an_interruption_and_failures_are_rows(tmp_path: Path) ->
     assert "Failed: ball 4× splat-transform" in (out / "report.html").read_text()
 
 
+@needs_processes
 def test_a_missing_scene_is_an_error_of_its_cells(tmp_path: Path) -> None:
     text = STUDY.replace("ball.ply", "nowhere.ply")
     rows = bench_run([read_definition(study(tmp_path, text))], tmp_path / "out")
@@ -169,6 +173,7 @@ def test_a_missing_scene_is_an_error_of_its_cells(tmp_path: Path) -> None:
     assert all("nowhere.ply" in row.error for row in rows)
 
 
+@needs_processes
 def test_reduction_that_takes_all_the_time_is_scored_without_recovery(tmp_path: Path) -> None:
     text = STUDY.replace("seconds = [3]", "seconds = [1e-5]").replace("steps = [9]", "")
     rows = bench_run([read_definition(study(tmp_path, text))], tmp_path / "out")
@@ -176,6 +181,7 @@ def test_reduction_that_takes_all_the_time_is_scored_without_recovery(tmp_path: 
     assert all(row.seconds > row.amount and row.recover_cpu_s == 0 for row in rows)
 
 
+@needs_processes
 def test_a_city_is_made_lifted_trained_and_adapted(tmp_path: Path) -> None:
     path = tmp_path / "city.toml"
     path.write_text("""
@@ -267,6 +273,7 @@ def test_luma_drift_is_the_mean_distance_of_lumas() -> None:
     assert luma(np.array([[[1, 0, 0], [0, 1, 0]]], np.float32)) == pytest.approx((0.2126 + 0.7152) / 2)
 
 
+@needs_processes
 def test_released_schedules_run_beside_the_matched_ones(tmp_path: Path) -> None:
     text = STUDY.replace('["g2ard", "pup", "rounds", "nanogs"]', '["light", "pair", "nanogs", "random"]')
     text = text.replace("steps = [9]", "released = true").replace("seconds = [3]", "")
@@ -292,6 +299,7 @@ def test_released_schedules_are_those_of_the_papers() -> None:
     assert METHODS["g2ard-paper"].released_schedule == "paper"
 
 
+@needs_processes
 def test_command(command_line: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
     study(tmp_path)
     options = ["--methods", "g2ard,random", "--ratios", "5", "--steps", "3", "--json", "-", "-o", "out"]
@@ -337,6 +345,7 @@ SMALL = STUDY.replace("seconds = [3]\n", "").replace(
 )
 
 
+@needs_processes
 def test_a_run_touches_nothing_of_others_and_knows_its_files(tmp_path: Path) -> None:
     path, out = study(tmp_path, SMALL), tmp_path / "out"
     thesis = out / "work" / "thesis.txt"
@@ -355,6 +364,7 @@ def test_a_run_touches_nothing_of_others_and_knows_its_files(tmp_path: Path) -> 
     assert [(row.study, row.input_count) for row in rows] == [("other", 800), ("balls", 800)]
 
 
+@needs_processes
 def test_rows_of_other_ratios_stay(tmp_path: Path) -> None:
     path, out = read_definition(study(tmp_path, SMALL)), tmp_path / "out"
     bench_run([path.narrowed(ratios=(4.0, 8.0))], out)
@@ -362,6 +372,7 @@ def test_rows_of_other_ratios_stay(tmp_path: Path) -> None:
     assert {row.ratio for row in read_rows(out / "rows.csv")} == {2.0, 4.0, 8.0}
 
 
+@needs_processes
 def test_one_reduction_a_round(tmp_path: Path) -> None:
     """The paper's method takes its 75 % where the study has rounds, and one shot where it has not."""
     text = STUDY.replace('methods = ["g2ard", "pup", "rounds", "nanogs"]', 'methods = ["rounds", "shot"]')
@@ -382,6 +393,7 @@ def test_one_reduction_a_round(tmp_path: Path) -> None:
     assert len(made) == 2
 
 
+@needs_processes
 def test_nothing_is_left_running(tmp_path: Path) -> None:
     mark = tmp_path / "alive"
     late = f"import time; time.sleep(1.5); open({str(mark)!r}, 'w')"
@@ -396,6 +408,7 @@ def test_nothing_is_left_running(tmp_path: Path) -> None:
     assert not mark.exists()
 
 
+@needs_processes
 def test_w_measures_again(tmp_path: Path) -> None:
     path, out = study(tmp_path, SMALL), tmp_path / "out"
     bench_run([read_definition(path)], out, keep=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scenes import around, checkered_ball
+from systems import needs_processes
 from test_bench_run import ROOT, check_page, study
 from test_evaluators import pictured
 
@@ -53,6 +54,7 @@ def run(folder: Path, text: str) -> tuple[Definition, list[Row], Path]:
     return definition, rows, folder / "out"
 
 
+@needs_processes
 def test_the_last_round_recovers_twice_and_stays_anchored_where_it_was_built(tmp_path: Path) -> None:
     text = HEAD.replace("[12]", "[60]") + 'methods = ["g2ard-paper"]\n' + SCENE
     _, (row,), out = run(tmp_path, text)
@@ -86,6 +88,7 @@ def test_legs_are_those_of_the_releases() -> None:
     assert shared[-1].share == 1
 
 
+@needs_processes
 def test_the_papers_method_has_the_papers_weights_of_each_prior(tmp_path: Path) -> None:
     methods = {"a": "trained", "b": "lift"}
     text = HEAD.replace("12", "6") + 'methods = ["a", "b", "c", "d"]\n'
@@ -106,6 +109,7 @@ def test_the_papers_method_has_the_papers_weights_of_each_prior(tmp_path: Path) 
     assert all(weights in found for weights in as_dicts)
 
 
+@needs_processes
 def test_policies_go_on_from_one_checkpoint(tmp_path: Path) -> None:
     text = HEAD + 'seeds = [0, 1]\nmethods = ["random", "directional", "own"]\n'
     for name, base in (("random", "g2ard-paper"), ("directional", "g2ard-paper"), ("own", "g2ard")):
@@ -126,6 +130,7 @@ def test_policies_go_on_from_one_checkpoint(tmp_path: Path) -> None:
     assert len({row.psnr for row in rows}) == 6
 
 
+@needs_processes
 def test_a_teacher_has_a_row_and_the_others_their_distance_from_it(tmp_path: Path) -> None:
     text = HEAD.replace("[4]", "[4, 8]").replace("12", "4") + 'differs = ["small <balls>"]\n'
     text += 'methods = ["random", "teacher"]\n' + CITY
@@ -168,6 +173,7 @@ def test_black_renders_are_counted_and_left_out() -> None:
     assert score(nothing, targets, (0.5, 0.5, 0.5)).black == 0
 
 
+@needs_processes
 def test_black_renders_are_told(tmp_path: Path) -> None:
     text = HEAD.replace("12", "4") + 'methods = ["random"]\n' + SCENE
     definition, (row,), out = run(tmp_path, text)
@@ -180,6 +186,7 @@ def test_black_renders_are_told(tmp_path: Path) -> None:
     assert "random†" in html
 
 
+@needs_processes
 def test_what_is_scored_is_not_trained_on(tmp_path: Path) -> None:
     views = around(16, size=(48, 36))
     scored = views.take(range(0, 4))
@@ -193,6 +200,7 @@ def test_what_is_scored_is_not_trained_on(tmp_path: Path) -> None:
     assert "4 views to train on are scored on" in (out / "report.html").read_text()
 
 
+@needs_processes
 def test_adaptation_takes_all_views_in_the_papers_schedule(tmp_path: Path) -> None:
     text = HEAD.replace("12", "4") + 'adapt_steps = 7\nadapt_schedule = "paper"\nadapt_on = "all"\n'
     _, rows, out = run(tmp_path, text + 'methods = ["random"]\n' + CITY)
@@ -209,6 +217,7 @@ def test_adaptation_takes_all_views_in_the_papers_schedule(tmp_path: Path) -> No
     assert json.loads(report.read_text())["steps"] == 7
 
 
+@needs_processes
 def test_the_last_training_views_may_be_the_new_trajectory(tmp_path: Path) -> None:
     text = HEAD.replace("12", "4") + 'adapt_steps = 3\nmethods = ["random"]\n'
     _, (row,), out = run(tmp_path, text + SCENE + "adapt_last = 5\n")
@@ -229,6 +238,7 @@ def test_the_last_training_views_may_be_the_new_trajectory(tmp_path: Path) -> No
             read_definition(none_left)
 
 
+@needs_processes
 def test_a_study_may_score_by_inrias_conventions_in_8_bit(tmp_path: Path) -> None:
     text = HEAD.replace("12", "4") + 'methods = ["random"]\n' + SCENE
     _, (plain,), _ = run(tmp_path, text)
@@ -244,6 +254,7 @@ def test_a_study_may_score_by_inrias_conventions_in_8_bit(tmp_path: Path) -> Non
     assert np.array_equal(first, again[0])
 
 
+@needs_processes
 def test_either_target_is_the_photo_or_the_priors_render(tmp_path: Path) -> None:
     io.write_views(tmp_path / "some.json", pictured(tmp_path), splits=["train", "train", "test", "test"])
     text = HEAD.replace("12", "4") + 'methods = ["random"]\n' + SCENE.replace("views.json", "some.json")
@@ -299,6 +310,7 @@ def test_every_study_says_what_differs_from_the_paper() -> None:
     assert Matched("none").label == "as it is"
 
 
+@needs_processes
 def test_a_study_is_one_command(command_line: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
     study(tmp_path, HEAD.replace("12", "4") + 'methods = ["random", "teacher"]\n' + SCENE)
     status, _, err = command_line("bench", "run", "balls.toml", cwd=tmp_path)
@@ -315,6 +327,7 @@ def test_rows_from_before_later_columns_can_be_read() -> None:
         assert {(row.black, row.delta_psnr) for row in rows} == {(None, None)}
 
 
+@needs_processes
 def test_a_variable_that_is_not_set_is_told_before_anything_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -106,6 +107,20 @@ def test_config_file_takes_plain_toml_values(command_line: CommandLine, tmp_path
     status, _, error = command_line("simplify", "s.ply", "-o", "o.ply", "--config", "c.toml", cwd=tmp_path)
     assert status == 0, error
     assert len(read_splats(tmp_path / "o.ply")) == 5
+
+
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+def test_config_files_are_utf_8(tmp_path: Path, mark: bytes) -> None:
+    """Whatever the locale, and with a byte order mark too, which editors on Windows write."""
+    (tmp_path / "c.toml").write_bytes(mark + 'output = "größe/×.ply"\n'.encode())
+    code = "import sys; from pathlib import Path; from g2ard.cli.config import _read;"
+    code += "print(ascii(_read(Path(sys.argv[1]))))"
+    plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "c.toml"], env=plain, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert eval(done.stdout) == {"output": "größe/×.ply"}
 
 
 def test_progress_lines_are_rare_and_tell_eta(

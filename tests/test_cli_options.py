@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scenes import around, checkered_ball
+from systems import needs_links
 
 from g2ard.io import read_splats, write_splats, write_views
 
@@ -139,7 +140,7 @@ def test_a_flag_wins_over_what_it_excludes_in_the_config(folder: Path, command_l
     ("arguments", "output"),
     [
         ("simplify a.ply -r 2 -o sub/../a.ply", "sub/../a.ply"),
-        ("simplify sub/link.ply -r 2 -o a.ply", "a.ply"),
+        pytest.param("simplify sub/link.ply -r 2 -o a.ply", "a.ply", marks=needs_links),
         ("simplify a.ply -r 2 -o o.ply --json a.ply", "a.ply"),
         ("recover a.ply --views views.json -o a.ply", "a.ply"),
         ("recover s.ply --views views.json --teacher a.ply -o a.ply", "a.ply"),
@@ -155,7 +156,8 @@ def test_an_input_is_not_written_over(
     folder: Path, command_line: CommandLine, arguments: str, output: str
 ) -> None:
     (folder / "sub").mkdir()
-    (folder / "sub" / "link.ply").symlink_to("../a.ply")
+    if "link" in arguments:
+        (folder / "sub" / "link.ply").symlink_to("../a.ply")
     before = {path.name: path.read_bytes() for path in folder.glob("*.*")}
     error = refused(command_line, folder, *arguments.split(), "-w")
     assert f"{output} would be written over, and is an input" in error
@@ -187,17 +189,17 @@ def test_the_folder_one_is_in_can_be_an_output(folder: Path, command_line: Comma
     [
         "class Finder:\n"  # as typer is imported
         "    def find_spec(name, *rest):\n"
-        "        if name == 'typer': os.kill(os.getpid(), signal.SIGINT)\n"
+        "        if name == 'typer': signal.raise_signal(signal.SIGINT)\n"
         "sys.meta_path.insert(0, Finder)\n",
         "import typer.main\n"  # as it builds the commands
-        "typer.main.get_group = lambda *a: os.kill(os.getpid(), signal.SIGINT)\n",
+        "typer.main.get_group = lambda *a: signal.raise_signal(signal.SIGINT)\n",
     ],
 )
 @pytest.mark.parametrize(("by", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
 def test_a_signal_before_a_command_is_one_line(moment: str, by: str, status: int) -> None:
     unignored = "signal.signal(signal.SIGINT, signal.default_int_handler)"  # ignored in background jobs
     moment = moment.replace("SIGINT", by)
-    code = f"import os, signal, sys\n{unignored}\n{moment}from g2ard.__main__ import main\nmain()"
+    code = f"import signal, sys\n{unignored}\n{moment}from g2ard.__main__ import main\nmain()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (status, "g2ard: interrupted\n")
 

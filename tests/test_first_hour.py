@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from scenes import around, checkered_ball
+from systems import needs_signals
 from view_files import transforms
 
 import g2ard
@@ -138,6 +139,7 @@ def test_finished_folders_among_several_budgets_are_told_and_checked(
     assert (folder / "10x" / "scene.ply").stat().st_mtime_ns == before
 
 
+@needs_signals
 def test_a_stopped_run_refuses_other_options_before_any_promise(
     command_line: CommandLine, folder: Path
 ) -> None:
@@ -186,7 +188,7 @@ def program(*arguments: object, folder: Path, **pipes: int) -> subprocess.Popen[
         [sys.executable, "-m", "g2ard", *map(str, arguments)],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": path},
-        preexec_fn=_heed_interrupts,
+        preexec_fn=_heed_interrupts if os.name == "posix" else None,
         **pipes,  # type: ignore[arg-type]
     )
 
@@ -219,6 +221,7 @@ def test_a_closed_pipe_loses_no_result(stream: str, folder: Path) -> None:
     assert len(g2ard.load(folder / "s.ply")) == 240
 
 
+@needs_signals
 @pytest.mark.parametrize(("by", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupt_says_what_was_kept(by: signal.Signals, status: int, folder: Path) -> None:
     ask = ("distill", "ball.ply", "-r", 4, "-o", "run", "--size", 48, "--steps", 100_000)
@@ -229,6 +232,7 @@ def test_an_interrupt_says_what_was_kept(by: signal.Signals, status: int, folder
     assert b"g2ard: interrupted; the same command with --resume goes on in run" in error
 
 
+@needs_signals
 def test_stopped_workers_leave_one_line(folder: Path) -> None:
     """Semaphores among them, which Python would tell of when the program is gone."""
     g2ard.save(folder / "large.ply", checkered_ball(20_000))

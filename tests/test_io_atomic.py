@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from systems import needs_modes
 
 from g2ard.errors import OutputError
 from g2ard.io import atomic_folder, atomic_output, check_output
@@ -76,6 +77,7 @@ def test_absent_folders_are_made_with_the_output_and_not_before(tmp_path: Path) 
         check_output(tmp_path / "file" / "a.ply")
 
 
+@needs_modes
 def test_unwritable_folder(tmp_path: Path) -> None:
     where = Path("/proc/1") if os.geteuid() == 0 else tmp_path / "locked"
     if where.parent == tmp_path:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import os
 import signal
 import time
 from collections.abc import Callable
@@ -97,7 +96,7 @@ class _StopAt:
 
     def __call__(self, stage: str, done: int, total: int, info: Any = None) -> None:
         if stage == "recover" and done == self.step:
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
 
 
 @pytest.mark.parametrize(("engine", "steps"), [("fused", 40), ("torch", 40), ("fused", 110)])

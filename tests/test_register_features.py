@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from g2ard.stages.register.solve import information, lifted, solved
 from g2ard.stages.render import Rendered, Renderer
 
 CommandLine = Callable[..., tuple[int, str, str]]
+ROOT = Path(__file__).resolve().parents[1]
 CONFIG = RegisterConfig(size=400, align_size=200, matcher="sift")
 
 
@@ -231,6 +233,32 @@ def test_without_pycolmap_direct_alignment_is_left(monkeypatch: pytest.MonkeyPat
     for name in ("sift", "json:dumps"):
         with pytest.raises(MissingDependencyError, match=r"pip install g2ard\[register\]"):
             matcher_named(name, 0.85, 100)
+
+
+@pytest.mark.parametrize(
+    ("machine", "words"), [("x86_64", ""), ("aarch64", ", and has no wheel for linux aarch64")]
+)
+def test_where_pycolmap_has_no_wheel_is_told(
+    machine: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    monkeypatch.setattr(module.sys, "platform", "linux")
+    monkeypatch.setattr(module.platform, "machine", lambda: machine)
+    with pytest.raises(MissingDependencyError, match=rf"\(pycolmap is not installed{words}\)"):
+        matcher_named("sift", 0.85, 100)
+
+
+def test_extras_name_pycolmap_where_it_has_wheels() -> None:
+    requirements = pytest.importorskip("packaging.requirements")
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for extra in ("register", "dev"):
+        (found,) = (r for r in extras["optional-dependencies"][extra] if r.startswith("pycolmap"))
+        marker = requirements.Requirement(found).marker
+        for system in ("linux", "darwin", "win32"):
+            for machine in ("x86_64", "AMD64", "aarch64", "arm64", "ARM64"):
+                if (system, machine) not in (("linux", "AMD64"), ("win32", "x86_64")):  # not their names
+                    named = marker.evaluate({"sys_platform": system, "platform_machine": machine})
+                    assert named == ((system, machine) in module._WHEELS)
 
 
 def test_a_pycolmap_that_does_not_load_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

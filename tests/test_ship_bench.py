@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from scenes import checkered_ball
 
+from g2ard.bench.process import measured
 from g2ard.bench.ship import bench_ship
-from g2ard.errors import InputError
+from g2ard.errors import G2ardError, InputError
 from g2ard.io import write_splats
 
 
@@ -23,6 +27,27 @@ def test_formats_lose_what_their_quanta_say(tmp_path: Path) -> None:
     assert abs(pool[5, "sog"].lost) < 0.1
     assert pool[1, "splat"].psnr < pool[1, "sog"].psnr  # no harmonics, coarse rotations
     assert len((tmp_path / "f.csv").read_text().splitlines()) == len(cells) + 1
+
+
+def test_what_cannot_be_measured_is_refused_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command_line: Callable[..., tuple[int, str, str]]
+) -> None:
+    """As on Windows, which has no such call."""
+    write_splats(tmp_path / "ball.ply", checkered_ball(100))
+    monkeypatch.delattr(os, "posix_spawnp", raising=False)
+    for ask in (
+        ("simplify", "ball.ply", "--methods", "fast", "--csv", "f.csv"),
+        ("run", "--scene", "ball.ply", "-o", "out"),
+        ("ship", "ball.ply", "--csv", "f.csv", "--splat-transform", sys.executable),
+    ):
+        status, _, error = command_line("bench", *ask, cwd=tmp_path)
+        assert status == 1
+        assert error.splitlines()[-1] == (
+            "g2ard: this benchmark measures processes by POSIX's calls, which Windows lacks"
+        )
+    assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]
+    with pytest.raises(G2ardError, match="POSIX"):
+        measured([sys.executable, "-c", ""], tmp_path / "log")
 
 
 def test_bad_words(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scenes import around, checkered_ball
+from systems import needs_processes
 
 from g2ard import io
 from g2ard.bench import rows as table
@@ -27,6 +28,7 @@ CommandLine = Callable[..., tuple[int, str, str]]
 METHODS = ("default", "fast", "paper", "nanogs", "lightgaussian")
 
 
+@needs_processes
 def test_measures_writes_and_resumes(tmp_path: Path) -> None:
     scene, views, csv = tmp_path / "ball.ply", tmp_path / "views.json", tmp_path / "figures.csv"
     io.write_splats(scene, checkered_ball(2000))
@@ -58,6 +60,7 @@ def test_measures_writes_and_resumes(tmp_path: Path) -> None:
     assert len(table.read(csv, Cell)) == 6  # in the old failure's place
 
 
+@needs_processes
 def test_standing_views_are_no_ones_own(tmp_path: Path, command_line: CommandLine) -> None:
     scene, csv = tmp_path / "ball.ply", tmp_path / "figures.csv"
     io.write_splats(scene, checkered_ball(3000))
@@ -176,6 +179,7 @@ def _rounded(cell: Cell) -> Cell:
     return Cell(**{k: round(v, 6) if isinstance(v, float) else v for k, v in vars(cell).items()})
 
 
+@needs_processes
 def test_refuses_a_foreign_file_an_unknown_method_and_an_absent_program(tmp_path: Path) -> None:
     csv = tmp_path / "mine.csv"
     csv.write_text("a,b\n1,2\n")

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from systems import needs_proc
 from test_tiles_simplify import ring, town
 
 from g2ard.errors import InputError
@@ -175,7 +176,7 @@ def test_a_killed_command_leaves_no_workers_and_goes_on(folder: Path, tmp_path: 
     assert all((steps / name).stat().st_mtime_ns == at for name, at in done.items())
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="/proc tells whose processes there are")
+@needs_proc
 @pytest.mark.parametrize("seconds", [0.0, 0.2, 0.5])
 def test_workers_that_have_just_begun_end_with_a_killed_command(
     folder: Path, tmp_path: Path, seconds: float

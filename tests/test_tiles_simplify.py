@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from systems import needs_proc
 
 from g2ard import _core
 from g2ard.cameras import Cameras, look_at
@@ -189,6 +190,7 @@ def test_a_cluster_of_two_workers_gives_the_same_bits(store: TileStore, tmp_path
     assert cluster.fingerprint() == here.fingerprint()
 
 
+@needs_proc
 @pytest.mark.parametrize("scheduler", [None, "local"])
 def test_workers_killed_at_random_cost_time_alone(
     store: TileStore, tmp_path: Path, scheduler: str | None
@@ -223,9 +225,6 @@ def test_workers_killed_at_random_cost_time_alone(
 
 def _children() -> list[int]:
     """Worker processes of this one."""
-    text = Path(f"/proc/self/task/{os.getpid()}/children")
-    if not text.exists():
-        pytest.skip("no /proc tells of children")
     pids = [
         int(pid)
         for task in Path("/proc/self/task").iterdir()

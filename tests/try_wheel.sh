@@ -9,7 +9,7 @@
 set -eu
 wheel=$(cd "$(dirname "$1")" && pwd)/$(basename "$1")
 folder=$(mktemp -d)
-trap 'rm -rf "$folder"' EXIT
+trap 'cd / && rm -rf "$folder"' EXIT # Windows removes no folder that one is in
 cd "$folder"
 "${PYTHON:-python3}" -m venv venv
 bin=venv/bin

@@ -213,7 +213,7 @@ def read_definition(path: Path) -> Definition:
         InputError: it cannot be read, or a key or value is not known; the message names the file.
     """
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: {error}") from None
     try:

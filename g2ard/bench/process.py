@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from g2ard.errors import InputError
+from g2ard.errors import G2ardError, InputError
 
-__all__ = ["Usage", "measured"]
+__all__ = ["Usage", "check_measurable", "measured"]
 
 _LAUNCHER = """
 import os, signal, sys, time
@@ -43,6 +44,16 @@ class Usage:
     peak_mb: float
 
 
+def check_measurable() -> None:
+    """Refuse where the system does not tell what a process took, as Windows does not in POSIX's way.
+
+    Raises:
+        G2ardError: it does not.
+    """
+    if not hasattr(os, "posix_spawnp"):
+        raise G2ardError("this benchmark measures processes by POSIX's calls, which Windows lacks")
+
+
 def measured(command: Sequence[str], log: Path) -> Usage:
     """Run a command to its end; it ends with us.
 
@@ -52,7 +63,9 @@ def measured(command: Sequence[str], log: Path) -> Usage:
 
     Raises:
         InputError: it failed; the message is its last line.
+        G2ardError: the system does not tell what a process took.
     """
+    check_measurable()
     with log.open("wb") as out:
         launched = [sys.executable, "-I", "-S", "-c", _LAUNCHER, *command]
         with subprocess.Popen(

@@ -95,7 +95,10 @@ def _notes(folder: Path, definition: Definition, rows: Sequence[Row]) -> list[st
     for scene in definition.scenes:
         cells = [cell for cell in cells_of([definition]) if cell.scene.name == scene.name]
         paths = [folder / "cells" / f"{cell.key}.json" for cell in cells]
-        dropped = max((json.loads(p.read_text()).get("dropped", 0) for p in paths if p.exists()), default=0)
+        dropped = max(
+            (json.loads(p.read_text(encoding="utf-8")).get("dropped", 0) for p in paths if p.exists()),
+            default=0,
+        )
         if dropped:
             lines.append(
                 f"{scene.name}: {dropped} views to train on are scored on: they were not trained on."
@@ -258,7 +261,7 @@ def _cell_files(
         if (cell.scene.name, cell.ratio) != (scene, ratio) or cell.method.name in found:
             continue
         path = folder / "cells" / f"{cell.key}.json"
-        content = json.loads(path.read_text()) if path.exists() else {"views": {}}
+        content = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"views": {}}
         if content["views"]:
             found[cell.method.name] = {**content, "key": cell.key}
     return list(found.items())

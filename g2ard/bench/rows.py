@@ -58,7 +58,10 @@ def _value(text: str, kind: str) -> Any:
 
 def rewrite(path: Path, rows: Iterable[Row], kind: type[Row]) -> None:
     """Replace the file by these rows, whole or not at all."""
-    with atomic_output(path, overwrite=True) as temporary, temporary.open("w", newline="") as file:
+    with (
+        atomic_output(path, overwrite=True) as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.DictWriter(file, [f.name for f in fields(kind)], lineterminator="\n")
         writer.writeheader()
         writer.writerows(_line(row) for row in rows)

@@ -13,6 +13,7 @@ from typing import Any
 from g2ard import __version__, io
 from g2ard.bench.definition import Definition
 from g2ard.bench.pipeline import Cell, Pipeline
+from g2ard.bench.process import check_measurable
 from g2ard.bench.run_rows import Row, with_deltas, write_csv
 from g2ard.bench.score import Scored, pictured, save_jpeg, score
 from g2ard.bench.simplify import machine
@@ -54,8 +55,10 @@ def bench_run(
     Raises:
         InputError: a path with an environment variable that is not set, LPIPS weights that cannot be
             read. What goes wrong in a cell is its row's error.
+        G2ardError: the system does not tell what a process took (Windows).
         KeyboardInterrupt: after Ctrl-C; the next call goes on.
     """
+    check_measurable()
     for definition in definitions:
         definition.require_variables()
     cells = cells_of(definitions)
@@ -108,7 +111,9 @@ def _done(folder: Path, cell: Cell) -> bool:
 
 def _read_cell(folder: Path, cell: Cell) -> list[Row]:
     path = folder / "cells" / f"{cell.key}.json"
-    return [Row(**row) for row in json.loads(path.read_text())["rows"]] if path.exists() else []
+    return (
+        [Row(**row) for row in json.loads(path.read_text(encoding="utf-8"))["rows"]] if path.exists() else []
+    )
 
 
 def _rows(folder: Path, cells: Sequence[Cell]) -> list[Row]:
@@ -120,7 +125,7 @@ def _others(folder: Path, cells: Sequence[Cell]) -> list[Row]:
     ours = {(cell.definition.name, cell.label, cell.seed) for cell in cells}
     found: dict[tuple[str, str, int], list[Row]] = {}
     for path in sorted((folder / "cells").glob("*.json"), key=lambda p: p.stat().st_mtime_ns):
-        held = json.loads(path.read_text())
+        held = json.loads(path.read_text(encoding="utf-8"))
         rows = [Row(**row) for row in held["rows"]]
         if rows:
             found[rows[0].study, held["label"], rows[0].seed] = rows
@@ -213,4 +218,4 @@ def _picture_targets(folder: Path, workspace: Workspace, split: str) -> None:
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
     with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_text(json.dumps(content))
+        temporary.write_text(json.dumps(content), encoding="utf-8", newline="\n")

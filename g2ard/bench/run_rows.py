@@ -166,7 +166,10 @@ def _typed(text: str, kind: str) -> Any:
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """Write rows, whole or not at all."""
-    with atomic_output(path, overwrite=True) as temporary, temporary.open("w", newline="") as file:
+    with (
+        atomic_output(path, overwrite=True) as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as file,
+    ):
         names = [f.name for f in fields(Row)]
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow([_SURVEY.get(name, name) for name in names])

@@ -13,6 +13,7 @@ import numpy as np
 
 from g2ard import io
 from g2ard.bench import rows as table
+from g2ard.bench.process import check_measurable
 from g2ard.bench.simplify import scene_label
 from g2ard.bench.standing import standing_targets
 from g2ard.errors import InputError
@@ -86,7 +87,10 @@ def bench_ship(
 
     Raises:
         InputError: a scene cannot be read, an unknown format, or a ratio below 1.
+        G2ardError: a peer is asked for where the system does not tell what a process took (Windows).
     """
+    if splat_transform is not None:
+        check_measurable()
     if unknown := [name for name in formats if name not in FORMATS]:
         raise InputError(f"formats: expected some of {', '.join(FORMATS)}, got {unknown[0]}")
     if not ratios or min(ratios) < 1:

@@ -18,7 +18,7 @@ import numpy as np
 from g2ard import __version__, baselines, io
 from g2ard.bench import rows as table
 from g2ard.bench.methods import REDUCERS
-from g2ard.bench.process import measured
+from g2ard.bench.process import check_measurable, measured
 from g2ard.bench.raster import cpu_name
 from g2ard.bench.standing import check_protocol, standing_targets
 from g2ard.errors import InputError
@@ -136,7 +136,9 @@ def bench_simplify(
 
     Raises:
         InputError: a scene, the views or the CSV cannot be read, an unknown method or protocol.
+        G2ardError: the system does not tell what a process took (Windows).
     """
+    check_measurable()
     kinds = check_protocol(protocol)
     unknown = [m for m in methods if m not in REDUCERS]
     if unknown:
@@ -269,7 +271,9 @@ def _version(method: str, splat_transform: Path | None) -> str:
         return f"g2ard {__version__}"
     if splat_transform is None:
         return ""
-    told = subprocess.run([splat_transform, "--version"], capture_output=True, text=True, check=False)
+    told = subprocess.run(
+        [splat_transform, "--version"], capture_output=True, encoding="utf-8", errors="replace", check=False
+    )
     lines = (told.stdout or told.stderr).splitlines()
     return lines[0].strip() if lines else ""
 

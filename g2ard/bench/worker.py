@@ -67,7 +67,7 @@ def store_targets(targets: Targets, folder: Path) -> None:
         if mask is not None:
             np.save(folder / f"{view}.mask.npy", mask)
     numbers = {name: i for i, name in enumerate(targets.cameras.names)}
-    (folder / "names.json").write_text(json.dumps(numbers))
+    (folder / "names.json").write_text(json.dumps(numbers), encoding="utf-8", newline="\n")
 
 
 def _reduce(job: Job) -> dict[str, Any]:
@@ -196,7 +196,7 @@ def _main(path: Path) -> None:
     try:
         report = _KINDS[job["kind"]](job)
         with atomic_output(Path(job["output"]).with_name("report.json"), overwrite=True) as temporary:
-            temporary.write_text(json.dumps(report))
+            temporary.write_text(json.dumps(report), encoding="utf-8", newline="\n")
     except (G2ardError, OSError) as error:
         sys.exit(" ".join(str(error).split()))
 

@@ -136,7 +136,7 @@ class Workspace:
     def dropped(self) -> int:
         """How many views were given both to train or adapt on and to score on; they are scored on alone."""
         path = self.folder / "dropped.json"
-        return sum(json.loads(path.read_text()).values()) if path.exists() else 0
+        return sum(json.loads(path.read_text(encoding="utf-8")).values()) if path.exists() else 0
 
     def _not_scored(self, cameras: Cameras, what: str) -> Cameras:
         """Those that no split scores on, by photo or pose; how many were is kept in dropped.json."""
@@ -149,8 +149,10 @@ class Workspace:
                 f"scene {self.scene.name}: all {plural(len(keep), 'view')} to {what} on are scored on"
             )
         path = self.folder / "dropped.json"
-        counts = json.loads(path.read_text()) if path.exists() else {}
-        path.write_text(json.dumps({**counts, what: int(np.count_nonzero(~keep))}))
+        counts = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        path.write_text(
+            json.dumps({**counts, what: int(np.count_nonzero(~keep))}), encoding="utf-8", newline="\n"
+        )
         return cameras.take(keep)
 
     def _last(self, cameras: Cameras) -> NDArray[np.bool_]:
@@ -346,16 +348,18 @@ class Workspace:
             shutil.rmtree(place, ignore_errors=True)
             place.mkdir(parents=True)
             paths = {name: str(path) for name, path in files.items()}
-            (place / "job.json").write_text(json.dumps({**job, **paths, "output": str(made)}))
+            (place / "job.json").write_text(
+                json.dumps({**job, **paths, "output": str(made)}), encoding="utf-8", newline="\n"
+            )
             worker = [sys.executable, "-m", "g2ard.bench.worker", str(place / "job.json")]
             took = measured(worker if command is None else command(made), place / "log")
-            usage.write_text(json.dumps(asdict(took)))
+            usage.write_text(json.dumps(asdict(took)), encoding="utf-8", newline="\n")
         report = place / "report.json"
         return Stage(
             key,
             made,
-            Usage(**json.loads(usage.read_text())),
-            json.loads(report.read_text()) if report.exists() else {},
+            Usage(**json.loads(usage.read_text(encoding="utf-8"))),
+            json.loads(report.read_text(encoding="utf-8")) if report.exists() else {},
         )
 
 

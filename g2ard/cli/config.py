@@ -49,7 +49,7 @@ def _read(path: Path) -> dict[str, Any]:
     import tomllib
 
     try:
-        return tomllib.loads(path.read_text())
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as e:
         raise typer.BadParameter(f"{path}: {e.strerror}") from None
     except UnicodeDecodeError:

@@ -204,7 +204,7 @@ class Run:
         from g2ard.io.atomic import atomic_output
 
         with atomic_output(Path(self.json), overwrite=self.overwrite) as temporary:
-            temporary.write_text(text + "\n")
+            temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
     def _used(self) -> dict[str, Any]:
         """What ran on a GPU, if anything did."""

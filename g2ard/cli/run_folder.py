@@ -53,7 +53,7 @@ def write_report(folder: Path, report: dict[str, Any]) -> None:
     from g2ard.io.atomic import atomic_output
 
     with atomic_output(folder / REPORT, overwrite=True) as temporary:
-        temporary.write_text(json.dumps(report, indent=2, default=str) + "\n")
+        temporary.write_text(json.dumps(report, indent=2, default=str) + "\n", encoding="utf-8", newline="\n")
 
 
 def check_place(run: Run, place: Path, budget: Budget, given: bool, resume: bool) -> None:
@@ -138,7 +138,9 @@ def note_options(run: Run, work: Path, told: Mapping[str, Any] = MappingProxyTyp
     """Write beside what will wait for --resume which options it belongs to, unless it waits already."""
     work.mkdir(parents=True, exist_ok=True)
     if not left_at(work):
-        (work / OPTIONS).write_text(json.dumps({**told, "config": run.config}, default=str))
+        (work / OPTIONS).write_text(
+            json.dumps({**told, "config": run.config}, default=str), encoding="utf-8", newline="\n"
+        )
 
 
 def check_same_options(run: Run, work: Path, besides: Sequence[str] = ()) -> None:

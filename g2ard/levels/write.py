@@ -102,10 +102,12 @@ def save_levels(
         if work is None:
             files.write(folder, Path(path), progress)
         else:
-            (work / _BESIDE).write_text(str(folder))
+            (work / _BESIDE).write_text(str(folder), encoding="utf-8", newline="\n")
             for name in files.parts:  # not moved: after an interruption all are whole here still
                 shutil.copytree((work / name).parent, (folder / name).parent, copy_function=_linked)
-        (folder / "lod-meta.json").write_text(json.dumps(meta, separators=(",", ":")))
+        (folder / "lod-meta.json").write_text(
+            json.dumps(meta, separators=(",", ":")), encoding="utf-8", newline="\n"
+        )
         written = {
             file.relative_to(folder): file.stat().st_size for file in folder.rglob("*") if file.is_file()
         }
@@ -121,7 +123,7 @@ def _sweep(work: Path) -> None:
     """Remove what a call that was killed had begun: folders of files here, and the one beside its output."""
     begun = [path for path in work.iterdir() if path.is_dir() and path.name.startswith(".")]
     if (note := work / _BESIDE).is_file():
-        beside = Path(note.read_text())
+        beside = Path(note.read_text(encoding="utf-8"))
         begun += [beside] if beside.name.startswith(".") else []
     for path in begun:
         shutil.rmtree(path, ignore_errors=True)
@@ -208,7 +210,7 @@ def _measure(
         else:
             node["errors"] = _rounded(leaf_errors(leaf, levels))
             if table is not None:
-                with table.open("a") as file:
+                with table.open("a", encoding="utf-8", newline="\n") as file:
                     file.write(json.dumps(node["errors"]) + "\n")
         progress("measure", number, len(leaves))
 

@@ -205,7 +205,7 @@ class Page:
     def write(self, path: Path) -> None:
         """Write the page, whole or not at all, over what is there."""
         with atomic_output(path, overwrite=True) as temporary:
-            temporary.write_text(self.text(), encoding="utf-8")
+            temporary.write_text(self.text(), encoding="utf-8", newline="\n")
 
 
 def legend(series: Sequence[str], marks: Sequence[str] = ()) -> str:

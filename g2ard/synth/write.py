@@ -74,8 +74,10 @@ def write_city(
             write_views(place / f"{name}.json", replace(cameras, image_paths=paths))
         _photograph(town, place, depth, threads, progress)
         manifest = _manifest(town, depth)
-        (place / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")
-        (place / "README.txt").write_text(_readme(config, manifest), encoding="utf-8")
+        (place / "manifest.json").write_text(
+            json.dumps(manifest, indent=2) + "\n", encoding="utf-8", newline="\n"
+        )
+        (place / "README.txt").write_text(_readme(config, manifest), encoding="utf-8", newline="\n")
     return manifest
 
 

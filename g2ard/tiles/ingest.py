@@ -231,7 +231,7 @@ def _differing(found: Sequence[Path], settings: dict[str, Any]) -> str:
     """Which settings of a manifest or journal are other ones, in brackets; nothing where none is."""
     for path in found:
         with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
-            theirs = dict(json.loads(path.read_text())["settings"])
+            theirs = dict(json.loads(path.read_text(encoding="utf-8"))["settings"])
             names = [name for name in {**theirs, **settings} if theirs.get(name) != settings.get(name)]
             told = [f"{name} {theirs.get(name)}, not {settings.get(name)}" for name in names]
             return f" ({'; '.join(told)})" if told else ""
@@ -243,7 +243,7 @@ def _key_in(path: Path) -> str | None:
     if not path.is_file():
         return None
     try:
-        return str(json.loads(path.read_text())["key"])
+        return str(json.loads(path.read_text(encoding="utf-8"))["key"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return ""
 

@@ -45,7 +45,7 @@ def clear(folder: Path) -> None:
 def _write_json(path: Path, content: dict[str, Any]) -> None:
     """Write beside and rename: the file is the old one or the new one."""
     temporary = path.with_name(f".{path.name}.new")
-    temporary.write_text(json.dumps(content) + "\n")
+    temporary.write_text(json.dumps(content) + "\n", encoding="utf-8", newline="\n")
     os.replace(temporary, path)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import platform
 import sys
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -29,6 +30,9 @@ Matcher = Callable[[Image, Image], Pairs]
 
 _DOUBLED = 500
 """Pixels of the longer side up to which SIFT doubles an image: small ones have few features otherwise."""
+
+_WHEELS = (("linux", "x86_64"), ("darwin", "arm64"), ("win32", "AMD64"))
+"""Where pycolmap has wheels; it has no source distribution, so the extra leaves it out elsewhere."""
 
 
 def matcher_named(name: str, ratio: float, most: int) -> Matcher | None:
@@ -64,7 +68,9 @@ def matcher_named(name: str, ratio: float, most: int) -> Matcher | None:
 def _unusable() -> str:
     """Why pycolmap cannot be had; nothing where it can."""
     if sys.modules.get("pycolmap", ...) is None or find_spec("pycolmap") is None:
-        return "pycolmap is not installed"
+        where = (sys.platform, platform.machine())
+        no_wheel = "" if where in _WHEELS else f", and has no wheel for {' '.join(where)}"
+        return f"pycolmap is not installed{no_wheel}"
     try:
         importlib.import_module("pycolmap")
     except Exception as error:

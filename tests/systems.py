@@ -1,0 +1,45 @@
+"""What tests need of the system, as marks that say what is missing."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+__all__ = ["needs_links", "needs_modes", "needs_proc", "needs_processes", "needs_signals"]
+
+needs_signals = pytest.mark.skipif(
+    os.name == "nt", reason="on Windows a program is sent no signal: it is ended at once"
+)
+"""For tests that send SIGINT or SIGTERM to another process."""
+
+needs_processes = pytest.mark.skipif(
+    not hasattr(os, "posix_spawnp"), reason="what a process took is measured by POSIX's calls"
+)
+"""For tests of benchmarks that run commands as processes."""
+
+needs_modes = pytest.mark.skipif(os.name == "nt", reason="on Windows a folder's mode keeps nobody out")
+
+needs_proc = pytest.mark.skipif(
+    not Path(f"/proc/self/task/{os.getpid()}/children").exists(), reason="no /proc tells of children"
+)
+"""For tests that look for workers."""
+
+
+@cache
+def _links() -> bool:
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            (Path(folder) / "link").symlink_to("target")
+        except (OSError, NotImplementedError):
+            return False
+    return True
+
+
+needs_links = pytest.mark.skipif(
+    sys.platform == "win32" and not _links(), reason="symbolic links need a privilege on Windows"
+)
