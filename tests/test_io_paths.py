@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from systems import needs_links
 from view_files import colmap, edit, orbit, views
 
 from g2ard.errors import InputError
@@ -43,7 +44,7 @@ def test_a_pipe_is_no_file(tmp_path: Path, scene: Path, command_line: CommandLin
     assert (status, "none of 1 photo found" in said) == (1, True)
 
 
-@pytest.mark.skipif(os.name == "nt", reason="links need a privilege there")
+@needs_links
 def test_links_in_a_circle(tmp_path: Path, scene: Path, command_line: CommandLine) -> None:
     loop = tmp_path / "loop.ply"
     loop.symlink_to(loop)
