@@ -223,6 +223,7 @@ def within(files: dict[str, bytes], part: str, key: str, value: Any) -> dict[str
                 ("means", "files", {}, r"malformed 'means\.files': expected a list, found an object"),
                 ("scales", "files", [5], r"'scales\.files\[0\]': expected the name of a file, found 5"),
                 ("scales", "files", ["a\nb"], r"'scales\.files\[0\]': expected the name of a file"),
+                ("scales", "files", [""], r"'scales\.files\[0\]': expected the name of a file"),
                 ("quats", "files", [], r"lacks 'quats\.files\[0\]'"),
                 ("scales", "codebook", 5, r"'scales\.codebook': expected a list, found 5"),
                 ("scales", "codebook", [1.0], r"'scales\.codebook': expected at least \d+ numbers, found 1"),
@@ -237,7 +238,7 @@ def within(files: dict[str, bytes], part: str, key: str, value: Any) -> dict[str
                     "shN",
                     "bands",
                     {},
-                    r"malformed 'shN\.bands': expected a number or a string, found an object",
+                    r"malformed 'shN\.bands': expected a whole number ≥ 0, found an object",
                 ),
             )
         ],
@@ -268,6 +269,21 @@ def test_a_gap_in_a_codebook_drops_what_names_it(tmp_path: Path) -> None:
     )
     assert len(found.splats) == 2
     assert [(n.code, n.count) for n in found.notes] == [("dropped_rows", 1)]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a" * 5000 + "/meta.json", r"'filenames\[0\]' cannot be looked for|names a{5000}"),
+        (5, r"malformed 'filenames\[0\]': expected the name of a file, found 5"),
+        ("a\n/meta.json", r"malformed 'filenames\[0\]': expected the name of a file"),
+    ],
+)
+def test_broken_names_in_lod_meta(tmp_path: Path, name: Any, message: str) -> None:
+    index = {"filenames": [name], "tree": {"lods": {"0": {"file": 0}}}}
+    (tmp_path / "lod-meta.json").write_text(json.dumps(index))
+    with pytest.raises(InputError, match=rf"lod-meta\.json: {message}"):
+        read_splats(tmp_path)
 
 
 @pytest.mark.parametrize(

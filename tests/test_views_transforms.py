@@ -82,7 +82,11 @@ BAD: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
     ),
     (
         lambda c: c["frames"][1]["transform_matrix"][2].pop(),
-        r"frame 1: malformed 'transform_matrix' \(its rows differ in length\)",
+        r"frame 1: malformed 'transform_matrix\[2\]': expected a list of 4, found a list of 3",
+    ),
+    (
+        lambda c: c["frames"][1]["transform_matrix"][2].__setitem__(1, []),
+        r"frame 1: malformed 'transform_matrix.*expected a number, found a list of 0",
     ),
     (lambda c: c["frames"][0].update(k1=[]), "frame 0: malformed 'k1': expected a number, found a list"),
     (

@@ -6,6 +6,7 @@ import json
 import math
 import re
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -272,7 +273,7 @@ def names_of(holder: Fields, key: str, count: int) -> list[str]:
         raise _UnexpectedError("a list", value)
     for at in range(count):
         name = value[at]
-        if not isinstance(name, str) or not name.isprintable():
+        if not isinstance(name, str) or not name or not name.isprintable():
             raise _UnexpectedError("the name of a file", name)
         found.append(name)
     return found
@@ -328,7 +329,7 @@ def _told(asked: _Asked, error: Exception) -> str:
     """The property at fault, what was expected there and what was found, or the error's own words."""
     words = " ".join(str(error).split())
     if "inhomogeneous" in words:
-        return f"{str(asked.path.property())!r} (its rows differ in length)"
+        return _odd_row(asked)
     expected = next((kind for pattern, kind in _EXPECTED if re.search(pattern, words)), None)
     try:
         path = (expected == _NUMBER and _no_number(asked)) or asked.path
@@ -353,6 +354,21 @@ def _no_number(asked: _Asked) -> _Path | None:
         except (TypeError, ValueError, OverflowError):
             return place
     return None
+
+
+def _odd_row(asked: _Asked) -> str:
+    """The first entry that is not like most beside it, of the list asked for last."""
+    places = [asked.path.property()]
+    for path in places:
+        rows = asked.value(path)
+        lengths = [len(row) if isinstance(row, list) else None for row in rows]
+        common = Counter(lengths).most_common(1)[0][0] if lengths else None
+        at = next((i for i, length in enumerate(lengths) if length != common), None)
+        if at is not None:
+            expected = _NUMBER if common is None else f"a list of {common}"
+            return f"{str(path.to(at))!r}: expected {expected}, found {_found(rows[at])}"
+        places.extend(path.to(i) for i in range(len(rows)) if common is not None)
+    return f"{str(places[0])!r}: expected rows of one length"
 
 
 def _found(value: Any) -> str:

@@ -56,10 +56,10 @@ def chunks_of(path: Path) -> list[Path]:
 
 def _listed(index: Path) -> list[Path]:
     """The chunks that lod-meta.json's tree uses at level 0, in the order of its list."""
-    from g2ard.io.jsonfile import fields_of, index_of, listed, object_of, objects, read_json
+    from g2ard.io.jsonfile import fields_of, index_of, listed, names_of, object_of, objects, read_json
 
     with fields_of(str(index), read_json(index)) as content:
-        names = listed(content, "filenames")
+        names = names_of(content, "filenames", len(listed(content, "filenames")))
         files = [index.parent / Path(name).parent for name in names]
         used: set[int] = set()
         nodes = [object_of(content, "tree")]
@@ -69,7 +69,13 @@ def _listed(index: Path) -> list[Path]:
             if "lods" in node and "0" in (levels := object_of(node, "lods")):
                 used.add(index_of(object_of(levels, "0"), "file", len(files)))
         for i in sorted(used):
-            if not (files[i] / "meta.json").is_file():
+            try:
+                there = (files[i] / "meta.json").is_file()
+            except OSError as error:  # a name too long
+                raise InputError(
+                    f"{index}: 'filenames[{i}]' cannot be looked for: {error.strerror}"
+                ) from error
+            if not there:
                 raise InputError(f"{index}: names {names[i]}, which is absent")
         return [files[i] for i in sorted(used)]
 

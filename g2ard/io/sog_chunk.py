@@ -62,7 +62,7 @@ def rest_of(chunk: Chunk) -> int:
         if "shN" not in chunk.meta:
             return 0
         if "bands" in (part := object_of(chunk.meta, "shN")):
-            return _COEFFICIENTS[part["bands"]]
+            return _COEFFICIENTS[whole(part, "bands")]
         width = _image(chunk, _sh_files(chunk)[0]).shape[1]
         return {_PALETTE_COLUMNS * k: k for k in (3, 8, 15)}[width]
 
