@@ -83,6 +83,35 @@ def test_float_colors_past_one(tmp_path: Path) -> None:
         read_points(ply(tmp_path / "a.ply", columns("f4", "f4"), rows))
 
 
+@pytest.mark.parametrize(
+    ("color", "value", "message"),
+    [
+        ("f4", -1, r"float colour 'green' falls to -1; expected values in \[0, 1\]"),
+        ("f8", -1e308, r"float colour 'green' falls to -1e\+308"),
+        ("i1", -5, r"colour 'green' falls to -5; expected values in \[0, 127\]"),
+        ("i2", -5, r"colour 'green' falls to -5; expected values in \[0, 32767\]"),
+        ("i4", -5, r"colour 'green' falls to -5"),
+    ],
+)
+def test_negative_colors(tmp_path: Path, color: str, value: float, message: str) -> None:
+    rows = np.zeros((4, 6))
+    rows[2, 4] = value
+    if color[0] == "f":
+        rows[3, 4] = np.inf  # hides no other value
+    with pytest.raises(InputError, match=rf"a\.ply: {message}"):
+        read_points(ply(tmp_path / "a.ply", columns("f4", color), rows))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("column", [0, 4])
+def test_a_signalling_nan_drops_its_point(tmp_path: Path, column: int) -> None:
+    path = ply(tmp_path / "a.ply", columns("f4", "f4"), np.zeros((3, 6)))
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, len(data) - 24 + 4 * column, 0x7F800001)
+    path.write_bytes(data)
+    assert len(read_points(path)) == 2
+
+
 def test_non_finite_points_are_dropped_and_counted(tmp_path: Path) -> None:
     rows = np.full((4, 6), 0.5)
     rows[1, 0], rows[3, 4] = np.nan, np.inf

@@ -12,11 +12,13 @@ import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from test_io_packed import save_spz, truth
 from test_io_sog import parts
+from test_io_write import glb_parts
 from test_views_trainers import inria
 from view_files import colmap, orbit, transforms, views
 
@@ -134,6 +136,16 @@ def huge_inria(path: Path) -> Path:
     return path
 
 
+def node_tree(path: Path, nodes: list[dict], changed: dict[str, Any] | None = None) -> Path:
+    """A .glb with these nodes, and other parts of its document changed."""
+    write_splats(path, truth(9, 0), overwrite=True)
+    document, binary = glb_parts(path)
+    text = json.dumps({**document, "nodes": nodes, **(changed or {})}).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A)
+    return written(path, head + text + struct.pack("<II", len(binary), 0x004E4942) + binary)
+
+
 def png(width: int, height: int) -> bytes:
     """A whole PNG of zeros, a thousandth of its pixels large."""
 
@@ -215,6 +227,80 @@ def test_a_claim_past_the_limits_is_one_line(what: str, tmp_path: Path) -> None:
     assert str(path) in line
     assert words in line
     assert "\n" not in line
+
+
+MESH = {"mesh": 0}
+BROKEN_NODES: dict[str, tuple[list[Any], str]] = {
+    "negative child": (
+        [MESH, {"children": [-2]}],
+        r"'nodes\[1\]\.children\[0\]': expected an index from 0 to 1",
+    ),
+    "absent child": ([MESH, {"children": [0, 2]}], r"'nodes\[1\]\.children\[1\]': expected .*, found 2"),
+    "child of lists": (
+        [MESH, {"children": [[]]}],
+        r"'nodes\[1\]\.children\[0\]': expected an index .* a list",
+    ),
+    "no object": ([MESH, 5], r"malformed 'nodes\[1\]': expected an object, found 5"),
+    "circle": ([MESH | {"children": [1]}, {"children": [0]}], r"node 0 is its own ancestor"),
+    "two parents": ([MESH, {"children": [0]}, {"children": [0]}], "a node has 2 parents"),
+    "column": (
+        [MESH | {"translation": [[1], [2], [3]]}],
+        r"'nodes\[0\]\.translation\[0\]': expected a number",
+    ),
+    "short": ([MESH | {"translation": [1]}], r"lacks 'nodes\[0\]\.translation\[1\]'"),
+    "far": (
+        [MESH | {"translation": [1e308] * 3}, {"children": [0], "translation": [1e308] * 3}],
+        r"its nodes move it by \(inf, inf, inf\)",
+    ),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("what", BROKEN_NODES)
+def test_broken_nodes_of_a_glb_are_named(what: str, tmp_path: Path) -> None:
+    nodes, words = BROKEN_NODES[what]
+    with pytest.raises(InputError, match=rf"a\.glb: .*{words}"):
+        read_scene(node_tree(tmp_path / "a.glb", nodes))
+
+
+@pytest.mark.parametrize("table", ["accessors", "bufferViews", "buffers"])
+@pytest.mark.parametrize("index", [-1, 99, "x", True, None, []])
+def test_an_index_in_a_glb_names_an_entry(table: str, index: Any, tmp_path: Path) -> None:
+    write_splats(tmp_path / "a.glb", truth(9, 0))
+    document, _ = glb_parts(tmp_path / "a.glb")
+    if table == "accessors":
+        document["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = index
+        words = r"'meshes\[0\]\.primitives\[0\]\.attributes\.POSITION': expected an index from 0 to"
+    elif table == "bufferViews":
+        document["accessors"][0]["bufferView"] = index
+        words = r"'accessors\[0\]\.bufferView': expected an index from 0 to"
+    else:
+        document["bufferViews"][0]["buffer"] = index
+        words = "lies outside the file"
+    with pytest.raises(InputError, match=rf"a\.glb: .*{words}"):
+        read_scene(node_tree(tmp_path / "a.glb", document["nodes"], document))
+
+
+def test_a_long_chain_of_nodes_is_followed_once(tmp_path: Path) -> None:
+    """Each node is looked at a few times, not once for each of its descendants."""
+    count = 20_000
+    nodes: list[dict[str, Any]] = [MESH, *({"children": [i], "translation": [0, 0, 1]} for i in range(count))]
+    path = node_tree(tmp_path / "a.glb", nodes)
+    assert read_scene(path).splats.offset.tolist() == [0, 0, count]
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_signalling_nan_in_a_glb_drops_its_row(tmp_path: Path) -> None:
+    for at in range(6):
+        path = tmp_path / f"{at}.glb"
+        write_splats(path, truth(9, 0))
+        document, binary = glb_parts(path)
+        start = len(path.read_bytes()) - len(binary) + document["bufferViews"][at]["byteOffset"]
+        data = bytearray(path.read_bytes())
+        struct.pack_into("<I", data, start, 0x7F800001)
+        found = read_scene(written(path, bytes(data)))
+        dropped = "COLOR_0" not in list(document["meshes"][0]["primitives"][0]["attributes"])[at]
+        assert len(found.splats) == 9 - dropped
 
 
 @pytest.mark.parametrize("what", ["ply of 2**63 rows", "nested", "angle 0", "png bomb"])

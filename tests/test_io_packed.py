@@ -229,6 +229,22 @@ def test_not_an_spz(tmp_path: Path) -> None:
         read_splats(nine)
 
 
+@pytest.mark.parametrize("version", [2, 3, 4])
+@pytest.mark.parametrize("bits", [25, 63, 64, 200, 255])
+def test_spz_of_more_fractional_bits_than_a_position_has(tmp_path: Path, version: int, bits: int) -> None:
+    path = save_spz(tmp_path / "a.spz", truth(3, 0), version)
+    data = path.read_bytes()
+    head = bytearray(data if version == 4 else gzip.decompress(data))
+    for allowed, value in ((True, 24), (False, bits)):
+        head[13] = value
+        path.write_bytes(bytes(head) if version == 4 else gzip.compress(bytes(head)))
+        if allowed:
+            np.testing.assert_allclose(read_splats(path).means, truth(3, 0).means / 4096, atol=1e-7)
+            continue
+        with pytest.raises(InputError, match=rf"a\.spz: fractionalBits is {bits}, more than the 24 bits"):
+            read_splats(path)
+
+
 def test_spz_without_zstandard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = save_spz(tmp_path / "a.spz", truth(3, 0), 4)
     for name in ("backports", "backports.zstd", "compression.zstd"):

@@ -184,12 +184,17 @@ def edit(files: dict[str, bytes], **changes: Any) -> dict[str, bytes]:
     return files | {"meta.json": json.dumps(json.loads(files["meta.json"]) | changes).encode()}
 
 
+def within(files: dict[str, bytes], part: str, key: str, value: Any) -> dict[str, bytes]:
+    return edit(files, **{part: json.loads(files["meta.json"])[part] | {key: value}})
+
+
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda f: {k: v for k, v in f.items() if k != "scales.webp"}, "scales.webp is missing"),
         (lambda f: f | {"quats.webp": f["quats.webp"][:40]}, "quats.webp: not a whole image"),
-        (lambda f: edit(f, version=3), "version 3"),
+        (lambda f: edit(f, version=3), r"scene.meta\.json: SOG version 3"),
         (lambda f: edit(f, count=17), "16 pixels for 17 Gaussians"),
         (lambda f: edit(f, count="ten"), "malformed"),
         (lambda f: edit(f, means={}), r"meta\.json: lacks 'means\.files'"),
@@ -197,6 +202,50 @@ def edit(files: dict[str, bytes], **changes: Any) -> dict[str, bytes]:
             lambda f: edit(f, scales={"codebook": [1.0], "files": ["scales.webp"]}),
             r"meta\.json: malformed 'scales\.",
         ),
+        *[
+            (lambda f, part=part, key=key, value=value: within(f, part, key, value), message)
+            for part, key, value, message in (
+                ("means", "mins", {}, r"malformed 'means\.mins': expected a number, found an object"),
+                ("means", "mins", [0, 1], r"lacks 'means\.mins\[2\]'"),
+                (
+                    "means",
+                    "mins",
+                    [0, None, 1],
+                    r"malformed 'means\.mins\[1\]': expected a number, found null",
+                ),
+                ("means", "maxs", [0, 1, 1e308], r"'means\.maxs\[2\]': expected a number within ±88.7228"),
+                (
+                    "means",
+                    "maxs",
+                    float("inf"),
+                    r"'means\.maxs': expected a number within ±88.7228, found inf",
+                ),
+                ("means", "files", {}, r"malformed 'means\.files': expected a list, found an object"),
+                ("scales", "files", [5], r"'scales\.files\[0\]': expected the name of a file, found 5"),
+                ("scales", "files", ["a\nb"], r"'scales\.files\[0\]': expected the name of a file"),
+                ("scales", "files", [""], r"'scales\.files\[0\]': expected the name of a file"),
+                ("quats", "files", [], r"lacks 'quats\.files\[0\]'"),
+                ("scales", "codebook", 5, r"'scales\.codebook': expected a list, found 5"),
+                ("scales", "codebook", [1.0], r"'scales\.codebook': expected at least \d+ numbers, found 1"),
+                ("sh0", "codebook", [0, -1e308] * 128, r"'sh0\.codebook\[1\]': expected a number within"),
+                (
+                    "shN",
+                    "codebook",
+                    ["x"] * 256,
+                    r"'shN\.codebook\[0\]': expected a number, found the string",
+                ),
+                (
+                    "shN",
+                    "bands",
+                    {},
+                    r"malformed 'shN\.bands': expected a whole number ≥ 0, found an object",
+                ),
+            )
+        ],
+        (lambda f: edit(f, means=[]), r"malformed 'means': expected an object, found a list"),
+        (lambda f: edit(f, quats="x"), r"malformed 'quats': expected an object, found the string 'x'"),
+        (lambda f: edit(f, count=True), r"malformed 'count': expected a whole number ≥ 0, found true"),
+        (lambda f: edit(f, g2ard={"offset": [0, "x", 1]}), r"'g2ard\.offset\[1\]': expected a number, found"),
         (lambda f: edit(f, count=0), "holds no Gaussians"),
         (lambda f: f | {"meta.json": b"{"}, "not JSON"),
         (lambda f: f | {"shN_labels.webp": webp(square(np.full((10, 2), 200)))}, "of 128"),
@@ -207,6 +256,55 @@ def test_broken_scene_is_named(tmp_path: Path, change: Any, message: str) -> Non
     with pytest.raises(InputError, match=message) as caught:
         read_splats(path)
     assert "scene" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_gap_in_a_codebook_drops_what_names_it(tmp_path: Path) -> None:
+    files = parts(count=3)
+    files["scales.webp"] = webp(square(np.array([[1, 2, 3], [1, 9, 3], [1, 2, 3]])))
+    book = [-3.0] * 256
+    found = read_scene(
+        folder(tmp_path / "s", within(files, "scales", "codebook", [*book[:9], None, *book[10:]]))
+    )
+    assert len(found.splats) == 2
+    assert [(n.code, n.count) for n in found.notes] == [("dropped_rows", 1)]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a" * 5000 + "/meta.json", r"'filenames\[0\]' cannot be looked for|names a{5000}"),
+        (5, r"malformed 'filenames\[0\]': expected the name of a file, found 5"),
+        ("a\n/meta.json", r"malformed 'filenames\[0\]': expected the name of a file"),
+    ],
+)
+def test_broken_names_in_lod_meta(tmp_path: Path, name: Any, message: str) -> None:
+    index = {"filenames": [name], "tree": {"lods": {"0": {"file": 0}}}}
+    (tmp_path / "lod-meta.json").write_text(json.dumps(index))
+    with pytest.raises(InputError, match=rf"lod-meta\.json: {message}"):
+        read_splats(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("tree", "message"),
+    [
+        ({"lods": {"0": {"file": -1}}}, r"'tree\.lods\.0\.file': expected an index from 0 to 1, found -1"),
+        ({"lods": {"0": {"file": 2}}}, r"'tree\.lods\.0\.file': expected an index from 0 to 1, found 2"),
+        ({"lods": {"0": {"file": 0.5}}}, r"expected an index from 0 to 1, found 0.5"),
+        ({"children": [{}, 5]}, r"'tree\.children\[1\]': expected an object, found 5"),
+        ({"children": {}}, r"'tree\.children': expected a list, found an object"),
+        ({"lods": []}, r"'tree\.lods': expected an object, found a list"),
+        ([], r"'tree': expected an object, found a list"),
+    ],
+)
+def test_broken_lod_meta_is_named(tmp_path: Path, tree: Any, message: str) -> None:
+    for name in "ab":
+        folder(tmp_path / name, parts(count=4))
+    index = {"filenames": ["a/meta.json", "b/meta.json"], "tree": tree}
+    (tmp_path / "lod-meta.json").write_text(json.dumps(index))
+    with pytest.raises(InputError, match=rf"lod-meta\.json: malformed .*{message}"):
+        read_splats(tmp_path)
 
 
 def test_broken_zip_is_named(tmp_path: Path) -> None:

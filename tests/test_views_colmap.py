@@ -143,6 +143,27 @@ def test_a_bad_row_of_a_text_table_is_named(tmp_path: Path) -> None:
         read_points(points)
 
 
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("2 0 0 0 -1 9 9 0.1", "R is '-1', expected 0 to 255"),
+        ("2 0 0 0 9 256 9 0.1", "G is '256', expected 0 to 255"),
+        ("2 0 0 0 9 9 nan 0.1", "B is 'nan', expected 0 to 255"),
+        ("2 0 0 0 9 9 1e308 0.1", "B is '1e308', expected 0 to 255"),
+        ("2 0 0 0 9 9 inf 0.1", "B is 'inf', expected 0 to 255"),
+        ("2 0 1_0 0 9 9 9 0.1", "Y is '1_0'"),
+        ("2 0 0 0 9 \u0663 9 0.1", "G is '\u0663'"),
+    ],
+)
+def test_numbers_of_points3d_text(tmp_path: Path, row: str, message: str) -> None:
+    points = tmp_path / "points3D.txt"
+    points.write_text(f"1 0 0 0 0 255 9 0.1\n{row}\n", encoding="utf-8")
+    with pytest.raises(InputError, match=rf"points3D\.txt: malformed point 1: {message}$"):
+        read_points(points)
+    points.write_text("1 nan 0 0 0 255 9 0.1\n2 0 0 0 0 255 9 0.1\n")
+    assert read_points(points).colors.tolist() == [[0, 1, np.float32(9 / 255)]]
+
+
 def test_caliterra() -> None:
     folder = real("caliterra")
     cameras = read_views(folder)

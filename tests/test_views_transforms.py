@@ -68,9 +68,32 @@ BAD: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
     (lambda c: c["frames"][0]["transform_matrix"][0].__setitem__(0, float("nan")), "frame 0: its pose"),
     (lambda c: c["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "not a rotation"),
     (lambda c: c["frames"][0].update(transform_matrix=np.diag([1, 2, 3, 1]).tolist()), "not a rotation"),
-    (lambda c: c["frames"][0].update(transform_matrix="x"), r"frame 0: malformed 'transform_matrix' \("),
-    (lambda c: c["frames"][0].update(k1="x"), r"frame 0: malformed 'k1' \("),
-    (lambda c: c["frames"].__setitem__(0, 7), r"frame 0: malformed \(a int, not an object"),
+    (
+        lambda c: c["frames"][0].update(transform_matrix="x"),
+        "frame 0: malformed 'transform_matrix': expected a number, found the string 'x'",
+    ),
+    (
+        lambda c: c["frames"][0]["transform_matrix"][0].__setitem__(0, "x" * 999),
+        r"frame 0: malformed 'transform_matrix\[0\]\[0\]': expected a number, found the string 'x{19}…x",
+    ),
+    (
+        lambda c: c["frames"][1]["transform_matrix"].__setitem__(1, [0, {}, 0, 0]),
+        r"frame 1: malformed 'transform_matrix\[1\]\[1\]': expected a number, found an object",
+    ),
+    (
+        lambda c: c["frames"][1]["transform_matrix"][2].pop(),
+        r"frame 1: malformed 'transform_matrix\[2\]': expected a list of 4, found a list of 3",
+    ),
+    (
+        lambda c: c["frames"][1]["transform_matrix"][2].__setitem__(1, []),
+        r"frame 1: malformed 'transform_matrix.*expected a number, found a list of 0",
+    ),
+    (lambda c: c["frames"][0].update(k1=[]), "frame 0: malformed 'k1': expected a number, found a list"),
+    (
+        lambda c: c["frames"][0].update(k1="x"),
+        "frame 0: malformed 'k1': expected a number, found the string 'x'",
+    ),
+    (lambda c: c["frames"].__setitem__(0, 7), "frame 0: malformed: expected an object, found 7"),
     (lambda c: c.pop("fl_x"), "no focal length"),
     (lambda c: c.pop("w"), "tell the size"),
     (lambda c: c.update(w=8.5), "frame 0: 'w' is 8.5, not a whole number"),

@@ -45,7 +45,8 @@ class _PlyPoints(PointStream):
     def __init__(self, path: Path) -> None:
         self._vertices, self._names = _vertices(path)
         sample = spread_rows(self._vertices)
-        at = np.stack([sample[name].astype(np.float64) for name in _POSITION], axis=1)
+        with np.errstate(invalid="ignore"):
+            at = np.stack([sample[name].astype(np.float64) for name in _POSITION], axis=1)
         at = at[np.isfinite(at).all(1)]
         low, high = np.percentile(at, (1, 99), axis=0) if len(at) else np.zeros((2, 3))
         super().__init__(path, len(self._vertices), cloud_middle(low, high))
@@ -67,17 +68,24 @@ def _vertices(path: Path) -> tuple[NDArray[Any], list[str]]:
 
 
 def _points(path: Path, rows: NDArray[Any], names: list[str]) -> RawPoints:
-    positions = np.stack([rows[name].astype(np.float64) for name in _POSITION], axis=1)
+    with np.errstate(invalid="ignore"):  # a signalling NaN
+        positions = np.stack([rows[name].astype(np.float64) for name in _POSITION], axis=1)
     return positions, np.stack([_unit(path, rows[name], name) for name in names], axis=1)
 
 
 def _unit(path: Path, values: NDArray[Any], name: str) -> NDArray[np.float32]:
     if values.dtype.kind in "iu":
-        return (values / np.float32(np.iinfo(values.dtype).max)).astype(np.float32)
-    top = float(np.nanmax(values, initial=0.0))
-    if np.isfinite(top) and top > 1.5:
-        raise InputError(f"{path}: float colour {name!r} reaches {top:g}; expected values in [0, 1]")
-    return values.astype(np.float32)
+        least, most = int(values.min(initial=0)), int(np.iinfo(values.dtype).max)
+        if least < 0:
+            raise InputError(f"{path}: colour {name!r} falls to {least}; expected values in [0, {most}]")
+        return (values / np.float32(most)).astype(np.float32)
+    finite = values[np.isfinite(values)]
+    low, top = float(finite.min(initial=0.0)), float(finite.max(initial=0.0))
+    if low < -0.5 or top > 1.5:
+        beyond = f"reaches {top:g}" if top > 1.5 else f"falls to {low:g}"
+        raise InputError(f"{path}: float colour {name!r} {beyond}; expected values in [0, 1]")
+    with np.errstate(invalid="ignore"):  # a signalling NaN
+        return values.astype(np.float32)
 
 
 def finite_cloud(

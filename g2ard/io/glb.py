@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,17 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.clean import Raw, cleaned
-from g2ard.io.jsonfile import Fields, fields_of, parse_json
+from g2ard.io.jsonfile import (
+    Fields,
+    fields_of,
+    index_of,
+    listed,
+    numbers,
+    object_of,
+    objects,
+    parse_json,
+    whole,
+)
 from g2ard.io.packing import unit_quats, writable
 from g2ard.io.types import Note, Scene
 from g2ard.splats import Splats
@@ -170,63 +181,67 @@ def _chunks(path: Path) -> tuple[Any, bytes]:
 
 
 def _scene(path: Path, document: Fields, binary: bytes) -> Scene:
-    meshes = document.get("meshes", [])
-    splatting = [
-        (at, p) for at, mesh in enumerate(meshes) for p in mesh["primitives"] if EXTENSION in _extensions(p)
-    ]
+    primitives = [objects(mesh, "primitives") for mesh in objects(document, "meshes")]
+    splatting = [(at, p) for at, held in enumerate(primitives) for p in held if EXTENSION in _extensions(p)]
     if len(splatting) != 1:
         raise InputError(f"{path}: holds {len(splatting)} primitives of {EXTENSION}; one is read")
     mesh, primitive = splatting[0]
-    if packed := sorted(_extensions(_extensions(primitive)[EXTENSION])):
-        raise InputError(f"{path}: {packed[0]} is not read")
-    if primitive.get("extensions", {})[EXTENSION].get("kernel") != "ellipse":
+    splats = object_of(_extensions(primitive), EXTENSION)
+    if packed := sorted(_extensions(splats)):
+        raise InputError(f"{path}: {packed[0]!r} is not read")
+    if splats.get("kernel") != "ellipse":
         raise InputError(f"{path}: kernels other than 'ellipse' are not read")
-    names: dict[str, int] = primitive["attributes"]
+    names = object_of(primitive, "attributes")
 
     def values(name: str, width: int) -> NDArray[np.float32]:
         if name not in names:
             raise InputError(f"{path}: its splats lack the attribute {name!r}")
-        return _accessor(path, document, binary, names[name], name, width)
+        return _accessor(path, document, binary, names, name, width)
 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names)
     means = values("POSITION", 3)
     raw = Raw.empty(len(means), (degree + 1) ** 2 - 1)
-    raw.means[:] = means * _TURN
-    raw.quats[:] = values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]] * (1, *_TURN)
     with np.errstate(divide="ignore", invalid="ignore"):  # a negative scale becomes NaN: the row is dropped
+        raw.means[:] = means * _TURN
+        raw.quats[:] = values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]] * (1, *_TURN)
         raw.log_scales[:] = np.log(values(f"{EXTENSION}:SCALE", 3).astype(np.float64))
         alphas = values(f"{EXTENSION}:OPACITY", 1)[:, 0].astype(np.float64)
         raw.logit_opacities[:] = np.log(alphas) - np.log1p(-alphas)
-    raw.sh0[:, 0] = values(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3)
-    for name, k in _harmonics(degree):
-        raw.shN[:, k] = values(name, 3) * _FLIPS[k]
+        raw.sh0[:, 0] = values(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3)
+        for name, k in _harmonics(degree):
+            raw.shN[:, k] = values(name, 3) * _FLIPS[k]
     raw.offset = _translation(path, document, mesh)
-    others = sum(len(m["primitives"]) for m in meshes) - 1
+    others = sum(map(len, primitives)) - 1
     notes = [Note("ignored_meshes", others, f"{others} other primitive(s) left out")] if others else []
     return cleaned(path, raw, notes)
 
 
-def _extensions(of: dict[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = of.get("extensions", {})
-    return found
+def _extensions(of: Fields) -> Fields:
+    return object_of(of, "extensions") if "extensions" in of else Fields({})
+
+
+def _pointed(document: Fields, table: str, holder: Fields, name: str) -> Fields:
+    """The entry of one of the document's tables that a property names by its index."""
+    entries = listed(document, table)
+    return object_of(entries, index_of(holder, name, len(entries)))
 
 
 def _accessor(
-    path: Path, document: Fields, binary: bytes, index: int, name: str, width: int
+    path: Path, document: Fields, binary: bytes, names: Fields, name: str, width: int
 ) -> NDArray[np.float32]:
     """(count, width) of an accessor; normalised integers become fractions."""
-    accessor = document["accessors"][index]
+    accessor = _pointed(document, "accessors", names, name)
     kind = accessor["componentType"]
     if kind not in _DTYPES or _TYPES.get(accessor["type"]) != width or "sparse" in accessor:
         raise InputError(f"{path}: attribute {name!r} is of a form that is not read")
-    view = document["bufferViews"][accessor["bufferView"]]
-    if view["buffer"] != 0 or "uri" in document["buffers"][0]:
+    view = _pointed(document, "bufferViews", accessor, "bufferView")
+    if view["buffer"] != 0 or "uri" in _pointed(document, "buffers", view, "buffer"):
         raise InputError(f"{path}: attribute {name!r} lies outside the file")
-    dtype, count = np.dtype(_DTYPES[kind]), int(accessor["count"])
-    step = int(view.get("byteStride", width * dtype.itemsize))
-    start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
-    if count < 0 or start < 0 or step < width * dtype.itemsize:
-        raise ValueError(f"{count} elements from byte {start}, {step} bytes each")
+    dtype, count = np.dtype(_DTYPES[kind]), whole(accessor, "count")
+    step = whole(view, "byteStride", width * dtype.itemsize)
+    start = whole(view, "byteOffset", 0) + whole(accessor, "byteOffset", 0)
+    if step < width * dtype.itemsize:
+        raise InputError(f"{path}: attribute {name!r} takes {step} bytes each, less than its elements have")
     if count and start + step * (count - 1) + width * dtype.itemsize > len(binary):
         raise InputError(f"{path}: truncated: attribute {name!r} ends past the file")
     rows = np.ndarray((count, width), dtype, binary, start, (step, dtype.itemsize))
@@ -242,7 +257,12 @@ def _translation(path: Path, document: Fields, mesh: int) -> NDArray[np.float64]
     Raises:
         InputError: several nodes, one that does more than translate, or one that is its own ancestor.
     """
-    nodes = document.get("nodes", [])
+    nodes = objects(document, "nodes")
+    parents: dict[int, list[int]] = {}
+    for i, node in enumerate(nodes):
+        children = listed(node, "children")
+        for k in range(len(children)):
+            parents.setdefault(index_of(children, k, len(nodes)), []).append(i)
     at = [i for i, node in enumerate(nodes) if node.get("mesh") == mesh]
     if len(at) > 1:
         raise InputError(f"{path}: {len(at)} nodes show its splats; one is read")
@@ -253,15 +273,22 @@ def _translation(path: Path, document: Fields, mesh: int) -> NDArray[np.float64]
             raise InputError(f"{path}: node {at[0]} is its own ancestor")
         seen.add(at[0])
         node = nodes[at[0]]
-        moved = np.array(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
-        matrix = np.array(node.get("matrix", np.eye(4).ravel()), np.float64).reshape(4, 4).T
-        turned = tuple(node.get("rotation", (0, 0, 0, 1))) != (0, 0, 0, 1)
-        if turned or tuple(node.get("scale", (1, 1, 1))) != (1, 1, 1) or (matrix[:3, :3] != np.eye(3)).any():
+        moved = _numbers(node, "translation", (0, 0, 0))
+        matrix = _numbers(node, "matrix", np.eye(4).ravel()).reshape(4, 4).T
+        turned = (_numbers(node, "rotation", (0, 0, 0, 1)) != (0, 0, 0, 1)).any()
+        scaled = (_numbers(node, "scale", (1, 1, 1)) != 1).any()
+        if turned or scaled or (matrix[:3, :3] != np.eye(3)).any():
             raise InputError(f"{path}: a node turns or scales its splats, which is not read")
-        total += moved + matrix[:3, 3]
-        at = [i for i, parent in enumerate(nodes) if at[0] in parent.get("children", ())]
+        with np.errstate(over="ignore", invalid="ignore"):
+            total += moved + matrix[:3, 3]
+        at = parents.get(at[0], [])
         if len(at) > 1:
             raise InputError(f"{path}: a node has {len(at)} parents")
     if not np.isfinite(total).all():
         raise InputError(f"{path}: its nodes move it by {tuple(total.tolist())}")
     return total * _TURN
+
+
+def _numbers(node: Fields, key: str, default: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
+    """A node's vector or matrix, as long as its default."""
+    return np.array(numbers(node, key, len(default)) if key in node else default, np.float64)

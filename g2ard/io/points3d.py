@@ -16,6 +16,7 @@ from g2ard.io.types import Cloud
 __all__ = ["read"]
 
 _COUNT = Record(["COUNT"], "Q")
+_COLUMNS = ("X", "Y", "Z", "R", "G", "B")
 _POINT = Record(["POINT3D_ID", *"XYZRGB", "ERROR", "TRACK"], "QdddBBBdQ")
 
 
@@ -53,12 +54,23 @@ def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
 
 
 def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    rows = [line.split(maxsplit=7) for line in text_lines(path) if line.strip()]
+    lines = [line for line in text_lines(path) if line.strip()]
+    rows = [line.split(maxsplit=7) for line in lines]
+    for i, line in enumerate(lines):
+        if "_" in line or not line.isascii():  # float() takes 1_0, and digits of other scripts
+            for name, word in zip(_COLUMNS, rows[i][1:7], strict=False):
+                if "_" in word or not word.isascii():
+                    raise InputError(f"{path}: malformed point {i}: {name} is {word!r}")
     try:
         values = np.array([words[1:7] for words in rows], np.float64).reshape(-1, 6)
     except ValueError:
         for i, words in enumerate(rows):
-            for at, name in enumerate(("X", "Y", "Z", "R", "G", "B"), 1):
+            for at, name in enumerate(_COLUMNS, 1):
                 number(path, f"point {i}", words, name, at, float)
         raise
+    inside = (values[:, 3:] >= 0) & (values[:, 3:] <= 255)
+    if not inside.all():
+        i, channel = (int(at) for at in np.argwhere(~inside)[0])
+        found = f"{_COLUMNS[3 + channel]} is {rows[i][4 + channel]!r}"
+        raise InputError(f"{path}: malformed point {i}: {found}, expected 0 to 255")
     return values[:, :3], values[:, 3:].astype(np.uint8)

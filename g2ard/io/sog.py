@@ -6,6 +6,7 @@ detail are alternatives, not parts: only the finest is read.
 
 from __future__ import annotations
 
+import os
 import re
 import struct
 import zipfile
@@ -56,21 +57,26 @@ def chunks_of(path: Path) -> list[Path]:
 
 def _listed(index: Path) -> list[Path]:
     """The chunks that lod-meta.json's tree uses at level 0, in the order of its list."""
-    from g2ard.io.jsonfile import fields_of, read_json
+    from g2ard.io.jsonfile import fields_of, index_of, listed, names_of, object_of, objects, read_json
 
     with fields_of(str(index), read_json(index)) as content:
-        if not isinstance(names := content["filenames"], list):
-            raise TypeError("not a list")
+        names = names_of(content, "filenames", len(listed(content, "filenames")))
         files = [index.parent / Path(name).parent for name in names]
         used: set[int] = set()
-        nodes = [content["tree"]]
+        nodes = [object_of(content, "tree")]
         while nodes:
             node = nodes.pop()
-            nodes.extend(node.get("children", ()))
-            if "0" in node.get("lods", {}):
-                used.add(int(node["lods"]["0"]["file"]))
+            nodes.extend(objects(node, "children"))
+            if "lods" in node and "0" in (levels := object_of(node, "lods")):
+                used.add(index_of(object_of(levels, "0"), "file", len(files)))
         for i in sorted(used):
-            if not (files[i] / "meta.json").is_file():
+            try:
+                there = (files[i] / "meta.json").is_file()
+            except OSError as error:  # a name too long
+                raise InputError(
+                    f"{index}: 'filenames[{i}]' cannot be looked for: {error.strerror}"
+                ) from error
+            if not there:
                 raise InputError(f"{index}: names {names[i]}, which is absent")
         return [files[i] for i in sorted(used)]
 
@@ -118,12 +124,13 @@ def _offset(chunks: list[Chunk]) -> NDArray[np.float64]:
     """What g2ard's own writer left under "g2ard"; zeros without it, or where chunks differ."""
     import numpy as np
 
+    from g2ard.io.jsonfile import Fields, numbers, object_of
+
     found = set()
     for chunk in chunks:
         with meta_errors(chunk):
-            own = chunk.meta.get("g2ard", {})
-            x, y, z = own.get("offset", (0, 0, 0))
-            found.add((float(x), float(y), float(z)))
+            own = object_of(chunk.meta, "g2ard") if "g2ard" in chunk.meta else Fields({})
+            found.add(tuple(numbers(own, "offset", 3)) if "offset" in own else (0.0, 0.0, 0.0))
     return np.array(found.pop() if len(found) == 1 else (0, 0, 0), np.float64)
 
 
@@ -144,7 +151,10 @@ def _opened(path: Path) -> Iterator[list[Chunk]]:
     from g2ard.io.jsonfile import Fields, parse_json, read_json
 
     if path.suffix.lower() != ".sog":
-        yield [Chunk(str(f), Fields(read_json(f / "meta.json")), _folder_loader(f)) for f in chunks_of(path)]
+        yield [
+            Chunk(f"{f}{os.sep}", Fields(read_json(f / "meta.json")), _folder_loader(f))
+            for f in chunks_of(path)
+        ]
         return
     try:
         with zipfile.ZipFile(path) as bundle:
@@ -156,7 +166,7 @@ def _opened(path: Path) -> Iterator[list[Chunk]]:
             meta = parse_json(f"{path}: meta.json", load("meta.json"))
             if not isinstance(meta, dict):
                 raise InputError(f"{path}: meta.json: expected a JSON object")
-            yield [Chunk(str(path), Fields(meta), load)]
+            yield [Chunk(f"{path}: ", Fields(meta), load)]
     except InputError:
         raise
     except (zipfile.BadZipFile, EOFError, OSError, ValueError, struct.error, OverflowError) as error:

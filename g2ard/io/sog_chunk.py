@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from g2ard.errors import InputError
-from g2ard.io.jsonfile import Fields, fields_of
+from g2ard.io.jsonfile import Fields, fields_of, listed, names_of, numbers, object_of, whole
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,36 +21,38 @@ if TYPE_CHECKING:
 __all__ = ["Chunk", "Decoder", "count_of", "means_of", "meta_errors", "rest_of"]
 
 _COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
+_LARGEST = float.fromhex("0x1.fffffep+127")
+"""Of float32."""
+_LARGEST_LOG = math.log1p(_LARGEST)
 _PALETTE_COLUMNS = 64
 """Entries of the SH palette beside each other in one row of its image."""
 
 
 class Chunk(NamedTuple):
-    """One meta.json, and how to get at the files beside it."""
+    """One meta.json, and how to get at the files beside it; `where` and a file's name tell which it is."""
 
-    name: str
+    where: str
     meta: Fields
     load: Callable[[str], bytes]
 
 
 def meta_errors(chunk: Chunk) -> AbstractContextManager[Fields]:
     """Turn what a malformed meta.json causes into one line that names the property."""
-    return fields_of(f"{chunk.name}: meta.json", chunk.meta)
+    return fields_of(f"{chunk.where}meta.json", chunk.meta)
 
 
 def count_of(chunk: Chunk) -> int:
     with meta_errors(chunk):
         version = chunk.meta.get("version", 1)
         if version not in (1, 2):
-            raise InputError(f"{chunk.name}: SOG version {version!r} is not known (1 and 2 are)")
-        count = chunk.meta["count"] if version == 2 else chunk.meta["means"]["shape"][0]
-        if not isinstance(count, int) or count < 0:
-            raise ValueError(f"is {count!r}")
-        first = chunk.meta["means"]["files"][0]
+            raise InputError(f"{chunk.where}meta.json: SOG version {version!r} is not known (1 and 2 are)")
+        means = object_of(chunk.meta, "means")
+        (first,) = names_of(means, "files", 1)
+        count = whole(chunk.meta, "count") if version == 2 else whole(listed(means, "shape"), 0)
     with _opened_image(chunk, first) as image:  # before room is made for them
         if image.width * image.height < count:
             pixels = image.width * image.height
-            raise InputError(f"{chunk.name}: {first} has {pixels:,} pixels for {count:,} Gaussians")
+            raise InputError(f"{chunk.where}{first} has {pixels:,} pixels for {count:,} Gaussians")
     return count
 
 
@@ -58,14 +61,14 @@ def rest_of(chunk: Chunk) -> int:
     with meta_errors(chunk):
         if "shN" not in chunk.meta:
             return 0
-        if "bands" in chunk.meta["shN"]:
-            return _COEFFICIENTS[chunk.meta["shN"]["bands"]]
+        if "bands" in (part := object_of(chunk.meta, "shN")):
+            return _COEFFICIENTS[whole(part, "bands")]
         width = _image(chunk, _sh_files(chunk)[0]).shape[1]
         return {_PALETTE_COLUMNS * k: k for k in (3, 8, 15)}[width]
 
 
 def _sh_files(chunk: Chunk) -> tuple[str, str]:
-    files = chunk.meta["shN"]["files"]
+    files = names_of(object_of(chunk.meta, "shN"), "files", 2)
     centroids = next((f for f in files if "centroids" in f), files[0])
     return centroids, next((f for f in files if f != centroids), files[1])
 
@@ -78,7 +81,7 @@ def _opened_image(chunk: Chunk, name: str) -> Iterator[Image]:
 
     from g2ard.io.limits import opened_image
 
-    where = f"{chunk.name}: {name}"
+    where = f"{chunk.where}{name}"
     try:
         data = chunk.load(name)
     except (KeyError, FileNotFoundError) as error:
@@ -101,7 +104,7 @@ def _rows(chunk: Chunk, name: str, count: int) -> NDArray[np.uint8]:
     """(count, 4) bytes, one pixel a Gaussian."""
     pixels = _image(chunk, name).reshape(-1, 4)
     if len(pixels) < count:
-        raise InputError(f"{chunk.name}: {name} has {len(pixels):,} pixels for {count:,} Gaussians")
+        raise InputError(f"{chunk.where}{name} has {len(pixels):,} pixels for {count:,} Gaussians")
     return pixels[:count]
 
 
@@ -118,9 +121,12 @@ class Decoder:
             self._low, self._high, self._quats, self._scales, self._base = (
                 _rows(chunk, name, count)
                 for part, files in (("means", 2), ("quats", 1), ("scales", 1), ("sh0", 1))
-                for name in meta[part]["files"][:files]
+                for name in names_of(object_of(meta, part), "files", files)
             )
-            self._positions, self._logits = _positions(meta["means"]), _logits(meta["sh0"])
+            self._positions = _positions(object_of(meta, "means"))
+            scales, base = object_of(meta, "scales"), object_of(meta, "sh0")
+            self._log_scales, self._colors = _Values(chunk, "scales", scales), _Values(chunk, "sh0", base)
+            self._logits = _logits(base)
             self._rest = rest_of(chunk)
             if self._rest:
                 self._palette, self._labels = _palette(chunk, self._rest, count)
@@ -135,11 +141,10 @@ class Decoder:
                 self._fill(slice(start, stop), raw.take(slice(start - rows.start, stop - rows.start)))
 
     def _fill(self, rows: slice, raw: Raw) -> None:
-        meta = self.chunk.meta
         _fill_means(raw.means, self._low[rows], self._high[rows], self._positions)
         raw.quats[:] = _quats(self._quats[rows])
-        raw.log_scales[:] = _values(meta["scales"], self._scales[rows, :3], slice(3))
-        raw.sh0[:, 0] = _values(meta["sh0"], self._base[rows, :3], slice(3))
+        raw.log_scales[:] = self._log_scales.of(self._scales[rows, :3])
+        raw.sh0[:, 0] = self._colors.of(self._base[rows, :3])
         raw.logit_opacities[:] = self._logits[self._base[rows, 3]]
         raw.shN[:, self._rest :] = 0
         if self._rest:
@@ -153,7 +158,7 @@ class Decoder:
         if index.max() >= len(self._palette):
             row = int(np.argmax(index >= len(self._palette)))
             named = f"Gaussian {rows.start + row} names entry {index[row]} of {len(self._palette)}"
-            raise InputError(f"{self.chunk.name}: {_sh_files(self.chunk)[1]}: {named}")
+            raise InputError(f"{self.chunk.where}{_sh_files(self.chunk)[1]}: {named}")
         np.take(self._palette, index, axis=0, out=out[:, : self._rest], mode="clip")
 
 
@@ -166,9 +171,10 @@ def means_of(chunk: Chunk, count: int) -> NDArray[np.float32]:
     import numpy as np
 
     with meta_errors(chunk):
-        low, high = (_rows(chunk, name, count) for name in chunk.meta["means"]["files"][:2])
+        part = object_of(chunk.meta, "means")
+        low, high = (_rows(chunk, name, count) for name in names_of(part, "files", 2))
         means = np.empty((count, 3), np.float32)
-        _fill_means(means, low, high, _positions(chunk.meta["means"]))
+        _fill_means(means, low, high, _positions(part))
         return means
 
 
@@ -180,48 +186,60 @@ def _fill_means(
         out[:, axis] = positions[axis][low[:, axis] + (high[:, axis].astype(int) << 8)]
 
 
-def _positions(part: dict[str, Any]) -> NDArray[Any]:
+def _positions(part: Fields) -> NDArray[Any]:
     """(3, 65536) what each code stands for on each axis; stored as sign(x)·ln(|x| + 1)."""
     import numpy as np
 
-    logs = _lerp(part, np.arange(65536)[:, None] / 65535, slice(3))
+    low, high = (_bound(part, end, slice(3), _LARGEST_LOG) for end in ("mins", "maxs"))
+    logs = low + (high - low) * (np.arange(65536)[:, None] / 65535)
     return (np.sign(logs) * np.expm1(np.abs(logs))).T.astype(np.float32)
 
 
-def _logits(part: dict[str, Any]) -> NDArray[Any]:
+def _logits(part: Fields) -> NDArray[Any]:
     """(256,) what each byte of opacity stands for: an α (version 2), or a logit (version 1)."""
     import numpy as np
 
     alpha = np.arange(256) / 255
     if "codebook" not in part:
-        return _lerp(part, alpha, 3)
+        low, high = (_bound(part, end, 3) for end in ("mins", "maxs"))
+        return low + (high - low) * alpha
     with np.errstate(divide="ignore"):
         return np.log(alpha) - np.log1p(-alpha)
 
 
-def _values(part: dict[str, Any], codes: NDArray[np.uint8], channels: slice) -> NDArray[Any]:
-    """Bytes to values: by codebook (version 2), or between mins and maxs (version 1)."""
+class _Values:
+    """What bytes stand for: by codebook (version 2), or between mins and maxs (version 1)."""
+
+    def __init__(self, chunk: Chunk, name: str, part: Fields) -> None:
+        import numpy as np
+
+        self._where = f"{chunk.where}meta.json: malformed '{name}.codebook'"
+        self._book: NDArray[Any] | None = None
+        if "codebook" in part:
+            count = len(listed(part, "codebook"))
+            book = numbers(part, "codebook", count, most=_LARGEST, gaps=True)
+            self._book = np.asarray(book, np.float32)
+        else:
+            self._low, self._high = (_bound(part, end, slice(3)) for end in ("mins", "maxs"))
+
+    def of(self, codes: NDArray[np.uint8]) -> NDArray[Any]:
+        if self._book is None:
+            values: NDArray[Any] = self._low + (self._high - self._low) * (codes / 255)
+            return values
+        if len(self._book) < 256 and codes.size and (top := int(codes.max())) >= len(self._book):
+            raise InputError(f"{self._where}: expected at least {top + 1} numbers, found {len(self._book)}")
+        return self._book[codes]
+
+
+def _bound(part: Fields, key: str, channels: slice | int, most: float = _LARGEST) -> NDArray[Any]:
+    """One number for all channels, or a list of one each, opacity's the fourth."""
     import numpy as np
 
-    if "codebook" in part:
-        return np.asarray(part["codebook"], np.float32)[codes]
-    return _lerp(part, codes / 255, channels)
-
-
-def _lerp(part: dict[str, Any], t: NDArray[Any], channels: slice | int) -> NDArray[Any]:
-
-    low, high = _bound(part["mins"], channels), _bound(part["maxs"], channels)
-    return low + (high - low) * t
-
-
-def _bound(values: Any, channels: slice | int) -> NDArray[Any]:
-    """One number for all channels, or a list of one each."""
-    import numpy as np
-
-    bound = np.asarray(values, np.float64)
-    if bound.ndim and isinstance(channels, slice) and bound.shape != (3,) and bound.shape != (4,):
-        raise ValueError(f"numbers of shape {bound.shape}, not 3")
-    return bound[channels] if bound.ndim else bound
+    if not isinstance(value := part[key], list):
+        return np.asarray(numbers(part, key, most=most))
+    wanted = 4 if channels == 3 or len(value) == 4 else 3
+    bound: NDArray[Any] = np.asarray(numbers(part, key, wanted, most=most))[channels]
+    return bound
 
 
 def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:
@@ -247,6 +265,7 @@ def _palette(chunk: Chunk, rest: int, count: int) -> tuple[NDArray[np.float32], 
     centroids, labels = _sh_files(chunk)
     image = _image(chunk, centroids)
     if image.shape[1] != _PALETTE_COLUMNS * rest:
-        raise InputError(f"{chunk.name}: {centroids} is {image.shape[1]} wide, not {_PALETTE_COLUMNS * rest}")
-    palette = _values(chunk.meta["shN"], image[:, :, :3].reshape(-1, rest, 3), slice(3)).astype(np.float32)
+        raise InputError(f"{chunk.where}{centroids} is {image.shape[1]} wide, not {_PALETTE_COLUMNS * rest}")
+    values = _Values(chunk, "shN", object_of(chunk.meta, "shN"))
+    palette = values.of(image[:, :, :3].reshape(-1, rest, 3)).astype(np.float32)
     return palette, _rows(chunk, labels, count)

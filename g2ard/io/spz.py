@@ -27,6 +27,7 @@ MAGIC = b"NGSP"
 _HEADER = 16
 """Bytes."""
 
+_POSITION_BITS = 24
 _COEFFICIENTS = (0, 3, 8, 15, 24)
 _HAS_EXTENSIONS = 0x2
 COLOR_SCALE = 0.15
@@ -91,13 +92,17 @@ def _gunzip(path: Path, data: bytes) -> bytes:
 
 def _sizes(path: Path, head: bytes) -> list[int]:
     """Bytes of the positions, alphas, colours, scales, rotations and harmonics that a header promises."""
-    version, count, degree = struct.unpack_from("<IIB", head, 4)
+    version, count, degree, fraction_bits = struct.unpack_from("<IIBB", head, 4)
     if head[:4] != MAGIC:
         raise InputError(f"{path}: not an SPZ file (begins with {head[:4]!r})")
     if version not in (2, 3, 4):
         raise InputError(f"{path}: SPZ version {version} is not known (2, 3 and 4 are)")
     if degree >= len(_COEFFICIENTS):
         raise InputError(f"{path}: SH degree {degree} is not known (0 to 4 are)")
+    if fraction_bits > _POSITION_BITS:
+        raise InputError(
+            f"{path}: fractionalBits is {fraction_bits}, more than the {_POSITION_BITS} bits of a position"
+        )
     rotation = 3 if version == 2 else 4
     return [9 * count, count, 3 * count, 3 * count, rotation * count, 3 * _COEFFICIENTS[degree] * count]
 
