@@ -55,7 +55,7 @@ def test_own_views_name_photos_splits_and_weights(tmp_path: Path) -> None:
     [
         (lambda c: c.update(version=2), "version 2"),
         (lambda c: c["views"][0].pop("K"), "view 0: lacks 'K'"),
-        (lambda c: c["views"][1].update(K=[1, 2]), r"view 1: malformed 'K' \("),
+        (lambda c: c["views"][1].update(K=[1, 2]), r"view 1: malformed 'K\[0\]': expected a list of 3"),
         (lambda c: c["views"][1].update(weight=-1), "view 1: weight -1"),
         (lambda c: c["views"][1].update(width=80.5), r"view 1: 'width' is 80\.5, not a whole number"),
         (lambda c: c["views"][0].update(height=math.inf), "view 0: 'height' is inf, not a whole number"),

@@ -89,8 +89,12 @@ def test_cameras_json_names_that_repeat_get_their_id(tmp_path: Path) -> None:
         (lambda c: c.pop("fx"), "cameras.json: camera 1: lacks 'fx'"),
         (lambda c: c.update(rotation=np.zeros((3, 3)).tolist()), "camera 1: its pose is not a rotation"),
         (lambda c: c.update(rotation=np.diag([1.0, 1, -1]).tolist()), "camera 1: its pose is not a rotation"),
-        (lambda c: c.update(position=[0, float("nan"), 0]), "camera 1: its pose is not a finite"),
-        (lambda c: c.update(position=[0, 1]), r"camera 1: malformed 'position' \("),
+        (
+            lambda c: c.update(position=[0, float("nan"), 0]),
+            r"camera 1: malformed 'position\[1\]': expected a number within .*, found nan",
+        ),
+        (lambda c: c.update(position=[0, 1]), r"camera 1: lacks 'position\[2\]'"),
+        (lambda c: c.update(position=3), r"camera 1: malformed 'position': expected a list of 3, found 3"),
         (lambda c: c.update(width=80.5), "camera 1: 'width' is 80.5"),
         (
             lambda c: c.update(fx="wide"),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from g2ard.io.jsonfile import fields_of, read_json_list
+from g2ard.io.jsonfile import fields_of, numbers, read_json_list
 from g2ard.io.photos import Frame, find_photo, inverse, pixels, rigid, view_set
 from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
@@ -62,8 +62,8 @@ def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
     with fields_of(where, entry) as camera:
         name = str(camera["img_name"])
         world_from_camera = np.eye(4)
-        world_from_camera[:3, :3] = np.array(camera["rotation"], np.float64)
-        world_from_camera[:3, 3] = np.array(camera["position"], np.float64)
+        world_from_camera[:3, :3] = numbers(camera, "rotation", 3, 3)
+        world_from_camera[:3, 3] = numbers(camera, "position", 3)
         width, height = pixels(where, camera, "width"), pixels(where, camera, "height")
         K = [[float(camera["fx"]), 0, width / 2], [0, float(camera["fy"]), height / 2], [0, 0, 1]]
         return Frame(

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
-from g2ard.io.jsonfile import fields_of, read_json
+from g2ard.io.jsonfile import fields_of, numbers, read_json
 from g2ard.io.paths import real_path
 from g2ard.io.photos import Frame, pixels, rigid, view_set
 from g2ard.io.types import ViewSet
@@ -65,7 +65,7 @@ def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
         return Frame(
             name=name,
             viewmat=_exact(where, np.array(view["camera_from_world"], np.float64)),
-            K=np.array(view["K"], np.float64).reshape(3, 3),
+            K=np.array(numbers(view, "K", 3, 3)),
             size=(pixels(where, view, "width"), pixels(where, view, "height")),
             photo=photo,
             mask=None if mask is None else path.parent / mask,
