@@ -7,6 +7,7 @@ import random
 import signal
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -207,8 +208,9 @@ def test_workers_killed_at_random_cost_time_alone(
             files = len(list(work.glob("[!.]*.npz")))
             if files >= done + 3 and (children := _children()):
                 time.sleep(draw.uniform(0, 0.05))
-                os.kill(draw.choice(children), signal.SIGKILL)
-                killed.append(files)
+                with suppress(ProcessLookupError):
+                    os.kill(draw.choice(children), signal.SIGKILL)
+                    killed.append(files)
                 done = files
 
     killer = threading.Thread(target=kill)
@@ -224,13 +226,18 @@ def test_workers_killed_at_random_cost_time_alone(
 
 
 def _children() -> list[int]:
-    """Worker processes of this one."""
-    pids = [
-        int(pid)
-        for task in Path("/proc/self/task").iterdir()
-        for pid in (task / "children").read_text().split()
-    ]
-    return [pid for pid in pids if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    """Worker processes of this one. Threads and processes may end while they are listed."""
+    pids = []
+    for task in Path("/proc/self/task").iterdir():
+        with suppress(OSError):
+            pids += [int(pid) for pid in (task / "children").read_text().split()]
+    return [pid for pid in pids if _is_worker(pid)]
+
+
+def _is_worker(pid: int) -> bool:
+    with suppress(OSError):
+        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    return False
 
 
 def test_what_is_done_is_not_done_again(store: TileStore, tmp_path: Path) -> None:
