@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 import pytest
 
-__all__ = ["needs_links", "needs_modes", "needs_proc", "needs_processes", "needs_signals"]
+__all__ = ["is_worker", "needs_links", "needs_modes", "needs_proc", "needs_processes", "needs_signals"]
 
 needs_signals = pytest.mark.skipif(
     os.name == "nt", reason="on Windows a program is sent no signal: it is ended at once"
@@ -35,7 +36,7 @@ def _links() -> bool:
     with tempfile.TemporaryDirectory() as folder:
         try:
             (Path(folder) / "link").symlink_to("target")
-        except (OSError, NotImplementedError):
+        except OSError:
             return False
     return True
 
@@ -43,3 +44,10 @@ def _links() -> bool:
 needs_links = pytest.mark.skipif(
     sys.platform == "win32" and not _links(), reason="symbolic links need a privilege on Windows"
 )
+
+
+def is_worker(pid: int) -> bool:
+    """Whether a process works on tiles, by what /proc tells; not where it has ended."""
+    with suppress(OSError):
+        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    return False

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from systems import needs_proc
+from systems import is_worker, needs_proc
 from test_tiles_simplify import ring, town
 
 from g2ard.errors import InputError
@@ -192,7 +192,7 @@ def test_workers_that_have_just_begun_end_with_a_killed_command(
         running.kill()
     assert workers
     until = time.monotonic() + 30
-    while (left := {pid for pid in workers if _is_worker(pid)}) and time.monotonic() < until:
+    while (left := {pid for pid in workers if is_worker(pid)}) and time.monotonic() < until:
         time.sleep(0.1)
     for pid in left:
         os.kill(pid, signal.SIGKILL)
@@ -203,14 +203,8 @@ def _workers(parent: int) -> set[int]:
     """Its processes that work on tiles."""
     listed = Path(f"/proc/{parent}/task/{parent}/children")
     with suppress(OSError):
-        return {int(pid) for pid in listed.read_text().split() if _is_worker(int(pid))}
+        return {int(pid) for pid in listed.read_text().split() if is_worker(int(pid))}
     return set()
-
-
-def _is_worker(pid: int) -> bool:
-    with suppress(OSError):
-        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    return False
 
 
 def test_memory_is_a_size(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:

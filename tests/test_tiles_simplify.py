@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from systems import needs_proc
+from systems import is_worker, needs_proc
 
 from g2ard import _core
 from g2ard.cameras import Cameras, look_at
@@ -231,13 +231,7 @@ def _children() -> list[int]:
     for task in Path("/proc/self/task").iterdir():
         with suppress(OSError):
             pids += [int(pid) for pid in (task / "children").read_text().split()]
-    return [pid for pid in pids if _is_worker(pid)]
-
-
-def _is_worker(pid: int) -> bool:
-    with suppress(OSError):
-        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    return False
+    return [pid for pid in pids if is_worker(pid)]
 
 
 def test_what_is_done_is_not_done_again(store: TileStore, tmp_path: Path) -> None:
