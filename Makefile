@@ -66,9 +66,9 @@ docs: setup $(VENV)/.docs
 QUICK := --only city,guitar --ratios 10,30 --seeds 0 --size 240 --steps 150 --seconds 8 --adapt-steps 500
 SCENE ?= $(G2ARD_DATA)/playbot/0_0
 bench: setup
-	$(BIN)/g2ard bench raster $(SCENE)
-	$(BIN)/g2ard bench simplify $(SCENE) --ratios 10,30 --csv bench.csv
-	$(BIN)/g2ard bench run benches/definitions/*.toml -o bench $(QUICK)
+	$(BIN)/python -m benchmarks raster $(SCENE)
+	$(BIN)/python -m benchmarks simplify $(SCENE) --ratios 10,30 --csv bench.csv
+	$(BIN)/python -m benchmarks run benchmarks/definitions/*.toml -o bench $(QUICK)
 
 # The core's kernels alone, on synthetic scenes: no Python, no data, under a minute once built.
 bench-kernels:

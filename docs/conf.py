@@ -12,7 +12,7 @@ version = release = g2ard.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "docs/index"
-include_patterns = ["*.md", "docs/**", "benches/record/**"]
+include_patterns = ["*.md", "docs/**", "benchmarks/record/**"]
 exclude_patterns = ["docs/conf.py"]
 
 html_theme = "furo"

@@ -29,7 +29,18 @@ def main() -> None:
     else:
         # A LiDAR-like cloud has geometry but no appearance: its photos are the targets.
         city = OUT / "city"
-        g2ard("synth", "city", "--size", "480x360", "--output", str(city), "--overwrite")
+        make = [
+            "-m",
+            "benchmarks",
+            "synth",
+            "city",
+            "--size",
+            "480x360",
+            "--output",
+            str(city),
+            "--overwrite",
+        ]
+        subprocess.run([sys.executable, *make], check=True)
         views = ["--views", str(city / "train.json"), "--held-out", str(city / "val.json")]
         options = ["--ratio", "10", "--background", "0.6,0.8,1", "--overwrite"]  # the sky's colour
         g2ard("distill", str(city / "cloud.ply"), *views, *options, "--output", str(OUT / "city-10x"))

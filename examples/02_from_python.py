@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import g2ard
-from g2ard.synth import City, city
+from benchmarks.synth import City, city
 
 SKY = (0.6, 0.8, 1.0)
 

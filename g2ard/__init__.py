@@ -40,7 +40,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from g2ard.cameras import Camera, Cameras, look_at
+    from g2ard.config.presets import preset
     from g2ard.errors import G2ardError, InputError, MissingDependencyError, OutputError
     from g2ard.io import Points
     from g2ard.io import read_points as load_points
@@ -56,18 +56,18 @@ if TYPE_CHECKING:
     from g2ard.policy.levels import lod
     from g2ard.policy.simplify import simplify
     from g2ard.poses import make_pool
-    from g2ard.presets import preset
-    from g2ard.splats import Splats
+    from g2ard.rendering.renderer import RasterSettings, Rendered, Renderer, render
+    from g2ard.scene.cameras import Camera, Cameras, look_at
+    from g2ard.scene.splats import Splats
+    from g2ard.scene.targets import Photos, TeacherRenders
     from g2ard.stages.adapt import AdaptConfig, Adapted, adapt
     from g2ard.stages.evaluate import Evaluation, evaluate
     from g2ard.stages.lift import lift
     from g2ard.stages.recover import RecoverConfig, Recovered, recover
     from g2ard.stages.recover.anchors import Regularizers
     from g2ard.stages.register import RegisterConfig, Registered, register
-    from g2ard.stages.render import RasterSettings, Rendered, Renderer, render
     from g2ard.stages.select import CoverageOptions, Selection, select
     from g2ard.stages.simplify import Simplified, SimplifyConfig
-    from g2ard.targets import Photos, TeacherRenders
     from g2ard.tiles.ingest import ingest
     from g2ard.tiles.store import TileStore
 
@@ -128,7 +128,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "cameras": ("Camera", "Cameras", "look_at"),
+    "scene.cameras": ("Camera", "Cameras", "look_at"),
     "errors": ("G2ardError", "InputError", "MissingDependencyError", "OutputError"),
     "io.types": ("Points",),
     "pipeline": ("DistillConfig", "Distilled"),
@@ -138,18 +138,18 @@ _HOMES = {
     "policy.levels": ("lod",),
     "policy.simplify": ("simplify",),
     "poses": ("make_pool",),
-    "presets": ("preset",),
-    "splats": ("Splats",),
+    "config.presets": ("preset",),
+    "scene.splats": ("Splats",),
     "stages.adapt": ("AdaptConfig", "Adapted", "adapt"),
     "stages.evaluate": ("Evaluation", "evaluate"),
     "stages.lift": ("lift",),
     "stages.recover": ("RecoverConfig", "Recovered", "recover"),
     "stages.recover.anchors": ("Regularizers",),
     "stages.register": ("RegisterConfig", "Registered", "register"),
-    "stages.render": ("RasterSettings", "Rendered", "Renderer", "render"),
+    "rendering.renderer": ("RasterSettings", "Rendered", "Renderer", "render"),
     "stages.select": ("CoverageOptions", "Selection", "select"),
     "stages.simplify": ("Simplified", "SimplifyConfig"),
-    "targets": ("Photos", "TeacherRenders"),
+    "scene.targets": ("Photos", "TeacherRenders"),
     "tiles.ingest": ("ingest",),
     "tiles.store": ("TileStore",),
 }

@@ -3,7 +3,7 @@
 import sys
 import warnings
 
-from g2ard import interrupt
+from g2ard.system import interrupt
 
 __all__ = ["main"]
 

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.splats import Splats
+from g2ard.rendering.renderer import RasterSettings
+from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Regularizers
 from g2ard.stages.recover.schedule import Rates
-from g2ard.stages.render import RasterSettings
 
 __version__: str
 

@@ -42,9 +42,21 @@ def command_line() -> Callable[..., Said]:
     return run
 
 
+def _program(words: list[str]) -> list[str]:
+    """The module that a command is of, and its words: `bench` and `synth` are the benchmarks'."""
+    if words[:1] == ["bench"]:
+        return ["benchmarks", *words[1:]]
+    return ["benchmarks" if words[:1] == ["synth"] else "g2ard", *words]
+
+
 def _apart(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
     done = subprocess.run(
-        [sys.executable, "-m", "g2ard", *words], cwd=cwd, env=env, capture_output=True, text=True, timeout=300
+        [sys.executable, "-m", *_program(words)],
+        cwd=cwd,
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     return done.returncode, done.stdout, done.stderr
 
@@ -52,12 +64,16 @@ def _apart(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
 def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
     from g2ard.cli import main
 
+    program, *words = _program(words)
+    if program == "benchmarks":
+        from benchmarks.__main__ import main  # type: ignore[no-redef]
+
     out, err = io.StringIO(), io.StringIO()
     status: object = 0
     before, known = Path.cwd(), set(sys.modules)
     with (
         patch.dict(os.environ, env),
-        patch.object(sys, "argv", ["g2ard", *words]),
+        patch.object(sys, "argv", [program, *words]),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from g2ard.cameras import Cameras, look_at
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.splats import Splats
 
 
 def checkered_ball(n: int = 3000, seed: int = 0) -> Splats:

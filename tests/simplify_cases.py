@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 
 def scene(n=2000, rest=3, seed=0, dtype=np.float32):
@@ -47,7 +47,7 @@ def assert_sound(result, count, budget):
 
 
 class Views:
-    """What a caller's views see, as `g2ard.stages.render.visibility` returns it."""
+    """What a caller's views see, as `g2ard.rendering.renderer.visibility` returns it."""
 
     def __init__(self, weight, pixel_size):
         self.weight, self.pixel_size = np.asarray(weight), np.asarray(pixel_size)
@@ -55,7 +55,7 @@ class Views:
 
 def opaque_wall():
     """1,600 opaque discs, thin along z, that overlap into a wall; a view of it."""
-    from g2ard.cameras import Cameras, look_at
+    from g2ard.scene.cameras import Cameras, look_at
 
     x, y = np.meshgrid(np.linspace(-1, 1, 40), np.linspace(-1, 1, 40))
     points = np.stack([x.ravel(), y.ravel(), np.zeros(1600)], 1)

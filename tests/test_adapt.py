@@ -13,9 +13,9 @@ from scenes import around, checkered_ball
 
 from g2ard import io
 from g2ard.errors import InputError
+from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.adapt import AdaptConfig, adapt
 from g2ard.stages.evaluate import evaluate
-from g2ard.targets import TeacherRenders
 
 VIEWS = around(24)
 TRAIN, OTHER = VIEWS.take(np.arange(24) % 3 > 0), VIEWS.take(np.arange(24) % 3 == 0)

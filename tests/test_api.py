@@ -16,8 +16,8 @@ from scenes import checkered_ball
 
 import g2ard
 from g2ard.io import Points
-from g2ard.reports import Report
-from g2ard.splats import Splats
+from g2ard.report.base import Report
+from g2ard.scene.splats import Splats
 
 CommandLine = Callable[..., tuple[int, str, str]]
 BALL = checkered_ball(1500)
@@ -154,7 +154,7 @@ import sys, numpy as np, g2ard
 ball = np.random.default_rng(0).normal(size=(900, 3))
 scene = g2ard.Splats.create(ball / np.linalg.norm(ball, axis=1)[:, None], scales=np.full((900, 3), 0.05))
 g2ard.distill(scene, ratio=10, steps=3, size=32)
-apart = ("g2ard.bench", "g2ard.synth", "g2ard.baselines", "g2ard.cli", "torch")
+apart = ("benchmarks", "benchmarks.synth", "benchmarks.baselines", "g2ard.cli", "torch")
 print([m for m in sys.modules if m.startswith(apart)])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.baselines.nanogs import _SAMPLES, nanogs
 from g2ard import _core
-from g2ard.baselines.nanogs import _SAMPLES, nanogs
 from g2ard.errors import InputError
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 
 def scene(n: int = 60) -> Splats:

@@ -19,16 +19,16 @@ import pytest
 from scenes import around, checkered_ball
 from systems import needs_processes
 
+from benchmarks.definition import METHODS, read_definition
+from benchmarks.report import write_report
+from benchmarks.run import bench_run
+from benchmarks.run_rows import read_rows
+from benchmarks.score import Scored, ViewFigures, luma
 from g2ard import io
-from g2ard.bench.definition import METHODS, read_definition
-from g2ard.bench.report import write_report
-from g2ard.bench.run import bench_run
-from g2ard.bench.run_rows import read_rows
-from g2ard.bench.score import Scored, ViewFigures, luma
 from g2ard.errors import InputError
 from g2ard.report.charts import Point, chart, pareto
 from g2ard.report.page import Comparison, Page, Shown
-from g2ard.targets import TeacherRenders
+from g2ard.scene.targets import TeacherRenders
 
 ROOT = Path(__file__).resolve().parents[1]
 STUDY = """
@@ -237,7 +237,9 @@ def test_definitions_say_what_is_wrong(tmp_path: Path, change: tuple[str, str], 
 
 
 def test_the_papers_studies_can_be_read() -> None:
-    found = {path.stem: read_definition(path) for path in (ROOT / "benches" / "definitions").rglob("*.toml")}
+    found = {
+        path.stem: read_definition(path) for path in (ROOT / "benchmarks" / "definitions").rglob("*.toml")
+    }
     for name in ("compression", "geobase", "k_sweep", "policies", "ablations", "source", "bounded"):
         assert found[name].methods
         assert found[name].scenes
@@ -246,7 +248,7 @@ def test_the_papers_studies_can_be_read() -> None:
 
 
 def test_paths_may_name_environment_variables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for path in (ROOT / "benches" / "definitions").rglob("*.toml"):
+    for path in (ROOT / "benchmarks" / "definitions").rglob("*.toml"):
         for name in re.findall(r"\$(\w+)", path.read_text()):
             monkeypatch.setenv(name, str(tmp_path))
         assert "$" not in repr([asdict(scene) for scene in read_definition(path).scenes]), path
@@ -329,7 +331,7 @@ def test_distill_writes_such_a_report(
 
 
 def test_scores_are_those_of_evaluate(tmp_path: Path) -> None:
-    from g2ard.bench.score import score
+    from benchmarks.score import score
     from g2ard.stages.evaluate import evaluate
 
     ball, views = checkered_ball(400), around(3)
@@ -398,7 +400,7 @@ def test_nothing_is_left_running(tmp_path: Path) -> None:
     mark = tmp_path / "alive"
     late = f"import time; time.sleep(1.5); open({str(mark)!r}, 'w')"
     code = (
-        "from pathlib import Path; import sys; from g2ard.bench.process import measured;"
+        "from pathlib import Path; import sys; from benchmarks.process import measured;"
         f"measured([sys.executable, '-c', {late!r}], Path({str(tmp_path / 'log')!r}))"
     )
     with subprocess.Popen([sys.executable, "-c", code]) as parent:

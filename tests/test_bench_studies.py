@@ -14,19 +14,19 @@ from systems import needs_processes
 from test_bench_run import ROOT, check_page, study
 from test_evaluators import pictured
 
+from benchmarks.definition import Definition, read_definition
+from benchmarks.methods import METHODS, Matched
+from benchmarks.report import write_report
+from benchmarks.run import bench_run
+from benchmarks.run_rows import Row, read_rows, with_deltas
+from benchmarks.score import score
 from g2ard import io
-from g2ard.bench.definition import Definition, read_definition
-from g2ard.bench.methods import METHODS, Matched
-from g2ard.bench.report import write_report
-from g2ard.bench.run import bench_run
-from g2ard.bench.run_rows import Row, read_rows, with_deltas
-from g2ard.bench.score import score
 from g2ard.errors import InputError
-from g2ard.splats import Splats
+from g2ard.rendering.renderer import RasterSettings
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS, Anchors, drift95
-from g2ard.stages.render import RasterSettings
 from g2ard.stages.simplify import schedule
-from g2ard.targets import TeacherRenders
 
 HEAD = 'title = "Balls"\nratios = [4]\nsteps = [12]\n'
 SCENE = '\n[[scene]]\nname = "ball"\nprior = "ball.ply"\ntrain = "views.json"\n'
@@ -294,7 +294,7 @@ def test_keep_is_a_share_of_the_prior(tmp_path: Path) -> None:
 
 
 def test_every_study_says_what_differs_from_the_paper() -> None:
-    found = {p.stem: read_definition(p) for p in (ROOT / "benches" / "definitions").rglob("*.toml")}
+    found = {p.stem: read_definition(p) for p in (ROOT / "benchmarks" / "definitions").rglob("*.toml")}
     assert all(definition.differs for definition in found.values())
     for name in ("ablations", "k_sweep", "policies", "protection", "compression", "geobase", "source"):
         assert any(method.lambdas == "paper" for method in found[name].methods), name
@@ -319,7 +319,7 @@ def test_a_study_is_one_command(command_line: Callable[..., tuple[int, str, str]
 
 
 def test_rows_from_before_later_columns_can_be_read() -> None:
-    files = sorted((ROOT / "benches" / "record").glob("amd-epyc-2c/run-*.csv"))
+    files = sorted((ROOT / "benchmarks" / "record").glob("amd-epyc-2c/run-*.csv"))
     assert files
     for path in files:
         rows = read_rows(path)

@@ -16,7 +16,7 @@ from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.policy.budget import DEVICES
 from g2ard.policy.fit import Aim, Quality, count_for_bytes, count_for_quality, file_bytes
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import Simplified, simplify
 
 CommandLine = Callable[..., tuple[int, str, str]]

@@ -6,11 +6,11 @@ from typing import get_args
 
 import pytest
 
-from g2ard import choices
-from g2ard.cameras import Cameras
+from g2ard.config import choices
 from g2ard.errors import InputError
 from g2ard.io.scene_formats import FORMATS
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS
 from g2ard.stages.recover.engine import engine_class
 from g2ard.stages.recover.schedule import SCHEDULES

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from scenes import around, checkered_ball
 
-from g2ard.cameras import Cameras, look_at
-from g2ard.clean import KINDS, find_clutter, within_reach
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
-from g2ard.metrics import psnr
-from g2ard.splats import Splats
-from g2ard.stages.render import render
-from g2ard.transform import merge
-from g2ard.visibility import visibility
+from g2ard.rendering.metrics import psnr
+from g2ard.rendering.renderer import render
+from g2ard.rendering.visibility import visibility
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.splats import Splats
+from g2ard.scene.transform import merge
+from g2ard.stages.clean import KINDS, find_clutter, within_reach
 
 
 def junk() -> tuple[Splats, np.ndarray]:

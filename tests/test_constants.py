@@ -11,11 +11,11 @@ from typing import Literal
 import pytest
 from scenes import around, checkered_ball
 
-from g2ard.constants import changed, listed, parsed
+from g2ard.config.constants import changed, listed, parsed
+from g2ard.config.presets import preset
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.pipeline import DistillConfig
-from g2ard.presets import preset
 from g2ard.stages.lift import LiftConfig
 
 CommandLine = Callable[..., tuple[int, str, str]]

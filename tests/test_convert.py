@@ -13,9 +13,9 @@ from scenes import around, checkered_ball
 
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
-from g2ard.splats import Splats
-from g2ard.stages.render import render
-from g2ard.transform import in_box, in_sphere, merge, rotate_harmonics, similarity, transform
+from g2ard.rendering.renderer import render
+from g2ard.scene.splats import Splats
+from g2ard.scene.transform import in_box, in_sphere, merge, rotate_harmonics, similarity, transform
 
 
 def turn(seed: int = 0) -> np.ndarray:

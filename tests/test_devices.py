@@ -16,15 +16,16 @@ from conftest import ROOT
 from realdata import real
 from scenes import around, checkered_ball
 
-from g2ard import _core, devices
-from g2ard.cameras import Cameras
+from g2ard import _core
 from g2ard.cli.frame import Run
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.poses import make_pool
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 from g2ard.stages.select import surface, visible_cells
 from g2ard.stages.simplify import Simplified, flag, simplify
+from g2ard.system import devices
 
 CommandLine = Callable[..., tuple[int, str, str]]
 

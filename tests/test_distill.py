@@ -13,15 +13,15 @@ import pytest
 from scenes import around, checkered_ball
 
 from g2ard.errors import InputError
-from g2ard.images import write_png
 from g2ard.io import Points, read_splats, write_points, write_splats, write_views
 from g2ard.pipeline import DistillConfig, distill
 from g2ard.progress import silent
-from g2ard.splats import SH_C0, Splats
+from g2ard.rendering.renderer import render
+from g2ard.scene.images import write_png
+from g2ard.scene.splats import SH_C0, Splats
+from g2ard.scene.targets import Targets, TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover.schedule import PAPER, TUNED
-from g2ard.stages.render import render
-from g2ard.targets import Targets, TeacherRenders
 
 CommandLine = Callable[..., tuple[int, str, str]]
 PRIOR = checkered_ball()

@@ -16,7 +16,7 @@ import g2ard
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
-    page for pattern in ("*.md", "docs/**/*.md", "benches/record/*.md") for page in ROOT.glob(pattern)
+    page for pattern in ("*.md", "docs/**/*.md", "benchmarks/record/*.md") for page in ROOT.glob(pattern)
 )
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 
@@ -99,7 +99,7 @@ def unknown_in(arguments: list[str]) -> str:
     return ""
 
 
-CURRENT = [n for n in NAMES if not n.startswith(("benches/record", "docs/decisions/", "CHANGELOG"))]
+CURRENT = [n for n in NAMES if not n.startswith(("benchmarks/record", "docs/decisions/", "CHANGELOG"))]
 
 
 @pytest.mark.parametrize("name", CURRENT)
@@ -148,7 +148,7 @@ def test_the_api_page_has_every_public_name_once() -> None:
     [
         ("docs/decisions.md", "docs/decisions"),
         ("docs/methods/index.md", "docs/methods"),
-        ("benches/record/README.md", "benches/record"),
+        ("benchmarks/record/README.md", "benchmarks/record"),
     ],
 )
 def test_an_index_lists_every_page_of_its_folder(index: str, folder: str) -> None:
@@ -159,7 +159,7 @@ def test_an_index_lists_every_page_of_its_folder(index: str, folder: str) -> Non
 
 
 def test_plots_are_what_the_recorded_rows_give() -> None:
-    path = ROOT / "benches" / "plots.py"
+    path = ROOT / "benchmarks" / "plots.py"
     spec = importlib.util.spec_from_file_location("plots", path)
     assert spec
     assert spec.loader
@@ -169,7 +169,7 @@ def test_plots_are_what_the_recorded_rows_give() -> None:
     folder = ROOT / "docs" / "plots"
     assert sorted(drawn) == sorted(p.name for p in folder.glob("*.svg"))
     for name, svg in drawn.items():
-        assert svg == (folder / name).read_text(encoding="utf-8"), f"{name}: run python benches/plots.py"
+        assert svg == (folder / name).read_text(encoding="utf-8"), f"{name}: run python benchmarks/plots.py"
 
 
 def test_the_readme_names_every_command_and_scene_format() -> None:

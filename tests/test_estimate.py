@@ -17,11 +17,11 @@ import pytest
 from test_first_hour import photos_of
 
 import g2ard
-from g2ard.memory import peak_rss
 from g2ard.policy.budget import Budget
 from g2ard.policy.distill import prepare
 from g2ard.policy.distill_options import DistillOptions
 from g2ard.policy.estimate import estimate, total
+from g2ard.system.memory import peak_rss
 
 CommandLine = Callable[..., tuple[int, str, str]]
 

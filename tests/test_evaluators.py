@@ -14,12 +14,12 @@ from test_lpips import weights
 
 from g2ard import io
 from g2ard.errors import InputError
-from g2ard.images import as_saved, write_png
-from g2ard.lpips import Lpips
-from g2ard.metrics import psnr
+from g2ard.rendering.lpips import Lpips
+from g2ard.rendering.metrics import psnr
+from g2ard.rendering.renderer import RasterSettings, render
+from g2ard.scene.images import as_saved, write_png
+from g2ard.scene.targets import PhotosOrRenders, TeacherRenders
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.render import RasterSettings, render
-from g2ard.targets import PhotosOrRenders, TeacherRenders
 
 INRIA = RasterSettings(convention="inria")
 

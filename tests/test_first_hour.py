@@ -20,10 +20,10 @@ from view_files import transforms
 
 import g2ard
 from g2ard.cli.budget_options import Counts
-from g2ard.images import write_png
 from g2ard.io import Points, write_points, write_views
 from g2ard.policy.photos import points_within_sight
-from g2ard.splats import SH_C0
+from g2ard.scene.images import write_png
+from g2ard.scene.splats import SH_C0
 
 CommandLine = Callable[..., tuple[int, str, str]]
 BALL = checkered_ball(1200)

@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 from realdata import real
 
-from g2ard.cameras import Cameras
 from g2ard.errors import InputError, OutputError
-from g2ard.images import contact_sheet, load_image, load_images, to_bytes, write_png
 from g2ard.io import read_views
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.images import contact_sheet, load_image, load_images, to_bytes, write_png
 
 
 def camera(

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from realdata import real
 
-from g2ard.cameras import Cameras, look_at
 from g2ard.io import Points, write_points, write_splats, write_views
 from g2ard.io.describe import describe
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.splats import Splats
 
 CommandLine = Callable[..., tuple[int, str, str]]
 

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from g2ard import io
-from g2ard.cameras import look_at
 from g2ard.errors import InputError
-from g2ard.images import load_image
+from g2ard.scene.cameras import look_at
+from g2ard.scene.images import load_image
 
 
 def photo(path: Path, size: tuple[int, int], shade: int = 90) -> None:

@@ -23,9 +23,9 @@ from test_views_trainers import inria
 from view_files import colmap, orbit, transforms, views
 
 from g2ard.errors import InputError
-from g2ard.images import load_image
 from g2ard.io import kind, limits, read_scene, read_splats, read_view_set, write_splats, write_views
-from g2ard.splats import Splats, unit_quats
+from g2ard.scene.images import load_image
+from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.simplify import simplify
 
 CommandLine = Callable[..., tuple[int, str, str]]

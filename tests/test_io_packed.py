@@ -16,8 +16,8 @@ from realdata import real
 
 from g2ard.errors import InputError, MissingDependencyError
 from g2ard.io import kind, read_scene, read_splats, write_splats
-from g2ard.io.clean import LOGIT_LIMIT
-from g2ard.splats import Splats
+from g2ard.io.sanitize import LOGIT_LIMIT
+from g2ard.scene.splats import Splats
 
 
 def rotations(count: int, seed: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from view_files import colmap, edit, orbit, views
 from g2ard.errors import InputError
 from g2ard.io import read_scene, read_splats, read_views, write_splats, write_views
 from g2ard.io.paths import output_names, real_path
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 CommandLine = Callable[..., tuple[int, str, str]]
 

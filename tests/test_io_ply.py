@@ -12,8 +12,8 @@ from plyfile import PlyData, PlyElement
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io import kind, read_scene, read_splats, write_splats
-from g2ard.io.clean import LOG_SCALE_LIMIT, LOGIT_LIMIT
-from g2ard.splats import DRAWN_LOGIT, Splats
+from g2ard.io.sanitize import LOG_SCALE_LIMIT, LOGIT_LIMIT
+from g2ard.scene.splats import DRAWN_LOGIT, Splats
 
 FIELDS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 

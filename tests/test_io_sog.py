@@ -16,7 +16,7 @@ from realdata import ROOT, real
 
 from g2ard.errors import InputError
 from g2ard.io import kind, read_scene, read_splats
-from g2ard.io.clean import LOGIT_LIMIT
+from g2ard.io.sanitize import LOGIT_LIMIT
 
 
 def webp(pixels: np.ndarray) -> bytes:

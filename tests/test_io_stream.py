@@ -17,7 +17,7 @@ from g2ard.io import read_cloud, read_scene, write_splats
 from g2ard.io.point_stream import open_point_stream
 from g2ard.io.stream import open_stream
 from g2ard.levels import Cut, save_levels
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 

@@ -20,8 +20,8 @@ from g2ard.io.glb import EXTENSION
 from g2ard.io.packing import morton_order, unit_quats
 from g2ard.io.sog_write import nearest, palette_size, sog_files
 from g2ard.io.spz_write import fraction_bits
-from g2ard.splats import Splats
-from g2ard.transform import transform
+from g2ard.scene.splats import Splats
+from g2ard.scene.transform import transform
 
 FORMATS = ("sog", "spz", "glb", "compressed.ply", "splat", "ply", "folder/meta.json")
 

@@ -14,11 +14,11 @@ from test_tiles_simplify import ring, town
 import g2ard
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
-from g2ard.regions import check_region, in_any
+from g2ard.rendering.visibility import SampledVisibility, visibility_source
+from g2ard.scene.regions import check_region, in_any
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.stages.simplify import simplify as reduce
 from g2ard.stages.simplify.pairs import emphasised
-from g2ard.visibility import SampledVisibility, visibility_source
 
 CommandLine = Callable[..., tuple[int, str, str]]
 BALL, BOX = (2.5, 0.0, 0.0, 2.0), (-8.0, -4.0, 0.0, -4.0, 0.0, 1.0)

@@ -11,7 +11,7 @@ import pytest
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.splats import SH_C0
+from g2ard.scene.splats import SH_C0
 from g2ard.stages.lift import lift
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -15,11 +15,11 @@ from browser import Browser
 from scenes import checkered_ball
 from test_view_browser import FRONT, GREY, HEIGHT, WIDTH, assert_shows, rendered, show
 
-from g2ard.cameras import Camera, Cameras
 from g2ard.levels import Cut, save_levels
 from g2ard.policy.levels import lod
 from g2ard.policy.view import stand_with
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.splats import Splats
 from g2ard.viewer import write_page
 
 RATIOS = (1.0, 4.0, 16.0)

@@ -10,9 +10,9 @@ import torch
 from scenes import around, checkered_ball
 
 from g2ard.errors import InputError
-from g2ard.lpips import Lpips, load_lpips
+from g2ard.rendering.lpips import Lpips, load_lpips
+from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
-from g2ard.targets import TeacherRenders
 
 ALEX = ((0, 3, 4, 11, 4, 2), (3, 4, 5, 5, 1, 2), (6, 5, 6, 3, 1, 1), (8, 6, 4, 3, 1, 1), (10, 4, 4, 3, 1, 1))
 """Index, channels in and out, kernel, stride, padding."""

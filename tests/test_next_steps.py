@@ -15,7 +15,6 @@ from PIL import Image
 from scenes import around, checkered_ball
 
 import g2ard
-from g2ard import devices
 from g2ard.cli.budget_options import Count, Counts
 from g2ard.cli.frame import Run
 from g2ard.cli.resume import rows_kept
@@ -23,6 +22,7 @@ from g2ard.errors import InputError
 from g2ard.io import Points, write_points
 from g2ard.report.window import Crop
 from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS
+from g2ard.system import devices
 
 CommandLine = Callable[..., tuple[int, str, str]]
 BALL = checkered_ball(400)

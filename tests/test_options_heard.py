@@ -58,8 +58,8 @@ def test_a_preset_above_the_tables_is_for_all_commands(
 
 
 def test_a_study_takes_the_row_of_regularisers() -> None:
-    from g2ard.bench.definition import METHODS, Definition
-    from g2ard.bench.paper import as_in_the_paper
+    from benchmarks.definition import METHODS, Definition
+    from benchmarks.paper import as_in_the_paper
 
     study = Definition("s", "", (), (METHODS["g2ard"], METHODS["pup"]), steps=(5,))
     assert [m.preset for m in as_in_the_paper(study, row="lift").methods] == ["lift", "auto"]

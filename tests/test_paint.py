@@ -12,8 +12,8 @@ from scenes import around, checkered_ball
 
 from g2ard import io
 from g2ard.errors import InputError
-from g2ard.paint import cell_labels, flag_colors, label_colors, painted
-from g2ard.splats import Splats
+from g2ard.report.paint import cell_labels, flag_colors, label_colors, painted
+from g2ard.scene.splats import Splats
 from g2ard.stages.select.surfaces import surface
 from g2ard.stages.simplify import flag, simplify
 

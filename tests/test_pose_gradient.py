@@ -13,8 +13,8 @@ from test_raster import NAMES, VARIANTS, camera, scene, splats_of
 
 from g2ard import _core
 from g2ard.errors import InputError
+from g2ard.rendering.renderer import Renderer, arrays_of, view_of
 from g2ard.stages.register.pose import moved
-from g2ard.stages.render import Renderer, arrays_of, view_of
 
 BACKGROUND = [0.2, 0.5, 0.9]
 

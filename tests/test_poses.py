@@ -20,7 +20,7 @@ from g2ard.poses import make_pool, plan_pool
 from g2ard.poses.lattice import fibonacci
 from g2ard.poses.sight import Lens, Poses
 from g2ard.poses.site import Site
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 sys.path.insert(0, str(Path(__file__).parent))
 from reference import poses as naive

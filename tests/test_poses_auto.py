@@ -19,7 +19,7 @@ from g2ard.poses.sight import Lens, Poses
 from g2ard.poses.site import Site
 from g2ard.poses.up import estimate_up
 from g2ard.poses.volume import OccupiedVolume
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 sys.path.insert(0, str(Path(__file__).parent))
 from reference import poses as naive

@@ -14,20 +14,20 @@ import pytest
 from scenes import around, checkered_ball
 
 import g2ard
-from g2ard.cameras import Cameras
-from g2ard.constants import listed
+from g2ard.config.constants import listed
+from g2ard.config.presets import preset
 from g2ard.errors import InputError
-from g2ard.images import write_png
 from g2ard.io import Points, read_splats, write_points, write_splats, write_views
 from g2ard.pipeline import DistillConfig, distill
-from g2ard.presets import preset
-from g2ard.splats import SH_C0, Splats
+from g2ard.rendering.renderer import render
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.images import write_png
+from g2ard.scene.splats import SH_C0, Splats
+from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, drift95
 from g2ard.stages.recover.schedule import PAPER, Schedule
-from g2ard.stages.render import render
 from g2ard.stages.simplify import simplify
-from g2ard.targets import TeacherRenders
 
 CommandLine = Callable[..., tuple[int, str, str]]
 PRIOR = checkered_ball()
@@ -146,8 +146,8 @@ def test_the_other_commands_know_it(folder: Path, command_line: CommandLine) -> 
 
 
 def test_a_study_takes_it_in_g2ard_s_place() -> None:
-    from g2ard.bench.definition import METHODS, Definition
-    from g2ard.bench.paper import as_in_the_paper
+    from benchmarks.definition import METHODS, Definition
+    from benchmarks.paper import as_in_the_paper
 
     study = Definition(
         "s", "", (), tuple(METHODS[name] for name in ("g2ard", "pup", "g2ard-paper")), steps=(5,)
@@ -159,13 +159,13 @@ def test_a_study_takes_it_in_g2ard_s_place() -> None:
     assert not as_in_the_paper(study, False).released
 
 
-DEFINITIONS = Path(__file__).parents[1] / "benches" / "definitions"
+DEFINITIONS = Path(__file__).parents[1] / "benchmarks" / "definitions"
 
 
 @pytest.mark.parametrize("name", sorted(str(p.relative_to(DEFINITIONS)) for p in DEFINITIONS.rglob("*.toml")))
 def test_it_means_every_row_of_the_paper_s_alike(name: str) -> None:
-    from g2ard.bench.definition import read_definition
-    from g2ard.bench.paper import as_in_the_paper
+    from benchmarks.definition import read_definition
+    from benchmarks.paper import as_in_the_paper
 
     study = read_definition(DEFINITIONS / name)
     done = as_in_the_paper(study)
@@ -189,8 +189,8 @@ def test_it_means_every_row_of_the_paper_s_alike(name: str) -> None:
 
 
 def test_two_priors_take_it_alike() -> None:
-    from g2ard.bench.definition import read_definition
-    from g2ard.bench.paper import as_in_the_paper
+    from benchmarks.definition import read_definition
+    from benchmarks.paper import as_in_the_paper
 
     study = read_definition(DEFINITIONS / "source.toml")
     rows = {m.name: m for m in as_in_the_paper(study).methods}

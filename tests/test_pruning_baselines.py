@@ -8,14 +8,14 @@ import torch
 from reference import raster as naive
 from scenes import around, checkered_ball
 
-from g2ard.baselines import METHODS, reduce
-from g2ard.baselines.lightgaussian import global_significance
-from g2ard.baselines.mini_splatting import importance, sample
-from g2ard.baselines.pup import _log_det, _quarter, fisher, pup, rounds
-from g2ard.baselines.simple import optical_mass
-from g2ard.cameras import Cameras
+from benchmarks.baselines import METHODS, reduce
+from benchmarks.baselines.lightgaussian import global_significance
+from benchmarks.baselines.mini_splatting import importance, sample
+from benchmarks.baselines.pup import _log_det, _quarter, fisher, pup, rounds
+from benchmarks.baselines.simple import optical_mass
 from g2ard.errors import InputError
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 
 VIEWS = around(3, size=(14, 11))
 

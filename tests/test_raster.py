@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from reference import raster as reference
 
 from g2ard import _core
-from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
-from g2ard.splats import Splats
+from g2ard.rendering.renderer import RasterSettings, render
+from g2ard.rendering.visibility import visibility
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.splats import Splats
 from g2ard.stages.recover.rasterize import rasterize
-from g2ard.stages.render import RasterSettings, render
-from g2ard.visibility import visibility
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 Params = dict[str, NDArray[np.float32]]

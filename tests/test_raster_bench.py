@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.raster import bench_raster, built_in_view, drawn
 from g2ard import _core
-from g2ard.bench.raster import bench_raster, built_in_view, drawn
 from g2ard.errors import InputError
-from g2ard.splats import Splats
-from g2ard.stages.render import render
+from g2ard.rendering.renderer import render
+from g2ard.scene.splats import Splats
 
 
 def cloud(n: int = 3000) -> Splats:

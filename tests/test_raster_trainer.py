@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 from test_raster import NAMES, Params, camera, scene, tensors_of
 
 from g2ard import _core
-from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.splats import Splats
+from g2ard.rendering.renderer import RasterSettings, view_of
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, Regularizers
 from g2ard.stages.recover.extent import extents, share_of_rate
 from g2ard.stages.recover.losses import l1_ssim
 from g2ard.stages.recover.rasterize import rasterize
 from g2ard.stages.recover.regularize import TorchAnchors, regularization
 from g2ard.stages.recover.schedule import Rates
-from g2ard.stages.render import RasterSettings, view_of
 
 RATES = {"means": 2e-3, "quats": 1e-2, "log_scales": 2e-2, "logit_opacities": 5e-2, "sh0": 2e-2, "shN": 2e-3}
 BACKGROUND = [0.1, 0.2, 0.3]

@@ -20,7 +20,9 @@ from scenes import around, checkered_ball, under_a_sky
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.splats import Splats
+from g2ard.rendering.visibility import visibility
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, loop, probe, recover
 from g2ard.stages.recover import checkpoint as checkpoint_module
@@ -29,8 +31,6 @@ from g2ard.stages.recover.guard import Guard, blended
 from g2ard.stages.recover.outcome import outcome
 from g2ard.stages.recover.schedule import PAPER, TUNED
 from g2ard.stages.simplify import simplify
-from g2ard.targets import TeacherRenders
-from g2ard.visibility import visibility
 
 ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 VIEWS = around()

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scenes import around, checkered_ball
 
+from benchmarks import rows
+from benchmarks.recover import Look, RecoverBench, bench_recover
+from benchmarks.speedup import speedups
 from g2ard import io
-from g2ard.bench import rows
-from g2ard.bench.recover import Look, RecoverBench, bench_recover
-from g2ard.bench.speedup import speedups
 from g2ard.errors import InputError
 
 

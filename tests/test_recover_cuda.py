@@ -16,10 +16,10 @@ from scenes import around, checkered_ball
 
 from g2ard import io
 from g2ard.errors import InputError
+from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig, gsplat_engine, recover
 from g2ard.stages.recover.losses import l1_ssim, l1_ssim_anywhere
 from g2ard.stages.simplify import simplify
-from g2ard.targets import TeacherRenders
 
 BALL = checkered_ball(1200)
 TARGETS = TeacherRenders(BALL, around(6, (40, 30)))

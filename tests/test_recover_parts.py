@@ -12,7 +12,7 @@ import torch
 from scenes import around, checkered_ball
 
 from g2ard.errors import InputError
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 from g2ard.stages.recover import checkpoint
 from g2ard.stages.recover.anchors import (
     PAPER_PRESETS,

@@ -14,13 +14,13 @@ from reference import register as twin
 from scenes import around, checkered_ball
 
 from g2ard import _core
-from g2ard.cameras import Camera, Cameras
-from g2ard.images import resized
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.images import resized
 from g2ard.stages.register.align import Level, Shot, align, level_of, normal_equations, shoot
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import grey_of, local_zncc, zncc
 from g2ard.stages.register.pose import moved, pose_error, rotation_of
-from g2ard.stages.render import Renderer
 
 CONFIG = RegisterConfig(size=160, coarsest=40)
 BALL = checkered_ball(2500)

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from scenes import around, checkered_ball
 
-from g2ard.bench import rows
-from g2ard.bench.register import STARTS, Cell, bench_register, displaced
-from g2ard.cameras import Cameras
+from benchmarks import rows
+from benchmarks.register import STARTS, Cell, bench_register, displaced
 from g2ard.errors import InputError
-from g2ard.images import write_png
 from g2ard.io import write_splats, write_views
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.images import write_png
 from g2ard.stages.register import RegisterConfig, pose_error
-from g2ard.stages.render import Renderer
 
 CommandLine = Callable[..., tuple[int, str, str]]
 

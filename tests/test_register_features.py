@@ -16,16 +16,16 @@ from hypothesis import strategies as st
 from scenes import around, checkered_ball
 from test_register_align import off
 
-from g2ard.cameras import Camera, Cameras
 from g2ard.errors import InputError, MissingDependencyError
-from g2ard.images import write_png
-from g2ard.splats import Splats
+from g2ard.rendering.renderer import Rendered, Renderer
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.images import write_png
+from g2ard.scene.splats import Splats
 from g2ard.stages.register import PhotoReport, RegisterConfig, pose_error, register
 from g2ard.stages.register import matchers as module
 from g2ard.stages.register.matchers import checked_pairs, matcher_named, mutual
 from g2ard.stages.register.pose import motion_between, moved
 from g2ard.stages.register.solve import information, lifted, solved
-from g2ard.stages.render import Rendered, Renderer
 
 CommandLine = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).resolve().parents[1]

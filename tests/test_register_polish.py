@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from scenes import around, checkered_ball
 from test_register_align import off, pyramid_of
 
+from g2ard.rendering.renderer import Renderer
 from g2ard.stages.register import RegisterConfig, pose_error
 from g2ard.stages.register.align import Aligned
 from g2ard.stages.register.grey import blurred, blurred_back
 from g2ard.stages.register.polish import Energy, Prior, polish
 from g2ard.stages.register.pose import moved
-from g2ard.stages.render import Renderer
 
 CONFIG = RegisterConfig(size=160)
 BALL = checkered_ball(2500)

@@ -11,12 +11,13 @@ from realdata import real
 from reference import rays
 from reference import select as naive
 
+from benchmarks.synth import city
 from g2ard import _core
-from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
 from g2ard.io import read_splats, read_view_set, write_splats, write_views
 from g2ard.poses import make_pool
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.splats import Splats
 from g2ard.stages.lift import lift
 from g2ard.stages.select import (
     POLICIES,
@@ -28,7 +29,6 @@ from g2ard.stages.select import (
     surfaces,
     visible_cells,
 )
-from g2ard.synth import city
 
 SIZE = (96, 72)
 FOCAL = 80.0

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scenes import checkered_ball
 
-from g2ard.bench import rows as table
-from g2ard.bench.select import ARMS, Trial, bench_select, summary
-from g2ard.bench.select_workspaces import Size, Workspace, pool_of, workspace_of
+from benchmarks import rows as table
+from benchmarks.select import ARMS, Trial, bench_select, summary
+from benchmarks.select_workspaces import Size, Workspace, pool_of, workspace_of
 from g2ard.errors import InputError
 from g2ard.io import write_splats
 

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from scenes import around, checkered_ball
 
-from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
 from g2ard.pipeline import DistillConfig, distill
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover.schedule import TUNED
 from g2ard.stages.select import select
-from g2ard.targets import TeacherRenders
 
 CommandLine = Callable[..., tuple[int, str, str]]
 PRIOR = checkered_ball(1500)

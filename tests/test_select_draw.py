@@ -14,11 +14,11 @@ from scenes import around, checkered_ball
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.draw import checked_weights, drawn
 from g2ard.stages.simplify import simplify
-from g2ard.targets import TeacherRenders
 
 ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 VIEWS = around()

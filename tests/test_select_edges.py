@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from scenes import around, checkered_ball
 
-from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
 from g2ard.io import read_view_set, write_splats, write_views
 from g2ard.progress import plural
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.splats import Splats
 from g2ard.stages.select import POLICIES, CoverageOptions, select
 
 CommandLine = Callable[..., tuple[int, str, str]]

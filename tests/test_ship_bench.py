@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from scenes import checkered_ball
 
-from g2ard.bench.process import measured
-from g2ard.bench.ship import bench_ship
+from benchmarks.process import measured
+from benchmarks.ship import bench_ship
 from g2ard.errors import G2ardError, InputError
 from g2ard.io import write_splats
 

@@ -11,7 +11,7 @@ from simplify_cases import ARRAYS, all_alike, assert_same, assert_sound, scene
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import METHODS, SimplifyConfig, schedule, simplify
 
 

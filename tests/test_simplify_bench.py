@@ -13,11 +13,11 @@ import pytest
 from scenes import around, checkered_ball
 from systems import needs_processes
 
+from benchmarks import rows as table
+from benchmarks.recover import Look
+from benchmarks.simplify import Cell, bench_simplify, find_splat_transform
+from benchmarks.standing import given_views, standing_targets, standing_views
 from g2ard import io
-from g2ard.bench import rows as table
-from g2ard.bench.recover import Look
-from g2ard.bench.simplify import Cell, bench_simplify, find_splat_transform
-from g2ard.bench.standing import given_views, standing_targets, standing_views
 from g2ard.errors import InputError
 from g2ard.poses import make_pool
 
@@ -167,7 +167,7 @@ def test_rows_from_before_the_last_column_are_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("name", "kind"), [("simplify", Cell), ("recover", Look)])
 def test_recorded_rows_are_read(name, kind) -> None:
-    paths = sorted((Path(__file__).parent.parent / "benches" / "record").rglob(f"{name}-*.csv"))
+    paths = sorted((Path(__file__).parent.parent / "benchmarks" / "record").rglob(f"{name}-*.csv"))
     assert paths
     for path in paths:
         stated = "views_kind" in path.read_text(encoding="utf-8").splitlines()[0]

@@ -14,9 +14,9 @@ from simplify_cases import ARRAYS, Views, all_alike, assert_sound, opaque_wall, 
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.splats import Splats, unit_quats
+from g2ard.rendering.visibility import visibility_source
+from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.simplify import SimplifyConfig, simplify
-from g2ard.visibility import visibility_source
 
 sys.path.insert(0, str(Path(__file__).parent))
 from reference import simplify as naive
@@ -89,8 +89,8 @@ def test_clusters_conserve_mass_mean_and_covariance(method, growth):
 
 @pytest.mark.parametrize("method", ["default", "fast"])
 def test_an_opaque_wall_stays_opaque_and_thin(method):
-    from g2ard.stages.render import render
-    from g2ard.visibility import visibility_source
+    from g2ard.rendering.renderer import render
+    from g2ard.rendering.visibility import visibility_source
 
     wall, cameras = opaque_wall()
     alpha = {}
@@ -140,7 +140,7 @@ def test_no_merged_cluster_is_dropped():
 @pytest.mark.parametrize("method", ["default", "fast"])
 @pytest.mark.parametrize("scale", [1.0, 2.0**-10])
 def test_what_is_seen_does_not_depend_on_the_order_of_rows(method, scale):
-    from g2ard.visibility import visibility_source
+    from g2ard.rendering.visibility import visibility_source
 
     wall, cameras = opaque_wall()
     viewmats = cameras.viewmats.copy()

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from simplify_cases import ARRAYS, assert_sound, scene
 
-from g2ard.splats import Splats, unit_quats
+from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.simplify import SimplifyConfig, flag, schedule, simplify
 
 sys.path.insert(0, str(Path(__file__).parent))

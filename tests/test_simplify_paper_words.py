@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from simplify_cases import ARRAYS
 
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import SimplifyConfig, flag, simplify
 
 C0 = 0.28209479177387814

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.splits import split_mask, split_names
+from g2ard.scene.splits import split_mask, split_names
 
 
 def test_every_eighth_sorted_name_is_test() -> None:

@@ -14,16 +14,16 @@ from realdata import real
 from scenes import around, checkered_ball
 from view_files import transforms
 
-from g2ard.bench.definition import read_definition
-from g2ard.bench.recover import RecoverBench
-from g2ard.bench.select_workspaces import Size, pool_of, workspace_of
-from g2ard.bench.workspace import Workspace
+from benchmarks.definition import read_definition
+from benchmarks.recover import RecoverBench
+from benchmarks.select_workspaces import Size, pool_of, workspace_of
+from benchmarks.workspace import Workspace
 from g2ard.errors import InputError
-from g2ard.images import write_png
 from g2ard.io import Points, read_points, read_view_set, write_points, write_splats, write_views
-from g2ard.splits import for_scores, for_training, not_held_out, split_mask, splits_of
+from g2ard.rendering.renderer import render
+from g2ard.scene.images import write_png
+from g2ard.scene.splits import for_scores, for_training, not_held_out, split_mask, splits_of
 from g2ard.stages.lift import lift
-from g2ard.stages.render import render
 
 CommandLine = Callable[..., tuple[int, str, str]]
 Program = Callable[..., None]
@@ -79,10 +79,10 @@ class Watch:
 
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
+    import g2ard.rendering.visibility
     import g2ard.stages.adapt
     import g2ard.stages.evaluate
     import g2ard.stages.recover
-    import g2ard.visibility
 
     seen = Watch()
 
@@ -98,7 +98,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
 
     watched(g2ard.stages.recover, "recover", 1, seen.trained)
     watched(g2ard.stages.adapt, "adapt", 1, seen.trained)
-    watched(g2ard.visibility, "visibility_source", 0, seen.looked)
+    watched(g2ard.rendering.visibility, "visibility_source", 0, seen.looked)
     watched(g2ard.stages.evaluate, "evaluate", 1, seen.scored)
     return seen
 
@@ -274,7 +274,7 @@ adapt = "photos"
 
 
 def test_simplifiers_are_given_training_views_alone(folder: Path) -> None:
-    from g2ard.bench.simplify import _Workspace
+    from benchmarks.simplify import _Workspace
 
     names = [f"{i:03d}.png" for i in range(16)]
     (folder / "photos" / "split.json").write_text(

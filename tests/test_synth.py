@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from reference import synth as naive
 
+from benchmarks.synth import City, CityConfig, city, write_city
+from benchmarks.synth.layout import Material
+from benchmarks.synth.noise import Noise, band, ramp
+from benchmarks.synth.shapes import Kind, Shapes, cast
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_points, read_views
-from g2ard.synth import City, CityConfig, city, write_city
-from g2ard.synth.layout import Material
-from g2ard.synth.noise import Noise, band, ramp
-from g2ard.synth.shapes import Kind, Shapes, cast
 
 SMALL = CityConfig(points=12_000, views=12, size=(96, 72), blocks=1, seed=3)
 LARGE = replace(SMALL, points=20_000, size=(480, 360), blocks=2)
@@ -129,7 +129,7 @@ def test_scan_is_exact_in_count_and_denser_near_scanners(large, large_scan):
 
 
 def test_a_scan_in_parts_is_as_the_scan_at_once(large, large_scan, monkeypatch):
-    monkeypatch.setattr("g2ard.synth.lidar.PART", 2500)
+    monkeypatch.setattr("benchmarks.synth.lidar.PART", 2500)
     blocks = list(large.scans())
     assert len(blocks) >= 16  # eight parts, each from the streets and from the air
     assert max(len(b.positions) for b in blocks) <= 2500

@@ -12,9 +12,9 @@ import pytest
 from scenes import around, checkered_ball
 
 import g2ard
-from g2ard.images import write_png
 from g2ard.io import write_splats, write_views
-from g2ard.stages.render import render
+from g2ard.rendering.renderer import render
+from g2ard.scene.images import write_png
 
 CommandLine = Callable[..., tuple[int, str, str]]
 PRIOR = checkered_ball()

@@ -21,12 +21,12 @@ from test_tiles_simplify import ring, town
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.policy.tiled import Tiling, bytes_of, check_memory, is_tiled, workers_for
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.schedule import schedule_named
 from g2ard.stages.simplify import simplify
-from g2ard.targets import TeacherRenders
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.store import TileStore
 

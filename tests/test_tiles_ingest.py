@@ -17,7 +17,7 @@ import pytest
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_scene, write_splats
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 from g2ard.tiles.cells import Cell, Sampler, cut_cells
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.store import TileStore, packed

@@ -14,11 +14,11 @@ from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io import sog
 from g2ard.levels import Cut, cut, save_levels, tree
-from g2ard.memory import peak_rss
 from g2ard.policy.distill_options import DistillOptions
 from g2ard.policy.tiled import Tiling
 from g2ard.policy.tiled_levels import TiledLevels, lod_in_tiles
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
+from g2ard.system.memory import peak_rss
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.stored import StoredScene
 

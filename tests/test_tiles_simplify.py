@@ -15,14 +15,14 @@ import pytest
 from systems import is_worker, needs_proc
 
 from g2ard import _core
-from g2ard.cameras import Cameras, look_at
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
-from g2ard.prepared import finite_rows_of
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.prepared import finite_rows_of
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.simplify import SimplifyConfig, schedule, simplify
-from g2ard.targets import TeacherRenders
 from g2ard.tiles.cut import cheapest
 from g2ard.tiles.executor import executor
 from g2ard.tiles.ingest import ingest
@@ -155,7 +155,7 @@ def test_an_exact_count_about_as_good_as_in_one_piece(
     assert len(small) == 900
     assert small.finite_rows().all()
     dense = read_splats(scene)
-    from g2ard.visibility import visibility_source
+    from g2ard.rendering.visibility import visibility_source
 
     whole = simplify(dense, 900, visibility=None if blind else visibility_source(views)).splats
     targets = TeacherRenders(dense, ring(5))

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from g2ard.cameras import Cameras, look_at
-from g2ard.splats import Splats
-from g2ard.stages.render import RasterSettings, render, settings_for
+from g2ard.rendering.renderer import RasterSettings, render, settings_for
+from g2ard.rendering.visibility import visibility, visibility_source
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.splats import Splats
 from g2ard.stages.select import select
 from g2ard.stages.simplify import simplify
-from g2ard.visibility import visibility, visibility_source
 
 ARRAYS = ("means", "scales", "quats", "logit_opacities", "sh0", "shN")
 
@@ -90,8 +90,8 @@ def test_views_are_chosen_in_any_unit(policy):
 
 def test_recovery_works_in_any_unit():
     pytest.importorskip("torch")
+    from g2ard.scene.targets import TeacherRenders
     from g2ard.stages.recover import RecoverConfig, recover
-    from g2ard.targets import TeacherRenders
 
     figures = []
     for unit in (1.0, 1e-3):

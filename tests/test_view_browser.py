@@ -14,12 +14,12 @@ from browser import Browser
 from realdata import real
 from scenes import checkered_ball
 
-from g2ard.cameras import Camera, Cameras
 from g2ard.io import read_splats, write_splats
-from g2ard.metrics import psnr
 from g2ard.policy.view import stand_with
-from g2ard.splats import Splats
-from g2ard.stages.render import Renderer
+from g2ard.rendering.metrics import psnr
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.splats import Splats
 from g2ard.viewer import write_page
 
 WIDTH, HEIGHT = 480, 360

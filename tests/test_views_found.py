@@ -12,8 +12,8 @@ import pytest
 from scenes import around, checkered_ball
 from test_views_trainers import inria
 
-from g2ard.cameras import Cameras, look_at
 from g2ard.io import read_splats, read_view_set, write_splats, write_views
+from g2ard.scene.cameras import Cameras, look_at
 
 CommandLine = Callable[..., tuple[int, str, str]]
 BALL = checkered_ball(1500)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from g2ard.cameras import Cameras, look_at
+from g2ard.scene.cameras import Cameras, look_at
 
 
 def photo(path: Path, size: tuple[int, int] = (8, 6)) -> Path:

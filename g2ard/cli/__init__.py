@@ -8,34 +8,44 @@ import sys
 
 import typer
 
-from g2ard import interrupt
 from g2ard.cli.commands import register_commands
 from g2ard.cli.frame import app
 from g2ard.cli.lazy_rich import defer_rich
 from g2ard.cli.pipes import outlive_readers
 from g2ard.cli.usage import usage_line
+from g2ard.system import interrupt
 
-__all__ = ["main"]
+__all__ = ["main", "run_program"]
 
 _COMPLETION = ("--show-completion", "--install-completion")
 
 
 def main() -> None:
-    """Entry point of the `g2ard` program: usage errors are one line and exit status 2, as all errors are."""
+    """Entry point of the `g2ard` program."""
+    _name_shell(sys.argv[1:])
+    register_commands(next(iter(sys.argv[1:]), None))  # the others would only take time
+    run_program(app, "g2ard")
+
+
+def run_program(app: typer.Typer, name: str) -> None:
+    """Run a command line to its exit status; usage errors are one line and exit status 2.
+
+    Args:
+        app: the commands.
+        name: the program's name in messages.
+    """
     # Kernels have threads of their own; those of numpy's BLAS only spin, for a thirtieth of a short command.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     outlive_readers()
     defer_rich()
     gc.set_threshold(50_000)  # importing makes many objects and no garbage: looking for it took a twentieth
-    _name_shell(sys.argv[1:])
-    register_commands(next(iter(sys.argv[1:]), None))  # the others would only take time
     try:
-        status = app(prog_name="g2ard", standalone_mode=False)
+        status = app(prog_name=name, standalone_mode=False)
     except typer.Abort:
         status = interrupt.status()
     except typer.TyperException as e:
         message = usage_line(e)
-        where = getattr(getattr(e, "ctx", None), "command_path", "g2ard")
+        where = getattr(getattr(e, "ctx", None), "command_path", name)
         if message:  # empty when a group without arguments has already shown its help
             print(f"{where}: {message} (see {where} --help)", file=sys.stderr)
         status = e.exit_code

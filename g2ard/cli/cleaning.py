@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Cameras
-    from g2ard.clean import Cleaning
-    from g2ard.splats import Splats
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
+    from g2ard.stages.clean import Cleaning
 
 __all__ = ["paint_clutter"]
 
@@ -26,10 +26,10 @@ def paint_clutter(path: Path, splats: Splats, found: Cleaning, cameras: Cameras,
     """Three views: as it is, what would go in the colour of its kind on grey, and what stays."""
     import numpy as np
 
-    from g2ard.clean import KINDS
-    from g2ard.images import contact_sheet, write_png
-    from g2ard.paint import painted
-    from g2ard.stages.render import Renderer
+    from g2ard.rendering.renderer import Renderer
+    from g2ard.report.paint import painted
+    from g2ard.scene.images import contact_sheet, write_png
+    from g2ard.stages.clean import KINDS
 
     colors = np.array([*_COLORS.values(), (0.45, 0.48, 0.52)])[found.kind]
     scenes = [splats, painted(splats, colors), splats.take(found.keep)]

@@ -20,13 +20,14 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from g2ard import __version__, interrupt
+from g2ard import __version__
 from g2ard.cli.budget_options import Counts, Ratios
 from g2ard.cli.config import load_config, printed
 from g2ard.cli.console import Console
 from g2ard.cli.usage import in_flags, present_name, typed
 from g2ard.errors import G2ardError
 from g2ard.progress import plural
+from g2ard.system import interrupt
 
 __all__ = ["Run", "app", "command", "group", "one_line"]
 
@@ -146,14 +147,14 @@ class Run:
             self.config["set"] = common["set"]
 
     def constants(self, *, over_options: bool = False, **configs: Any) -> dict[str, Any]:
-        """What --set and the config file say of configs' constants (`g2ard.constants.parsed`), as a usage
-        check: names and types, and values as far as the other constants' defaults allow to say.
+        """What --set and the config file say of configs' constants (`g2ard.config.constants.parsed`), as a
+        usage check: names and types, and values as far as the other constants' defaults allow to say.
 
         Args:
             over_options: constants that are options of the command too may be set; they win.
             configs: prefix → a dataclass that holds constants.
         """
-        from g2ard.constants import changed, parsed
+        from g2ard.config.constants import changed, parsed
         from g2ard.errors import InputError
 
         try:
@@ -175,7 +176,7 @@ class Run:
     def tell_notes(self) -> None:
         """Why the CPU took over from a GPU, if it has since last told, and that a GPU is none."""
         if self.device in ("auto", "gpu"):
-            from g2ard import devices
+            from g2ard.system import devices
 
             for note in devices.notes():
                 self.noted = True
@@ -210,7 +211,7 @@ class Run:
         """What ran on a GPU, if anything did."""
         if self.device not in ("auto", "gpu"):
             return {}
-        from g2ard import devices
+        from g2ard.system import devices
 
         state = devices.state()
         if not state.served:
@@ -254,7 +255,7 @@ def _plain(value: Any) -> Any:
 
 
 def group(name: str, text: str) -> typer.Typer:
-    """A command with subcommands, such as `g2ard synth`."""
+    """A command with subcommands, such as `python -m benchmarks synth`."""
     sub = typer.Typer(help=text, no_args_is_help=True)
     app.add_typer(sub, name=name)
     return sub
@@ -367,7 +368,7 @@ def _device(run: Run) -> Iterator[None]:
     if run.device not in ("auto", "gpu"):
         yield
         return
-    from g2ard import devices
+    from g2ard.system import devices
 
     devices.use(run.device, timed=run.verbose)
     ended = False

@@ -10,13 +10,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from g2ard.choices import UNMEASURED, Convention, Engine, FormatName, PaperPresetName, Policy, PresetName
 from g2ard.cli.budget_options import Count
+from g2ard.config.choices import (
+    UNMEASURED,
+    Convention,
+    Engine,
+    FormatName,
+    PaperPresetName,
+    Policy,
+    PresetName,
+)
 from g2ard.report.window import Crop
 
 if TYPE_CHECKING:
     from g2ard.cli.frame import Run
-    from g2ard.splats import Splats
+    from g2ard.scene.splats import Splats
 
 __all__ = [
     "ConventionOption",
@@ -140,7 +148,7 @@ class Spot(tuple[float, ...]):
 
 def _spot(text: str) -> Spot:
     from g2ard.errors import InputError
-    from g2ard.regions import check_region
+    from g2ard.scene.regions import check_region
 
     try:
         return Spot(check_region([float(word) for word in text.replace(",", " ").split()]))

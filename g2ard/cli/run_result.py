@@ -10,7 +10,7 @@ from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.policy.fit import Aim
-    from g2ard.splats import Splats
+    from g2ard.scene.splats import Splats
 
 __all__ = ["say_views", "say_weight", "tell_quality", "told", "write_table"]
 

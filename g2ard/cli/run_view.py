@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Cameras
-    from g2ard.splats import Splats
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
 
 __all__ = ["run_view"]
 

@@ -41,9 +41,9 @@ class TiledCommand:
             self._simplify(config, views, blind, up)
 
     def _simplify(self, config: SimplifyConfig, views: Any, blind: bool, up: Sequence[float] | None) -> None:
-        from g2ard.constants import listed
-        from g2ard.memory import peak_rss_of_all
+        from g2ard.config.constants import listed
         from g2ard.policy.tiled import simplify_in_tiles
+        from g2ard.system.memory import peak_rss_of_all
 
         run, began, reports = self.run, time.perf_counter(), []
         made = simplify_in_tiles(
@@ -93,10 +93,10 @@ class TiledCommand:
         from dataclasses import asdict
 
         from g2ard import io
-        from g2ard.memory import peak_rss_of_all
         from g2ard.policy.tiled_distill import distill_in_tiles
         from g2ard.policy.whole import refuse_whole, whole_budgets, whole_options
         from g2ard.report.tiled import tiled_report
+        from g2ard.system.memory import peak_rss_of_all
 
         own = [name for name in ("dry_run", "keep", "crop") if self.run.config[name]]
         given = [*whole_options(options), *whole_budgets(self.budgets)]

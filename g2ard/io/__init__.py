@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from g2ard.cameras import Cameras
     from g2ard.io.types import Cloud, Note, Points, Scene, ViewSet
-    from g2ard.splats import Splats
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
 
 __all__ = [
     "Cloud",
@@ -79,7 +79,7 @@ def read_splats(path: str | Path) -> Splats:
             names the file and what is wrong.
 
     >>> import tempfile
-    >>> from g2ard.splats import Splats
+    >>> from g2ard.scene.splats import Splats
     >>> path = Path(tempfile.mkdtemp()) / "two.ply"
     >>> write_splats(path, Splats.create([[0, 0, 0], [1, 0, 0]], scales=[[1, 1, 1], [1, 2, 3]]))
     >>> read_splats(path).scales.round(5).tolist()
@@ -266,7 +266,7 @@ def read_views(path: str | Path, *, images: str | Path | None = None, split: str
         path: a COLMAP folder (or its images_4), a transforms.json or its folder, a Cambridge Landmarks
             scene, or a .json that g2ard wrote.
         images: the folder of the photos, where they are not where the file says.
-        split: "train", "test", or "all"; see `g2ard.splits.split_mask`.
+        split: "train", "test", or "all"; see `g2ard.scene.splits.split_mask`.
 
     Returns:
         The views in OpenCV axes, COLMAP's sorted by name, others in file order. Views whose photo is
@@ -304,7 +304,7 @@ def read_view_set(
     from g2ard.errors import InputError
     from g2ard.io.detect import KINDS, file_format, run_views
     from g2ard.io.photos import pictured
-    from g2ard.splits import split_mask
+    from g2ard.scene.splits import split_mask
 
     path = run_views(path)
     found = file_format(path)

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.io.clean import Raw, cleaned
 from g2ard.io.plyfiles import offset_of, read_element, read_header, require, row_blocks
+from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Scene
 from g2ard.progress import plural
-from g2ard.splats import SH_C0
+from g2ard.scene.splats import SH_C0
 
 __all__ = ["read", "stream"]
 

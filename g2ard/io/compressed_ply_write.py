@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard.io.atomic import atomic_output
 from g2ard.io.packing import coded, log_scales, morton_order, smallest_three, unit_quats, writable
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 __all__ = ["write"]
 

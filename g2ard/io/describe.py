@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Cameras
 from g2ard.io import kind, read_cloud, read_scene, read_view_set
 from g2ard.io.detect import file_format, run_scene
 from g2ard.io.sog import chunks_of
 from g2ard.io.types import Points, ViewSet
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 
 __all__ = ["bytes_of", "describe"]
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import read_json
+from g2ard.scene.cameras import Cameras
 
 __all__ = ["find_exposures", "read"]
 

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
-from g2ard.io.clean import Raw, cleaned
 from g2ard.io.jsonfile import (
     Fields,
     fields_of,
@@ -30,8 +29,9 @@ from g2ard.io.jsonfile import (
     whole,
 )
 from g2ard.io.packing import unit_quats, writable
+from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 __all__ = ["EXTENSION", "read", "write"]
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.io.clean import LOG_SCALE_LIMIT
-from g2ard.splats import Splats
+from g2ard.io.sanitize import LOG_SCALE_LIMIT
+from g2ard.scene.splats import Splats
 
 __all__ = [
     "coded",

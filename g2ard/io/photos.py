@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.io.limits import opened_image
 from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
+from g2ard.scene.cameras import Cameras
 
 __all__ = [
     "Frame",

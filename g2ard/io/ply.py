@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
-from g2ard.io.clean import BLOCK, LOG_SCALE_LIMIT, Raw, cleaned
 from g2ard.io.plyfiles import offset_of, read_element, read_header, require, row_blocks, spread_rows
+from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw, cleaned
 from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Note, Scene
 from g2ard.progress import plural
-from g2ard.splats import Splats, unit_quats
+from g2ard.scene.splats import Splats, unit_quats
 
 __all__ = ["read", "stream", "write"]
 

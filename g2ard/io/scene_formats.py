@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from g2ard.choices import FormatName
+from g2ard.config.choices import FormatName
 from g2ard.errors import OutputError
 
 __all__ = ["FORMATS", "SceneFormat", "check_options", "scene_format"]

@@ -89,7 +89,7 @@ def read(path: Path) -> Scene:
     Raises:
         InputError: a part is missing or broken, or nothing in it is finite.
     """
-    from g2ard.io.clean import Raw, cleaned
+    from g2ard.io.sanitize import Raw, cleaned
 
     with _opened(path) as chunks:
         counts = [count_of(chunk) for chunk in chunks]

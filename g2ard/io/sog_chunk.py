@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from PIL.Image import Image
 
-    from g2ard.io.clean import Raw
+    from g2ard.io.sanitize import Raw
 
 __all__ = ["Chunk", "Decoder", "count_of", "means_of", "meta_errors", "rest_of"]
 
@@ -133,7 +133,7 @@ class Decoder:
 
     def fill(self, rows: slice, raw: Raw) -> None:
         """Decode the Gaussians `rows` into `raw`, in blocks that stay in the cache."""
-        from g2ard.io.clean import BLOCK
+        from g2ard.io.sanitize import BLOCK
 
         for start in range(rows.start, rows.stop, BLOCK):
             stop = min(start + BLOCK, rows.stop)

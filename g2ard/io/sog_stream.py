@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.io.clean import Raw
+from g2ard.io.sanitize import Raw
 from g2ard.io.sog_chunk import Chunk, Decoder, means_of
 from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Note

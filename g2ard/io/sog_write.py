@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from g2ard.splats import Splats
+    from g2ard.scene.splats import Splats
 
 __all__ = ["palette_size", "sog_bytes", "sog_files", "write", "write_folder"]
 

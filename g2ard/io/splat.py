@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
-from g2ard.io.clean import Raw, cleaned
 from g2ard.io.packing import world_means, writable
+from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Scene
-from g2ard.splats import SH_C0, Splats, unit_quats
+from g2ard.scene.splats import SH_C0, Splats, unit_quats
 
 __all__ = ["read", "stream", "write"]
 

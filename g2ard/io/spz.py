@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, MissingDependencyError
-from g2ard.io.clean import Raw, cleaned
 from g2ard.io.limits import check_unpacked
+from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
 
 __all__ = ["COLOR_SCALE", "FLIPS", "MAGIC", "read", "zstandard"]

@@ -23,7 +23,7 @@ from g2ard.io.packing import (
     writable,
 )
 from g2ard.io.spz import COLOR_SCALE, FLIPS, MAGIC, zstandard
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 __all__ = ["VERSIONS", "fraction_bits", "write"]
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.io.clean import BLOCK, Raw, Tally
+from g2ard.io.sanitize import BLOCK, Raw, Tally
 from g2ard.io.types import Note
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 __all__ = ["PartsStream", "SceneStream", "file_identity", "open_stream"]
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Cameras
-    from g2ard.splats import Splats
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
 
 __all__ = ["Cloud", "Note", "Points", "Scene", "ViewSet"]
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from g2ard.cameras import Cameras
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import fields_of, numbers, read_json
@@ -19,6 +18,7 @@ from g2ard.io.paths import real_path
 from g2ard.io.photos import Frame, pixels, rigid, view_set
 from g2ard.io.types import ViewSet
 from g2ard.progress import plural
+from g2ard.scene.cameras import Cameras
 
 __all__ = ["read", "write"]
 

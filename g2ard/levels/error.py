@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Camera
 from g2ard.levels.tree import Leaf
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Camera
+from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:
     from g2ard.levels.tree import Level
@@ -95,7 +95,7 @@ def _axes() -> Float:
 
 def _images(splats: Splats, cameras: Sequence[Camera]) -> NDArray[np.float32]:
     """(6, S, S, 4) colours over black, and alpha."""
-    from g2ard.stages.render import Renderer
+    from g2ard.rendering.renderer import Renderer
 
     renderer = Renderer(splats)
     drawn = [renderer.render(camera) for camera in cameras]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, require
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import rotation_matrices
 
 if TYPE_CHECKING:

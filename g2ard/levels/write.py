@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from g2ard.levels.tree import Level
-    from g2ard.splats import Splats
+    from g2ard.scene.splats import Splats
 
 __all__ = ["save_levels"]
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Cameras
-    from g2ard.clean import Cleaning
-    from g2ard.splats import Splats
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
+    from g2ard.stages.clean import Cleaning
 
 __all__ = ["clutter_seen"]
 
@@ -33,7 +33,7 @@ def clutter_seen(
 
     Args:
         splats: the scene.
-        kinds: looked for; None for all of `g2ard.clean.KINDS`.
+        kinds: looked for; None for all of `g2ard.stages.clean.KINDS`.
         seed: of the poses.
         progress: told of planning and looks.
         say: told what was found.
@@ -41,9 +41,9 @@ def clutter_seen(
     Raises:
         InputError: an unknown kind, or a scene with no room for poses.
     """
-    from g2ard.clean import KINDS, find_clutter, within_reach
     from g2ard.poses import plan_pool
-    from g2ard.visibility import visibility
+    from g2ard.rendering.visibility import visibility
+    from g2ard.stages.clean import KINDS, find_clutter, within_reach
 
     kinds = kinds or KINDS
     pool = plan_pool(splats, _VIEWS, seed=seed, rows=_ROWS, near=_NEAR, looks=True, progress=progress)

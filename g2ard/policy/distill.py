@@ -16,8 +16,8 @@ from g2ard.policy.inputs import load_scene, say_regions
 from g2ard.policy.job import DistillJob
 from g2ard.policy.views import is_made, views_of
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.regions import as_regions
-from g2ard.splats import Splats
+from g2ard.scene.regions import as_regions
+from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:
     from g2ard.io.types import Points
@@ -108,7 +108,7 @@ def prepare(
     Raises:
         InputError: as `distill`.
     """
-    from g2ard.constants import changed, full_names
+    from g2ard.config.constants import changed, full_names
     from g2ard.pipeline import DistillConfig
     from g2ard.policy.clean import clutter_seen
     from g2ard.stages.lift import LiftConfig
@@ -179,7 +179,7 @@ def prepare(
 
 def _task(prior: Splats, aims: Sequence[Aim], photos: int, renders: int) -> str:
     """What is to be made of what, in words."""
-    from g2ard.targets import kinds_told
+    from g2ard.scene.targets import kinds_told
 
     counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
     views = plural(photos + renders, "view")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from g2ard.choices import Engine
+from g2ard.config.choices import Engine
 
 if TYPE_CHECKING:
     from g2ard.policy.inputs import Views
@@ -25,7 +25,7 @@ class DistillOptions:
 
     Args:
         format: of the file that `fit` speaks of: ply, compressed.ply, sog, spz, glb or splat.
-        clean: first take out what no picture of the scene needs (`g2ard.clean`).
+        clean: first take out what no picture of the scene needs (`g2ard.stages.clean`).
         views: cameras in world coordinates, or where they lie; None takes those beside the scene, else makes
             a pool of poses; "made" always makes one. Their test split is held out.
         photos: True for the views' photos as targets, and no view without one; False for the scene's renders;

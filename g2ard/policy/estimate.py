@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from g2ard.errors import InputError
-from g2ard.memory import peak_rss
 from g2ard.policy.tile_memory import RECOVERY_TIMES, TileMemory, amount
 from g2ard.progress import plural
-from g2ard.targets import CACHE_BYTES, Targets
+from g2ard.rendering.visibility import MOST_LOOKS, fewest_looks, visibility_source
+from g2ard.scene.targets import CACHE_BYTES, Targets
+from g2ard.system.memory import peak_rss
 from g2ard.tiles.pour import foretold
 from g2ard.tiles.store import row_width
-from g2ard.visibility import MOST_LOOKS, fewest_looks, visibility_source
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Cameras
     from g2ard.policy.job import DistillJob
-    from g2ard.splats import Splats
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
 
 __all__ = ["Estimate", "check_memory", "estimate", "total"]
 

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.metrics import psnr, ssim
 from g2ard.policy.budget import Budget
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.splats import Splats
-from g2ard.stages.render import Renderer
+from g2ard.rendering.metrics import psnr, ssim
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:
     from g2ard.stages.simplify import Simplified

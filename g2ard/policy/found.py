@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from g2ard.cameras import Cameras
-    from g2ard.splats import Splats
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
 
 __all__ = ["as_pool", "check_sight", "found_views", "warn_of_photos", "warn_of_sight"]
 
@@ -46,7 +46,7 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
     """
     from g2ard.errors import InputError
     from g2ard.io import find_views, read_view_set
-    from g2ard.splits import split_mask
+    from g2ard.scene.splits import split_mask
 
     path = find_views(scene)
     if path is None:
@@ -84,8 +84,8 @@ def check_sight(splats: Splats, cameras: Cameras, say: Say = unsaid) -> None:
     Raises:
         InputError: with what to look at.
     """
-    from g2ard.cameras import unseeing
     from g2ard.errors import InputError
+    from g2ard.scene.cameras import unseeing
 
     if not cameras.facing(splats.means + splats.offset).any():
         raise InputError(unseeing(cameras, "the scene"))
@@ -99,8 +99,8 @@ def warn_of_photos(
     brightness of their pixels, in the median of a few small photos, is next to none."""
     import numpy as np
 
-    from g2ard.stages.render import Renderer
-    from g2ard.targets import Photos, mask_of
+    from g2ard.rendering.renderer import Renderer
+    from g2ard.scene.targets import Photos, mask_of
 
     pictured = np.flatnonzero([path is not None for path in cameras.image_paths])
     tried = np.unique(np.linspace(0, len(pictured) - 1, min(_LOOKED_AT, len(pictured))).astype(int))

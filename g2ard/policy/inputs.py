@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from g2ard.cameras import Cameras
     from g2ard.io import Note, ViewSet
-    from g2ard.splats import Splats
-    from g2ard.stages.render import RasterSettings
+    from g2ard.rendering.renderer import RasterSettings
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
+    from g2ard.scene.targets import Targets
     from g2ard.stages.simplify import SimplifyConfig
-    from g2ard.targets import Targets
 
     Views = Cameras | ViewSet | str | Path  # read already, or where they lie
 
@@ -61,7 +61,7 @@ def say_regions(splats: Splats, config: SimplifyConfig, name: str, say: Say) -> 
         InputError: none.
     """
     from g2ard.errors import InputError
-    from g2ard.regions import in_any
+    from g2ard.scene.regions import in_any
 
     if config.keep_region:
         inside = int(in_any(splats, config.keep_region).sum())
@@ -97,7 +97,7 @@ def load_view_sets(
     Raises:
         InputError: as `load_views`.
     """
-    from g2ard.splits import split_mask
+    from g2ard.scene.splits import split_mask
 
     found, path = _read(views, say, unpictured=unpictured)
     masks = [split_mask(path, found.cameras.names, split, stated=found.splits) for split in splits]
@@ -111,9 +111,9 @@ def load_for_training(
     states splits, else all; `unpictured` as for `load_views`.
 
     Raises:
-        InputError: as `load_views`, and as `g2ard.splits.for_training`.
+        InputError: as `load_views`, and as `g2ard.scene.splits.for_training`.
     """
-    from g2ard.splits import for_training
+    from g2ard.scene.splits import for_training
 
     found, path = _read(views, say, unpictured=unpictured)
     return found.take(for_training(path, found.cameras.names, found.splits)).resized(size)
@@ -123,9 +123,9 @@ def load_held_out(views: Views, size: int | None, say: Say = unsaid, *, unpictur
     """The views of a set given to score on; `unpictured` as for `load_views`.
 
     Raises:
-        InputError: as `load_views`, and as `g2ard.splits.for_scores`.
+        InputError: as `load_views`, and as `g2ard.scene.splits.for_scores`.
     """
-    from g2ard.splits import for_scores
+    from g2ard.scene.splits import for_scores
 
     found, path = _read(views, say, unpictured=unpictured)
     return found.take(for_scores(path, found.cameras.names, found.splits)).resized(size)
@@ -138,7 +138,7 @@ def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewS
         InputError: all of them are.
     """
     from g2ard.errors import InputError
-    from g2ard.splits import not_held_out
+    from g2ard.scene.splits import not_held_out
 
     keep = not_held_out(train.cameras, held_out)
     if not keep.any():
@@ -177,7 +177,7 @@ def load_split_views(
     Raises:
         InputError: as `load_views`.
     """
-    from g2ard.splits import split_mask, splits_of
+    from g2ard.scene.splits import split_mask, splits_of
 
     found, path = _read(views, say, unpictured=unpictured)
     names = found.cameras.names
@@ -213,7 +213,7 @@ def make_targets(
     """The teacher's renders (`lazy`: when first asked for), or the photos where no teacher is given; with
     `photos` the photo of each view that has one, and the teacher's render of the others."""
     from g2ard.io.exposures import find_exposures
-    from g2ard.targets import Photos, PhotosOrRenders, TeacherRenders
+    from g2ard.scene.targets import Photos, PhotosOrRenders, TeacherRenders
 
     if teacher is not None and not photos:
         return TeacherRenders(

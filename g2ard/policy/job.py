@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any
 from g2ard.policy.inputs import make_targets
 from g2ard.policy.views import RunViews
 from g2ard.progress import Progress, Say, silent, unsaid
-from g2ard.splats import Splats
-from g2ard.targets import kinds_of
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import kinds_of
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Cameras
     from g2ard.pipeline import DistillConfig, Distilled
     from g2ard.policy.fit import Aim
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.targets import Targets
     from g2ard.stages.lift import LiftConfig
     from g2ard.stages.recover.presets import PriorMeasures
-    from g2ard.targets import Targets
 
 __all__ = ["DistillJob"]
 

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 from g2ard.policy.budget import Budget
 from g2ard.policy.inputs import make_targets
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.reports import Report
-from g2ard.splats import Splats
+from g2ard.report.base import Report
+from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Cameras
     from g2ard.policy.inputs import Views
     from g2ard.policy.job import DistillJob
-    from g2ard.targets import Targets
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.targets import Targets
 
 __all__ = ["RATIOS", "LevelReport", "Levels", "check_ratios", "level_size", "lod"]
 
@@ -204,8 +204,8 @@ def _level(
 
 def _merged(job: DistillJob, finer: Splats, count: int) -> Splats:
     """One step of the chain, weighed by the views that recovery would learn from."""
+    from g2ard.rendering.visibility import visibility_source
     from g2ard.stages.simplify import simplify
-    from g2ard.visibility import visibility_source
 
     look = visibility_source(job.views.train.cameras, progress=job.progress)
     return simplify(finer, count, visibility=look, progress=job.progress).splats

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.images import load_image
 from g2ard.io.types import Points
 from g2ard.policy.inputs import load_for_training, load_view_sets
 from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.images import load_image
 
 if TYPE_CHECKING:
     from g2ard.policy.inputs import Views

@@ -10,12 +10,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Camera, Cameras
 from g2ard.errors import InputError
 from g2ard.io import read_view_set
 from g2ard.io.photos import photo_size
 from g2ard.progress import Progress, Say, silent, unsaid
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.splats import Splats
 
 __all__ = ["matched", "photos_of", "pool_of", "poses_for", "read_poses"]
 
@@ -38,7 +38,7 @@ def photos_of(
 
     Args:
         path: views with photos, or a folder of photos.
-        split: of views, see `g2ard.splits`; a folder has none but "all".
+        split: of views, see `g2ard.scene.splits`; a folder has none but "all".
         intrinsics: for a folder: views that hold the lens of each photo by name, or one lens for all.
         focal: for a folder: pixels of the photo as stored, principal point in the middle, no distortion.
         say: told what readers noticed.

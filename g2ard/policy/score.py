@@ -11,8 +11,8 @@ from g2ard.progress import Progress
 if TYPE_CHECKING:
     from g2ard.pipeline import Distilled
     from g2ard.policy.job import DistillJob
-    from g2ard.splats import Splats
-    from g2ard.targets import Targets
+    from g2ard.scene.splats import Splats
+    from g2ard.scene.targets import Targets
 
 __all__ = ["report_of"]
 
@@ -29,7 +29,7 @@ def report_of(job: DistillJob, done: Distilled, options: Mapping[str, Any] | Non
         Counts, bytes, scores in each kind of views (None where there are none of a kind), rounds, seconds by
         stage, and every constant.
     """
-    from g2ard.constants import listed
+    from g2ard.config.constants import listed
 
     kinds = {"scores": job.held_out, "apart": job.apart[1]}
     config = job.config

@@ -12,8 +12,8 @@ from g2ard.policy.budget import Budget
 from g2ard.policy.inputs import load_scene, say_regions
 from g2ard.policy.views import cameras_for_looks
 from g2ard.progress import Progress, Say, silent, unsaid
-from g2ard.regions import as_regions
-from g2ard.splats import Splats
+from g2ard.scene.regions import as_regions
+from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:
     from g2ard.policy.inputs import Views
@@ -86,7 +86,7 @@ def simplify(
     >>> len(small.splats), small.parents.shape, small.report.output_count
     (90, (900,), 90)
     """
-    from g2ard.constants import changed, full_names
+    from g2ard.config.constants import changed, full_names
     from g2ard.policy.fit import aim_of
     from g2ard.stages.simplify import SimplifyConfig
 
@@ -186,7 +186,7 @@ class Reduction:
 
     @cached_property
     def _look(self) -> VisibilitySource | None:
-        from g2ard.visibility import visibility_source
+        from g2ard.rendering.visibility import visibility_source
 
         cameras = None if self.blind else self._plan()
         return None if cameras is None else _remembering(visibility_source(cameras, progress=self.progress))

@@ -12,7 +12,7 @@ __all__ = ["RECOVERY_TIMES", "TASK_BYTES", "TileMemory", "amount", "cut_into"]
 TASK_BYTES, _ROW_BYTES, _ROW_TIMES = 200_000_000, 290, 0.8
 """Of a task at its peak: of the program, and of a tile's Gaussians, halo included, so many and so many times
 what their arrays take. Measured are 1.95 GB for 5.5 million of SH 0, and 0.98 GB for 1.8 million of SH 3
-(`benches/record/tiles.md`)."""
+(`benchmarks/record/tiles.md`)."""
 
 RECOVERY_TIMES = 1.5
 """Memory of a tile's recovery or scores, renders included, over that of merging it."""

@@ -17,10 +17,10 @@ from g2ard.policy.whole import refuse_whole, whole_budgets
 from g2ard.progress import Progress, Say, silent, unsaid
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Cameras
     from g2ard.policy.budget import Budget
     from g2ard.policy.inputs import Views
-    from g2ard.splats import Splats
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
     from g2ard.stages.simplify import SimplifyConfig
     from g2ard.tiles.simplify import TiledScene
     from g2ard.tiles.store import TileStore

@@ -13,10 +13,10 @@ from g2ard.policy.tiled import Tiling, cores_of, tiles_of, workers_for
 from g2ard.progress import Progress, Say, silent, unsaid
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Cameras
     from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.views import RunViews
-    from g2ard.splats import Splats
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.simplify import SimplifyConfig
     from g2ard.tiles.executor import Executor
@@ -129,9 +129,9 @@ def tiled_job(
     Raises:
         InputError: a scene or views that cannot be read, or too little memory for a tile.
     """
-    from g2ard.constants import changed, full_names
+    from g2ard.config.constants import changed, full_names
     from g2ard.policy.views import views_of
-    from g2ard.regions import as_regions
+    from g2ard.scene.regions import as_regions
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover.presets import preset_for
     from g2ard.stages.recover.schedule import schedule_named

@@ -17,9 +17,9 @@ from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.viewer import Start
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Camera, Cameras
     from g2ard.policy.inputs import Views
-    from g2ard.splats import Splats
+    from g2ard.scene.cameras import Camera, Cameras
+    from g2ard.scene.splats import Splats
 
 __all__ = ["Stand", "stand_of", "stand_with"]
 
@@ -60,7 +60,7 @@ class Stand:
 
     def of(self, splats: Splats) -> Splats:
         """A scene in this frame, without an offset."""
-        from g2ard.transform import transform
+        from g2ard.scene.transform import transform
 
         turn = np.eye(4)
         turn[:3, :3] = self.rotation

@@ -12,11 +12,11 @@ from g2ard.policy.inputs import drop_held_out, load_for_training, load_held_out,
 from g2ard.progress import Progress, Say, silent, unsaid
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Cameras
     from g2ard.io import ViewSet
     from g2ard.policy.inputs import Views
     from g2ard.poses import Pool
-    from g2ard.splats import Splats
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
 
     Up = Sequence[float] | None
 
@@ -99,7 +99,7 @@ def views_of(
     """
     from g2ard.errors import InputError
     from g2ard.io import ViewSet
-    from g2ard.splits import split_mask, splits_of
+    from g2ard.scene.splits import split_mask, splits_of
 
     found = None
     if views is None and beside is not None:
@@ -164,7 +164,7 @@ def views_or_pool(
     """
     from g2ard.io import ViewSet
     from g2ard.poses import plan_pool
-    from g2ard.splits import splits_of
+    from g2ard.scene.splits import splits_of
 
     if views is not None and not is_made(views):
         return views

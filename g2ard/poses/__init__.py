@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from numpy.typing import ArrayLike
 
-from g2ard.cameras import Cameras
 from g2ard.poses.pool import Pool, plan_pool
 from g2ard.progress import Progress, silent
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 
 __all__ = ["Pool", "make_pool", "plan_pool"]
 

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.cameras import Cameras
 from g2ard.poses.lattice import halton
 from g2ard.poses.numbers import canonical_order, norms, quantile
 from g2ard.poses.sight import Lens, Poses, clearance
 from g2ard.poses.site import Site
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 
 __all__ = ["Focus", "Glance", "plan_focus"]
 
@@ -94,7 +94,7 @@ class Glance:
 
     def of(self, cameras: Cameras, tell: Callable[[int, int], None], reach: Floats | None = None) -> Focus:
         """Look through each camera; what is farther than `reach`, (C,), is a backdrop and does not count."""
-        from g2ard.stages.render import RasterSettings, view_of
+        from g2ard.rendering.renderer import RasterSettings, view_of
 
         if not len(cameras):
             return Focus(*np.zeros((3, 0)))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 __all__ = ["along", "canonical_order", "middle", "moments", "norms", "quantile", "turned"]
 

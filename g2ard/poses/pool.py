@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.cameras import Cameras
-from g2ard.choices import POOL_KINDS
+from g2ard.config.choices import POOL_KINDS
 from g2ard.errors import InputError
 from g2ard.poses.aerial import plan_aerial
 from g2ard.poses.auto import plan_auto
@@ -24,8 +23,9 @@ from g2ard.poses.sight import Lens, Poses
 from g2ard.poses.site import Site
 from g2ard.poses.walk import plan_walk
 from g2ard.progress import Progress, counter, silent
-from g2ard.splats import Splats
-from g2ard.splits import HOLD_OUT
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+from g2ard.scene.splits import HOLD_OUT
 
 __all__ = ["Pool", "plan_pool"]
 

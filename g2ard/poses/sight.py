@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Cameras
 from g2ard.poses.site import Site
+from g2ard.scene.cameras import Cameras
 
 __all__ = ["Lens", "Poses", "ViewStatistics", "clearance", "view_statistics"]
 

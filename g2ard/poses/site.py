@@ -13,7 +13,7 @@ from g2ard.poses.numbers import along, middle, moments, quantile, turned
 from g2ard.poses.terrain import Terrain
 from g2ard.poses.up import Up, estimate_up, given_up
 from g2ard.poses.volume import OccupiedVolume, Sample
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 __all__ = ["Site"]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.poses.numbers import canonical_order, middle, norms, quantile
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 __all__ = ["OccupiedVolume", "Sample"]
 

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from g2ard.errors import InputError
-from g2ard.images import to_bytes
 from g2ard.progress import plural
+from g2ard.rendering.renderer import Renderer
 from g2ard.report.charts import Point, chart
 from g2ard.report.page import Comparison, Page, Shown, legend
 from g2ard.report.window import Crop
-from g2ard.splats import Splats
-from g2ard.stages.render import Renderer
-from g2ard.targets import Targets
+from g2ard.scene.images import to_bytes
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import Targets
 
 __all__ = ["check_crops", "distill_report"]
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.images import to_bytes
 from g2ard.io.atomic import atomic_output
 from g2ard.report.window import Window
+from g2ard.scene.images import to_bytes
 
 __all__ = ["COLORS", "Comparison", "Page", "Shown", "legend", "worst_windows"]
 

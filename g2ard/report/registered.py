@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.images import load_image, to_bytes
 from g2ard.progress import plural
+from g2ard.rendering.renderer import Renderer
 from g2ard.report.page import Comparison, Page, Shown
-from g2ard.splats import Splats
-from g2ard.stages.render import Renderer
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.images import load_image, to_bytes
+from g2ard.scene.splats import Splats
 
 __all__ = ["registration_report"]
 

@@ -9,18 +9,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from g2ard.appearance import blended, colour_change, recoloured, views_seeing
-from g2ard.choices import ADAPT_SCHEDULES, AdaptSchedule
+from g2ard.config.choices import ADAPT_SCHEDULES, AdaptSchedule
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, silent
-from g2ard.reports import Report
-from g2ard.splats import Splats
+from g2ard.report.base import Report
+from g2ard.scene.appearance import blended, colour_change, recoloured, views_seeing
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import Targets, fingerprint_of
 from g2ard.stages.recover import RecoverConfig, checkpoint, recover
 from g2ard.stages.recover.anchors import Regularizers
 from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.report import Gain
 from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
-from g2ard.targets import Targets, fingerprint_of
 
 __all__ = ["AdaptConfig", "AdaptReport", "Adapted", "adapt", "appearance_only"]
 
@@ -169,8 +169,8 @@ def adapt(
     """Refit spherical harmonics and opacities to targets; means, rotations and scales stay.
 
     First one affine map c ↦ M·(c, 1) of all colours, M (3, 4) by least squares
-    (`g2ard.appearance.colour_change`), where it gains enough on the images: a change of light is then right
-    in unseen places too. From there each Gaussian's own appearance, under L = (1−λ)·L1 + λ·(1−SSIM) as in
+    (`g2ard.scene.appearance.colour_change`), where it gains enough on the images: a change of light is then
+    right in unseen places too. Then each Gaussian's own appearance, under L = (1−λ)·L1 + λ·(1−SSIM) as in
     recovery, without regularisers. Last a blend: a Gaussian seen by v images goes v/(v + prior_views) of the
     way to its fit. PSNR on other trajectories then measures the geometry (`tab:geobase`).
 

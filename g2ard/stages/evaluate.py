@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from g2ard.images import as_saved
-from g2ard.lpips import Lpips
-from g2ard.metrics import psnr, ssim
 from g2ard.progress import Progress, silent
-from g2ard.splats import Splats
-from g2ard.targets import Targets, against_of, mask_of
+from g2ard.rendering.lpips import Lpips
+from g2ard.rendering.metrics import psnr, ssim
+from g2ard.scene.images import as_saved
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import Targets, against_of, mask_of
 
 if TYPE_CHECKING:
-    from g2ard.stages.render import RasterSettings
+    from g2ard.rendering.renderer import RasterSettings
 
 __all__ = ["Evaluation", "ViewScore", "evaluate"]
 
@@ -99,9 +99,9 @@ def evaluate(
         splats: the scene; its offset counts, cameras are in world coordinates.
         targets: photos or teacher renders; photo-relative and teacher-relative figures never mix.
         background: RGB in [0, 1] behind the scene.
-        lpips: networks to score with as well, as `g2ard.lpips.load_lpips` finds them.
+        lpips: networks to score with as well, as `g2ard.rendering.lpips.load_lpips` finds them.
         settings: the renderer's conventions; None means gsplat's. A teacher's renders have their own, see
-            `g2ard.targets.TeacherRenders`.
+            `g2ard.scene.targets.TeacherRenders`.
         eight_bit: round renders and targets to multiples of 1/255, as evaluations from saved PNGs do.
         progress: told after each view.
         stage: the name progress is reported under.
@@ -112,7 +112,7 @@ def evaluate(
     Raises:
         InputError: a photo cannot be read.
     """
-    from g2ard.stages.render import Renderer
+    from g2ard.rendering.renderer import Renderer
 
     cameras = targets.cameras
     renderer = Renderer(splats, background=background, settings=settings)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
-from g2ard.splats import SH_C0, Splats
+from g2ard.scene.splats import SH_C0, Splats
 
 __all__ = ["LiftConfig", "lift"]
 

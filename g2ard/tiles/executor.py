@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Protocol
 
 from g2ard.errors import InputError
-from g2ard.memory import forget_workers, note_worker, peak_rss
 from g2ard.progress import Progress, silent
+from g2ard.system.memory import forget_workers, note_worker, peak_rss
 from g2ard.tiles.task import Task, run_task
 
 __all__ = ["Executor", "executor"]

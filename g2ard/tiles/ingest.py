@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io import kind
-from g2ard.io.clean import Tally
 from g2ard.io.lock import LOCK, locked
 from g2ard.io.point_stream import open_point_stream
+from g2ard.io.sanitize import Tally
 from g2ard.io.stream import SceneStream, open_stream
 from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural, silent, unsaid
@@ -113,7 +113,7 @@ def ingest(
     >>> import tempfile
     >>> import numpy as np
     >>> from g2ard.io import write_splats
-    >>> from g2ard.splats import Splats
+    >>> from g2ard.scene.splats import Splats
     >>> work = Path(tempfile.mkdtemp())
     >>> row = np.stack([np.arange(100.0), np.zeros(100), np.zeros(100)], 1)
     >>> write_splats(work / "row.ply", Splats.create(row, scales=np.ones((100, 3))))

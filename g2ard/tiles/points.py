@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from g2ard.io.point_stream import PointStream, PointTally
 from g2ard.io.types import Note
 from g2ard.progress import Progress, Say
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 from g2ard.stages.lift import LiftConfig, lift
 from g2ard.tiles.cells import Points
 from g2ard.tiles.journal import POINTS, Journal

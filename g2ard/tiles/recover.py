@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Cameras
-from g2ard.constants import changed, values_of
-from g2ard.prepared import PreparedScene
+from g2ard.config.constants import changed, values_of
 from g2ard.progress import Progress, silent
-from g2ard.splats import SH_C0, Splats
+from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.prepared import PreparedScene
+from g2ard.scene.splats import SH_C0, Splats
+from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.anchors import Anchors
-from g2ard.stages.render import RasterSettings, Renderer, settings_for
-from g2ard.targets import TeacherRenders
 from g2ard.tiles.executor import Executor
 from g2ard.tiles.scenes import (
     Arguments,

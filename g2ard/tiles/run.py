@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from g2ard import _core
-from g2ard.prepared import finite_rows_of
 from g2ard.progress import Progress
+from g2ard.scene.prepared import finite_rows_of
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.executor import Executor
 from g2ard.tiles.scenes import joined, scene_of

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Cameras
-from g2ard.prepared import PreparedScene, as_prepared, finite_rows_of
-from g2ard.splats import Splats
-from g2ard.stages.render import RasterSettings
+from g2ard.rendering.renderer import RasterSettings
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
+from g2ard.scene.splats import Splats
 from g2ard.stages.simplify.pairs import fit_opacities
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.task import Arrays, load

@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.cameras import Cameras
 from g2ard.io.atomic import atomic_output
 from g2ard.progress import Progress
+from g2ard.rendering.visibility import LONGEST, MOST_LOOKS, NEAR
+from g2ard.scene.cameras import Cameras
 from g2ard.tiles.executor import Executor
 from g2ard.tiles.run import TiledRun
 from g2ard.tiles.scenes import scene_of
 from g2ard.tiles.steps import COARSE
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.task import Task, is_whole, load
-from g2ard.visibility import LONGEST, MOST_LOOKS, NEAR
 
 __all__ = ["Sights", "Surroundings", "in_sight", "light_of", "written"]
 

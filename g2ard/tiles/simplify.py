@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.stream import PartsStream
 from g2ard.progress import Progress, Say, silent, unsaid
-from g2ard.regions import Region, in_any
-from g2ard.splats import Splats, unit_quats
+from g2ard.scene.regions import Region, in_any
+from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.cut import cheapest
 from g2ard.tiles.executor import Executor
@@ -27,7 +27,7 @@ from g2ard.tiles.store import TileStore
 from g2ard.tiles.task import load
 
 if TYPE_CHECKING:
-    from g2ard.cameras import Cameras
+    from g2ard.scene.cameras import Cameras
 
 __all__ = ["TiledScene", "finished", "key_of", "sample_of", "simplify_tiles"]
 

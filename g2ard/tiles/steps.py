@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.prepared import PreparedScene, as_prepared
-from g2ard.splats import Splats
-from g2ard.stages.render import RasterSettings, view_of
+from g2ard.rendering.renderer import RasterSettings, view_of
+from g2ard.rendering.visibility import CONVERGED, NEAR, ROUND, spread
+from g2ard.scene.prepared import PreparedScene, as_prepared
+from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import SimplifyConfig, schedule, simplify
 from g2ard.stages.simplify.pairs import emphasised
 from g2ard.tiles.scenes import (
@@ -41,7 +42,6 @@ from g2ard.tiles.scenes import (
     with_surroundings,
 )
 from g2ard.tiles.task import Arrays, load
-from g2ard.visibility import CONVERGED, NEAR, ROUND, spread
 
 __all__ = ["COARSE", "coarse", "glance", "look", "look_again", "merge", "pair_plan", "run_costs"]
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import read_json
 from g2ard.io.types import Note
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 from g2ard.tiles.cells import Cell
 
 __all__ = ["MANIFEST", "Tile", "TileStore", "halo_name", "packed", "row_width", "tile_name", "unpacked"]

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 from g2ard.tiles.store import TileStore, unpacked
 
 __all__ = ["StoredScene"]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from g2ard.errors import InputError, OutputError
 
 if TYPE_CHECKING:
-    from g2ard.splats import Splats
+    from g2ard.scene.splats import Splats
 
 __all__ = ["Start", "Written", "check_page_output", "write_page"]
 

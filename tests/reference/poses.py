@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 
 def king_steps(cells, reach):

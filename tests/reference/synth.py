@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from g2ard.synth.shapes import Kind, Shapes
+from benchmarks.synth.shapes import Kind, Shapes
 
 
 def first_hits(shapes: Shapes, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from g2ard import _core
+from g2ard.rendering.renderer import view_of
 from g2ard.stages.recover.schedule import Rates
-from g2ard.stages.render import view_of
 from stress.scenes import NAMES, Problem, random_problem
 
 __all__ = ["THREADS", "differing", "large_problem"]

@@ -25,15 +25,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scenes import around, checkered_ball
 
-from g2ard import _core, io, visibility
-from g2ard.cameras import Cameras
-from g2ard.splats import Splats
+from g2ard import _core, io
+from g2ard.rendering import visibility
+from g2ard.rendering.renderer import RasterSettings, Renderer, arrays_of, view_of
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import PRESETS
-from g2ard.stages.render import RasterSettings, Renderer, arrays_of, view_of
 from g2ard.stages.select import CoverageOptions, select
 from g2ard.stages.simplify import METHODS, flag, simplify
-from g2ard.targets import TeacherRenders
 
 __all__ = ["lines", "random_scene"]
 

@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from reference import raster as reference
 
-from g2ard.cameras import Cameras, look_at
+from g2ard.rendering.renderer import RasterSettings
+from g2ard.scene.cameras import Cameras, look_at
 from g2ard.stages.recover.rasterize import rasterize
-from g2ard.stages.render import RasterSettings
 
 __all__ = ["NAMES", "Params", "Problem", "random_problem", "weighted"]
 

@@ -21,8 +21,6 @@ COMMANDS = (
     "lod",
     "evaluate",
     "info",
-    "bench",
-    "synth",
 )
 
 

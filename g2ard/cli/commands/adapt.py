@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from g2ard.choices import AdaptSchedule
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
@@ -21,6 +20,7 @@ from g2ard.cli.options import (
     TeacherOption,
     trained_on,
 )
+from g2ard.config.choices import AdaptSchedule
 from g2ard.progress import plural
 
 
@@ -51,7 +51,7 @@ def adapt(
 ) -> None:
     """Refit colours and opacities to new images; means, rotations and scales stay as they are."""
     from g2ard.cli.resume import check_stopped, left_at, stoppable
-    from g2ard.constants import changed, listed
+    from g2ard.config.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
     from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import load_scene, load_trained, make_targets

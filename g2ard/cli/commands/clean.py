@@ -36,11 +36,11 @@ def clean(
     What is seen is measured from a pool of poses of the scene's own.
     """
     from g2ard import io
-    from g2ard.clean import KINDS
     from g2ard.cli.cleaning import paint_clutter
     from g2ard.errors import InputError
     from g2ard.policy.clean import clutter_seen
     from g2ard.policy.inputs import load_scene
+    from g2ard.stages.clean import KINDS
 
     kinds = KINDS if only is None else tuple(word.strip() for word in only.split(","))
     if wrong := [word for word in kinds if word not in KINDS]:

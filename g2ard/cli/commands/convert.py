@@ -12,7 +12,7 @@ from g2ard.cli.lists import numbers
 from g2ard.cli.options import ShDegreeOption
 
 if TYPE_CHECKING:
-    from g2ard.splats import Splats
+    from g2ard.scene.splats import Splats
 
 
 @command("convert", example="g2ard convert room.ply tree.spz --box -2,-2,-2,2,2,2 both.sog")
@@ -61,8 +61,8 @@ def convert(
     from g2ard import io
     from g2ard.io.scene_formats import check_options
     from g2ard.policy.inputs import load_scene
-    from g2ard.transform import in_box, in_sphere, merge
-    from g2ard.transform import transform as moved
+    from g2ard.scene.transform import in_box, in_sphere, merge
+    from g2ard.scene.transform import transform as moved
 
     scenes, output = _parted(run, scenes, output)
     options: dict[str, Any] = {} if spz_version is None else {"version": spz_version}

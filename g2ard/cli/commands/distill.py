@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from g2ard.choices import Method, ScheduleName
 from g2ard.cli.budget_options import (
     Count,
     CountsOption,
@@ -60,6 +59,7 @@ from g2ard.cli.tile_options import (
     tiling_of,
 )
 from g2ard.cli.tiled import TiledCommand
+from g2ard.config.choices import Method, ScheduleName
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -67,8 +67,8 @@ if TYPE_CHECKING:
     from g2ard.policy.budget import Budget
     from g2ard.policy.job import DistillJob
     from g2ard.report.window import Crop
-    from g2ard.splats import Splats
-    from g2ard.targets import Targets
+    from g2ard.scene.splats import Splats
+    from g2ard.scene.targets import Targets
 
     Colour = tuple[float, float, float]
 
@@ -364,7 +364,7 @@ def _write(
 ) -> None:
     """The picture, the scene and, last, what is said of both."""
     from g2ard.io import write_splats
-    from g2ard.preview import preview
+    from g2ard.report.preview import preview
 
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
     preview(place.parent / "preview.png", unseen, scenes, colour)

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import typer
 
-from g2ard.choices import LpipsInput
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
@@ -19,6 +18,7 @@ from g2ard.cli.options import (
     can_be_made,
     views_or_teacher,
 )
+from g2ard.config.choices import LpipsInput
 from g2ard.progress import plural
 
 
@@ -58,12 +58,12 @@ def evaluate(
     from g2ard.errors import InputError
     from g2ard.io import check_scene
     from g2ard.io.describe import bytes_of
-    from g2ard.lpips import load_lpips
     from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import load_scene, load_views, make_targets
+    from g2ard.rendering.lpips import load_lpips
+    from g2ard.rendering.renderer import RasterSettings
     from g2ard.stages.evaluate import evaluate as score
     from g2ard.stages.recover.anchors import Anchors, drift95, needle
-    from g2ard.stages.render import RasterSettings
 
     if photos and teacher is None:
         raise typer.BadParameter("--photos goes with --teacher: without a teacher all targets are photos")

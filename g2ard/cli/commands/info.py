@@ -99,7 +99,7 @@ def _devices(run: Run) -> None:
     """Every adapter and its limits, and what --device takes."""
     from dataclasses import asdict
 
-    from g2ard import devices
+    from g2ard.system import devices
 
     found = devices.adapters()
     real = next((a.name for a in found or () if a.kind != "cpu"), None)

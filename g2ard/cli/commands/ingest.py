@@ -36,9 +36,9 @@ def ingest(
     --resume or without."""
     import time
 
-    from g2ard.constants import changed
-    from g2ard.memory import peak_rss
+    from g2ard.config.constants import changed
     from g2ard.stages.lift import LiftConfig
+    from g2ard.system.memory import peak_rss
     from g2ard.tiles.ingest import TILE_ROWS
     from g2ard.tiles.ingest import ingest as into_tiles
 

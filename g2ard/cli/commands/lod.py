@@ -183,8 +183,8 @@ def _in_tiles(
 ) -> None:
     """What is done stays in the tiling's folder until all is, longer where the user named the folder."""
     from g2ard.levels import save_levels
-    from g2ard.memory import peak_rss_of_all
     from g2ard.policy.tiled_levels import lod_in_tiles
+    from g2ard.system.memory import peak_rss_of_all
 
     assert tiling.folder is not None
     run.kept = [f"what is done stands in {tiling.folder}, and the same command goes on"]

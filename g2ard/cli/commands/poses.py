@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from g2ard.choices import PoolKind
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import OutputOption, SceneArgument, UpOption
+from g2ard.config.choices import PoolKind
 from g2ard.progress import plural
 
 _FEW = 0.005
@@ -56,7 +56,7 @@ def poses(
     from g2ard.io import check_views_output, write_views
     from g2ard.policy.inputs import load_scene
     from g2ard.poses import plan_pool
-    from g2ard.splits import splits_of
+    from g2ard.scene.splits import splits_of
 
     check_views_output(output, run.overwrite)
     splats = load_scene(scene, run.say)

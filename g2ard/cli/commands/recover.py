@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from g2ard.choices import ScheduleName
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
@@ -27,10 +26,11 @@ from g2ard.cli.options import (
     trained_on,
     views_or_teacher,
 )
+from g2ard.config.choices import ScheduleName
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
-    from g2ard.splats import Splats
+    from g2ard.scene.splats import Splats
     from g2ard.stages.recover.anchors import Anchors
 
 
@@ -72,7 +72,7 @@ def recover(
 ) -> None:
     """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
     from g2ard.cli.resume import check_stopped, left_at, stoppable
-    from g2ard.constants import changed, listed
+    from g2ard.config.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
     from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import (
@@ -80,12 +80,12 @@ def recover(
         load_trained,
         make_targets,
     )
+    from g2ard.scene.targets import kinds_of
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover import recover as optimize
     from g2ard.stages.recover.outcome import outcome, unregularized
     from g2ard.stages.recover.presets import preset_for
     from g2ard.stages.recover.schedule import schedule_named
-    from g2ard.targets import kinds_of
 
     values = run.constants(recover=RecoverConfig())
     one_horizon(steps, recovery_time, values)

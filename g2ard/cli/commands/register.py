@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from g2ard.choices import Keep, Refinement
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import BackgroundOption, OutputOption, SceneArgument
+from g2ard.config.choices import Keep, Refinement
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def register(
     """
     from dataclasses import replace
 
-    from g2ard.constants import changed, listed
+    from g2ard.config.constants import changed, listed
     from g2ard.errors import InputError
     from g2ard.io import check_views_output, write_views
     from g2ard.io.atomic import check_output

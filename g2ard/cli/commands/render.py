@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from g2ard.choices import Method
 from g2ard.cli.budget_options import Count, LooksOption, RatioOption, one_budget
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
@@ -22,13 +21,14 @@ from g2ard.cli.options import (
     is_made,
     picture,
 )
+from g2ard.config.choices import Method
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from g2ard.splats import Splats
+    from g2ard.scene.splats import Splats
 
 Color = Literal["scene", "flags", "cells", "parents"]
 
@@ -65,13 +65,13 @@ def render(
     """Render a scene into every view as PNG, or what simplification makes of it painted on its surfaces."""
     import numpy as np
 
-    from g2ard.images import write_png
     from g2ard.io.atomic import check_output
     from g2ard.io.paths import output_names
     from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import load_scene, load_views
     from g2ard.policy.views import views_or_pool
-    from g2ard.stages.render import RasterSettings, Renderer
+    from g2ard.rendering.renderer import RasterSettings, Renderer
+    from g2ard.scene.images import write_png
 
     if output is None and sheet is None:
         raise typer.BadParameter("give -o DIR, --sheet FILE.png or both")
@@ -133,7 +133,7 @@ def _write_sheet(
     """A grid about as wide as high; views of several sizes stand in rows of their own."""
     import math
 
-    from g2ard.images import contact_sheet, write_png
+    from g2ard.scene.images import contact_sheet, write_png
 
     columns = math.ceil(math.sqrt(len(images)))
     rows = [images[i : i + columns] for i in range(0, len(images), columns)]
@@ -170,7 +170,7 @@ def _check(color: Color, count: Count | None, ratio: float | None, parents: Path
 def _painted(
     run: Run, splats: Splats, color: Color, budget: int | None, method: Method, parents: Path | None
 ) -> Splats:
-    from g2ard.paint import cell_labels, flag_colors, label_colors, painted
+    from g2ard.report.paint import cell_labels, flag_colors, label_colors, painted
     from g2ard.stages.simplify import flag, simplify
 
     if color == "flags":

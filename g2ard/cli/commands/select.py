@@ -46,7 +46,7 @@ def select(
 
     Views that are not for training follow after them, with their split and no weight, to score on.
     """
-    from g2ard.constants import changed, listed
+    from g2ard.config.constants import changed, listed
     from g2ard.io import check_views_output
     from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import load_scene, load_split_views

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from g2ard.choices import Method
 from g2ard.cli.budget_options import CountsOption, FitOption, MinPsnrOption, MinSsimOption, RatiosOption
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
@@ -31,6 +30,7 @@ from g2ard.cli.tile_options import (
     tiling_of,
 )
 from g2ard.cli.tiled import TiledCommand
+from g2ard.config.choices import Method
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def simplify(
         raise typer.BadParameter("--keep-region: needs views, which --no-views and --method paper do without")
     tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)
     from g2ard import io
-    from g2ard.constants import changed
+    from g2ard.config.constants import changed
     from g2ard.policy.fit import aim_of
     from g2ard.policy.inputs import say_notes
     from g2ard.policy.simplify import Reduction
@@ -167,8 +167,8 @@ def _bytes_of(place: Path) -> int:
 def _report(
     run: Run, found: Scene, small: Simplified, config: SimplifyConfig, method: str, clock: list[float]
 ) -> dict[str, Any]:
-    from g2ard.constants import listed
-    from g2ard.memory import peak_rss
+    from g2ard.config.constants import listed
+    from g2ard.system.memory import peak_rss
 
     began, read, simplified, written = clock
     return {

@@ -12,7 +12,7 @@ from g2ard.cli.options import BackgroundOption, OutputOption, UpOption, ViewsOrM
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
-    from g2ard.splats import Splats
+    from g2ard.scene.splats import Splats
 
 
 @command("view", example="g2ard view run/ dense.ply -o compare.html")

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import require
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
 
 __all__ = [
     "NEEDLE_RANK",

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import interrupt
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
+from g2ard.system import interrupt
 
 __all__ = ["PERIOD", "deferred_interrupt", "load", "save"]
 

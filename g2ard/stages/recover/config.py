@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from g2ard.choices import Engine
+from g2ard.config.choices import Engine
 from g2ard.errors import InputError
 from g2ard.stages.recover.anchors import PRESETS, Regularizers
 from g2ard.stages.recover.schedule import TUNED, Schedule

@@ -9,10 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Cameras
-from g2ard.choices import ENGINES
+from g2ard.config.choices import ENGINES
 from g2ard.errors import InputError
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, Regularizers
 from g2ard.stages.recover.schedule import Rates
 

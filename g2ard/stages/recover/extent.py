@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from g2ard.cameras import Cameras
+from g2ard.scene.cameras import Cameras
 
 __all__ = ["extents", "rotations", "share_of_rate"]
 

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.splats import Splats
+from g2ard.rendering.renderer import arrays_of, settings_for, view_of
+from g2ard.scene.splats import Splats
 from g2ard.stages.recover.engine import Objective
 from g2ard.stages.recover.schedule import Rates
 from g2ard.stages.recover.sizes import radii
-from g2ard.stages.render import arrays_of, settings_for, view_of
 
 __all__ = ["FusedEngine"]
 

@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.splats import Splats
-from g2ard.stages.render import arrays_of
+from g2ard.rendering.renderer import arrays_of
+from g2ard.scene.splats import Splats
 
 __all__ = ["LOOKS", "Guard", "blended"]
 

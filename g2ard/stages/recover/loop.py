@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.progress import Progress, silent
-from g2ard.splats import Splats
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import Targets, fingerprint_of, mask_of
 from g2ard.stages.recover import checkpoint as checkpoints
 from g2ard.stages.recover.anchors import Anchors, drift95, needle
 from g2ard.stages.recover.config import RecoverConfig
@@ -23,7 +24,6 @@ from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.probe import MULTIPLIERS, Probe, calm, search_multiplier, trial_steps
 from g2ard.stages.recover.schedule import multiplier_for, reach_for
 from g2ard.stages.recover.sizes import typical_share
-from g2ard.targets import Targets, fingerprint_of, mask_of
 
 __all__ = ["Loop", "Watch", "finite"]
 

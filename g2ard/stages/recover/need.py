@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from g2ard.cameras import Cameras
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 
 __all__ = ["steps_for"]
 
@@ -32,7 +32,7 @@ def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
     Returns:
         Between `steps` and 2.25 times that.
 
-    >>> from g2ard.cameras import look_at
+    >>> from g2ard.scene.cameras import look_at
     >>> line = Splats.create([[0, 0, 0], [9, 0, 0], [0, 0, 9], [-9, 0, 0]], scales=np.ones((4, 3)))
     >>> K = [[50, 0, 32], [0, 50, 32], [0, 0, 1]]
     >>> view = Cameras.from_lists([look_at([0, -3, 0], [0, 0, 0])], [K], [(64, 64)], ["a"])

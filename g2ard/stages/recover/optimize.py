@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.cameras import unseeing
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
-from g2ard.splats import Splats
+from g2ard.scene.cameras import unseeing
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import Targets, fingerprint_of
 from g2ard.stages.recover.anchors import Anchors, drift95, needle
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import checked_weights
@@ -27,7 +28,6 @@ from g2ard.stages.recover.report import (
     Trial,
     Validation,
 )
-from g2ard.targets import Targets, fingerprint_of
 
 __all__ = ["Recovered", "Watch", "recover"]
 

@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS, Regularizers, needle
 
 __all__ = ["PriorMeasures", "measure_prior", "preset_for", "view_consistency"]
@@ -87,7 +87,7 @@ def view_consistency(scene: Splats, cameras: Cameras) -> float | None:
         Agreeing over agreeing and floating points, in [0, 1]; None if no point is in two views.
     """
     from g2ard import _core
-    from g2ard.stages.render import arrays_of, centred, settings_for, view_of
+    from g2ard.rendering.renderer import arrays_of, centred, settings_for, view_of
 
     if len(cameras) < 2 or not len(scene):
         return None

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from g2ard.metrics import psnr
-from g2ard.splats import Splats
-from g2ard.targets import Targets, mask_of
+from g2ard.rendering.metrics import psnr
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import Targets, mask_of
 
 if TYPE_CHECKING:
-    from g2ard.stages.render import Renderer
+    from g2ard.rendering.renderer import Renderer
 
 __all__ = ["MULTIPLIERS", "Probe", "calm", "search_multiplier", "trial_steps"]
 
@@ -112,7 +112,7 @@ class Probe:
 
     def all_of(self, splats: Splats) -> float:
         """Mean over all of the views."""
-        from g2ard.stages.render import Renderer
+        from g2ard.rendering.renderer import Renderer
 
         renderer = Renderer(splats, background=self._background)
         return float(np.mean([self._score(renderer, view) for view in self._views]))

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from g2ard import _core
-from g2ard.cameras import Cameras
 from g2ard.errors import InputError
-from g2ard.stages.render import RasterSettings, View, view_of
+from g2ard.rendering.renderer import RasterSettings, View, view_of
+from g2ard.scene.cameras import Cameras
 
 __all__ = ["rasterize"]
 
@@ -102,7 +102,7 @@ def rasterize(
         InputError: a tensor that is not float32 on the CPU, shapes that do not fit, an index out of range.
 
     >>> import torch
-    >>> from g2ard.cameras import Cameras, look_at
+    >>> from g2ard.scene.cameras import Cameras, look_at
     >>> views = Cameras.from_lists(
     ...     [look_at([0, -2, 0], [0, 0, 0])], [[[50, 0, 16], [0, 50, 12], [0, 0, 1]]], [(32, 24)], ["front"])
     >>> means = torch.zeros(1, 3, requires_grad=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from g2ard.reports import LEFT_OUT, Report
+from g2ard.report.base import LEFT_OUT, Report
 
 __all__ = ["Gain", "Geometry", "Look", "RecoverReport", "Regularized", "Trial", "Validation"]
 

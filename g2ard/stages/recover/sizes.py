@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Cameras
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 
 __all__ = ["radii", "typical_share"]
 
@@ -36,7 +36,7 @@ def typical_share(splats: Splats, cameras: Cameras) -> float:
         splats: the scene; its offset counts, cameras are in world coordinates.
         cameras: evenly spaced ones of them are used; occlusion does not matter.
 
-    >>> from g2ard.cameras import look_at
+    >>> from g2ard.scene.cameras import look_at
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1, 0.2, 0.01]])
     >>> views = Cameras.from_lists(
     ...     [look_at([0, -2, 0], [0, 0, 0])], [[[50, 0, 16], [0, 50, 12], [0, 0, 1]]], [(40, 24)], ["v"])

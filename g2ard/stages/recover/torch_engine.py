@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from g2ard.splats import Splats
+from g2ard.rendering.renderer import settings_for
+from g2ard.scene.splats import Splats
 from g2ard.stages.recover.engine import Objective
 from g2ard.stages.recover.extent import extents, share_of_rate
 from g2ard.stages.recover.losses import l1_ssim
@@ -20,7 +21,6 @@ from g2ard.stages.recover.regularize import TorchAnchors, regularization
 from g2ard.stages.recover.schedule import Rates
 from g2ard.stages.recover.selective_adam import SelectiveAdam
 from g2ard.stages.recover.sizes import radii
-from g2ard.stages.render import settings_for
 
 __all__ = ["TorchEngine"]
 

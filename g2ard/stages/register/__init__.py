@@ -9,11 +9,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.cameras import Cameras
-from g2ard.choices import Keep
+from g2ard.config.choices import Keep
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
-from g2ard.splats import Splats
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 from g2ard.stages.register.attempts import Candidate, Photo, Search, Start, loaded
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import band_passed
@@ -28,7 +29,6 @@ from g2ard.stages.register.outcome import (
 )
 from g2ard.stages.register.pool import PoolRenders, small_render, turned
 from g2ard.stages.register.pose import pose_error
-from g2ard.stages.render import Renderer
 
 __all__ = [
     "PhotoReport",
@@ -89,7 +89,7 @@ def register(
             matcher that is none.
         MissingDependencyError: a matcher is asked for without the extra `register`.
 
-    >>> from g2ard.cameras import Camera
+    >>> from g2ard.scene.cameras import Camera
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
     >>> view = Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0], name="a.png")])
     >>> report = register(dot, view, starts={"a.png": view.viewmats[0]}).report

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.cameras import Camera
+from g2ard.rendering.renderer import Rendered, Renderer
+from g2ard.scene.cameras import Camera
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import blurred, gradient
 from g2ard.stages.register.pose import moved
-from g2ard.stages.render import Rendered, Renderer
 
 __all__ = [
     "Aligned",

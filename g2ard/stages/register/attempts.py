@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Camera, Cameras
-from g2ard.images import load_image, load_mask, resized
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.images import load_image, load_mask, resized
 from g2ard.stages.register.align import Aligned, Level, align, inverse, level_of
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import grey_of, local_zncc
@@ -16,7 +17,6 @@ from g2ard.stages.register.matchers import Matcher
 from g2ard.stages.register.polish import Prior, polish
 from g2ard.stages.register.pose import motion_between, moved
 from g2ard.stages.register.solve import Solved, solve
-from g2ard.stages.render import Renderer
 
 __all__ = ["Candidate", "Photo", "Search", "Start", "loaded"]
 

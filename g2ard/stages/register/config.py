@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from g2ard.choices import REFINEMENTS, Refinement
+from g2ard.config.choices import REFINEMENTS, Refinement
 from g2ard.errors import require
 
 __all__ = ["RegisterConfig"]

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Cameras
-from g2ard.choices import Keep
-from g2ard.reports import Report
+from g2ard.config.choices import Keep
+from g2ard.report.base import Report
+from g2ard.scene.cameras import Cameras
 
 __all__ = ["KEPT", "PhotoReport", "PoseError", "RegisterReport", "Registered", "Status"]
 

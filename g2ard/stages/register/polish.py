@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Camera
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Camera
 from g2ard.stages.register.align import (
     Aligned,
     Level,
@@ -29,7 +30,6 @@ from g2ard.stages.register.align import (
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import LUMA, blurred_back
 from g2ard.stages.register.pose import motion_between, moved
-from g2ard.stages.render import Renderer
 
 __all__ = ["Energy", "Point", "Prior", "polish"]
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Camera, Cameras
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Camera, Cameras
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import band_passed, grey_of, shift_between
 from g2ard.stages.register.pose import rotation_of
-from g2ard.stages.render import Renderer
 
 __all__ = ["PoolRenders", "Turned", "turned"]
 

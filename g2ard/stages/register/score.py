@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from g2ard.choices import Keep
+from g2ard.config.choices import Keep
 from g2ard.errors import require
-from g2ard.reports import Report
+from g2ard.report.base import Report
 from g2ard.stages.register.outcome import KEPT, PhotoReport, PoseError
 
 __all__ = ["RECALLS", "Accuracy", "Summary", "summarize"]

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Camera
+from g2ard.rendering.renderer import Rendered, Renderer
+from g2ard.scene.cameras import Camera
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.matchers import Matcher
-from g2ard.stages.render import Rendered, Renderer
 
 __all__ = ["Solved", "information", "lifted", "solve", "solved"]
 

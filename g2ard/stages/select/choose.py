@@ -9,11 +9,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.cameras import Cameras, unseeing
-from g2ard.choices import POLICIES, UNMEASURED
+from g2ard.config.choices import POLICIES, UNMEASURED
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras, unseeing
+from g2ard.scene.splats import Splats
 from g2ard.stages.select import poses
 from g2ard.stages.select.surfaces import CoverageOptions, greedy, surface
 
@@ -92,7 +92,7 @@ def select(
     Raises:
         InputError: `k` is not positive, an unknown policy, no candidates, or none that sees the scene.
 
-    >>> from g2ard.cameras import look_at
+    >>> from g2ard.scene.cameras import look_at
     >>> ball = Splats.create(np.random.default_rng(0).normal(size=(500, 3)), scales=np.full((500, 3), 0.1))
     >>> around = [look_at([4 * np.cos(a), 4 * np.sin(a), 0], [0, 0, 0]) for a in (0.0, 0.1, 0.2, 3.1)]
     >>> K = [[50, 0, 32], [0, 50, 32], [0, 0, 1]]

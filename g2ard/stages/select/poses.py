@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.cameras import Cameras
 from g2ard.progress import Progress, counter
-from g2ard.splats import Splats
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 from g2ard.stages.select.surfaces import Surface, core_scene, core_views
 
 __all__ = [

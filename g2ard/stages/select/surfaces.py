@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.cameras import Cameras
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, silent
-from g2ard.splats import Splats
-from g2ard.stages.render import settings_for
+from g2ard.rendering.renderer import settings_for
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 
 __all__ = [
     "CoverageOptions",

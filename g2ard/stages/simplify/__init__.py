@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.prepared import PreparedScene, finite_rows_of, with_some_opacity
 from g2ard.progress import Progress, counter, silent
-from g2ard.splats import DRAWN_LOGIT, Splats, unit_quats
+from g2ard.scene.prepared import PreparedScene, finite_rows_of, with_some_opacity
+from g2ard.scene.splats import DRAWN_LOGIT, Splats, unit_quats
 from g2ard.stages.simplify.config import METHODS, SimplifyConfig, schedule
 from g2ard.stages.simplify.pairs import (
     Visibility,
@@ -135,8 +135,8 @@ def simplify(
             non-finite values are dropped and counted.
         budget: Gaussians to keep, at most as many as there are.
         method: the policy.
-        visibility: for `default` and `fast`: what views see of each Gaussian (`g2ard.visibility`), or
-            a function that finds it for a scene, asked again for the result, whose opacities it fits.
+        visibility: for `default` and `fast`: what views see of each Gaussian (`g2ard.rendering.visibility`),
+            or a function that finds it for a scene, asked again for the result, whose opacities it fits.
         protected: (N,) bool flags to inherit. With None, `paper` computes them (see `flag`), the others,
             which have no use for them, go without.
         final_budget: for `paper`: N_S, where this call is one round on the way to a smaller count; it sets

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass, field, replace
 
 from g2ard import _core
-from g2ard.choices import METHODS
+from g2ard.config.choices import METHODS
 from g2ard.errors import InputError
-from g2ard.regions import Region, check_region
+from g2ard.scene.regions import Region, check_region
 
 __all__ = ["METHODS", "SimplifyConfig", "schedule"]
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.prepared import PreparedScene
 from g2ard.progress import Progress, counter
-from g2ard.regions import in_any
-from g2ard.splats import DRAWN_LOGIT, Splats
+from g2ard.scene.prepared import PreparedScene
+from g2ard.scene.regions import in_any
+from g2ard.scene.splats import DRAWN_LOGIT, Splats
 from g2ard.stages.simplify.config import SimplifyConfig, schedule
 
 __all__ = [
@@ -47,7 +47,7 @@ DRAWN_OPACITY = float(1 / (1 + np.exp(-DRAWN_LOGIT)))
 
 
 class Visibility(Protocol):
-    """What views see of N Gaussians, such as `g2ard.visibility.visibility` returns."""
+    """What views see of N Gaussians, such as `g2ard.rendering.visibility.visibility` returns."""
 
     @property
     def weight(self) -> NDArray[Any]:
@@ -59,7 +59,7 @@ class Visibility(Protocol):
 
 
 VisibilitySource = Callable[[Splats], Visibility]
-"""Finds what views see of a scene, such as `g2ard.visibility.visibility_source` returns."""
+"""Finds what views see of a scene, such as `g2ard.rendering.visibility.visibility_source` returns."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-//! `g2ard.devices`: which device the kernels run on, for the whole process as their threads are.
+//! `g2ard.system.devices`: which device the kernels run on, for the whole process as their threads are.
 
 use std::sync::{Arc, PoisonError, RwLock};
 

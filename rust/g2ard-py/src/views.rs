@@ -27,7 +27,7 @@ impl View {
     }
 }
 
-/// The attributes of a `g2ard.stages.render.RasterSettings` that do not depend on the view.
+/// The attributes of a `g2ard.rendering.renderer.RasterSettings` that do not depend on the view.
 #[derive(FromPyObject)]
 pub struct RasterOptions {
     convention: String,

@@ -1,0 +1,90 @@
+"""PUP 3D-GS's pruning (arXiv 2406.10219): how sharply the views determine each Gaussian's place and size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.baselines.ranking import keep_best
+from g2ard import _core
+from g2ard.progress import Progress, counter, silent
+from g2ard.rendering.renderer import arrays_of, centred, settings_for, view_of
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+
+__all__ = ["fisher", "pup", "rounds", "sensitivity"]
+
+_FIRST, _TOTAL = 0.2, 0.1
+"""The release keeps a fifth, then half of it."""
+
+_DOWNSAMPLE = 4
+_SINGULAR = 1e-7
+"""Least eigenvalue of F with unit diagonal; pixels are summed in float32, so below this it is rounding."""
+
+
+def fisher(splats: Splats, cameras: Cameras, *, progress: Progress = silent) -> NDArray[np.float64]:
+    """(N, 6, 6) F = Σ g gᵀ over views, pixels and channels, g = ∂C/∂(mean, log scale).
+
+    Args:
+        splats: the scene.
+        cameras: the views, at the size they are to be rendered at.
+        progress: told after each view.
+    """
+    splats, cameras = centred(splats, cameras)
+    settings = settings_for(splats.means)
+    views = [view_of(cameras, i, settings) for i in range(len(cameras))]
+    upper = _core.sensitivity(arrays_of(splats), views, settings, counter(progress, "sensitivity"))
+    out = np.zeros((len(splats), 6, 6))
+    rows, columns = np.triu_indices(6)
+    out[:, rows, columns] = out[:, columns, rows] = upper
+    return out
+
+
+def sensitivity(splats: Splats, cameras: Cameras, *, progress: Progress = silent) -> NDArray[np.float64]:
+    """(N,) log det F at a quarter of the views' size; −∞ where F is singular."""
+    return _log_det(fisher(splats, _quarter(cameras), progress=progress))
+
+
+def pup(splats: Splats, budget: int, cameras: Cameras, *, progress: Progress = silent) -> Splats:
+    """The `budget` Gaussians of highest `sensitivity`: one round. See `rounds` for the release's two.
+
+    Raises:
+        InputError: the budget does not fit.
+    """
+    return keep_best(splats, sensitivity(splats, cameras, progress=progress), budget)
+
+
+def rounds(count: int, budget: int) -> list[int]:
+    """Counts after each round: for 10× a fifth, then half of that, as released; other ratios split in like
+    proportion of their logarithm.
+
+    >>> rounds(1000, 100), rounds(1000, 1000)
+    ([200, 100], [1000])
+    """
+    share = budget / count
+    first = round(count * share ** (np.log(_FIRST) / np.log(_TOTAL)))
+    return [first, budget] if budget < first < count else [budget]
+
+
+def _quarter(cameras: Cameras) -> Cameras:
+    """⌈W/4⌉ × ⌈H/4⌉."""
+    widths, heights = -(-cameras.widths // _DOWNSAMPLE), -(-cameras.heights // _DOWNSAMPLE)
+    Ks = cameras.Ks.copy()
+    Ks[:, 0] *= (widths / cameras.widths)[:, None]
+    Ks[:, 1] *= (heights / cameras.heights)[:, None]
+    return replace(cameras, Ks=Ks, widths=widths, heights=heights)
+
+
+def _log_det(F: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of F scaled to a unit diagonal, whose eigenvalues tell rank from rounding, plus the scale's."""
+    diagonal = np.einsum("nii->ni", F)
+    lively = (diagonal > 0).all(1) & np.isfinite(F).all((1, 2))
+    root = np.sqrt(diagonal[lively])
+    values = np.linalg.eigvalsh(F[lively] / (root[:, :, None] * root[:, None, :]))
+    regular = values[:, 0] > _SINGULAR
+    out = np.full(len(F), -np.inf)
+    logs = np.log(np.where(regular[:, None], values, 1)).sum(1) + 2 * np.log(root).sum(1)
+    out[lively] = np.where(regular, logs, -np.inf)
+    return out

@@ -1,0 +1,141 @@
+"""What a cell's result is worth: figures of every view, and pictures of some."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from g2ard.rendering.lpips import Lpips
+from g2ard.rendering.metrics import psnr, ssim
+from g2ard.rendering.renderer import RasterSettings, Renderer
+from g2ard.scene.images import as_saved, to_bytes
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import Targets, mask_of
+
+__all__ = ["Scored", "ViewFigures", "luma", "pictured", "save_jpeg", "score"]
+
+_LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
+_PICTURES = 32
+_QUALITY = 88
+
+
+@dataclass(frozen=True)
+class ViewFigures:
+    """One view's figures; `luma` is the mean luma of the render less the target's, `black` whether all pixels
+    of the render are 0 in 8 bits, though not the target's."""
+
+    name: str
+    psnr: float
+    ssim: float
+    luma: float
+    lpips_alex: float | None = None
+    lpips_vgg: float | None = None
+    black: bool = False
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Means over the views, but for those that came out black (`tab:geobase`, †); of nothing but black ones
+    over all.
+
+    Args:
+        views: in the cameras' order.
+    """
+
+    views: tuple[ViewFigures, ...]
+
+    @property
+    def black(self) -> int:
+        """Views that came out black."""
+        return sum(view.black for view in self.views)
+
+    @property
+    def counted(self) -> tuple[ViewFigures, ...]:
+        """The views that the means are of."""
+        return tuple(view for view in self.views if not view.black) or self.views
+
+    def mean(self, name: str) -> float | None:
+        """Of one figure; None where it was not measured."""
+        values = [getattr(view, name) for view in self.counted]
+        return None if None in values else float(np.mean(values))
+
+    @property
+    def luma_drift(self) -> float:
+        """Mean over views of |mean luma of the render − the target's|, in [0, 1]: exposure that wandered
+        off."""
+        return float(np.mean([abs(view.luma) for view in self.counted]))
+
+
+def luma(image: NDArray[np.float32], mask: NDArray[np.bool_] | None = None) -> float:
+    """Mean Rec. 709 luma of an image in [0, 1], or of the pixels that count.
+
+    >>> round(luma(np.full((2, 2, 3), 0.5, np.float32)), 6)
+    0.5
+    """
+    pixels = image if mask is None else image[mask]
+    return float((pixels.astype(np.float64) @ _LUMA).mean())
+
+
+def score(
+    splats: Splats,
+    targets: Targets,
+    background: tuple[float, float, float],
+    *,
+    lpips: dict[str, Lpips] | None = None,
+    settings: RasterSettings | None = None,
+    eight_bit: bool = False,
+    pictures: Path | None = None,
+) -> Scored:
+    """Render and score every view; JPEGs of `pictured` ones go to `pictures`, by the view's number.
+
+    Args:
+        splats: the scene.
+        targets: photos or renders.
+        background: RGB behind the scene.
+        lpips: networks to score with as well.
+        settings: the renderer's conventions; None means gsplat's.
+        eight_bit: as for `g2ard.stages.evaluate.evaluate`.
+        pictures: a folder; None keeps no pictures.
+    """
+    renderer = Renderer(splats, background=background, settings=settings)
+    views = []
+    for number, name in enumerate(targets.cameras.names):
+        image, target = np.clip(renderer.image(targets.cameras[number]), 0, 1), targets[number]
+        if eight_bit:
+            image, target = as_saved(image), as_saved(target)
+        mask = mask_of(targets, number)
+        off = luma(image, mask) - luma(target, mask)
+        perceived = {f"lpips_{net}": model(image, target) for net, model in (lpips or {}).items()}
+        views.append(
+            ViewFigures(
+                name,
+                psnr(image, target, mask),
+                ssim(image, target, mask),
+                off,
+                **perceived,
+                black=not to_bytes(image).any() and bool(to_bytes(target).any()),
+            )
+        )
+        if pictures is not None and number in pictured(len(targets.cameras)):
+            save_jpeg(pictures / f"{number}.jpg", image)
+    return Scored(tuple(views))
+
+
+def pictured(count: int) -> list[int]:
+    """The views that are kept as pictures: all, or 32 evenly spaced.
+
+    >>> pictured(3), len(pictured(100))
+    ([0, 1, 2], 32)
+    """
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _PICTURES)).round().astype(int))
+    return [int(view) for view in chosen]
+
+
+def save_jpeg(path: Path, image: NDArray[np.float32]) -> None:
+    """Write an image in [0, 1], making its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(to_bytes(image)).save(path, quality=_QUALITY)

@@ -1,0 +1,137 @@
+"""Views of other kinds than a pool's, that no method sees: from near, and from where people stand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from g2ard import io
+from g2ard.errors import InputError
+from g2ard.poses import plan_pool
+from g2ard.poses.lattice import halton
+from g2ard.poses.orbit import plan_orbit
+from g2ard.poses.sight import Lens, Poses, view_statistics
+from g2ard.poses.site import Site
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+from g2ard.scene.splits import for_scores
+from g2ard.scene.targets import TeacherRenders
+
+__all__ = ["PROTOCOLS", "check_protocol", "given_views", "standing_targets", "standing_views"]
+
+PROTOCOLS: dict[str, tuple[str, ...]] = {
+    "pool": ("pool",),
+    "standing": ("near", "standing"),
+    "both": ("pool", "near", "standing"),
+}
+"""By protocol, the kinds of views that are scored."""
+
+_SEED = 7919
+"""Added to the seed of a pool: these poses are of another sequence than any that a method looks from."""
+
+_POOL, _NEAR, _STANDING = 128, 16, 24
+_FOV = 70.0
+"""Degrees; a pool's poses have 50."""
+
+_BETWEEN = (0.35, 0.8)
+"""Share of the way to an object's surface that is left to those who stand between near and far."""
+
+
+def check_protocol(protocol: str) -> tuple[str, ...]:
+    """The kinds of views that a protocol scores.
+
+    Raises:
+        InputError: an unknown protocol.
+    """
+    if protocol not in PROTOCOLS:
+        raise InputError(f"protocol: expected one of {', '.join(PROTOCOLS)}, got {protocol!r}")
+    return PROTOCOLS[protocol]
+
+
+def given_views(scene: Path) -> Cameras | None:
+    """The views of a standing.json in the scene's folder, or in the one above; None without.
+
+    Raises:
+        InputError: it is broken.
+    """
+    folder = scene.absolute() if scene.is_dir() else scene.absolute().parent
+    path = next((p for place in (folder, folder.parent) if (p := place / "standing.json").is_file()), None)
+    if path is None:
+        return None
+    found = io.read_view_set(path)
+    return found.cameras.take(for_scores(path, found.cameras.names, found.splits))
+
+
+def standing_views(splats: Splats, scene: Path, seed: int = 0) -> dict[str, Cameras]:
+    """Views by kind, "near" and "standing"; a kind for which there is no place is missing.
+
+    near: at most 16 on the way from poses of a pool to what those see. standing: of a standing.json beside
+    the scene; without, 24 poses 70° wide: between near and far for an object, at eye level for a landscape,
+    else a pool of its own. All are of another seed than the pools that methods make.
+
+    Raises:
+        InputError: nothing visible in the scene, or a broken standing.json.
+    """
+    pool = plan_pool(splats, _POOL, seed=seed + _SEED, apart=_NEAR)
+    found = {} if pool.apart is None else {"near": pool.apart}
+    given = given_views(scene)
+    standing = given if given is not None else _standing(splats, pool.kind, seed + 2 * _SEED)
+    return found if standing is None or not len(standing) else {**found, "standing": standing}
+
+
+def standing_targets(
+    splats: Splats,
+    scene: Path,
+    seed: int = 0,
+    *,
+    size: int | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> dict[str, TeacherRenders]:
+    """What `standing_views` show of the scene, shrunk to `size`; views that show nothing of it are left out.
+
+    Raises:
+        InputError: as `standing_views`.
+    """
+    found = {}
+    for kind, cameras in standing_views(splats, scene, seed).items():
+        targets = TeacherRenders(splats, cameras.resized(size), background=background)
+        shown = np.array([np.ptp(targets[view], axis=(0, 1)).any() for view in range(len(cameras))])
+        if shown.any():
+            found[kind] = (
+                targets
+                if shown.all()
+                else TeacherRenders(splats, targets.cameras.take(shown), background=background)
+            )
+    return found
+
+
+def _standing(splats: Splats, kind: str, seed: int) -> Cameras | None:
+    if kind == "orbit":
+        return _between(splats, seed)
+    for other in ("walk", "auto") if "aerial" in kind else ("auto",):
+        try:
+            cameras = plan_pool(splats, _STANDING, kind=other, fov=_FOV, seed=seed).cameras
+        except InputError:
+            continue
+        return _named(cameras)
+    return None
+
+
+def _between(splats: Splats, seed: int) -> Cameras:
+    """Around an object, nearer than a pool stands and farther than near views do, in free space."""
+    site, lens = Site.of(splats), Lens(fov=_FOV)
+    far = plan_orbit(site, 4 * _STANDING, lens, seed, lambda done, total: None)
+    met = site.grid.cast(far.eyes, far.gazes)
+    far, met = far.take(np.isfinite(met)), met[np.isfinite(met)]
+    share = _BETWEEN[0] + (_BETWEEN[1] - _BETWEEN[0]) * halton(0, len(far), 1, seed)[:, 0]
+    eyes = far.eyes + ((1 - share) * met)[:, None] * far.gazes
+    free = (site.grid.distance(eyes) > 2 * site.grid.cell) & (site.above_ground(eyes) > 0.01)
+    poses = Poses(eyes[free], far.gazes[free])
+    poses = poses.take(view_statistics(site, poses, lens).close > 2 * site.grid.cell)
+    return _named(poses.take(slice(_STANDING)).cameras(site, lens))
+
+
+def _named(cameras: Cameras) -> Cameras:
+    return replace(cameras, names=tuple(name.replace("pose", "standing") for name in cameras.names))

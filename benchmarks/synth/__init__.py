@@ -1,0 +1,8 @@
+"""A small procedural city: coloured laser cloud, photos with exact poses and depth, four splits."""
+
+from __future__ import annotations
+
+from benchmarks.synth.city import City, CityConfig, Hits, Scan, city
+from benchmarks.synth.write import write_city
+
+__all__ = ["City", "CityConfig", "Hits", "Scan", "city", "write_city"]

@@ -1,0 +1,303 @@
+"""The city as an object: sample it as a cloud, photograph it, ask what a ray meets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from benchmarks.synth.layout import plan
+from benchmarks.synth.lidar import scan
+from benchmarks.synth.paint import Painter
+from benchmarks.synth.shapes import Float, cast
+from benchmarks.synth.trajectories import trajectories
+from g2ard.errors import InputError
+from g2ard.scene.cameras import Cameras
+
+__all__ = ["City", "CityConfig", "Hits", "Scan", "city"]
+
+_TILE = 32
+_BEAM = 0.01, 4e-4
+"""A laser spot's width: metres at the scanner, and radians of divergence."""
+_CHUNK = 1 << 16
+
+
+@dataclass(frozen=True)
+class CityConfig:
+    """What a city is made of.
+
+    Args:
+        points: laser returns in the cloud.
+        views: photos in all four splits together; at least 8.
+        size: (width, height) of a photo, pixels.
+        blocks: city blocks along each side; one is 72 m × 58 m, streets included.
+        seed: of everything random.
+        noise: standard deviation of the laser's range, metres; that of a good survey scanner.
+        fov: horizontal field of view of the photos, degrees.
+        supersample: samples a pixel along each axis; two suffice, for textures are averaged in closed form.
+        sky: colour in [0, 1] where a ray meets nothing; the default is exact in eight bits.
+        offset: (3,) world coordinates of the city's middle; map coordinates are large (UTM).
+
+    Raises:
+        InputError: a value no city can be built from.
+    """
+
+    points: int = 500_000
+    views: int = 120
+    size: tuple[int, int] = (800, 600)
+    blocks: int = 3
+    seed: int = 0
+    noise: float = 0.015
+    fov: float = 65.0
+    supersample: int = 2
+    sky: tuple[float, float, float] = (0.6, 0.8, 1.0)
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name, value, least, most in (
+            ("points", self.points, 1, 10**9),
+            ("views", self.views, 8, 10**5),
+            ("width", self.size[0], 1, 2**14),
+            ("height", self.size[1], 1, 2**14),
+            ("blocks", self.blocks, 1, 40),
+            ("seed", self.seed, 0, 2**63),
+            ("noise", self.noise, 0, 10),
+            ("fov", self.fov, 1, 170),
+            ("supersample", self.supersample, 1, 8),
+        ):
+            if not least <= value <= most:
+                raise InputError(f"city: {name} must lie between {least} and {most}, got {value}")
+        if not all(0 <= c <= 1 for c in self.sky):
+            raise InputError(f"city: sky must be three numbers between 0 and 1, got {self.sky}")
+        if not np.isfinite(self.offset).all():
+            raise InputError(f"city: offset must be finite, got {self.offset}")
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """n laser returns.
+
+    Args:
+        positions: (n, 3) float64 world coordinates, range noise included.
+        colors: (n, 3) float32 in [0, 1].
+        primitives: (n,) which surface each one was returned from.
+    """
+
+    positions: Float
+    colors: NDArray[np.float32]
+    primitives: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """What n rays meet first.
+
+    Args:
+        depth: (n,) float64, in lengths of the ray's direction; inf where it meets nothing.
+        color: (n, 3) float32 in [0, 1]; the sky's where it meets nothing.
+        normal: (n, 3) float64 outward unit normal; zero where it meets nothing.
+        primitive: (n,) int64, −1 where it meets nothing.
+    """
+
+    depth: Float
+    color: NDArray[np.float32]
+    normal: Float
+    primitive: NDArray[np.int64]
+
+
+class City:
+    """A procedural city; build it with `city`."""
+
+    def __init__(self, config: CityConfig) -> None:
+        self.config = config
+        self.layout = plan(config.blocks, config.seed)
+        self._paint = Painter(self.layout, config.seed)
+        self._offset = np.asarray(config.offset, np.float64)
+        local = trajectories(self.layout, config.views, config.size, config.fov)
+        self.views: dict[str, Cameras] = {k: v.recentred(-self._offset) for k, v in local.items()}
+
+    def points(self, count: int | None = None) -> Scan:
+        """A laser scan of `count` returns (default: the configuration's), coloured as photos are."""
+        parts = list(self.scans(count))
+        positions, colors, primitives = zip(
+            *((p.positions, p.colors, p.primitives) for p in parts), strict=True
+        )
+        return Scan(np.concatenate(positions), np.concatenate(colors), np.concatenate(primitives))
+
+    def scans(self, count: int | None = None) -> Iterator[Scan]:
+        """The returns of `points` in its order, in blocks: some two million are in memory at a time."""
+        config = self.config
+        rng = np.random.default_rng([config.seed, 2])
+        for returns in scan(self.layout, config.points if count is None else count, config.seed):
+            for i in range(0, len(returns.ranges), _CHUNK):
+                part = returns.take(np.arange(i, min(i + _CHUNK, len(returns.ranges))))
+                o, d, t = part.origins, part.directions, part.ranges
+                color = self._shade(o, d, t, part.primitives, _BEAM[0] + _BEAM[1] * t)
+                noisy = o + d * (t + config.noise * rng.standard_normal(len(t)))
+                yield Scan(noisy.T + self._offset, color.T, part.primitives)
+
+    def cast(self, origins: ArrayLike, directions: ArrayLike, width: float = 0.01) -> Hits:
+        """Exact first hits of any rays, in world coordinates.
+
+        Args:
+            origins: (n, 3) or (3,) world coordinates.
+            directions: (n, 3), any length but zero.
+            width: metres across which a sample's texture is averaged.
+
+        Raises:
+            InputError: shapes that do not fit, or a direction that is zero or not finite.
+        """
+        d = np.asarray(directions, np.float64)
+        o = np.atleast_2d(np.asarray(origins, np.float64)) - self._offset
+        if d.ndim != 2 or d.shape[1] != 3 or o.shape not in {(1, 3), d.shape}:
+            raise InputError(
+                f"cast: expected directions (n, 3) and origins (n, 3) or (3,), got {d.shape}, {o.shape}"
+            )
+        length = np.linalg.norm(d, axis=1)
+        if not (np.isfinite(o).all() and np.isfinite(length).all() and (length > 0).all()):
+            raise InputError("cast: origins and directions must be finite, directions not zero")
+        order = _coherent(o, d / length[:, None])
+        o = o if len(o) == 1 else o[order]
+        d = d[order]
+        t, hit = cast(self.layout.shapes, np.ascontiguousarray(o.T), np.ascontiguousarray(d.T), packet=1024)
+        depth, primitive = np.empty(len(d)), np.empty(len(d), np.int64)
+        color = np.empty((len(d), 3), np.float32)
+        normal = np.zeros((len(d), 3))
+        depth[order], primitive[order] = t, hit
+        unit = d.T / length[order]
+        found = np.flatnonzero(hit >= 0)
+        at = o.T if o.shape[0] == 1 else o.T[:, found]
+        normal[order[found]] = self.layout.shapes.normals(at + d.T[:, found] * t[found], hit[found]).T
+        color[order] = np.asarray(self.config.sky, np.float32)
+        color[order[found]] = self._shade(
+            at, unit[:, found], (t * length[order])[found], hit[found], np.full(len(found), width)
+        ).T
+        return Hits(depth, color, normal, primitive)
+
+    def photo(self, cameras: Cameras, index: int) -> NDArray[np.float32]:
+        """(H, W, 3) colours in [0, 1] of one view: the mean of supersample² rays a pixel."""
+        view = self._local(cameras, index)
+        width, height = int(view.widths[0]), int(view.heights[0])
+        image = np.empty((height, width, 3), np.float32)
+        for row in range(0, height, _TILE):
+            rows = min(_TILE, height - row)
+            order, o, d, scale = _pixel_rays(view, row, rows, self.config.supersample)
+            t, hit = cast(self.layout.shapes, o, d)
+            flat = np.empty((rows * width, 3), np.float32)
+            flat[order] = self._pixels(o, d, t, hit, scale, len(order))
+            image[row : row + rows] = flat.reshape(rows, width, 3)
+        return image
+
+    def depth(self, cameras: Cameras, index: int) -> Float:
+        """(H, W) metres along the optical axis at the pixels' centres; inf where there is sky."""
+        view = self._local(cameras, index)
+        width, height = int(view.widths[0]), int(view.heights[0])
+        image = np.empty((height, width))
+        for row in range(0, height, _TILE):
+            rows = min(_TILE, height - row)
+            order, o, d, _ = _pixel_rays(view, row, rows, 1)
+            t, _ = cast(self.layout.shapes, o, d)
+            flat = np.empty(rows * width)
+            flat[order] = t * (view.viewmats[0, 2, :3] @ d)
+            image[row : row + rows] = flat.reshape(rows, width)
+        return image
+
+    def _local(self, cameras: Cameras, index: int) -> Cameras:
+        return cameras.take([index]).recentred(self._offset)
+
+    def _pixels(
+        self, o: Float, d: Float, t: Float, hit: NDArray[np.int64], scale: float, count: int
+    ) -> NDArray[np.float32]:
+        """(count, 3) colours of pixels, each seen along n/count consecutive rays.
+
+        Patterns are averaged in closed form: a pixel all of whose rays meet one face is painted once, at
+        the rays' mean; only pixels on edges are painted ray by ray.
+        """
+        each = d.shape[1] // count
+        hits = hit.reshape(count, each)
+        one = (hits == hits[:, :1]).all(1) & (hits[:, 0] >= 0)
+        one[one] = self._flat(o, d, t, hit, np.flatnonzero(one) * each, each)
+        color = np.empty((count, 3), np.float32)
+        mean = (d * np.where(hit >= 0, t, 0.0)).reshape(3, count, each)[:, one].mean(2)
+        depth = np.linalg.norm(mean, axis=0)
+        color[one] = self._shade(o, mean / depth, depth, hits[one, 0], scale * depth).T
+        rays = np.repeat(~one, each)
+        rest = self._color(o, d[:, rays], t[rays], hit[rays], scale / np.sqrt(each))
+        color[~one] = rest.T.reshape(-1, each, 3).mean(1)
+        return color
+
+    def _flat(
+        self, o: Float, d: Float, t: Float, hit: NDArray[np.int64], first: NDArray[np.int64], each: int
+    ) -> NDArray[np.bool_]:
+        """Whether the first and last of the `each` rays from `first` on meet one face of their primitive."""
+        last = first + each - 1
+        normals = [self.layout.shapes.normals(o + d[:, i] * t[i], hit[i]) for i in (first, last)]
+        return (normals[0] * normals[1]).sum(0) > 0.9
+
+    def _color(
+        self, o: Float, d: Float, t: Float, hit: NDArray[np.int64], scale: float
+    ) -> NDArray[np.float32]:
+        color = np.empty(d.shape, np.float32)
+        color[:] = np.asarray(self.config.sky, np.float32)[:, None]
+        found = np.flatnonzero(hit >= 0)
+        if len(found):
+            color[:, found] = self._shade(o, d[:, found], t[found], hit[found], scale * t[found])
+        return color
+
+    def _shade(
+        self, o: Float, d: Float, t: Float, hit: NDArray[np.int64], width: Float
+    ) -> NDArray[np.float32]:
+        p = o + d * t
+        return self._paint(p, self.layout.shapes.normals(p, hit), d, hit, width)
+
+
+def city(config: CityConfig | None = None, **options: object) -> City:
+    """Build a small procedural city: ground with road markings, facades, roofs, trees, lamps, cars.
+
+    Args:
+        config: its configuration; None is `CityConfig()`.
+        options: fields of `CityConfig` to set over `config`.
+
+    Returns:
+        The city: `views` (its four splits), `points()`, `photo()`, `depth()`, `cast()`. The same
+        configuration gives the same bits.
+
+    Raises:
+        InputError: a value no city can be built from.
+
+    >>> town = city(blocks=1, points=1000, views=8, size=(32, 24))
+    >>> town.points().positions.shape, town.photo(town.views["train"], 0).shape
+    ((1000, 3), (24, 32, 3))
+    """
+    return City(replace(config or CityConfig(), **options))  # type: ignore[arg-type]
+
+
+def _coherent(o: Float, d: Float) -> NDArray[np.int64]:
+    """An order of rays in which neighbours start near each other and look the same way."""
+    span = np.ptp(o, axis=0).max() or 1.0
+    start = np.floor((o - o.min(0)) / span * 15.99).astype(np.int64)
+    facing = np.floor((d + 1) * 5.99).astype(np.int64)
+    key = ((start[:, 0] * 16 + start[:, 1]) * 16 + start[:, 2]) * 2048
+    return np.argsort(key + (facing[:, 0] * 12 + facing[:, 1]) * 12 + facing[:, 2], kind="stable")
+
+
+def _pixel_rays(view: Cameras, row: int, rows: int, s: int) -> tuple[NDArray[np.int64], Float, Float, float]:
+    """Rays through s × s samples of each pixel in `rows` rows from `row`, tile after tile, pixel after pixel.
+
+    Returns:
+        order (n/s²,), each pixel's place in raster order; origin (3, 1); unit directions (3, n);
+        how wide a pixel is at distance 1.
+    """
+    width = int(view.widths[0])
+    R, K = view.viewmats[0, :3, :3], view.Ks[0]
+    place = np.arange(rows * width).reshape(rows, width)
+    order = np.concatenate([place[:, c : c + _TILE].ravel() for c in range(0, width, _TILE)])
+    y, x = np.divmod(order, width)
+    part = (np.arange(s) + 0.5) / s
+    x = (x[:, None] + np.tile(part, s)).ravel()
+    y = (row + y[:, None] + np.repeat(part, s)).ravel()
+    camera = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones(len(x))])
+    d = R.T @ camera
+    return order, view.positions.T, d / np.linalg.norm(d, axis=0), 1.0 / float(K[0, 0])

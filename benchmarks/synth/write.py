@@ -1,0 +1,154 @@
+"""A city as a folder: cloud, photos, depth, the splits' views, and what made it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from benchmarks.synth.city import City, CityConfig, city
+from g2ard import __version__
+from g2ard.io import Points, atomic_folder, check_output, write_views
+from g2ard.io.cloud_ply import write_blocks
+from g2ard.progress import Progress, silent
+from g2ard.scene.cameras import Cameras
+
+__all__ = ["write_city"]
+
+_README = """A procedural city by `benchmarks synth city` (g2ard {version}); equal options, equal bits.
+
+cloud.ply      {points} points: x y z (double, metres, z up) and red green blue; laser range noise {noise} m
+images/        photos, 8-bit RGB; where there is sky the colour is {sky} (give it as --background)
+{depth}{views}
+manifest.json  every option, the seed, and the counts
+"""
+_ROLES = {
+    "train": "candidate pool: drives along every second street, flights over the roofs",
+    "val": "held out evenly from the train trajectories",
+    "adapt": "trajectories of their own: drives along the other streets, crossing flights",
+    "ood": "trajectories of their own: low drone flights, a wide orbit",
+}
+
+
+def write_city(
+    folder: str | Path,
+    config: CityConfig | None = None,
+    *,
+    depth: bool = False,
+    overwrite: bool = False,
+    threads: int = 0,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Build a city and write it as a data set, whole or not at all.
+
+    Args:
+        folder: where to; holds cloud.ply, images/, train.json, val.json, adapt.json, ood.json,
+            manifest.json, README.txt and, if asked for, depth/.
+        config: see `CityConfig`; None is the default city.
+        depth: also write depth/NAME.npy, (H, W) float32 metres along the optical axis, inf for sky.
+        overwrite: whether a folder that is not empty may be written into.
+        threads: photos taken side by side; 0 means every core. The result does not depend on it.
+        progress: told of points and photos.
+
+    Returns:
+        The manifest.
+
+    Raises:
+        InputError: a value no city can be built from.
+        OutputError: the folder exists and may not be overwritten, or cannot be written.
+    """
+    config = config or CityConfig()
+    check_output(folder, overwrite, folder=True)
+    town = city(config)
+    with atomic_folder(folder, overwrite) as place:
+        _scan(town, place / "cloud.ply", progress)
+        for name, cameras in town.views.items():
+            paths = tuple(place / "images" / f"{view}.png" for view in cameras.names)
+            write_views(place / f"{name}.json", replace(cameras, image_paths=paths))
+        _photograph(town, place, depth, threads, progress)
+        manifest = _manifest(town, depth)
+        (place / "manifest.json").write_text(
+            json.dumps(manifest, indent=2) + "\n", encoding="utf-8", newline="\n"
+        )
+        (place / "README.txt").write_text(_readme(config, manifest), encoding="utf-8", newline="\n")
+    return manifest
+
+
+def _scan(town: City, path: Path, progress: Progress) -> None:
+    count = town.config.points
+
+    def blocks() -> Iterator[Points]:
+        done = 0
+        progress("cloud", 0, count)
+        for part in town.scans():
+            yield Points(part.positions, part.colors)
+            done += len(part.positions)
+            progress("cloud", done, count)
+
+    write_blocks(path, count, blocks())
+
+
+def _photograph(town: City, place: Path, depth: bool, threads: int, progress: Progress) -> None:
+    (place / "images").mkdir()
+    if depth:
+        (place / "depth").mkdir()
+    jobs = [(cameras, i) for cameras in town.views.values() for i in range(len(cameras))]
+
+    def shoot(cameras: Cameras, index: int) -> None:
+        pixels = np.rint(town.photo(cameras, index) * 255).astype(np.uint8)
+        Image.fromarray(pixels).save(place / "images" / f"{cameras.names[index]}.png")
+        if depth:
+            np.save(
+                place / "depth" / f"{cameras.names[index]}.npy", town.depth(cameras, index).astype(np.float32)
+            )
+
+    _side_by_side(shoot, jobs, threads, lambda done: progress("photos", done, len(jobs)))
+
+
+def _side_by_side(
+    work: Callable[[Cameras, int], None],
+    jobs: list[tuple[Cameras, int]],
+    threads: int,
+    tell: Callable[[int], None],
+) -> None:
+    pool = ThreadPoolExecutor(threads or os.cpu_count() or 1)
+    try:
+        for done, future in enumerate(as_completed([pool.submit(work, *job) for job in jobs]), start=1):
+            future.result()
+            tell(done)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _manifest(town: City, depth: bool) -> dict[str, Any]:
+    return {
+        "generator": f"python -m benchmarks synth city {__version__}",
+        "options": asdict(town.config),
+        "background": town.config.sky,
+        "primitives": len(town.layout.shapes),
+        "points": town.config.points,
+        "views": {name: len(cameras) for name, cameras in town.views.items()},
+        "depth": "depth/NAME.npy: float32 metres along the optical axis, inf is sky" if depth else None,
+    }
+
+
+def _readme(config: CityConfig, manifest: dict[str, Any]) -> str:
+    views = "\n".join(
+        f"{name + '.json':<15}{count} views; {_ROLES[name]}" for name, count in manifest["views"].items()
+    )
+    depth = f"depth/         {manifest['depth']}\n" if manifest["depth"] else ""
+    return _README.format(
+        version=__version__,
+        points=config.points,
+        noise=config.noise,
+        sky=",".join(f"{c:g}" for c in config.sky),
+        depth=depth,
+        views=views,
+    )

@@ -1,0 +1,1 @@
+"""Configuration: constants by name, names to choose from, presets of published methods."""

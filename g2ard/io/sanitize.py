@@ -1,0 +1,162 @@
+"""The one gate every scene passes on its way in: non-finite rows go, infinities that mean something stay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.io.types import Note, Scene
+from g2ard.progress import plural
+from g2ard.scene.splats import DRAWN_LOGIT, Splats
+
+__all__ = ["BLOCK", "LOGIT_LIMIT", "LOG_SCALE_LIMIT", "Raw", "Tally", "cleaned"]
+
+BLOCK = 8192
+"""Rows handled at a time: 60 float32 columns of them are 2 MB and stay in the cache."""
+
+LOGIT_LIMIT = 16.0
+"""Logits past this are clamped to it: sigmoid(16) = 1 − 1.1e-7, far past the 0.99 at which a rasteriser clips
+and far within an 8-bit step of 1, while −log(1 − α) is still exact enough in float32."""
+
+LOG_SCALE_LIMIT = 43.0
+"""exp(43)² = 2.2e37 and exp(−43)² = 4.5e-38 are the last squares that are normal float32."""
+
+
+@dataclass
+class Raw:
+    """A scene as files store it: logarithmic scales, logits; every array float32, C-contiguous, writable."""
+
+    means: NDArray[np.float32]
+    quats: NDArray[np.float32]
+    log_scales: NDArray[np.float32]
+    logit_opacities: NDArray[np.float32]
+    sh0: NDArray[np.float32]
+    shN: NDArray[np.float32]
+    offset: NDArray[np.float64]
+
+    @classmethod
+    def empty(cls, count: int, rest: int) -> Raw:
+        """Room for `count` Gaussians with `rest` higher-band coefficients each."""
+
+        def room(*shape: int) -> NDArray[np.float32]:
+            return np.empty((count, *shape), np.float32)
+
+        return cls(room(3), room(4), room(3), room(), room(1, 3), room(rest, 3), np.zeros(3))
+
+    def take(self, rows: slice) -> Raw:
+        """A view of some rows."""
+        return Raw(
+            self.means[rows],
+            self.quats[rows],
+            self.log_scales[rows],
+            self.logit_opacities[rows],
+            self.sh0[rows],
+            self.shN[rows],
+            self.offset,
+        )
+
+    def activated(self) -> Splats:
+        """The scene, once `Tally.clean` has exponentiated `log_scales` in place."""
+        return Splats(
+            self.means, self.quats, self.log_scales, self.logit_opacities, self.sh0, self.shN, self.offset
+        )
+
+
+def cleaned(path: Path, raw: Raw, notes: list[Note] | None = None) -> Scene:
+    """Check, clamp and activate what a reader found. `raw` is consumed: its arrays become the scene's.
+
+    Rows with a NaN, or with an infinity where none has a meaning, are dropped and counted. Infinite or
+    extreme logits (|x| > 16) and log-scales (|x| > 43) are clamped, quaternions of length zero become
+    the identity; both counted. A scene of which nothing shows is noted.
+
+    Raises:
+        InputError: no row is left.
+    """
+    count = len(raw.means)
+    keep, tally = np.ones(count, bool), Tally()
+    for start in range(0, count, BLOCK):
+        rows = slice(start, start + BLOCK)
+        keep[rows] = tally.clean(raw.take(rows))
+    notes = [*(notes or ()), *tally.notes(path)]
+    splats = raw.activated()
+    return Scene(splats.take(keep) if tally.dropped else splats, tuple(notes))
+
+
+@dataclass
+class Tally:
+    """Counts of what was dropped, clamped and mended in the rows so far, of a scene taken in blocks."""
+
+    rows: int = 0
+    dropped: int = 0
+    first: int = -1
+    logits: int = 0
+    scales: int = 0
+    quats: int = 0
+    brightest: float = -LOGIT_LIMIT
+
+    def clean(self, raw: Raw) -> NDArray[np.bool_]:
+        """Clamp and activate the next rows in place, so that `raw.log_scales` hold linear scales.
+
+        Returns:
+            (N,) which rows are to be kept.
+        """
+        logits, scales, quats = raw.logit_opacities, raw.log_scales, raw.quats
+        good = ~np.isnan(logits) & ~(np.isnan(scales) | (scales == np.inf)).any(1)
+        for values in (raw.means, quats, raw.sh0, raw.shN):
+            good &= _finite_rows(values)
+
+        self.logits += int(np.count_nonzero(good & (np.abs(logits) > LOGIT_LIMIT)))
+        np.clip(logits, -LOGIT_LIMIT, LOGIT_LIMIT, out=logits)
+        self.scales += int(np.count_nonzero(good[:, None] & (np.abs(scales) > LOG_SCALE_LIMIT)))
+        np.clip(scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT, out=scales)
+        scales[:] = np.exp(scales, dtype=np.float64)
+        zero = good & ~quats.any(1)
+        if zero.any():
+            self.quats += int(np.count_nonzero(zero))
+            quats[zero] = (1, 0, 0, 0)
+        lost = len(good) - int(np.count_nonzero(good))
+        if lost and not self.dropped:
+            self.first = self.rows + int(np.argmin(good))
+        self.dropped += lost
+        self.rows += len(good)
+        self.brightest = float(np.max(logits, where=good, initial=self.brightest))
+        return good
+
+    def notes(self, path: Path) -> list[Note]:
+        """What was done to all rows.
+
+        Raises:
+            InputError: there were none, or none is left.
+        """
+        if not self.rows:
+            raise InputError(f"{path}: holds no Gaussians")
+        if self.dropped == self.rows:
+            raise InputError(
+                f"{path}: none of its {plural(self.rows, 'Gaussian')} is finite; take an earlier state of it"
+            )
+        notes = []
+        if self.dropped:
+            text = f"{plural(self.dropped, 'non-finite Gaussian')} dropped (the first is row {self.first})"
+            notes.append(Note("dropped_rows", self.dropped, text))
+        for count, code, what, then in (
+            (self.logits, "clamped_logits", "opacity logit", f"beyond ±{LOGIT_LIMIT:g} clamped"),
+            (self.scales, "clamped_scales", "log-scale", f"beyond ±{LOG_SCALE_LIMIT:g} clamped"),
+            (self.quats, "zero_quats", "quaternion", "of length zero made the identity"),
+        ):
+            if count:
+                notes.append(Note(code, count, f"{plural(count, what)} {then}"))
+        if self.brightest < DRAWN_LOGIT:
+            left = self.rows - self.dropped
+            notes.append(Note("invisible", left, "nothing of it shows: every α is below 1/255"))
+        return notes
+
+
+def _finite_rows(values: NDArray[Any]) -> NDArray[np.bool_]:
+    flat = values.reshape(len(values), -1)
+    finite = np.isfinite(flat)
+    return np.ones(len(flat), bool) if finite.all() else finite.all(1)

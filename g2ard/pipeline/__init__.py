@@ -1,0 +1,393 @@
+"""The whole pipeline: select, simplify, freeze anchors, recover, by rounds; it alone joins the stages."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from g2ard.config.choices import Engine
+from g2ard.errors import require
+from g2ard.pipeline.report import DistillReport, RoundReport, StageSeconds, ViewsReport
+from g2ard.progress import Progress, silent
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import Photos, PhotosOrRenders, Subset, Targets, fingerprint_of
+from g2ard.stages.recover import checkpoint as checkpoints
+from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.draw import checked_weights
+from g2ard.stages.recover.schedule import Schedule
+from g2ard.stages.select.surfaces import CoverageOptions
+from g2ard.stages.simplify.config import SimplifyConfig
+
+if TYPE_CHECKING:
+    from g2ard.scene.cameras import Cameras
+    from g2ard.stages.recover.optimize import Watch
+
+__all__ = ["DistillConfig", "Distilled", "distill"]
+
+_ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+
+
+@dataclass(frozen=True)
+class DistillConfig:
+    """How a scene is distilled; the paper's way is `g2ard.preset("paper").distill`.
+
+    What recovery has too has its default from `RecoverConfig`.
+
+    Args:
+        method: simplification's: default, fast or paper.
+        schedule: recovery's; one with `round_steps` recovers after every round of 75 % (the paper), without
+            them the reduction is one shot and all recovery happens at the target count.
+        steps: the final horizon; None means the schedule's, more where a view holds little of the scene
+            (`g2ard.stages.recover.need`).
+        recovery_time: seconds for all recovery, shared out over rounds in proportion to their steps; horizons
+            become what fits into them.
+        regularizers: weights of L_anchor and L_shape.
+        sh_degree: of the result; None keeps the prior's.
+        background: RGB behind the scene.
+        views: how many of the targets' views recovery looks at, best first; a float is a share of them,
+            rounded up; "auto" takes as many as the curve of gains asks for, None all that see the scene.
+        policy: how views are chosen, see `g2ard.stages.select`.
+        weighted: draw views by the weights of the selection, so that crowded poses do not rule: on a
+            crowded pool all views drawn so beat an even draw, and every choice of a tenth of them.
+        reselect: choose again from every round's scene; else once, from the raw prior.
+        seed: of the order of views, and of the policy "random".
+        engine: what takes recovery's steps, see `RecoverConfig`.
+        ssim_weight: λ of the photometric loss, see `RecoverConfig`.
+        simplify: simplification's constants; its retention also sets the counts of rounds, 0.75 if None.
+        select: those of the policies that look at surfaces.
+    """
+
+    method: str = "default"
+    schedule: Schedule = RecoverConfig.schedule
+    steps: int | None = None
+    recovery_time: float | None = None
+    regularizers: Regularizers = RecoverConfig.regularizers
+    sh_degree: int | None = None
+    background: tuple[float, float, float] = RecoverConfig.background
+    views: int | float | Literal["auto"] | None = None
+    policy: str = "auto"
+    weighted: bool = True
+    reselect: bool = False
+    seed: int = 0
+    engine: Engine = RecoverConfig.engine
+    ssim_weight: float = RecoverConfig.ssim_weight
+    simplify: SimplifyConfig = field(default_factory=SimplifyConfig)
+    select: CoverageOptions = field(default_factory=CoverageOptions)
+
+    def __post_init__(self) -> None:
+        share = not isinstance(self.views, float) or 0 < self.views <= 1
+        require("views", self.views, share, "a count, auto, none, or a share in (0, 1]")
+
+
+@dataclass(frozen=True, eq=False)
+class Distilled:
+    """A compact scene and how it came about.
+
+    Args:
+        splats: exactly `budget` Gaussians.
+        simplified: the same Gaussians before any recovery at their count: the anchors of all that followed,
+            and what Drift95 is measured from.
+        report: what was done, in numbers.
+        held_out: targets that nothing was learned from, to score on; None where the caller has their own.
+    """
+
+    splats: Splats
+    simplified: Splats
+    report: DistillReport
+    held_out: Targets | None = None
+
+
+def distill(
+    prior: Splats,
+    budget: int,
+    targets: Targets,
+    config: DistillConfig | None = None,
+    *,
+    weights: ArrayLike | None = None,
+    validation: Targets | None = None,
+    work: Path | None = None,
+    progress: Progress = silent,
+    watch: Watch | None = None,
+) -> Distilled:
+    """Distil a dense prior into exactly `budget` Gaussians.
+
+    N_r = max(N_S, ⌈0.75·N_{r−1}⌉) with recovery after each round where the schedule asks for it, else one
+    shot.
+
+    Args:
+        prior: a trained model, or a lift; its offset counts, cameras are in world coordinates.
+        budget: N_S, at most the prior's count.
+        targets: photos, or the prior's own renders.
+        config: see `DistillConfig`.
+        weights: (C,) how often to draw each view, where that is known already; None weighs them here.
+        validation: a few views of another kind, never learned from, which decide how much of recovery's
+            changes stays where they lose, see `g2ard.stages.recover.recover`.
+        work: a folder for finished rounds and checkpoints; a second call with the same inputs goes on there.
+        progress: told of all stages.
+        watch: called after every step of every recovery, see `g2ard.stages.recover.recover`.
+
+    Returns:
+        A `Distilled`.
+
+    Raises:
+        InputError: the budget does not fit, no view sees the prior, or `work` belongs to another run.
+        KeyboardInterrupt: after Ctrl-C, with `work` ready for a resume.
+    """
+    from g2ard.stages.simplify import schedule as counts_of
+
+    config = config or DistillConfig()
+    many = config.schedule.round_steps > 0
+    kept, fold = config.simplify.retention or 0.75, config.simplify.fold
+    counts = counts_of(len(prior), budget, kept, fold) if many else [budget]
+    rounds = _Rounds(prior, budget, targets, config, len(counts), weights, validation, work, progress, watch)
+    for number, count in enumerate(counts, start=1):
+        rounds.advance(number, count, final=number == len(counts))
+    report = DistillReport(
+        tuple(map(RoundReport.of, rounds.log)), StageSeconds.of(rounds.seconds), rounds.supervision.report
+    )
+    return Distilled(rounds.state, rounds.simplified, report)
+
+
+def final_steps(config: DistillConfig, scene: Splats, cameras: Cameras, *, photos: bool) -> int:
+    """Steps of the last recovery: as asked for, the schedule's, or by need where a teacher renders targets.
+
+    Args:
+        config: of the pipeline.
+        scene: what is to be recovered.
+        cameras: the views it learns from.
+        photos: whether those are photos.
+    """
+    from g2ard.stages.recover.need import steps_for
+
+    schedule = config.schedule
+    if config.steps is not None:
+        return config.steps
+    if not schedule.means_in_scales or photos:
+        return schedule.steps
+    return steps_for(scene, cameras, schedule.steps)
+
+
+@dataclass(frozen=True, eq=False)
+class _Supervision:
+    """What recovery looks at, how often, and why."""
+
+    targets: Targets
+    weights: Any
+    report: ViewsReport | None
+
+    @classmethod
+    def of(
+        cls, scene: Splats, targets: Targets, config: DistillConfig, weights: Any, progress: Progress
+    ) -> _Supervision:
+        """The views worth having of `scene`; `weights` that are given stand, over what selection says."""
+        from g2ard.stages.select import select
+
+        cameras = targets.cameras
+        if config.views is None and (weights is not None or not config.weighted):
+            return cls(targets, weights, None)
+        wanted = 1.0 if config.views is None else config.views
+        k = math.ceil(wanted * len(cameras) - 1e-9) if isinstance(wanted, float) else wanted
+        policy = config.policy if config.views is not None else "auto"
+        chosen = select(
+            scene,
+            cameras,
+            k,
+            policy=policy,
+            seed=config.seed,
+            options=config.select,
+            progress=progress,
+        )
+        rows = np.argsort(chosen.order)
+        subset = Subset(targets, chosen.order[rows])
+        if weights is not None:
+            weights = weights[chosen.order[rows]]
+        elif config.weighted:
+            weights = chosen.weights[rows]
+        report = ViewsReport(
+            policy=policy,
+            candidates=len(cameras),
+            chosen=[cameras.names[i] for i in chosen.order],
+            weighted=weights is not None,
+            refused=[cameras.names[i] for i in chosen.refused],
+            left_out=chosen.left_out,
+        )
+        return cls(subset, weights, report)
+
+    def fill(self, progress: Progress) -> None:
+        """Have every target at hand, so that later steps take equal time."""
+        count = len(self.targets.cameras)
+        for view in range(count):
+            self.targets[view]
+            progress("targets", view + 1, count)
+
+
+class _Rounds:
+    """The scene as it shrinks, its protection flags, and the log; each stage is saved if `work` is given."""
+
+    def __init__(
+        self,
+        prior: Splats,
+        budget: int,
+        targets: Targets,
+        config: DistillConfig,
+        count: int,
+        weights: ArrayLike | None,
+        validation: Targets | None,
+        work: Path | None,
+        progress: Progress,
+        watch: Watch | None,
+    ) -> None:
+        self.prior, self.budget, self.targets, self.config = prior, budget, targets, config
+        self.validation = validation
+        self.count, self.work, self.progress, self.watch = count, work, progress, watch
+        self.state = self.simplified = prior
+        self.protected: Any = None
+        self.log: list[dict[str, Any]] = []
+        self.seconds: dict[str, float] = {"select": 0.0, "simplify": 0.0, "recover": 0.0}
+        self.weights = checked_weights(weights, len(targets.cameras))
+        self.key = _fingerprint(prior, budget, targets, config, self.weights, validation)
+        self._select(prior)
+
+    def advance(self, number: int, count: int, *, final: bool) -> None:
+        """One round: simplify to `count`, recover; the final one recovers for the final horizon as well."""
+        entry: dict[str, Any] = {"count": count}
+        if self.config.reselect and number > 1:
+            self._select(self.state)
+        self._simplify(number, count, entry)
+        if self.config.schedule.round_steps > 0:
+            self._recover(f"round-{number}", entry, final=False)
+        if final:
+            self._recover("final", entry, final=True)
+        self.log.append(entry)
+
+    def _select(self, scene: Splats) -> None:
+        began = time.monotonic()
+        self.supervision = _Supervision.of(scene, self.targets, self.config, self.weights, self.progress)
+        self.seconds["select"] += time.monotonic() - began
+        if self.config.views is not None:
+            self.supervision.fill(self.progress)
+
+    def _simplify(self, number: int, count: int, entry: dict[str, Any]) -> None:
+        from g2ard.rendering.visibility import visibility_source
+        from g2ard.stages.simplify import simplify
+
+        name = f"simplified-{number}"
+        if self._restore(name, entry):
+            self._resumed(entry["simplify"]["seconds"])
+        else:
+            began = time.monotonic()
+            done = simplify(
+                self.state,
+                count,
+                config=self.config.simplify,
+                method=self.config.method,
+                visibility=None
+                if self.config.method == "paper"
+                else visibility_source(self.targets.cameras, progress=self.progress),
+                protected=self.protected,
+                final_budget=self.budget,
+                progress=self.progress,
+            )
+            self.state, self.protected = done.splats, done.protected
+            entry["simplify"] = {**done.report.as_dict(), "seconds": time.monotonic() - began}
+            self._save(name, entry)
+        self.seconds["simplify"] += entry["simplify"]["seconds"]
+        if self.config.sh_degree is not None:
+            self.state = self.state.with_sh_degree(self.config.sh_degree)
+        self.simplified = self.state
+
+    def _recover(self, name: str, entry: dict[str, Any], *, final: bool) -> None:
+        from g2ard.stages.recover import recover
+
+        if self._restore(name, entry):
+            self._resumed(entry["recover"][-1]["seconds"])
+        else:
+            config = RecoverConfig(
+                schedule=self.config.schedule,
+                steps=self._steps() if final else None,
+                recovery_time=self._seconds(final),
+                regularizers=self.config.regularizers,
+                ssim_weight=self.config.ssim_weight,
+                background=self.config.background,
+                final=final,
+                seed=self.config.seed,
+                engine=self.config.engine,
+            )
+            checkpoint = self.work / f"{name}.checkpoint.npz" if self.work else None
+            done = recover(
+                self.state,
+                self.supervision.targets,
+                config,
+                weights=self.supervision.weights,
+                anchors=Anchors.of(self.simplified, self.config.regularizers.in_plane),
+                validation=self.validation,
+                checkpoint=checkpoint,
+                progress=self.progress,
+                stage="recover" if final else f"recover {name}",
+                watch=self.watch,
+            )
+            self.state = done.splats
+            entry.setdefault("recover", []).append(done.report.as_dict())
+            if done.report.resumed is not None:
+                self._resumed(done.report.resumed)
+            self._save(name, entry)
+            if checkpoint is not None:
+                checkpoint.unlink(missing_ok=True)
+        self.seconds["recover"] += entry["recover"][-1]["seconds"]
+
+    def _steps(self) -> int:
+        """The final horizon."""
+        photos = isinstance(self.targets, Photos | PhotosOrRenders)
+        return final_steps(self.config, self.state, self.supervision.targets.cameras, photos=photos)
+
+    def _seconds(self, final: bool) -> float | None:
+        """This recovery's part of the time limit."""
+        if self.config.recovery_time is None:
+            return None
+        schedule = self.config.schedule
+        last = schedule.steps if self.config.steps is None else self.config.steps
+        whole = last + self.count * schedule.round_steps
+        return self.config.recovery_time * (last if final else schedule.round_steps) / whole
+
+    def _resumed(self, seconds: float) -> None:
+        self.seconds["resumed"] = self.seconds.get("resumed", 0.0) + seconds
+
+    def _save(self, name: str, entry: dict[str, Any]) -> None:
+        if self.work is None:
+            return
+        arrays = {name: getattr(self.state, name) for name in _ARRAYS}
+        arrays["protected"] = np.asarray(self.protected)
+        checkpoints.save(self.work / f"{name}.npz", self.key, {"entry": entry}, arrays)
+
+    def _restore(self, name: str, entry: dict[str, Any]) -> bool:
+        """Take up a finished stage of an earlier run; False where there is none."""
+        path = self.work / f"{name}.npz" if self.work else None
+        if path is None or not path.exists():
+            return False
+        meta, arrays = checkpoints.load(path, self.key)
+        self.protected = arrays.pop("protected")
+        self.state = replace(self.prior, **arrays)
+        entry.update(meta["entry"])
+        return True
+
+
+def _fingerprint(
+    prior: Splats,
+    budget: int,
+    targets: Targets,
+    config: DistillConfig,
+    weights: Any,
+    validation: Targets | None,
+) -> str:
+    given = None if weights is None else weights.tolist()
+    held = [] if validation is None else [fingerprint_of(validation)]
+    parts = (repr((budget, config, given)), prior.fingerprint(), fingerprint_of(targets), *held)
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()

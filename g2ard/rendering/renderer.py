@@ -1,0 +1,277 @@
+"""Rendering with the CPU rasteriser: numpy in, numpy out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.config.choices import CONVENTIONS, Convention
+from g2ard.errors import InputError
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS
+from g2ard.scene.splats import Splats
+
+__all__ = [
+    "RasterSettings",
+    "Rendered",
+    "Renderer",
+    "arrays_of",
+    "centred",
+    "render",
+    "settings_for",
+    "view_of",
+]
+
+_Floats = NDArray[np.float32]
+View = tuple[list[list[float]], list[float], tuple[int, int], float]
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """What the rasteriser's conventions leave open.
+
+    Args:
+        convention: "gsplat" (the default: what trainers of today use) or "inria" (also cuts every splat to
+            the tiles its 3σ square touches).
+        antialiased: opacity × √(det Σ₂ / det(Σ₂ + 0.3 I)), Mip-Splatting's factor; for scenes trained so.
+        alpha_max: α is clipped here. 0.99 as in 3DGS; some trainers use 0.999.
+        near: Gaussians nearer than this are left out, scene units; None means the convention's 0.01 or 0.2,
+            and less in a small scene (`settings_for`). A sequence holds one distance per camera.
+
+    Raises:
+        InputError: a value out of range.
+
+    >>> RasterSettings(convention="inria").near_of(0)
+    0.2
+    """
+
+    convention: Convention = "gsplat"
+    antialiased: bool = False
+    alpha_max: float = 0.99
+    near: float | Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.convention not in CONVENTIONS:
+            raise InputError(f"convention: expected {' or '.join(CONVENTIONS)}, got {self.convention!r}")
+        if not 1 / 255 <= self.alpha_max < 1:
+            raise InputError(f"alpha_max: expected a value in [1/255, 1), got {self.alpha_max}")
+
+    def near_of(self, index: int) -> float:
+        """The near plane of camera `index`."""
+        if self.near is None:
+            return 0.01 if self.convention == "gsplat" else 0.2
+        if isinstance(self.near, (int, float)):
+            return float(self.near)
+        return float(self.near[index])
+
+
+def settings_for(means: NDArray[Any], settings: RasterSettings | None = None) -> RasterSettings:
+    """`settings` whose near plane does not depend on how small a unit the scene is in.
+
+    The conventions' near planes are lengths, made for scenes of some units. Where half of the Gaussians lie
+    within r < ½ of their middle, the near plane is 2 r times the convention's.
+
+    Args:
+        means: (N, 3) scene units.
+        settings: None means gsplat's convention. A near plane that is given stays.
+
+    >>> import numpy as np
+    >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    >>> settings_for(corners).near_of(0), round(settings_for(corners / 1024).near_of(0), 9)
+    (0.01, 1.6915e-05)
+    """
+    settings = settings or RasterSettings()
+    if settings.near is not None or not len(means):
+        return settings
+    sample = means[:: -(-len(means) // _NEAR_SAMPLE)].astype(np.float64)
+    radius = float(np.median(np.linalg.norm(sample - np.median(sample, axis=0), axis=1)))
+    return replace(settings, near=settings.near_of(0) * min(1.0, 2 * radius or 1.0))
+
+
+def view_of(cameras: Cameras, index: int, settings: RasterSettings) -> View:
+    """One camera as `_core` takes it."""
+    K = cameras.Ks[index]
+    return (
+        cameras.viewmats[index].tolist(),
+        [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
+        (int(cameras.widths[index]), int(cameras.heights[index])),
+        settings.near_of(index),
+    )
+
+
+def arrays_of(splats: Splats) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats, _Floats]:
+    """The six stored-form float32 arrays `_core` takes.
+
+    Logits and logarithms are clamped to where float32 can follow them: opacity 255 of a byte decodes to +∞.
+    """
+    with np.errstate(divide="ignore"):
+        log_scales = np.clip(splats.log_scales, *DRAWN_LOG_SCALES)
+    logits = np.clip(splats.logit_opacities, *DRAWN_LOGITS)
+    arrays = (splats.means, splats.quats, log_scales, logits, splats.sh0, splats.shN)
+    a, b, c, d, e, f = (np.ascontiguousarray(array, dtype=np.float32) for array in arrays)
+    return a, b, c, d, e, f
+
+
+def middle_of(splats: Splats) -> NDArray[np.float64] | None:
+    """(3,) a point that float32 means can be taken from: float64 means may be map coordinates; None where the
+    means are float32 already."""
+    if splats.means.dtype == np.float32 or not len(splats):
+        return None
+    return np.median(splats.means, axis=0)
+
+
+def centred(splats: Splats, cameras: Cameras) -> tuple[Splats, Cameras]:
+    """Both about `middle_of` the scene."""
+    cameras = cameras.recentred(splats.offset)
+    middle = middle_of(splats)
+    if middle is None:
+        return splats, cameras
+    return splats.recentred(splats.offset + middle), cameras.recentred(middle)
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """One view.
+
+    Args:
+        image: (H, W, 3) float32, linear in the SH colours, ≥ 0, not clipped at 1.
+        alpha: (H, W) float32 in [0, 1], how much of the background is hidden.
+        depth: (H, W) float32, scene units, Σ αT·z: the expected depth times alpha; divide by alpha for a
+            distance.
+        median: (H, W) float32, scene units, depth of the splat behind which less than half the light is
+            left, 0 if there is none; None unless asked for.
+    """
+
+    image: _Floats
+    alpha: _Floats
+    depth: _Floats
+    median: _Floats | None = None
+
+
+class Renderer:
+    """One scene, rendered into any number of views; the scene is prepared once and buffers are kept.
+
+    Args:
+        splats: the scene, SH degree 0–3.
+        background: RGB in [0, 1] behind the scene.
+        settings: conventions; None means gsplat's.
+
+    Raises:
+        InputError: a background that is not three numbers, or near planes of several cameras.
+
+    >>> from g2ard.scene.cameras import Camera
+    >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
+    >>> front = Camera.facing([0, -2, 0], [0, 0, 0], width=32, height=24)
+    >>> renderer = Renderer(dot, background=(1, 1, 1))
+    >>> renderer.image(front).shape, round(float(renderer.render(front).depth[12, 16]))
+    ((24, 32, 3), 2)
+    """
+
+    def __init__(
+        self,
+        splats: Splats,
+        *,
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+        settings: RasterSettings | None = None,
+    ) -> None:
+        self._background = [float(c) for c in background]
+        if len(self._background) != 3:
+            raise InputError(f"background: expected 3 numbers, got {len(self._background)}")
+        if settings is not None and not isinstance(settings.near, int | float | None):
+            raise InputError("near: expected one distance, for all views of a renderer")
+        self._offset, middle = splats.offset, middle_of(splats)
+        if middle is not None:
+            splats = splats.recentred(splats.offset + middle)
+        self._middle = middle
+        self._settings = settings_for(splats.means, settings)
+        self._arrays = arrays_of(splats)
+        self._rasterizer = _core.Rasterizer()
+
+    def image(self, camera: Camera) -> _Floats:
+        """The view's (H, W, 3) image alone, see `Rendered.image`; without depths it takes less time.
+
+        Raises:
+            InputError: a camera that makes no sense, see `Cameras`.
+        """
+        image, _, _, _ = self._forward(camera, depth=False, median=False)
+        return image
+
+    def render(self, camera: Camera, *, median: bool = False) -> Rendered:
+        """One view: C = Σᵢ cᵢ αᵢ Πⱼ<ᵢ (1 − αⱼ), front to back.
+
+        Args:
+            camera: the view, in world coordinates; its K and size decide the image.
+            median: also return the median depth.
+
+        Raises:
+            InputError: a camera that makes no sense, see `Cameras`.
+        """
+        image, alpha, depth, middle = self._forward(camera, depth=True, median=median)
+        assert depth is not None
+        return Rendered(image, alpha, depth, middle)
+
+    def pose_gradient(self, gradient: _Floats) -> NDArray[np.float64]:
+        """(6,) dL/d(v, ω) of the last render's pose T, T ← exp(v, ω)·T in the camera's axes.
+
+        g_v = Σ W·dL/dμ and g_ω = Σ X × dL/dX + Σᵢ W·(dL/djwᵢ × jwᵢ), with X = Wμ + t, dL/dX without the
+        colour's direction and jw the rows of the projection's J·W. Where a Gaussian enters or leaves at
+        α = 1/255 there is no gradient.
+
+        Args:
+            gradient: (H, W, 3) float32 dL/d(image).
+        """
+        return np.array(self._rasterizer.pose_gradient(self._arrays, np.ascontiguousarray(gradient)))
+
+    def _forward(
+        self, camera: Camera, *, depth: bool, median: bool
+    ) -> tuple[_Floats, _Floats, _Floats | None, _Floats | None]:
+        here = Cameras.of([camera]).recentred(self._offset)
+        if self._middle is not None:
+            here = here.recentred(self._middle)
+        settings = self._settings
+        view = view_of(here, 0, settings)
+        return self._rasterizer.forward(self._arrays, view, settings, self._background, depth, median)
+
+
+def render(
+    splats: Splats,
+    camera: Camera,
+    *,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    settings: RasterSettings | None = None,
+    median: bool = False,
+) -> Rendered:
+    """Render one view of a scene; for many views of one scene `Renderer` is faster.
+
+    C = Σᵢ cᵢαᵢTᵢ + T·background from front to back, αᵢ = min(0.99, oᵢ·exp(−½dᵀΣ₂⁻¹d)), Tᵢ = Πⱼ(1 − αⱼ) over
+    the splats in front; Σ₂ is the projected covariance with a dilation of 0.3 px² (3DGS, Kerbl et al. 2023).
+
+    Args:
+        splats: the scene, SH degree 0–3.
+        camera: the view, world coordinates.
+        background: RGB in [0, 1] behind the scene.
+        settings: conventions; None means gsplat's.
+        median: whether the median depth is wanted too.
+
+    Returns:
+        A `Rendered`: image (H, W, 3), alpha (H, W) and depth (H, W), all float32; depth in scene units.
+
+    Raises:
+        InputError: a camera whose values are out of range, a background that is not three numbers.
+
+    >>> from g2ard.scene.cameras import Camera
+    >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
+    >>> out = render(dot, Camera.facing([0, -2, 0], [0, 0, 0], width=32, height=24), background=(1, 1, 1))
+    >>> out.image.shape, bool(out.alpha[12, 16] > 0.9), out.image[0, 0].tolist()
+    ((24, 32, 3), True, [1.0, 1.0, 1.0])
+    """
+    return Renderer(splats, background=background, settings=settings).render(camera, median=median)
+
+
+_NEAR_SAMPLE = 65_536
+"""Gaussians, at most, that tell how large a scene is."""

@@ -1,0 +1,112 @@
+"""What simplification sees, painted on the scene: protection flags, locality cells, and where rows went."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard import _core
+from g2ard.errors import InputError
+from g2ard.scene.splats import SH_C0, Splats
+
+__all__ = ["cell_labels", "flag_colors", "label_colors", "painted"]
+
+_FLAGGED = np.array([0.93, 0.33, 0.10])
+_PLAIN = np.array([0.55, 0.60, 0.66])
+_GONE = np.array([0.06, 0.06, 0.06])
+"""Of rows that went nowhere: dropped, or trimmed."""
+
+_LUMA = np.array([0.2126, 0.7152, 0.0722])
+_SHADE = 0.45
+"""How much of a paint's brightness is the scene's own, so that its shape stays legible."""
+
+_GOLDEN = 0.6180339887498949
+
+
+def painted(splats: Splats, colors: ArrayLike) -> Splats:
+    """The scene in other colours, alike from every side, shaded by the luma of its own.
+
+    Args:
+        splats: N Gaussians.
+        colors: (N, 3) in [0, 1].
+
+    Returns:
+        The same geometry and opacities, SH degree 0.
+
+    Raises:
+        InputError: another number of colours.
+
+    >>> scene = Splats.create(np.zeros((2, 3)), scales=np.ones((2, 3)), sh0=np.full((2, 1, 3), 9.0))
+    >>> painted(scene, [[1, 0, 0], [0, 0, 1]]).colors.round(3).tolist() == [[1, 0, 0], [0, 0, 1]]
+    True
+    """
+    paint = np.asarray(colors, np.float64)
+    if paint.shape != (len(splats), 3):
+        raise InputError(f"colors: expected shape ({len(splats)}, 3), got {paint.shape}")
+    luma = np.clip(splats.colors.astype(np.float64) @ _LUMA, 0, 1)
+    shaded = paint * (1 - _SHADE + _SHADE * luma[:, None])
+    sh0 = np.ascontiguousarray(((shaded - 0.5) / SH_C0)[:, None], np.float32)
+    return replace(splats, sh0=sh0, shN=np.zeros((len(splats), 0, 3), np.float32))
+
+
+def flag_colors(flags: ArrayLike) -> NDArray[np.float64]:
+    """(N, 3) colours of (N,) protection flags: orange where p_i = 1 (eq. `frequency`), else grey."""
+    return np.where(np.asarray(flags, bool)[:, None], _FLAGGED, _PLAIN)
+
+
+def label_colors(labels: ArrayLike) -> NDArray[np.float64]:
+    """(N, 3) colours of (N,) labels: each its own hue, nearly black below 0.
+
+    Hues go round by the golden ratio, so that labels in sequence differ; labels far apart may look alike.
+
+    >>> np.unique(label_colors([0, 1, 1, -1]), axis=0).shape
+    (3, 3)
+    """
+    numbers = np.asarray(labels, np.int64)
+    hue = (numbers * _GOLDEN) % 1.0
+    wheel = np.abs((hue[:, None] * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1
+    tone = 0.25 + 0.25 * ((numbers * _GOLDEN**2) % 1.0)
+    colors = tone[:, None] + (1 - tone[:, None]) * np.clip(wheel, 0, 1)
+    return np.where(numbers[:, None] < 0, _GONE, colors)
+
+
+def cell_labels(splats: Splats, count: int) -> NDArray[np.int64]:
+    """The locality cell of every Gaussian: adaptive voxels, about `count` of them occupied (`tab:s_config`).
+
+    They are the cells of `simplify.flag` for a budget of `count`. A Gaussian beyond the lattice is a
+    cell of its own.
+
+    Args:
+        splats: N Gaussians, all of them finite.
+        count: of cells, N_S in the paper.
+
+    Returns:
+        (N,) cells numbered from 0, in no order that means anything.
+
+    Raises:
+        InputError: no Gaussian, or a count below 1.
+    """
+    if count < 1 or not len(splats):
+        raise InputError(f"cells: {count} of {len(splats)} Gaussians: expected at least one of each")
+    means = splats.means.astype(np.float64)
+    origin, radius = _frame(means)
+    arrays = (means - origin, splats.quats, splats.scales, splats.opacities)
+    size = _core.select_surface(tuple(np.ascontiguousarray(a) for a in arrays), count)["size"]
+    lattice = np.floor((means - origin + radius) / size)
+    outside = ((lattice < 0) | (lattice >= 2**21)).any(1)
+    lattice[outside, 0] = -1 - np.arange(np.count_nonzero(outside))
+    lattice[outside, 1:] = 0
+    return np.unique(lattice.astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _frame(means: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Middle and half-width of the lattice's cube, as the core's `Frame`: order statistics of each axis."""
+    last = len(means) - 1
+    ranks = np.sort(means, axis=0)
+    low, middle, high = (ranks[rank] for rank in (last // 100, last // 2, last - last // 100))
+    reach = float(np.maximum(middle - low, high - middle).max())
+    if not reach > 0:
+        reach = float(np.maximum(middle - ranks[0], ranks[-1] - middle).max())
+    return middle, 2 * reach if reach > 0 else 1.0

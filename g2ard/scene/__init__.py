@@ -1,0 +1,1 @@
+"""Scenes and what stages pass on: splats, cameras, targets, images, splits, regions."""

@@ -1,0 +1,113 @@
+"""What new images say of a scene's appearance: of all its colours at once, and of each Gaussian's own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.visibility import visibility
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import SH_C0, Splats
+from g2ard.scene.targets import Targets, mask_of
+
+__all__ = ["ColourChange", "blended", "colour_change", "recoloured", "views_seeing"]
+
+_VIEWS = 16
+"""Of the targets, evenly spaced, that tell the change of colours."""
+_PIXELS = 20_000
+"""Of each, at most."""
+_RIDGE = 1e-5
+"""Weight of no change, as a share of the pixels: colours that a scene lacks say nothing of theirs."""
+_LOOK = 300
+"""Pixels along the longer side where a Gaussian's visibility is measured."""
+_SEEN = 10.0
+"""Σ αT over such pixels at which a view has half seen a Gaussian."""
+
+
+@dataclass(frozen=True, eq=False)
+class ColourChange:
+    """c → matrix·c + shift, for every colour of a scene.
+
+    Args:
+        matrix: (3, 3) float64.
+        shift: (3,) float64.
+        gain: dB that it brings over the pixels it was fitted to.
+    """
+
+    matrix: NDArray[np.float64]
+    shift: NDArray[np.float64]
+    gain: float
+
+
+def colour_change(splats: Splats, targets: Targets, background: tuple[float, float, float]) -> ColourChange:
+    """The affine map of colours under which a scene's renders best fit images: exposure, white balance.
+
+    A pixel is C + (1 − A)·background, C = Σ αT·c and A = Σ αT, so under the map it is matrix·C + A·shift +
+    (1 − A)·background: linear least squares in twelve numbers, with a little weight on no change.
+
+    Args:
+        splats: the scene.
+        targets: images; masked pixels do not count.
+        background: RGB behind the scene, which stays as it is.
+    """
+    cameras = targets.cameras
+    behind = np.asarray(background)
+    normal, right = np.zeros((4, 4)), np.zeros((4, 3))
+    before = pixels = 0.0
+    renderer = Renderer(splats, background=background)
+    for view in np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), _VIEWS)).round().astype(int)):
+        rendered = renderer.render(cameras[int(view)])
+        image, mask = targets[int(view)], mask_of(targets, int(view))
+        counts = np.ones(image.shape[:2], bool) if mask is None else mask
+        rows = np.flatnonzero(counts)[:: max(1, int(counts.sum()) // _PIXELS)]
+        alpha = rendered.alpha.reshape(-1, 1)[rows].astype(np.float64)
+        beyond = (1 - alpha) * behind
+        own = rendered.image.reshape(-1, 3)[rows] - beyond
+        missing = image.reshape(-1, 3)[rows] - beyond - own
+        features = np.hstack([own, alpha])
+        normal += features.T @ features
+        right += features.T @ missing
+        before += float((missing**2).sum())
+        pixels += len(rows)
+    change = np.linalg.solve(normal + _RIDGE * pixels * np.eye(4), right)
+    # |y − Xb|² = |y|² − 2 bᵀXᵀy + bᵀXᵀXb
+    after = before - 2 * float((change * right).sum()) + float((change * (normal @ change)).sum())
+    tiny = np.finfo(np.float64).tiny
+    gain = 10 * float(np.log10(max(before, tiny) / max(after, tiny)))
+    return ColourChange(np.eye(3) + change[:3].T, change[3], gain)
+
+
+def recoloured(splats: Splats, change: ColourChange) -> Splats:
+    """A scene whose colours are changed: in every band by the matrix, in the base by the shift too."""
+    matrix = change.matrix.astype(np.float32)
+    rest = (change.matrix.sum(1) * 0.5 + change.shift - 0.5) / SH_C0
+    base = splats.sh0 @ matrix.T + rest.astype(np.float32)
+    return replace(splats, sh0=base, shN=splats.shN @ matrix.T)
+
+
+def views_seeing(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:
+    """(N,) how many views have seen each Gaussian: each counts w/(w + 10), w = Σ αT over a small render."""
+    small = cameras.resized(_LOOK)
+    out = np.zeros(len(splats))
+    for view in range(len(small)):
+        weight = visibility(splats, small.take([view])).weight
+        out += weight / (weight + _SEEN)
+    return out
+
+
+def blended(start: Splats, fitted: Splats, share: NDArray[np.float64]) -> Splats:
+    """Colours and opacity logits between those of a start and of a fit, (N,) `share` of the way."""
+    s = share.astype(np.float32)
+
+    def between(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+        return a + s.reshape(-1, *[1] * (a.ndim - 1)) * (b - a)
+
+    return replace(
+        fitted,
+        sh0=between(start.sh0, fitted.sh0),
+        shN=between(start.shN, fitted.shN),
+        logit_opacities=between(start.logit_opacities, fitted.logit_opacities),
+    )

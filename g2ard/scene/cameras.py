@@ -1,0 +1,353 @@
+"""Pinhole cameras, OpenCV axes (x right, y down, z forward), and what evaluation needs to name them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard.errors import InputError
+from g2ard.io.limits import check_image
+from g2ard.progress import plural
+
+__all__ = ["Camera", "Cameras", "look_at"]
+
+_LARGEST = 1e12
+"""Of a pose or intrinsics: more is damage, and overflows where it is squared."""
+
+_MEDIAN_OF = 16
+"""Views that stand for all of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One view.
+
+    Args:
+        viewmat: (4, 4) float64, camera_from_world, rigid; see `look_at`.
+        K: (3, 3) float64 pinhole intrinsics in pixels; pixel centres at +0.5.
+        width: pixels.
+        height: pixels.
+        name: of the photo, or of the pose.
+        image_path: the photo; None where there is none.
+        mask_path: which of its pixels count; None where all do.
+        distortion: (5,) float64, OpenCV k1 k2 p1 p2 k3 of the photo.
+
+    Shapes and values are checked where views come together, by `Cameras`.
+
+    >>> camera = Camera.facing([0, -2, 0], [0, 0, 0], width=32, height=24, fov=50)
+    >>> camera.position.tolist(), camera.holds([[0, 0, 0], [0, -3, 0]]).tolist()
+    ([0.0, -2.0, 0.0], [True, False])
+    """
+
+    viewmat: NDArray[np.float64]
+    K: NDArray[np.float64]
+    width: int
+    height: int
+    name: str = "view"
+    image_path: Path | None = None
+    mask_path: Path | None = None
+    distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(5))
+
+    @classmethod
+    def facing(
+        cls,
+        position: ArrayLike,
+        target: ArrayLike,
+        *,
+        width: int = 800,
+        height: int = 600,
+        fov: float = 50.0,
+        up: ArrayLike = (0.0, 0.0, 1.0),
+        name: str = "view",
+    ) -> Camera:
+        """A view from `position` to `target`, image top towards `up`; `fov` is horizontal, in degrees.
+
+        Raises:
+            InputError: position and target coincide, or a field of view that is not between 0 and 180°.
+        """
+        if not 0 < fov < 180:
+            raise InputError(f"fov: expected degrees between 0 and 180, got {fov}")
+        focal = width / 2 / np.tan(np.radians(fov) / 2)
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        return cls(look_at(position, target, up), K, width, height, name)
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """(3,) the camera's centre in the world."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def holds(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Which of some points, (N, 3) in the world, lie within the image, as (N,) bool.
+
+        What hides them does not count.
+        """
+        x, y, z = self.viewmat[:3, :3] @ (np.asarray(points, np.float64) - self.position).T
+        K, front = self.K, z > 0
+        ahead = np.where(front, z, 1.0)
+        u, v = K[0, 0] * x / ahead + K[0, 2], K[1, 1] * y / ahead + K[1, 2]
+        return front & (u >= 0) & (u <= self.width) & (v >= 0) & (v <= self.height)
+
+
+@dataclass(frozen=True, eq=False)
+class Cameras:
+    """C views.
+
+    Args:
+        viewmats: (C, 4, 4) float64, camera_from_world, rigid.
+        Ks: (C, 3, 3) float64 pinhole intrinsics in pixels; pixel centres at +0.5.
+        widths: (C,) int64 pixels.
+        heights: (C,) int64 pixels.
+        names: C unique names (of photos, or of poses).
+        image_paths: C paths, None where a view has no photo.
+        mask_paths: C paths of masks, None where all of a photo counts.
+        distortions: (C, 5) float64, OpenCV k1 k2 p1 p2 k3 of the *photo*; `g2ard.scene.images` undistorts on
+            loading, to these very Ks. Zero for a pinhole photo.
+        source: the file or folder that lists the views, for messages; None for views made in memory.
+
+    Raises:
+        InputError: shapes that do not fit, a non-finite pose, an empty image, or one of more than
+            160 million pixels.
+    """
+
+    viewmats: NDArray[np.float64]
+    Ks: NDArray[np.float64]
+    widths: NDArray[np.int64]
+    heights: NDArray[np.int64]
+    names: tuple[str, ...]
+    image_paths: tuple[Path | None, ...] = ()
+    distortions: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 5)))
+    mask_paths: tuple[Path | None, ...] = ()
+    source: Path | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.viewmats)
+        if not self.image_paths:
+            object.__setattr__(self, "image_paths", (None,) * n)
+        if not self.mask_paths:
+            object.__setattr__(self, "mask_paths", (None,) * n)
+        if not len(self.distortions):
+            object.__setattr__(self, "distortions", np.zeros((n, 5)))
+        for name, shape in (
+            ("viewmats", (n, 4, 4)),
+            ("Ks", (n, 3, 3)),
+            ("widths", (n,)),
+            ("heights", (n,)),
+            ("distortions", (n, 5)),
+        ):
+            got = getattr(self, name).shape
+            if got != shape:
+                raise InputError(f"{name}: expected shape {shape}, got {got}")
+        for name in ("names", "image_paths", "mask_paths"):
+            if len(getattr(self, name)) != n:
+                raise InputError(f"{name}: expected {n}, got {len(getattr(self, name))}")
+        for i in range(n):
+            given = (self.viewmats[i], self.Ks[i], self.distortions[i])
+            if not all(np.isfinite(values).all() for values in given):
+                raise InputError(f"view {i} ({self.names[i]}): its pose or intrinsics are not finite")
+            if max(np.abs(values).max() for values in given) > _LARGEST:
+                raise InputError(
+                    f"view {i} ({self.names[i]}): its pose or intrinsics are past {_LARGEST:.0e}"
+                )
+            if self.widths[i] < 1 or self.heights[i] < 1:
+                raise InputError(
+                    f"view {i} ({self.names[i]}): empty image {self.widths[i]}×{self.heights[i]}"
+                )
+            check_image(f"view {i} ({self.names[i]})", int(self.widths[i]), int(self.heights[i]))
+            if self.Ks[i, 0, 0] <= 0 or self.Ks[i, 1, 1] <= 0:
+                raise InputError(f"view {i} ({self.names[i]}): focal length must be positive")
+
+    def __len__(self) -> int:
+        return len(self.viewmats)
+
+    def __getitem__(self, index: int) -> Camera:
+        """One view; several are `take`n."""
+        i = range(len(self))[index]
+        return Camera(
+            self.viewmats[i],
+            self.Ks[i],
+            int(self.widths[i]),
+            int(self.heights[i]),
+            self.names[i],
+            self.image_paths[i],
+            self.mask_paths[i],
+            self.distortions[i],
+        )
+
+    def __iter__(self) -> Iterator[Camera]:
+        return (self[i] for i in range(len(self)))
+
+    @classmethod
+    def of(cls, views: Iterable[Camera]) -> Cameras:
+        """Single views, together.
+
+        Raises:
+            InputError: as `Cameras`.
+
+        >>> pair = [Camera.facing([0, y, 0], [0, 0, 0], name=str(y)) for y in (-2, -3)]
+        >>> Cameras.of(pair)[1].name, len(Cameras.of(pair))
+        ('-3', 2)
+        """
+        found = list(views)
+        return cls.from_lists(
+            [v.viewmat for v in found],
+            [v.K for v in found],
+            [(v.width, v.height) for v in found],
+            [v.name for v in found],
+            [v.image_path for v in found],
+            [v.distortion for v in found],
+            [v.mask_path for v in found],
+        )
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """(C, 3) camera centres in the world."""
+        R, t = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
+        return -np.einsum("cji,cj->ci", R, t)
+
+    @property
+    def forwards(self) -> NDArray[np.float64]:
+        """(C, 3) unit viewing directions in the world."""
+        return self.viewmats[:, 2, :3]
+
+    @property
+    def extent(self) -> float:
+        """1.1 × the greatest distance of a camera from the middle of them all, scene units (3DGS's
+        `cameras_extent`); 0 where they all stand in one place, or there are none."""
+        if not len(self):
+            return 0.0
+        away = np.linalg.norm(self.positions - self.positions.mean(0), axis=1).max()
+        return 1.1 * float(away) if away > 1e-9 * np.abs(self.positions).max() else 0.0
+
+    def take(self, index: ArrayLike) -> Cameras:
+        """The views `index` selects (a mask or indices), in its order."""
+        index = np.asarray(index)
+        rows = np.flatnonzero(index) if index.dtype == bool else index.astype(int).reshape(-1)
+        return replace(
+            self,
+            viewmats=self.viewmats[rows],
+            Ks=self.Ks[rows],
+            widths=self.widths[rows],
+            heights=self.heights[rows],
+            names=tuple(self.names[i] for i in rows),
+            image_paths=tuple(self.image_paths[i] for i in rows),
+            mask_paths=tuple(self.mask_paths[i] for i in rows),
+            distortions=self.distortions[rows],
+        )
+
+    def resized(self, longest: int | None) -> Cameras:
+        """The same views with their longer side shrunk to at most `longest` pixels (None keeps them)."""
+        if longest is None:
+            return self
+        factor = np.minimum(1.0, longest / np.maximum(self.widths, self.heights))
+        widths = np.maximum(1, np.rint(self.widths * factor)).astype(np.int64)
+        heights = np.maximum(1, np.rint(self.heights * factor)).astype(np.int64)
+        Ks = self.Ks.copy()
+        Ks[:, 0] *= (widths / self.widths)[:, None]
+        Ks[:, 1] *= (heights / self.heights)[:, None]
+        return replace(self, Ks=Ks, widths=widths, heights=heights)
+
+    def facing(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Which views have any of some points in front of them and within their image.
+
+        Args:
+            points: (N, 3) world.
+
+        Returns:
+            (C,) bool.
+
+        >>> K = [[50, 0, 32], [0, 50, 32], [0, 0, 1]]
+        >>> eyes = [look_at([3, 0, 0], [0, 0, 0]), look_at([3, 0, 0], [6, 0, 0])]
+        >>> Cameras.from_lists(eyes, [K] * 2, [(64, 64)] * 2, "ab").facing([[0, 0, 0]]).tolist()
+        [True, False]
+        """
+        world = np.asarray(points, np.float64)
+        few = world[:: max(1, len(world) // 1024)]  # usually tell
+        return np.array([view.holds(few).any() or view.holds(world).any() for view in self], bool)
+
+    def usual_share(self, points: ArrayLike) -> float:
+        """Share of some points, (N, 3) in the world, that a view holds: the median over 16 views at most."""
+        some = np.unique(np.linspace(0, len(self) - 1, min(len(self), _MEDIAN_OF)).round().astype(int))
+        return float(np.median([self[int(view)].holds(points).mean() for view in some]))
+
+    def recentred(self, offset: ArrayLike) -> Cameras:
+        """The same views in coordinates whose origin is the world point `offset` (see `Splats.offset`)."""
+        shift = np.asarray(offset, np.float64)
+        viewmats = self.viewmats.copy()
+        viewmats[:, :3, 3] += viewmats[:, :3, :3] @ shift
+        return replace(self, viewmats=viewmats)
+
+    @classmethod
+    def from_lists(
+        cls,
+        viewmats: Sequence[Any],
+        Ks: Sequence[Any],
+        sizes: Sequence[tuple[int, int]],
+        names: Sequence[str],
+        image_paths: Sequence[Path | None] = (),
+        distortions: Sequence[Any] = (),
+        mask_paths: Sequence[Path | None] = (),
+    ) -> Cameras:
+        """Stack per-view lists; `sizes` holds (width, height)."""
+        n = len(viewmats)
+        for name, size in zip(names, sizes, strict=True):  # before they must fit an int64
+            check_image(f"view {name}", *map(int, size))
+        return cls(
+            viewmats=np.asarray(viewmats, np.float64).reshape(n, 4, 4),
+            Ks=np.asarray(Ks, np.float64).reshape(n, 3, 3),
+            widths=np.asarray([w for w, _ in sizes], np.int64),
+            heights=np.asarray([h for _, h in sizes], np.int64),
+            names=tuple(names),
+            image_paths=tuple(image_paths),
+            distortions=np.asarray(distortions, np.float64).reshape(-1, 5),
+            mask_paths=tuple(mask_paths),
+        )
+
+
+def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
+    """(4, 4) camera_from_world of a camera at `position` facing `target`, image top towards `up`.
+
+    Args:
+        position: (3,) the camera's centre, world coordinates.
+        target: (3,) a point it faces.
+        up: (3,) a direction, of any length but 0; where the camera faces along it, some right axis is taken.
+
+    Returns:
+        (4, 4) float64, rigid; OpenCV axes: x right, y down, z forward.
+
+    Raises:
+        InputError: position and target coincide.
+
+    >>> look_at([0, 0, -2], [0, 0, 0], up=[0, -1, 0]).tolist()[2]
+    [0.0, 0.0, 1.0, 2.0]
+    """
+    eye = np.asarray(position, np.float64)
+    forward = np.asarray(target, np.float64) - eye
+    length = np.linalg.norm(forward)
+    if not length > 0:
+        raise InputError("look_at: position and target coincide")
+    z = forward / length
+    x = np.cross(z, np.asarray(up, np.float64))
+    if np.linalg.norm(x) < 1e-9 * np.linalg.norm(up):  # looking along `up`: any right axis will do
+        x = np.cross(z, np.roll(np.asarray(up, np.float64), 1))
+    x /= np.linalg.norm(x)
+    R = np.stack([x, np.cross(z, x), z])
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = R, -R @ eye
+    return view
+
+
+def unseeing(cameras: Cameras, what: str) -> str:
+    """What an error says where no view sees `what`, and what to do.
+
+    >>> unseeing(Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0])]), "the scene").partition(" (")[0]
+    'none of 1 view sees the scene; the views and the scene must be of one world'
+    """
+    return (
+        f"none of {plural(len(cameras), 'view')} sees {what}; the views and the scene must be of one world "
+        "(`g2ard info` shows both, `g2ard convert --transform` moves a scene)"
+    )

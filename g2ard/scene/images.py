@@ -1,0 +1,297 @@
+"""Photos as arrays that fit their cameras, PNGs, and sheets that show images side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from g2ard.errors import InputError
+from g2ard.io.atomic import atomic_output
+from g2ard.io.limits import opened_image
+from g2ard.progress import Progress, silent
+from g2ard.scene.cameras import Cameras
+
+__all__ = [
+    "as_saved",
+    "contact_sheet",
+    "load_image",
+    "load_images",
+    "load_mask",
+    "resized",
+    "to_bytes",
+    "write_png",
+]
+
+_ASPECT_SLACK = 0.02
+"""Relative difference of aspect ratio that rounding a resized photo may cause; more is another photo."""
+
+_GAP = 6
+"""Pixels between the images of a sheet."""
+
+
+def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
+    """The photo of one view, as a pinhole camera with the view's K and size would have taken it.
+
+    A distorted photo is undistorted at its own resolution, then resized by area. Where the undistorted
+    view looks past the photo's edge, the edge is repeated. EXIF orientation is ignored, for poses are of
+    the stored pixels; grey becomes three equal channels, alpha is composited over black.
+
+    Args:
+        cameras: C views.
+        index: which one.
+
+    Returns:
+        (H, W, 3) float32 in [0, 1].
+
+    Raises:
+        InputError: the view has no photo, it is absent or broken, or of another aspect ratio.
+    """
+    path, name = cameras.image_paths[index], cameras.names[index]
+    if path is None:
+        raise InputError(
+            f"view {index} ({name}) has no photo: its views name no image for it; give views with photos"
+        )
+    listed_in = "" if cameras.source is None else f"{cameras.source}: view {name!r}: "
+    image = _open(f"{listed_in}{path}", path)
+    height, width = image.shape[:2]
+    target = int(cameras.widths[index]), int(cameras.heights[index])
+    if abs(width * target[1] - height * target[0]) > _ASPECT_SLACK * height * target[0]:
+        raise InputError(
+            f"{listed_in}{path}: the photo is {width}×{height}, its view {target[0]}×{target[1]}: "
+            "the aspects differ; give the photos as their poses were made from, uncropped"
+        )
+    distortion = cameras.distortions[index]
+    if distortion.any():
+        K = cameras.Ks[index] * np.array([[width / target[0]], [height / target[1]], [1.0]])
+        image = _undistorted(image, K, distortion)
+    return resized(image, target)
+
+
+def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
+    """Where the photo of one view counts, in the pixels of `load_image`.
+
+    Args:
+        cameras: C views.
+        index: which one.
+
+    Returns:
+        (H, W), true where the mask is brighter than half; None if the view has no mask.
+
+    Raises:
+        InputError: as `load_image`, of the mask.
+    """
+    path = cameras.mask_paths[index]
+    if path is None:
+        return None
+    image = load_image(replace(cameras, image_paths=cameras.mask_paths), index)
+    return np.ascontiguousarray(image.mean(2) > 0.5)
+
+
+def load_images(cameras: Cameras, progress: Progress = silent) -> list[NDArray[np.float32]]:
+    """Every view's photo; see `load_image`.
+
+    Args:
+        cameras: C views, all with photos.
+        progress: told of each photo.
+
+    Returns:
+        C arrays (H, W, 3), float32 in [0, 1]: 12 bytes a pixel.
+
+    Raises:
+        InputError: as `load_image`.
+    """
+    images = []
+    for i in range(len(cameras)):
+        images.append(load_image(cameras, i))
+        progress("photos", i + 1, len(cameras))
+    return images
+
+
+def _open(where: str, path: Path) -> NDArray[np.float32]:
+    try:
+        with opened_image(where, path) as image:
+            if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey, whatever PIL calls it
+                values = np.asarray(image, np.float32)
+                top = 1.0 if image.mode == "F" else 65535.0
+                return np.repeat((values / np.float32(top))[..., None], 3, axis=2)
+            if image.has_transparency_data:
+                rgba = np.asarray(image.convert("RGBA"), np.float32) / np.float32(255)
+                return rgba[..., :3] * rgba[..., 3:]
+            return np.asarray(image.convert("RGB"), np.float32) / np.float32(255)
+    except FileNotFoundError as error:
+        raise InputError(f"{where}: no such photo; it must lie where its views name it") from error
+
+
+def _undistorted(
+    image: NDArray[np.float32], K: NDArray[np.float64], distortion: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Look up, for each pixel of the pinhole image, where the lens put it; bilinear."""
+    height, width = image.shape[:2]
+    rows, columns, down, right = _lookup(width, height, tuple(K.ravel()), tuple(distortion))
+    flat = image.reshape(-1, 3)
+    at = rows * width + columns
+    top = flat[at] * (1 - right) + flat[at + 1] * right
+    bottom = flat[at + width] * (1 - right) + flat[at + width + 1] * right
+    return (top * (1 - down) + bottom * down).reshape(image.shape)
+
+
+@lru_cache(maxsize=2)  # one lens for all photos is the rule
+def _lookup(width: int, height: int, K: tuple[float, ...], distortion: tuple[float, ...]) -> tuple[Any, ...]:
+    """Row, column and fraction of each pixel's source: OpenCV's model, pixel centres at +0.5.
+
+    x' = x·(1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²), y' alike with p1 and p2 exchanged.
+    """
+    if width < 2 or height < 2:
+        raise InputError(f"a photo of {width}×{height} pixels cannot be undistorted")
+    k1, k2, p1, p2, k3 = distortion
+    matrix = np.array(K).reshape(3, 3)
+    v, u = np.mgrid[0:height, 0:width] + 0.5
+    x, y, _ = np.linalg.inv(matrix) @ np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    bent = np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            np.ones_like(x),
+        ]
+    )
+    source = matrix[:2] @ bent - 0.5
+    column = np.clip(source[0], 0, width - 1)
+    row = np.clip(source[1], 0, height - 1)
+    left, above = np.minimum(column.astype(int), width - 2), np.minimum(row.astype(int), height - 2)
+    fractions = ((row - above)[:, None].astype(np.float32), (column - left)[:, None].astype(np.float32))
+    return above, left, *fractions
+
+
+def resized(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """An image (H, W, C) float32 at another (width, height): each pixel the mean of the area it covers;
+    bilinear along an axis that grows.
+
+    >>> resized(np.full((4, 8, 3), 0.5, np.float32), (2, 1)).tolist()
+    [[[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]]
+    """
+    for axis, length in ((0, size[1]), (1, size[0])):
+        if length < image.shape[axis]:
+            image = _averaged(image, length, axis)
+    height, width = image.shape[:2]
+    if (width, height) != size:
+        planes = [Image.fromarray(np.ascontiguousarray(image[..., c])) for c in range(image.shape[2])]
+        grown = [np.asarray(plane.resize(size, Image.Resampling.BILINEAR), np.float32) for plane in planes]
+        image = np.stack(grown, axis=2)
+    return np.ascontiguousarray(image)
+
+
+def _averaged(image: NDArray[np.float32], length: int, axis: int) -> NDArray[np.float32]:
+    """Exact means over `length` equal stretches of an axis, from differences of its running sum."""
+    count = image.shape[axis]
+    pad = [(1, 0) if i == axis else (0, 0) for i in range(3)]
+    sums = np.pad(np.cumsum(image, axis=axis, dtype=np.float64), pad)
+    edges = np.linspace(0, count, length + 1)
+    below = np.minimum(edges.astype(int), count - 1)
+    share = np.expand_dims(edges - below, [i for i in range(3) if i != axis])
+    low, high = sums.take(below, axis), sums.take(below + 1, axis)
+    return (np.diff(low + share * (high - low), axis=axis) * (length / count)).astype(np.float32)
+
+
+def to_bytes(image: ArrayLike) -> NDArray[np.uint8]:
+    """Values in [0, 1] as bytes, clipped and rounded to nearest; bytes stay as they are. NaN is black.
+
+    >>> to_bytes([[-1.0, 0.5, 2.0]]).tolist()
+    [[0, 128, 255]]
+    """
+    values = np.asarray(image)
+    if values.dtype == np.uint8:
+        return values
+    return np.rint(np.clip(np.nan_to_num(values, nan=0.0), 0, 1) * 255).astype(np.uint8)
+
+
+def as_saved(image: ArrayLike) -> NDArray[np.float32]:
+    """An image in [0, 1] as it comes back from an 8-bit PNG: clipped, and rounded to multiples of 1/255.
+
+    >>> (255 * as_saved([[-1.0, 0.5, 2.0]])).tolist()
+    [[0.0, 128.0, 255.0]]
+    """
+    return to_bytes(image).astype(np.float32) / np.float32(255)
+
+
+def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) -> None:
+    """Write an image as an 8-bit PNG, whole or not at all.
+
+    Args:
+        path: the file.
+        image: (H, W, 3), (H, W, 4) or (H, W), floats in [0, 1] or bytes.
+        overwrite: whether an existing file may be replaced.
+
+    Raises:
+        InputError: a shape that is no image.
+        OutputError: see `atomic_output`.
+    """
+    values = to_bytes(image)
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[..., 0]
+    if not values.size or not (values.ndim == 2 or (values.ndim == 3 and values.shape[2] in (3, 4))):
+        raise InputError(f"{path}: an array of shape {values.shape} is not an image")
+    with atomic_output(path, overwrite) as temporary:
+        Image.fromarray(np.ascontiguousarray(values)).save(temporary, format="PNG")
+
+
+def contact_sheet(
+    rows: Sequence[Sequence[ArrayLike]],
+    labels: Sequence[str],
+    *,
+    row_labels: Sequence[str] = (),
+    cell_width: int | None = None,
+) -> NDArray[np.uint8]:
+    """Images in a grid: one row a view, one column a kind (photo, simplified, recovered…).
+
+    Args:
+        rows: rows of images (H, W, 3), floats in [0, 1] or bytes, of any sizes; rows may be short.
+        labels: a caption above each column.
+        row_labels: a caption under each row; () for none.
+        cell_width: resize every image to this width; None keeps sizes.
+
+    Returns:
+        (H, W, 3) bytes, on a dark ground.
+
+    Raises:
+        InputError: no images.
+    """
+    grid = [[_cell(image, cell_width) for image in row] for row in rows]
+    if not any(grid):
+        raise InputError("a contact sheet needs images")
+    columns = max(map(len, grid))
+    widths = [max(row[c].width for row in grid if c < len(row)) for c in range(columns)]
+    heights = [max((cell.height for cell in row), default=0) for row in grid]
+    text = max(11, min(28, max(widths) // 20))
+    font, line = ImageFont.load_default(text), round(1.6 * text)
+    foot = line if row_labels else 0
+    lefts = [_GAP + sum(widths[:c]) + _GAP * c for c in range(columns)]
+    size = sum(widths) + _GAP * (columns + 1), line + sum(heights) + (foot + _GAP) * len(grid) + _GAP
+    sheet = Image.new("RGB", size, (24, 24, 24))
+    draw = ImageDraw.Draw(sheet)
+    for left, label in zip(lefts, labels, strict=False):
+        draw.text((left, _GAP), label, fill=(235, 235, 235), font=font)
+    top = _GAP + line
+    for r, (row, height) in enumerate(zip(grid, heights, strict=True)):
+        for left, cell in zip(lefts, row, strict=False):
+            sheet.paste(cell, (left, top))
+        if r < len(row_labels):
+            draw.text((_GAP, top + height), row_labels[r], fill=(200, 200, 200), font=font)
+        top += height + foot + _GAP
+    return np.asarray(sheet)
+
+
+def _cell(image: ArrayLike, width: int | None) -> Image.Image:
+    cell = Image.fromarray(np.ascontiguousarray(to_bytes(image))).convert("RGB")
+    if width is None or cell.width == width:
+        return cell
+    height = max(1, round(cell.height * width / cell.width))
+    return cell.resize((width, height), Image.Resampling.LANCZOS)

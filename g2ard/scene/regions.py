@@ -1,0 +1,72 @@
+"""Regions that a user points at: spheres and boxes in world coordinates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.scene.splats import Splats
+from g2ard.scene.transform import in_box, in_sphere
+
+__all__ = ["Region", "as_regions", "check_region", "in_any"]
+
+Region = tuple[float, ...]
+"""(x, y, z, r), a sphere, or (x, y, z, x, y, z), the lower and the upper corner of a box."""
+
+
+def check_region(region: Sequence[float]) -> Region:
+    """The region, as plain numbers.
+
+    Raises:
+        InputError: neither 4 nor 6 finite numbers, a radius that is not positive, a box that holds nothing.
+
+    >>> check_region([0, 0, 0, 2])
+    (0.0, 0.0, 0.0, 2.0)
+    """
+    numbers = tuple(float(value) for value in region)
+    if len(numbers) not in (4, 6) or not all(map(math.isfinite, numbers)):
+        raise InputError(
+            f"region: expected X,Y,Z,R or X,Y,Z,X,Y,Z, got {', '.join(f'{n:g}' for n in numbers)}"
+        )
+    if len(numbers) == 4 and not numbers[3] > 0:
+        raise InputError(f"region: expected a radius > 0, got {numbers[3]:g}")
+    if len(numbers) == 6 and not all(low < high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
+        raise InputError("region: a box with nothing in it; the lower corner comes first")
+    return numbers
+
+
+def as_regions(given: Sequence[Any]) -> tuple[Region, ...]:
+    """Regions, or one alone, as plain numbers.
+
+    Raises:
+        InputError: as `check_region`, or no numbers.
+
+    >>> as_regions((0, 0, 0, 2)), as_regions([[0, 0, 0, 2]])
+    (((0.0, 0.0, 0.0, 2.0),), ((0.0, 0.0, 0.0, 2.0),))
+    """
+    try:
+        alone = len(given) > 0 and not np.ndim(given[0])
+        return tuple(check_region(region) for region in ([given] if alone else given))
+    except (TypeError, ValueError):
+        raise InputError(f"keep_region: expected (x, y, z, r) or (x, y, z, x, y, z), got {given!r}") from None
+
+
+def in_any(splats: Splats, regions: Sequence[Region]) -> NDArray[np.bool_]:
+    """(N,) whose means lie in one of the regions.
+
+    >>> pair = Splats.create([[0, 0, 0], [5, 0, 0]], scales=np.ones((2, 3)))
+    >>> in_any(pair, [(4.0, -1.0, -1.0, 6.0, 1.0, 1.0)]).tolist()
+    [False, True]
+    """
+    inside = np.zeros(len(splats), bool)
+    for region in regions:
+        if len(region) == 4:
+            inside |= in_sphere(splats, region[:3], region[3])
+        else:
+            inside |= in_box(splats, region[:3], region[3:])
+    return inside

@@ -1,0 +1,330 @@
+"""What recovery and evaluation compare renders with: photos, or the teacher's renders of the same views."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard.errors import InputError
+from g2ard.progress import Progress, plural, silent
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+
+if TYPE_CHECKING:
+    from g2ard.rendering.renderer import RasterSettings, Renderer
+
+__all__ = [
+    "CACHE_BYTES",
+    "Photos",
+    "PhotosOrRenders",
+    "Subset",
+    "Targets",
+    "TeacherRenders",
+    "against_of",
+    "fingerprint_of",
+    "kinds_of",
+    "kinds_told",
+    "mask_of",
+]
+
+CACHE_BYTES = 2_000_000_000
+"""Targets are kept in memory up to this many bytes; beyond it they are made again when they are asked for."""
+
+
+class Targets(Protocol):
+    """One (H, W, 3) float32 image in [0, 1] for each view of `cameras`."""
+
+    cameras: Cameras
+
+    def __getitem__(self, view: int) -> NDArray[np.float32]: ...
+
+
+def mask_of(targets: Targets, view: int) -> NDArray[np.bool_] | None:
+    """(H, W), where a target counts; None where all of it does, which is the rule."""
+    masks = getattr(targets, "mask", None)
+    return None if masks is None else masks(view)
+
+
+def against_of(targets: Targets, view: int) -> str | None:
+    """What a view's target is, "photo" or "teacher"; None where the targets do not say."""
+    says: Callable[[int], str | None] | None = getattr(targets, "against", None)
+    return None if says is None else says(view)
+
+
+def kinds_of(targets: Targets) -> str:
+    """Of how many views the target is a photo, and of how many a teacher's render."""
+    said = [against_of(targets, view) for view in range(len(targets.cameras))]
+    return kinds_told(said.count("photo"), said.count("teacher"))
+
+
+def kinds_told(photos: int, renders: int) -> str:
+    """Targets of two kinds in words, counted where there are both.
+
+    >>> kinds_told(7, 9), kinds_told(7, 0)
+    ('7 photos and 9 teacher renders', 'photos')
+    """
+    if photos and renders:
+        return f"{plural(photos, 'photo')} and {plural(renders, 'teacher render')}"
+    return "photos" if photos else "teacher renders"
+
+
+def fingerprint_of(targets: Targets) -> str:
+    """What a checkpoint stores of its targets: the views, and where their images come from."""
+    cameras = targets.cameras
+    digest = hashlib.sha256(str(getattr(targets, "source", type(targets).__name__)).encode())
+    for array in (cameras.viewmats, cameras.Ks, cameras.widths, cameras.heights):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+class Subset:
+    """Some of other targets.
+
+    Args:
+        targets: all of them.
+        rows: which, in which order.
+    """
+
+    def __init__(self, targets: Targets, rows: ArrayLike) -> None:
+        self._targets, self._rows = targets, np.asarray(rows, np.int64)
+        self.cameras = targets.cameras.take(self._rows)
+        self.source = getattr(targets, "source", type(targets).__name__)
+
+    def __getitem__(self, view: int) -> NDArray[np.float32]:
+        return self._targets[int(self._rows[view])]
+
+    def mask(self, view: int) -> NDArray[np.bool_] | None:
+        """See `mask_of`."""
+        return mask_of(self._targets, int(self._rows[view]))
+
+    def against(self, view: int) -> str | None:
+        """See `against_of`."""
+        return against_of(self._targets, int(self._rows[view]))
+
+
+class _Cached(ABC):
+    """Keeps what `_make` returns, first come first kept, within `limit` bytes."""
+
+    def __init__(self, cameras: Cameras, limit: int) -> None:
+        self.cameras = cameras
+        self._limit = limit
+        self._kept: dict[int, NDArray[Any]] = {}
+        self._bytes = 0
+
+    @abstractmethod
+    def _make(self, view: int) -> NDArray[Any]:
+        """The image of one view, as it is kept."""
+
+    def _stored(self, view: int) -> NDArray[Any]:
+        image = self._kept.get(view)
+        if image is None:
+            image = self._make(view)
+            if self._bytes + image.nbytes <= self._limit:
+                self._kept[view] = image
+                self._bytes += image.nbytes
+        return image
+
+    def fill(self, progress: Progress, stage: str) -> None:
+        """Make every target now, as far as memory allows, so that later steps take equal time."""
+        for view in range(len(self.cameras)):
+            self._stored(view)
+            progress(stage, view + 1, len(self.cameras))
+            if self._bytes >= self._limit:
+                break
+
+
+class Photos(_Cached):
+    """The photos of `cameras`, undistorted and at each camera's size; kept as 8-bit.
+
+    A photo whose camera has a mask counts only where the mask is bright, and is black elsewhere. A photo
+    with an exposure, the affine colour transform C that trainers fit (photo = C·render), is undone to what
+    the scene shows.
+
+    Args:
+        cameras: every one with a photo.
+        exposures: (3, 4) of the photos that have one, by view name.
+        limit: bytes kept in memory.
+
+    Raises:
+        InputError: a view without a photo, an exposure that cannot be undone.
+    """
+
+    def __init__(
+        self,
+        cameras: Cameras,
+        *,
+        exposures: Mapping[str, NDArray[np.float64]] | None = None,
+        limit: int = CACHE_BYTES,
+    ) -> None:
+        missing = next(
+            (n for n, p in zip(cameras.names, cameras.image_paths, strict=True) if p is None), None
+        )
+        if missing is not None:
+            raise InputError(f"view {missing}: has no photo; TeacherRenders of a scene can stand in")
+        super().__init__(cameras, limit)
+        self.source = "photos " + " ".join(str(path) for path in cameras.image_paths)
+        if any(cameras.mask_paths):
+            self.source += " masks " + " ".join(str(path) for path in cameras.mask_paths)
+        self._masks: dict[int, NDArray[np.bool_] | None] = {}
+        self._undo = {
+            view: _inverse(name, exposures[name])
+            for view, name in enumerate(cameras.names)
+            if exposures and name in exposures
+        }
+        if self._undo:
+            self.source += f" exposures {[(v, m.tolist()) for v, m in self._undo.items()]}"
+
+    def against(self, view: int) -> str:
+        """See `against_of`."""
+        return "photo"
+
+    def mask(self, view: int) -> NDArray[np.bool_] | None:
+        """Where the photo counts; None if it has no mask."""
+        if view not in self._masks:
+            from g2ard.scene.images import load_mask
+
+            self._masks[view] = load_mask(self.cameras, view)
+        return self._masks[view]
+
+    def _make(self, view: int) -> NDArray[np.uint8]:
+        from g2ard.scene.images import load_image
+
+        return np.rint(load_image(self.cameras, view) * 255).astype(np.uint8)
+
+    def __getitem__(self, view: int) -> NDArray[np.float32]:
+        photo = self._stored(view).astype(np.float32) / np.float32(255)
+        undo = self._undo.get(view)
+        if undo is not None:
+            photo = np.ascontiguousarray(photo @ undo[:, :3].T + undo[:, 3], dtype=np.float32)
+        mask = self.mask(view)
+        if mask is not None:  # SSIM's window reaches over the mask's edge: what lies there must not matter
+            photo[~mask] = 0
+        return photo
+
+
+def _inverse(name: str, exposure: NDArray[np.float64]) -> NDArray[np.float32]:
+    matrix = np.asarray(exposure, np.float64)
+    if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:, :3])) < 1e-6:
+        raise InputError(f"exposure of {name}: expected an invertible 3×4 matrix")
+    inverse = np.linalg.inv(matrix[:, :3])
+    return np.hstack([inverse, -inverse @ matrix[:, 3:]]).astype(np.float32)
+
+
+class TeacherRenders(_Cached):
+    """The dense scene rendered into each view: (H, W, 3) float32, clipped to [0, 1], never rounded to 8 bits.
+
+    Args:
+        teacher: the dense scene.
+        cameras: the views, world coordinates.
+        background: RGB in [0, 1] behind the scene.
+        settings: the renderer's conventions; None means gsplat's.
+        limit: bytes of renders kept in memory; what is over it is rendered again when asked for.
+        lazy: render a view when it is first asked for, not all at once.
+        progress: told of views rendered.
+
+    Raises:
+        InputError: a camera or a background that cannot be rendered.
+    """
+
+    def __init__(
+        self,
+        teacher: Splats,
+        cameras: Cameras,
+        *,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        settings: RasterSettings | None = None,
+        limit: int = CACHE_BYTES,
+        lazy: bool = False,
+        progress: Progress = silent,
+    ) -> None:
+        super().__init__(cameras, limit)
+        self._teacher = teacher
+        self._background, self._settings = background, settings
+        self.source = f"teacher {teacher.fingerprint()} {background}"
+        if settings is not None:
+            self.source += f" {settings}"
+        self._renderer: Renderer | None = None
+        if not lazy:
+            self.fill(progress, "teacher")
+            self._renderer = None  # its buffers are larger than the scene
+
+    def _make(self, view: int) -> NDArray[np.float32]:
+        if self._renderer is None:
+            from g2ard.rendering.renderer import Renderer
+
+            self._renderer = Renderer(self._teacher, background=self._background, settings=self._settings)
+        return np.clip(self._renderer.image(self.cameras[view]), 0, 1)
+
+    def against(self, view: int) -> str:
+        """See `against_of`."""
+        return "teacher"
+
+    def __getitem__(self, view: int) -> NDArray[np.float32]:
+        return self._stored(view)
+
+
+class PhotosOrRenders:
+    """The photo of a view where there is one, else the dense scene's render (sec. 3.1: "real images are used
+    when available, otherwise teacher renders").
+
+    Args:
+        cameras: with photos or without.
+        teacher: the dense scene.
+        background: RGB behind it.
+        exposures: of the photos, see `Photos`.
+        settings: the renderer's conventions; None means gsplat's.
+        limit: bytes kept in memory, of each kind.
+        lazy: render when first asked for.
+        progress: told of every render.
+
+    Raises:
+        InputError: an exposure that cannot be undone.
+    """
+
+    def __init__(
+        self,
+        cameras: Cameras,
+        teacher: Splats,
+        *,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        exposures: Mapping[str, NDArray[np.float64]] | None = None,
+        settings: RasterSettings | None = None,
+        limit: int = CACHE_BYTES,
+        lazy: bool = False,
+        progress: Progress = silent,
+    ) -> None:
+        self.cameras = cameras
+        pictured = np.array([path is not None for path in cameras.image_paths], bool)
+        photos = Photos(cameras.take(np.flatnonzero(pictured)), exposures=exposures, limit=limit)
+        renders = TeacherRenders(
+            teacher,
+            cameras.take(np.flatnonzero(~pictured)),
+            background=background,
+            settings=settings,
+            limit=limit,
+            lazy=lazy,
+            progress=progress,
+        )
+        rows = np.where(pictured, np.cumsum(pictured), np.cumsum(~pictured)) - 1
+        self._places: list[tuple[Photos | TeacherRenders, int]] = [
+            (photos if photo else renders, int(row)) for photo, row in zip(pictured, rows, strict=True)
+        ]
+        self.source = f"{photos.source} | {renders.source}"
+
+    def __getitem__(self, view: int) -> NDArray[np.float32]:
+        targets, row = self._places[view]
+        return targets[row]
+
+    def mask(self, view: int) -> NDArray[np.bool_] | None:
+        """See `mask_of`."""
+        targets, row = self._places[view]
+        return mask_of(targets, row)
+
+    def against(self, view: int) -> str:
+        """See `against_of`."""
+        return self._places[view][0].against(view)

@@ -1,0 +1,188 @@
+"""Scenes moved, cut out and put together: what `g2ard convert` does between reading and writing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard.errors import InputError
+from g2ard.scene.splats import Splats
+
+__all__ = ["in_box", "in_sphere", "merge", "rotate_harmonics", "similarity", "transform"]
+
+_FAR = 16.0
+"""Extents from the origin past which a move goes into `offset`: float32 means keep their precision."""
+
+
+def transform(splats: Splats, matrix: ArrayLike) -> Splats:
+    """The scene after x ↦ s·R·x + t: means, scales, rotations and harmonics.
+
+    Args:
+        splats: the scene.
+        matrix: (4, 4) row-major, a similarity: one scale s > 0, a rotation R, a translation t in scene units.
+
+    Returns:
+        The scene; `offset` moves along where there is one, or where t is over 16 extents of the scene.
+
+    Raises:
+        InputError: the matrix is no similarity.
+
+    >>> quarter = [[0, -2, 0, 5], [2, 0, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
+    >>> one = Splats.create([[1, 0, 0]], scales=[[0.1, 0.2, 0.3]])
+    >>> moved = transform(one, quarter)
+    >>> moved.means.round(6).tolist(), moved.scales.round(6).tolist()
+    ([[5.0, 2.0, 0.0]], [[0.20000000298023224, 0.4000000059604645, 0.6000000238418579]])
+    """
+    scale, rotation, shift = similarity(matrix)
+    means = scale * splats.means.astype(np.float64) @ rotation.T
+    offset = scale * splats.offset @ rotation.T
+    extent = float(np.linalg.norm(np.ptp(means, axis=0))) if len(means) else 0.0
+    if splats.offset.any() or np.abs(shift).max() > _FAR * extent > 0:
+        offset = offset + shift
+    else:
+        means, offset = means + shift, np.zeros(3)
+    turn = _quaternion(rotation)
+    return replace(
+        splats,
+        means=means.astype(splats.means.dtype),
+        quats=_product(turn, splats.quats.astype(np.float64)).astype(np.float32),
+        scales=(splats.scales * scale).astype(np.float32),
+        shN=rotate_harmonics(splats.shN, rotation),
+        offset=offset,
+    )
+
+
+def similarity(matrix: ArrayLike) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """s, R (3, 3) and t (3,) of a 4×4 matrix.
+
+    Raises:
+        InputError: it is not 4×4 and finite, mirrors, or scales differently along different axes.
+    """
+    m = np.asarray(matrix, np.float64)
+    if m.shape != (4, 4) or not np.isfinite(m).all() or not np.allclose(m[3], [0, 0, 0, 1]):
+        raise InputError("transform: expected 4×4 finite numbers, row-major, the last row 0 0 0 1")
+    det = float(np.linalg.det(m[:3, :3]))
+    if det <= 0:
+        raise InputError(f"transform: mirrors or flattens the scene (its determinant is {det:g})")
+    scale = det ** (1 / 3)
+    rotation = m[:3, :3] / scale
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
+        raise InputError(
+            "transform: shears, or scales differently along different axes; Gaussians cannot follow"
+        )
+    u, _, v = np.linalg.svd(rotation)
+    return scale, u @ v, m[:3, 3]
+
+
+def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4,) wxyz: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
+    r = rotation
+    k = np.array(
+        [
+            [np.trace(r), r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+            [0, r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+            [0, 0, r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
+            [0, 0, 0, r[2, 2] - r[0, 0] - r[1, 1]],
+        ]
+    )
+    q: NDArray[np.float64] = np.linalg.eigh(np.triu(k) + np.triu(k, 1).T)[1][:, -1]
+    return q if q[0] >= 0 else -q
+
+
+def _product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 4) p·q: q's rotation, then p's."""
+    w, x, y, z = p
+    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return q @ left.T
+
+
+def rotate_harmonics(shN: NDArray[np.float32], rotation: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Coefficients of bands 1 to 3 of colours turned by R: c'(d) = c(R⁻¹·d).
+
+    A band's functions turn among themselves: its matrix M solves Y(d)·M = Y(R⁻¹·d) over more directions than
+    it has functions.
+
+    Args:
+        shN: (N, K, 3), K in {0, 3, 8, 15}, 3DGS's order and signs.
+        rotation: (3, 3).
+    """
+    out = np.empty_like(shN)
+    directions = np.random.default_rng(0).normal(size=(64, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    here, there = _basis(directions), _basis(directions @ rotation)
+    for band in range(1, 4):
+        rows = slice(band * band - 1, (band + 1) ** 2 - 1)
+        if rows.stop > shN.shape[1]:
+            break
+        turn = np.linalg.lstsq(here[:, rows], there[:, rows], rcond=None)[0]
+        out[:, rows] = np.einsum("kj,njc->nkc", turn, shN[:, rows].astype(np.float64))
+    return out
+
+
+def _basis(d: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 15) the real harmonics of bands 1 to 3 at unit vectors."""
+    x, y, z = d.T
+    xx, yy, zz = x * x, y * y, z * z
+    a, b, c = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
+    e, f, g, h = 0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154
+    columns: list[Any] = [
+        *(-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x),
+        *(a * x * y, -a * y * z, b * (2 * zz - xx - yy), -a * x * z, c * (xx - yy)),
+        *(-e * y * (3 * xx - yy), f * x * y * z, -g * y * (4 * zz - xx - yy)),
+        h * z * (2 * zz - 3 * xx - 3 * yy),
+        *(-g * x * (4 * zz - xx - yy), 0.5 * f * z * (xx - yy), -e * x * (xx - 3 * yy)),
+    ]
+    return np.stack(columns, axis=1)
+
+
+def merge(scenes: Sequence[Splats]) -> Splats:
+    """Several scenes as one, in world coordinates: relative to the first one's offset, at the highest degree.
+
+    Raises:
+        InputError: no scene.
+
+    >>> a = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]], offset=[100, 0, 0])
+    >>> b = Splats.create([[1, 0, 0]], scales=[[1, 1, 1]])
+    >>> merge([a, b]).means.tolist()
+    [[0.0, 0.0, 0.0], [-99.0, 0.0, 0.0]]
+    """
+    if not scenes:
+        raise InputError("merge: no scenes")
+    degree = max(scene.sh_degree for scene in scenes)
+    parts = [scene.recentred(scenes[0].offset).with_sh_degree(degree) for scene in scenes]
+    names = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+    together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return Splats(**together, offset=scenes[0].offset)
+
+
+def in_box(splats: Splats, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]:
+    """(N,) whose means lie in an axis-aligned box, bounds included, world coordinates.
+
+    Raises:
+        InputError: a lower bound above its upper one.
+    """
+    low, high = (np.asarray(v, np.float64) for v in (low, high))
+    if not (low <= high).all():
+        raise InputError(
+            f"box: from {low.tolist()} to {high.tolist()} holds nothing; the lower corner comes first"
+        )
+    world = splats.means.astype(np.float64) + splats.offset
+    inside: NDArray[np.bool_] = np.all((world >= low) & (world <= high), axis=1)
+    return inside
+
+
+def in_sphere(splats: Splats, center: ArrayLike, radius: float) -> NDArray[np.bool_]:
+    """(N,) whose means lie within `radius` of `center`, world coordinates.
+
+    Raises:
+        InputError: a radius that is not positive.
+    """
+    if not radius > 0:
+        raise InputError(f"sphere: expected a radius > 0, got {radius:g}")
+    world = splats.means.astype(np.float64) + splats.offset
+    away = world - np.asarray(center, np.float64)
+    return (away * away).sum(axis=1) <= radius * radius

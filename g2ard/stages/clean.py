@@ -1,0 +1,238 @@
+"""What a trained scene holds that no picture of it needs: found by kind, from its own views and neighbours.
+
+| kind | what it is |
+|---|---|
+| invisible | within reach of a view, no pixel changes by half an 8-bit step without it, nor their mean |
+| giant | larger than the scene, which lies within its 3σ: fog over everything |
+| needle | ten times as long as wide, with both ends beyond the 3σ of every neighbour |
+| floater | with all it touches less than a thousandth of the scene, in number and in light |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.errors import InputError
+from g2ard.progress import Progress, silent
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import DRAWN_LOGIT, Splats
+
+__all__ = ["KINDS", "Cleaning", "find_clutter", "within_reach"]
+
+KINDS = ("invisible", "giant", "needle", "floater")
+
+_HALF_STEP = 0.5 / 255
+_REACH = 3.0
+"""Standard deviations at which renderers end a footprint."""
+_LONG = 10.0
+_SMALL = 1e-3
+"""Share of the scene's Gaussians, and of its light, below which a group of its own is a floater."""
+_NEIGHBORS = 16
+_BEHIND = 0.01
+"""Share of the depth that a Gaussian may lie behind what a view sees and count as looked at."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cleaning:
+    """What each Gaussian was found to be.
+
+    Args:
+        kind: (N,) int8, −1 for what stays, else an index into `KINDS`.
+    """
+
+    kind: NDArray[np.int8]
+
+    @property
+    def keep(self) -> NDArray[np.bool_]:
+        """(N,) what stays."""
+        return self.kind < 0
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many of each kind."""
+        return {name: int(np.count_nonzero(self.kind == i)) for i, name in enumerate(KINDS)}
+
+
+def find_clutter(
+    splats: Splats, seen: Any, looked: NDArray[np.bool_], pixels: int, kinds: tuple[str, ...] = KINDS
+) -> Cleaning:
+    """Find what can go. A Gaussian of several kinds counts as the first of them in the order of `KINDS`.
+
+    Args:
+        splats: N Gaussians, finite.
+        seen: what views see of them (`g2ard.rendering.visibility.visibility`): `weight` and `peak` are read.
+        looked: (N,) those that the views could see (`within_reach`): no other is called invisible, unless
+            its α is below 1/255.
+        pixels: of all those views together.
+        kinds: the kinds looked for.
+
+    Returns:
+        A kind for each.
+
+    Raises:
+        InputError: an unknown kind, or `seen` or `looked` of another length.
+    """
+    if unknown := sorted(set(kinds) - set(KINDS)):
+        raise InputError(f"kinds: expected some of {', '.join(KINDS)}, got {unknown[0]!r}")
+    for name, rows in (("seen", seen.weight), ("looked", looked)):
+        if len(rows) != len(splats):
+            raise InputError(f"{name}: expected {len(splats)} rows, got {len(rows)}")
+    kind = np.full(len(splats), -1, np.int8)
+    hidden = _invisible(splats, seen, looked, pixels)
+    finders = {
+        "invisible": lambda rest: hidden,
+        "giant": lambda rest: _giants(splats),
+        "needle": lambda rest: _needles(splats, rest),
+        "floater": lambda rest: _floaters(splats, rest, seen.weight, looked),
+    }
+    for number, name in enumerate(KINDS):
+        if name in kinds:
+            rest = (kind < 0) & ~hidden  # what hides nothing supports nothing either
+            found = finders[name](rest)
+            kind[found & (kind < 0)] = number
+    return Cleaning(kind)
+
+
+def _invisible(splats: Splats, seen: Any, looked: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+    """What no renderer draws; and, least light first, what changes no pixel by half a step, until all
+    together would change the mean pixel by as much."""
+    faint = splats.logit_opacities < DRAWN_LOGIT
+    small = np.flatnonzero(looked & ~faint & (seen.peak < _HALF_STEP))
+    order = small[np.argsort(seen.weight[small], kind="stable")]
+    total = np.cumsum(seen.weight[order], dtype=np.float64)
+    out: NDArray[np.bool_] = faint.copy()
+    out[order[total <= _HALF_STEP * pixels]] = True
+    return out
+
+
+def within_reach(splats: Splats, cameras: Cameras, progress: Progress = silent) -> NDArray[np.bool_]:
+    """(N,) whose mean lies in the image of some view, before its matter or 1 % of the depth behind.
+
+    Matter is where half of a pixel's light is hidden. What lies deeper in all views, behind a wall or in a
+    corner that none of them looks into, may show from elsewhere.
+
+    Args:
+        splats: the scene.
+        cameras: in world coordinates.
+        progress: told after each view.
+    """
+    renderer = Renderer(splats)
+    means = splats.means.astype(np.float64) + splats.offset
+    out = np.zeros(len(splats), bool)
+    for done, camera in enumerate(cameras, 1):
+        depths = renderer.render(camera, median=True).median
+        assert depths is not None
+        x, y, z = camera.viewmat[:3, :3] @ means.T + camera.viewmat[:3, 3:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.floor(camera.K[0, 0] * x / z + camera.K[0, 2])
+            v = np.floor(camera.K[1, 1] * y / z + camera.K[1, 2])
+        framed = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        rows = np.flatnonzero(framed)
+        there = depths[v[rows].astype(int), u[rows].astype(int)]
+        out[rows[(there == 0) | (z[rows] < (1 + _BEHIND) * there)]] = True
+        progress("reach", done, len(cameras), {})
+    return out
+
+
+def _giants(splats: Splats) -> NDArray[np.bool_]:
+    """Larger than the radius that holds 99 % of the means, whose middle is within 3σ."""
+    means = splats.means.astype(np.float64)
+    middle = np.median(means, axis=0)
+    radius = float(np.percentile(np.linalg.norm(means - middle, axis=1), 99))
+    large = np.flatnonzero(splats.scales.max(axis=1) > radius)
+    out = np.zeros(len(splats), bool)
+    if len(large):
+        out[large[_away(splats, large, middle) <= _REACH]] = True
+    return out
+
+
+def _away(splats: Splats, rows: NDArray[np.intp], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) standard deviations of each of some rows from a point to its mean: √((p − μ)ᵀ Σ⁻¹ (p − μ))."""
+    local = np.einsum("nji,nj->ni", _axes(splats.quats[rows]), points - splats.means[rows].astype(np.float64))
+    local /= np.maximum(splats.scales[rows].astype(np.float64), 1e-30)
+    return np.sqrt((local * local).sum(axis=1))
+
+
+def _needles(splats: Splats, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Long and thin ones of `rest` whose both ends (2σ) lie beyond 3σ of their nearest neighbours,
+    taken as spheres of their largest scale: by their true shape eight times as many were needles on a clean
+    scene, many of them its fine lines."""
+    out = np.zeros(len(splats), bool)
+    rows = np.flatnonzero(rest)
+    order = np.sort(splats.scales[rows], axis=1).astype(np.float64)
+    long = rows[order[:, 2] > _LONG * np.maximum(order[:, 1], 1e-30)]
+    if not len(long) or len(rows) <= 2 * _NEIGHBORS:
+        return out
+    axis = np.argmax(splats.scales[long], axis=1)
+    along = np.take_along_axis(_axes(splats.quats[long]), axis[:, None, None], axis=2)[:, :, 0]
+    reach = 2 * splats.scales[long, axis].astype(np.float64)[:, None] * along
+    means = splats.means.astype(np.float64)
+    ends = np.concatenate([means[long] - reach, means[long] + reach])
+    points = np.concatenate([means[rows], ends])
+    near = _core.knn(np.ascontiguousarray(points), _NEIGHBORS)[len(rows) :].astype(np.int64)
+    real = near < len(rows)
+    other = rows[np.where(real, near, 0)]
+    covered = real & (other != np.tile(long, 2)[:, None])
+    away = np.linalg.norm(means[other] - ends[:, None], axis=2)
+    covered &= away <= _REACH * splats.scales[other].max(axis=2)
+    out[long[~covered.any(axis=1).reshape(2, -1).any(axis=0)]] = True
+    return out
+
+
+def _floaters(
+    splats: Splats, rest: NDArray[np.bool_], weight: NDArray[Any], looked: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Groups of `rest` that touch (spheres of 3σ of the largest scale meet), small in number and light, some
+    of them within reach of a view."""
+    out = np.zeros(len(splats), bool)
+    rows = np.flatnonzero(rest)
+    if len(rows) <= _NEIGHBORS:
+        return out
+    means = splats.means[rows].astype(np.float64)
+    reach = _REACH * splats.scales[rows].max(axis=1).astype(np.float64)
+    near = _core.knn(means, _NEIGHBORS).astype(np.int64)
+    away = np.linalg.norm(means[near] - means[:, None], axis=2)
+    a, b = np.nonzero(away <= reach[:, None] + reach[near])
+    group = _groups(len(rows), a, near[a, b])
+    count = np.bincount(group, minlength=len(rows))
+    light = np.bincount(group, weight[rows], minlength=len(rows))
+    small = (count <= _SMALL * len(rows)) & (light <= _SMALL * light.sum())
+    small &= np.bincount(group, looked[rows], minlength=len(rows)) > 0
+    out[rows[small[group]]] = True
+    return out
+
+
+def _groups(count: int, a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.int64]:
+    """(count,) the least row that each is connected to by the edges a–b.
+
+    >>> _groups(5, np.array([3, 1]), np.array([4, 3])).tolist()
+    [0, 1, 2, 1, 1]
+    """
+    root = np.arange(count)
+    while True:
+        low = np.minimum(root[a], root[b])
+        before = root.copy()
+        np.minimum.at(root, root[a], low)
+        np.minimum.at(root, root[b], low)
+        root = root[root]
+        if (root == before).all():
+            return root
+
+
+def _axes(quats: NDArray[Any]) -> NDArray[np.float64]:
+    """(N, 3, 3) rotation matrices; columns are the axes of the scales."""
+    from g2ard.io.packing import unit_quats
+
+    w, x, y, z = unit_quats(quats).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)

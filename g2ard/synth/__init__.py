@@ -1,8 +1,0 @@
-"""A small procedural city: coloured laser cloud, photos with exact poses and depth, four splits."""
-
-from __future__ import annotations
-
-from g2ard.synth.city import City, CityConfig, Hits, Scan, city
-from g2ard.synth.write import write_city
-
-__all__ = ["City", "CityConfig", "Hits", "Scan", "city", "write_city"]

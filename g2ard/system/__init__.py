@@ -1,0 +1,1 @@
+"""What g2ard uses of the machine: devices, memory, signals."""
