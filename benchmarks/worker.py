@@ -150,7 +150,7 @@ def _recover(job: Job) -> dict[str, Any]:
 
 
 def _adapt(job: Job) -> dict[str, Any]:
-    from g2ard.stages.adapt import AdaptConfig, adapt
+    from g2ard.pipeline.adapt import AdaptConfig, adapt
 
     config = AdaptConfig(
         steps=job["steps"],

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from g2ard.levels import save_levels
     from g2ard.pipeline import DistillConfig, Distilled
     from g2ard.pipeline import distill as distill_against
+    from g2ard.pipeline.adapt import AdaptConfig, Adapted, adapt
     from g2ard.policy.distill import distill
     from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.levels import lod
@@ -60,7 +61,6 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Camera, Cameras, look_at
     from g2ard.scene.splats import Splats
     from g2ard.scene.targets import Photos, TeacherRenders
-    from g2ard.stages.adapt import AdaptConfig, Adapted, adapt
     from g2ard.stages.evaluate import Evaluation, evaluate
     from g2ard.stages.lift import lift
     from g2ard.stages.recover import RecoverConfig, Recovered, recover
@@ -140,7 +140,7 @@ _HOMES = {
     "poses": ("make_pool",),
     "config.presets": ("preset",),
     "scene.splats": ("Splats",),
-    "stages.adapt": ("AdaptConfig", "Adapted", "adapt"),
+    "pipeline.adapt": ("AdaptConfig", "Adapted", "adapt"),
     "stages.evaluate": ("Evaluation", "evaluate"),
     "stages.lift": ("lift",),
     "stages.recover": ("RecoverConfig", "Recovered", "recover"),

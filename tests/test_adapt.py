@@ -13,8 +13,8 @@ from scenes import around, checkered_ball
 
 from g2ard import io
 from g2ard.errors import InputError
+from g2ard.pipeline.adapt import AdaptConfig, adapt
 from g2ard.scene.targets import TeacherRenders
-from g2ard.stages.adapt import AdaptConfig, adapt
 from g2ard.stages.evaluate import evaluate
 
 VIEWS = around(24)

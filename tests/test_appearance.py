@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from scenes import around, checkered_ball
 
+from g2ard.pipeline.adapt import AdaptConfig, adapt
 from g2ard.rendering.renderer import render
 from g2ard.scene.appearance import blended, colour_change, recoloured, views_seeing
 from g2ard.scene.targets import Subset, TeacherRenders
-from g2ard.stages.adapt import AdaptConfig, adapt
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.simplify import simplify
 

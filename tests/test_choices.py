@@ -12,7 +12,7 @@ from g2ard.io.scene_formats import FORMATS
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS
-from g2ard.stages.recover.engine import engine_class
+from g2ard.stages.recover.loop import engine_class
 from g2ard.stages.recover.schedule import SCHEDULES
 from g2ard.stages.select import select
 from g2ard.stages.simplify import SimplifyConfig

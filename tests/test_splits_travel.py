@@ -79,8 +79,8 @@ class Watch:
 
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
+    import g2ard.pipeline.adapt
     import g2ard.rendering.visibility
-    import g2ard.stages.adapt
     import g2ard.stages.evaluate
     import g2ard.stages.recover
 
@@ -97,7 +97,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
         monkeypatch.setattr(module, name, told)
 
     watched(g2ard.stages.recover, "recover", 1, seen.trained)
-    watched(g2ard.stages.adapt, "adapt", 1, seen.trained)
+    watched(g2ard.pipeline.adapt, "adapt", 1, seen.trained)
     watched(g2ard.rendering.visibility, "visibility_source", 0, seen.looked)
     watched(g2ard.stages.evaluate, "evaluate", 1, seen.scored)
     return seen

@@ -62,7 +62,7 @@ Engine = Literal["fused", "torch", "gsplat"]
 ENGINES: tuple[Engine, ...] = get_args(Engine)
 
 AdaptSchedule = Literal["default", "paper"]
-"""Schedules of adaptation (`g2ard.stages.adapt`)."""
+"""Schedules of adaptation (`g2ard.pipeline.adapt`)."""
 ADAPT_SCHEDULES: tuple[AdaptSchedule, ...] = get_args(AdaptSchedule)
 
 Refinement = Literal["auto", "none", "photometric", "exact"]

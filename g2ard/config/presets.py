@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from g2ard.errors import InputError
 from g2ard.pipeline import DistillConfig
-from g2ard.stages.adapt import AdaptConfig
+from g2ard.pipeline.adapt import AdaptConfig
 from g2ard.stages.recover.anchors import PAPER_PRESETS
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.schedule import PAPER

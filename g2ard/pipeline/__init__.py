@@ -1,4 +1,4 @@
-"""The whole pipeline: select, simplify, freeze anchors, recover, by rounds; it alone joins the stages."""
+"""The whole pipeline: select, simplify, freeze anchors and recover, in rounds."""
 
 from __future__ import annotations
 

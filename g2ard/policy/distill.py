@@ -203,6 +203,7 @@ def _aims(
 ) -> tuple[Aim, ...]:
     """What the budgets come to; bytes are of the scene at the degree that the result is written in."""
     from g2ard.policy.fit import aim_of
+    from g2ard.policy.simplify import Reduction
 
     written = prior if degree is None else prior.with_sh_degree(degree)
     return tuple(
@@ -211,6 +212,8 @@ def _aims(
             prior if budget.bytes is None else written,
             name,
             file=f"scene.{options.format}",
+            reduce=Reduction(prior, seed=options.seed, progress=progress),
+            recovered=True,
             seed=options.seed,
             progress=progress,
             say=say,

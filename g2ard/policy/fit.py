@@ -293,7 +293,8 @@ def aim_of(
     name: str = "scene",
     *,
     file: str = "scene.ply",
-    reduce: Callable[[int], Simplified] | None = None,
+    reduce: Callable[[int], Simplified],
+    recovered: bool = False,
     seed: int = 0,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -305,8 +306,8 @@ def aim_of(
         splats: the scene.
         name: what errors call the scene.
         file: a name whose suffix is the format of the file that `Budget.fit` speaks of.
-        reduce: what the result will be made with, where nothing follows; None if recovery does. A quality is
-            then looked for with `default` and a pool of its own, bytes with `fast`.
+        reduce: count → scene, the reduction that the result will be made with.
+        recovered: whether recovery follows. Bytes are then searched with the method `fast` and a margin.
         seed: of the views that quality is measured in.
         progress: told of planning.
         say: told what was found.
@@ -319,7 +320,7 @@ def aim_of(
         wanted = Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0)
         return _by_quality(splats, wanted, file, reduce, seed, progress, say)
     if budget.bytes is not None:
-        if reduce is None:
+        if recovered:
             found = count_for_bytes(splats, int(budget.bytes * _MARGIN), file, partial(_fast, splats))
         else:
             found = count_for_bytes(splats, budget.bytes, file, lambda count: reduce(count).splats)
@@ -335,17 +336,15 @@ def _by_quality(
     splats: Splats,
     wanted: Quality,
     file: str,
-    reduce: Callable[[int], Simplified] | None,
+    reduce: Callable[[int], Simplified],
     seed: int,
     progress: Progress,
     say: Say,
 ) -> Aim:
-    from g2ard.policy.simplify import Reduction
     from g2ard.poses import plan_pool
 
     pool = plan_pool(splats, _VIEWS, seed=seed, rows=_ROWS, looks=True, progress=progress)
     cameras = pool.cameras.resized(_SIDE)
-    reduce = reduce or Reduction(splats, seed=seed, progress=progress)
 
     def written(count: int) -> Splats:
         return as_file(reduce(count).splats, file)

@@ -53,10 +53,10 @@ def adapt(
     from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.config.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
+    from g2ard.pipeline.adapt import AdaptConfig, appearance_only
+    from g2ard.pipeline.adapt import adapt as refit
     from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import load_scene, load_trained, make_targets
-    from g2ard.stages.adapt import AdaptConfig, appearance_only
-    from g2ard.stages.adapt import adapt as refit
     from g2ard.stages.recover.schedule import schedule_named
 
     if schedule == "paper" and prior_views:

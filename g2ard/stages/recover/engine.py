@@ -1,22 +1,19 @@
-"""What takes the steps of a recovery, and which there are."""
+"""Objective and interface of the engines that take the steps of a recovery."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.choices import ENGINES
-from g2ard.errors import InputError
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, Regularizers
 from g2ard.stages.recover.schedule import Rates
 
-__all__ = ["Engine", "Objective", "engine_class"]
+__all__ = ["Engine", "Objective"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +42,7 @@ class Objective:
 
 
 class Engine(Protocol):
-    """What takes steps: holds parameters and optimiser state."""
+    """Parameters and optimiser state of a recovery, advanced one view at a time."""
 
     def step(
         self,
@@ -68,20 +65,3 @@ class Engine(Protocol):
 
     @property
     def skipped(self) -> int: ...
-
-
-def engine_class(name: str) -> Callable[[Objective], Engine]:
-    """The class of an engine by its name in `RecoverConfig.engine`; its packages are imported only then."""
-    if name == "fused":
-        from g2ard.stages.recover.fused_engine import FusedEngine
-
-        return FusedEngine
-    if name == "torch":
-        from g2ard.stages.recover.torch_engine import TorchEngine
-
-        return TorchEngine
-    if name == "gsplat":
-        from g2ard.stages.recover.gsplat_engine import GsplatEngine
-
-        return GsplatEngine
-    raise InputError(f"engine: expected {', '.join(ENGINES)}, got {name!r}")

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import ENGINES
+from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Targets, fingerprint_of, mask_of
@@ -19,13 +21,13 @@ from g2ard.stages.recover import checkpoint as checkpoints
 from g2ard.stages.recover.anchors import Anchors, drift95, needle
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import drawn
-from g2ard.stages.recover.engine import Engine, Objective, engine_class
+from g2ard.stages.recover.engine import Engine, Objective
 from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.probe import MULTIPLIERS, Probe, calm, search_multiplier, trial_steps
 from g2ard.stages.recover.schedule import multiplier_for, reach_for
 from g2ard.stages.recover.sizes import typical_share
 
-__all__ = ["Loop", "Watch", "finite"]
+__all__ = ["Loop", "Watch", "engine_class", "finite"]
 
 _TRIAL_STEPS = 20
 _TRIAL_SHARE, _CALM_SHARE = 0.1, 0.3
@@ -314,3 +316,20 @@ def _fingerprint(
     if frozen is not None:
         digest.update(frozen.tobytes())
     return digest.hexdigest()
+
+
+def engine_class(name: str) -> Callable[[Objective], Engine]:
+    """Return an engine's class by its name in `RecoverConfig.engine`, importing its packages only now."""
+    if name == "fused":
+        from g2ard.stages.recover.fused_engine import FusedEngine
+
+        return FusedEngine
+    if name == "torch":
+        from g2ard.stages.recover.torch_engine import TorchEngine
+
+        return TorchEngine
+    if name == "gsplat":
+        from g2ard.stages.recover.gsplat_engine import GsplatEngine
+
+        return GsplatEngine
+    raise InputError(f"engine: expected {', '.join(ENGINES)}, got {name!r}")

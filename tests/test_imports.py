@@ -1,0 +1,105 @@
+"""What modules import: no cycles, stages only foundations, and nothing heavy with `import g2ard`."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import g2ard
+
+ROOT = Path(g2ard.__file__).parent
+
+FOUNDATIONS = {
+    "_core",
+    "__version__",
+    "config",
+    "errors",
+    "io",
+    "progress",
+    "rendering",
+    "report",
+    "scene",
+    "system",
+}
+
+UNRESOLVED = {
+    *("g2ard.cli.config", "g2ard.cli.frame"),
+    *(f"g2ard.io{name}" for name in ("", ".cloud_ply", ".detect", ".point_stream")),
+    *(f"g2ard.io.{name}" for name in ("sog", "sog_stream", "stream")),
+}
+"""Modules that still import each other in a circle; remove a name once its circle is gone."""
+
+
+def modules() -> dict[str, Path]:
+    """Every module of the package by its full name."""
+    found = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        parts = ("g2ard", *path.relative_to(ROOT).with_suffix("").parts)
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imported(path: Path) -> Iterator[str]:
+    """What a module imports of g2ard, in functions too; not what only type checkers read."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            node.body = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "g2ard":
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.startswith("g2ard"))
+
+
+def graph() -> dict[str, set[str]]:
+    """Module → the modules that it imports; a name that is no module stands for the module it lies in."""
+    known = modules()
+    edges: dict[str, set[str]] = {}
+    for module, path in known.items():
+        targets = {name if name in known else name.rpartition(".")[0] for name in imported(path)}
+        edges[module] = targets & known.keys() - {module}
+    return edges
+
+
+def reachable(edges: dict[str, set[str]], start: str) -> set[str]:
+    """All modules that a module comes to by its imports."""
+    seen: set[str] = set()
+    waiting = list(edges[start])
+    while waiting:
+        module = waiting.pop()
+        if module not in seen:
+            seen.add(module)
+            waiting += edges[module]
+    return seen
+
+
+def test_no_import_cycles() -> None:
+    edges = graph()
+    del edges["g2ard"]  # it loads the public names only when they are used
+    edges = {module: targets - {"g2ard"} for module, targets in edges.items()}
+    assert {module for module in edges if module in reachable(edges, module)} <= UNRESOLVED
+
+
+def test_stages_import_only_foundations() -> None:
+    wrong = []
+    for module, path in modules().items():
+        if not module.startswith("g2ard.stages."):
+            continue
+        stage = ".".join(module.split(".")[:3])
+        for name in imported(path):
+            package = name.split(".")[1]
+            if package not in FOUNDATIONS and not name.startswith(stage):
+                wrong.append(f"{module} imports {name}")
+    assert wrong == []
+
+
+def test_importing_g2ard_loads_neither_numpy_nor_torch() -> None:
+    code = (
+        "import g2ard, sys; print([m for m in ('numpy', 'torch', 'PIL', 'g2ard._core') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
