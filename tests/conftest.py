@@ -13,12 +13,11 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
-from scenes import around, checkered_ball
 
 import g2ard
 from g2ard.io import write_views
-
-ROOT = Path(__file__).resolve().parents[1]
+from helpers.project import ROOT
+from helpers.scenes import around, checkered_ball
 
 Said = tuple[int, str, str]
 

@@ -56,7 +56,7 @@ def run_case(what: str, seconds: int, seed: int) -> None:
         for module in pkgutil.iter_modules(package.__path__, "g2ard.io."):
             importlib.import_module(module.name)
     from fuzz_readers import answer
-    from test_io_fuzz import MAKERS, READ
+    from helpers.reader_cases import MAKERS, READ
 
     warnings.simplefilter("ignore")
     memory = Path("/dev/shm")
@@ -97,7 +97,7 @@ def main() -> None:
     if options.case:
         run_case(options.case, options.seconds, options.seed)
         return
-    from test_io_fuzz import MAKERS
+    from helpers.reader_cases import MAKERS
 
     total, broken = 0, 0
     for what in MAKERS:

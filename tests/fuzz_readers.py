@@ -32,11 +32,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from test_io_fuzz import MAKERS, READ
-
 from g2ard.errors import InputError
 from g2ard.io import kind, read_cloud, read_scene, read_view_set
 from g2ard.io.limits import LARGEST_IMAGE
+from helpers.reader_cases import MAKERS, READ
 
 EXTREMES = [
     struct.pack(form, value)

@@ -6,20 +6,19 @@ import inspect
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import checkered_ball
 
 import g2ard
 from g2ard.io import Points
 from g2ard.report.base import Report
 from g2ard.scene.splats import Splats
+from helpers.commands import CommandLine
+from helpers.scenes import checkered_ball
 
-CommandLine = Callable[..., tuple[int, str, str]]
 BALL = checkered_ball(1500)
 ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 

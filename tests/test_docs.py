@@ -13,8 +13,11 @@ from typing import Any
 import pytest
 
 import g2ard
+from g2ard.errors import InputError
+from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS
+from helpers.project import ROOT
+from helpers.scenes import around, checkered_ball
 
-ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
     page for pattern in ("*.md", "docs/**/*.md", "benchmarks/record/*.md") for page in ROOT.glob(pattern)
 )
@@ -183,3 +186,26 @@ def test_the_readme_names_every_command_and_scene_format() -> None:
     names = {"sog": "SOG", "compressed_ply": ".compressed.ply", "tiles": "folders of tiles"}
     kinds = [name for name, kind in KINDS.items() if kind == "splats"]
     assert [name for name in kinds if names.get(name, f".{name}") not in scenes] == []
+
+
+BALL = checkered_ball(400)
+
+
+def test_scripts_need_no_deep_imports() -> None:
+    """Examples and pages import `g2ard` and what stands right under it."""
+    pages = [*ROOT.glob("examples/*.py"), *ROOT.glob("docs/methods/*.md"), ROOT / "README.md"]
+    pages += [page for page in ROOT.glob("docs/*.md") if page.name != "benchmarks.md"]
+    deep = [
+        f"{page.name}: {line}"
+        for page in pages
+        for line in page.read_text(encoding="utf-8").splitlines()
+        if re.match(r"\s*(from g2ard\.(?!synth import)|import g2ard\.)", line)
+    ]
+    assert deep == []
+    assert g2ard.Regularizers.of("lift") == PRESETS["lift"]
+    assert g2ard.Regularizers.of("noisy", paper=True) == PAPER_PRESETS["noisy"]
+    with pytest.raises(InputError, match="one of trained, lift, noisy, got 'lifted'"):
+        g2ard.Regularizers.of("lifted")
+    targets = g2ard.TeacherRenders(BALL, around(4, (32, 24)))
+    found = g2ard.distill_against(BALL, 50, targets, g2ard.DistillConfig(steps=2))
+    assert len(found.splats) == 50

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import runpy
-from pathlib import Path
 
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+from helpers.project import ROOT
+
+EXAMPLES = ROOT / "examples"
 
 
 def test_from_python() -> None:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from reference.raster import Oracle
 
+from reference.raster import Oracle
 from stress.scenes import NAMES, Params, Problem, random_problem, weighted
 
 __all__ = ["ENGINE_TOLERANCE", "TWIN_TOLERANCE", "Tally", "check_problem", "crossings"]

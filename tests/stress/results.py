@@ -23,7 +23,6 @@ if __name__ == "__main__":
 
 import numpy as np
 from numpy.typing import NDArray
-from scenes import around, checkered_ball
 
 from g2ard import _core, io
 from g2ard.rendering import visibility
@@ -35,6 +34,7 @@ from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import PRESETS
 from g2ard.stages.select import CoverageOptions, select
 from g2ard.stages.simplify import METHODS, flag, simplify
+from helpers.scenes import around, checkered_ball
 
 __all__ = ["lines", "random_scene"]
 

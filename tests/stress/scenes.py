@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from reference import raster as reference
 
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.stages.recover.rasterize import rasterize
+from reference import raster as reference
 
 __all__ = ["NAMES", "Params", "Problem", "random_problem", "weighted"]
 

@@ -1,0 +1,156 @@
+"""Pruning baselines: their scores against naive float64 twins, and exact counts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.baselines import METHODS, reduce
+from benchmarks.baselines.lightgaussian import global_significance
+from benchmarks.baselines.mini_splatting import importance, sample
+from benchmarks.baselines.pup import _log_det, _quarter, fisher, pup, rounds
+from benchmarks.baselines.simple import optical_mass
+from g2ard.errors import InputError
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+from helpers.scenes import around, checkered_ball
+from reference import raster as naive
+
+VIEWS = around(3, size=(14, 11))
+
+
+def scene(n: int = 12, rest: int = 3) -> Splats:
+    rng = np.random.default_rng(5)
+    return Splats.create(
+        rng.uniform(-1, 1, (n, 3)),
+        quats=rng.normal(size=(n, 4)),
+        scales=np.exp(rng.uniform(-2.5, -0.7, (n, 3))),
+        logit_opacities=rng.normal(0.5, 1.5, n),
+        sh0=rng.normal(size=(n, 1, 3)),
+        shN=rng.normal(0, 0.3, (n, rest, 3)),
+    )
+
+
+def tensors(s: Splats) -> list[torch.Tensor]:
+    arrays = (s.means, s.quats, np.log(s.scales.astype(np.float64)), s.logit_opacities, s.sh0, s.shN)
+    return [torch.from_numpy(np.asarray(a, np.float64)) for a in arrays]
+
+
+def oracle(s: Splats, cameras: Cameras, i: int, parameters: list[torch.Tensor] | None = None) -> naive.Oracle:
+    return naive.render(
+        *(parameters or tensors(s)),
+        viewmat=torch.from_numpy(cameras.viewmats[i]),
+        K=torch.from_numpy(cameras.Ks[i]),
+        width=int(cameras.widths[i]),
+        height=int(cameras.heights[i]),
+    )
+
+
+@pytest.mark.parametrize("rest", [0, 3, 15])
+def test_pups_fisher_is_the_gram_matrix_of_autograds_jacobian(rest: int) -> None:
+    s = scene(rest=rest)
+    expected = np.zeros((len(s), 6, 6))
+    for i in range(len(VIEWS)):
+        fixed = tensors(s)
+
+        def image(means: torch.Tensor, log_scales: torch.Tensor, i: int = i, fixed: list = fixed):
+            return oracle(s, VIEWS, i, [means, fixed[1], log_scales, *fixed[3:]]).image
+
+        by_mean, by_scale = torch.autograd.functional.jacobian(image, (fixed[0], fixed[2]), vectorize=True)
+        g = torch.cat([by_mean, by_scale], -1).reshape(-1, len(s), 6).numpy()
+        expected += np.einsum("pni,pnj->nij", g, g)
+    found = fisher(s, VIEWS)
+    size = np.sqrt(np.einsum("nii->ni", expected))
+    np.testing.assert_allclose(
+        found / (size[:, :, None] * size[:, None]), expected / (size[:, :, None] * size[:, None]), atol=2e-4
+    )
+    assert (size > 0).all()
+    np.testing.assert_allclose(_log_det(found), np.linalg.slogdet(expected)[1], atol=0.02)
+
+
+def test_pup_prunes_the_singular_first_and_looks_at_a_quarter() -> None:
+    s = scene(40)
+    hidden = Splats.create(s.means + np.float32([0, 0, 50]), scales=s.scales)  # beyond every view
+    both = Splats.create(
+        np.concatenate([hidden.means, s.means]),
+        quats=np.concatenate([hidden.quats, s.quats]),
+        scales=np.concatenate([hidden.scales, s.scales]),
+    )
+    big = around(8, size=(90, 61))
+    assert _quarter(big).widths[0] == 23
+    assert _quarter(big).heights[0] == 16
+    np.testing.assert_array_equal(pup(both, 30, big).means[:, 2] > 25, False)
+    np.testing.assert_array_equal(_log_det(np.stack([np.ones((6, 6)), np.eye(6)])), [-np.inf, 0])
+    assert rounds(90, 9) == [18, 9]
+    assert rounds(1000, 33)[-1] == 33
+
+
+def test_lightgaussians_significance_is_what_pixels_say() -> None:
+    s = scene(10)
+    volume = s.scales.astype(float).prod(1)
+    typical = sorted(volume, reverse=True)[9]
+    for kernel in ("transmittance", "hits"):
+        expected = np.zeros(len(s))
+        for i in range(len(VIEWS)):
+            seen = oracle(s, VIEWS, i)
+            for j in range(len(s)):
+                for p in range(seen.before.shape[1]):
+                    if seen.before[j, p] > 0:
+                        expected[j] += s.opacities[j] * (seen.before[j, p] if kernel != "hits" else 1)
+        expected *= (volume / typical) ** 0.1
+        np.testing.assert_allclose(global_significance(s, VIEWS, kernel=kernel), expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("indoor", [True, False])
+def test_mini_splattings_importance_is_what_pixels_say(indoor: bool) -> None:
+    s = scene(14)
+    expected, leads = np.zeros(len(s)), np.zeros(len(s))
+    for i in range(len(VIEWS)):
+        w = oracle(s, VIEWS, i).weight.numpy()
+        lead = np.bincount(w.argmax(0)[w.max(0) > 0], minlength=len(s))
+        leads += lead
+        area = (w > 0).sum(1)
+        share = w.sum(1) / np.maximum(area, 1)
+        expected += w.sum(1) if indoor else np.where(lead > 0, share, 0)
+    expected[leads == 0] = 0
+    assert (expected == 0).any()
+    np.testing.assert_allclose(importance(s, VIEWS, indoor=indoor), expected, rtol=1e-4)
+
+
+def test_sampling_takes_each_with_its_weight() -> None:
+    weights = np.array([1.0, 2.0, 0.0, 5.0])
+    first = np.zeros(4)
+    for seed in range(4000):
+        first[sample(weights, 1, seed=seed)] += 1
+    np.testing.assert_allclose(first / 4000, weights / 8, atol=0.03)
+    assert first[2] == 0
+    assert sample(weights, 4).tolist() == [0, 1, 2, 3]
+    # Second draws follow the weights of those left: P(both of 0, 1) = 1/8·2/7 + 2/8·1/6.
+    pairs = [tuple(sample(weights, 2, seed=seed)) for seed in range(4000)]
+    assert pairs.count((0, 1)) / 4000 == pytest.approx(1 / 28 + 1 / 24, abs=0.015)
+
+
+def test_optical_mass_is_the_papers_formula() -> None:
+    s = scene()
+    two = np.sort(s.scales.astype(float), 1)[:, 1:].prod(1)
+    np.testing.assert_allclose(optical_mass(s), -np.log1p(-s.opacities.astype(float)) * two, rtol=1e-4)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_baseline_keeps_exactly_the_budget(method: str) -> None:
+    ball, views = checkered_ball(600), around(4)
+    for budget in (1, 37, 600):
+        assert len(reduce(method, ball, budget, views)) == budget
+    again = [reduce(method, ball, 50, views, seed=3).fingerprint() for _ in range(2)]
+    assert again[0] == again[1]
+    for budget in (0, 601):
+        with pytest.raises(InputError, match="budget"):
+            reduce(method, ball, budget, views)
+
+
+def test_refuses_unknown_names_and_missing_views() -> None:
+    with pytest.raises(InputError, match="expected one of"):
+        reduce("magic", scene(), 3)
+    with pytest.raises(InputError, match="none were given"):
+        reduce("pup", scene(), 3)

@@ -1,0 +1,341 @@
+"""The procedural city: exact rays against a naive caster, clouds and photos that agree, disjoint splits."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.synth import City, CityConfig, city, write_city
+from benchmarks.synth.layout import Material
+from benchmarks.synth.noise import Noise, band, ramp
+from benchmarks.synth.shapes import Kind, Shapes, cast
+from g2ard.errors import InputError, OutputError
+from g2ard.io import read_points, read_views
+from reference import synth as naive
+
+SMALL = CityConfig(points=12_000, views=12, size=(96, 72), blocks=1, seed=3)
+LARGE = replace(SMALL, points=20_000, size=(480, 360), blocks=2)
+
+
+@pytest.fixture(scope="module")
+def town() -> City:
+    return city(SMALL)
+
+
+@pytest.fixture(scope="module")
+def large() -> City:
+    return city(LARGE)
+
+
+@pytest.fixture(scope="module")
+def large_scan(large):
+    return large.points()
+
+
+@pytest.fixture(scope="module")
+def scan(town):
+    return town.points()
+
+
+def one_of_each(rng: np.random.Generator, count: int) -> Shapes:
+    lo = rng.uniform(-10, 10, (count, 3))
+    return Shapes(np.arange(count) % len(Kind), lo, lo + rng.uniform(0.2, 6, (count, 3)))
+
+
+@pytest.mark.parametrize("packet", [1, 64, 8192])
+def test_first_hits_are_the_naive_casters(packet):
+    rng = np.random.default_rng(0)
+    shapes = one_of_each(rng, 60)
+    origins = rng.uniform(-15, 15, (4000, 3))  # some of them within bodies
+    directions = rng.standard_normal((4000, 3))
+    directions[:300, rng.integers(3)] = 0.0  # parallel to faces
+    want, body = naive.first_hits(shapes, origins, directions)
+    t, hit = cast(shapes, np.ascontiguousarray(origins.T), np.ascontiguousarray(directions.T), packet=packet)
+    assert (hit >= 0).mean() > 0.2
+    np.testing.assert_array_equal(hit, body)
+    np.testing.assert_allclose(t, want, rtol=1e-9, atol=1e-9)
+
+
+def test_city_depth_is_exact(town):
+    rng = np.random.default_rng(1)
+    directions = rng.standard_normal((3000, 3)) * rng.uniform(0.1, 10, (3000, 1))
+    origins = np.column_stack([rng.uniform(-50, 50, (3000, 2)), rng.uniform(0.5, 40, 3000)])
+    hits = town.cast(origins, directions)
+    want, body = naive.first_hits(town.layout.shapes, origins, directions)
+    assert (hits.primitive == body).mean() > 0.99  # from within a body faces of two may coincide
+    np.testing.assert_allclose(hits.depth, want, rtol=1e-9, atol=1e-9)
+    assert np.isinf(hits.depth).sum() == (body < 0).sum() > 100
+
+
+def test_photo_depth_is_exact(town):
+    view = town.views["ood"].take([0])
+    depth = town.depth(view, 0)
+    rng = np.random.default_rng(2)
+    y, x = rng.integers(0, 72, 400), rng.integers(0, 96, 400)
+    rays = np.linalg.inv(view.Ks[0]) @ np.stack([x + 0.5, y + 0.5, np.ones(400)])
+    origins = np.repeat(view.positions, 400, 0)
+    want, _ = naive.first_hits(town.layout.shapes, origins, rays.T @ view.viewmats[0, :3, :3])
+    np.testing.assert_allclose(depth[y, x], want, rtol=1e-9)
+
+
+def test_normals_are_outward_and_unit():
+    rng = np.random.default_rng(4)
+    shapes = one_of_each(rng, 30)
+    origins = rng.uniform(-40, 40, (3, 5000))
+    t, hit = cast(shapes, origins, -origins)
+    found = hit >= 0
+    p = (origins - origins * np.where(found, t, 0))[:, found]
+    normals = shapes.normals(p, hit[found])
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=0), 1, rtol=1e-12)
+    outside = ~shapes.inside((p + 1e-6 * normals).T)
+    assert ((normals * -origins[:, found]).sum(0) < 1e-9).mean() > 0.98  # they face where the ray came from
+    for k in np.flatnonzero(outside)[:200]:  # along the normal, away from the surface
+        lo, hi, kind = (a[hit[found][k]] for a in (shapes.lo, shapes.hi, shapes.kinds))
+        at = np.stack([p[:, k], p[:, k] + 1e-4 * normals[:, k]])
+        near = naive.surface_distance(Kind(kind), lo, hi, at)
+        assert near[0] < 1e-9
+        assert near[1] == pytest.approx(1e-4, rel=0.05)
+
+
+def test_points_lie_on_surfaces_within_noise(town, scan):
+    shapes, noise = town.layout.shapes, town.config.noise
+    away = np.empty(len(scan.positions))
+    for p in np.unique(scan.primitives):
+        at = scan.primitives == p
+        away[at] = naive.surface_distance(
+            Kind(shapes.kinds[p]), shapes.lo[p], shapes.hi[p], scan.positions[at]
+        )
+    assert away.max() < 6 * noise
+    assert 0.2 * noise < away.mean() < 0.8 * noise  # a half-normal's mean is 0.8 σ, less where beams graze
+    exact = City(replace(SMALL, noise=0.0)).points(1000)
+    for p in np.unique(exact.primitives):
+        at = exact.positions[exact.primitives == p]
+        assert naive.surface_distance(Kind(shapes.kinds[p]), shapes.lo[p], shapes.hi[p], at).max() < 1e-8
+
+
+def test_scan_is_exact_in_count_and_denser_near_scanners(large, large_scan):
+    assert len(large_scan.positions) == LARGE.points
+    materials = large.layout.materials[large_scan.primitives]
+    assert set(Material) <= set(materials.tolist())  # ground, blocks, facades, roofs, leaves, the rest
+    ground = large_scan.positions[materials == Material.GROUND]
+    beyond = (np.abs(ground[:, :2]) - large.layout.reach).max(1)
+    street, edge = (beyond < 5).sum(), (beyond > 25).sum()
+    outer = (2 * (large.layout.reach + 45)).prod() - (2 * (large.layout.reach + 25)).prod()
+    carriageway = (2 * (large.layout.reach + 5)).prod() - 4 * 62 * 48
+    assert street / carriageway > 3 * edge / outer
+
+
+def test_a_scan_in_parts_is_as_the_scan_at_once(large, large_scan, monkeypatch):
+    monkeypatch.setattr("benchmarks.synth.lidar.PART", 2500)
+    blocks = list(large.scans())
+    assert len(blocks) >= 16  # eight parts, each from the streets and from the air
+    assert max(len(b.positions) for b in blocks) <= 2500
+    parts = large.points()
+    for name in ("positions", "colors", "primitives"):
+        np.testing.assert_array_equal(
+            getattr(parts, name), np.concatenate([getattr(b, name) for b in blocks])
+        )
+    assert len(parts.positions) == LARGE.points == len(np.unique(parts.positions, axis=0))
+    whole, split = (
+        np.bincount(large.layout.materials[s.primitives], minlength=len(Material))
+        for s in (large_scan, parts)
+    )
+    spread = np.sqrt(whole + split)
+    assert (np.abs(whole - split) < 5 * spread + 0.01 * LARGE.points).all()
+    np.testing.assert_allclose(parts.positions.mean(0), large_scan.positions.mean(0), atol=3)
+    np.testing.assert_allclose(parts.positions.std(0), large_scan.positions.std(0), rtol=0.1)
+    shapes = large.layout.shapes
+    for p in np.unique(parts.primitives)[::7]:
+        at = parts.positions[parts.primitives == p]
+        away = naive.surface_distance(Kind(shapes.kinds[p]), shapes.lo[p], shapes.hi[p], at)
+        assert away.max() < 6 * large.config.noise
+
+
+def test_a_million_is_so_many_points_on_a_city_of_that_size(tmp_path, command_line):
+    few = ("--views", "8", "--size", "32x24")
+    status, _, said = command_line("synth", "city", "-o", "a", "--million", "0.012", *few, cwd=tmp_path)
+    assert status == 0, said
+    given = ("synth", "city", "-o", "b", "--points", "12k", "--blocks", "1", *few)
+    assert command_line(*given, cwd=tmp_path)[0] == 0
+    assert (tmp_path / "a" / "cloud.ply").read_bytes() == (tmp_path / "b" / "cloud.ply").read_bytes()
+    scan = city(points=12_000, blocks=1, views=8).points()
+    found = read_points(tmp_path / "a" / "cloud.ply")
+    np.testing.assert_array_equal(found.positions, scan.positions)
+    assert np.abs(found.colors - scan.colors).max() <= 0.5001 / 255
+    both = command_line("synth", "city", "-o", "c", "--million", "1", "--points", "5", cwd=tmp_path)
+    assert both[0] == 2
+    assert "not both" in both[2]
+
+
+def test_cloud_and_photos_agree_in_colour(large, large_scan):
+    seen, difference = 0, []
+    for name in ("train", "adapt", "ood"):
+        view = large.views[name].take([0])
+        camera = large_scan.positions @ view.viewmats[0, :3, :3].T + view.viewmats[0, :3, 3]
+        x, y = (camera @ view.Ks[0].T)[:, :2].T / np.where(camera[:, 2] > 0.5, camera[:, 2], np.nan)
+        with np.errstate(invalid="ignore"):
+            inside = (x > 0) & (x < 480) & (y > 0) & (y < 360)
+        at = np.flatnonzero(inside)
+        column, row = x[at].astype(int), y[at].astype(int)
+        visible = np.abs(large.depth(view, 0)[row, column] - camera[at, 2]) < 0.02 * camera[at, 2]
+        photo = large.photo(view, 0)[row, column]
+        difference.append(np.abs(photo - large_scan.colors[at])[visible].mean(1))
+        seen += int(visible.sum())
+    away = np.concatenate(difference)
+    assert seen > 1000
+    assert np.median(away) < 0.035  # leaves, bricks and edges differ within a pixel
+    assert away.mean() < 0.06
+
+
+def test_same_seed_same_bits(town, scan):
+    again = city(SMALL)
+    np.testing.assert_array_equal(again.points().positions, scan.positions)
+    np.testing.assert_array_equal(again.points().colors, scan.colors)
+    np.testing.assert_array_equal(again.photo(again.views["val"], 0), town.photo(town.views["val"], 0))
+    other = city(replace(SMALL, seed=4))
+    assert not np.array_equal(other.points().positions, scan.positions)
+
+
+def test_splits_are_disjoint(town):
+    views = town.views
+    assert sum(len(v) for v in views.values()) == SMALL.views
+    names = [name for v in views.values() for name in v.names]
+    assert len(set(names)) == SMALL.views
+
+    def nearest(a: str, b: str) -> float:
+        return float(np.linalg.norm(views[a].positions[:, None] - views[b].positions, axis=2).min())
+
+    assert nearest("train", "val") > 0.1
+    for own in ("adapt", "ood"):
+        for other in ({"train", "val", "adapt", "ood"}) - {own}:
+            assert nearest(own, other) > 0.5
+    many = city(replace(LARGE, views=100)).views  # val lies on the train trajectories: between its neighbours
+    gaps = np.linalg.norm(many["val"].positions[:, None] - many["train"].positions, axis=2).min(1)
+    assert np.median(gaps) < 20
+
+
+@pytest.mark.parametrize(("blocks", "seed"), [(1, 0), (2, 3), (3, 0)])
+def test_cameras_have_room_and_something_to_see(blocks, seed):
+    town = city(blocks=blocks, seed=seed, views=40, size=(16, 12))
+    directions = np.random.default_rng(0).standard_normal((100, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    for cameras in town.views.values():
+        for i, at in enumerate(cameras.positions):
+            hits = town.cast(at, directions)
+            assert hits.depth.min() > 0.3, cameras.names[i]
+            inward = (hits.normal * directions).sum(1) > 1e-9
+            assert not inward.any(), f"{cameras.names[i]} is within matter"
+            assert np.isfinite(town.depth(cameras, i)).mean() > 0.2, f"{cameras.names[i]} sees nothing"
+
+
+def test_offset_moves_everything_together(town, scan):
+    offset = (443_000.0, 4_428_000.0, 1_600.0)
+    moved = city(replace(SMALL, offset=offset))
+    np.testing.assert_allclose(moved.points().positions - offset, scan.positions, atol=2e-9)
+    np.testing.assert_allclose(
+        moved.views["train"].positions - offset, town.views["train"].positions, atol=1e-8
+    )
+    np.testing.assert_allclose(
+        moved.depth(moved.views["train"], 1), town.depth(town.views["train"], 1), rtol=1e-6
+    )
+
+
+def test_bands_are_averages():
+    rng = np.random.default_rng(5)
+    x, width = rng.uniform(-3, 3, 50), rng.uniform(0.01, 2, 50)
+    at = x[:, None] + width[:, None] * (np.arange(20_000) + 0.5) / 20_000 - width[:, None] / 2
+    want = ((at / 0.7 % 1) * 0.7 < 0.3).mean(1) - ((at / 0.7 % 1) * 0.7 < 0.1).mean(1)
+    np.testing.assert_allclose(band(x, 0.1, 0.3, width, 0.7), want, atol=2e-4)
+    np.testing.assert_allclose(ramp(x, 0.5, width), (at > 0.5).mean(1), atol=2e-4)
+    u, v = rng.uniform(0, 200, (2, 100_000)).astype(np.float32)
+    noise = Noise(1)(u, v, 0.5, np.float32(0.0) * u)
+    assert abs(noise.mean()) < 0.02
+    assert 0.2 < noise.std() < 0.6
+    assert np.abs(Noise(1)(u, v, 0.5, 0 * u + 10)).max() < 1e-3  # gone where a pixel spans many
+
+
+def test_writes_a_data_set(tmp_path, town, scan):
+    out = tmp_path / "city"
+    manifest = write_city(out, SMALL, depth=True, threads=2)
+    assert [p.name for p in tmp_path.iterdir()] == ["city"]
+    cloud = read_points(out / "cloud.ply")
+    np.testing.assert_array_equal(cloud.positions, scan.positions)
+    assert np.abs(cloud.colors - scan.colors).max() <= 0.5 / 255 + 1e-6
+    for name, cameras in town.views.items():
+        back = read_views(out / f"{name}.json")
+        np.testing.assert_array_equal(back.viewmats, cameras.viewmats)
+        assert back.names == cameras.names
+        assert all(path is not None and path.is_file() for path in back.image_paths)
+        assert manifest["views"][name] == len(cameras)
+    depth = np.load(out / "depth" / f"{town.views['val'].names[0]}.npy")
+    np.testing.assert_array_equal(depth, town.depth(town.views["val"], 0).astype(np.float32))
+    assert json.loads((out / "manifest.json").read_text())["options"]["seed"] == 3
+    assert "0.6,0.8,1" in (out / "README.txt").read_text()
+    again = tmp_path / "again"
+    write_city(again, SMALL, depth=True, threads=1)
+    files = sorted(p.relative_to(out) for p in out.rglob("*") if p.is_file())
+    assert len(files) == 2 * SMALL.views + 7
+    assert all((out / f).read_bytes() == (again / f).read_bytes() for f in files)
+    with pytest.raises(OutputError, match="exists"):
+        write_city(out, SMALL)
+
+
+def test_interrupted_leaves_nothing(tmp_path):
+    def stop(stage, done, total, info=None):
+        if stage == "photos":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_city(tmp_path / "city", replace(SMALL, points=500), progress=stop)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"views": 7},
+        {"points": 0},
+        {"blocks": 0},
+        {"size": (0, 5)},
+        {"fov": 180.0},
+        {"noise": float("nan")},
+        {"sky": (2.0, 0.0, 0.0)},
+        {"offset": (float("inf"), 0.0, 0.0)},
+        {"seed": -1},
+    ],
+)
+def test_refuses_what_makes_no_city(options):
+    with pytest.raises(InputError, match=next(iter(options)).replace("size", "width")):
+        CityConfig(**options)
+
+
+def test_refuses_bad_rays(town):
+    with pytest.raises(InputError, match="zero"):
+        town.cast([0, 0, 1], [[0, 0, 0]])
+    with pytest.raises(InputError, match="expected"):
+        town.cast([0, 0, 1], [[1, 0]])
+
+
+def test_command_line(tmp_path, command_line):
+    options = ["--points", "2k", "--views", "8", "--size", "40x30", "--blocks", "1", "--sky", "0,0,0"]
+    options += ["--offset", "1e6,2e6,100", "--seed", "5"]
+
+    def run(*more):
+        return command_line("synth", "city", "-o", "out", *options, *more, cwd=tmp_path)
+
+    status, out, err = run("-q", "--json", "-")
+    assert (status, err) == (0, "")
+    assert json.loads(out)["options"]["size"] == [40, 30]
+    assert json.loads(out)["options"]["seed"] == 5
+    cloud = read_points(tmp_path / "out" / "cloud.ply")
+    assert len(cloud) == 2000
+    np.testing.assert_allclose(cloud.positions.mean(0), [1e6, 2e6, 105], atol=30)
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+    status, _, err = run()
+    assert status == 1
+    assert "exists" in err
+    for wrong in (["--size", "0x4"], ["--points", "25%"], ["--offset", "1,2"], ["--views", "3"]):
+        assert run("-w", *wrong)[0] == 2

@@ -1,0 +1,83 @@
+"""Budgets on the command line: counts, ratios, and several in one call."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import g2ard
+from g2ard.cli.budget_options import Count, Counts
+from helpers.commands import CommandLine, refused
+from helpers.scenes import checkered_ball
+
+
+def test_several_budgets_are_what_single_runs_give(command_line: CommandLine, folder: Path) -> None:
+    several = ("simplify", "ball.ply", "-r", "4,5", "-r", 10, "-o", "s_{ratio}x_{count}.ply", "--json", "-")
+    status, out, error = command_line(*several, cwd=folder)
+    assert status == 0, error
+    assert [run["output_count"] for run in json.loads(out)["runs"]] == [100, 80, 40]
+    for ratio, count in ((4, 100), (5, 80), (10, 40)):
+        command_line("simplify", "ball.ply", "-r", ratio, "-o", f"one_{ratio}.ply", cwd=folder)
+        one = (folder / f"one_{ratio}.ply").read_bytes()
+        assert (folder / f"s_{ratio}x_{count}.ply").read_bytes() == one
+    ask = ("distill", "ball.ply", "--steps", 8, "--size", 48)
+    status, _, error = command_line(*ask, "-n", "200,100", "-o", "runs/{count}", cwd=folder)
+    assert status == 0, error
+    command_line(*ask, "-n", "100", "-o", "alone", "--no-view", cwd=folder)
+    assert (folder / "runs/100/scene.ply").read_bytes() == (folder / "alone/scene.ply").read_bytes()
+    assert (folder / "runs/200/report.html").exists()
+    assert (folder / "runs/100/view.html").exists()
+    assert not (folder / "alone/view.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "counts"),
+    [("1,000", [1000]), ("1_100", [1100]), ("300", [300]), ("0.2k,10%", [200, 120]), ("200,100", [200, 100])],
+)
+def test_counts_take_separators(text: str, counts: list[int]) -> None:
+    assert [count.of(1200) for count in Counts.parse(text)] == counts
+
+
+def test_several_counts_are_named_by_count(command_line: CommandLine, folder: Path) -> None:
+    status, _, error = command_line("simplify", "ball.ply", "-n", "200,100", "-o", "s.ply", cwd=folder)
+    assert (status, "such as s_{count}.ply; one number has no commas, or reads 10_000" in error) == (2, True)
+    g2ard.save(folder / "larger.ply", checkered_ball(1200))
+    status, _, error = command_line("simplify", "larger.ply", "-n", "1,000", "-o", "s.ply", cwd=folder)
+    assert (status, "1,000 of 1,200 Gaussians" in error) == (0, True), error
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("9.000", "write 9000 or 9_000"),
+        ("1.234.567", "write 1234567 or 1_234_567"),
+        ("9.0", "without a dot"),
+        ("0.500", "without a dot"),
+        ("5,000,4,000", "5_000,4_000 or 5k,4k"),
+        ("5,000,10k", "5_000,4_000 or 5k,4k"),
+    ],
+)
+def test_counts_that_could_be_others_are_refused(text: str, words: str) -> None:
+    with pytest.raises(Exception, match="not '") as refusal:
+        Counts.parse(text)
+    assert words in str(refusal.value)
+    assert Count.parse("1.500M").of(2_000_000) == 1_500_000
+
+
+def test_budgets_that_come_to_one_place_are_refused_before_any_work(
+    command_line: CommandLine, folder: Path
+) -> None:
+    ask = ("distill", "ball.ply", "--json", "-")
+    for budgets, name in (("20,20", "{ratio}"), ("20,20", "{count}"), ("20,20.01", "{count}")):
+        error = refused(command_line, folder, *ask, "-r", budgets, "-o", name)
+        assert "written to the same place" in error
+    assert "poses" not in error
+
+
+@pytest.mark.parametrize("command", ["simplify", "distill"])
+def test_a_name_has_no_unknown_words(command: str, command_line: CommandLine, folder: Path) -> None:
+    error = refused(command_line, folder, command, "ball.ply", "-r", 4, "-o", "{foo}_{ratio}.ply")
+    assert "{foo} stands for nothing; {ratio} and {count}" in error
+    assert sorted(path.name for path in folder.iterdir()) == ["ball.ply", "views.json"]

@@ -1,0 +1,207 @@
+"""The command line's contract: exit statuses, one-line errors, lazy imports."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from g2ard.cli.commands import COMMANDS
+from g2ard.cli.console import Console
+from helpers.commands import CommandLine
+
+
+def imported_by(statement: str, *heavy: str) -> list[str]:
+    code = f"import sys; {statement}; print([m for m in {heavy!r} if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return eval(out.stdout)
+
+
+def test_import_and_help_load_nothing_heavy() -> None:
+    assert imported_by("import g2ard", "torch", "numpy", "typer", "rich") == []
+    help_ = "import contextlib, io\nfrom g2ard.cli import main\nsys.argv = ['g2ard', '--help']\n"
+    help_ += "with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit): main()\n"
+    heavy = ("torch", "numpy", "PIL", "markdown_it", "pygments")
+    code = f"import sys\n{help_}print([m for m in {heavy} if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert eval(out.stdout) == []
+
+
+def test_what_help_defers_of_rich_loads_when_it_is_used() -> None:
+    code = """
+from g2ard.cli.lazy_rich import defer_rich
+defer_rich()
+from rich.markdown import Markdown
+from rich.traceback import Traceback
+import rich.traceback
+assert Markdown("*a*").markup == "*a*"
+assert Traceback.extract(ValueError, ValueError("a"), None).stacks[0].exc_value == "a"
+assert rich.traceback.PathHighlighter.__module__ == "rich.traceback"
+from rich.traceback import Traceback as real
+assert isinstance(Traceback.extract(ValueError, ValueError("a"), None).stacks, list) and real is not Traceback
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_package_hands_out_what_its_docstring_names() -> None:
+    import g2ard
+
+    for name in g2ard.__all__:
+        assert getattr(g2ard, name) is not None
+    with pytest.raises(AttributeError, match="nonsense"):
+        _ = g2ard.nonsense
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_an_example(command: str, command_line: CommandLine, tmp_path: Path) -> None:
+    status, shown, _ = command_line(command, "--help", cwd=tmp_path)
+    assert status == 0
+    assert "Example: g2ard " + command in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nonsense"], "nonsense"),
+        (["render", "x.ply", "--views", "v.json", "-o", "out", "--threads", "-1"], "--threads"),
+        (["render", "x.ply", "--views", "v.json", "-o", "out", "--background", "2,0,0"], "--background"),
+        (["render", "x.ply", "--views", "v.json", "-o", "out", "--device", "abacus"], "abacus"),
+    ],
+)
+def test_usage_errors_are_one_line_and_status_2(
+    arguments: list[str], words: str, command_line: CommandLine, tmp_path: Path
+) -> None:
+    status, _, error = command_line(*arguments, cwd=tmp_path)
+    assert status == 2
+    assert len(error.strip().splitlines()) == 1
+    assert words in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_config_file_gives_defaults_and_refuses_unknown_names(
+    command_line: CommandLine, tmp_path: Path
+) -> None:
+    (tmp_path / "bad.toml").write_text('[render]\nbackgruond = "white"\n')
+    (tmp_path / "good.toml").write_text('[render]\ndevice = "abacus"\n')
+    render = ("render", "x.ply", "--views", "v", "-o", "o", "--config")
+    status, _, error = command_line(*render, "bad.toml", cwd=tmp_path)
+    assert status == 2
+    assert "backgruond" in error
+    assert "abacus" in command_line(*render, "good.toml", cwd=tmp_path)[2]  # the file's value is used …
+    flagged = command_line(*render, "good.toml", "--device", "cpu", cwd=tmp_path)[2]
+    assert "abacus" not in flagged  # … a flag wins
+
+
+def test_config_file_takes_plain_toml_values(command_line: CommandLine, tmp_path: Path) -> None:
+    from scenes import checkered_ball
+
+    from g2ard.io import read_splats, write_splats
+
+    write_splats(tmp_path / "s.ply", checkered_ball(50))
+    (tmp_path / "c.toml").write_text("[simplify]\nratio = 10\nno-views = true\n")
+    status, _, error = command_line("simplify", "s.ply", "-o", "o.ply", "--config", "c.toml", cwd=tmp_path)
+    assert status == 0, error
+    assert len(read_splats(tmp_path / "o.ply")) == 5
+
+
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+def test_config_files_are_utf_8(tmp_path: Path, mark: bytes) -> None:
+    """Whatever the locale, and with a byte order mark too, which editors on Windows write."""
+    (tmp_path / "c.toml").write_bytes(mark + 'output = "größe/×.ply"\n'.encode())
+    code = "import sys; from pathlib import Path; from g2ard.cli.config import _read;"
+    code += "print(ascii(_read(Path(sys.argv[1]))))"
+    plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "c.toml"], env=plain, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert eval(done.stdout) == {"output": "größe/×.ply"}
+
+
+def test_progress_lines_are_rare_and_tell_eta(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter(range(100))
+    monkeypatch.setattr("g2ard.cli.console.time.monotonic", lambda: next(clock))
+    console = Console()
+    for done in range(1, 41):
+        console("recover", done, 40, {"loss": 0.5})
+    console("short", 1, 1)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 4  # every 10 s, and the end
+    assert "ETA" in lines[0]
+    assert "loss 0.5" in lines[0]
+    assert lines[-1].startswith("recover: 40/40")
+
+
+def test_quiet_says_errors_only(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console(quiet=True)
+    console.say("hello")
+    console("stage", 1, 1)
+    console.table("t", ["a"], [["1"]])
+    console.error("bad")
+    assert capsys.readouterr().err == "g2ard: bad\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["simplify", "absent.ply", "-r", "2", "-o", "out.obj"], "out.obj: scenes are written as"),
+        (["lift", "absent.ply", "-o", "out.gltf"], "out.gltf: scenes are written as"),
+        (["recover", "absent.ply", "--views", "v.json", "-o", "out.obj"], "out.obj: scenes are written as"),
+        (["adapt", "absent.ply", "--views", "v.json", "-o", "out.obj"], "out.obj: scenes are written as"),
+        (
+            ["select", "absent.ply", "--views", "v.json", "-k", "2", "-o", "out.txt"],
+            "out.txt: views are written",
+        ),
+        (["poses", "absent.ply", "-n", "2", "-o", "out.txt"], "out.txt: views are written"),
+    ],
+)
+def test_a_format_that_is_not_written_is_refused_before_the_work(
+    command_line: CommandLine, tmp_path: Path, arguments: list[str], words: str
+) -> None:
+    status, _, error = command_line(*arguments, cwd=tmp_path)
+    assert status == 1
+    assert words in error
+    assert len(error.splitlines()) == 1
+
+
+def test_an_interrupt_while_a_string_is_executed_ends_with_130_too(tmp_path: Path) -> None:
+    """`python -m` would end by the signal, though the interrupt was handled."""
+    (tmp_path / "stopped.py").write_text("""
+import sys
+import g2ard.cli
+from g2ard.__main__ import main
+def stopped():
+    try:
+        exec("raise KeyboardInterrupt")
+    except KeyboardInterrupt:
+        print("kept")
+    sys.exit(130)
+g2ard.cli.main = stopped
+main()
+""")
+    command = [sys.executable, "-m", "stopped"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (130, "kept\n")
+
+
+def test_version_has_a_letter(command_line: CommandLine, folder: Path) -> None:
+    assert command_line("-V", cwd=folder) == command_line("--version", cwd=folder)
+    assert "--install-completion" in command_line("--help", cwd=folder)[1]
+
+
+def test_completion_is_of_the_shell_that_is_named(command_line: CommandLine, folder: Path) -> None:
+    for shell, words in (
+        ("zsh", "#compdef g2ard"),
+        ("fish", "complete --command g2ard"),
+        ("bash", "complete -o"),
+    ):
+        status, out, error = command_line("--show-completion", shell, cwd=folder, apart=True)
+        assert (status, error) == (0, "")
+        assert words in out
+    status, _, error = command_line("--show-completion", "tcsh", cwd=folder, apart=True)
+    assert (status, error.count("\n"), "zsh" in error) == (2, 1, True), error

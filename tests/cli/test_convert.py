@@ -1,0 +1,86 @@
+"""`g2ard convert`: its arguments and outputs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import g2ard
+from g2ard.io import read_splats, write_splats
+from g2ard.scene.splats import Splats
+from g2ard.scene.transform import merge, transform
+from helpers.commands import CommandLine, refused
+from helpers.scenes import checkered_ball
+
+# ── the command ──────────────────────────────────────────────────────────────────────────────────────
+
+
+def directional(degree: int = 3) -> Splats:
+    ball = checkered_ball(800)
+    rng = np.random.default_rng(5)
+    return replace(ball, shN=rng.normal(0, 0.2, (800, (degree + 1) ** 2 - 1, 3)).astype(np.float32))
+
+
+def matrix(scale: float, rotation: np.ndarray, shift: list[float]) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = scale * rotation, shift
+    return out
+
+
+def turn(seed: int = 0) -> np.ndarray:
+    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    return q * np.sign(np.linalg.det(q))
+
+
+def test_convert_merges_crops_moves(tmp_path: Path, command_line: CommandLine) -> None:
+    a, b = directional(1), transform(directional(3), matrix(1, np.eye(3), [5, 0, 0]))
+    write_splats(tmp_path / "a.ply", a)
+    write_splats(tmp_path / "b.glb", b)
+    (tmp_path / "m.json").write_text(json.dumps({"transform": matrix(1, turn(), [0, 0, 1]).tolist()}))
+    out = tmp_path / "c.ply"
+    words = ["a.ply", "b.glb", "c.ply", "--box", "-9,-9,0,9,9,9", "--transform", "m.json"]
+    code, _, told = command_line("convert", *words, cwd=tmp_path)
+    assert code == 0, told
+    whole = merge([a, b])
+    expected = transform(whole.take(whole.means[:, 2] >= 0), matrix(1, turn(), [0, 0, 1]))
+    found = read_splats(out)
+    np.testing.assert_allclose(found.means, expected.means, atol=1e-6)
+    np.testing.assert_allclose(found.shN, expected.shN, atol=1e-5)
+
+
+def test_convert_says_what_is_wrong(tmp_path: Path, command_line: CommandLine) -> None:
+    write_splats(tmp_path / "a.ply", directional())
+    for words, code, message in (
+        (("b.ksplat",), 1, "scenes are written as"),
+        (("b.ply", "--spz-version", "3"), 1, "no option 'version'"),
+        (("b.ply", "--box", "1,2"), 2, "expected 6 numbers"),
+        (("b.ply", "--box", "8,8,8,9,9,9"), 1, "nothing is left"),
+        (("b.ply", "--transform", "1 2 3"), 2, "expected 16 numbers"),
+        (("a.ply", "-w"), 2, "is an input"),
+    ):
+        found, _, told = command_line("convert", "a.ply", *words, cwd=tmp_path)
+        assert (found, message in told, told.count("\n")) == (code, True, 1), told
+        assert not (tmp_path / "b.ply").exists()
+    words = ("a.ply", "b.spz", "--spz-version", "2", "--sh-degree", "1")
+    assert command_line("convert", *words, cwd=tmp_path)[0] == 0
+    assert read_splats(tmp_path / "b.spz").sh_degree == 1
+
+
+def test_convert_takes_its_output_as_the_others_do(command_line: CommandLine, folder: Path) -> None:
+    written = [("ball.ply", "-o", "a.splat"), ("-o", "b.splat", "ball.ply"), ("ball.ply", "c.splat")]
+    for arguments in written:
+        status, out, error = command_line("convert", *arguments, "--json", "-", cwd=folder)
+        assert status == 0, error
+        config = json.loads(out)["config"]
+        assert config["scenes"] == ["ball.ply"]
+        assert config["output"].endswith(".splat")
+    one = {(folder / f"{name}.splat").read_bytes() for name in "abc"}
+    assert len(one) == 1
+    assert command_line("convert", "ball.ply", "ball.ply", "-o", "two.ply", cwd=folder)[0] == 0
+    assert len(g2ard.load(folder / "two.ply")) == 800
+    assert "SCENE… OUT, or SCENE… -o OUT" in refused(command_line, folder, "convert", "ball.ply")
+    for arguments in (("ball.ply", "./ball.ply"), ("ball.ply", "-o", "ball.ply")):
+        assert "is an input" in refused(command_line, folder, "convert", *arguments, "-w")

@@ -1,0 +1,156 @@
+"""`g2ard info`: the figures, and one clear line with exit status 1 for every kind of bad input."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard.io import Points, write_points, write_splats, write_views
+from g2ard.io.describe import describe
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.splats import Splats
+from helpers.commands import CommandLine
+from helpers.realdata import real
+
+
+def scene(path: Path, count: int = 400) -> Splats:
+    rng = np.random.default_rng(0)
+    splats = Splats.create(
+        rng.normal(size=(count, 3)),
+        scales=np.exp(rng.normal(-3, 1, (count, 3))),
+        logit_opacities=rng.normal(0, 3, count),
+        shN=rng.normal(size=(count, 8, 3)),
+        offset=(1e6, 0, 0),
+    )
+    write_splats(path, splats)
+    return splats
+
+
+def test_scene(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    splats = scene(path)
+    found = describe(path)
+    assert (found["kind"], found["format"], found["count"], found["sh_degree"]) == ("splats", "ply", 400, 2)
+    assert found["bytes"] == path.stat().st_size
+    assert found["bytes_as_ply"] == 400 * 4 * (14 + 24)
+    world = splats.means.astype(np.float32) + splats.offset
+    np.testing.assert_allclose(found["extent"]["min"], world.min(0))
+    np.testing.assert_allclose(found["extent"]["robust_max"], np.percentile(world, 99, axis=0))
+    assert found["opacity"]["50"] == pytest.approx(np.median(splats.opacities))
+    assert found["largest_scale"]["100"] == pytest.approx(splats.scales.max(), rel=1e-6)
+    assert found["odd"]["opacity_below_0.005"] == (splats.opacities < 0.005).sum() > 0
+    assert found["odd"]["same_position_as_another"] == 0
+
+
+def test_cloud(tmp_path: Path) -> None:
+    positions = np.random.default_rng(0).normal(size=(50, 3)) + 1e6
+    write_points(tmp_path / "a.ply", Points(positions, np.full((50, 3), 0.2, np.float32)))
+    found = describe(tmp_path / "a.ply")
+    assert (found["kind"], found["count"]) == ("points", 50)
+    np.testing.assert_array_equal(found["extent"]["max"], positions.max(0))
+    np.testing.assert_allclose(found["color"]["mean"], [0.2] * 3, atol=1e-6)
+
+
+def test_views(tmp_path: Path) -> None:
+    matrices = [look_at([3, i, 1], [0, 0, 0]) for i in range(3)]
+    K = [[4, 0, 4], [0, 4, 3], [0, 0, 1]]
+    cameras = Cameras.from_lists(matrices, [K] * 3, [(8, 6)] * 3, ["a", "b", "c"])
+    write_views(tmp_path / "a.json", cameras, splits=["train", "test", "train"])
+    found = describe(tmp_path / "a.json")
+    assert (found["kind"], found["count"], found["photos"]) == ("views", 3, 0)
+    assert found["sizes"] == {"8×6": 3}
+    assert found["splits"] == {"train": 2, "test": 1}
+    assert found["fov_degrees"]["50"] == pytest.approx(90)
+
+
+def test_command(tmp_path: Path, command_line: CommandLine) -> None:
+    scene(tmp_path / "a.ply")
+    status, out, error = command_line("info", "a.ply", cwd=tmp_path)
+    assert (status, error) == (0, "")
+    assert "400" in out
+    assert "SH degree" in out
+    status, out, _ = command_line("info", "a.ply", "--json", "-", cwd=tmp_path)
+    assert json.loads(out)["count"] == 400
+    status, out, _ = command_line("info", "a.ply", "-q", cwd=tmp_path)
+    assert (status, out) == (0, "")
+
+
+def make(folder: Path, what: str) -> str:
+    """A bad input; returns the words its error line must have."""
+    path = folder / "a.ply"
+    if what == "missing":
+        return "no such file"
+    if what == "empty":
+        path.touch()
+        return "empty"
+    if what == "not a PLY":
+        path.write_bytes(b"\x89PNG")
+        return "not a PLY"
+    scene(path)
+    content = path.read_bytes()
+    if what == "truncated":
+        path.write_bytes(content[:-1000])
+        return "promises 400 rows"
+    if what == "property":
+        path.write_bytes(content.replace(b"property float rot_3\n", b"property float other\n"))
+        return "'rot_3'"
+    rows = content.index(b"end_header\n") + 11
+    nan = np.full((len(content) - rows) // 4, np.nan, "<f4").tobytes()
+    path.write_bytes(content[:rows] + nan)
+    return "none of its 400 Gaussians is finite"
+
+
+@pytest.mark.parametrize("what", ["missing", "empty", "not a PLY", "truncated", "property", "nothing finite"])
+def test_bad_input_is_one_line_and_status_1(tmp_path: Path, what: str, command_line: CommandLine) -> None:
+    words = make(tmp_path, what)
+    status, out, error = command_line("info", "a.ply", cwd=tmp_path)
+    assert status == 1
+    assert out == ""
+    assert len(error.strip().splitlines()) == 1
+    assert "a.ply" in error
+    assert words in error
+
+
+def test_unwritable_json(tmp_path: Path, command_line: CommandLine) -> None:
+    scene(tmp_path / "a.ply")
+    status, _, error = command_line("info", "a.ply", "--json", "a.ply/x.json", cwd=tmp_path)
+    assert status == 1
+    assert "a.ply" in error
+    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_playbot_as_its_readme_says() -> None:
+    found = describe(real("playbot"))
+    assert (found["count"], found["sh_degree"], found["notes"]) == (500_000, 2, [])
+    np.testing.assert_allclose(found["extent"]["min"], [-1.03, -1.08, -1.04], atol=0.005)
+    opacities = [found["opacity"][q] for q in ("0", "1", "25", "50", "75", "99", "100")]
+    np.testing.assert_allclose(opacities, [0.020, 0.090, 0.42, 0.68, 0.90, 0.996, 0.996], atol=0.005)
+
+
+def test_info_of_several_files_and_of_a_run(command_line: CommandLine, folder: Path) -> None:
+    command_line("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 4, "--size", 48, cwd=folder)
+    status, out, error = command_line("info", "ball.ply", "views.json", "run", "--json", "-", cwd=folder)
+    assert status == 0, error
+    scene, views, made = json.loads(out)["files"]
+    assert (scene["kind"], views["kind"], made["count"]) == ("splats", "views", 40)
+    assert made["run"]["input_count"] == 400
+    assert made["run"]["scores"]["recovered"]["psnr"] > 10
+    assert "made from" in command_line("info", "run", cwd=folder)[1]
+
+
+def test_info_goes_on_after_what_it_cannot_read(command_line: CommandLine, folder: Path) -> None:
+    (folder / "text.ply").write_text("hello")
+    ask = ("info", "ball.ply", "gone.ply", "text.ply", "views.json")
+    status, out, error = command_line(*ask, cwd=folder)
+    assert (status, error.count("\n")) == (1, 2), error
+    assert "gone.ply: no such file" in error
+    assert "give the file the suffix of what it is" in error
+    assert "ball.ply" in out
+    assert "views.json" in out
+    status, out, _ = command_line(*ask, "--json", "-", cwd=folder)
+    result = json.loads(out)
+    assert (status, result["failed"]) == (1, ["gone.ply", "text.ply"])
+    assert [figures["kind"] for figures in result["files"]] == ["splats", "views"]

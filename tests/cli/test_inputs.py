@@ -1,0 +1,177 @@
+"""Errors for inputs that are missing, damaged or of the wrong kind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import g2ard
+from g2ard.errors import InputError
+from g2ard.io import Points, write_points
+from helpers.commands import CommandLine, refused
+from helpers.photos import photos_of
+from helpers.scenes import checkered_ball
+
+
+def test_the_wrong_kind_of_input_is_told_what_takes_it(command_line: CommandLine, folder: Path) -> None:
+    photos_of(folder / "photos", points=True)
+    for ask, words in (
+        (("distill", "photos", "-n", 100, "-o", "x"), "photos holds views, no scene: give it as --views"),
+        (("simplify", "photos/sparse.ply", "-r", 2, "-o", "x.ply"), "`g2ard lift` makes a scene of it"),
+    ):
+        status, _, error = command_line(*ask, cwd=folder)
+        assert (status != 0, words in error, error.count("\n")) == (True, True, 1), error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (
+            ("distill", "--views", "views.json", "--renders", "-n", 9, "-o", "run"),
+            2,
+            "--renders: there is no scene to render; leave it out, or give a SCENE",
+        ),
+        (
+            ("distill", "ball.ply", "--photos", "-n", 9, "-o", "run"),
+            1,
+            "--photos: a pool of made views has no photos; give views that have them",
+        ),
+        (("distill", "--views", "views.json", "--fit", "1kB", "-o", "run"), 1, "--fit could be measured on"),
+        (
+            ("distill", "--views", "views.json", "--min-psnr", 30, "-o", "run"),
+            1,
+            "--min-psnr could be measured on: give -n COUNT",
+        ),
+        (
+            ("render", "ball.ply", "-n", 4, "--views", "views.json", "--sheet", "a.png"),
+            2,
+            "-n makes views, and --views gives them: leave -n out",
+        ),
+        (
+            ("recover", "ball.ply", "--views", "made", "-o", "o.ply"),
+            2,
+            "--teacher is missing: views that are made have no photos",
+        ),
+        (
+            ("simplify", "ball.ply", "-ratio", 5, "-o", "o.ply"),
+            2,
+            "-ratio: long options have two dashes: ",
+        ),
+    ],
+)
+def test_what_is_missing_is_named_before_any_work(
+    arguments: tuple[object, ...], status: int, words: str, command_line: CommandLine, folder: Path
+) -> None:
+    found, _, error = command_line(*arguments, cwd=folder)
+    assert (found, error.count("\n")) == (status, 1), error
+    assert words in error
+    assert sorted(path.name for path in folder.iterdir()) == ["ball.ply", "views.json"]
+
+
+def test_photos_below_their_poses_are_told_of_them(folder: Path) -> None:
+    (folder / "scan" / "shots").mkdir(parents=True)
+    Image.new("RGB", (8, 8)).save(folder / "scan" / "shots" / "a.png")
+    shots = folder / "scan" / "shots"
+    with pytest.raises(InputError, match="COLMAP finds them"):
+        g2ard.load_views(shots)
+    (folder / "scan" / "transforms.json").write_text("{}")
+    with pytest.raises(InputError, match=r"their poses lie in .*scan/transforms\.json: give that$"):
+        g2ard.load_views(shots)
+    (folder / "scan" / "transforms.json").unlink()
+    (folder / "scan" / "sparse" / "0").mkdir(parents=True)
+    for name in ("cameras.bin", "images.bin"):
+        (folder / "scan" / "sparse" / "0" / name).touch()
+    with pytest.raises(InputError, match=r"their poses lie in .*scan: give that$"):
+        g2ard.load_views(shots)
+
+
+def test_a_folder_that_is_nothing_says_what_in_it_would_do(command_line: CommandLine, folder: Path) -> None:
+    for name in ("bare/photo.jpg", "project/images/photo.PNG", "empty"):
+        place = folder / name
+        (place.parent if place.suffix else place).mkdir(parents=True, exist_ok=True)
+        if place.suffix:
+            Image.new("RGB", (16, 16)).save(place)
+    for name, photos in (("bare", "bare"), ("project", "project/images")):
+        error = refused(command_line, folder, "distill", "--views", name, "-n", 9, "-o", "x", status=1)
+        assert "photos, without their poses; COLMAP finds them: colmap automatic_recon" in error
+        assert f"--image_path {photos}, then give project" in error
+    assert "looked for SOG's meta.json" in refused(command_line, folder, "info", "empty", status=1)
+    ask = ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 3, "--size", 32, "--no-view")
+    assert command_line(*ask, cwd=folder)[0] == 0
+    (folder / "run" / "report.json").unlink()  # a folder as `distill` leaves none
+    held = "run: nothing known in this folder; name what is meant of its files: scene.ply (a scene), views"
+    for ask in (
+        ("simplify", "run", "-r", 2, "-o", "x.ply"),
+        ("evaluate", "ball.ply", "--teacher", "ball.ply", "--views", "run"),
+    ):
+        assert f"{held}.json (views)\n" in refused(command_line, folder, *ask, status=1)
+
+
+BALL = checkered_ball(400)
+
+
+def test_views_without_photos_say_what_stands_in(command_line: CommandLine, folder: Path) -> None:
+    colors = np.full((400, 3), 0.5, np.float32)
+    write_points(folder / "cloud.ply", Points(BALL.means.astype(np.float64), colors))
+    to = ("-r", 4, "-o", "x", "--views", "views.json")
+    for ask, words in (
+        (("distill", "ball.ply", *to, "--photos"), "without --photos the scene's render stands in for it"),
+        (("distill", "cloud.ply", *to), "give views with photos, or a trained scene"),
+        (("distill", *to[2:], "-n", 50), "give views with photos, or a scene beside them"),
+        (("recover", "ball.ply", "-o", "x.ply", *to[4:]), "--teacher SCENE stands in"),
+    ):
+        status, _, error = command_line(*ask, cwd=folder)
+        last = error.splitlines()[-1]
+        assert (status, "has no" in last or "has none" in last, words in last) == (1, True, True), error
+
+
+def test_what_is_of_the_wrong_kind_says_what_it_is(folder: Path) -> None:
+    with pytest.raises(InputError, match="g2ard's views, no scene; name the scene's own file"):
+        g2ard.load(folder / "views.json")
+    with pytest.raises(InputError, match=r"views are needed .*, this is a Gaussian scene"):
+        g2ard.load_views(folder / "ball.ply")
+
+
+def test_a_name_mistyped_is_told_with_one_alike(command_line: CommandLine, folder: Path) -> None:
+    ask = ("simplify", "bal.ply", "-r", 2, "-o", "o.ply")
+    assert "bal.ply: no such file or folder; did you mean ball.ply?\n" in refused(
+        command_line, folder, *ask, status=1
+    )
+    (folder / "sub").mkdir()
+    with pytest.raises(InputError, match=r"folder$"):
+        g2ard.load(folder / "sub" / "zzz.ply")
+    with pytest.raises(InputError, match=r"folder, nor a folder .*gone$"):
+        g2ard.load(folder / "gone" / "ball.ply")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".sog", ".spz", ".glb"])
+def test_a_damaged_file_is_told_what_to_do_about(
+    suffix: str, command_line: CommandLine, folder: Path
+) -> None:
+    g2ard.save(folder / f"a{suffix}", BALL)
+    (folder / f"b{suffix}").write_bytes((folder / f"a{suffix}").read_bytes()[:-700])
+    error = refused(command_line, folder, "info", f"b{suffix}", status=1)
+    assert error.endswith("; the file is damaged: copy or export it again\n")
+
+
+def test_what_is_missing_or_too_much_is_named(command_line: CommandLine, folder: Path) -> None:
+    """Refusals of common mistakes end with what would do."""
+    for name in ("bare", "d.ply"):
+        (folder / name).mkdir()
+    Image.new("RGB", (16, 16)).save(folder / "bare" / "a.png")
+    for ask, status, step in (
+        (("recover", "ball.ply", "-o", "o.ply", "--steps", 3, "--recovery-time", 9), 2, "; give one"),
+        (("simplify", "ball.ply", "-r", 2, "-o", "o.ply", "--views", "v", "--no-views"), 2, "; give one"),
+        (("simplify", "ball.ply", "-r", 2, "-o", "d.ply"), 1, "name one in it"),
+        (("render", "ball.ply", "-n", 1, "-o", "ball.ply"), 2, "name another output"),
+        (("render", "ball.ply", "-n", 1, "-o", "views.json"), 1, "name another"),
+        (("simplify", "ball.ply", "-r", 2, "-o", "o.ply", "--json", "o.ply"), 2, "name another file for one"),
+        (("convert", "ball.ply", "o.ply", "--box", "1,1,1,0,0,0"), 1, "the lower corner comes first"),
+        (("lift", "ball.ply", "-o", "o.ply"), 1, "ready for `simplify` and `distill`"),
+        (("register", "ball.ply", "--photos", "bare", "-o", "o.json", "--pool", 8), 1, "--focal PIXELS"),
+        (("evaluate", "ball.ply", "--views", "views.json", "--split", "val"), 1, "there are test, train"),
+    ):
+        assert step in refused(command_line, folder, *ask, status=status)

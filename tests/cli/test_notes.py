@@ -1,0 +1,143 @@
+"""Notes and warnings that commands print."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+import g2ard
+from g2ard.cli.frame import Run
+from g2ard.cli.run_result import told, write_table
+from g2ard.io import Points, write_points, write_views
+from helpers.commands import CommandLine
+from helpers.photos import BALL, photos_of
+from helpers.scenes import around, checkered_ball
+
+
+def test_a_result_that_outweighs_its_input_says_so(command_line: CommandLine, tmp_path: Path) -> None:
+    photos_of(tmp_path / "photos", points=True)
+    ask = ("distill", "photos/sparse.ply", "--views", "photos", "-n", 1000, "--steps", 3)
+    error = command_line(*ask, "-o", "run", cwd=tmp_path)[2]
+    assert (
+        "run/scene.ply: 0.24 MB, sparse.ply has 0.03 MB: 76% of it is SH above degree 0 (--sh-degree" in error
+    )
+    g2ard.save(tmp_path / "ball.ply", BALL)
+    assert "MB" not in command_line("simplify", "ball.ply", "-r", 2, "-o", "s.ply", cwd=tmp_path)[2]
+
+
+def test_a_lift_that_outweighs_its_cloud_says_so(command_line: CommandLine, folder: Path) -> None:
+    colors = np.full((1200, 3), 0.5, np.float32)
+    write_points(folder / "cloud.ply", Points(BALL.means.astype(np.float64), colors))
+    status, _, error = command_line("lift", "cloud.ply", "-o", "lift.ply", cwd=folder)
+    assert (status, "lift.ply: 0.07 MB, cloud.ply has 0.03 MB: packed formats" in error) == (0, True), error
+
+
+SHORT = ("distill", "ball.ply", "--steps", 5, "--size", 48)
+
+
+def test_a_short_run_has_no_needless_notes(command_line: CommandLine, folder: Path) -> None:
+    status, _, error = command_line(*SHORT, "-r", 10, "-o", "run", cwd=folder)
+    assert status == 0, error
+    assert "poses: 160, orbit; which way is up is a guess\n" in error
+    for needless in ("never acted", "of its box", "times as high"):
+        assert needless not in error
+    assert "never acted" in command_line(*SHORT, "-r", 10, "-o", "run", "-wv", cwd=folder)[2]
+
+
+def test_one_is_one(command_line: CommandLine, folder: Path) -> None:
+    ask = ("distill", "ball.ply", "-n", 1, "-o", "run", "--steps", 2, "--size", 32, "--format", "splat")
+    status, _, error = command_line(*ask, cwd=folder)
+    assert status == 0, error
+    assert "400 → 1 Gaussian;" in error
+    assert "MB as .ply" in error
+    for ask in (("simplify", "ball.ply", "-n", 1, "-o", "s.ply"), ("convert", "s.ply", "t.splat")):
+        error += command_line(*ask, cwd=folder)[2]
+    error += "".join(command_line("info", "run", cwd=folder)[1:])
+    ask = ("evaluate", "s.ply", "--teacher", "s.ply", "--views", "views.json", "--size", 16)
+    error += command_line(*ask, cwd=folder)[2]
+    assert re.findall(r"(?<![\d.,])1 [A-Za-z]*(?:Gaussian|view|step|point|photo|disc)s\b", error) == []
+
+
+def test_views_of_another_world_are_told(command_line: CommandLine, folder: Path) -> None:
+    cameras = around(16, (48, 36))
+    far = np.where(np.arange(16)[:, None] < 10, [[1e3, 0, 0]], 0)
+    for count, name in ((10, "some.json"), (16, "none.json")):
+        viewmats = cameras.viewmats.copy()
+        viewmats[:count, :3, 3] += 1e3 if count == 16 else far[:count]
+        write_views(folder / name, replace(cameras, viewmats=viewmats))
+    for ask in (("distill", "-n", 9, "-o", "run", "--dry-run"), ("evaluate", "--teacher", "ball.ply")):
+        split = ("--split", "all") if ask[0] == "evaluate" else ()
+        for name, status, words in (
+            ("some.json", 0, "views have nothing of the scene in sight"),
+            ("none.json", int(not split), "16 of 16 views" if split else "the scene must be of one world"),
+            ("views.json", 0, ""),
+        ):
+            call = (ask[0], "ball.ply", *ask[1:], "--views", name, "--size", 32, *split)
+            found, _, error = command_line(*call, cwd=folder)
+            assert (found, words in error) == (status, True), error
+            assert ("of one world" in error or "warning" in error) == bool(words)
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        ("simplify", "ball.ply", "-r", 4, "-o", "s.ply"),
+        ("recover", "ball.ply", "--teacher", "ball.ply", "--steps", 2, "-o", "r.ply"),
+        ("adapt", "ball.ply", "--teacher", "ball.ply", "--steps", 2, "-o", "a.ply"),
+        ("select", "ball.ply", "-k", 3, "-o", "v.json"),
+        ("render", "ball.ply", "-o", "looks"),
+    ],
+)
+def test_every_command_tells_of_views_of_another_world(
+    ask: tuple[object, ...], command_line: CommandLine, folder: Path
+) -> None:
+    viewmats = around(16, (48, 36)).viewmats.copy()
+    viewmats[1:9, :3, 3] += 1e3
+    write_views(folder / "some.json", replace(around(16, (48, 36)), viewmats=viewmats))
+    for views, warned in (("some.json", True), ("views.json", False)):
+        status, _, error = command_line(*ask, "--views", views, "-w", cwd=folder)
+        assert status == 0, error
+        assert ("views have nothing of the scene in sight: are both of one world?" in error) == warned, error
+
+
+def test_photos_of_another_world_are_told(command_line: CommandLine, folder: Path) -> None:
+    """Whose views may see much of the scene: both stand about the origin."""
+    photos_of(folder / "photos")
+    ask = ("-n", 50, "--views", "photos", "--steps", 2, "--dry-run")
+    own = checkered_ball(1200)
+    g2ard.save(folder / "own.ply", own)
+    g2ard.save(folder / "other.ply", replace(own, means=6 * own.means, scales=6 * own.scales))
+    for scene, warned in (("other.ply", True), ("own.ply", False)):
+        status, _, error = command_line("distill", scene, *ask, "-o", "run", cwd=folder)
+        assert status == 0, error
+        assert ("warning: the scene looks like none of the photos (correlation" in error) == warned, error
+
+
+def test_the_table_has_a_start_where_there_are_photos_alone() -> None:
+    rows: list[list[str]] = []
+    report: dict[str, Any] = {
+        "scores": {"recovered": {"views": [], "psnr": 30.0, "ssim": 0.9}},
+        "apart": None,
+        "bytes": {"input": 9, "output": 9},
+        "seconds": {},
+        "input_count": 9,
+        "output_count": 9,
+        "against": "photos",
+    }
+    console = SimpleNamespace(table=lambda title, head, found: rows.extend(found))
+    for scene in (None, Path("a.ply")):
+        write_table(cast("Run", SimpleNamespace(config={"scene": scene}, console=console)), report)
+    others = ["simplified", "recovered"]
+    assert [row[0] for row in rows] == ["start", *others, "dense", *others]
+
+
+@pytest.mark.parametrize(("unseen", "lines"), [(0.004, 0), (0.005, 0), (0.02, 1)])
+def test_what_no_view_sees_is_told_if_it_is_not_nothing(unseen: float, lines: int) -> None:
+    found = told({"rounds": [], "scores": None, "apart": None, "unseen": unseen})
+    assert (len(found), any("0%" in line for line in found)) == (lines, False)

@@ -1,0 +1,230 @@
+"""What is refused of options, config files and outputs, and in which words; Ctrl-C before any command."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard.io import read_splats, write_splats, write_views
+from helpers.commands import CommandLine, refused
+from helpers.scenes import around, checkered_ball
+from helpers.systems import needs_links
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A scene and views of it."""
+    write_splats(tmp_path / "a.ply", checkered_ball(200))
+    write_views(tmp_path / "views.json", around(8, (32, 24)))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--method", "best", "'--method': one of default, fast, paper, not 'best'"),
+        ("--retention", "x", "'--retention': a number, not 'x'"),
+        ("--seed", "-1", "'--seed': a whole number of at least 0, not '-1'"),
+        ("--seed", "1.5", "'--seed': a whole number of at least 0, not '1.5'"),
+        ("--threads", "1000", "'--threads': a whole number from 0 to 256, not '1000'"),
+    ],
+)
+def test_a_bad_value_is_named_with_what_is_allowed(
+    folder: Path, command_line: CommandLine, option: str, value: str, words: str
+) -> None:
+    simplify = ("simplify", "a.ply", "-n", 5, "-o", "o.ply")
+    assert words in refused(command_line, folder, *simplify, option, value)
+    table = f'[simplify]\n{option[2:]} = "{value}"\n'
+    (folder / "c.toml").write_text(table)
+    assert f"{words} (from c.toml)" in refused(command_line, folder, *simplify, "--config", "c.toml")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("distill", "a.ply", "-n", 5, "-o", "run", "--held-out", "made"), "--held-out: a file of views"),
+        (("distill", "a.ply", "-n", 5, "-o", "run", "--views", "made", "--photos"), "--photos: views that"),
+        (
+            ("distill", "a.ply", "-n", 5, "-o", "run", "--steps", 5, "--set", "schedule.steps=9"),
+            "--steps and --set schedule.steps exclude each other",
+        ),
+        (
+            ("bench", "simplify", "a.ply", "--protocol", "x"),
+            "'--protocol': one of pool, standing, both, not 'x'",
+        ),
+        (("simplify", "a.ply", "-n", 5, "-o", "o.ply", "--up", "0,0,0"), "a direction such as 0,0,1"),
+    ],
+)
+def test_what_cannot_go_together_is_told_before_any_work(
+    folder: Path, command_line: CommandLine, arguments: tuple[object, ...], words: str
+) -> None:
+    before = sorted(path.name for path in folder.iterdir())
+    assert words in refused(command_line, folder, *arguments)
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+def test_a_format_is_named_in_any_case(folder: Path, command_line: CommandLine) -> None:
+    said = command_line("distill", "none.ply", "-n", "9", "--format", "SOG", "-o", "run", cwd=folder)
+    assert said[0] == 1
+    assert "none.ply: no such file" in said[2]
+
+
+def test_a_scene_that_lies_down_is_seen_upright_if_told(folder: Path, command_line: CommandLine) -> None:
+    for up in ("0,0,1", "1,0,0"):
+        status, _, error = command_line(
+            "distill",
+            "a.ply",
+            "-n",
+            20,
+            "--views",
+            "made",
+            "--steps",
+            1,
+            "--size",
+            48,
+            "--up",
+            up,
+            "-o",
+            up[:1],
+            cwd=folder,
+        )
+        assert status == 0, error
+    upright, lying = (json.loads((folder / name / "views.json").read_text()) for name in "01")
+    assert upright != lying
+
+
+def test_a_config_that_is_none_is_named(folder: Path, command_line: CommandLine) -> None:
+    (folder / "c.toml").write_text("[simplify]\nretention = true\n")
+    (folder / "d.toml").write_text("[simplify\n")
+    for name, words in (
+        ("absent.toml", "absent.toml: No such file"),
+        ("a.ply", "a.ply: not a text file"),
+        ("c.toml", "'--retention': a number, not 'true'"),
+        ("d.toml", "d.toml: Expected"),
+    ):
+        error = refused(command_line, folder, "simplify", "a.ply", "-n", 5, "-o", "o.ply", "--config", name)
+        assert words in error
+        assert "Errno" not in error
+
+
+def test_a_flag_wins_over_what_it_excludes_in_the_config(folder: Path, command_line: CommandLine) -> None:
+    (folder / "c.toml").write_text("[simplify]\ncount = 50\nno-views = true\n[recover]\nsteps = 100000\n")
+    for arguments, count in ((("-r", 10), 20), ((), 50), (("--views", "views.json"), 50)):
+        ask = ("simplify", "a.ply", *arguments, "-o", "small.ply", "-w", "--config", "c.toml")
+        status, _, error = command_line(*ask, cwd=folder)
+        assert status == 0, error
+        assert len(read_splats(folder / "small.ply")) == count
+    ask = ("simplify", "a.ply", "-r", 10, "-n", 5, "-o", "o.ply", "--config", "c.toml")
+    assert "either -n COUNT or -r RATIO" in refused(command_line, folder, *ask)
+    ask = ("recover", "small.ply", "--views", "views.json", "--teacher", "a.ply", "-o", "o.ply")
+    status, _, error = command_line(*ask, "--config", "c.toml", "--recovery-time", "1s", cwd=folder)
+    assert status == 0, error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "output"),
+    [
+        ("simplify a.ply -r 2 -o sub/../a.ply", "sub/../a.ply"),
+        pytest.param("simplify sub/link.ply -r 2 -o a.ply", "a.ply", marks=needs_links),
+        ("simplify a.ply -r 2 -o o.ply --json a.ply", "a.ply"),
+        ("recover a.ply --views views.json -o a.ply", "a.ply"),
+        ("recover s.ply --views views.json --teacher a.ply -o a.ply", "a.ply"),
+        ("adapt a.ply --views views.json -o a.ply", "a.ply"),
+        ("lift cloud.ply -o cloud.ply", "cloud.ply"),
+        ("select a.ply --views views.json -k 2 -o views.json", "views.json"),
+        ("distill run/scene.ply -r 2 -o run", "run/scene.ply"),
+        ("distill a.ply --held-out run/views.json -r 2 -o run", "run/views.json"),
+        ("evaluate a.ply --views views.json --json a.ply", "a.ply"),
+    ],
+)
+def test_an_input_is_not_written_over(
+    folder: Path, command_line: CommandLine, arguments: str, output: str
+) -> None:
+    (folder / "sub").mkdir()
+    if "link" in arguments:
+        (folder / "sub" / "link.ply").symlink_to("../a.ply")
+    before = {path.name: path.read_bytes() for path in folder.glob("*.*")}
+    error = refused(command_line, folder, *arguments.split(), "-w")
+    assert f"{output} would be written over, and is an input" in error
+    assert {path.name: path.read_bytes() for path in folder.glob("*.*")} == before
+
+
+@pytest.mark.parametrize("policy", ["random", "uniform"])
+def test_auto_needs_a_policy_that_measures(folder: Path, command_line: CommandLine, policy: str) -> None:
+    for ask in (("select", "absent.ply", "--views", "v"), ("distill", "absent.ply", "-r", 2)):
+        error = refused(command_line, folder, *ask, "-k", "auto", "--policy", policy, "-o", "out")
+        assert f"--policy {policy} does not measure" in error
+
+
+def test_the_folder_one_is_in_can_be_an_output(folder: Path, command_line: CommandLine) -> None:
+    (folder / "out").mkdir()
+    ask = ("render", "../a.ply", "--views", "../views.json", "--split", "test", "-o", ".")
+    status, _, error = command_line(*ask, cwd=folder / "out")
+    assert status == 0, error
+    assert (folder / "out" / "view_000.png").is_file()
+    for command in ("recover", "adapt"):
+        ask = (command, "../a.ply", "--views", "../views.json", "-o", ".")
+        status, _, error = command_line(*ask, cwd=folder / "out")
+        assert (status, error.count("\n")) == (1, 1)
+        assert error.startswith("g2ard: .: scenes are written as .compressed.ply, .ply, .sog, .spz")
+
+
+@pytest.mark.parametrize(
+    "moment",
+    [
+        "class Finder:\n"  # as typer is imported
+        "    def find_spec(name, *rest):\n"
+        "        if name == 'typer': signal.raise_signal(signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Finder)\n",
+        "import typer.main\n"  # as it builds the commands
+        "typer.main.get_group = lambda *a: signal.raise_signal(signal.SIGINT)\n",
+    ],
+)
+@pytest.mark.parametrize(("by", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_a_signal_before_a_command_is_one_line(moment: str, by: str, status: int) -> None:
+    unignored = "signal.signal(signal.SIGINT, signal.default_int_handler)"  # ignored in background jobs
+    moment = moment.replace("SIGINT", by)
+    code = f"import signal, sys\n{unignored}\n{moment}from g2ard.__main__ import main\nmain()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (status, "g2ard: interrupted\n")
+
+
+def test_recover_says_what_became_of_steps_that_lost(tmp_path: Path, command_line: CommandLine) -> None:
+    ball = checkered_ball(800)
+    grain = np.random.default_rng(0).normal(0, 1e-3, ball.sh0.shape).astype(np.float32)
+    write_splats(tmp_path / "ball.ply", ball)
+    write_splats(tmp_path / "start.ply", replace(ball, sh0=ball.sh0 + grain))
+    write_views(tmp_path / "v.json", around(6))
+    asked = ("recover", "start.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "o.ply", "-w")
+    for steps, words in ((4, "kept the simplified scene: every step only"), (24, "recovery fell to ")):
+        status, _, told = command_line(*asked, "--steps", steps, cwd=tmp_path)
+        assert status == 0, told
+        assert sum(words in line for line in told.splitlines()) == 1
+
+
+def test_the_time_of_recovery_is_called_so(command_line: CommandLine, folder: Path) -> None:
+    shown = command_line("distill", "--help", cwd=folder)[1]
+    assert "--recovery-time" in shown
+    assert "--time-limit" not in shown
+    ask = ("distill", "a.ply", "-r", 10, "-o", "run")
+    for name in ("--recovery-time", "--time-limit"):
+        status, out, error = command_line(*ask, name, "90s", "--print-config", cwd=folder)
+        assert status == 0, error
+        assert "recovery-time = 90\n" in out
+    for name in ("recovery-time", "time-limit", "time_limit"):
+        (folder / "c.toml").write_text(f"[distill]\n{name} = '2m'\n")
+        status, out, error = command_line(*ask, "--config", "c.toml", "--print-config", cwd=folder)
+        assert (status, "recovery-time = 120\n" in out) == (0, True), error
+
+
+def test_render_tells_what_its_count_is(command_line: CommandLine, folder: Path) -> None:
+    shown = " ".join(command_line("render", "--help", cwd=folder)[1].replace("│", " ").split())
+    assert "How many views to make of the scene; with --color flags, cells or parents the budget" in shown
+    ask = ("render", "a.ply", "-n", 2, "--views", "views.json", "-o", "out")
+    assert "leave -n out" in refused(command_line, folder, *ask)

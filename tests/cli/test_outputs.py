@@ -1,0 +1,49 @@
+"""Output paths: folders, suffixes, names and what is overwritten."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+import g2ard
+from helpers.commands import CommandLine, refused
+from helpers.photos import BALL
+
+
+def test_folders_are_made_and_suffixes_are_of_any_case(command_line: CommandLine, folder: Path) -> None:
+    g2ard.save(folder / "a" / "b" / "ball.PLY", BALL)
+    assert len(g2ard.load(folder / "a" / "b" / "ball.PLY")) == 1200
+    status, _, error = command_line(
+        "simplify", "a/b/ball.PLY", "-r", 4, "-o", "c/d/small.Ply", "--json", "e/f.json", cwd=folder
+    )
+    assert status == 0, error
+    assert json.loads((folder / "e" / "f.json").read_text())["output_count"] == 300
+    assert len(g2ard.load(folder / "c" / "d" / "small.Ply")) == 300
+
+
+SHORT = ("distill", "ball.ply", "--steps", 5, "--size", 48)
+
+
+def test_a_folder_has_one_scene(command_line: CommandLine, folder: Path) -> None:
+    assert command_line(*SHORT, "-r", 10, "-o", "run", cwd=folder)[0] == 0
+    status, _, error = command_line(*SHORT, "-r", 10, "-o", "run", "-w", "--format", "sog", cwd=folder)
+    assert status == 0, error
+    assert [path.name for path in (folder / "run").glob("scene*")] == ["scene.sog"]
+    again = ("distill", "run/scene.sog", "-r", 2, "-o", "run", "-w", "--steps", 3)
+    status, _, error = command_line(*again, cwd=folder)
+    assert (status, "run/scene.sog would be written over, and is an input" in error) == (2, True), error
+
+
+@pytest.mark.parametrize("option", ["render --sheet", "clean --dry-run --preview"])
+def test_a_picture_is_what_its_name_says(option: str, command_line: CommandLine, folder: Path) -> None:
+    command, *options = option.split()
+    error = refused(command_line, folder, command, "ball.ply", *options, "a.jpg")
+    assert "written as .png, not 'a.jpg'" in error
+    if command == "render":
+        ask = ("render", "ball.ply", "-n", 1, "--size", 32, "--sheet", "a.PNG")
+        assert command_line(*ask, cwd=folder)[0] == 0
+        with Image.open(folder / "a.PNG") as picture:
+            assert picture.format == "PNG"

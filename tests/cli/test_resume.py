@@ -1,0 +1,166 @@
+"""What commands make of a checkpoint that a stopped run left: gone on from, refused, or replaced under -w."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from g2ard.cli.frame import Run
+from g2ard.cli.resume import rows_kept, stoppable
+from g2ard.cli.run_folder import work_folder
+from g2ard.errors import InputError
+from g2ard.io import write_splats, write_views
+from g2ard.pipeline import Distilled
+from g2ard.policy.job import DistillJob
+from g2ard.stages.recover import checkpoint
+from helpers.commands import CommandLine
+from helpers.scenes import around, checkered_ball
+
+LEFT = [
+    ("recover a.ply --steps 3 -o out.ply", ".out.ply.checkpoint.npz"),
+    ("adapt a.ply --steps 3 -o out.ply", ".out.ply.work/stretches.npz"),
+    ("distill a.ply -r 2 --steps 3 -o run", "run/.unfinished/simplified-1.npz"),
+]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_splats(tmp_path / "a.ply", checkered_ball(200))
+    write_views(tmp_path / "views.json", around(16, (32, 24)))
+    return tmp_path
+
+
+@pytest.mark.parametrize(("command", "left"), LEFT)
+def test_a_checkpoint_is_not_thrown_away(
+    folder: Path, command_line: CommandLine, command: str, left: str
+) -> None:
+    teacher = () if command.startswith("distill") else ("--teacher", "a.ply")
+    ask = (*command.split(), "--views", "views.json", *teacher)
+    place = folder / left
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_bytes(b"junk")
+    for flags, words in (
+        ((), "left by a stopped run; --resume goes on from it, -w starts anew"),
+        (("--resume", "-w"), f"{left}: not a checkpoint of g2ard, or a damaged one"),
+    ):
+        status, _, error = command_line(*ask, *flags, "-q", cwd=folder)
+        assert (status, words in error, len(error.splitlines())) == (1, True, 1), error
+        assert place.read_bytes() == b"junk"
+    status, _, error = command_line(*ask, "-w", cwd=folder)
+    assert status == 0, error
+    assert not place.exists()
+    assert not list(folder.glob(".*"))
+
+
+@pytest.mark.parametrize("command", ["recover", "adapt"])
+def test_what_is_said_names_the_split(folder: Path, command_line: CommandLine, command: str) -> None:
+    ask = (command, "a.ply", "--steps", 2, "--views", "views.json", "--teacher", "a.ply", "-wo", "out.ply")
+    for split, words in (("train", "training views "), ("test", ", test views "), ("all", ", all views ")):
+        status, _, error = command_line(*ask, "--split", split, cwd=folder)
+        assert (status, words in error) == (0, True), error
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_ctrl_c_says_how_to_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
+    common = ("overwrite", "seed", "threads", "device", "verbose", "json", "quiet", "config")
+    run, place = Run("recover", dict.fromkeys(common), {}), tmp_path / "place"
+    with pytest.raises(KeyboardInterrupt), stoppable(run, place, resume=False):
+        raise KeyboardInterrupt  # before any checkpoint
+    assert capsys.readouterr().err == ""
+
+    def stopped_later() -> None:
+        if kind == "folder":
+            place.mkdir()
+        (place / "file" if kind == "folder" else place).touch()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), stoppable(run, place, resume=False):
+        stopped_later()
+    assert run.kept == [f"the same command with --resume goes on from {place}"]
+    assert place.exists()
+    with stoppable(run, place, resume=True):
+        assert place.exists()
+    assert not place.exists()
+
+
+def bytes_of(save: Callable[[io.BytesIO], None]) -> bytes:
+    buffer = io.BytesIO()
+    save(buffer)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"junk",
+        b"PK\x03\x04 no zip",
+        bytes_of(lambda file: np.save(file, np.arange(3))),
+        bytes_of(lambda file: np.savez(file, a=np.arange(3))),
+        bytes_of(lambda file: np.savez(file, meta=np.array("[1]"))),
+        bytes_of(lambda file: np.savez(file, meta=np.array("{}"))),
+        bytes_of(lambda file: np.savez(file, meta=np.array([{}], object))),
+    ],
+)
+def test_a_file_that_is_no_checkpoint_is_named(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "c.npz"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        checkpoint.load(path, "key")
+    assert str(caught.value).startswith(f"{path}: not a checkpoint of g2ard, or a damaged one; ")
+
+
+def test_distill_stopped_before_its_first_checkpoint_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    common = ("overwrite", "seed", "threads", "device", "verbose", "json", "quiet", "config")
+    run, output = Run("distill", dict.fromkeys(common), {}), tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt), work_folder(run, output, resume=False):
+        raise KeyboardInterrupt
+    assert capsys.readouterr().err == ""
+    assert not output.exists()
+    saved = output / ".unfinished" / "simplified-1.npz"
+
+    def stopped_later() -> None:
+        saved.touch()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), work_folder(run, output, resume=False):
+        stopped_later()
+    assert run.kept == [f"the same command with --resume goes on in {output}"]
+    assert saved.exists()
+
+
+def test_the_total_of_a_resumed_run_holds_what_was_done_before(
+    folder: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = DistillJob.run
+
+    def resumed(self: DistillJob, *given: Any, **named: Any) -> Distilled:
+        done = real(self, *given, **named)
+        seconds = replace(done.report.seconds, recover=60.0, resumed=50.0)
+        return replace(done, report=replace(done.report, seconds=seconds))
+
+    monkeypatch.setattr(DistillJob, "run", resumed)
+    ask = ("distill", "a.ply", "-r", 2, "--steps", 2, "--size", 32, "--no-view", "-o", "run", "--json", "-")
+    status, out, error = command_line(*ask, cwd=folder)
+    assert status == 0, error
+    seconds = json.loads(out)["seconds"]
+    assert seconds["total"] > seconds["resumed"] == 50.0
+    assert f"recover 60.0 s, total {seconds['total']:.1f} s" in " ".join((out + error).split())
+
+
+def test_an_interrupt_says_which_rows_stay(folder: Path) -> None:
+    common = dict.fromkeys(("overwrite", "verbose", "quiet", "json", "config")) | {"seed": 0, "threads": 0}
+    for table, told in ((folder / "ball.ply", ["goes on"]), (folder / "none.csv", [])):
+        run = Run("simplify", {**common, "device": "cpu"}, {})
+        with pytest.raises(KeyboardInterrupt), rows_kept(run, table, goes_on=True):
+            raise KeyboardInterrupt
+        assert [line.split("the same command ")[-1] for line in run.kept] == told

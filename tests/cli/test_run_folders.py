@@ -1,0 +1,80 @@
+"""A folder that `distill` wrote, given where a scene or views are wanted."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import g2ard
+from g2ard.errors import InputError
+from helpers.commands import CommandLine
+from helpers.scenes import checkered_ball
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a scene and two runs of it, one of them in another format."""
+    folder = tmp_path_factory.mktemp("runs")
+    g2ard.save(folder / "ball.ply", checkered_ball(1200))
+    for name, ratio in (("a", 4), ("b", 8)):
+        made = g2ard.distill(folder / "ball.ply", ratio=ratio, steps=3, size=48)
+        run = folder / "runs" / name
+        g2ard.save(run / ("scene.ply" if name == "a" else "scene.sog"), made.splats)
+        assert made.held_out is not None
+        g2ard.save_views(run / "views.json", made.held_out.cameras)
+        (run / "report.json").write_text("{}")
+        (run / "preview.png").touch()
+    return folder
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        ("render", "runs/a", "-n", 2, "--sheet", "{}/look.png"),
+        ("render", "runs/a", "--views", "runs/a", "-o", "{}/looks"),
+        ("evaluate", "runs/a", "runs/b", "--teacher", "ball.ply", "--size", 48),
+        ("evaluate", "runs/b", "--teacher", "runs/a", "--views", "runs/a", "--split", "all"),
+        ("simplify", "runs/a", "-r", 2, "-o", "{}/small.ply"),
+        ("convert", "runs/a", "runs/b", "{}/both.spz"),
+        ("view", "runs/a", "runs/b", "-o", "{}/page.html"),
+        ("recover", "runs/a", "--teacher", "ball.ply", "--size", 48, "--steps", 2, "-o", "{}/better.ply"),
+        ("distill", "runs/a", "-r", 2, "--size", 48, "--steps", 2, "--no-view", "-o", "{}/again"),
+    ],
+)
+def test_commands_read_the_scene_of_a_run(
+    ask: tuple[object, ...], home: Path, tmp_path: Path, command_line: CommandLine
+) -> None:
+    words = [str(word).replace("{}", str(tmp_path)) for word in ask]
+    status, _, error = command_line(*words, cwd=home)
+    assert status == 0, error
+
+
+def test_python_reads_them_too(home: Path) -> None:
+    assert len(g2ard.load(home / "runs" / "a")) == 300
+    assert len(g2ard.load(home / "runs" / "b")) == 150
+    assert len(g2ard.load_views(home / "runs" / "a")) == 20
+
+
+def test_the_size_is_the_scene_files(home: Path, command_line: CommandLine) -> None:
+    ask = ("evaluate", "runs/a", "--teacher", "ball.ply", "--size", 48, "--json", "-")
+    (row,) = json.loads(command_line(*ask, cwd=home)[1])["scenes"]
+    assert row["file_bytes"] == (home / "runs" / "a" / "scene.ply").stat().st_size
+
+
+def test_a_runs_scene_is_not_written_over(home: Path, command_line: CommandLine) -> None:
+    ask = ("simplify", "runs/a", "-r", 2, "-o", "runs/a/scene.ply", "-w")
+    status, _, error = command_line(*ask, cwd=home)
+    assert (status, "would be written over, and is an input" in error) == (2, True), error
+
+
+def test_a_folder_of_runs_names_them(home: Path) -> None:
+    with pytest.raises(InputError, match=r"runs: nothing known in this folder; name one of its runs: a, b$"):
+        g2ard.load(home / "runs")
+
+
+def test_scenes_are_checked_before_poses_are_made_for_them(home: Path, command_line: CommandLine) -> None:
+    ask = ("evaluate", "runs/a", "gone.ply", "--teacher", "ball.ply", "--size", 48)
+    status, _, error = command_line(*ask, cwd=home)
+    assert (status, error) == (1, "g2ard: gone.ply: no such file or folder\n")

@@ -1,0 +1,61 @@
+"""Signals and closed pipes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+import g2ard
+from helpers.commands import interrupt_at_checkpoint, program
+from helpers.scenes import checkered_ball
+from helpers.systems import needs_signals
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_a_closed_pipe_loses_no_result(stream: str, folder: Path) -> None:
+    """As under `| head -0`: the reader is gone before anything is said."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, stream: writer}
+    running = program(
+        "simplify", "ball.ply", "-r", 5, "-o", "s.ply", "--json", "-", "-v", folder=folder, **quiet
+    )
+    os.close(writer)
+    _, error = running.communicate(timeout=120)
+    assert running.returncode == 0, error
+    assert b"roken" not in (error or b"")
+    assert len(g2ard.load(folder / "s.ply")) == 80
+
+
+@needs_signals
+@pytest.mark.parametrize(("by", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupt_says_what_was_kept(by: signal.Signals, status: int, folder: Path) -> None:
+    ask = ("distill", "ball.ply", "-r", 4, "-o", "run", "--size", 48, "--steps", 100_000)
+    running = program(*ask, folder=folder, stderr=subprocess.PIPE)
+    interrupt_at_checkpoint(running, folder, by)
+    _, error = running.communicate(timeout=120)
+    assert running.returncode == status, error
+    assert b"g2ard: interrupted; the same command with --resume goes on in run" in error
+
+
+@needs_signals
+def test_stopped_workers_leave_one_line(folder: Path) -> None:
+    """Semaphores among them, which Python would tell of when the program is gone."""
+    g2ard.save(folder / "large.ply", checkered_ball(20_000))
+    ask = ("simplify", "large.ply", "-r", 4, "--tile-rows", "3k", "--workers", 2, "-o", "s.ply")
+    running = program(*ask, folder=folder, stderr=subprocess.PIPE)
+    assert running.stderr is not None
+    while not (line := running.stderr.readline()).startswith(b"poses: "):  # workers begin to look
+        assert line
+    time.sleep(0.3)
+    running.send_signal(signal.SIGTERM)
+    error = running.stderr.read()
+    assert running.wait(timeout=120) == 143, error
+    assert error.endswith(
+        b"g2ard: interrupted; what is done stands in .s.ply.tiles, and the same command goes on\n"
+    )

@@ -1,0 +1,317 @@
+"""`--preset paper` and `preset("paper")` mean the whole paper; anchors are those of construction."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import g2ard
+from g2ard.config.constants import listed
+from g2ard.config.presets import preset
+from g2ard.errors import InputError
+from g2ard.io import Points, read_splats, write_points, write_splats, write_views
+from g2ard.pipeline import DistillConfig, distill
+from g2ard.rendering.renderer import render
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.images import write_png
+from g2ard.scene.splats import SH_C0, Splats
+from g2ard.scene.targets import TeacherRenders
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, drift95
+from g2ard.stages.recover.schedule import PAPER, Schedule
+from g2ard.stages.simplify import simplify
+from helpers.commands import CommandLine
+from helpers.project import ROOT
+from helpers.scenes import around, checkered_ball
+
+PRIOR = checkered_ball()
+FEW = PAPER.scaled(75)  # 20 steps a round
+FREE = Regularizers(0.0, 0.0, effective_rank=False)
+
+
+@pytest.fixture(scope="module")
+def targets() -> TeacherRenders:
+    return TeacherRenders(PRIOR, around())
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_splats(tmp_path / "ball.ply", PRIOR)
+    write_views(tmp_path / "v.json", around(24), splits=["train"] * 20 + ["test"] * 4)
+    return tmp_path
+
+
+def run(command_line: CommandLine, folder: Path, *arguments: object) -> dict[str, Any]:
+    status, out, error = command_line(*arguments, "-w", "--json", "-", cwd=folder)
+    assert status == 0, error
+    return json.loads(out)
+
+
+DISTILL = ("distill", "ball.ply", "-r", 3, "--views", "v.json", "-o", "run", "--steps", 75)
+SHORT = (*DISTILL, "--steps", 8)
+
+
+def test_distill_does_all_that_the_paper_says(folder: Path, command_line: CommandLine) -> None:
+    report = run(command_line, folder, *DISTILL, "--preset", "paper")
+    whole = preset("paper").distill
+    used = replace(whole, simplify=whole.simplify.resolved("paper"), schedule=FEW)
+    wanted = json.loads(json.dumps(listed({"recover": used}, report["config"])))
+    assert report["constants"] == wanted
+    config = report["config"]
+    options = ("method", "schedule", "policy", "weighted", "reselect", "sh_degree")
+    assert [config[key] for key in options] == ["paper", "paper", whole.policy, False, False, 3]
+    views = report["views"]
+    assert (views["policy"], len(views["chosen"]), views["weighted"]) == ("directional", 10, False)
+    assert [entry["count"] for entry in report["rounds"]] == [2250, 1688, 1266, 1000]
+    taken = [[done["steps"] for done in entry["recover"]] for entry in report["rounds"]]
+    assert taken == [[20], [20], [20], [20, 75]]
+    assert not any(done["kept_start"] for entry in report["rounds"] for done in entry["recover"])
+    assert read_splats(folder / "run" / "scene.ply").sh_degree == 3
+    assert (PAPER.steps, PAPER.round_steps) == (30_000, 8_000)
+
+
+def test_rounds_without_regularisers_are_named_once(folder: Path, command_line: CommandLine) -> None:
+    status, _, error = command_line(*DISTILL, "--preset", "paper", "-wv", cwd=folder)
+    assert status == 0, error
+    assert error.count("never acted") == 1
+    assert "never acted in round 1, round 2, round 3, round 4, the last recovery of round 4" in error
+    assert "there were 20 to 75" in error
+
+
+def test_what_is_said_beside_the_preset_stands(folder: Path, command_line: CommandLine) -> None:
+    (folder / "c.toml").write_text('[distill]\npolicy = "pose-diverse"\nmethod = "default"\n')
+    said = ("--config", "c.toml", "--method", "fast", "-k", 4, "--set", "regularizers.anchor=0.3")
+    report = run(command_line, folder, *SHORT, "--preset", "paper", *said, "--sh-degree", 1)
+    assert (report["views"]["policy"], len(report["views"]["chosen"])) == ("pose-diverse", 4)
+    assert (report["config"]["method"], report["config"]["schedule"]) == ("fast", "paper")
+    assert report["constants"]["regularizers"]["anchor"] == 0.3
+    assert read_splats(folder / "run" / "scene.ply").sh_degree == 1
+    (folder / "c.toml").write_text('[distill]\npreset = "paper-noisy"\n[distill.set]\nperiod = 7\n')
+    report = run(command_line, folder, *SHORT, "--config", "c.toml", "--weights")
+    assert (report["config"]["method"], report["views"]["weighted"]) == ("paper", True)
+    regularizers = report["constants"]["regularizers"]
+    assert (regularizers["shape"], regularizers["period"]) == (1e-3, 7)
+
+
+def test_a_cloud_takes_the_lift_s_row(folder: Path, command_line: CommandLine) -> None:
+    colors = np.clip(0.5 + SH_C0 * PRIOR.sh0[:, 0], 0, 1).astype(np.float32)
+    write_points(folder / "cloud.ply", Points(PRIOR.means.astype(np.float64), colors))
+    views = around(12)
+    paths = tuple(folder / f"{name}.png" for name in views.names)
+    for i, path in enumerate(paths):
+        write_png(path, render(PRIOR, views[i]).image)
+    write_views(folder / "photos.json", replace(views, image_paths=paths))
+    ask = ("distill", "cloud.ply", "-r", 3, "--views", "photos.json", "-o", "run", "--steps", 8)
+    report = run(command_line, folder, *ask, "--preset", "paper", "--set", "lift.neighbors=8")
+    regularizers = report["constants"]["regularizers"]
+    assert [regularizers[key] for key in ("anchor", "shape", "effective_rank")] == [1e-3, 1e-4, True]
+    assert report["preset"].startswith("the paper's for lift (as asked)")
+    assert report["constants"]["lift"]["neighbors"] == 8
+
+
+def test_recover_raises_sh_for_the_schedule_and_the_rest_for_the_preset(
+    folder: Path, command_line: CommandLine
+) -> None:
+    ask = ("recover", "ball.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "o.ply", "--steps", 4)
+    for option, weighted in (("--schedule", True), ("--preset", False)):
+        report = run(command_line, folder, *ask, option, "paper")
+        assert read_splats(folder / "o.ply").sh_degree == 3
+        assert report["config"]["weighted"] is weighted
+        assert report["constants"]["schedule"]["guarded"] is False
+    run(command_line, folder, *ask, "--preset", "paper", "--sh-degree", 0)
+    assert read_splats(folder / "o.ply").sh_degree == 0
+
+
+def test_the_other_commands_know_it(folder: Path, command_line: CommandLine) -> None:
+    for asked in (("--method", "paper"), ("--preset", "paper")):
+        run(command_line, folder, "simplify", "ball.ply", "-r", 3, "-o", f"{asked[0][2:]}.ply", *asked)
+    assert (folder / "method.ply").read_bytes() == (folder / "preset.ply").read_bytes()
+    found = run(
+        command_line, folder, "select", "ball.ply", "--views", "v.json", "-o", "k.json", "--preset", "paper"
+    )
+    assert (found["policy"], len(found["views"])) == ("directional", 10)
+    ask = ("adapt", "ball.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "o.ply", "--steps", 6)
+    done = run(command_line, folder, *ask, "--preset", "paper")
+    assert done["constants"]["rates"] == {
+        **listed({"rates": PAPER.rates})["rates"],
+        **dict.fromkeys(("means", "log_scales", "quats"), 0.0),
+    }
+    assert (done["steps"], done["config"]["tolerance"], done["colour_change"]) == (6, 0.0, None)
+
+
+def test_a_study_takes_it_in_g2ard_s_place() -> None:
+    from benchmarks.definition import METHODS, Definition
+    from benchmarks.paper import as_in_the_paper
+
+    study = Definition(
+        "s", "", (), tuple(METHODS[name] for name in ("g2ard", "pup", "g2ard-paper")), steps=(5,)
+    )
+    paper, pup = as_in_the_paper(study).methods
+    assert (paper.name, paper.reduce, paper.rounds, paper.k) == ("g2ard-paper", "paper", "paper", 0.5)
+    assert (paper.schedule, as_in_the_paper(study).sh_degree) == ("paper", 3)
+    assert (pup, as_in_the_paper(study).released) == (METHODS["pup"], True)
+    assert not as_in_the_paper(study, False).released
+
+
+DEFINITIONS = ROOT / "benchmarks" / "definitions"
+
+
+@pytest.mark.parametrize("name", sorted(str(p.relative_to(DEFINITIONS)) for p in DEFINITIONS.rglob("*.toml")))
+def test_it_means_every_row_of_the_paper_s_alike(name: str) -> None:
+    from benchmarks.definition import read_definition
+    from benchmarks.paper import as_in_the_paper
+
+    study = read_definition(DEFINITIONS / name)
+    done = as_in_the_paper(study)
+    papers = [m for m in done.methods if m.reduce == "paper"]
+    assert papers
+    assert not any(m.reduce == "default" for m in done.methods)
+    assert {m.schedule for m in papers} == {"paper"}
+    if all(m.policy is None for m in study.methods):
+        assert {(m.policy, m.k) for m in papers} == {("directional", 0.5)}
+    else:  # which views there are is what is compared
+        before = {m.name: (m.policy, m.k) for m in study.methods}
+        assert all(before[m.name] == (m.policy, m.k) for m in papers)
+    told = "\n".join(done.differences)
+    for untrue in ("g2ard's rates in all rows", "all training views, not a", "not each method's released"):
+        assert untrue not in told
+    assert "rows g2ard" not in told
+    assert "row g2ard is ours" not in told
+    assert "paper's preset" in told
+    matched = "\n".join(as_in_the_paper(study, False).differences)
+    assert "stand beside" not in matched
+
+
+def test_two_priors_take_it_alike() -> None:
+    from benchmarks.definition import read_definition
+    from benchmarks.paper import as_in_the_paper
+
+    study = read_definition(DEFINITIONS / "source.toml")
+    rows = {m.name: m for m in as_in_the_paper(study).methods}
+    assert list(rows)[:3] == ["g2ard-paper", "g2ard-paper (lift)", "lightgaussian"]
+    lift = rows["g2ard-paper (lift)"]
+    assert lift == replace(rows["g2ard-paper"], name=lift.name, prior="lift")
+    alone = study.narrowed(methods=tuple(m for m in study.methods if m.name == "g2ard (lift)"))
+    assert as_in_the_paper(alone).methods == (lift,)
+
+
+def test_in_python() -> None:
+    noisy = g2ard.preset("paper", prior="noisy")
+    assert noisy.distill.regularizers == noisy.recover.regularizers == PAPER_PRESETS["noisy"]
+    assert noisy.adapt.stretches() == [7000]
+    for wrong in ({"name": "peer"}, {"prior": "gentle"}):
+        with pytest.raises(InputError, match="expected"):
+            preset(**wrong)
+    with pytest.raises(InputError, match="share"):
+        DistillConfig(views=1.5)
+
+
+def test_anchors_hold_from_construction_to_the_end(targets: TeacherRenders) -> None:
+    config = DistillConfig(method="paper", schedule=FEW, regularizers=FREE)
+    result = distill(PRIOR, 1000, targets, config)
+    first, last = result.report.rounds[-1].recover
+    anchors = Anchors.of(result.simplified)
+    assert last.drift95 == drift95(anchors, result.splats.means)
+    # The round's drift is not forgotten.
+    assert last.geometry[0].drift95 > 0.5 * first.drift95 > 0.05
+    held = replace(config, regularizers=Regularizers(100.0, 0.0, effective_rank=False, period=1))
+    assert distill(PRIOR, 1000, targets, held).report.rounds[-1].recover[-1].drift95 < last.drift95
+
+
+def test_the_paper_s_steps_are_kept_whatever_comes_of_them(targets: TeacherRenders) -> None:
+    config = RecoverConfig(schedule=PAPER, steps=30, regularizers=FREE)
+    grain = np.random.default_rng(0).normal(0, 1e-3, PRIOR.sh0.shape).astype(np.float32)
+    start = replace(PRIOR, sh0=PRIOR.sh0 + grain)  # so near that such steps only lose
+    done = recover(start, targets, config, validation=targets)
+    assert done.report.psnr.after < done.report.psnr.before
+    assert (done.report.kept_start, done.report.blend, done.report.validation) == (False, 1.0, None)
+    assert (done.splats.sh0 != start.sh0).any()
+    guarded = replace(config, schedule=replace(PAPER, guarded=True))
+    assert recover(start, targets, guarded).report.kept_start
+
+
+def scaled(scene: Splats, cameras: Cameras, unit: float) -> tuple[Splats, Cameras]:
+    """The same in another unit."""
+    viewmats = cameras.viewmats.copy()
+    viewmats[:, :3, 3] *= unit
+    size = np.float32(unit)
+    return replace(scene, means=scene.means * size, scales=scene.scales * size), replace(
+        cameras, viewmats=viewmats
+    )
+
+
+def test_the_paper_s_rates_do_not_depend_on_the_unit() -> None:
+    student = simplify(PRIOR, 500, method="paper").splats
+
+    def moved(unit: float, schedule: Schedule = PAPER) -> float:
+        start, cameras = scaled(student, around(), unit)
+        teacher, _ = scaled(PRIOR, around(), unit)
+        config = RecoverConfig(schedule=schedule, steps=60, regularizers=FREE)
+        done = recover(start, TeacherRenders(teacher, cameras), config).splats
+        return float(np.abs(done.means - start.means).mean()) / unit
+
+    assert math.isclose(moved(64.0), moved(1.0), rel_tol=0.02)
+    stated = replace(PAPER, reference_extent=None)
+    assert moved(64.0, stated) < 0.1 * moved(1.0, stated)
+    assert math.isclose(around().extent, 1.1 * 3.0, rel_tol=0.1)
+    assert around().take([0]).extent == 0.0
+    assert PAPER.within(0.0) == PAPER
+
+
+def test_what_was_kept_gives_the_drift_again(folder: Path, command_line: CommandLine) -> None:
+    report = run(command_line, folder, *DISTILL, "--preset", "paper", "--keep")
+    kept = folder / "run" / "simplified" / "scene.ply"
+    ask = ("evaluate", "run/scene.ply", "--views", "v.json", "--teacher", "ball.ply", "--anchors", kept)
+    found = run(command_line, folder, *ask)["scenes"][0]["drift95"]
+    assert math.isclose(found, report["rounds"][-1]["recover"][-1]["drift95"], rel_tol=1e-4)
+    ask = ("recover", "run/scene.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "more.ply")
+    short = ("--schedule", "paper", "--steps", 2)
+    again = run(command_line, folder, *ask, *short, "--anchors", kept)["drift95"]
+    assert abs(again - found) < abs(run(command_line, folder, *ask, *short)["drift95"] - found)
+    status, _, error = command_line(*ask, *short, "-w", "--anchors", "ball.ply", cwd=folder)
+    assert (status, error.splitlines()[-1]) == (
+        1,
+        "g2ard: ball.ply: 3,000 Gaussians, the student has 1,000; anchors are the student as it was "
+        "simplified, before any recovery",
+    )
+    run(command_line, folder, *SHORT, "--schedule", "fast")
+    assert not kept.exists()  # it would not be of this run
+
+
+VIEWED = ("--views", "v.json", "--teacher", "ball.ply", "-w", "--json", "-")
+
+
+def test_the_paper_s_adaptation_blends_nothing(folder: Path, command_line: CommandLine) -> None:
+    ask = ("adapt", "ball.ply", "-o", "o.ply", "--steps", 2, *VIEWED)
+    for paper in (("--preset", "paper"), ("--schedule", "paper")):
+        status, _, error = command_line(*ask, *paper, "--prior-views", 3, cwd=folder)
+        assert (status, "--prior-views" in error) == (2, True), error
+        status, out, error = command_line(*ask, *paper, cwd=folder)
+        assert status == 0, error
+        assert json.loads(out)["prior_share"] == 0
+    assert g2ard.preset("paper").adapt.prior_views == 0
+    status, out, error = command_line(*ask, cwd=folder)
+    assert status == 0, error
+    assert json.loads(out)["prior_share"] > 0
+
+
+@pytest.mark.parametrize("preset", ["paper", "paper-trained", "paper-lift", "paper-noisy"])
+def test_a_preset_above_the_tables_is_for_all_commands(
+    folder: Path, command_line: CommandLine, preset: str
+) -> None:
+    (folder / "c.toml").write_text(f'preset = "{preset}"\n[recover]\nsteps = 2\n')
+    config = ("-w", "--json", "-", "--config", "c.toml")
+    status, out, error = command_line(
+        "select", "ball.ply", "-k", 3, "--views", "v.json", "-o", "k.json", *config, cwd=folder
+    )
+    assert status == 0, error
+    assert json.loads(out)["policy"] == "directional"
+    status, out, error = command_line("simplify", "ball.ply", "-r", 9, "-o", "s.ply", *config, cwd=folder)
+    assert status == 0, error
+    assert json.loads(out)["config"]["method"] == "paper"

@@ -1,0 +1,22 @@
+"""The parts of a .glb file."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+# ── glTF's rules ─────────────────────────────────────────────────────────────────────────────────────
+
+
+def glb_parts(path: Path) -> tuple[dict, bytes]:
+    data = path.read_bytes()
+    magic, version, total = struct.unpack_from("<4sII", data)
+    assert (magic, version, total) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON"
+    assert size % 4 == 0
+    rest, kind = struct.unpack_from("<I4s", data, 20 + size)
+    assert kind == b"BIN\0"
+    assert len(data) == 28 + size + rest
+    return json.loads(data[20 : 20 + size]), data[28 + size :]

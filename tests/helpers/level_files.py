@@ -1,0 +1,29 @@
+"""Scenes for levels of detail, and the files written for them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from g2ard.levels import Leaf, Node
+from g2ard.scene.splats import Splats
+
+
+def scattered(count: int, seed: int = 0, offset: float = 0.0) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats.create(
+        rng.normal(size=(count, 3)) * (4, 2, 1),
+        quats=rng.normal(size=(count, 4)),
+        scales=rng.uniform(0.02, 0.2, size=(count, 3)),
+        logit_opacities=rng.normal(size=count),
+        offset=np.full(3, offset),
+    )
+
+
+def leaves_of(tree: Node | Leaf) -> list[Leaf]:
+    return [tree] if isinstance(tree, Leaf) else list(tree.leaves())
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}

@@ -1,0 +1,62 @@
+"""Viewer pages opened in a browser."""
+
+from __future__ import annotations
+
+import base64
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from g2ard.rendering.metrics import psnr
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Camera
+from g2ard.scene.splats import Splats
+from helpers.browser import Browser
+
+WIDTH, HEIGHT = 480, 360
+
+
+GREY = (0.2, 0.3, 0.4)
+
+
+FRONT = Camera.facing([1.8, -1.6, 0.9], [0, 0, 0], width=WIDTH, height=HEIGHT, fov=55, name="front")
+
+
+def show(browser: Browser, page: Path | str) -> None:
+    browser.open(page if isinstance(page, str) else page.absolute().as_uri())
+    browser.run(
+        "new Promise(done => { const look = () => window.g2ard ? done() : setTimeout(look, 20); look(); })"
+    )
+    browser.run("g2ard.ready.then(() => null)")
+
+
+def drawn(browser: Browser, accept: Callable[[np.ndarray], bool], index: int = 0) -> np.ndarray:
+    """(H, W, 3) in [0, 1]: what a viewer draws, without the controls above it. Sorting runs beside drawing:
+    frames are asked for until one is accepted; the last one is given after a minute."""
+    size = f"{{width: {WIDTH}, height: {HEIGHT}, supersample: 1}}"
+    until = time.monotonic() + 60
+    while True:
+        shot = browser.run(f"g2ard.ready.then(viewers => viewers[{index}].captureFrame({size}))")["data"]
+        pixels = np.frombuffer(base64.b64decode(shot), np.uint8).reshape(HEIGHT, WIDTH, 4)
+        picture = pixels[..., :3] / np.float32(255)
+        if accept(picture) or time.monotonic() > until:
+            return picture
+        browser.run("new Promise(done => setTimeout(done, 300))")
+
+
+def like(expected: np.ndarray, decibels: float) -> Callable[[np.ndarray], bool]:
+    """Whether a picture has more than so many decibels against an expected one."""
+    return lambda picture: psnr(picture, expected) > decibels
+
+
+def assert_shows(browser: Browser, expected: np.ndarray, decibels: float, index: int = 0) -> np.ndarray:
+    """What a viewer draws, which must be like an expected picture."""
+    picture = drawn(browser, like(expected, decibels), index)
+    assert psnr(picture, expected) > decibels
+    return picture
+
+
+def rendered(scene: Splats, camera: Camera = FRONT) -> np.ndarray:
+    return np.clip(Renderer(scene, background=GREY).image(camera), 0, 1)

@@ -1,0 +1,123 @@
+"""A small valid file of every kind that g2ard reads, for fuzzing."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from g2ard.io import write_splats, write_views
+from helpers.cloud_files import columns, las, ply
+from helpers.dataset_files import cambridge
+from helpers.packed_files import compressed, save_spz, truth
+from helpers.sog_files import parts
+from helpers.trainer_files import data_of, export, inria, result_of, run_of
+from helpers.view_files import colmap, orbit, transforms, views
+
+
+def ascii_cloud(path: Path) -> Path:
+    lines = ["ply", "format ascii 1.0", "element vertex 3"]
+    lines += [f"property float {a}" for a in "xyz"]
+    lines += [f"property uchar {c}" for c in ("red", "green", "blue")]
+    lines += ["end_header", "0 0 1 1 2 3", "1 0 0 4 5 6", "0 1 0 7 8 9"]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def bundle(path: Path) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in parts().items():
+            archive.writestr(name, content)
+    return path
+
+
+def saved(path: Path, write: Callable[..., None], what: object) -> Path:
+    write(path, what)
+    return path
+
+
+def table(folder: Path, name: str, text: bool = False) -> Path:
+    return colmap(folder / "project", orbit(3), text) / "sparse" / "0" / name
+
+
+def run_file(folder: Path, name: str) -> Path:
+    """A file of a nerfstudio run, or its data."""
+    data, run = data_of(folder), run_of(folder)
+    return data if name == "transforms.json" else run / name
+
+
+def landmarks(folder: Path, name: str) -> Path:
+    """A file of a scene of Cambridge Landmarks."""
+    cambridge(folder / "college")
+    return folder / "college" / name
+
+
+def chunks(folder: Path) -> Path:
+    """The meta.json of a SOG folder."""
+    for name, content in parts().items():
+        (folder / name).write_bytes(content)
+    return folder / "meta.json"
+
+
+def levels(folder: Path) -> Path:
+    """The lod-meta.json of a folder of SOG chunks."""
+    (folder / "0_0").mkdir()
+    chunks(folder / "0_0")
+    tree = {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 10}}}]}
+    path = folder / "lod-meta.json"
+    path.write_text(json.dumps({"lodLevels": 1, "filenames": ["0_0/meta.json"], "tree": tree}))
+    return path
+
+
+def exports(folder: Path) -> Path:
+    data_of(folder)
+    return export(folder / "exports", Path("data/poster/images"), "transforms_train.json", range(3))
+
+
+def result(folder: Path) -> Path:
+    colmap(folder / "data" / "garden", orbit(3), text=False)
+    return result_of(folder)
+
+
+MAKERS: dict[str, Callable[[Path], Path]] = {
+    "scene": lambda f: saved(f / "a.ply", write_splats, truth(9, 1)),
+    "compressed": lambda f: compressed(f / "a.ply", truth(9, 1)),
+    "spz 3": lambda f: save_spz(f / "a.spz", truth(9, 1), 3),
+    "spz 4": lambda f: save_spz(f / "a.spz", truth(9, 1), 4),
+    "splat": lambda f: saved(f / "a.splat", write_splats, truth(9, 0)),
+    "sog": lambda f: bundle(f / "a.sog"),
+    "meta.json": chunks,
+    "lod-meta.json": levels,
+    "glb": lambda f: saved(f / "a.glb", write_splats, truth(9, 1)),
+    "cloud": lambda f: ply(f / "a.ply", columns("f4", "u1"), np.arange(36.0).reshape(6, 6), faces=3),
+    "ascii cloud": lambda f: ascii_cloud(f / "a.ply"),
+    "las": lambda f: las(f / "a.las", np.arange(30.0).reshape(10, 3), np.ones((10, 3), int)),
+    "laz": lambda f: las(f / "a.laz", np.arange(30.0).reshape(10, 3), np.ones((10, 3), int)),
+    "cameras.bin": lambda f: table(f, "cameras.bin"),
+    "images.bin": lambda f: table(f, "images.bin"),
+    "points3D.bin": lambda f: table(f, "points3D.bin"),
+    "cameras.txt": lambda f: table(f, "cameras.txt", text=True),
+    "images.txt": lambda f: table(f, "images.txt", text=True),
+    "points3D.txt": lambda f: table(f, "points3D.txt", text=True),
+    "dataset_train.txt": lambda f: landmarks(f, "dataset_train.txt"),
+    "reconstruction.nvm": lambda f: landmarks(f, "reconstruction.nvm"),
+    "transforms": lambda f: transforms(f / "a.json", orbit(2)),
+    "cameras.json": lambda f: inria(f / "cameras.json", orbit(3)),
+    "dataparser_transforms.json": lambda f: run_file(f, "dataparser_transforms.json"),
+    "config.yml": lambda f: run_file(f, "config.yml"),
+    "transforms of a run": lambda f: run_file(f, "transforms.json"),
+    "ns-export": exports,
+    "cfg.yml": result,
+    "views": lambda f: saved(f / "a.json", write_views, views(2)),
+}
+
+
+READ = {
+    "transforms of a run": "outputs/poster/splatfacto/today",
+    "dataset_train.txt": "college",
+    "reconstruction.nvm": "college",
+}
+"""What to read instead of the damaged file, in the test's folder."""

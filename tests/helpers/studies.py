@@ -1,0 +1,74 @@
+"""Small studies and checks of their report page."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+
+from g2ard import io
+from g2ard.scene.images import write_png
+from helpers.scenes import around, checkered_ball
+
+STUDY = """
+title = "Balls"
+ratios = [4]
+steps = [9]
+seconds = [3]
+methods = ["g2ard", "pup", "rounds", "nanogs"]
+
+[method.rounds]
+base = "g2ard-paper"
+protection = 0.0
+
+[[scene]]
+name = "ball"
+prior = "ball.ply"
+train = "views.json"
+"""
+
+
+def study(folder: Path, text: str = STUDY) -> Path:
+    io.write_splats(folder / "ball.ply", checkered_ball(1200))
+    io.write_views(folder / "views.json", around(16, size=(48, 36)))
+    path = folder / "balls.toml"
+    path.write_text(text)
+    return path
+
+
+def check_page(html: str) -> None:
+    """Parses, and asks nothing of a network."""
+
+    class Parser(HTMLParser):
+        def __init__(self) -> None:
+            super().__init__()
+            self.open: list[str] = []
+
+        def handle_starttag(self, tag: str, attributes: list) -> None:
+            assert tag not in ("link", "iframe")
+            assert not [v for k, v in attributes if k in ("src", "href")]
+            if tag not in ("meta", "img", "input", "br", "line", "circle", "polyline", "polygon"):
+                self.open.append(tag)
+
+        def handle_endtag(self, tag: str) -> None:
+            if tag in ("line", "circle", "polyline", "polygon"):
+                return
+            assert self.open.pop() == tag
+
+    parser = Parser()
+    parser.feed(html)
+    assert parser.open == []
+    assert not re.search(r"https?://|@import|url\(", html)
+
+
+def pictured(folder: Path, which: tuple[int, ...] = (0, 2)):
+    """Four views, of which some have a photo: of one colour, so that they are told from renders."""
+    views = around(4)
+    paths = [folder / f"{name}.png" if i in which else None for i, name in enumerate(views.names)]
+    for path in paths:
+        if path is not None:
+            write_png(path, np.full((48, 64, 3), 0.25, np.float32))
+    return replace(views, image_paths=tuple(paths))

@@ -1,0 +1,51 @@
+"""Scenes and views for tests of tiles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.splats import Splats
+from g2ard.tiles.executor import executor
+from g2ard.tiles.simplify import simplify_tiles
+from g2ard.tiles.store import TileStore
+
+
+def town(count: int = 9000, seed: int = 0) -> Splats:
+    """A textured ground with boxes on it."""
+    rng = np.random.default_rng(seed)
+    ground = rng.uniform([-8, -4, 0], [8, 4, 0], (count, 3))
+    high = rng.random(count) < 0.4
+    ground[high, :2] = (
+        rng.choice([-6.0, -2.0, 3.0, 7.0], (count, 1))[high] + rng.uniform(-0.5, 0.5, (count, 2))[high]
+    )
+    ground[high, 1] *= 0.3
+    ground[high, 2] = rng.uniform(0, 1, count)[high]
+    color = np.sin(ground @ rng.normal(size=(3, 3)) * 2)
+    return Splats.create(
+        ground,
+        quats=rng.normal(size=(count, 4)),
+        scales=np.exp(rng.normal(-2.6, 0.3, (count, 3))),
+        logit_opacities=rng.normal(2, 2, count),
+        sh0=color[:, None],
+    )
+
+
+def ring(count: int = 6) -> Cameras:
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    eyes = np.stack([12 * np.cos(angles), 8 * np.sin(angles), np.full(count, 5.0)], 1)
+    K = [[150, 0, 80], [0, 150, 60], [0, 0, 1]]
+    return Cameras.from_lists(
+        [look_at(eye, [0, 0, 0]) for eye in eyes],
+        [K] * count,
+        [(160, 120)] * count,
+        [f"{i}" for i in range(count)],
+    )
+
+
+def reduced(store: TileStore, work: Path, budget: int = 900, **options: object) -> Splats:
+    where = {key: options.pop(key) for key in ("workers", "threads", "scheduler") if key in options}
+    with executor(**where) as runs:  # type: ignore[arg-type]
+        return simplify_tiles(store, budget, executor=runs, work=work, **options).whole()  # type: ignore[arg-type]

@@ -1,0 +1,182 @@
+"""COLMAP's models as views and as points."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard.errors import InputError
+from g2ard.io import kind, read_points, read_views
+from helpers.realdata import real
+from helpers.view_files import MODELS, colmap, orbit, photo
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("model", range(len(MODELS)))
+def test_colmap(tmp_path: Path, text: bool, model: int) -> None:
+    truth = orbit(5)
+    folder = colmap(tmp_path / "project", truth, text, model)
+    for i in range(5):
+        photo(folder / "images" / f"photo {i}.png")
+    for path in (folder, folder / "sparse" / "0"):
+        cameras = read_views(path)
+        assert cameras.names == tuple(f"photo {i}.png" for i in range(5))
+        np.testing.assert_allclose(cameras.viewmats, truth, atol=1e-12)
+        fx, fy, cx, cy = MODELS[model][3]
+        np.testing.assert_array_equal(cameras.Ks[0], [[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        np.testing.assert_array_equal(cameras.distortions[0], [*MODELS[model][4], 0])
+        assert (cameras.widths == 8).all()
+        assert (cameras.heights == 6).all()
+        assert cameras.image_paths[2] == folder / "images" / "photo 2.png"
+    assert kind(folder) == "views"
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_colmap_points(tmp_path: Path, text: bool) -> None:
+    folder = colmap(tmp_path / "project", orbit(2), text)
+    file = folder / "sparse" / "0" / f"points3D.{'txt' if text else 'bin'}"
+    assert kind(file) == "points"
+    for path in (folder, file):
+        points = read_points(path)
+        np.testing.assert_array_equal(points.positions, [[1.5, 2, 3], [-4, 5, 6]])
+        np.testing.assert_allclose(points.colors * 255, [[255, 128, 0], [0, 1, 2]], atol=1e-4)
+
+
+def test_colmap_photos_elsewhere(tmp_path: Path) -> None:
+    folder = colmap(tmp_path / "project", orbit(2), text=False)
+    for i in range(2):
+        photo(tmp_path / "elsewhere" / f"photo {i}.png")
+    cameras = read_views(folder, images=tmp_path / "elsewhere")
+    assert cameras.image_paths[1] == tmp_path / "elsewhere" / "photo 1.png"
+    assert read_views(folder).image_paths == (None, None)
+    with pytest.raises(InputError, match="no such folder of photos"):
+        read_views(folder, images=tmp_path / "gone")
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+@pytest.mark.parametrize("keep", [4, 30, -10])
+def test_truncated_colmap(tmp_path: Path, name: str, keep: int) -> None:
+    folder = colmap(tmp_path / "project", orbit(3), text=False)
+    path = folder / "sparse" / "0" / name
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(InputError, match=rf"{name}: truncated"):
+        (read_points if "points" in name else read_views)(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "keep", "column"),
+    [
+        ("cameras.bin", 7, r"COUNT of table 0"),
+        ("cameras.bin", 8 + 11, "WIDTH of camera 0"),
+        ("cameras.bin", 8 + 24 + 3 * 8, r"PARAMS\[3\] of camera 0"),
+        ("images.bin", 8 + 4 + 4 * 8 + 7, r"TX of image 0"),
+        ("images.bin", 8 + 64 + 3, r"NAME of image 0"),
+        ("images.bin", 8 + 64 + 12 + 8 + 47, r"POINTS2D of image 0, 'photo 2\.png'"),
+        ("points3D.bin", 109, "B of point 1"),
+    ],
+)
+def test_the_column_that_is_cut_is_named(tmp_path: Path, name: str, keep: int, column: str) -> None:
+    folder = colmap(tmp_path / "project", orbit(3), text=False)
+    path = folder / "sparse" / "0" / name
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(InputError, match=rf"{name}: truncated in ({column})$"):
+        (read_points if "points" in name else read_views)(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "column"),
+    [("cameras.bin", 8 + 24 + 8, r"camera 0: PARAMS\[1\]"), ("images.bin", 8 + 4 + 5 * 8, "image 0: TY")],
+)
+def test_a_binary_value_that_is_not_finite_is_named(tmp_path: Path, name: str, at: int, column: str) -> None:
+    folder = colmap(tmp_path / "project", orbit(3), text=False)
+    path = folder / "sparse" / "0" / name
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<d", data, at, float("nan"))
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=rf"{name}: malformed {column} is nan$"):
+        read_views(folder)
+
+
+def test_fisheye_is_refused(tmp_path: Path) -> None:
+    folder = colmap(tmp_path / "project", orbit(2), text=True)
+    cameras = folder / "sparse" / "0" / "cameras.txt"
+    cameras.write_text("7 OPENCV_FISHEYE 8 6 500 500 4 3 0 0 0 0\n")
+    with pytest.raises(InputError, match="OPENCV_FISHEYE is not supported"):
+        read_views(folder)
+    cameras.write_text("9 PINHOLE 8 6 500 500 4 3\n")
+    with pytest.raises(InputError, match="names camera 7, which is absent"):
+        read_views(folder)
+    cameras.write_text("7 PINHOLE 8 six 500 500 4 3\n")
+    with pytest.raises(InputError, match=r"cameras\.txt: malformed camera 0: HEIGHT is 'six'$"):
+        read_views(folder)
+    for word in ("1_0", "٣"):
+        cameras.write_text(f"7 PINHOLE 8 {word} 500 500 4 3\n", encoding="utf-8")
+        with pytest.raises(InputError, match=rf"cameras\.txt: malformed camera 0: HEIGHT is '{word}'$"):
+            read_views(folder)
+    cameras.write_text("7 PINHOLE 8 6 500 x 4 3\n")
+    with pytest.raises(InputError, match=r"cameras\.txt: malformed camera 0: PARAMS\[1\] is 'x'$"):
+        read_views(folder)
+    cameras.write_text("7 PINHOLE 8\n")
+    with pytest.raises(InputError, match=r"cameras\.txt: malformed camera 0: lacks HEIGHT$"):
+        read_views(folder)
+
+
+def test_a_bad_row_of_a_text_table_is_named(tmp_path: Path) -> None:
+    folder = colmap(tmp_path / "project", orbit(2), text=True)
+    images = folder / "sparse" / "0" / "images.txt"
+    images.write_text("1 1 0 0 0 0 0 4 7 a.png\n\n2 1 0 0 0 0 deep 4 7 b.png\n\n")
+    with pytest.raises(InputError, match=r"images\.txt: malformed image 1: TY is 'deep'$"):
+        read_views(folder)
+    images.write_text("1 1 0 0 0 0 0 inf 7 a.png\n\n")
+    with pytest.raises(InputError, match=r"images\.txt: malformed image 0: TZ is 'inf'$"):
+        read_views(folder)
+    images.write_text("1 1 0 0 0 0 0 4 7\n\n")
+    with pytest.raises(InputError, match=r"images\.txt: malformed image 0: lacks NAME$"):
+        read_views(folder)
+    points = folder / "sparse" / "0" / "points3D.txt"
+    points.write_text("1 0 0 0 9 9 9 0.1\n2 0 0 0 9 nine 9 0.1\n")
+    with pytest.raises(InputError, match=r"points3D\.txt: malformed point 1: G is 'nine'$"):
+        read_points(points)
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("2 0 0 0 -1 9 9 0.1", "R is '-1', expected 0 to 255"),
+        ("2 0 0 0 9 256 9 0.1", "G is '256', expected 0 to 255"),
+        ("2 0 0 0 9 9 nan 0.1", "B is 'nan', expected 0 to 255"),
+        ("2 0 0 0 9 9 1e308 0.1", "B is '1e308', expected 0 to 255"),
+        ("2 0 0 0 9 9 inf 0.1", "B is 'inf', expected 0 to 255"),
+        ("2 0 1_0 0 9 9 9 0.1", "Y is '1_0'"),
+        ("2 0 0 0 9 \u0663 9 0.1", "G is '\u0663'"),
+    ],
+)
+def test_numbers_of_points3d_text(tmp_path: Path, row: str, message: str) -> None:
+    points = tmp_path / "points3D.txt"
+    points.write_text(f"1 0 0 0 0 255 9 0.1\n{row}\n", encoding="utf-8")
+    with pytest.raises(InputError, match=rf"points3D\.txt: malformed point 1: {message}$"):
+        read_points(points)
+    points.write_text("1 nan 0 0 0 255 9 0.1\n2 0 0 0 0 255 9 0.1\n")
+    assert read_points(points).colors.tolist() == [[0, 1, np.float32(9 / 255)]]
+
+
+def test_caliterra() -> None:
+    folder = real("caliterra")
+    cameras = read_views(folder)
+    assert len(cameras) == 75
+    assert all(p is not None and p.is_file() for p in cameras.image_paths)
+    points = read_points(folder)
+    assert len(points) == 41_590
+    split = json.loads((folder / "split.json").read_text())
+    for which in ("train", "test"):
+        assert sorted(read_views(folder, split=which).names) == sorted(split[which])
+    # every point in front of some camera lands in its image: axes and intrinsics agree
+    X = np.c_[points.positions, np.ones(len(points))] @ cameras.viewmats[30].T
+    seen = X[:, 2] > 0
+    uv = (X[seen, :3] @ cameras.Ks[30].T) / X[seen, 2:3]
+    inside = (uv[:, 0] > 0) & (uv[:, 0] < 1000) & (uv[:, 1] > 0) & (uv[:, 1] < 751)
+    assert inside.sum() > 1000

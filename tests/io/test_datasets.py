@@ -1,0 +1,95 @@
+"""Views of public data sets, on small files of their true form."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard import io
+from g2ard.errors import InputError
+from g2ard.scene.images import load_image
+from helpers.dataset_files import POSES, cambridge, mip_nerf_360, opengl, photo
+
+
+def test_matrix_citys_pose_folder_states_its_splits(tmp_path: Path) -> None:
+    pose = tmp_path / "aerial" / "pose" / "block_A"
+    pose.mkdir(parents=True)
+    head = {"camera_angle_x": 0.7853981633974483, "camera_angle_y": 0.4735, "w": 192, "h": 108}
+    head |= {"fl_x": 231.8, "fl_y": 231.8, "cx": 96.0, "cy": 54.0, "k1": 0, "k2": 0, "p1": 0, "p2": 0}
+    for split, rows in (("train", range(6)), ("test", range(6, 9))):
+        block = "block_1" if split == "train" else "block_1_test"
+        frames = []
+        for i in rows:
+            photo(tmp_path / "aerial" / split / block / f"{i:04d}.png", (192, 108), 10 * i)
+            where = f"../../{split}/{block}/{i:04d}.png"
+            frames.append({"file_path": where, "transform_matrix": opengl(POSES[i]).tolist()})
+        (pose / f"transforms_{split}.json").write_text(json.dumps({**head, "frames": frames}))
+    found = io.read_view_set(pose)
+    assert found.splits == ("train",) * 6 + ("test",) * 3
+    assert found.notes == ()
+    test = io.read_views(pose, split="test")
+    np.testing.assert_allclose(test.viewmats, POSES[6:], atol=1e-9)
+    assert test.Ks[0, 0, 0] == 231.8
+    assert load_image(test, 2)[0, 0, 0] == pytest.approx(80 / 255)
+    assert len(io.read_views(pose / "transforms_train.json")) == 6
+
+
+def test_matrix_citys_blocks_have_numbers_and_small_rotations(tmp_path: Path) -> None:
+    block = tmp_path / "block_1"
+    frames = []
+    for i, view in enumerate(POSES[:4]):
+        matrix = opengl(view)
+        matrix[:3, :3] /= 100
+        frames.append({"frame_index": i + 7, "rot_mat": matrix.tolist()})
+        photo(block / "rgb" / f"{i + 7:04d}.png", (64, 36))
+    content = {"camera_angle_x": 0.7853981633974483, "frames": frames}
+    (block / "transforms.json").write_text(json.dumps(content))
+    found = io.read_views(block)
+    np.testing.assert_allclose(found.viewmats, POSES[:4], atol=1e-9)
+    assert found.names[0] == "rgb/0007.png"
+    np.testing.assert_allclose(found.Ks[0, 0, 0], 32 / np.tan(np.pi / 8))
+
+
+def test_mip_nerf_360_at_a_quarter(tmp_path: Path) -> None:
+    mip_nerf_360(tmp_path)
+    whole, quarter = io.read_views(tmp_path), io.read_views(tmp_path / "images_4")
+    assert (whole.widths[0], quarter.widths[0], quarter.heights[0]) == (400, 100, 75)
+    np.testing.assert_allclose(quarter.Ks[0], [[95, 0, 50.25], [0, 95.25, 37.25], [0, 0, 1]])
+    np.testing.assert_allclose(quarter.viewmats, POSES, atol=1e-9)
+    assert load_image(quarter, 0).shape == (75, 100, 3)
+    half = io.read_views(tmp_path, images=tmp_path / "images_2", split="test")
+    assert half.names == ("DSC0000.JPG", "DSC0008.JPG")  # every 8th: llffhold
+    assert half.widths[0] == 200
+
+
+def test_cambridge_landmarks(tmp_path: Path) -> None:
+    cambridge(tmp_path)
+    found = io.read_view_set(tmp_path)
+    assert found.splits == ("train",) * 6 + ("test",) * 3
+    np.testing.assert_allclose(found.cameras.viewmats, POSES, atol=1e-7)
+    np.testing.assert_allclose(found.cameras.Ks[0], [[167, 0, 96], [0, 167, 54], [0, 0, 1]])
+    np.testing.assert_allclose(found.cameras.distortions[0], [0.05, 0, 0, 0, 0])
+    assert found.cameras.Ks[4, 0, 0] == pytest.approx(167.4)  # the median, for it is not listed
+    assert [note.code for note in found.notes] == ["guessed_focal"]
+    assert len(io.read_views(tmp_path, split="test")) == 3
+    assert io.kind(tmp_path) == "views"
+
+
+def test_cambridges_errors_name_the_line(tmp_path: Path) -> None:
+    cambridge(tmp_path)
+    path = tmp_path / "dataset_test.txt"
+    text = path.read_text()
+    for broken, message in (
+        (text.replace("seq2/frame00007.png", "seq2/frame00007.png x"), "line 5"),
+        (text.replace("seq2/frame00007.png ", ""), "line 5"),
+    ):
+        path.write_text(broken)
+        with pytest.raises(InputError, match=message):
+            io.read_views(tmp_path)
+    path.write_text(text)
+    (tmp_path / "reconstruction.nvm").write_text("nothing")
+    with pytest.raises(InputError, match="NVM_V3"):
+        io.read_views(tmp_path)

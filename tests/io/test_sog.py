@@ -1,0 +1,295 @@
+"""SOG: built here byte by byte, then compared with an independent decoder on real scenes."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from g2ard.errors import InputError
+from g2ard.io import kind, read_scene, read_splats
+from g2ard.io.sanitize import LOGIT_LIMIT
+from helpers.realdata import ROOT, real
+from helpers.sog_files import folder, parts, square, webp
+
+
+def decoded(files: dict[str, bytes], name: str, count: int) -> np.ndarray:
+    return (
+        np.asarray(Image.open(io.BytesIO(files[name])).convert("RGBA")).reshape(-1, 4)[:count].astype(float)
+    )
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("bands", [0, 1, 2, 3])
+def test_decodes_every_field(tmp_path: Path, version: int, bands: int) -> None:
+    """Each Gaussian by hand, in a plain loop."""
+    count = 10
+    files = parts(count, bands, seed=bands, version=version)
+    splats = read_splats(folder(tmp_path / "scene", files))
+    low, high, scales, quats, sh0 = (
+        decoded(files, f"{name}.webp", count) for name in ("low", "high", "scales", "quats", "sh0")
+    )
+    meta = json.loads(files["meta.json"])
+    assert splats.sh_degree == bands
+    for i in range(count):
+        for axis in range(3):
+            lo, hi = meta["means"]["mins"][axis], meta["means"]["maxs"][axis]
+            log = lo + (hi - lo) * (low[i, axis] + 256 * high[i, axis]) / 65535
+            assert splats.means[i, axis] == pytest.approx(np.sign(log) * (np.exp(abs(log)) - 1), abs=1e-6)
+            if version == 2:
+                log_scale = -9 + 8 * scales[i, axis] / 255
+                color = -3 + 6 * sh0[i, axis] / 255
+            else:
+                log_scale = (-9 + axis) + (8 - 2 * axis) * scales[i, axis] / 255
+                color = (-3 + axis) * (1 - 2 * sh0[i, axis] / 255)
+            assert np.log(splats.scales[i, axis]) == pytest.approx(log_scale, abs=1e-5)
+            assert splats.sh0[i, 0, axis] == pytest.approx(color, abs=1e-6)
+        alpha = sh0[i, 3] / 255
+        logit = np.log(alpha / (1 - alpha)) if version == 2 else -5 + 10 * alpha
+        assert splats.logit_opacities[i] == pytest.approx(logit, abs=1e-5)
+        left_out = int(quats[i, 3]) - 252
+        others = [k for k in range(4) if k != left_out]
+        expected = (quats[i, :3] / 255 - 0.5) * np.sqrt(2)
+        np.testing.assert_allclose(splats.quats[i, others], expected, atol=1e-6)
+        assert splats.quats[i, left_out] == pytest.approx(np.sqrt(max(0, 1 - (expected**2).sum())), abs=1e-6)
+    if bands:
+        rest = splats.shN.shape[1]
+        palette = np.asarray(Image.open(io.BytesIO(files["shN_centroids.webp"])).convert("RGB")).astype(float)
+        labels = decoded(files, "shN_labels.webp", count)[:, :2] @ [1, 256]
+        for i, label in enumerate(labels.astype(int)):
+            column = (label % 64) * rest
+            entry = palette[label // 64, column : column + rest] / 255 * 2 - 1
+            np.testing.assert_allclose(splats.shN[i], entry, atol=1e-6)
+
+
+@pytest.mark.parametrize("prefix", ["", "scene/"])
+def test_zipped(tmp_path: Path, prefix: str) -> None:
+    files = parts()
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as bundle:
+        for name, content in files.items():
+            bundle.writestr(prefix + name, content)
+    plain = read_splats(folder(tmp_path / "plain", files))
+    zipped = read_splats(tmp_path / "a.sog")
+    for name in ("means", "quats", "scales", "logit_opacities", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(plain, name), getattr(zipped, name))
+    assert kind(tmp_path / "a.sog") == kind(tmp_path / "plain") == "splats"
+    np.testing.assert_array_equal(read_splats(tmp_path / "plain" / "meta.json").means, plain.means)
+
+
+def test_chunks_make_one_scene_of_the_finest_level(tmp_path: Path) -> None:
+    for i, name in enumerate(["0_0", "0_10", "0_2", "1_0", "env"]):
+        folder(tmp_path / name, parts(count=5 + i, bands=i % 2, seed=i))
+    found = read_scene(tmp_path)
+    assert len(found.splats) == 5 + 6 + 7
+    assert found.splats.sh_degree == 1
+    second = read_splats(tmp_path / "0_2")
+    np.testing.assert_array_equal(found.splats.means[5:12], second.means)  # 0_2 before 0_10
+    assert not found.splats.shN[:5].any()
+    assert [(n.code, n.count) for n in found.notes] == [("ignored_chunks", 2)]
+
+
+def test_lod_meta_lists_the_chunks(tmp_path: Path) -> None:
+    names = ["b/meta.json", "a/meta.json", "coarse/meta.json"]
+    for i, name in enumerate(names):
+        folder((tmp_path / name).parent, parts(count=4 + i, seed=i))
+    leaf = [{"lods": {"0": {"file": i}, "1": {"file": 2}}} for i in (1, 0)]
+    index = {"lodLevels": 2, "filenames": names, "tree": {"children": [{"children": leaf}]}}
+    (tmp_path / "lod-meta.json").write_text(json.dumps(index))
+    splats = read_splats(tmp_path)
+    assert len(splats) == 4 + 5
+    np.testing.assert_array_equal(splats.means[:4], read_splats(tmp_path / "b").means)
+    index["filenames"] = ["b/meta.json", "gone/meta.json", "coarse/meta.json"]
+    (tmp_path / "lod-meta.json").write_text(json.dumps(index))
+    with pytest.raises(InputError, match=r"lod-meta\.json: names gone/meta\.json"):
+        read_splats(tmp_path)
+
+
+def test_full_opacity_is_kept_and_counted(tmp_path: Path) -> None:
+    files = parts(count=3)
+    files["sh0.webp"] = webp(square(np.array([[1, 2, 3, 255], [1, 2, 3, 0], [1, 2, 3, 128]])))
+    found = read_scene(folder(tmp_path / "s", files))
+    np.testing.assert_allclose(found.splats.logit_opacities[:2], [LOGIT_LIMIT, -LOGIT_LIMIT])
+    assert [(n.code, n.count) for n in found.notes] == [("clamped_logits", 2)]
+
+
+def test_unknown_quaternion_mode_becomes_identity(tmp_path: Path) -> None:
+    files = parts(count=2)
+    files["quats.webp"] = webp(square(np.array([[1, 2, 3, 7], [1, 2, 3, 252]])))
+    found = read_scene(folder(tmp_path / "s", files))
+    np.testing.assert_array_equal(found.splats.quats[0], [1, 0, 0, 0])
+    assert [(n.code, n.count) for n in found.notes] == [("zero_quats", 1)]
+
+
+def edit(files: dict[str, bytes], **changes: Any) -> dict[str, bytes]:
+    return files | {"meta.json": json.dumps(json.loads(files["meta.json"]) | changes).encode()}
+
+
+def within(files: dict[str, bytes], part: str, key: str, value: Any) -> dict[str, bytes]:
+    return edit(files, **{part: json.loads(files["meta.json"])[part] | {key: value}})
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: {k: v for k, v in f.items() if k != "scales.webp"}, "scales.webp is missing"),
+        (lambda f: f | {"quats.webp": f["quats.webp"][:40]}, "quats.webp: not a whole image"),
+        (lambda f: edit(f, version=3), r"scene.meta\.json: SOG version 3"),
+        (lambda f: edit(f, count=17), "16 pixels for 17 Gaussians"),
+        (lambda f: edit(f, count="ten"), "malformed"),
+        (lambda f: edit(f, means={}), r"meta\.json: lacks 'means\.files'"),
+        (
+            lambda f: edit(f, scales={"codebook": [1.0], "files": ["scales.webp"]}),
+            r"meta\.json: malformed 'scales\.",
+        ),
+        *[
+            (lambda f, part=part, key=key, value=value: within(f, part, key, value), message)
+            for part, key, value, message in (
+                ("means", "mins", {}, r"malformed 'means\.mins': expected a number, found an object"),
+                ("means", "mins", [0, 1], r"lacks 'means\.mins\[2\]'"),
+                (
+                    "means",
+                    "mins",
+                    [0, None, 1],
+                    r"malformed 'means\.mins\[1\]': expected a number, found null",
+                ),
+                ("means", "maxs", [0, 1, 1e308], r"'means\.maxs\[2\]': expected a number within ±88.7228"),
+                (
+                    "means",
+                    "maxs",
+                    float("inf"),
+                    r"'means\.maxs': expected a number within ±88.7228, found inf",
+                ),
+                ("means", "files", {}, r"malformed 'means\.files': expected a list, found an object"),
+                ("scales", "files", [5], r"'scales\.files\[0\]': expected the name of a file, found 5"),
+                ("scales", "files", ["a\nb"], r"'scales\.files\[0\]': expected the name of a file"),
+                ("scales", "files", [""], r"'scales\.files\[0\]': expected the name of a file"),
+                ("quats", "files", [], r"lacks 'quats\.files\[0\]'"),
+                ("scales", "codebook", 5, r"'scales\.codebook': expected a list, found 5"),
+                ("scales", "codebook", [1.0], r"'scales\.codebook': expected at least \d+ numbers, found 1"),
+                ("sh0", "codebook", [0, -1e308] * 128, r"'sh0\.codebook\[1\]': expected a number within"),
+                (
+                    "shN",
+                    "codebook",
+                    ["x"] * 256,
+                    r"'shN\.codebook\[0\]': expected a number, found the string",
+                ),
+                (
+                    "shN",
+                    "bands",
+                    {},
+                    r"malformed 'shN\.bands': expected a whole number ≥ 0, found an object",
+                ),
+            )
+        ],
+        (lambda f: edit(f, means=[]), r"malformed 'means': expected an object, found a list"),
+        (lambda f: edit(f, quats="x"), r"malformed 'quats': expected an object, found the string 'x'"),
+        (lambda f: edit(f, count=True), r"malformed 'count': expected a whole number ≥ 0, found true"),
+        (lambda f: edit(f, g2ard={"offset": [0, "x", 1]}), r"'g2ard\.offset\[1\]': expected a number, found"),
+        (lambda f: edit(f, count=0), "holds no Gaussians"),
+        (lambda f: f | {"meta.json": b"{"}, "not JSON"),
+        (lambda f: f | {"shN_labels.webp": webp(square(np.full((10, 2), 200)))}, "of 128"),
+    ],
+)
+def test_broken_scene_is_named(tmp_path: Path, change: Any, message: str) -> None:
+    path = folder(tmp_path / "scene", change(parts()))
+    with pytest.raises(InputError, match=message) as caught:
+        read_splats(path)
+    assert "scene" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_gap_in_a_codebook_drops_what_names_it(tmp_path: Path) -> None:
+    files = parts(count=3)
+    files["scales.webp"] = webp(square(np.array([[1, 2, 3], [1, 9, 3], [1, 2, 3]])))
+    book = [-3.0] * 256
+    found = read_scene(
+        folder(tmp_path / "s", within(files, "scales", "codebook", [*book[:9], None, *book[10:]]))
+    )
+    assert len(found.splats) == 2
+    assert [(n.code, n.count) for n in found.notes] == [("dropped_rows", 1)]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a" * 5000 + "/meta.json", r"'filenames\[0\]' cannot be looked for|names a{5000}"),
+        (5, r"malformed 'filenames\[0\]': expected the name of a file, found 5"),
+        ("a\n/meta.json", r"malformed 'filenames\[0\]': expected the name of a file"),
+    ],
+)
+def test_broken_names_in_lod_meta(tmp_path: Path, name: Any, message: str) -> None:
+    index = {"filenames": [name], "tree": {"lods": {"0": {"file": 0}}}}
+    (tmp_path / "lod-meta.json").write_text(json.dumps(index))
+    with pytest.raises(InputError, match=rf"lod-meta\.json: {message}"):
+        read_splats(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("tree", "message"),
+    [
+        ({"lods": {"0": {"file": -1}}}, r"'tree\.lods\.0\.file': expected an index from 0 to 1, found -1"),
+        ({"lods": {"0": {"file": 2}}}, r"'tree\.lods\.0\.file': expected an index from 0 to 1, found 2"),
+        ({"lods": {"0": {"file": 0.5}}}, r"expected an index from 0 to 1, found 0.5"),
+        ({"children": [{}, 5]}, r"'tree\.children\[1\]': expected an object, found 5"),
+        ({"children": {}}, r"'tree\.children': expected a list, found an object"),
+        ({"lods": []}, r"'tree\.lods': expected an object, found a list"),
+        ([], r"'tree': expected an object, found a list"),
+    ],
+)
+def test_broken_lod_meta_is_named(tmp_path: Path, tree: Any, message: str) -> None:
+    for name in "ab":
+        folder(tmp_path / name, parts(count=4))
+    index = {"filenames": ["a/meta.json", "b/meta.json"], "tree": tree}
+    (tmp_path / "lod-meta.json").write_text(json.dumps(index))
+    with pytest.raises(InputError, match=rf"lod-meta\.json: malformed .*{message}"):
+        read_splats(tmp_path)
+
+
+def test_broken_zip_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.sog").write_bytes(b"PK\x03\x04nonsense")
+    with pytest.raises(InputError, match=r"a\.sog: not a whole \.sog archive"):
+        read_splats(tmp_path / "a.sog")
+    with zipfile.ZipFile(tmp_path / "b.sog", "w") as bundle:
+        bundle.writestr("other.txt", "x")
+    with pytest.raises(InputError, match=r"no meta\.json"):
+        read_splats(tmp_path / "b.sog")
+
+
+def independent(*chunks: Path) -> np.ndarray:
+    """The columns x y z, f_dc, f_rest, opacity, scale, rot that sog2ply.py decodes."""
+    spec = importlib.util.spec_from_file_location("sog2ply", real("sog2ply.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return np.concatenate([module.decode(str(chunk))[0] for chunk in chunks])
+
+
+@pytest.mark.parametrize(
+    ("scene", "chunks"), [("playbot", ["playbot/0_0"]), ("taebak_park/0_0", ["taebak_park/0_0"])]
+)
+def test_equals_the_independent_decoder(scene: str, chunks: list[str]) -> None:
+    splats = read_splats(real(scene))
+    table = independent(*(ROOT / chunk for chunk in chunks))
+    rest = 3 * splats.shN.shape[1]
+    np.testing.assert_array_equal(splats.means, table[:, :3])
+    np.testing.assert_array_equal(splats.sh0[:, 0], table[:, 3:6])
+    channel_major = splats.shN.transpose(0, 2, 1).reshape(len(splats), -1)
+    np.testing.assert_array_equal(channel_major, table[:, 6 : 6 + rest])
+    alpha = 1 / (1 + np.exp(-table[:, 6 + rest].astype(float)))
+    np.testing.assert_allclose(splats.opacities, alpha, atol=2e-6)  # it clips opacities at 1e-6
+    np.testing.assert_allclose(splats.log_scales, table[:, 7 + rest : 10 + rest], atol=2e-6)
+    np.testing.assert_array_equal(splats.quats, table[:, 10 + rest : 14 + rest])
+
+
+def test_a_park_in_eight_chunks() -> None:
+    assert len(read_splats(real("taebak_park"))) == 4_249_286

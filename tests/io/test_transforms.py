@@ -1,0 +1,155 @@
+"""transforms.json, of instant-ngp, nerfstudio and NeRF's synthetic scenes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from g2ard.errors import InputError
+from g2ard.io import kind, read_view_set, read_views
+from helpers.realdata import real
+from helpers.view_files import edit, orbit, photo, transforms
+
+
+def test_transforms(tmp_path: Path) -> None:
+    truth = orbit(4)
+    path = transforms(tmp_path / "transforms.json", truth, k1=0.1, k2=0.2, p1=0.3, p2=0.4)
+    for i in (0, 1, 3):
+        photo(tmp_path / "images" / f"{i:03d}.png")
+    found = read_view_set(tmp_path)
+    assert found.cameras.names == ("000.png", "001.png", "003.png")
+    np.testing.assert_allclose(found.cameras.viewmats, [truth[i] for i in (0, 1, 3)], atol=1e-12)
+    np.testing.assert_array_equal(found.cameras.Ks[0], [[10, 0, 4.5], [0, 11, 2.5], [0, 0, 1]])
+    np.testing.assert_array_equal(found.cameras.distortions[0], [0.1, 0.2, 0.3, 0.4, 0])
+    (note,) = found.notes
+    assert (note.code, note.count) == ("missing_photos", 1)
+    assert "002.png" in note.text
+    assert kind(path) == "views"
+
+
+def test_a_frame_has_its_own_intrinsics(tmp_path: Path) -> None:
+    path = transforms(tmp_path / "a.json", orbit(2))
+    edit(path, lambda c: c["frames"][1].update(fl_x=20, fl_y=21, w=16, h=12, cx=8, cy=6))
+    cameras = read_views(path)
+    assert cameras.widths.tolist() == [8, 16]
+    assert cameras.Ks[:, 0, 0].tolist() == [10, 20]
+
+
+def test_blender_style(tmp_path: Path) -> None:
+    """camera_angle_x alone, names without suffix, size from the photo."""
+    angle = 0.7
+    none = dict.fromkeys(("fl_x", "fl_y", "cx", "cy", "w", "h"))
+    path = transforms(tmp_path / "a.json", orbit(1), camera_angle_x=angle, **none)
+    edit(path, lambda c: c["frames"][0].update(file_path="./train/r_0"))
+    file = photo(tmp_path / "train" / "r_0.png", (40, 30))
+    cameras = read_views(path)
+    assert cameras.names == ("train/r_0",)
+    assert cameras.image_paths == (file,)
+    focal = 20 / math.tan(angle / 2)
+    np.testing.assert_allclose(cameras.Ks[0], [[focal, 0, 20], [0, focal, 15], [0, 0, 1]])
+
+
+def test_poses_without_any_photo_stay(tmp_path: Path) -> None:
+    found = read_view_set(transforms(tmp_path / "a.json", orbit(3)))
+    assert len(found.cameras) == 3
+    assert found.cameras.image_paths == (None, None, None)
+    assert [n.code for n in found.notes] == ["no_photos"]
+
+
+BAD: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
+    (lambda c: c.update(frames=[]), "no views found"),
+    (lambda c: c["frames"][1].pop("file_path"), "frame 1: lacks 'file_path'"),
+    (lambda c: c["frames"][1].update(transform_matrix=[[1, 2], [3, 4]]), "frame 1: its pose is not a finite"),
+    (lambda c: c["frames"][0]["transform_matrix"][0].__setitem__(0, float("nan")), "frame 0: its pose"),
+    (lambda c: c["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "not a rotation"),
+    (lambda c: c["frames"][0].update(transform_matrix=np.diag([1, 2, 3, 1]).tolist()), "not a rotation"),
+    (
+        lambda c: c["frames"][0].update(transform_matrix="x"),
+        "frame 0: malformed 'transform_matrix': expected a number, found the string 'x'",
+    ),
+    (
+        lambda c: c["frames"][0]["transform_matrix"][0].__setitem__(0, "x" * 999),
+        r"frame 0: malformed 'transform_matrix\[0\]\[0\]': expected a number, found the string 'x{19}…x",
+    ),
+    (
+        lambda c: c["frames"][1]["transform_matrix"].__setitem__(1, [0, {}, 0, 0]),
+        r"frame 1: malformed 'transform_matrix\[1\]\[1\]': expected a number, found an object",
+    ),
+    (
+        lambda c: c["frames"][1]["transform_matrix"][2].pop(),
+        r"frame 1: malformed 'transform_matrix\[2\]': expected a list of 4, found a list of 3",
+    ),
+    (
+        lambda c: c["frames"][1]["transform_matrix"][2].__setitem__(1, []),
+        r"frame 1: malformed 'transform_matrix.*expected a number, found a list of 0",
+    ),
+    (lambda c: c["frames"][0].update(k1=[]), "frame 0: malformed 'k1': expected a number, found a list"),
+    (
+        lambda c: c["frames"][0].update(k1="x"),
+        "frame 0: malformed 'k1': expected a number, found the string 'x'",
+    ),
+    (lambda c: c["frames"].__setitem__(0, 7), "frame 0: malformed: expected an object, found 7"),
+    (lambda c: c.pop("fl_x"), "no focal length"),
+    (lambda c: c.pop("w"), "tell the size"),
+    (lambda c: c.update(w=8.5), "frame 0: 'w' is 8.5, not a whole number"),
+    (lambda c: c["frames"][1].update(h=6.25), "frame 1: 'h' is 6.25, not a whole number"),
+    (lambda c: c.update(fl_x=-3), "focal length must be positive"),
+    (lambda c: c.update(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE"),
+    (lambda c: c.update(is_fisheye=True), "fisheye"),
+    (lambda c: c["frames"][1].update(file_path="images/000.png"), "2 views are named '000.png'"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BAD)
+def test_bad_transforms(tmp_path: Path, change: Callable[[dict[str, Any]], Any], message: str) -> None:
+    path = transforms(tmp_path / "a.json", orbit(2), fl_y=None)
+    edit(path, change)
+    with pytest.raises(InputError, match=message) as caught:
+        read_views(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "not JSON"),
+        ("[1]", "a JSON list, but neither"),
+        ("{}", "neither"),
+        ('{"views": []}', "not g2ard's"),
+    ],
+)
+def test_other_json(tmp_path: Path, content: str, message: str) -> None:
+    (tmp_path / "a.json").write_text(content)
+    with pytest.raises(InputError, match=rf"a\.json: .*{message}"):
+        read_views(tmp_path / "a.json")
+
+
+def test_a_scale_in_the_pose_is_taken_out(tmp_path: Path) -> None:
+    path = transforms(tmp_path / "a.json", orbit(1))
+
+    def scale(content: dict[str, Any]) -> None:
+        matrix = np.array(content["frames"][0]["transform_matrix"])
+        matrix[:3, :3] *= 2.5
+        content["frames"][0]["transform_matrix"] = matrix.tolist()
+
+    edit(path, scale)
+    np.testing.assert_allclose(read_views(path).viewmats, orbit(1), atol=1e-12)
+
+
+def test_fox() -> None:
+    found = read_view_set(real("fox"))
+    assert len(found.cameras) == 50
+    assert [(n.code, n.count) for n in found.notes] == [("missing_photos", 17)]
+    assert found.cameras.distortions.any()
+    # the cameras look at one object: all axes pass near one point
+    p, d = found.cameras.positions, found.cameras.forwards
+    A = np.eye(3) - d[:, :, None] * d[:, None, :]
+    centre = np.linalg.solve(A.sum(0), np.einsum("cij,cj->i", A, p))
+    distance = np.linalg.norm(np.einsum("cij,cj->ci", A, centre - p), axis=1)
+    assert np.median(distance) < 0.35 * np.median(np.linalg.norm(p - centre, axis=1))
+    assert (np.einsum("ci,ci->c", centre - p, d) > 0).all()

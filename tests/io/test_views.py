@@ -1,0 +1,89 @@
+"""g2ard's own file of views."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from g2ard.errors import InputError, OutputError
+from g2ard.io import read_view_set, read_views, write_views
+from helpers.view_files import edit, views
+
+
+@settings(max_examples=20, deadline=None)
+@given(count=st.integers(1, 12), seed=st.integers(0, 1000))
+def test_own_views_round_trip(tmp_path_factory: pytest.TempPathFactory, count: int, seed: int) -> None:
+    path = tmp_path_factory.mktemp("views") / "a.json"
+    truth = views(count, seed)
+    write_views(path, truth)
+    found = read_views(path)
+    for name in ("viewmats", "Ks", "widths", "heights", "distortions"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(truth, name))
+    assert found.names == truth.names
+    assert found.image_paths == (None,) * count
+
+
+def test_own_views_name_photos_splits_and_weights(tmp_path: Path) -> None:
+    truth = views(4, photos=tmp_path / "photos")
+    (tmp_path / "deep").mkdir()
+    path = tmp_path / "deep" / "a.json"
+    write_views(path, truth, splits=["train", "test", "train", None], weights=[1, 0.5, 2, 0])
+    assert json.loads(path.read_text())["views"][1]["image"] == "../photos/1.png"
+    found = read_view_set(path)
+    assert [p.resolve() for p in found.cameras.image_paths if p] == list(truth.image_paths)
+    assert found.splits == ("train", "test", "train", None)
+    assert found.weights is not None
+    assert found.weights.tolist() == [1, 0.5, 2, 0]
+    train = read_view_set(path, split="train")
+    assert train.cameras.names == ("v0", "v2")
+    assert train.weights is not None
+    assert train.weights.tolist() == [1, 2]
+    (tmp_path / "photos" / "2.png").unlink()
+    assert [(n.code, n.count) for n in read_view_set(path).notes] == [("missing_photos", 1)]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c.update(version=2), "version 2"),
+        (lambda c: c["views"][0].pop("K"), "view 0: lacks 'K'"),
+        (lambda c: c["views"][1].update(K=[1, 2]), r"view 1: malformed 'K\[0\]': expected a list of 3"),
+        (lambda c: c["views"][1].update(weight=-1), "view 1: weight -1"),
+        (lambda c: c["views"][1].update(width=80.5), r"view 1: 'width' is 80\.5, not a whole number"),
+        (lambda c: c["views"][0].update(height=math.inf), "view 0: 'height' is inf, not a whole number"),
+        (lambda c: c.update(views=[]), "no views found"),
+        (lambda c: c["views"][0].update(camera_from_world=np.zeros((4, 4)).tolist()), "not a rotation"),
+    ],
+)
+def test_bad_own_views(tmp_path: Path, change: Callable[[dict[str, Any]], Any], message: str) -> None:
+    write_views(tmp_path / "a.json", views(2))
+    edit(tmp_path / "a.json", change)
+    with pytest.raises(InputError, match=message):
+        read_views(tmp_path / "a.json")
+
+
+def test_a_whole_width_may_be_a_float(tmp_path: Path) -> None:
+    write_views(tmp_path / "a.json", views(2))
+    edit(tmp_path / "a.json", lambda c: c["views"][1].update(width=80.0))
+    assert read_views(tmp_path / "a.json").widths.tolist() == [8, 80]
+
+
+def test_own_views_refuse_what_does_not_fit(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="do not fit"):
+        write_views(tmp_path / "a.json", views(2), weights=[1])
+    with pytest.raises(OutputError, match=r"written as \.json"):
+        write_views(tmp_path / "a.txt", views(2))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_views_in_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nothing known in this folder"):
+        read_views(tmp_path)

@@ -1,0 +1,419 @@
+"""Packed formats as written: read back within each attribute's quantum, by us and by other readers."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard import _core
+from g2ard.errors import InputError, OutputError
+from g2ard.io import check_scene_output, read_scene, read_splats, write_splats
+from g2ard.io.glb import EXTENSION
+from g2ard.io.packing import morton_order, unit_quats
+from g2ard.io.sog_write import nearest, palette_size, sog_files
+from g2ard.io.spz_write import fraction_bits
+from g2ard.scene.splats import Splats
+from g2ard.scene.transform import transform
+from helpers.glb_files import glb_parts
+from helpers.peers import adobe_spz, gltf_report, splat_transform
+from helpers.realdata import real
+
+FORMATS = ("sog", "spz", "glb", "compressed.ply", "splat", "ply", "folder/meta.json")
+
+
+def scene(count: int = 700, degree: int = 2, seed: int = 0) -> Splats:
+    """Random attributes within what every format holds; quaternions of any sign and length."""
+    rng = np.random.default_rng(seed)
+    return Splats.create(
+        rng.normal(0, 3, (count, 3)).astype(np.float32),
+        quats=rng.normal(size=(count, 4)) * rng.uniform(0.1, 5, (count, 1)),
+        scales=np.exp(rng.uniform(-8, 1, (count, 3))),
+        logit_opacities=rng.uniform(-5, 5, count),
+        sh0=rng.uniform(-1.7, 1.7, (count, 1, 3)),
+        shN=rng.uniform(-0.9, 0.9, (count, (degree + 1) ** 2 - 1, 3)),
+    )
+
+
+def saved(tmp_path: Path, name: str, splats: Splats, **options: object) -> Path:
+    path = tmp_path / ("a." + name if "/" not in name else name)
+    write_splats(path, splats, **options)
+    return path
+
+
+def in_order(splats: Splats) -> Splats:
+    return splats.take(morton_order(splats.means))
+
+
+def turned(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(N,) the largest difference of a component of two unit quaternions, up to their sign."""
+    a, b = unit_quats(a), unit_quats(b)
+    return np.abs(a - b * np.sign((a * b).sum(1, keepdims=True))).max(1)
+
+
+# ── every format ─────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_equal_scenes_give_equal_bytes_on_any_threads(tmp_path: Path, name: str) -> None:
+    found = []
+    try:
+        for threads in (1, 2, 8):
+            _core.set_num_threads(threads)
+            folder = tmp_path / str(threads)
+            folder.mkdir()
+            path = saved(folder, name, scene(3000))
+            files = sorted(path.parent.iterdir()) if name.endswith("meta.json") else [path]
+            found.append([file.read_bytes() for file in files])
+    finally:
+        _core.set_num_threads(0)
+    assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_odd_scenes(tmp_path: Path, name: str) -> None:
+    one = Splats.create([[1.0, 2, 3]], scales=[[0.1, 0.2, 0.3]], quats=[[0, 0, 0, 0]])
+    far = 16 if name == "ply" else np.inf  # .ply refuses infinities
+    same = Splats.create(np.ones((9, 3)), scales=np.zeros((9, 3)), logit_opacities=[far, -far, *[0] * 7])
+    for splats in (one, same, one.with_sh_degree(3)):
+        path = tmp_path / f"{len(list(tmp_path.iterdir()))}"
+        path.mkdir()
+        found = read_splats(saved(path, name, splats))
+        assert len(found) == len(splats)
+        np.testing.assert_allclose(found.means, splats.means, atol=2e-4)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_what_cannot_be_written_is_one_line(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match="without Gaussians"):
+        saved(tmp_path, name, scene().take(slice(0, 0)))
+    broken = scene()
+    broken.means[7, 1] = np.nan
+    with pytest.raises(InputError, match=r"Gaussian 7 is not finite"):
+        saved(tmp_path, name, broken)
+    assert not [p for p in tmp_path.rglob("*") if p.is_file()]
+
+
+def test_names_and_options(tmp_path: Path) -> None:
+    for name in ("B.SOG", "b.Spz", "b.GLB", "b.Compressed.PLY", "b.PLY", "b.SPLAT"):
+        write_splats(tmp_path / name, scene(50, 0))
+        assert len(read_splats(tmp_path / name)) == 50
+    for name in ("b.ksplat", "b", "meta.txt"):
+        with pytest.raises(OutputError, match=r"scenes are written as .*\.sog"):
+            write_splats(tmp_path / name, scene(5))
+    with pytest.raises(OutputError, match=r"\.sog has no option 'version'"):
+        write_splats(tmp_path / "c.sog", scene(5), version=3)
+    with pytest.raises(OutputError, match="exists"):
+        check_scene_output(tmp_path / "b.PLY")
+    write_splats(tmp_path / "room" / "meta.json", scene(5))
+    with pytest.raises(OutputError, match="exists"):
+        check_scene_output(tmp_path / "room" / "meta.json")
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_offsets_are_kept_or_refused(tmp_path: Path, name: str) -> None:
+    utm = (443_000.0, 5_411_000.5, 120.25)
+    splats = replace(scene(300, 1), offset=np.array(utm))
+    if name in ("spz", "splat"):
+        with pytest.raises(InputError, match="--recentre"):
+            saved(tmp_path, name, splats)
+        near = replace(splats, offset=np.array([3.0, 4, 5]))
+        found = read_splats(saved(tmp_path, name, near))
+        assert not found.offset.any()
+        np.testing.assert_allclose(found.means.mean(0), near.means.mean(0) + near.offset, atol=1e-3)
+        return
+    found = read_splats(saved(tmp_path, name, splats))
+    np.testing.assert_array_equal(found.offset, utm)
+    np.testing.assert_allclose(found.means.mean(0), splats.means.mean(0), atol=2e-2)
+
+
+# ── quanta, by each format's formula ─────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("name", ["sog", "folder/meta.json"])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_sog(tmp_path: Path, name: str, degree: int) -> None:
+    truth = in_order(scene(700, degree))
+    found = read_splats(saved(tmp_path, name, truth))
+    assert found.sh_degree == degree
+    logs = np.sign(truth.means) * np.log1p(np.abs(truth.means.astype(float)))
+    half = (logs.max(0) - logs.min(0)) / 65535 / 2
+    slope = 1 + np.abs(truth.means.astype(float))  # d v / d log
+    assert (np.abs(found.means - truth.means) <= half * slope * 1.01 + 1e-6).all()
+    assert turned(found.quats, truth.quats).max() <= 3 * math.sqrt(2) / 255 / 2 + 1e-6
+    np.testing.assert_allclose(found.opacities, truth.opacities, atol=0.5 / 255 + 1e-6)
+    files = sog_files(tmp_path, truth)
+    meta = json.loads(files["meta.json"])
+    for values, back, book in (
+        (truth.log_scales, found.log_scales, meta["scales"]["codebook"]),
+        (truth.sh0, found.sh0, meta["sh0"]["codebook"]),
+    ):
+        assert len(book) == 256
+        least = np.abs(values.astype(float)[..., None] - np.array(book)).min(-1)
+        np.testing.assert_allclose(np.abs(back - values), least, atol=2e-6)
+    if degree:
+        assert meta["shN"]["count"] == 512 == palette_size(700)
+        spread = ((truth.shN - truth.shN.mean(0)) ** 2).sum()
+        assert ((found.shN - truth.shN) ** 2).sum() < 0.35 * spread  # 512 entries for 700 random rows
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_spz(tmp_path: Path, version: int, degree: int) -> None:
+    truth = in_order(scene(700, degree))
+    path = saved(tmp_path, "spz", truth, version=version)
+    found = read_splats(path)
+    bits = fraction_bits(path, truth.means.astype(float), truth)
+    np.testing.assert_allclose(found.means, truth.means, atol=0.5 / (1 << bits) + 1e-6)
+    np.testing.assert_allclose(found.log_scales, truth.log_scales, atol=0.5 / 16 + 1e-5)
+    np.testing.assert_allclose(found.opacities, truth.opacities, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(found.sh0, truth.sh0, atol=0.5 / 255 / 0.15 + 1e-6)
+    np.testing.assert_allclose(found.shN[:, :3], truth.shN[:, :3], atol=4.5 / 128 + 1e-6)
+    np.testing.assert_allclose(found.shN[:, 3:], truth.shN[:, 3:], atol=8.5 / 128 + 1e-6)
+    if version == 2:  # w follows from x y z: near 0 their half step becomes its square root
+        assert turned(found.quats, truth.quats).max() <= math.sqrt(2 * 3 * 0.5 / 127.5)
+    else:
+        assert turned(found.quats, truth.quats).max() <= 3 / (511 * math.sqrt(2)) / 2 + 1e-6
+
+
+def test_spz_bits_follow_the_extent(tmp_path: Path) -> None:
+    for extent in (0.01, 1.0, 3000.0, 100_000.0):
+        truth = scene(400, 0)
+        truth = replace(truth, means=truth.means / 10 * extent, scales=truth.scales * extent)
+        bits = fraction_bits(tmp_path, truth.means.astype(float), truth)
+        assert np.abs(truth.means).max() * 2.0**bits < 1 << 23
+        found = read_splats(saved(tmp_path / "..", f"{extent}.spz", truth, overwrite=True))
+        np.testing.assert_allclose(
+            np.sort(found.means, 0), np.sort(truth.means, 0), atol=0.5 / 2**bits + 1e-6 * extent
+        )
+    assert fraction_bits(tmp_path, np.full((1, 3), 4.0), scene(400, 0)) >= 12
+    fine = Splats.create([[1e7, 0, 0], [0, 0, 0]], scales=np.full((2, 3), 0.01))
+    with pytest.raises(InputError, match=r"steps of 2 at 1e\+07"):
+        write_splats(tmp_path / "fine.spz", fine)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_compressed_ply(tmp_path: Path, degree: int) -> None:
+    truth = in_order(scene(700, degree))
+    found = read_splats(saved(tmp_path, "compressed.ply", truth))
+    for start in range(0, 700, 256):
+        rows = slice(start, start + 256)
+        for name, steps in (
+            ("means", [2047, 1023, 2047]),
+            ("log_scales", [2047, 1023, 2047]),
+            ("colors", 255),
+        ):
+            a, b = getattr(found, name)[rows], getattr(truth, name)[rows]
+            assert (np.abs(a - b) <= np.ptp(b, axis=0) / np.array(steps) / 2 + 2e-6).all(), name
+    np.testing.assert_allclose(found.opacities, truth.opacities, atol=0.5 / 255 + 1e-6)
+    assert turned(found.quats, truth.quats).max() <= 3 * math.sqrt(2) / 1023 / 2 + 1e-6
+    np.testing.assert_allclose(found.shN, truth.shN, atol=8 / 256 / 2 + 1e-6)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_glb_loses_nothing_but_roundings(tmp_path: Path, degree: int) -> None:
+    truth = scene(700, degree)
+    found = read_splats(saved(tmp_path, "glb", truth))
+    np.testing.assert_array_equal(found.means, truth.means)
+    np.testing.assert_array_equal(found.sh0, truth.sh0)
+    np.testing.assert_array_equal(found.shN, truth.shN)
+    np.testing.assert_allclose(found.scales, truth.scales, rtol=1e-5)
+    np.testing.assert_allclose(found.opacities, truth.opacities, atol=1e-7)
+    assert turned(found.quats, truth.quats).max() < 1e-6
+
+
+# ── codebooks, against a naive twin ──────────────────────────────────────────────────────────────────
+
+
+def test_codebook_is_the_best_there_is() -> None:
+    """Every cut of the sorted values, in float64, by the textbook's O(K·n²)."""
+    rng = np.random.default_rng(3)
+    for values in (rng.normal(size=60), rng.exponential(size=60), rng.integers(0, 9, 60).astype(float)):
+        values = np.sort(values.astype(np.float32)).astype(float)
+        n, count = len(values), 7
+        error = lambda i, j: ((values[i:j] - values[i:j].mean()) ** 2).sum()  # noqa: B023, E731
+        best = [error(0, j) if j else 0.0 for j in range(n + 1)]
+        for _ in range(count - 1):
+            best = [min([best[j], *(best[i] + error(i, j) for i in range(1, j))]) for j in range(n + 1)]
+        book = _core.codebook(values.astype(np.float32), count)
+        found = ((values - book[nearest(book, values.astype(np.float32))]) ** 2).sum()
+        assert found == pytest.approx(best[n], rel=1e-5, abs=1e-9)
+
+
+def test_codebook_survives_strays() -> None:
+    """Two far values take two entries, and nearly nothing of the others' resolution."""
+    values = np.random.default_rng(0).normal(size=20_000).astype(np.float32)
+    mse = [
+        ((v - book[nearest(book, v)]) ** 2)[:20_000].mean()
+        for v in (values, np.append(values, np.float32([-1e4, 1e4])))
+        for book in [_core.codebook(v, 256)]
+    ]
+    assert mse[1] < 1.1 * mse[0]
+
+
+def test_palette_is_as_good_as_lloyd_by_brute_force() -> None:
+    rng = np.random.default_rng(1)
+    points = (rng.normal(size=(3000, 24)) @ np.diag(rng.exponential(size=24))).astype(np.float32)
+    entries, labels = _core.palette(points, 200, 10)
+    assert entries.shape == (200, 24)
+    ours = ((points - entries[labels]) ** 2).sum()
+    centres = points[rng.choice(3000, 200, replace=False)].astype(float)
+    for _ in range(10):
+        near = ((points[:, None].astype(float) - centres) ** 2).sum(-1).argmin(1)
+        centres = np.stack(
+            [points[near == k].mean(0) if (near == k).any() else centres[k] for k in range(200)]
+        )
+    theirs = ((points[:, None].astype(float) - centres) ** 2).sum(-1).min(1).sum()
+    assert ours < 1.03 * theirs
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: _core.codebook(np.array([1, np.nan], np.float32), 2), "values: expected finite"),
+        (lambda: _core.codebook(np.zeros(0, np.float32), 2), "values: expected at least one"),
+        (lambda: _core.palette(np.full((4, 3), np.inf, np.float32), 2, 1), "inf in row 0"),
+        (lambda: _core.palette(np.zeros((4, 3), np.float32), 0, 1), "count"),
+        (lambda: _core.palette(np.zeros((4, 3), np.float32), 2, 1, -np.ones(4, np.float32)), "weights"),
+    ],
+)
+def test_bad_input_of_quantisers(call: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        call()  # type: ignore[operator]
+
+
+def test_glb_keeps_the_rules(tmp_path: Path) -> None:
+    truth = replace(scene(321, 3), offset=np.array([10.0, 20, 30]))
+    document, binary = glb_parts(saved(tmp_path, "glb", truth))
+    assert document["asset"]["version"] == "2.0"
+    assert document["extensionsUsed"] == [EXTENSION]
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert primitive["mode"] == 0
+    assert primitive["extensions"][EXTENSION]["kernel"] == "ellipse"
+    assert primitive["extensions"][EXTENSION]["colorSpace"] == "srgb_rec709_display"
+    arrays = {}
+    for name, index in primitive["attributes"].items():
+        accessor = document["accessors"][index]
+        view = document["bufferViews"][accessor["bufferView"]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        dtype = np.dtype({5126: "<f4", 5123: "<u2"}[accessor["componentType"]])
+        assert view["byteOffset"] % 4 == 0
+        assert view["byteLength"] == 321 * width * dtype.itemsize
+        assert view["byteOffset"] + view["byteLength"] <= len(binary)
+        assert ("normalized" in accessor) == (dtype.itemsize == 2)
+        arrays[name] = np.frombuffer(binary, dtype, 321 * width, view["byteOffset"]).reshape(321, width)
+        if name == "POSITION":
+            assert accessor["min"] == arrays[name].min(0).tolist()
+            assert accessor["max"] == arrays[name].max(0).tolist()
+    np.testing.assert_array_equal(arrays["POSITION"], truth.means * (-1, -1, 1))  # y up, z forward
+    assert document["nodes"][0]["translation"] == [-10, -20, 30]
+    shown = np.clip(truth.colors, 0, 1).astype(float)
+    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(arrays["COLOR_0"][:, :3] / 65535, linear, atol=0.5 / 65535 + 1e-6)
+    np.testing.assert_allclose(arrays["COLOR_0"][:, 3] / 65535, truth.opacities, atol=0.5 / 65535 + 1e-6)
+    np.testing.assert_allclose(np.linalg.norm(arrays[f"{EXTENSION}:ROTATION"], axis=1), 1, atol=1e-6)
+    assert (arrays[f"{EXTENSION}:OPACITY"] <= 1).all()
+    assert sum(name.startswith(f"{EXTENSION}:SH_DEGREE_") for name in arrays) == 16
+
+
+def test_broken_glb_is_one_line(tmp_path: Path) -> None:
+    good = saved(tmp_path, "glb", scene(50, 1)).read_bytes()
+    path = tmp_path / "b.glb"
+    for keep, message in ((10, "not a .glb"), (len(good) // 2, "truncated|broken")):
+        path.write_bytes(good[:keep])
+        with pytest.raises(InputError, match=message):
+            read_splats(path)
+    for old, new, message in (
+        (b'"ellipse"', b'"boxes!!"', "kernels"),
+        (b'"mesh":0', b'"mesh":9', ""),
+        (f'"{EXTENSION}:SCALE"'.encode(), f'"{EXTENSION}:SCALY"'.encode(), "lack the attribute"),
+        (b'"count":50', b'"count":99', "truncated"),
+    ):
+        path.write_bytes(good.replace(old, new))
+        if message:
+            with pytest.raises(InputError, match=message):
+                read_splats(path)
+        else:
+            assert not read_splats(path).offset.any()
+
+
+# ── other people's readers ───────────────────────────────────────────────────────────────────────────
+
+
+def covariances(splats: Splats) -> np.ndarray:
+    w, x, y, z = unit_quats(splats.quats).T
+    columns = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+        [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+        [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    axes = np.stack([np.stack(c, 1) for c in columns], 1) * splats.scales[..., None].astype(float)
+    return np.einsum("nka,nkb->nab", axes, axes)
+
+
+def about_x(splats: Splats) -> Splats:
+    """Half a turn about x, which is how splat-transform 3.7 reads .spz: as it is stored, axes and all."""
+    turn = np.diag([1.0, -1, -1, 1])
+    return transform(splats, turn)
+
+
+def agree(ours: Splats, theirs: Splats, *, shape: float = 2e-3) -> None:
+    np.testing.assert_allclose(theirs.means, ours.means, atol=2e-6, rtol=2e-6)
+    np.testing.assert_allclose(theirs.log_scales, ours.log_scales, atol=2e-5)
+    np.testing.assert_allclose(theirs.opacities, ours.opacities, atol=1e-6)
+    np.testing.assert_allclose(theirs.sh0, ours.sh0, atol=2e-5)
+    np.testing.assert_allclose(theirs.shN, ours.shN, atol=2e-5)
+    a, b = covariances(theirs), covariances(ours)
+    assert (np.abs(a - b).max((1, 2)) <= shape * ours.scales.max(1).astype(float) ** 2).all()
+
+
+@pytest.mark.parametrize("name", ["sog", "folder/meta.json", "spz", "compressed.ply"])
+def test_splat_transform_reads_it_as_we_do(tmp_path: Path, name: str) -> None:
+    path = saved(tmp_path, name, scene(2000, 3))
+    splat_transform(path, tmp_path / "peer.ply")
+    ours = read_splats(path)
+    agree(about_x(ours) if name == "spz" else ours, read_splats(tmp_path / "peer.ply"))
+
+
+def test_splat_transform_reads_spz_3_and_splat(tmp_path: Path) -> None:
+    path = saved(tmp_path, "spz", scene(500, 2), version=3)
+    splat_transform(path, tmp_path / "peer.ply")
+    agree(about_x(read_splats(path)), read_splats(tmp_path / "peer.ply"))
+    path = saved(tmp_path, "splat", scene(500, 0))
+    splat_transform(path, tmp_path / "peer.ply")
+    agree(read_splats(path), read_splats(tmp_path / "peer.ply"), shape=2e-2)  # bytes around 127.5, not 128
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_adobe_reads_spz_as_we_do(tmp_path: Path, version: int) -> None:
+    path = saved(tmp_path, "spz", scene(500, 3), version=version)
+    ours, theirs = read_splats(path), adobe_spz(path)
+    np.testing.assert_allclose(theirs["positions"].reshape(-1, 3), ours.means, atol=1e-6)
+    np.testing.assert_allclose(theirs["scales"].reshape(-1, 3), ours.log_scales, atol=1e-5)
+    np.testing.assert_allclose(theirs["colors"].reshape(-1, 1, 3), ours.sh0, atol=1e-5)
+    np.testing.assert_allclose(theirs["sh"].reshape(-1, 15, 3), ours.shN, atol=1e-6)
+    assert turned(theirs["rotations"].reshape(-1, 4)[:, [3, 0, 1, 2]], ours.quats).max() < 1e-3
+
+
+def test_khronos_validator_finds_no_error(tmp_path: Path) -> None:
+    report = gltf_report(saved(tmp_path, "glb", replace(scene(500, 3), offset=np.array([1.0, 2, 3]))))
+    ours = f"/meshes/0/primitives/0/attributes/{EXTENSION}:"  # names that only the extension allows
+    found = [m for m in report["issues"]["messages"] if m["severity"] < 2]
+    left = [
+        m for m in found if not (m["code"].endswith("INVALID_ATTRIBUTE") and m["pointer"].startswith(ours))
+    ]
+    assert not left
+
+
+def test_a_real_scene_keeps_its_values(tmp_path: Path) -> None:
+    """What comes from a .compressed.ply: infinite logits, strays, thin scales."""
+    truth = read_splats(real("format_samples", "biker.compressed.ply"))
+    found = read_scene(saved(tmp_path, "sog", truth)).splats
+    order = in_order(truth)
+    assert np.abs(found.opacities - order.opacities).max() <= 0.5 / 255 + 1e-6
+    assert np.sqrt(((found.log_scales - order.log_scales) ** 2).mean()) < 0.02
+    assert np.sqrt(((found.sh0 - order.sh0) ** 2).mean()) < 0.01

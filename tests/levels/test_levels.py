@@ -1,0 +1,209 @@
+"""Levels of detail: the tree, what leaves lose, streamed SOG, and the command."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard import io
+from g2ard.errors import InputError
+from g2ard.io import sog
+from g2ard.levels import Cut, Leaf, Node, cut, leaf_errors, save_levels
+from g2ard.policy.levels import lod
+from g2ard.scene.splats import Splats
+from g2ard.stages.recover.anchors import rotation_matrices
+from helpers.level_files import leaves_of, scattered
+from helpers.scenes import checkered_ball
+
+
+@pytest.mark.parametrize("rule", [Cut(), Cut(most=300), Cut(most=10_000, extent=3, least=50), Cut(most=1)])
+def test_every_row_of_every_level_lies_in_one_leaf_and_its_box(rule: Cut) -> None:
+    levels = [scattered(900), scattered(200, 1), scattered(40, 2)]
+    leaves = leaves_of(cut(levels, rule))
+    for number, level in enumerate(levels):
+        rows = np.concatenate([leaf.rows[number] for leaf in leaves])
+        assert sorted(rows) == list(range(len(level)))
+    for leaf in leaves:
+        means = np.concatenate([level.means[rows] for level, rows in zip(levels, leaf.rows, strict=True)])
+        assert len(means) <= rule.most
+        assert len(means) <= rule.least or np.ptp(means, axis=0).max() <= rule.extent
+        for level, rows in zip(levels, leaf.rows, strict=True):
+            for row in rows[:20]:
+                axes = rotation_matrices(level.quats[row : row + 1])[0] * level.scales[row]
+                corners = np.array([axes @ (np.array(corner) * 2 - 1) for corner in np.ndindex(2, 2, 2)])
+                assert (level.means[row] + corners >= leaf.low - 1e-6).all()
+                assert (level.means[row] + corners <= leaf.high + 1e-6).all()
+
+
+def test_a_node_is_split_by_count_and_by_extent_alone() -> None:
+    wide = [scattered(500)]
+    assert isinstance(cut(wide, Cut(most=500, extent=100)), Leaf)
+    assert isinstance(cut(wide, Cut(most=499, extent=100)), Node)
+    assert isinstance(cut(wide, Cut(most=500, extent=1, least=500)), Leaf)
+    assert isinstance(cut(wide, Cut(most=500, extent=1, least=499)), Node)
+
+
+def test_levels_that_do_not_fit_together_are_refused() -> None:
+    with pytest.raises(InputError, match="offsets differ"):
+        cut([scattered(9), scattered(9, offset=5)])
+    with pytest.raises(InputError, match="none of them empty"):
+        cut([scattered(9), scattered(9).take([])])
+    with pytest.raises(InputError, match="extent: "):
+        Cut(extent=0)
+
+
+def test_errors_are_none_for_the_same_all_for_nothing_and_never_fall() -> None:
+    fine = checkered_ball(1500)
+    gone = Splats.create(fine.means[:1], scales=[[1e-4] * 3], logit_opacities=[-20])
+    half = fine.take(np.arange(0, 1500, 2))
+    levels = [fine, fine, half, fine, gone]
+    (leaf,) = leaves_of(cut(levels))
+    errors = leaf_errors(leaf, levels)
+    assert errors[:2] == [0.0, 0.0]
+    assert 0.001 < errors[2] < 0.9
+    assert errors[3] == errors[2]  # no coarser level may promise less
+    assert errors[4] == pytest.approx(1, abs=1e-3)
+
+
+def test_a_level_that_is_absent_from_a_leaf_has_no_error() -> None:
+    fine = scattered(50)
+    leaf = Leaf(
+        fine.means.min(0).astype(float), fine.means.max(0).astype(float), (np.arange(0), np.arange(50))
+    )
+    assert leaf_errors(leaf, [fine, fine]) == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("offset", [0.0, 500_000.0])
+def test_streamed_sog_holds_the_leaves_where_the_tree_says(tmp_path: Path, offset: float) -> None:
+    levels = [scattered(900, offset=offset), scattered(200, 1, offset)]
+    size = save_levels(tmp_path / "out", levels, cut=Cut(most=250))
+    meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
+    assert size == sum(p.stat().st_size for p in (tmp_path / "out").rglob("*") if p.is_file())
+    assert (meta["version"], meta["count"], meta["counts"], meta["lodLevels"]) == (1, 1100, [900, 200], 2)
+    files = [sog.read(tmp_path / "out" / name).splats for name in meta["filenames"]]
+    assert [len(file) for file in files].count(0) == 0
+    nodes, seen = [meta["tree"]], np.zeros((2, 2), int)
+    while nodes:
+        node = nodes.pop()
+        nodes += node.get("children", [])
+        low, high = np.array(node["bound"]["min"]), np.array(node["bound"]["max"])
+        for level, part in node.get("lods", {}).items():
+            rows = files[part["file"]].means[part["offset"] : part["offset"] + part["count"]]
+            assert len(rows) == part["count"]
+            assert (rows > low - 1e-3).all()
+            assert (rows < high + 1e-3).all()
+            seen[int(level)] += part["count"], 1
+            assert meta["filenames"][part["file"]].startswith(f"{level}_")
+        if "lods" in node:
+            assert len(node["errors"]) == 2
+    assert seen[:, 0].tolist() == [900, 200]
+    back = io.read_splats(tmp_path / "out" / "lod-meta.json")
+    assert len(back) == 900
+    np.testing.assert_array_equal(back.offset, np.full(3, offset))
+    np.testing.assert_allclose(np.sort(back.means, axis=0), np.sort(levels[0].means, axis=0), atol=2e-3)
+
+
+def test_files_of_an_earlier_call_go_and_others_stay(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    shN = rng.normal(size=(900, 3, 3))
+    fine = Splats.create(scattered(900).means, scales=scattered(900).scales, shN=shN)
+    save_levels(tmp_path / "out", [fine, scattered(300, 1)], cut=Cut(most=250))
+    own = [tmp_path / "out" / name for name in ("notes.txt", "0_1/notes.txt", "0_9/meta.json")]
+    for file in own:
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("{}")
+    save_levels(tmp_path / "out", [scattered(100)], overwrite=True)
+    save_levels(tmp_path / "clean", [scattered(100)])
+    files = {
+        str(file.relative_to(folder))
+        for folder in (tmp_path / "out", tmp_path / "clean")
+        for file in folder.rglob("*")
+        if file.is_file() and file not in own
+    }
+    clean = {
+        str(file.relative_to(tmp_path / "clean"))
+        for file in (tmp_path / "clean").rglob("*")
+        if file.is_file()
+    }
+    assert files == clean
+    assert all(file.exists() for file in own)
+    assert {folder.name for folder in (tmp_path / "out").iterdir()} == {
+        *("lod-meta.json", "notes.txt", "0_0", "0_1", "0_9")
+    }
+
+
+def test_equal_levels_give_equal_bytes(tmp_path: Path) -> None:
+    levels = [scattered(300), scattered(90, 1)]
+    for name in ("a", "b"):
+        save_levels(tmp_path / name, levels, cut=Cut(most=100))
+    for file in (tmp_path / "a").rglob("*.*"):
+        assert file.read_bytes() == (tmp_path / "b" / file.relative_to(tmp_path / "a")).read_bytes()
+
+
+def test_a_stopped_lod_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+    ball = checkered_ball(1200)
+    options = {"ratios": (1, 3, 9), "steps": 6, "size": 64}
+    whole = lod(ball, **options)
+    assert [len(level) for level in whole.splats] == [1200, 400, 133]
+    assert whole.reports[0].recovered is None
+    assert whole.reports[1].recovered is not None
+
+    def stop(line: str) -> None:
+        if line.startswith("level 2"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        lod(ball, **options, work=tmp_path / "work", say=stop)
+    assert (tmp_path / "work" / "level-1").is_dir()
+    again = lod(ball, **options, work=tmp_path / "work")
+    assert [level.fingerprint() for level in again.splats] == [level.fingerprint() for level in whole.splats]
+
+
+@pytest.mark.parametrize("ratios", [(), (2, 1), (1, 1), (0.5, 2), (1, float("nan"))])
+def test_ratios_rise(ratios: tuple[float, ...]) -> None:
+    with pytest.raises(InputError, match="ratios: expected rising numbers"):
+        lod(checkered_ball(50), ratios=ratios)
+
+
+def test_the_command(tmp_path: Path, command_line) -> None:
+    io.write_splats(tmp_path / "ball.ply", checkered_ball(800))
+    given = ("lod", "ball.ply", "-o", "deep/out", "-r", "1,4,8", "--merge-only", "--size", "48")
+    status, _, said = command_line(*given, "--json", "out.json", cwd=tmp_path)
+    assert status == 0, said
+    told = json.loads((tmp_path / "out.json").read_text())
+    assert [level["count"] for level in told["levels"]] == [800, 200, 100]
+    assert "level 2: 100 Gaussians" in said
+    assert len(io.read_splats(tmp_path / "deep" / "out")) == 800
+    assert not list(tmp_path.glob("deep/.*"))
+    status, _, said = command_line(*given, cwd=tmp_path)
+    assert (status, "exists" in said) == (1, True)
+    status, _, said = command_line(*given, "--resume", cwd=tmp_path)
+    assert (status, "finished already" in said) == (0, True)
+    for other in ("1,4", "1,4,16"):
+        status, _, said = command_line(*given[:5], other, *given[6:], "--resume", cwd=tmp_path)
+        assert (status, "levels of 800, 200, 100 Gaussians, made with other -r" in said) == (1, True), said
+    status, _, said = command_line("lod", "ball.ply", "-o", "x", "-r", "4,2", cwd=tmp_path)
+    assert (status, "ratios: expected rising numbers" in said) == (2, True)
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_stopped_run_with_other_options_is_told(
+    tmp_path: Path, command_line, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    io.write_splats(tmp_path / "ball.ply", checkered_ball(800))
+    given = ("lod", "ball.ply", "-o", "out", "-r", "1,4", "--steps", "3", "--size", "48")
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("g2ard.levels.save_levels", stop)
+        status, _, said = command_line(*given, cwd=tmp_path)
+    assert (status, "--resume goes on from" in said) == (130, True)
+    status, _, said = command_line(*given[:-1], "64", "--resume", cwd=tmp_path)
+    assert (status, "begun with other options (size); -w without --resume starts anew" in said) == (1, True)
+    assert not (tmp_path / "out").exists()
+    status, _, said = command_line(*given, "--resume", "--no-errors", cwd=tmp_path)
+    assert status == 0, said
+    assert {path.name for path in tmp_path.iterdir()} == {"ball.ply", "out"}

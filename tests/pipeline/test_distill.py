@@ -1,0 +1,305 @@
+"""The pipeline: exact budgets, one shot and rounds, resumable; and its command as a user types it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import g2ard
+from g2ard.errors import InputError
+from g2ard.io import Points, read_splats, write_points, write_splats, write_views
+from g2ard.pipeline import DistillConfig, distill
+from g2ard.progress import silent
+from g2ard.rendering.renderer import render
+from g2ard.scene.images import write_png
+from g2ard.scene.splats import SH_C0, Splats
+from g2ard.scene.targets import Targets, TeacherRenders
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover.schedule import PAPER, TUNED
+from helpers.commands import CommandLine, refused
+from helpers.scenes import around, checkered_ball
+
+PRIOR = checkered_ball()
+ROUNDS = replace(TUNED, steps=20, round_steps=10)
+ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+
+
+@pytest.fixture(scope="module")
+def targets() -> TeacherRenders:
+    return TeacherRenders(PRIOR, around())
+
+
+def test_views_of_another_kind_are_handed_on(targets: TeacherRenders, tmp_path: Path) -> None:
+    near = TeacherRenders(PRIOR, around(4, (64, 48), 2.0))
+    config = DistillConfig(steps=20)
+    done = distill(PRIOR, 300, targets, config, validation=near, work=tmp_path)
+    assert done.report.rounds[0].recover[0].validation.looks
+    with pytest.raises(InputError, match="other options"):
+        distill(PRIOR, 300, targets, config, work=tmp_path)
+
+
+def test_one_shot_reaches_the_budget_and_recovers(targets: TeacherRenders) -> None:
+    result = distill(PRIOR, 300, targets, DistillConfig(steps=120))
+    assert len(result.splats) == len(result.simplified) == 300
+    assert [entry.count for entry in result.report.rounds] == [300]
+    assert evaluate(result.splats, targets).psnr > evaluate(result.simplified, targets).psnr + 3
+
+
+def test_rounds_follow_the_paper_s_counts(targets: TeacherRenders) -> None:
+    result = distill(PRIOR, 1000, targets, DistillConfig(method="paper", schedule=ROUNDS))
+    assert [entry.count for entry in result.report.rounds] == [2250, 1688, 1266, 1000]
+    assert [len(entry.recover) for entry in result.report.rounds] == [1, 1, 1, 2]
+
+
+def test_an_interrupted_run_goes_on_to_the_same_bits(targets: TeacherRenders, tmp_path: Path) -> None:
+    config = DistillConfig(method="paper", schedule=ROUNDS)
+    whole = distill(PRIOR, 1000, targets, config)
+    calls = 0
+
+    def stop(stage: str, done: int, total: int, info: Any = None) -> None:
+        nonlocal calls
+        calls += stage == "recover round-3"
+        if calls == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        distill(PRIOR, 1000, targets, config, work=tmp_path, progress=stop)
+    resumed = distill(PRIOR, 1000, targets, config, work=tmp_path)
+    kept = resumed.report.rounds[:3]
+    earlier = [entry.recover[0].seconds for entry in kept[:2]] + [
+        entry.simplify.seconds or 0 for entry in kept
+    ]
+    assert whole.report.seconds.resumed is None
+    assert resumed.report.seconds.resumed == pytest.approx(sum(earlier))
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(whole.splats, name), getattr(resumed.splats, name))
+    with pytest.raises(InputError, match="belongs to a run with another scene"):
+        distill(PRIOR, 1000, targets, replace(config, seed=1), work=tmp_path)
+
+
+def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -> None:
+    write_splats(tmp_path / "ball.ply", PRIOR)
+    ask = (
+        "distill",
+        "ball.ply",
+        "-r",
+        10,
+        "-o",
+        "run",
+        "--steps",
+        60,
+        "--method",
+        "paper",
+        "--size",
+        100,
+        "--json",
+        "-",
+    )
+    status, out, error = command_line(*ask, cwd=tmp_path)
+    assert status == 0, error
+    report = json.loads(out)
+    assert report["output_count"] == len(read_splats(tmp_path / "run" / "scene.ply")) == 300
+    assert report["scores"]["recovered"]["psnr"] > report["scores"]["simplified"]["psnr"]
+    assert report["against"] == "teacher renders"
+    apart = report["apart"]
+    assert {view["name"][:5] for view in apart["recovered"]["views"]} == {"near_"}
+    assert not {view["name"] for view in report["scores"]["recovered"]["views"]} & {
+        view["name"] for view in apart["recovered"]["views"]
+    }
+    assert 0 <= report["unseen"] < 0.5
+    assert "of another kind" in error
+    left = sorted(p.name for p in (tmp_path / "run").iterdir())
+    assert left == ["preview.png", "report.html", "report.json", "scene.ply", "view.html", "views.json"]
+    assert report["bytes"]["view"] == (tmp_path / "run" / "view.html").stat().st_size
+    assert "view: run/view.html" in error
+    status, _, error = command_line(*ask, cwd=tmp_path)
+    assert status == 1
+    assert "run" in error
+    assert "-w" in error
+
+
+def test_a_loss_in_any_kind_of_views_is_told() -> None:
+    from g2ard.cli.run_result import told
+
+    def said(pool: float, near: float | None, unseen: float | None, ssim: float = 0.0) -> list[str]:
+        def scores(gain: float) -> dict[str, dict[str, Any]]:
+            views = [[{"psnr": 30.0 + share * gain} for share in part] for part in ((0, 0), (2.5, -0.5))]
+            return {
+                "simplified": {"psnr": 30.0, "ssim": 0.9, "views": views[0]},
+                "recovered": {"psnr": 30.0 + gain, "ssim": 0.9 + ssim, "views": views[1]},
+            }
+
+        apart = None if near is None else scores(near)
+        return told({"rounds": [], "scores": scores(pool), "apart": apart, "unseen": unseen})
+
+    assert said(1.0, None, None) == ["1 of 2 unseen views lost, though all together gained"]
+    assert said(0.02, 0.02, 0.0) == []
+    line = said(0.02, -0.5, 0.0)[0]
+    assert "lost 0.50 dB in views of another kind" in line
+    mixed = said(0.3, 0.3, 0.0, ssim=-0.004)[0]
+    assert mixed == "recovery lost 0.004 of SSIM in unseen views, and gained 0.30 dB"
+    assert said(0.0, None, 0.0, ssim=-0.004)[0].startswith("warning: recovery lost 0.004 of SSIM")
+    lines = said(-0.2, -0.3, 0.25)
+    assert "lost 0.20 dB in unseen views" in lines[0]
+    assert "no view sees 25% of the scene" in lines[2]
+
+
+def test_steps_by_need_are_for_teachers() -> None:
+    from g2ard.pipeline import _Rounds
+
+    part = replace(around(12), Ks=around(12).Ks * [[[4], [4], [1]]])  # a sixteenth of the ball in each
+
+    def horizon(targets: Targets, config: DistillConfig) -> int | None:
+        return _Rounds(PRIOR, 300, targets, config, 1, None, None, None, silent, None)._steps()
+
+    teacher, config = TeacherRenders(PRIOR, part, lazy=True), DistillConfig(schedule=TUNED)
+    assert horizon(teacher, config) > 1.5 * TUNED.steps
+    assert horizon(TeacherRenders(PRIOR, around(12), lazy=True), config) < 1.2 * TUNED.steps
+    assert horizon(teacher, replace(config, steps=7)) == 7
+    assert horizon(teacher, replace(config, schedule=PAPER)) == PAPER.steps
+
+
+def cloud_with_photos(folder: Path) -> None:
+    """A coloured cloud of the ball, and photos of it."""
+    colors = np.clip(0.5 + SH_C0 * PRIOR.sh0[:, 0], 0, 1).astype(np.float32)
+    write_points(folder / "cloud.ply", Points(PRIOR.means.astype(np.float64), colors))
+    views = around(12)
+    paths = []
+    for i, name in enumerate(views.names):
+        paths.append(folder / f"{name}.png")
+        write_png(paths[-1], render(PRIOR, views[i]).image)
+    write_views(folder / "views.json", replace(views, image_paths=tuple(paths)))
+
+
+def test_command_on_a_cloud_with_photos(command_line: CommandLine, tmp_path: Path) -> None:
+    cloud_with_photos(tmp_path)
+    ask = ("distill", "cloud.ply", "-n", 400, "-o", "run", "--steps", 80, "--json", "-")
+    status, out, error = command_line(*ask, "--views", "views.json", cwd=tmp_path)
+    assert status == 0, error
+    report = json.loads(out)
+    assert report["against"] == "photos"
+    assert report["apart"] is None  # photos are only where they were taken
+    assert 0 <= report["unseen"] < 0.05
+    simplified, recovered = (report["scores"][stage]["psnr"] for stage in ("simplified", "recovered"))
+    assert simplified > 21.3
+    assert recovered > max(21.5, simplified)
+    result = read_splats(tmp_path / "run" / "scene.ply")
+    assert (len(result), result.sh_degree) == (400, 3)
+    status, _, error = command_line(*ask, "-w", cwd=tmp_path)
+    assert status == 2
+    assert "--views" in error
+
+
+def small(folder: Path) -> Splats:
+    scene = checkered_ball(50)
+    write_splats(folder / "s.ply", scene)
+    return scene
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (["distill", "absent.ply", "-r", "10", "-o", "run"], 1, "absent.ply"),
+        (["distill", "s.ply", "-n", "51", "-o", "run"], 1, "51"),
+        (["distill", "s.ply", "-n", "0", "-o", "run"], 2, "'0'"),
+        (["distill", "s.ply", "-n", "many", "-o", "run"], 2, "many"),
+        (["distill", "s.ply", "-r", "0.5", "-o", "run"], 2, "0.5"),
+        (["distill", "s.ply", "-o", "run"], 2, "-n COUNT or -r RATIO"),
+        (["distill", "s.ply", "-r", "2", "-o", "run", "--views", "none.json"], 1, "none.json"),
+        (["distill", "s.ply", "-r", "2", "-o", "s.ply/run"], 1, "s.ply is a file"),
+        (["distill", "s.ply", "-r", "2,5", "-o", "run"], 2, "{ratio}"),
+        (["simplify", "s.ply", "-r", "2", "-r", "2", "-o", "s{ratio}.ply"], 2, "same place"),
+        (["distill", "s.ply", "-r", "2", "-o", "run", "--schedule", "hasty"], 2, "hasty"),
+        (["distill", "s.ply", "-r", "2", "-o", "run", "--preset", "gentle"], 2, "gentle"),
+        (["distill", "s.ply", "-r", "2", "-o", "run", "--method", "magic"], 2, "magic"),
+        (
+            ["distill", "s.ply", "-r", "2", "-o", "run", "--steps", "5", "--recovery-time", "2s"],
+            2,
+            "--recovery-time",
+        ),
+        (["distill", "s.ply", "-r", "2", "-o", "run", "--json", "s.ply/where.json"], 1, "where.json"),
+        (["simplify", "s.ply", "-r", "2", "-o", "o.ply", "--json", "o.ply"], 2, "o.ply"),
+        (["simplify", "s.ply", "-n", "60", "-o", "o.ply"], 1, "s.ply"),
+        (["simplify", "s.ply", "-n", "6", "-o", "o.ply", "--seed", "-1"], 2, "--seed"),
+        (["recover", "s.ply", "--views", "none.json", "-o", "out.ply"], 1, "none.json"),
+        (["recover", "s.ply", "--views", "v.json", "-o", "no/out.ply"], 1, "--teacher"),
+        (["recover", "s.ply", "--views", "v.json", "-o", "s.ply/out.ply"], 1, "s.ply is a file"),
+        (["render", "s.ply", "--views", "none.json", "-o", "out"], 1, "none.json"),
+        (["render", "v.json", "--views", "v.json", "-o", "out"], 1, "v.json"),
+        (["evaluate", "s.ply", "--views", "v.json", "--teacher", "absent.ply"], 1, "absent.ply"),
+        (["evaluate", "s.ply", "--views", "v.json", "--split", "dev"], 1, "dev"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    arguments: list[str], status: int, words: str, command_line: CommandLine, tmp_path: Path
+) -> None:
+    small(tmp_path)
+    write_views(tmp_path / "v.json", around(8))
+    before = sorted(tmp_path.iterdir())
+    code, _, error = command_line(*arguments, cwd=tmp_path)
+    lines = [line for line in error.splitlines() if line.startswith("g2ard")]  # others tell of progress
+    assert code == status, error
+    assert len(lines) == 1, error
+    assert words in lines[0]
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_every_stage_writes_the_same_bytes_for_any_threads(command_line: CommandLine, tmp_path: Path) -> None:
+    cloud_with_photos(tmp_path)
+    write_splats(tmp_path / "ball.ply", PRIOR)
+    commands = [
+        ("lift", "cloud.ply", "-o", "lift.ply"),
+        ("simplify", "ball.ply", "-r", 8, "-o", "small.ply"),
+        ("recover", "small.ply", "--views", "views.json", "--steps", 30, "-o", "better.ply"),
+        ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 30, "--size", 80),
+        ("render", "better.ply", "--views", "views.json", "-o", "renders"),
+    ]
+    written = []
+    for threads in (1, 2):
+        for command in commands:
+            status, _, error = command_line(*command, "-w", "--threads", threads, cwd=tmp_path)
+            assert status == 0, error
+        files = [tmp_path / name for name in ("lift.ply", "small.ply", "better.ply", "run/scene.ply")]
+        files += sorted((tmp_path / "renders").iterdir())
+        written.append([file.read_bytes() for file in files])
+    assert len(written[0]) == 4 + 12
+    assert written[0] == written[1]
+
+
+def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp_path: Path) -> None:
+    """As of a city on a map: positions of a million metres, one offset, photos in the same coordinates."""
+    laspy = pytest.importorskip("laspy")
+    city = ("synth", "city", "-o", "city", "--points", "2k", "--views", 16, "--size", "32x24")
+    assert command_line(*city, "--offset", "443000,4428000,1600", cwd=tmp_path)[0] == 0
+    error = refused(command_line, tmp_path, "info", "city", status=1)
+    assert "cloud.ply (a cloud), adapt.json, ood.json, train.json, val.json (views)\n" in error
+    cloud = g2ard.load_points(tmp_path / "city" / "cloud.ply")
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.offsets, header.scales = cloud.positions.mean(0).round(), [1e-3] * 3
+    scan = laspy.LasData(header)
+    scan.x, scan.y, scan.z = cloud.positions.T
+    scan.red, scan.green, scan.blue = (cloud.colors * 65535).astype(np.uint16).T
+    for name in ("a.las", "b.LAZ"):
+        scan.write(tmp_path / name)
+        np.testing.assert_allclose(g2ard.load_points(tmp_path / name).positions, cloud.positions, atol=6e-4)
+    ask = ("distill", name, "--views", "city/train.json", "-n", 400, "-o", "run", "--steps", 3, "--no-view")
+    status, _, error = command_line(*ask, "--held-out", "city/val.json", cwd=tmp_path)
+    assert (status, "2,000 → 400 Gaussians" in error) == (0, True), error
+    np.testing.assert_allclose(g2ard.load(tmp_path / "run" / "scene.ply").offset[1], 4428000, rtol=1e-4)
+    away = g2ard.Cameras.of([g2ard.Camera.facing([0, 0, 0], [0, -9, 0], width=48, height=36)])
+    g2ard.save_views(tmp_path / "away.json", away)
+    assert command_line("lift", name, "-o", "lifted.ply", cwd=tmp_path)[0] == 0
+    ask = ("recover", "lifted.ply", "--teacher", "lifted.ply", "--views", "away.json", "-o", "r.ply")
+    status, _, error = command_line(*ask, "--split", "all", cwd=tmp_path)
+    moved = "of one world (`g2ard info` shows both, `g2ard convert --transform` moves a scene)"
+    assert (status, moved in error) == (1, True), error
+    plain = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    plain.x, plain.y, plain.z = cloud.positions.T
+    plain.write(tmp_path / "plain.las")
+    error = refused(command_line, tmp_path, "lift", "plain.las", "-o", "p.ply", status=1)
+    assert "points must be coloured (as by PDAL's filters.colorization)" in error

@@ -1,0 +1,148 @@
+"""How distillation chooses and weighs its views, and what it says of those it leaves out."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from g2ard.errors import InputError
+from g2ard.io import write_splats, write_views
+from g2ard.pipeline import DistillConfig, distill
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.targets import TeacherRenders
+from g2ard.stages.recover.schedule import TUNED
+from g2ard.stages.select import select
+from helpers.commands import CommandLine
+from helpers.scenes import around, checkered_ball
+
+PRIOR = checkered_ball(1500)
+ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+SHORT = DistillConfig(method="paper", steps=20)
+
+
+def crowded() -> Cameras:
+    """12 views around, 20 more in one spot, and one that sees nothing."""
+    even = around(12)
+    rng = np.random.default_rng(0)
+    crowd = [look_at([3, 0, 0.5] + 0.05 * rng.standard_normal(3), [0, 0, 0]) for _ in range(20)]
+    poses = [*even.viewmats, *crowd, look_at([30.0, 0, 0], [60, 0, 0])]
+    n = len(poses)
+    return Cameras.from_lists(poses, [even.Ks[0]] * n, [(64, 48)] * n, [f"v{i:02d}" for i in range(n)])
+
+
+class Watched(TeacherRenders):
+    """Remembers which targets were asked for."""
+
+    def __init__(self, cameras: Cameras) -> None:
+        super().__init__(PRIOR, cameras, lazy=True)
+        self.asked: set[int] = set()
+
+    def __getitem__(self, view: int) -> Any:
+        self.asked.add(view)
+        return super().__getitem__(view)
+
+
+def test_all_views_are_drawn_by_weight_unless_told_otherwise() -> None:
+    targets = TeacherRenders(PRIOR, crowded())
+    done = distill(PRIOR, 200, targets, SHORT)
+    said = done.report.views
+    assert (said.candidates, len(said.chosen), said.refused) == (33, 32, ["v32"])
+    assert said.weighted
+    assert said.left_out == 0
+    plain = distill(PRIOR, 200, targets, replace(SHORT, weighted=False))
+    assert plain.report.views is None
+    assert any(not np.array_equal(getattr(done.splats, a), getattr(plain.splats, a)) for a in ARRAYS)
+
+
+def test_only_chosen_views_are_looked_at_and_the_rest_is_accounted_for() -> None:
+    targets = Watched(crowded())
+    report = distill(PRIOR, 200, targets, replace(SHORT, views=8)).report
+    chosen = select(PRIOR, targets.cameras, 8)
+    assert report.views.chosen == [targets.cameras.names[i] for i in chosen.order]
+    assert targets.asked == set(chosen.order.tolist())
+    assert 0 < report.views.left_out == chosen.left_out < 1
+    assert report.seconds.select > 0
+
+
+def test_auto_takes_as_many_as_the_curve_asks_for() -> None:
+    targets = TeacherRenders(PRIOR, crowded())
+    report = distill(PRIOR, 200, targets, replace(SHORT, views="auto", policy="coverage")).report
+    assert 1 < len(report.views.chosen) < 20
+    assert report.views.policy == "coverage"
+
+
+def test_given_weights_stand() -> None:
+    cameras = around(12)
+    targets, weights = Watched(cameras), np.r_[np.zeros(11), 1.0]
+    report = distill(PRIOR, 200, targets, SHORT, weights=weights).report
+    assert report.views is None
+    with pytest.raises(InputError, match="expected 12"):
+        distill(PRIOR, 200, targets, SHORT, weights=[1.0])
+    with pytest.raises(InputError, match="policy"):
+        distill(PRIOR, 200, targets, replace(SHORT, views=3, policy="best"))
+
+
+def test_selects_once_unless_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    import g2ard.stages.select as stage
+
+    counts: list[int] = []
+    whole = stage.select
+
+    def counted(splats: Any, *rest: Any, **options: Any) -> Any:
+        counts.append(len(splats))
+        return whole(splats, *rest, **options)
+
+    monkeypatch.setattr(stage, "select", counted)
+    config = replace(SHORT, schedule=replace(TUNED, steps=10, round_steps=5), views=6)
+    targets = TeacherRenders(PRIOR, crowded())
+    distill(PRIOR, 600, targets, config)
+    assert counts == [1500]
+    counts.clear()
+    distill(PRIOR, 600, targets, replace(config, reselect=True))
+    assert counts == [1500, 1125, 844, 633]
+
+
+def test_a_stopped_run_goes_on_with_the_same_views(tmp_path: Path) -> None:
+    config = replace(SHORT, schedule=replace(TUNED, steps=20, round_steps=10), views=6, reselect=True)
+    targets = TeacherRenders(PRIOR, crowded())
+    whole = distill(PRIOR, 600, targets, config)
+    calls = 0
+
+    def stop(stage: str, done: int, total: int, info: Any = None) -> None:
+        nonlocal calls
+        calls += stage == "recover round-2"
+        if calls == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        distill(PRIOR, 600, targets, config, work=tmp_path, progress=stop)
+    again = distill(PRIOR, 600, targets, config, work=tmp_path)
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(whole.splats, name), getattr(again.splats, name))
+    assert whole.report.views == again.report.views
+    with pytest.raises(InputError, match="another scene or other options"):
+        distill(PRIOR, 600, targets, replace(config, views=7), work=tmp_path)
+
+
+def test_the_command_reports_what_it_left_out(command_line: CommandLine, tmp_path: Path) -> None:
+    write_splats(tmp_path / "ball.ply", PRIOR)
+    write_views(tmp_path / "pool.json", crowded())
+    ask = ("distill", "ball.ply", "-n", 200, "--views", "pool.json", "--method", "paper", "--steps", 20)
+    status, out, error = command_line(*ask, "-k", "25%", "-o", "run", "--json", "-", cwd=tmp_path)
+    assert status == 0, error
+    report = json.loads(out)
+    assert len(report["views"]["chosen"]) == 7  # of 28 that are not held out
+    share = f"{100 * report['views']['left_out']:.1f} %"
+    assert f"views: 7 of 28 by auto; those left out would have added {share}" in error
+    stored = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert stored["views"] == report["views"]
+    for wrong, words in ((["-k", "0"], "'0'"), (["-k", "3", "--policy", "best"], "best")):
+        status, _, error = command_line(*ask, *wrong, "-o", "bad", cwd=tmp_path)
+        assert status == 2
+        assert words in error
+        assert not (tmp_path / "bad").exists()

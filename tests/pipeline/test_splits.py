@@ -1,0 +1,328 @@
+"""No held-out view ever trains: splits travel with views through every command that reads or writes them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.definition import read_definition
+from benchmarks.recover import RecoverBench
+from benchmarks.select_workspaces import Size, pool_of, workspace_of
+from benchmarks.workspace import Workspace
+from g2ard.errors import InputError
+from g2ard.io import Points, read_points, read_view_set, write_points, write_splats, write_views
+from g2ard.rendering.renderer import render
+from g2ard.scene.images import write_png
+from g2ard.scene.splits import for_scores, for_training, not_held_out, split_mask, splits_of
+from g2ard.stages.lift import lift
+from helpers.commands import CommandLine
+from helpers.realdata import real
+from helpers.scenes import around, checkered_ball
+from helpers.view_files import transforms
+
+Program = Callable[..., None]
+BALL = checkered_ball(1500)
+VIEWS = around(16)
+TEST = {"001.png", "005.png", "009.png", "013.png"}
+"""None of these is an eighth name: a command that falls back to the rule trains on all four."""
+TRAIN = {f"{i:03d}.png" for i in range(16)} - TEST
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A scene, its photos with a split.json beside them, and a cloud."""
+    write_splats(tmp_path / "ball.ply", BALL)
+    write_splats(tmp_path / "small.ply", checkered_ball(200))
+    write_points(tmp_path / "cloud.ply", Points(BALL.means.astype(np.float64), np.full((1500, 3), 0.5, "f4")))
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    K = VIEWS.Ks[0]
+    size: dict[str, Any] = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": 64, "h": 48}
+    transforms(photos / "transforms.json", list(VIEWS.viewmats), **size)
+    (photos / "images").mkdir()
+    for i in range(16):
+        write_png(photos / "images" / f"{i:03d}.png", render(BALL, VIEWS[i]).image)
+    split = {"train": sorted(TRAIN), "test": sorted(TEST)}
+    (photos / "split.json").write_text(json.dumps(split))
+    return tmp_path
+
+
+@pytest.fixture
+def g2ard(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Program:
+    """The program in this process and in the folder, so that stages can be watched."""
+    from g2ard.cli.commands import register_commands
+    from g2ard.cli.frame import app
+
+    monkeypatch.chdir(folder)
+    register_commands(None)
+
+    def run(*arguments: object) -> None:
+        app([str(a) for a in (*arguments, "-q")], prog_name="g2ard", standalone_mode=False)
+
+    return run
+
+
+class Watch:
+    """What each stage looked at: names of views."""
+
+    def __init__(self) -> None:
+        self.trained: list[set[str]] = []
+        self.looked: list[set[str]] = []
+        self.scored: list[set[str]] = []
+
+
+@pytest.fixture
+def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
+    import g2ard.pipeline.adapt
+    import g2ard.rendering.visibility
+    import g2ard.stages.evaluate
+    import g2ard.stages.recover
+
+    seen = Watch()
+
+    def watched(module: Any, name: str, argument: int, into: list[set[str]]) -> None:
+        stage = getattr(module, name)
+
+        def told(*args: Any, **options: Any) -> Any:
+            given = args[argument]
+            into.append(set(getattr(given, "cameras", given).names))
+            return stage(*args, **options)
+
+        monkeypatch.setattr(module, name, told)
+
+    watched(g2ard.stages.recover, "recover", 1, seen.trained)
+    watched(g2ard.pipeline.adapt, "adapt", 1, seen.trained)
+    watched(g2ard.rendering.visibility, "visibility_source", 0, seen.looked)
+    watched(g2ard.stages.evaluate, "evaluate", 1, seen.scored)
+    return seen
+
+
+def test_select_takes_training_views_and_hands_the_others_on(folder: Path, g2ard: Program) -> None:
+    g2ard("select", "ball.ply", "--views", "photos", "-k", 6, "-o", "chosen.json", "--json", "said.json")
+    said = json.loads((folder / "said.json").read_text())
+    order = [view["name"] for view in said["views"]]
+    found = read_view_set(folder / "chosen.json")
+    assert found.cameras.names[:6] == tuple(order)
+    assert set(order) <= TRAIN
+    assert set(found.cameras.names[6:]) == TEST
+    assert found.splits == ("train",) * 6 + ("test",) * 4
+    train = read_view_set(folder / "chosen.json", split="train")
+    assert train.weights is not None
+    np.testing.assert_allclose(train.weights, [view["weight"] for view in said["views"]])
+    written = json.loads((folder / "chosen.json").read_text())["views"]
+    assert all("weight" not in view for view in written[6:])
+    source = read_view_set(folder / "photos", split="test").cameras
+    test = read_view_set(folder / "chosen.json", split="test").cameras
+    assert test.names == source.names
+    np.testing.assert_array_equal(test.viewmats, source.viewmats)
+
+
+def test_select_out_of_a_selection_and_out_of_other_splits(folder: Path, g2ard: Program) -> None:
+    g2ard("select", "ball.ply", "--views", "photos", "-k", 8, "-o", "a.json")
+    g2ard("select", "ball.ply", "--views", "a.json", "-k", 3, "-o", "b.json")
+    again = read_view_set(folder / "b.json")
+    assert again.splits == ("train",) * 3 + ("test",) * 4
+    assert set(again.cameras.names[:3]) <= set(read_view_set(folder / "a.json").cameras.names[:8])
+    g2ard("select", "ball.ply", "--views", "photos", "-k", 16, "--split", "all", "-o", "all.json")
+    whole = read_view_set(folder / "all.json")
+    stated = dict(zip(whole.cameras.names, whole.splits, strict=True))
+    assert stated == {name: "test" if name in TEST else "train" for name in TRAIN | TEST}
+    g2ard("select", "ball.ply", "--views", "photos", "-k", 2, "--split", "test", "-o", "test.json")
+    assert read_view_set(folder / "test.json").splits == ("test",) * 4
+
+
+def test_no_command_trains_on_what_a_selection_holds_out(folder: Path, g2ard: Program, watch: Watch) -> None:
+    g2ard("select", "ball.ply", "--views", "photos", "-k", 6, "-o", "chosen.json")
+    chosen = set(read_view_set(folder / "chosen.json").cameras.names[:6])
+    g2ard("simplify", "ball.ply", "-n", 300, "--views", "chosen.json", "-o", "simplified.ply")
+    g2ard("recover", "small.ply", "--views", "chosen.json", "--steps", 4, "-o", "recovered.ply")
+    g2ard("adapt", "small.ply", "--views", "chosen.json", "--steps", 4, "-o", "adapted.ply")
+    g2ard("distill", "ball.ply", "-n", 200, "--views", "chosen.json", "--steps", 4, "-o", "run")
+    assert watch.trained == [chosen] * 3
+    assert watch.looked == [chosen] * 2
+    assert watch.scored == [TEST] * 2  # of distill: simplified and recovered
+    g2ard("evaluate", "small.ply", "--views", "chosen.json")
+    assert watch.scored[2:] == [TEST]
+    g2ard("render", "small.ply", "--views", "chosen.json", "--split", "test", "-o", "renders")
+    assert {p.name for p in (folder / "renders").iterdir()} == TEST
+
+
+def test_no_command_trains_on_what_a_split_file_holds_out(folder: Path, g2ard: Program, watch: Watch) -> None:
+    g2ard("recover", "small.ply", "--views", "photos", "--steps", 4, "-o", "recovered.ply")
+    g2ard("distill", "ball.ply", "-n", 200, "--views", "photos", "-k", 5, "--steps", 4, "-o", "run")
+    g2ard("distill", "cloud.ply", "-n", 200, "--views", "photos", "--steps", 4, "-o", "lifted")
+    assert len(watch.trained) == 3
+    assert set().union(*watch.trained, *watch.looked) <= TRAIN
+    assert set().union(*watch.scored) == TEST
+
+
+def test_views_beside_held_out_ones_train_without_their_own_test_views(
+    folder: Path, g2ard: Program, watch: Watch
+) -> None:
+    g2ard("select", "ball.ply", "--views", "photos", "-k", 6, "-o", "chosen.json")
+    chosen = set(read_view_set(folder / "chosen.json").cameras.names[:6])
+    ask = ("distill", "ball.ply", "-n", 200, "--steps", 4)
+    g2ard(*ask, "--views", "chosen.json", "--held-out", "photos", "-o", "run")
+    assert watch.trained == [chosen]
+    assert watch.scored[:2] == [TEST] * 2
+    assert all(
+        name.startswith("near_") for part in watch.scored[2:] for name in part
+    )  # made, no photo's pose
+    bench = RecoverBench(folder / "ball.ply", folder / "chosen.json", folder / "photos")
+    assert [set(part.names) for part in bench.cameras] == [chosen, TEST]
+    g2ard(*ask, "--held-out", "photos", "-o", "pool")
+    assert [part for part in watch.scored if part == TEST] == [TEST] * 4
+    assert set(read_view_set(folder / "pool" / "views.json").splits) == {"train"}
+
+
+def test_a_view_that_is_held_out_never_trains_whatever_its_file_states(
+    folder: Path, g2ard: Program, watch: Watch
+) -> None:
+    whole = read_view_set(folder / "photos").cameras
+    write_views(folder / "bare.json", whole)  # states no splits
+    ask = ("distill", "ball.ply", "-n", 200, "--steps", 4, "--photos", "--held-out", "photos")
+    g2ard(*ask, "--views", "bare.json", "-o", "run")
+    assert watch.trained == [set(whole.names) - TEST]
+    held_out = whole.take([name in TEST for name in whole.names])
+    assert not_held_out(held_out, whole).sum() == 0
+    elsewhere = replace(held_out, image_paths=(None,) * len(TEST))
+    assert not_held_out(elsewhere, whole).sum() == 0  # by pose alone
+    moved = elsewhere.recentred([0.0, 0.0, 1.0])
+    assert not_held_out(moved, whole).all()
+
+
+def test_pools_state_their_splits(folder: Path, g2ard: Program, watch: Watch) -> None:
+    (folder / "split.json").write_text(json.dumps({"train": ["a"], "test": ["b"]}))  # of something else
+    g2ard("poses", "ball.ply", "-n", 24, "-o", "poses.json")
+    g2ard("distill", "ball.ply", "-n", 200, "--steps", 4, "--size", 64, "-o", "run")
+    for path, count in ((folder / "poses.json", 24), (folder / "run" / "views.json", 160)):
+        found = read_view_set(path)
+        assert found.splits == splits_of(None, found.cameras.names)
+        assert found.splits.count("test") == count // 8
+    assert watch.trained[0].isdisjoint(watch.scored[0])
+    g2ard("select", "ball.ply", "--views", "poses.json", "-k", 4, "-o", "chosen.json")
+    assert read_view_set(folder / "chosen.json").splits == ("train",) * 4 + ("test",) * 3
+
+
+def test_a_split_that_is_not_stated_is_one_line(command_line: CommandLine, folder: Path) -> None:
+    write_views(folder / "train.json", VIEWS, splits=["train"] * 16)
+    look = ("--views", "train.json", "--teacher", "ball.ply")
+    for ask in (
+        ("evaluate", "small.ply", *look),
+        ("recover", "small.ply", *look, "--split", "test", "-o", "out.ply"),
+        ("select", "ball.ply", "--views", "train.json", "-k", 2, "--split", "test", "-o", "out.json"),
+        ("distill", "ball.ply", "-r", 10, "--views", "train.json", "-o", "run"),
+    ):
+        status, _, error = command_line(*ask, cwd=folder)
+        assert status == 1
+        assert error.strip().splitlines()[-1] == "g2ard: train.json: no split 'test' (there are train)"
+    ask = ("distill", "ball.ply", "-r", 10, "--views", "photos", "--held-out", "train.json", "-o", "run")
+    status, _, error = command_line(*ask, cwd=folder)
+    assert status == 1
+    assert "train.json: all of its 16 views are for training" in error
+
+
+def test_training_on_test_views_is_said(command_line: CommandLine, folder: Path) -> None:
+    look = ("--views", "photos", "--steps", 4, "-o")
+    for command in ("recover", "adapt"):
+        for split, words in (("all", "4 of the 16"), ("test", "4 of the 4"), ("train", None)):
+            output = f"{command}-{split}.ply"
+            status, _, error = command_line(command, "small.ply", *look, output, "--split", split, cwd=folder)
+            assert status == 0, error
+            said = f"split {split}: {words} views trained on are test views"
+            assert (said in error) if words else ("test views" not in error)
+
+
+def test_splits_of_views() -> None:
+    names = ["c", "a", "b"]
+    assert splits_of(None, names) == ("train", "test", "train")
+    assert splits_of(None, names, ["test", None, "val"]) == ("test", None, "val")
+    assert for_training(None, names).all()
+    assert for_scores(None, names).all()
+    assert for_training(None, names, ["test", None, "train"]).tolist() == [False, False, True]
+    assert for_scores(None, names, ["test", None, "train"]).tolist() == [True, True, False]
+
+
+def test_a_name_in_both_splits_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "split.json").write_text(json.dumps({"train": ["a", "b.jpg"], "test": ["b"], "ood": ["a"]}))
+    for ask in (lambda: split_mask(tmp_path, ["a", "b"], "train"), lambda: splits_of(tmp_path, ["a", "b"])):
+        with pytest.raises(InputError, match=r"split\.json lists 'b' as both train and test"):
+            ask()
+    (tmp_path / "split.json").write_text(json.dumps({"train": ["a"], "test": ["b"], "ood": ["a", "c"]}))
+    assert splits_of(tmp_path, ["a", "b", "c", "d"]) == ("train", "test", "ood", None)
+
+
+STUDY = """
+title = "Balls"
+ratios = [4]
+steps = [9]
+methods = ["g2ard"]
+adapt_steps = 5
+
+[[scene]]
+name = "ball"
+prior = "ball.ply"
+train = "photos"
+adapt = "photos"
+"""
+
+
+def test_simplifiers_are_given_training_views_alone(folder: Path) -> None:
+    from benchmarks.simplify import _Workspace
+
+    names = [f"{i:03d}.png" for i in range(16)]
+    (folder / "photos" / "split.json").write_text(
+        json.dumps({"train": names[:6], "val": names[6:9], "test": names[9:13]})
+    )
+    made = _Workspace(folder, folder / "ball.ply", folder / "photos", None, 0, ["pool"])
+    assert set(made.targets["pool"].cameras.names) == set(names[9:13])
+    written = read_view_set(made.views)
+    assert written.splits == ("train",) * 6 + ("val",) * 3 + ("test",) * 4 + (None,) * 3
+    pool = read_view_set(_Workspace(folder / "photos", folder / "ball.ply", None, None, 0, ["pool"]).views)
+    assert pool.splits == splits_of(None, pool.cameras.names)
+
+
+def test_studies_read_the_stated_splits(folder: Path) -> None:
+    for score in ("", 'score = { unseen = "photos" }\n'):
+        (folder / "study.toml").write_text(STUDY + score)
+        definition = read_definition(folder / "study.toml")
+        made = Workspace(folder / f"work{len(score)}", definition, definition.scenes[0])
+        for path in (made.train, made.adapt):
+            found = read_view_set(path)
+            assert (set(found.cameras.names), set(found.splits)) == (TRAIN, {"train"})
+        for targets in made.test.values():
+            assert set(targets.cameras.names) == TEST
+
+
+def test_caliterra_s_photos_stay_apart(folder: Path, g2ard: Program, watch: Watch) -> None:
+    data = real("caliterra")
+    split = {word: set(names) for word, names in json.loads((data / "split.json").read_text()).items()}
+    points = read_points(data)
+    write_splats(folder / "prior.ply", lift(points.positions[::8], points.colors[::8]))
+    g2ard("select", "prior.ply", "--views", data, "-k", 10, "-o", "chosen.json")
+    train = set(read_view_set(folder / "chosen.json", split="train").cameras.names)
+    assert len(train) == 10
+    assert train <= split["train"]
+    small = ("--size", 64, "--steps", 4)
+    g2ard("recover", "prior.ply", "--views", "chosen.json", *small, "-o", "recovered.ply")
+    g2ard("distill", "prior.ply", "-n", 500, "--views", "chosen.json", *small, "-o", "run")
+    assert watch.trained == [train] * 2
+    assert watch.looked == [train]
+    assert watch.scored == [split["test"]] * 2
+
+
+def test_the_study_of_policies_never_offers_test_photos() -> None:
+    data = real("caliterra")
+    test = set(json.loads((data / "split.json").read_text())["test"])
+    made = workspace_of(data, Size(gaussians=500, pixels=64))
+    names = np.array(made.targets.cameras.names)
+    assert set(names[made.tests]) <= test
+    for kind in ("biased", "even"):
+        pool = pool_of(made, kind, 0)
+        assert not set(names[np.concatenate([pool.rows, pool.crowd])]) & test

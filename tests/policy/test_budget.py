@@ -1,0 +1,152 @@
+"""Budgets in bytes, devices and quality."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import g2ard
+from g2ard.errors import InputError
+from g2ard.io import read_splats, write_splats
+from g2ard.policy.budget import DEVICES
+from g2ard.policy.fit import Aim, Quality, count_for_bytes, count_for_quality, file_bytes
+from g2ard.scene.splats import Splats
+from g2ard.stages.simplify import Simplified, simplify
+from helpers.commands import CommandLine
+from helpers.scenes import around, checkered_ball
+
+
+def fast(splats: Splats, count: int) -> Splats:
+    return simplify(splats, count, method="fast").splats
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.SOG", "a.spz", "a.compressed.ply", "x/meta.json"])
+def test_the_count_fills_the_bytes(name: str) -> None:
+    scene = checkered_ball(6000)
+    whole = file_bytes(scene, name)
+    count = count_for_bytes(scene, whole // 3, name, partial(fast, scene))
+    got = file_bytes(fast(scene, count), name)
+    assert 0.9 * whole / 3 < got <= whole // 3
+    assert count_for_bytes(scene, 2 * whole, name, partial(fast, scene)) == 6000
+    with pytest.raises(InputError, match="hold hardly a Gaussian"):
+        count_for_bytes(scene, 900, name, partial(fast, scene))
+
+
+def test_the_count_keeps_the_quality() -> None:
+    scene, views = checkered_ball(4000), around(6)
+    counts, looked = [], []
+
+    def reduce(count: int) -> Splats:
+        looked.append(count)
+        return fast(scene, count)
+
+    for wanted in (Quality(22, 0), Quality(26, 0), Quality(0, 0.9), Quality(22, 0.9)):
+        looked.clear()
+        count, found = count_for_quality(scene, wanted, views, reduce)
+        assert found.meets(wanted)
+        assert found.over(wanted) < 0.3
+        assert len(looked) <= 8
+        counts.append(count)
+    assert counts[0] < counts[1]
+    assert counts[3] == max(counts[0], counts[2])
+    assert count_for_quality(scene, Quality(200, 0), views, reduce)[0] == 4000
+    looked.clear()
+    count, found = count_for_quality(scene, Quality(41, 0), views, reduce)  # far above what a quarter keeps
+    assert 2000 < count < 4000
+    assert found.psnr >= 41
+    assert count_for_quality(scene, Quality(1, 0), views, reduce)[0] == 64
+
+
+def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
+    write_splats(tmp_path / "a.ply", checkered_ball(6000))
+    code, _, told = command_line("simplify", "a.ply", "--fit", "60kB", "-o", "b.sog", cwd=tmp_path)
+    assert code == 0, told
+    assert "60kB: about" in told
+    assert f"b.sog: {(tmp_path / 'b.sog').stat().st_size:,} of 60,000 bytes" in told
+    assert 50_000 < (tmp_path / "b.sog").stat().st_size <= 60_000
+    assert command_line("simplify", "a.ply", "--fit", "quest3", "-o", "c.ply", cwd=tmp_path)[0] == 0
+    assert len(read_splats(tmp_path / "c.ply")) == 6000 < DEVICES["quest3"]
+    code, _, told = command_line("simplify", "a.ply", "--min-psnr", "25", "-o", "d.ply", cwd=tmp_path)
+    assert code == 0, told
+    assert "should keep 2" in told
+    assert " dB, SSIM " in told.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    "words", [["--fit", "5"], ["--fit", "5MB", "-n", "10"], ["--fit", "web", "--min-psnr", "30"], []]
+)
+def test_one_budget_that_makes_sense(words: list[str], tmp_path: Path, command_line: CommandLine) -> None:
+    write_splats(tmp_path / "a.ply", checkered_ball(50))
+    code, _, told = command_line("simplify", "a.ply", *words, "-o", "b.ply", cwd=tmp_path)
+    assert (code, told.count("\n")) == (2, 1), told
+
+
+@pytest.mark.parametrize("words", [["--fit", "20kB"], ["--min-psnr", "25"]])
+def test_a_measured_budget_names_no_place(
+    words: list[str], tmp_path: Path, command_line: CommandLine
+) -> None:
+    write_splats(tmp_path / "a.ply", checkered_ball(50))
+    code, _, told = command_line("simplify", "a.ply", *words, "-o", "b_{count}.ply", cwd=tmp_path)
+    assert (code, told.count("\n")) == (2, 1), told
+
+
+def test_what_is_merged_on_keeps_its_parents() -> None:
+    """A file that came out too large: rows, flags and figures are those of both reductions."""
+    scene = checkered_ball(3000)
+    first = simplify(scene, 1000)
+    most = file_bytes(first.splats, "a.ply") // 2
+    small = Aim(1000, bytes=most, file="a.ply").shrink_simplified(replace(first, protected=flags(first)))
+    left = len(small.splats)
+    assert file_bytes(small.splats, "a.ply") <= most
+    assert 0.9 * 500 < left < 510
+    assert small.report.output_count == left
+    assert set(small.parents[small.parents >= 0]) == set(range(left))
+    counts = np.bincount(small.parents[small.parents >= 0], minlength=left)
+    assert small.report.merged_members == counts[counts > 1].sum()
+    whole = np.zeros(left, bool)
+    to = small.parents[(first.parents >= 0) & flags(first)[first.parents]]
+    whole[to[to >= 0]] = True
+    np.testing.assert_array_equal(small.protected, whole)
+
+
+def flags(small: Simplified) -> np.ndarray:
+    return np.arange(len(small.splats)) % 3 == 0
+
+
+def test_bytes_are_of_the_degree_that_is_written() -> None:
+    scene, said = checkered_ball(3000), []
+    small = g2ard.distill(
+        scene, fit="300kB", format="ply", sh_degree=3, steps=3, size=64, say=lambda line: said.append(line)
+    )
+    assert small.splats.sh_degree == 3
+    assert not [line for line in said if "merged on" in line]
+    assert 0.95 * 300_000 < file_bytes(small.splats, "a.ply") <= 300_000
+
+
+def test_decibels_are_of_the_file(tmp_path: Path, command_line: CommandLine) -> None:
+    scene = checkered_ball(3000)
+    write_splats(tmp_path / "a.ply", replace(scene, shN=4 * scene.shN))
+    counts = {}
+    for name in ("b.ply", "b.splat"):
+        code, _, told = command_line("simplify", "a.ply", "--min-psnr", "26", "-o", name, cwd=tmp_path)
+        assert code == 0, told
+        counts[name] = len(read_splats(tmp_path / name))
+    assert counts["b.splat"] > counts["b.ply"]
+    code, _, told = command_line("simplify", "a.ply", "--min-psnr", "90", "-o", "c.splat", cwd=tmp_path)
+    assert code == 3
+    assert "nothing less than all 3,000 Gaussians was found to keep what was asked" in told
+    assert ".splat keeps no more" in told.splitlines()[-1]
+
+
+BALL = checkered_ball(400)
+
+
+@pytest.mark.parametrize(("name", "value"), [("ratio", [5, 10]), ("count", (9, 8)), ("min_psnr", "high")])
+def test_a_budget_is_one_number(name: str, value: object) -> None:
+    words = f"{name}: expected a number, got 'high'" if value == "high" else f"{name}: one a call, got "
+    with pytest.raises(InputError, match=f"^{words}"):
+        g2ard.distill(BALL, **{name: value})  # type: ignore[arg-type]

@@ -1,0 +1,169 @@
+"""What `distill --dry-run` says: counts exactly, seconds and bytes about."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import g2ard
+from g2ard.policy.budget import Budget
+from g2ard.policy.distill import prepare
+from g2ard.policy.distill_options import DistillOptions
+from g2ard.policy.estimate import estimate, total
+from g2ard.system.memory import peak_rss
+from helpers.commands import CommandLine, refused
+from helpers.photos import photos_of
+from helpers.project import ROOT
+
+
+def ball(count: int = 900) -> g2ard.Splats:
+    points = np.random.default_rng(0).normal(size=(count, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return g2ard.Splats.create(points, scales=np.full((count, 3), 0.05), logit_opacities=np.full(count, 4))
+
+
+def test_a_dry_run_counts_what_the_run_takes_and_writes_nothing(
+    tmp_path: Path, command_line: CommandLine
+) -> None:
+    g2ard.save(tmp_path / "ball.ply", ball())
+    ask = ("distill", "ball.ply", "-r", "10", "-o", "run", "--steps", "12", "--size", "48", "--json", "-")
+    status, out, error = command_line(*ask, "--dry-run", cwd=tmp_path)
+    assert status == 0, error
+    assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]
+    assert "nothing is written" in error
+    (told,) = json.loads(out)["runs"]
+    status, out, error = command_line(*ask, cwd=tmp_path)
+    assert status == 0, error
+    ran = json.loads(out)
+    assert told["count"] == ran["output_count"] == 90
+    assert told["steps"] == ran["rounds"][-1]["recover"][-1]["steps"] == 12
+    views = len(g2ard.load_views(tmp_path / "run" / "views.json"))
+    assert views < told["views"] <= views + 24  # those of another kind are in no file
+    assert told["total_seconds"] == sum(told["seconds"].values()) > 0
+    assert told["pixels"] == 48 * 36
+
+
+def test_several_budgets_have_a_total(tmp_path: Path, command_line: CommandLine) -> None:
+    g2ard.save(tmp_path / "ball.ply", ball())
+    ask = ("distill", "ball.ply", "-r", "5,10", "-o", "{ratio}", "--steps", "4", "--size", "48", "--dry-run")
+    status, _, error = command_line(*ask, cwd=tmp_path)
+    assert status == 0, error
+    assert "all 2, which share their targets: about" in error
+
+
+def test_memory_grows_by_views_and_gaussians_and_a_recovery_time_is_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    job = prepare(ball(), [Budget(90, None)], DistillOptions(steps=3, size=48, recovery_time=7.0))
+    monkeypatch.setattr("g2ard.policy.estimate.peak_rss", lambda: 10**9)
+    few, many = estimate(job, 90), estimate(job, 450)
+    assert few.bytes > 10**9 + 12 * few.views * few.pixels
+    assert few.seconds["recover"] == 7.0
+    seconds, size = total([few, many])
+    assert size == many.bytes > few.bytes
+    assert few.seconds["prepare"] == job.seconds > 0
+    assert seconds == pytest.approx(
+        few.total + many.total - many.seconds["prepare"] - many.seconds["targets"]
+    )
+    monkeypatch.setattr("g2ard.policy.estimate.peak_rss", lambda: None)  # a system that does not tell
+    few, many = estimate(job, 90), estimate(job, 900)
+    assert many.bytes - few.bytes >= (983 - 192) * 900
+
+
+def test_every_stage_is_estimated_from_a_few_of_its_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that only the stages move: what they take by themselves, and for each view."""
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    job = prepare(ball(), [Budget(90, None)], DistillOptions(steps=3, size=48))
+    job = replace(job, seconds=4.0)
+
+    def slow(name: str, seconds: Callable[..., float]) -> None:
+        module, _, function = name.rpartition(".")
+        real = getattr(import_module(module), function)
+
+        def timed(*given: Any, **named: Any) -> Any:
+            now[0] += seconds(*given)
+            return real(*given, **named)
+
+        monkeypatch.setattr(name, timed)
+
+    slow("g2ard.stages.select.select", lambda splats, cameras, *_: 3 + 0.5 * len(cameras))
+    slow("g2ard.stages.evaluate.evaluate", lambda splats, targets: 0.25 * len(targets.cameras))
+    slow("g2ard.io.sog_write.sog_bytes", lambda path, splats: 7.0)
+    told = estimate(job, 90)
+    scored = len(job.views.test) + len(job.views.apart or ()) // 2
+    assert told.seconds["prepare"] == 4.0
+    assert told.seconds["select"] == pytest.approx(3 + 0.5 * len(job.views.train.cameras))
+    assert told.seconds["score"] == pytest.approx(2 * 0.25 * scored)
+    assert told.seconds["write"] - estimate(job, 90, page=False).seconds["write"] == pytest.approx(7.0)
+    assert told.total == sum(told.seconds.values())
+
+
+def test_a_dry_run_says_which_file_it_writes(tmp_path: Path, command_line: CommandLine) -> None:
+    g2ard.save(tmp_path / "ball.ply", ball())
+    ask = ("distill", "ball.ply", "-r", "10", "-o", "run", "--steps", "4", "--size", "48", "--dry-run")
+    status, _, error = command_line(*ask, "--json", "told.json", cwd=tmp_path)
+    assert status == 0, error
+    assert error.endswith("nothing is written but told.json\n"), error
+    assert {path.name for path in tmp_path.iterdir()} == {"ball.ply", "told.json"}
+
+
+@pytest.mark.skipif(peak_rss() is None, reason="the system tells no memory")
+@pytest.mark.parametrize("source", ["scene", "photos"])
+def test_memory_is_about_what_the_run_takes(source: str, tmp_path: Path) -> None:
+    """The program itself included, which is most of it where the scene is small."""
+    if source == "scene":
+        g2ard.save(tmp_path / "ball.ply", ball(20_000))
+        ask = ["distill", "ball.ply", "-r", "4", "--steps", "12", "--size", "320"]
+    else:
+        photos_of(tmp_path / "photos")
+        ask = ["distill", "--views", "photos", "-n", "500", "--steps", "12"]
+    peak_of([*ask, "-o", "run", "--dry-run", "--json", "told.json"], tmp_path)
+    taken = peak_of([*ask, "-o", "run"], tmp_path)
+    said = json.loads((tmp_path / "told.json").read_text())["total"]["bytes"]
+    assert 0.75 * taken < said < 1.25 * taken, (said, taken)
+
+
+def peak_of(ask: list[str], folder: Path) -> int:
+    """The most bytes that were resident, of a run as a program."""
+    program = [sys.executable, "-m", "g2ard", *ask, "-q"]
+    root = str(ROOT)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
+    code = (
+        "import resource, subprocess, sys; status = subprocess.run(sys.argv[1:]).returncode;"
+        "print(status, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *program],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=True,
+    )
+    status, peak = map(int, done.stdout.split())
+    assert status == 0, done.stderr
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def test_a_dry_run_is_in_nobodys_way(command_line: CommandLine, folder: Path) -> None:
+    (folder / "run").mkdir()
+    (folder / "run" / "kept.txt").write_text("")
+    ask = ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 3, "--size", 32)
+    assert "-w (--overwrite)" in refused(command_line, folder, *ask, status=1)
+    status, _, error = command_line(*ask, "--dry-run", cwd=folder)
+    assert (status, "nothing is written" in error) == (0, True), error
+    status, _, error = command_line("clean", "ball.ply", "-o", "views.json", "--dry-run", cwd=folder)
+    assert status == 0, error
+    assert [path.name for path in (folder / "run").iterdir()] == ["kept.txt"]

@@ -1,0 +1,145 @@
+"""`--keep-region`: more of the budget where the user points."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import g2ard
+from g2ard.errors import InputError
+from g2ard.io import read_splats, write_splats, write_views
+from g2ard.rendering.visibility import SampledVisibility, visibility_source
+from g2ard.scene.regions import check_region, in_any
+from g2ard.stages.simplify import SimplifyConfig
+from g2ard.stages.simplify import simplify as reduce
+from g2ard.stages.simplify.pairs import emphasised
+from helpers.commands import CommandLine
+from helpers.tiled_scenes import ring, town
+
+BALL, BOX = (2.5, 0.0, 0.0, 2.0), (-8.0, -4.0, 0.0, -4.0, 0.0, 1.0)
+
+
+def share(splats: g2ard.Splats, region: tuple[float, ...]) -> float:
+    return float(in_any(splats, [region]).mean())
+
+
+@pytest.mark.parametrize("region", [BALL, BOX])
+@pytest.mark.parametrize("method", ["default", "fast"])
+def test_a_region_gets_more_at_the_same_budget(region: tuple[float, ...], method: str) -> None:
+    dense, look = town(3000), visibility_source(ring())
+    shares = []
+    for times in (1, 4, 16):
+        config = SimplifyConfig(keep_region=(region,), keep_times=times)
+        small = reduce(dense, 300, method=method, visibility=look, config=config).splats
+        assert len(small) == 300
+        shares.append(share(small, region))
+    assert shares[0] * 1.3 < shares[1] < shares[2]
+    plain = reduce(dense, 300, method=method, visibility=look).splats
+    one = SimplifyConfig(keep_region=(region,), keep_times=1)
+    same = reduce(dense, 300, method=method, visibility=look, config=one).splats
+    assert same.fingerprint() == plain.fingerprint()
+
+
+def test_views_count_as_if_they_stood_nearer() -> None:
+    """What two views of a far camera see, and what they would see at half the distance."""
+    scene = g2ard.Splats.create([[0, 0, 0]], scales=np.full((1, 3), 0.05), logit_opacities=[3])
+    far, near = (
+        g2ard.Cameras.of([g2ard.Camera.facing([0, -away, 0], [0, 0, 0], width=200, height=200, fov=30)])
+        for away in (4.0, 2.0)
+    )
+    seen, nearer = (visibility_source(cameras)(scene) for cameras in (far, near))
+    config = SimplifyConfig(keep_region=((0, 0, 0, 1),))
+    weight, pixel = emphasised(scene, seen.weight, seen.pixel_size, config)
+    np.testing.assert_allclose(weight, nearer.weight, rtol=0.05)
+    np.testing.assert_allclose(pixel, nearer.pixel_size, rtol=1e-5)
+
+
+def test_regions_are_in_world_coordinates() -> None:
+    dense = town(1200)
+    moved = replace(dense, offset=np.array([4e5, 6e6, 50.0]))
+    region = tuple(np.add(BALL, (4e5, 6e6, 50, 0)))
+    seen = SampledVisibility(np.ones(1200, np.float32), np.full(1200, 0.02, np.float32))
+    here, there = (
+        reduce(scene, 120, visibility=seen, config=SimplifyConfig(keep_region=(spot,))).splats
+        for scene, spot in ((dense, BALL), (moved, region))
+    )
+    np.testing.assert_array_equal(here.means, there.means)
+
+
+@pytest.mark.parametrize(
+    ("region", "said"),
+    [
+        ((1, 2, 3), "expected X,Y,Z,R or X,Y,Z,X,Y,Z, got 1, 2, 3"),
+        ((0, 0, 0, 0), "expected a radius > 0"),
+        ((0, 0, 0, 1, 1, 0), "the lower corner comes first"),
+        ((0, 0, 0, float("nan")), "got 0, 0, 0, nan"),
+    ],
+)
+def test_what_is_no_region(region: tuple[float, ...], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        check_region(region)
+    with pytest.raises(InputError, match=said):
+        SimplifyConfig(keep_region=(region,))
+
+
+def test_the_commands(command_line: CommandLine, tmp_path: Path) -> None:
+    write_splats(tmp_path / "town.ply", town(3000))
+    write_views(tmp_path / "views.json", ring(8), splits=["train"] * 6 + ["test"] * 2)
+
+    def run(*args: object) -> str:
+        code, _, said = command_line(*args, cwd=tmp_path)
+        assert code == 0, said
+        return said
+
+    common = ("town.ply", "-r", 10, "--views", "views.json")
+    spot = ("--keep-region", "2.5,0,0,2")
+    run("simplify", *common, "-o", "plain.ply")
+    assert "in the regions to keep" in run(
+        "simplify", *common, *spot, "-o", "kept.ply", "--json", "kept.json"
+    )
+    assert json.loads((tmp_path / "kept.json").read_text())["keep_region"] == [[2.5, 0, 0, 2]]
+    run("simplify", *common, *spot, "--tile-rows", 1000, "--workers", 1, "-o", "tiles.ply")
+    run("distill", *common, *spot, "--steps", 5, "-o", "run", "--no-view")
+    plain = share(read_splats(tmp_path / "plain.ply"), BALL)
+    for name in ("kept.ply", "tiles.ply", "run/scene.ply"):
+        assert share(read_splats(tmp_path / name), BALL) > 1.3 * plain, name
+    from_python = g2ard.simplify(
+        tmp_path / "town.ply", ratio=10, views=tmp_path / "views.json", keep_region=[BALL]
+    )
+    code, config, _ = command_line(
+        "simplify", *common, *spot, "-o", "again.ply", "--print-config", cwd=tmp_path
+    )
+    assert (code, 'keep-region = "2.5,0,0,2"' in config) == (0, True)
+    (tmp_path / "config.toml").write_text(config)
+    run("simplify", "--config", "config.toml")
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "kept.ply").read_bytes()
+    write_splats(tmp_path / "python.ply", from_python.splats)
+    assert (tmp_path / "python.ply").read_bytes() == (tmp_path / "kept.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "said"),
+    [
+        (("--keep-region", "0,0,90,1"), 1, "none of the 500 Gaussians of the scene lies there"),
+        (
+            ("--keep-region", "0,0,90,1", "--tile-rows", "200", "--workers", "1"),
+            1,
+            "a fair sample of the scene",
+        ),
+        (("--keep-region", "0,0,1"), 2, "expected X,Y,Z,R or X,Y,Z,X,Y,Z, got 0, 0, 1"),
+        (("--keep-region", "0,0,0,1", "--no-views"), 2, "--keep-region: needs views"),
+        (("--keep-region", "0,0,0,1", "--method", "paper"), 2, "--keep-region: needs views"),
+        (("--keep-region", "0,0,0,-1"), 2, "expected a radius > 0"),
+    ],
+)
+def test_refusals(
+    command_line: CommandLine, tmp_path: Path, args: tuple[str, ...], code: int, said: str
+) -> None:
+    write_splats(tmp_path / "town.ply", town(500))
+    got, _, told = command_line("simplify", "town.ply", "-n", 50, "-o", "out.ply", *args, cwd=tmp_path)
+    assert (got, said in told) == (code, True), told
+    assert not (tmp_path / "out.ply").exists()

@@ -1,0 +1,59 @@
+"""Distillation from photos without a scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import g2ard
+from g2ard.policy.photos import points_within_sight
+from helpers.commands import CommandLine
+from helpers.photos import photos_of
+
+
+@pytest.mark.parametrize("points", [False, True])
+def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_path: Path) -> None:
+    photos_of(tmp_path / "photos", points)
+    ask = ("distill", "--views", "photos", "-o", "run", "--json", "-")
+    status, out, error = command_line(*ask, "-n", 500, "--steps", 150, cwd=tmp_path)
+    assert status == 0, error
+    found = json.loads(out)
+    assert (found["output_count"], found["against"]) == (500, "photos")
+    assert found["scores"]["recovered"]["psnr"] > max(17, found["scores"]["simplified"]["psnr"] + 1)
+    said = (
+        "starts from 1,200 sparse points\n"
+        if points
+        else "starts from 500 points within the cameras' sight\n"
+    )
+    assert said in error
+    ours = g2ard.distill(None, views=tmp_path / "photos", count=500, steps=150).splats
+    g2ard.save(tmp_path / "ours.ply", ours)
+    assert (tmp_path / "ours.ply").read_bytes() == (tmp_path / "run" / "scene.ply").read_bytes()
+    status, _, error = command_line(*ask, "-r", 4, "--steps", 5, "-w", cwd=tmp_path)
+    assert status == (0 if points else 1)
+    assert points or "give a count, -n COUNT" in error
+    status, _, error = command_line("distill", "-n", 500, "-o", "run", cwd=tmp_path)
+    assert (status, "give a SCENE, or photos" in error) == (2, True)
+
+
+def test_a_result_that_outweighs_the_photos_points_says_so(command_line: CommandLine, tmp_path: Path) -> None:
+    photos_of(tmp_path / "photos", points=True)
+    ask = ("distill", "--views", "photos", "-n", 900, "--steps", 3)
+    error = command_line(*ask, "-o", "run", cwd=tmp_path)[2]
+    assert "MB, the points, lifted as they are, have 0." in error, error
+    light = command_line(*ask, "--sh-degree", 0, "-n", 300, "-o", "light", cwd=tmp_path)[2]
+    assert "lifted as they are" not in light, light
+
+
+def test_points_within_sight_lie_on_what_is_seen(tmp_path: Path) -> None:
+    photos_of(tmp_path / "photos")
+    cameras = g2ard.load_views(tmp_path / "photos")
+    found = points_within_sight(cameras, 600)
+    assert found.positions.shape == (600, 3)
+    bright = found.colors.max(1) > 0.1  # the background is black everywhere, and everywhere agrees
+    away = np.abs(np.linalg.norm(found.positions[bright], axis=1) - 1)
+    assert np.median(away) < 0.15
+    np.testing.assert_array_equal(found.positions, points_within_sight(cameras, 600).positions)

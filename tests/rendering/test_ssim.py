@@ -1,0 +1,82 @@
+"""The fused loss and the metrics against a naive float64 twin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.errors import InputError
+from g2ard.stages.recover.losses import l1_ssim
+from reference import ssim as reference
+
+Image = NDArray[np.float32]
+SHAPES = [(48, 64, 3), (1, 1, 3), (5, 7, 3), (33, 100, 1), (130, 17, 3), (12, 11, 4)]
+
+
+def images(shape: tuple[int, int, int], kind: str) -> tuple[Image, Image]:
+    rng = np.random.default_rng(sum(shape))
+    y, x = np.mgrid[: shape[0], : shape[1]] / 20
+    smooth = (0.5 + 0.4 * np.sin(x + 2 * y))[..., None] * np.ones(shape[2])
+    a, b = {
+        "noise": (rng.random(shape), rng.random(shape)),
+        "close": (smooth, smooth + rng.normal(size=shape) * 0.01),
+        "flat": (np.full(shape, 0.3), np.full(shape, 0.6)),
+        "dark": (np.zeros(shape), rng.random(shape) * 0.01),
+    }[kind]
+    return a.astype(np.float32), b.astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", ["noise", "close", "flat", "dark"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_loss_and_gradient_are_the_twin_s(shape: tuple[int, int, int], kind: str) -> None:
+    a, b = images(shape, kind)
+    for weight in (0.0, 0.2, 1.0):
+        x = torch.from_numpy(a).requires_grad_()
+        loss = l1_ssim(x, torch.from_numpy(b), weight)
+        (3 * loss).backward()
+        x64 = torch.from_numpy(a.astype(np.float64)).requires_grad_()
+        want = reference.l1_ssim(x64, torch.from_numpy(b.astype(np.float64)), weight)
+        (3 * want).backward()
+        assert abs(loss.item() - want.item()) < 1e-5
+        assert x.grad is not None
+        assert x64.grad is not None
+        error = float((x.grad - x64.grad).norm() / x64.grad.norm().clamp(min=1e-9))
+        assert error < 3e-4
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_metrics_are_the_twin_s(shape: tuple[int, int, int]) -> None:
+    a, b = images(shape, "noise")
+    a64, b64 = a.astype(np.float64), b.astype(np.float64)
+    want = float(reference.ssim(torch.from_numpy(a64), torch.from_numpy(b64)))
+    assert abs(_core.ssim(a, b) - want) < 1e-12
+    assert abs(_core.psnr(a, b) - -10 * np.log10(np.mean((a64 - b64) ** 2))) < 1e-9
+    assert abs(_core.ssim(a, a) - 1) < 1e-12
+    assert _core.psnr(a, a) == np.inf
+
+
+def test_bits_do_not_depend_on_threads() -> None:
+    a, b = images((200, 150, 3), "noise")
+    before = _core.num_threads()
+    try:
+        results = []
+        for threads in (1, 2, 8):
+            _core.set_num_threads(threads)
+            loss, gradient = _core.l1_ssim(a, b, 0.2)
+            results.append((loss, gradient.tobytes(), _core.ssim(a, b), _core.psnr(a, b)))
+    finally:
+        _core.set_num_threads(before)
+    assert results[0] == results[1] == results[2]
+
+
+def test_shapes_must_fit() -> None:
+    a = np.zeros((4, 5, 3), np.float32)
+    with pytest.raises(InputError, match="target: expected the image's shape"):
+        _core.ssim(a, a[:3])
+    with pytest.raises(InputError, match="image"):
+        _core.psnr(a[:0], a[:0])
+    with pytest.raises(InputError, match=r"target: expected \(H, W, C\) float32"):
+        l1_ssim(torch.zeros(4, 5, 3), torch.zeros(4, 5, 3, dtype=torch.float64))

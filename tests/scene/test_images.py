@@ -1,0 +1,186 @@
+"""Photos become what their pinhole cameras would have taken; images come out as they went in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from g2ard.errors import InputError, OutputError
+from g2ard.io import read_views
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.images import contact_sheet, load_image, load_images, to_bytes, write_png
+from helpers.realdata import real
+
+
+def camera(
+    photo: Path | None, size: tuple[int, int], K: list[float] | None = None, distortion: object = ()
+) -> Cameras:
+    fx, fy, cx, cy = K or (size[0], size[0], size[0] / 2, size[1] / 2)
+    matrix = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+    return Cameras.from_lists(
+        [np.eye(4)], [matrix], [size], ["view"], [photo], [distortion] if distortion else ()
+    )
+
+
+def save(path: Path, array: np.ndarray, **options: object) -> Path:
+    Image.fromarray(array).save(path, **options)
+    return path
+
+
+def test_a_photo_of_the_right_size_is_untouched(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+    image = load_image(camera(save(tmp_path / "a.png", pixels), (8, 6)), 0)
+    np.testing.assert_array_equal(image, (pixels / np.float32(255)).astype(np.float32))
+    assert image.flags.c_contiguous
+
+
+def test_shrinking_takes_the_mean_of_the_area(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(1).integers(0, 256, (12, 16, 3), dtype=np.uint8)
+    image = load_image(camera(save(tmp_path / "a.png", pixels), (4, 3)), 0)
+    expected = pixels.reshape(3, 4, 4, 4, 3).mean((1, 3)) / 255
+    np.testing.assert_allclose(image, expected, atol=1e-6)
+
+
+def test_shrinking_by_an_odd_factor_weighs_parts_of_pixels(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(2).integers(0, 256, (21, 28, 3), dtype=np.uint8)
+    image = load_image(camera(save(tmp_path / "a.png", pixels), (12, 9)), 0)
+    fine = np.repeat(np.repeat(pixels / 255, 9, axis=0), 12, axis=1)  # 189×336: both grids divide it
+    np.testing.assert_allclose(image, fine.reshape(9, 21, 12, 28, 3).mean((1, 3)), atol=1e-6)
+
+
+def test_growing_stays_in_range(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(3).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+    image = load_image(camera(save(tmp_path / "a.png", pixels), (16, 12)), 0)
+    assert image.shape == (12, 16, 3)
+    assert pixels.min() / 255 <= image.min() <= image.max() <= pixels.max() / 255
+
+
+@pytest.mark.parametrize(
+    ("array", "expected"),
+    [
+        (np.full((4, 4), 51, np.uint8), [0.2, 0.2, 0.2]),
+        (np.full((4, 4), 13107, np.uint16), [0.2, 0.2, 0.2]),
+        (np.full((4, 4, 4), (255, 0, 51, 51), np.uint8), [0.2, 0, 0.04]),
+        (np.full((4, 4, 2), (255, 51), np.uint8), [0.2, 0.2, 0.2]),
+    ],
+)
+def test_other_pixel_types(tmp_path: Path, array: np.ndarray, expected: list[float]) -> None:
+    image = load_image(camera(save(tmp_path / "a.png", array), (4, 4)), 0)
+    assert (image.shape, image.dtype) == ((4, 4, 3), np.float32)
+    np.testing.assert_allclose(image[2, 1], expected, atol=1e-6)
+
+
+def test_palette_photo(tmp_path: Path) -> None:
+    Image.new("RGB", (4, 4), (255, 0, 51)).convert("P", palette=Image.Palette.ADAPTIVE).save(
+        tmp_path / "a.png"
+    )
+    image = load_image(camera(tmp_path / "a.png", (4, 4)), 0)
+    np.testing.assert_allclose(image[0, 0], [1, 0, 0.2], atol=0.01)
+
+
+def test_exif_orientation_is_ignored(tmp_path: Path) -> None:
+    pixels = np.zeros((6, 8, 3), np.uint8)
+    pixels[0, 0] = 255
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    path = save(tmp_path / "a.png", pixels, exif=exif)
+    image = load_image(camera(path, (8, 6)), 0)
+    assert image.shape == (6, 8, 3)
+    assert image[0, 0, 0] == 1
+
+
+def bend(x: np.ndarray, y: np.ndarray, k: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """OpenCV's distortion as its manual states it."""
+    k1, k2, p1, p2, k3 = k
+    r2 = x**2 + y**2
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
+        y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
+    )
+
+
+def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A smooth picture of the plane z = 1, so that interpolation is all but exact."""
+    return np.stack(
+        [0.5 + 0.4 * np.sin(5 * x), 0.5 + 0.4 * np.cos(4 * y), 0.5 + 0.3 * np.sin(3 * (x + y))], -1
+    )
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+def test_undistorted_photo_is_the_pinhole_picture(tmp_path: Path, scale: int) -> None:
+    """Draw the distorted photo by inverting the lens numerically; loading must give the undistorted one."""
+    k = (0.25, -0.05, 0.01, -0.02, 0.01)
+    width, height = 160, 120
+    fx, fy, cx, cy = 150.0, 155.0, 78.3, 61.4
+    v, u = np.mgrid[0 : height * scale, 0 : width * scale] + 0.5
+    xd, yd = (u / scale - cx) / fx, (v / scale - cy) / fy
+    x, y = xd.copy(), yd.copy()
+    for _ in range(50):
+        bx, by = bend(x, y, k)
+        x, y = x + xd - bx, y + yd - by
+    photo = save(tmp_path / "a.png", to_bytes(pattern(x, y)))
+    image = load_image(camera(photo, (width, height), [fx, fy, cx, cy], k), 0)
+    v, u = np.mgrid[0:height, 0:width] + 0.5
+    expected = pattern((u - cx) / fx, (v - cy) / fy)
+    inside = (slice(14, -14), slice(14, -14))  # the edge is repeated where the lens saw no more
+    np.testing.assert_allclose(image[inside], expected[inside], atol=0.5 / 255 + 1.5e-3)
+    undone = np.asarray(Image.open(photo), np.float32)[::scale, ::scale] / 255
+    assert np.abs(undone[inside] - expected[inside]).max() > 0.02  # it was distorted
+
+
+def test_what_cannot_be_loaded_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"view 0 \(view\) has no photo"):
+        load_image(camera(None, (4, 4)), 0)
+    with pytest.raises(InputError, match=r"gone\.png: no such photo"):
+        load_image(camera(tmp_path / "gone.png", (4, 4)), 0)
+    (tmp_path / "a.png").write_bytes(b"not an image")
+    with pytest.raises(InputError, match=r"a\.png: not an image"):
+        load_image(camera(tmp_path / "a.png", (4, 4)), 0)
+    path = save(tmp_path / "b.png", np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8))
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(InputError, match=r"b\.png: not a whole image"):
+        load_image(camera(path, (64, 64)), 0)
+    path = save(tmp_path / "c.png", np.zeros((40, 30, 3), np.uint8))
+    with pytest.raises(InputError, match="the photo is 30×40, its view 40×30"):
+        load_image(camera(path, (40, 30)), 0)
+
+
+def test_fox_photos_load() -> None:
+    cameras = read_views(real("fox"))
+    told = []
+    images = load_images(cameras.take([0, 1, 2]), lambda *a: told.append(a))
+    assert [image.shape for image in images] == [(960, 540, 3)] * 3
+    assert told[-1] == ("photos", 3, 3)
+    raw = np.asarray(Image.open(cameras.image_paths[0]), np.float32) / 255
+    assert 0.001 < np.abs(images[0] - raw).mean() < 0.05
+
+
+def test_png_round_trip(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).random((5, 7, 3))
+    write_png(tmp_path / "a.png", image)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), np.rint(image * 255))
+    write_png(tmp_path / "grey.png", image[..., 0])
+    assert Image.open(tmp_path / "grey.png").mode == "L"
+    with pytest.raises(OutputError, match="exists"):
+        write_png(tmp_path / "a.png", image)
+    with pytest.raises(InputError, match="is not an image"):
+        write_png(tmp_path / "b.png", np.zeros((2, 3, 5)))
+
+
+def test_contact_sheet_holds_its_images() -> None:
+    rng = np.random.default_rng(0)
+    rows = [[rng.random((20, 30, 3)) for _ in range(3)], [rng.random((10, 30, 3))]]
+    labels = ["photo", "simplified", "recovered"]
+    sheet = contact_sheet(rows, labels, row_labels=["one", "two"])
+    assert sheet.dtype == np.uint8
+    for image in (*rows[0], *rows[1]):
+        windows = np.lib.stride_tricks.sliding_window_view(sheet, image.shape)[:, :, 0]
+        assert (windows == to_bytes(image)).all((2, 3, 4)).sum() == 1
+    assert contact_sheet(rows, labels).shape[0] < sheet.shape[0]
+    assert contact_sheet(rows, labels, cell_width=15).shape[1] < sheet.shape[1]
+    with pytest.raises(InputError, match="needs images"):
+        contact_sheet([], ["photo"])

@@ -1,0 +1,164 @@
+"""Masks and exposures: found where a scene has them, and then only what counts counts."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from g2ard import io
+from g2ard.errors import InputError
+from g2ard.io.exposures import find_exposures
+from g2ard.rendering.metrics import psnr, ssim
+from g2ard.rendering.renderer import render
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.images import load_mask, write_png
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import Photos
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.anchors import Regularizers
+from g2ard.stages.simplify import simplify
+from helpers.scenes import around, checkered_ball
+
+BALL = checkered_ball()
+VIEWS = around(10)
+BARE = Regularizers(0, 0, effective_rank=False)
+
+
+def photographed(folder: Path, *, spoil: float | None = None, masks: bool = True) -> Cameras:
+    """Photos of the ball with a block of rubbish, and masks that leave it out; read back as a user would."""
+    paths = []
+    for view, name in enumerate(VIEWS.names):
+        image = np.clip(render(BALL, VIEWS[view]).image, 0, 1)
+        mask = np.ones(image.shape[:2])
+        if spoil is not None:
+            image[10:30, 20:50] = spoil
+            mask[10:30, 20:50] = 0
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+        paths.append(folder / "images" / f"{name}.png")
+        write_png(paths[-1], image)
+        if masks:
+            (folder / "masks").mkdir(exist_ok=True)
+            write_png(folder / "masks" / f"{name}.png", mask)
+    io.write_views(folder / "views.json", replace(VIEWS, image_paths=tuple(paths)))
+    return io.read_view_set(folder / "views.json").cameras
+
+
+@pytest.fixture(scope="module")
+def student() -> Splats:
+    return simplify(BALL, 500, method="paper").splats
+
+
+def test_masks_beside_the_photos_are_found(tmp_path: Path) -> None:
+    cameras = photographed(tmp_path, spoil=1.0)
+    mask = load_mask(cameras, 3)
+    assert mask is not None
+    assert mask.shape == (48, 64)
+    assert not mask[10:30, 20:50].any()
+    assert mask.sum() == 48 * 64 - 600
+    targets = Photos(cameras)
+    assert not targets[3][~mask].any()
+    assert not Photos(cameras.take([2, 1])).mask(1).all()  # type: ignore[union-attr]
+    small = Photos(cameras.resized(32))
+    assert small.mask(0).shape == small[0].shape[:2]  # type: ignore[union-attr]
+    notes = io.read_view_set(tmp_path / "views.json").notes
+    assert [note.count for note in notes if note.code == "masks"] == [10]
+    assert Photos(photographed(tmp_path / "bare", masks=False)).mask(0) is None
+
+
+def test_masks_survive_g2ard_s_own_file(tmp_path: Path) -> None:
+    cameras = photographed(tmp_path, spoil=1.0)
+    elsewhere = tmp_path / "else" / "where"
+    elsewhere.mkdir(parents=True)
+    moved = tuple(elsewhere / f"{name}.png" for name in cameras.names)
+    for path, mask in zip(moved, cameras.mask_paths, strict=True):
+        assert mask is not None
+        path.write_bytes(mask.read_bytes())
+    io.write_views(tmp_path / "v.json", replace(cameras, mask_paths=moved))
+    again = io.read_view_set(tmp_path / "v.json").cameras
+    assert [p.resolve() for p in again.mask_paths if p] == [p.resolve() for p in moved]
+
+
+def test_transforms_json_names_masks(tmp_path: Path) -> None:
+    photographed(tmp_path, spoil=1.0, masks=False)
+    write_png(tmp_path / "m.png", np.eye(48, 64))
+    frame = {"file_path": "images/view_000.png", "transform_matrix": np.eye(4).tolist(), "mask_path": "m.png"}
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 50, "frames": [frame]}))
+    cameras = io.read_view_set(tmp_path / "transforms.json").cameras
+    mask = load_mask(cameras, 0)
+    assert mask is not None
+    assert mask.sum() == 48
+    (tmp_path / "m.png").unlink()
+    with pytest.raises(InputError, match=r"frame 0: its mask .*m\.png does not exist"):
+        io.read_view_set(tmp_path / "transforms.json")
+
+
+@pytest.mark.parametrize("engine", ["fused", "torch"])
+def test_what_a_mask_hides_does_not_matter(student: Splats, tmp_path: Path, engine: Any) -> None:
+    config = RecoverConfig(steps=30, engine=engine, regularizers=BARE)
+    found = [
+        recover(student, Photos(photographed(tmp_path / str(spoil), spoil=spoil)), config)
+        for spoil in (1.0, 0.3)
+    ]
+    for name in ("means", "quats", "scales", "logit_opacities", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(found[0].splats, name), getattr(found[1].splats, name))
+    assert found[0].report.loss == found[1].report.loss
+    assert found[0].report.psnr == found[1].report.psnr
+
+
+def test_masked_photos_teach_what_whole_ones_do(student: Splats, tmp_path: Path) -> None:
+    config = RecoverConfig(steps=150)
+    whole = Photos(photographed(tmp_path / "whole", masks=False))
+    scores = [
+        evaluate(recover(student, targets, config).splats, whole).psnr
+        for targets in (
+            Photos(photographed(tmp_path / "masked", spoil=1.0)),
+            Photos(photographed(tmp_path / "spoilt", spoil=1.0, masks=False)),
+        )
+    ]
+    assert scores[0] > scores[1] + 3
+
+
+def test_both_engines_step_alike_under_a_mask(student: Splats, tmp_path: Path) -> None:
+    targets = Photos(photographed(tmp_path, spoil=1.0))
+    losses = [
+        recover(student, targets, RecoverConfig(steps=3, engine=engine, regularizers=BARE)).report.loss
+        for engine in ("fused", "torch")
+    ]
+    assert losses[0] == pytest.approx(losses[1], abs=2e-4)
+
+
+def test_metrics_look_only_where_the_mask_says() -> None:
+    rng = np.random.default_rng(0)
+    a = rng.random((40, 50, 3)).astype(np.float32)
+    mask = np.zeros((40, 50), bool)
+    mask[5:35, 10:40] = True
+    b = np.where(mask[..., None], np.clip(a + 0.1, 0, 2), a).astype(np.float32)
+    assert psnr(b, a, mask) == pytest.approx(20, abs=0.01)
+    assert psnr(b, a) > 20.5
+    assert ssim(b, a, mask) < ssim(b, a)
+    assert ssim(a, a, mask) == pytest.approx(1)
+    assert ssim(b, a, np.ones_like(mask)) == pytest.approx(ssim(b, a))
+
+
+def test_exposures_are_undone(tmp_path: Path) -> None:
+    cameras = photographed(tmp_path, masks=False)
+    plain = Photos(cameras)[1]
+    matrix: NDArray[np.float64] = np.array([[0.8, 0, 0.1, 0.02], [0, 0.7, 0, 0.05], [0, 0.1, 0.9, 0]])
+    write_png(tmp_path / "images" / "view_001.png", plain @ matrix[:, :3].T + matrix[:, 3], overwrite=True)
+    (tmp_path / "exposure.json").write_text(json.dumps({"view_001.png": matrix.tolist()}))
+    found = find_exposures(cameras)
+    assert list(found) == ["view_001"]
+    np.testing.assert_allclose(Photos(cameras, exposures=found)[1], plain, atol=6e-3)
+    np.testing.assert_array_equal(Photos(cameras, exposures=found)[2], Photos(cameras)[2])
+    with pytest.raises(InputError, match="exposure of view_001: expected an invertible"):
+        Photos(cameras, exposures={"view_001": np.zeros((3, 4))})
+    (tmp_path / "exposure.json").write_text('{"view_001": [1, 2]}')
+    with pytest.raises(InputError, match="not a finite 3×4 matrix"):
+        find_exposures(cameras)

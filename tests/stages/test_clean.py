@@ -1,0 +1,130 @@
+"""What `g2ard clean` takes, and what it leaves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard.errors import InputError
+from g2ard.io import read_splats, write_splats
+from g2ard.rendering.metrics import psnr
+from g2ard.rendering.renderer import render
+from g2ard.rendering.visibility import visibility
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.splats import Splats
+from g2ard.scene.transform import merge
+from g2ard.stages.clean import KINDS, find_clutter, within_reach
+from helpers.commands import CommandLine
+from helpers.scenes import around, checkered_ball
+
+
+def junk() -> tuple[Splats, np.ndarray]:
+    """A ball with some of every kind, and which kind each row is; −1 for the ball."""
+    ball = checkered_ball(2500)
+    shells = [replace(ball, means=ball.means * np.float32(1 - 0.02 * i)) for i in range(3)]
+    ball = merge([replace(shell, logit_opacities=np.full(2500, 5, np.float32)) for shell in shells])
+    rng = np.random.default_rng(0)
+    within = replace(ball.take(slice(0, 200)), means=ball.means[:200] * 0.3)
+    faint = replace(ball.take(slice(0, 50)), logit_opacities=np.full(50, -7, np.float32))
+    giant = Splats.create([[0.5, 0, 0]], scales=[[40, 40, 40]], logit_opacities=[-4])
+    ends = rng.normal(size=(10, 3))
+    ends /= np.linalg.norm(ends, axis=1, keepdims=True)
+    up = np.cross(ends, [0, 0, 1])
+    quats = np.concatenate([1 + ends[:, 2:], np.cross([0, 0, 1], ends)], axis=1)
+    assert np.abs(up).max() > 0
+    needles = Splats.create(2 * ends, quats=quats, scales=np.tile([0.002, 0.002, 0.1], (10, 1)))
+    floaters = Splats.create(
+        [[1.8, 0, 0], [1.81, 0, 0], [0, -2, 0.5]], scales=np.full((3, 3), 0.01), logit_opacities=[2, 2, 2]
+    )
+    parts = [ball, within, faint, giant, needles, floaters]
+    kinds = np.repeat([-1, 0, 0, 1, 2, 3], [len(part) for part in parts])
+    return merge(parts), kinds
+
+
+def find(splats: Splats, **options: object):
+    """What is found if views could see all of it."""
+    views = around(24)
+    pixels = int((views.widths * views.heights).sum())
+    return find_clutter(splats, visibility(splats, views), np.ones(len(splats), bool), pixels, **options)
+
+
+def test_every_kind_is_found_and_the_ball_stays() -> None:
+    splats, kinds = junk()
+    found = find(splats)
+    for number, name in enumerate(KINDS):
+        assert (found.kind[kinds == number] == number).mean() > 0.85, name  # shells have gaps
+    outer = np.flatnonzero(kinds < 0)[:2500]
+    assert (found.kind[outer] >= 0).mean() < 0.02
+    assert sum(found.counts.values()) == (~found.keep).sum()
+
+
+def test_the_invisible_are_invisible() -> None:
+    splats, _ = junk()
+    found = find(splats, kinds=("invisible",))
+    assert set(np.unique(found.kind)) == {-1, 0}
+    views = around(7, distance=2.5)
+    for i in range(7):  # other views than were measured
+        with_all, without = (render(s, views[i]).image for s in (splats, splats.take(found.keep)))
+        assert psnr(np.clip(without, 0, 1), np.clip(with_all, 0, 1)) > 55
+
+
+def test_what_no_view_looks_at_stays() -> None:
+    splats, _ = junk()
+    view = around(24).take([0])
+    behind = replace(splats, means=splats.means + (100 * view.positions[0]).astype(np.float32))
+    reached = within_reach(behind, view)
+    assert not reached.any()
+    found = find_clutter(behind, visibility(behind, view), reached, 64 * 48, ("invisible",))
+    np.testing.assert_array_equal(found.kind >= 0, splats.logit_opacities < -5.54)
+
+
+def test_what_lies_behind_a_wall_stays() -> None:
+    """A view sees a wall alone: what stands behind it is in its frame, and no other view tells more."""
+    x, z = np.meshgrid(np.linspace(-3, 3, 61), np.linspace(-3, 3, 61))
+    means = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], 1)
+    wall = Splats.create(means, scales=np.full((x.size, 3), 0.1), logit_opacities=np.full(x.size, 9.0))
+    beyond = replace(checkered_ball(500), logit_opacities=np.full(500, 5, np.float32))
+    beyond = replace(beyond, means=beyond.means + np.float32([0, 3, 0]))
+    before = replace(wall.take([0]), means=np.float32([[0, -1, 0]]), logit_opacities=np.float32([-5.4]))
+    scene = merge([wall, beyond, before])
+    K = [[60, 0, 32], [0, 60, 24], [0, 0, 1]]
+    view = Cameras.from_lists([look_at([0, -4, 0], [0, 0, 0])], [K], [(64, 48)], ["front"])
+    reached = within_reach(scene, view)
+    assert not reached[x.size : -1].any()
+    assert reached[-1]
+    hidden = visibility(scene, view).weight[x.size : -1]
+    assert hidden.max() < 1e-3  # it would be called invisible by what shows alone
+    kinds = find_clutter(scene, visibility(scene, view), reached, 64 * 48, ("invisible",)).kind
+    assert (kinds[x.size : -1] < 0).all()
+
+
+def test_a_chain_of_thin_ones_is_no_needle() -> None:
+    """A string: each end lies in the next one."""
+    along = np.linspace(-1, 1, 21)[:, None] * [1, 0, 0]
+    string = Splats.create(along, scales=np.tile([0.05, 0.001, 0.001], (21, 1)), logit_opacities=[3] * 21)
+    scene = merge([checkered_ball(500), replace(string, means=string.means + np.float32([0, 0, 2]))])
+    found = find(scene, kinds=("needle",))
+    assert found.counts["needle"] <= 2  # the string's own ends
+
+
+def test_bad_words() -> None:
+    splats, _ = junk()
+    with pytest.raises(InputError, match="kinds: expected"):
+        find(splats, kinds=("dust",))
+
+
+def test_the_command(tmp_path: Path, command_line: CommandLine) -> None:
+    splats, _ = junk()
+    write_splats(tmp_path / "a.ply", splats)
+    code, _, told = command_line("clean", "a.ply", "--dry-run", "--preview", "p.png", cwd=tmp_path)
+    assert code == 0, told
+    assert "can go" in told
+    assert (tmp_path / "p.png").stat().st_size > 1000
+    assert not (tmp_path / "b.ply").exists()
+    assert command_line("clean", "a.ply", "--only", "giant", "-o", "b.sog", cwd=tmp_path)[0] == 0
+    assert len(read_splats(tmp_path / "b.sog")) == len(splats) - 1
+    for words, code in ((["a.ply"], 2), (["a.ply", "--only", "dust", "--dry-run"], 2)):
+        assert command_line("clean", *words, cwd=tmp_path)[0] == code

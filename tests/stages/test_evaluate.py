@@ -1,0 +1,137 @@
+"""Evaluators as other people's: INRIA's conventions, 8-bit renders, unscaled LPIPS, mixed targets."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard import io
+from g2ard.errors import InputError
+from g2ard.io import write_splats, write_views
+from g2ard.rendering.lpips import Lpips
+from g2ard.rendering.metrics import psnr
+from g2ard.rendering.renderer import RasterSettings, render
+from g2ard.scene.images import as_saved, write_png
+from g2ard.scene.targets import PhotosOrRenders, TeacherRenders
+from g2ard.stages.evaluate import evaluate
+from helpers.commands import CommandLine
+from helpers.lpips_weights import weights
+from helpers.scenes import around, checkered_ball
+from helpers.studies import pictured
+
+INRIA = RasterSettings(convention="inria")
+
+
+def test_inrias_convention_reaches_renders_and_targets() -> None:
+    ball, views = checkered_ball(300), around(2, distance=1.15)  # nearer than 0.2 to some of the discs
+    own, theirs = (
+        evaluate(ball, TeacherRenders(ball, views, settings=s), settings=s).psnr for s in (None, INRIA)
+    )
+    assert own == theirs == 100  # the same conventions on both sides
+    mixed = evaluate(ball, TeacherRenders(ball, views), settings=INRIA)
+    assert mixed.psnr < 60
+    expected = psnr(
+        np.clip(render(ball, views[0], settings=INRIA).image, 0, 1),
+        np.clip(render(ball, views[0]).image, 0, 1),
+    )
+    assert mixed.views[0].psnr == expected
+
+
+def test_eight_bit_rounds_both_sides_as_png_does(tmp_path: Path) -> None:
+    ball, views = checkered_ball(300), around(2)
+    small = ball.take(slice(150))
+    found = evaluate(small, TeacherRenders(ball, views), eight_bit=True)
+    images = []
+    for scene in (small, ball):
+        write_png(tmp_path / "x.png", render(scene, views[0]).image, overwrite=True)
+        from PIL import Image
+
+        with Image.open(tmp_path / "x.png") as image:
+            images.append(np.asarray(image, np.float32) / 255)
+    assert found.views[0].psnr == pytest.approx(psnr(*images), abs=1e-4)
+    assert found.views[0].psnr != evaluate(small, TeacherRenders(ball, views)).views[0].psnr
+    assert as_saved(np.array([0.4999, 1.2])).tolist() == [np.float32(127 / 255), 1.0]
+
+
+def test_unscaled_lpips_feeds_images_as_they_are() -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.random((70, 66, 3), np.float32), rng.random((70, 66, 3), np.float32)
+    scaled, plain = (Lpips("alex", *weights(), scaled=scaled) for scaled in (True, False))
+    assert plain(a, b) == pytest.approx(scaled((a + 1) / 2, (b + 1) / 2), rel=1e-4)
+    assert abs(plain(a, b) - scaled(a, b)) > 1e-3
+
+
+def test_each_view_has_its_photo_or_the_teachers_render(tmp_path: Path) -> None:
+    ball, views = checkered_ball(300), pictured(tmp_path)
+    targets = PhotosOrRenders(views, ball)
+    rendered = TeacherRenders(ball, views)
+    for view in range(4):
+        expected = np.full((48, 64, 3), 64 / 255, np.float32) if view in (0, 2) else rendered[view]
+        assert np.array_equal(targets[view], expected)
+    found = evaluate(ball, targets)
+    assert [v.against for v in found.views] == ["photo", "teacher", "photo", "teacher"]
+    assert found.views[1].psnr == 100 > found.views[0].psnr
+    only = PhotosOrRenders(pictured(tmp_path, ()), ball)
+    assert np.array_equal(only[3], rendered[3])
+    with pytest.raises(InputError, match="exposure of view_000"):
+        PhotosOrRenders(views, ball, exposures={"view_000": np.zeros((3, 4))})
+
+
+def test_command(command_line: CommandLine, tmp_path: Path) -> None:
+    ball = checkered_ball(300)
+    io.write_splats(tmp_path / "ball.ply", ball)
+    io.write_splats(tmp_path / "small.ply", ball.take(slice(200)))
+    io.write_views(tmp_path / "views.json", pictured(tmp_path))
+    common = ["small.ply", "--views", "views.json", "--split", "all", "--json", "-"]
+    options = ["--teacher", "ball.ply", "--photos", "--convention", "inria", "--8bit"]
+    status, out, err = command_line("evaluate", *common, *options, cwd=tmp_path)
+    assert status == 0, err
+    found = json.loads(out)
+    assert found["against"] == {"photo": 2, "teacher": 2}
+    assert found["protocol"] == {"convention": "inria", "8bit": True, "lpips_input": None}
+    assert [v["against"] for v in found["scenes"][0]["views"]] == ["photo", "teacher"] * 2
+    plain = json.loads(command_line("evaluate", *common, "--teacher", "ball.ply", cwd=tmp_path)[1])
+    assert plain["against"] == "teacher"
+    assert plain["scenes"][0]["psnr"] != found["scenes"][0]["psnr"]
+    status, _, err = command_line("evaluate", *common, "--photos", cwd=tmp_path)
+    assert status == 2
+    assert "--photos goes with --teacher" in err
+    assert "Traceback" not in err
+
+
+def test_sizes_say_of_what_they_are(command_line: CommandLine, folder: Path) -> None:
+    assert command_line("convert", "ball.ply", "ball.sog", cwd=folder)[0] == 0
+    assert command_line("convert", "ball.ply", "folder/meta.json", cwd=folder)[0] == 0
+    ask = ("evaluate", "ball.ply", "ball.sog", "folder", "--teacher", "ball.ply", "--views", "views.json")
+    status, out, error = command_line(*ask, "--json", "-", cwd=folder)
+    assert status == 0, error
+    assert "file MB" in error
+    whole, packed, chunks = (row["file_bytes"] for row in json.loads(out)["scenes"])
+    assert (whole, packed) == tuple((folder / name).stat().st_size for name in ("ball.ply", "ball.sog"))
+    assert chunks == sum(file.stat().st_size for file in (folder / "folder").iterdir())
+    assert f"{whole / 1e6:.2f}" != f"{packed / 1e6:.2f}"
+    assert f"{packed / 1e6:.2f}" in error
+
+
+VIEWED = ("--views", "v.json", "--teacher", "ball.ply", "-w", "--json", "-")
+
+
+PRIOR = checkered_ball()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_splats(tmp_path / "ball.ply", PRIOR)
+    write_views(tmp_path / "v.json", around(8, (48, 36)))
+    return tmp_path
+
+
+def test_unscaled_images_need_a_network(folder: Path, command_line: CommandLine) -> None:
+    status, _, error = command_line(
+        "evaluate", "ball.ply", *VIEWED[:4], "--lpips-input", "unscaled", cwd=folder
+    )
+    assert status == 2
+    assert "--lpips-input" in error

@@ -1,0 +1,135 @@
+"""The lift against its float64 twin, and on the clouds that break lifts."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from g2ard import _core
+from g2ard.errors import InputError
+from g2ard.scene.splats import SH_C0
+from g2ard.stages.lift import lift
+from reference.lift import discs
+
+
+def surface(n=400, seed=0):
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-5, 5, (2, n))
+    return np.stack([x, y, np.sin(x) + 0.01 * rng.normal(size=n)], 1)
+
+
+def normals(splats):
+    w, x, y, z = splats.quats.T.astype(np.float64)
+    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
+
+
+def test_equals_the_naive_twin():
+    points = surface()
+    got = lift(points, np.full_like(points, 0.25))
+    want_normals, want_scales = discs(points - np.median(points, 0))
+    np.testing.assert_allclose(got.scales, want_scales, rtol=1e-5)
+    np.testing.assert_allclose(np.abs((normals(got) * want_normals).sum(1)), 1, atol=1e-5)
+    np.testing.assert_allclose(0.5 + SH_C0 * got.sh0[:, 0], 0.25, atol=1e-6)
+    np.testing.assert_allclose(got.opacities, 0.5, atol=1e-6)
+    assert got.sh_degree == 0
+
+
+def test_map_coordinates_keep_their_precision():
+    points = surface() + np.array([637_000.0, 5_400_000.0, 120.0])
+    got = lift(points, np.full_like(points, 0.5))
+    np.testing.assert_allclose(got.means + got.offset, points, atol=1e-6)
+
+
+def test_translation_and_scale_by_powers_of_two_are_exact():
+    points = np.round(surface() * 2**20) / 2**20
+    colors = np.full_like(points, 0.5)
+    here, far = lift(points, colors), lift(points * 4 + 2**22, colors)
+    assert far.offset.any()  # float32 cannot hold such coordinates
+    np.testing.assert_allclose(far.means + far.offset, points * 4 + 2**22, rtol=0, atol=1e-5)
+    for there in (far, lift(points * 4 + 1024, colors)):
+        np.testing.assert_array_equal(there.scales, here.scales * 4)
+        np.testing.assert_array_equal(there.quats, here.quats)
+
+
+def test_threads_do_not_matter():
+    points = surface(20_000)
+    found = []
+    for threads in (1, 2, 8):
+        _core.set_num_threads(threads)
+        found.append(lift(points, np.full_like(points, 0.5)))
+    _core.set_num_threads(0)
+    for other in found[1:]:
+        np.testing.assert_array_equal(found[0].quats, other.quats)
+        np.testing.assert_array_equal(found[0].scales, other.scales)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.zeros((1, 3)),
+        np.zeros((1000, 3)),
+        np.array([[0.0, 0, 0], [1, 0, 0]]),
+        np.arange(30.0)[:, None] * [1, 0, 0],
+        np.concatenate([surface(200), [[1e5, 1e5, 1e5], [-1e5, 0, 0]]]),
+        np.repeat(surface(100), 5, 0),
+        surface(200) * 1e-9,
+        surface(200) * 1e9,
+    ],
+    ids=["one", "identical", "two", "line", "floaters", "duplicates", "tiny", "huge"],
+)
+def test_degenerate_clouds_give_sensible_discs(points):
+    got = lift(points, np.full(points.shape, 0.5))
+    assert len(got) == len(points)
+    assert got.finite_rows().all()
+    assert (got.scales > 0).all()
+    assert (got.scales[:, 0] <= 4.0001 * got.scales[:, 1]).all()
+
+
+def test_non_finite_points_are_left_out():
+    points = surface(50)
+    points[7, 1] = np.nan
+    assert len(lift(points, np.full_like(points, 0.5))) == 49
+
+
+@pytest.mark.parametrize(
+    ("points", "colors", "options", "message"),
+    [
+        (np.zeros((3, 2)), np.zeros((3, 2)), {}, "points: expected shape"),
+        (np.zeros((3, 3)), np.zeros((2, 3)), {}, "colors: expected shape"),
+        (np.full((3, 3), np.nan), np.zeros((3, 3)), {}, "none of 3 is finite"),
+        (np.zeros((3, 3)), np.zeros((3, 3)), {"opacity": 1.0}, "opacity: expected"),
+        (np.zeros((3, 3)), np.zeros((3, 3)), {"neighbors": 1}, "neighbors: expected at least 3"),
+        (np.zeros((3, 3)), np.zeros((3, 3)), {"max_anisotropy": 0.5}, "max_anisotropy: expected"),
+    ],
+)
+def test_bad_input_is_named(points, colors, options, message):
+    with pytest.raises(InputError, match=message):
+        lift(points, colors, **options)
+
+
+def test_command_line(tmp_path, command_line):
+    from g2ard.io import read_splats, write_points
+    from g2ard.io.types import Points
+
+    points = surface(300) + np.array([500_000.0, 4_000_000.0, 0.0])
+    write_points(tmp_path / "cloud.ply", Points(points, np.full((300, 3), 0.5, np.float32)))
+    status, out, err = command_line("lift", "cloud.ply", "-o", "prior.ply", "--json", "-", cwd=tmp_path)
+    assert status == 0, err
+    assert json.loads(out)["output_count"] == 300
+    prior = read_splats(tmp_path / "prior.ply")
+    np.testing.assert_allclose(prior.means + prior.offset, points, atol=0.01)
+    status, _, err = command_line("lift", "absent.ply", "-o", "other.ply", cwd=tmp_path)
+    assert (status, len(err.splitlines())) == (1, 1)
+    assert "absent.ply" in err
+
+
+def test_near_coordinates_stay_the_caller_s_own():
+    rng = np.random.default_rng(3)
+    points, shift = rng.uniform(-100, 100, (500, 3)), np.array([5e5, 4e6, 0])
+    near, far = lift(points, np.full((500, 3), 0.5)), lift(points + shift, np.full((500, 3), 0.5))
+    np.testing.assert_array_equal(near.offset, 0)
+    np.testing.assert_array_equal(near.means, points.astype(np.float32))
+    assert far.offset.any()
+    np.testing.assert_allclose(far.means + far.offset, points + shift, atol=1e-3)

@@ -1,0 +1,507 @@
+"""The recovery loop: it recovers, both engines agree, it resumes to the same bits, it holds the anchors."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.errors import InputError
+from g2ard.rendering.visibility import visibility
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import TeacherRenders
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover import RecoverConfig, loop, probe, recover
+from g2ard.stages.recover import checkpoint as checkpoint_module
+from g2ard.stages.recover.anchors import PRESETS, Anchors, Regularizers
+from g2ard.stages.recover.guard import Guard, blended
+from g2ard.stages.recover.outcome import outcome
+from g2ard.stages.recover.schedule import PAPER, TUNED
+from g2ard.stages.simplify import simplify
+from helpers.scenes import around, checkered_ball, under_a_sky
+
+ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+VIEWS = around()
+TEACHER = checkered_ball()
+
+
+@pytest.fixture(scope="module")
+def targets() -> TeacherRenders:
+    return TeacherRenders(TEACHER, VIEWS)
+
+
+@pytest.fixture(scope="module")
+def student() -> Splats:
+    return simplify(TEACHER, 500, method="paper").splats  # leaves recovery more to do than the default
+
+
+def assert_same_bits(a: Splats, b: Splats) -> None:
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+@pytest.mark.parametrize("engine", ["fused", "torch"])
+def test_recovery_lifts_unseen_views(student: Splats, targets: TeacherRenders, engine: Any) -> None:
+    result = recover(student, targets, RecoverConfig(steps=150, engine=engine))
+    unseen = TeacherRenders(TEACHER, around(7, (80, 60), 2.5))
+    assert len(result.splats) == len(student)
+    assert evaluate(result.splats, unseen).psnr > evaluate(student, unseen).psnr + 3
+    assert result.report.psnr.after > result.report.psnr.before + 3
+    assert len(result.report.loss) == 100
+    assert [point.step for point in result.report.geometry] == [15 * k for k in range(1, 11)]
+    assert result.report.geometry[-1].drift95 == result.report.drift95
+    assert result.report.regularizers.steps == 1
+
+
+def test_both_engines_take_the_same_way(student: Splats, targets: TeacherRenders) -> None:
+    fused, torch = (recover(student, targets, RecoverConfig(steps=60, engine=e)) for e in ("fused", "torch"))
+    assert abs(fused.report.psnr.after - torch.report.psnr.after) < 0.005
+    for name in ("means", "scales", "logit_opacities", "sh0", "shN"):
+        ours, theirs = getattr(fused.splats, name), getattr(torch.splats, name)
+        moved = np.linalg.norm(ours - getattr(student.with_sh_degree(fused.splats.sh_degree), name))
+        assert np.linalg.norm(ours - theirs) < 1e-2 * moved, name
+
+
+def test_same_bits_from_run_to_run_and_for_any_threads(student: Splats, targets: TeacherRenders) -> None:
+    config = RecoverConfig(steps=25, regularizers=replace(PRESETS["noisy"], period=10))
+    before = _core.num_threads()
+    try:
+        results = []
+        for threads in (1, 2, 8):
+            _core.set_num_threads(threads)
+            results.append(recover(student, targets, config).splats)
+    finally:
+        _core.set_num_threads(before)
+    assert_same_bits(results[0], results[1])
+    assert_same_bits(results[0], results[2])
+
+
+class _StopAt:
+    """A progress callback that presses Ctrl-C at a step."""
+
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+    def __call__(self, stage: str, done: int, total: int, info: Any = None) -> None:
+        if stage == "recover" and done == self.step:
+            signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize(("engine", "steps"), [("fused", 40), ("torch", 40), ("fused", 110)])
+def test_ctrl_c_then_resume_is_never_having_stopped(
+    student: Splats, targets: TeacherRenders, engine: Any, steps: int, tmp_path: Path
+) -> None:
+    config = RecoverConfig(steps=steps, engine=engine, regularizers=replace(PRESETS["lift"], period=10))
+    whole = recover(student, targets, config)
+    checkpoint = tmp_path / "c.npz"
+    with pytest.raises(KeyboardInterrupt):
+        recover(student, targets, config, checkpoint=checkpoint, progress=_StopAt(17))
+    assert checkpoint.exists()
+    resumed = recover(student, targets, config, checkpoint=checkpoint)
+    assert_same_bits(whole.splats, resumed.splats)
+    assert whole.report.loss == resumed.report.loss
+    assert whole.report.resumed is None
+    assert resumed.report.resumed is not None
+    assert 0 < resumed.report.resumed < resumed.report.seconds
+    assert whole.report.trials == resumed.report.trials
+    assert whole.report.regularizers.steps == resumed.report.regularizers.steps
+    assert bool(whole.report.trials) == (steps >= 100)
+    assert whole.report.geometry == resumed.report.geometry
+
+
+def test_a_run_that_was_killed_goes_on_from_the_last_minute(
+    student: Splats, targets: TeacherRenders, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = RecoverConfig(steps=30, regularizers=replace(PRESETS["lift"], period=10))
+    whole = recover(student, targets, config)
+    monkeypatch.setattr(checkpoint_module, "PERIOD", 0.0)  # a minute has always passed
+
+    def fall_over(stage: str, done: int, total: int, info: Any = None) -> None:
+        if stage == "recover" and done == 21:
+            raise RuntimeError("power cut")
+
+    checkpoint = tmp_path / "c.npz"
+    with pytest.raises(RuntimeError, match="power cut"):
+        recover(student, targets, config, checkpoint=checkpoint, progress=fall_over)
+    meta, _ = checkpoint_module.load(checkpoint, json.loads(str(np.load(checkpoint)["meta"]))["key"])
+    assert meta["done"] == 20
+    resumed = recover(student, targets, config, checkpoint=checkpoint)
+    assert_same_bits(whole.splats, resumed.splats)
+    assert whole.report.geometry == resumed.report.geometry
+
+
+def test_resume_refuses_other_options(student: Splats, targets: TeacherRenders, tmp_path: Path) -> None:
+    checkpoint = tmp_path / "c.npz"
+    config = RecoverConfig(steps=40)
+    moved = replace(student, means=student.means + 1)
+    with pytest.raises(KeyboardInterrupt):
+        recover(student, targets, config, checkpoint=checkpoint, progress=_StopAt(5))
+    with pytest.raises(InputError, match="other options"):
+        recover(student, targets, replace(config, seed=1), checkpoint=checkpoint)
+    with pytest.raises(InputError, match="other options"):  # another teacher, the same views
+        recover(student, TeacherRenders(student, VIEWS), config, checkpoint=checkpoint)
+    with pytest.raises(InputError, match="other options"):
+        recover(student, targets, config, checkpoint=checkpoint, anchors=Anchors.of(moved))
+
+
+def test_a_strong_anchor_holds_gaussians_to_their_surface(student: Splats, targets: TeacherRenders) -> None:
+    free = RecoverConfig(steps=120, regularizers=Regularizers(0, 0, effective_rank=False))
+    held = replace(free, regularizers=Regularizers(50.0, 0, effective_rank=False, period=1))
+    drift = [recover(student, targets, config).report.drift95 for config in (free, held)]
+    assert drift[1] < 0.8 * drift[0]
+
+
+def test_the_effective_rank_barrier_keeps_needles_away(targets: TeacherRenders) -> None:
+    thin = checkered_ball(400)
+    thin = replace(thin, scales=(thin.scales * np.float32([4, 0.01, 0.05])).astype(np.float32))
+    free = RecoverConfig(steps=80, regularizers=Regularizers(0, 0, effective_rank=False))
+    held = replace(free, regularizers=Regularizers(0, 20.0, effective_rank=True, period=1))
+    needles = [recover(thin, targets, config).report.needle for config in (free, held)]
+    assert needles[1] < needles[0]
+
+
+def test_paper_schedule_runs_with_its_own_rates(student: Splats, targets: TeacherRenders) -> None:
+    result = recover(student, targets, RecoverConfig(schedule=PAPER, steps=40, sh_degree=3))
+    assert result.splats.sh_degree == 3
+    assert result.report.multiplier == 1.0
+    assert result.report.psnr.after > result.report.psnr.before
+
+
+def test_trials_choose_rates_that_suit_the_scene(student: Splats, targets: TeacherRenders) -> None:
+    report = recover(student, targets, RecoverConfig(steps=100)).report
+    most = max(trial.psnr for trial in report.trials) - report.psnr.before
+    good = [t for t in report.trials if t.psnr - report.psnr.before >= 0.96 * most]
+    assert report.multiplier == max(trial.multiplier for trial in good)
+    assert len(report.trials) >= 2
+    nearly = recover(TEACHER, targets, RecoverConfig(steps=100)).report  # nothing to gain: small steps
+    assert nearly.multiplier == pytest.approx(1 / 3)
+    fixed = RecoverConfig(schedule=replace(TUNED, multiplier=0.7), steps=100)
+    report = recover(student, targets, fixed).report
+    assert (report.multiplier, report.trials) == (0.7, ())
+
+
+def test_layers_as_wide_as_the_sky_do_not_shake_the_image() -> None:
+    targets = TeacherRenders(under_a_sky(TEACHER), around(12, (160, 120)))
+    start = under_a_sky(simplify(TEACHER, 1500).splats)
+    held, free = (
+        recover(
+            start, targets, RecoverConfig(schedule=replace(TUNED, multiplier=1.0, reach=reach), steps=150)
+        )
+        for reach in (None, math.inf)
+    )
+    assert (held.report.reach, free.report.reach) == (pytest.approx(0.0252, rel=1e-2), None)
+    assert held.report.psnr.after > free.report.psnr.after + 0.5
+    moved = [np.abs(done.splats.means - start.means)[-300:].max() for done in (held, free)]
+    assert moved[0] < 0.01 * moved[1]
+
+
+def test_both_engines_limit_the_same_gaussians(student: Splats, targets: TeacherRenders) -> None:
+    tight = replace(TUNED, multiplier=1.0, reach=0.02)
+    fused, torch = (
+        recover(student, targets, RecoverConfig(schedule=tight, steps=30, engine=e)).splats
+        for e in ("fused", "torch")
+    )
+    free = recover(student, targets, RecoverConfig(schedule=replace(tight, reach=math.inf), steps=30)).splats
+    for name in ("means", "scales", "sh0"):
+        ours, theirs = getattr(fused, name), getattr(torch, name)
+        moved = np.linalg.norm(ours - getattr(student.with_sh_degree(fused.sh_degree), name))
+        assert np.linalg.norm(ours - theirs) < 1e-2 * moved, name
+    assert np.linalg.norm(fused.means - student.means) < 0.8 * np.linalg.norm(free.means - student.means)
+
+
+def test_a_start_that_is_nearly_there_takes_small_steps_without_trials(targets: TeacherRenders) -> None:
+    near = replace(TEACHER, sh0=TEACHER.sh0 + np.float32(0.004))
+    report = recover(near, targets, RecoverConfig(recovery_time=0.05)).report
+    assert report.trials == ()
+    assert report.multiplier < 1 / 3
+
+
+@pytest.mark.parametrize("engine", ["fused", "torch"])
+def test_masked_gaussians_are_left_alone(student: Splats, engine: Any) -> None:
+    kept = 20  # columns that count
+
+    class Masked(TeacherRenders):
+        def mask(self, view: int) -> Any:
+            height, width, _ = self[view].shape
+            return np.tile(np.arange(width) < kept, (height, 1))
+
+    views = VIEWS.take(np.arange(2))
+    config = RecoverConfig(steps=12, engine=engine, schedule=replace(TUNED, multiplier=1.0, reach=math.inf))
+    after = recover(student, Masked(TEACHER, views), config).splats
+    strip = replace(views, widths=np.full_like(views.widths, kept))
+    drawn, counted = (visibility(student, v).hits > 0 for v in (views, strip))
+    alone = drawn & ~counted
+    assert alone.sum() > 30
+    assert counted.sum() > 30
+    for name in ("means", "logit_opacities", "sh0"):
+        moved = (getattr(after, name) != getattr(student, name)).reshape(len(student), -1).any(axis=1)
+        assert not moved[alone].any(), name
+        assert moved[counted].mean() > 0.5, name
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock by which every look at it takes a hundredth of a second, on any machine."""
+    ticks = itertools.count()
+    monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic=lambda: next(ticks) / 100))
+
+
+@pytest.mark.usefixtures("clock")
+def test_trials_stop_where_the_clock_is_short(student: Splats, targets: TeacherRenders) -> None:
+    report = recover(student, targets, RecoverConfig(recovery_time=0.05)).report
+    assert report.trials == ()
+    assert report.seconds < 0.3
+
+
+@pytest.mark.usefixtures("clock")
+def test_a_recovery_time_sets_the_horizon(student: Splats, targets: TeacherRenders) -> None:
+    report = recover(student, targets, RecoverConfig(recovery_time=6.0)).report
+    assert 50 < report.steps < 600
+    assert 6.0 <= report.seconds < 6.1
+    assert report.psnr.after > report.psnr.before + 1
+
+
+def test_progress_shows_loss_psnr_and_speed(
+    student: Splats, targets: TeacherRenders, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for share in ("_SHARE", "_FIRST_SHARE"):  # these steps are too short for honest ones
+        monkeypatch.setattr(probe, share, 0.5)
+    seen: list[Any] = []
+    scenes: dict[int, Splats] = {}
+    recover(
+        student,
+        targets,
+        RecoverConfig(steps=60),
+        progress=lambda *a: seen.append(a) if a[0] == "recover" else None,
+        watch=lambda step, _, splats: scenes.update({step: splats()}),
+    )
+    assert [a[1] for a in seen] == list(range(1, 61))
+    assert set(seen[-1][3]) == {"loss", "PSNR", "steps/s"}
+    shown = {tuple(figures["PSNR"].split(" @")) for *_, figures in seen}
+    assert len(shown) > 2
+    for value, step in shown:  # each is of the step it names
+        want = probe.Probe(targets, (0.0, 0.0, 0.0)).all_of(scenes[int(step)])
+        assert float(value) == pytest.approx(want, abs=0.0051)
+
+
+def test_watching_costs_no_time_and_changes_no_bit(student: Splats, targets: TeacherRenders) -> None:
+    counts: list[tuple[int, float]] = []
+
+    def watch(step: int, seconds: float, splats: Any) -> None:
+        time.sleep(0.02)
+        if step == 20:
+            counts.append((len(splats()), seconds))
+
+    plain = recover(student, targets, RecoverConfig(steps=20))
+    watched = recover(student, targets, RecoverConfig(steps=20), watch=watch)
+    assert_same_bits(plain.splats, watched.splats)
+    assert counts[0][0] == len(student)
+    assert counts[0][1] == watched.report.seconds < plain.report.seconds + 0.2
+
+
+def test_a_far_offset_changes_nothing_but_the_offset(student: Splats, targets: TeacherRenders) -> None:
+    far = np.array([447_000.0, 5_411_000.0, 130.0])
+    moved = replace(student, offset=student.offset + far)
+    views = VIEWS.recentred(-far)
+    teacher = replace(TEACHER, offset=TEACHER.offset + far)
+    here = recover(student, targets, RecoverConfig(steps=20)).report.psnr.after
+    there = recover(moved, TeacherRenders(teacher, views), RecoverConfig(steps=20)).report.psnr.after
+    assert there == pytest.approx(here, abs=0.05)
+
+
+def test_nothing_to_do_is_said(student: Splats, targets: TeacherRenders) -> None:
+    with pytest.raises(InputError, match="0 Gaussians"):
+        recover(student.take(slice(0, 0)), targets)
+    with pytest.raises(InputError, match="engine"):
+        recover(student, targets, RecoverConfig(engine="steam"))  # type: ignore[arg-type]
+
+
+def test_a_start_that_cannot_be_bettered_is_kept(targets: TeacherRenders) -> None:
+    ball = checkered_ball(1500)
+    grain = np.random.default_rng(0).normal(0, 1e-3, ball.sh0.shape).astype(np.float32)
+    start = replace(ball, sh0=ball.sh0 + grain)
+    there = TeacherRenders(ball, targets.cameras)
+    done = recover(start, there, RecoverConfig(schedule=replace(TUNED, multiplier=3**0.5), steps=5))
+    assert done.report.kept_start
+    np.testing.assert_array_equal(done.splats.means, start.means)
+    np.testing.assert_array_equal(done.splats.sh0, start.sh0)
+    assert done.report.psnr.after == done.report.psnr.before < 100
+    calm = recover(start, there, RecoverConfig(steps=100)).report
+    assert calm.multiplier < 0.3
+
+
+WILD = replace(TUNED, multiplier=20.0, reach=math.inf)
+"""Rates that no scene bears."""
+
+
+def test_what_loses_goes_back_and_on_with_smaller_steps(targets: TeacherRenders) -> None:
+    start = simplify(TEACHER, 1500).splats
+    done = recover(start, targets, RecoverConfig(schedule=WILD, steps=100)).report
+    assert [found.step for found in done.backed_off][:2] == [10, 30]
+    assert done.multiplier == pytest.approx(20 / 3 ** len(done.backed_off))
+    assert done.psnr.after > done.psnr.before + 1
+    assert not done.kept_start
+    told = outcome(done)
+    assert told is not None
+    assert told.startswith(f"recovery fell to {done.backed_off[0].psnr:.2f} dB (start ")
+
+
+def test_a_resume_after_going_back_is_never_having_stopped(targets: TeacherRenders, tmp_path: Path) -> None:
+    start = simplify(TEACHER, 1500).splats
+    config = RecoverConfig(schedule=replace(WILD, multiplier=6.0), steps=60)
+    whole = recover(start, targets, config)
+    assert whole.report.backed_off
+    for step in (9, 35, 58):
+        checkpoint = tmp_path / f"{step}.npz"
+        with pytest.raises(KeyboardInterrupt):
+            recover(start, targets, config, checkpoint=checkpoint, progress=_StopAt(step))
+        resumed = recover(start, targets, config, checkpoint=checkpoint)
+        assert_same_bits(whole.splats, resumed.splats)
+        for key in ("backed_off", "multiplier", "psnr", "stopped", "blend"):
+            assert getattr(whole.report, key) == getattr(resumed.report, key), key
+
+
+def test_a_hopeless_recovery_stops_early_and_says_so(targets: TeacherRenders) -> None:
+    grain = np.random.default_rng(0).normal(0, 1e-3, TEACHER.sh0.shape).astype(np.float32)
+    start = replace(TEACHER, sh0=TEACHER.sh0 + grain)
+    done = recover(start, targets, RecoverConfig(schedule=WILD, steps=100))
+    assert done.report.kept_start
+    assert done.report.steps == done.report.stopped == 75
+    assert_same_bits(done.splats, start)
+    told = outcome(done.report)
+    assert told is not None
+    assert told.startswith("kept the simplified scene: recovery fell to ")
+    assert told.endswith("given up at step 75")
+
+
+def test_of_a_way_that_ends_too_low_the_first_part_is_gone() -> None:
+    ball = checkered_ball(50)
+    end = replace(ball, means=ball.means + 4, quats=-ball.quats, scales=ball.scales * 16)
+    half = blended(ball, end, 0.5)
+    np.testing.assert_allclose(half.means, ball.means + 2, rtol=1e-5)
+    np.testing.assert_allclose(half.scales, ball.scales * 4, rtol=1e-5)
+    norm = np.linalg.norm(ball.quats, axis=1, keepdims=True)
+    np.testing.assert_allclose(np.abs(half.quats), np.abs(ball.quats / norm), atol=1e-6)
+
+    def score(scene: Splats) -> float:  # best at a third of the way
+        return -abs(float(scene.means.mean()) - float(ball.means.mean()) - 4 / 3)
+
+    guard = Guard(score, ball, score(ball))
+    part, value, way = guard.judge(end)
+    assert way == 0.5
+    np.testing.assert_array_equal(part.means, half.means)
+    assert value > guard.before
+    assert Guard(score, ball, 0.0).judge(end)[0] is ball
+
+
+def test_views_of_another_kind_decide_what_stays() -> None:
+    start = checkered_ball(4)
+    end = replace(start, means=start.means + 1)
+    views = np.array([1.0, 5.0, 20.0, 400.0])
+
+    def way(scene: Splats) -> NDArray[np.float64]:
+        return (scene.means - start.means).mean(1).astype(np.float64)
+
+    def guard(training: float, others: Callable[[Splats], float]) -> Guard:
+        return Guard(lambda scene: training * float(way(scene).mean()), start, 0.0, others)
+
+    def doubtful(scene: Splats) -> float:  # what one view has seen costs, what many have pays
+        return float(way(scene) @ [-3, 0.5, 1, 1])
+
+    part, k = guard(10.0, doubtful).settle(end, views, 9)
+    assert k == 5
+    np.testing.assert_allclose(way(part), views / (views + 5), atol=1e-5)
+    gaining = guard(10.0, lambda scene: float(way(scene).mean()))
+    assert gaining.settle(end, views, 9) == (end, 0.0)
+    harm = guard(10.0, lambda scene: -float(way(scene).mean()))
+    assert harm.settle(end, views, 9) == (start, math.inf)
+    half = guard(10.0, lambda scene: -abs(float(way(scene)[0]) - 0.25) - abs(float(way(scene)[3]) - 0.25))
+    part, k = half.settle(end, views, 9)
+    assert k is None
+    np.testing.assert_allclose(way(part), 0.25, atol=1e-5)
+    assert [found["psnr"] for found in half.validation] == pytest.approx([-0.5, -1.5, 0.0], abs=1e-5)
+    alone = Guard(lambda scene: 0.0, start, 0.0)
+    assert alone.settle(end, views, 9) == (end, 0.0)
+
+
+def test_a_recovery_that_other_views_only_lose_by_ends_at_half(targets: TeacherRenders) -> None:
+    """The other views ask for another scene: whatever is learned, they lose."""
+    start = simplify(TEACHER, 1500).splats
+    elsewhere = TeacherRenders(start, around(5, (64, 48), 2.0))
+    done = recover(start, targets, RecoverConfig(steps=100), validation=elsewhere)
+    assert done.report.stopped == done.report.steps == 50
+    assert done.report.kept_start
+    assert_same_bits(done.splats, start)
+    looks = done.report.validation.looks
+    assert [found.step for found in looks] == [0, 10, 30, 50, 50, 50]
+    told = outcome(done.report)
+    assert told is not None
+    assert told.startswith("kept the simplified scene: views of another kind only lost by the steps (")
+
+
+def test_other_views_gain_where_training_views_can_spare_it(student: Splats, tmp_path: Path) -> None:
+    cap = around(40).take(np.arange(8))  # from above alone
+    targets, near = TeacherRenders(TEACHER, cap), TeacherRenders(TEACHER, around(6, (64, 48), 2.0))
+    config = RecoverConfig(steps=100)
+    plain = recover(student, targets, config)
+    held = recover(student, targets, config, validation=near)
+    assert plain.report.validation is None
+    assert held.report.psnr.after >= plain.report.psnr.after - 0.2
+    assert evaluate(held.splats, near).psnr >= evaluate(plain.splats, near).psnr
+    assert held.report.validation.looks[-1].psnr == pytest.approx(evaluate(held.splats, near).psnr, abs=1e-3)
+    checkpoint = tmp_path / "c.npz"
+    with pytest.raises(KeyboardInterrupt):
+        recover(student, targets, config, validation=near, checkpoint=checkpoint, progress=_StopAt(60))
+    with pytest.raises(InputError, match="other options"):
+        recover(student, targets, config, checkpoint=checkpoint)
+    resumed = recover(student, targets, config, validation=near, checkpoint=checkpoint)
+    assert_same_bits(held.splats, resumed.splats)
+    assert held.report.validation == resumed.report.validation
+
+
+def test_both_engines_count_the_same_steps(student: Splats, targets: TeacherRenders) -> None:
+    counts = []
+    for name in ("fused", "torch"):
+        config = RecoverConfig(steps=12, engine=name)  # type: ignore[arg-type]
+        last: list[Any] = []
+        recover(student, targets, config, watch=lambda *told, into=last: into.append(told[2]))
+        counts.append(last[-1].__self__.counts)
+    assert counts[0].max() == 12
+    assert (counts[0] != counts[1]).mean() < 0.01
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"steps": 0},
+        {"steps": -1},
+        {"recovery_time": 0.0},
+        {"recovery_time": float("nan")},
+        {"ssim_weight": 2.0},
+    ],
+)
+def test_refuses_a_horizon_that_is_none(wrong: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        RecoverConfig(**wrong)
+
+
+def test_views_that_see_nothing_of_the_scene_are_refused() -> None:
+    ahead = VIEWS.take([0])
+    behind = replace(TEACHER, means=(TEACHER.means - 99 * ahead.forwards[0]).astype(np.float32))
+    with pytest.raises(
+        InputError,
+        match="recover: none of 1 view sees the scene; the views and the scene must be of one world",
+    ):
+        recover(behind, TeacherRenders(TEACHER, ahead), RecoverConfig(steps=2))

@@ -1,0 +1,119 @@
+"""--device cuda: the gsplat engine, on a GPU where there is one, and its wiring everywhere."""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from g2ard import io
+from g2ard.errors import InputError
+from g2ard.scene.targets import TeacherRenders
+from g2ard.stages.recover import RecoverConfig, gsplat_engine, recover
+from g2ard.stages.recover.losses import l1_ssim, l1_ssim_anywhere
+from g2ard.stages.simplify import simplify
+from helpers.commands import CommandLine, refused
+from helpers.scenes import around, checkered_ball
+from reference import raster as reference
+
+BALL = checkered_ball(1200)
+TARGETS = TeacherRenders(BALL, around(6, (40, 30)))
+
+
+def ready() -> str | None:
+    """Why the GPU tests cannot run here."""
+    if not torch.cuda.is_available():
+        return "torch sees no CUDA device"
+    return None if find_spec("gsplat") else "gsplat is not installed"
+
+
+@pytest.mark.skipif(ready() is not None, reason=ready() or "")
+def test_gsplat_recovers_like_the_cpu() -> None:
+    student = simplify(BALL, 300, method="paper").splats
+    scores = [
+        recover(student, TARGETS, RecoverConfig(steps=60, engine=engine)).report.psnr
+        for engine in ("torch", "gsplat")
+    ]
+    assert scores[0]["before"] == scores[1]["before"]
+    assert scores[1]["after"] == pytest.approx(scores[0]["after"], abs=0.3)
+
+
+def oracle_rasterization(**given: Any) -> tuple[torch.Tensor, None, None]:
+    """What gsplat's documentation says of the arguments, rendered by the naive oracle."""
+    assert given["packed"] is False
+    assert given["colors"].shape[1] == (given["sh_degree"] + 1) ** 2
+    out = reference.render(
+        *(given[k].double() for k in ("means", "quats")),
+        given["scales"].double().log(),
+        torch.logit(given["opacities"].double()),
+        given["colors"][:, :1].double(),
+        given["colors"][:, 1:].double(),
+        viewmat=given["viewmats"][0].double(),
+        K=given["Ks"][0].double(),
+        width=given["width"],
+        height=given["height"],
+        background=tuple(given["backgrounds"][0].tolist()),
+    )
+    return out.image[None].float(), None, None
+
+
+def test_the_engine_hands_gsplat_what_it_documents(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=oracle_rasterization))
+    monkeypatch.setattr(gsplat_engine, "check_cuda", lambda: None)
+    monkeypatch.setattr(gsplat_engine.GsplatEngine, "device", torch.device("cpu"))
+    student = simplify(BALL, 60, method="paper").splats
+    reports = [
+        recover(student, TARGETS, RecoverConfig(steps=4, engine=engine, background=(0.2, 0.4, 0.1))).report
+        for engine in ("torch", "gsplat")
+    ]
+    assert reports[1].loss == pytest.approx(reports[0].loss, abs=1e-4)
+
+
+def test_the_loss_in_plain_torch_is_the_fused_one() -> None:
+    torch.manual_seed(0)
+    target = torch.rand(37, 53, 3)
+    gradients = []
+    for loss in (l1_ssim, l1_ssim_anywhere):
+        image = (
+            0.7 * target + 0.3 * torch.rand(37, 53, 3, generator=torch.Generator().manual_seed(1))
+        ).requires_grad_()
+        value = loss(image, target, 0.3)
+        value.backward()
+        gradients.append((value.detach(), image.grad))
+    assert torch.allclose(gradients[0][0], gradients[1][0], atol=1e-6)
+    assert torch.allclose(gradients[0][1], gradients[1][1], atol=1e-8, rtol=1e-3)  # type: ignore[arg-type]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_without_cuda_one_line_says_so(tmp_path: Path, command_line: CommandLine) -> None:
+    with pytest.raises(InputError, match="torch sees no CUDA device"):
+        recover(BALL, TARGETS, RecoverConfig(steps=1, engine="gsplat"))
+    io.write_splats(tmp_path / "b.ply", BALL)
+    io.write_views(tmp_path / "v.json", TARGETS.cameras)
+    asked = ("recover", "b.ply", "--views", "v.json", "--teacher", "b.ply", "-o", "o.ply", "--device", "cuda")
+    status, _, told = command_line(*asked, cwd=tmp_path)
+    assert status == 1
+    assert "--device cuda: torch sees no CUDA device here; " in told.strip().splitlines()[-1]
+    assert not (tmp_path / "o.ply").exists()
+
+
+def test_a_missing_gsplat_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(gsplat_engine, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"gsplat is not installed \(pip install 'g2ard\[cuda\]'\)"):
+        gsplat_engine.check_cuda()
+
+
+def test_no_cuda_says_what_would_do(command_line: CommandLine, folder: Path) -> None:
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("there is one")
+    ask = ("recover", "ball.ply", "--teacher", "ball.ply", "-o", "o.ply", "--device", "cuda")
+    error = refused(command_line, folder, *ask, status=1)
+    assert "g2ard[cuda]; --device cpu needs none" in error

@@ -1,0 +1,226 @@
+"""Schedules, anchors, regularisers, presets and checkpoints, against the paper or a naive twin."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from g2ard.errors import InputError
+from g2ard.scene.splats import Splats
+from g2ard.stages.recover import checkpoint
+from g2ard.stages.recover.anchors import (
+    PAPER_PRESETS,
+    PRESETS,
+    Anchors,
+    Regularizers,
+    drift95,
+    effective_rank,
+    needle,
+)
+from g2ard.stages.recover.presets import preset_for, view_consistency
+from g2ard.stages.recover.regularize import TorchAnchors, anchor_loss, regularization, shape_loss
+from g2ard.stages.recover.schedule import PAPER, TUNED, schedule_named
+from helpers.scenes import around, checkered_ball
+
+
+def random_splats(n: int = 40, seed: int = 0) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats.create(
+        rng.normal(size=(n, 3)),
+        quats=rng.normal(size=(n, 4)),
+        scales=np.exp(rng.normal(-2, 1, size=(n, 3))),
+        logit_opacities=rng.normal(size=n),
+        sh0=rng.normal(size=(n, 1, 3)),
+    )
+
+
+def naive_rotation(q: np.ndarray) -> np.ndarray:
+    """R v = q v q⁻¹, column by column."""
+
+    def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        w = a[0] * b[0] - a[1:] @ b[1:]
+        return np.concatenate([[w], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])])
+
+    q = q.astype(np.float64) / np.linalg.norm(q.astype(np.float64))
+    conjugate = q * [1, -1, -1, -1]
+    return np.stack([product(product(q, np.r_[0.0, e]), conjugate)[1:] for e in np.eye(3)], axis=1)
+
+
+def test_tuned_rates_follow_a_cosine_to_one_percent() -> None:
+    first, half, last = (TUNED.at(t, final=True) for t in (0, 0.5, 1))
+    assert first == TUNED.rates
+    assert half.means == pytest.approx(TUNED.rates.means * 0.505)
+    assert last.shN == pytest.approx(TUNED.rates.shN * 0.01)
+
+
+def test_paper_decays_appearance_only_and_differently_in_rounds() -> None:
+    end_of_round, end = PAPER.at(1, final=False), PAPER.at(1, final=True)
+    assert end_of_round.means == end.means == 9.2e-4
+    assert end_of_round.sh0 == pytest.approx(0.36 * 2.5e-3)
+    assert end.logit_opacities == pytest.approx(0.1 * 5e-3)
+    with pytest.raises(InputError, match="schedule"):
+        schedule_named("hasty")
+
+
+def test_anchor_frames_put_the_thinnest_axis_last() -> None:
+    splats = random_splats()
+    anchors = Anchors.of(splats)
+    for i in range(len(splats)):
+        R, order = naive_rotation(splats.quats[i]), np.argsort(-splats.scales[i])
+        np.testing.assert_allclose(anchors.frames[i], R[:, order], atol=1e-6)
+        s = splats.scales[i][order]
+        assert anchors.r_perp[i] == s[2]
+        assert anchors.r_parallel[i] == pytest.approx(1.5 * (s[0] + s[1]), rel=1e-6)
+
+
+def test_drift_is_counted_in_thicknesses_along_the_normal() -> None:
+    splats = random_splats(200)
+    anchors = Anchors.of(splats)
+    tangent = anchors.means + 5 * anchors.r_perp[:, None] * anchors.frames[:, :, 0]
+    normal = anchors.means + 5 * anchors.r_perp[:, None] * anchors.frames[:, :, 2]
+    assert drift95(anchors, tangent) < 0.05
+    assert drift95(anchors, normal) == pytest.approx(5, rel=1e-2)
+    assert drift95(anchors, anchors.means) == 0
+
+
+def test_effective_rank_and_needle_share() -> None:
+    scales = np.array([[1, 1, 1], [1, 1, 1e-6], [1, 1e-3, 1e-3]], np.float32)
+    assert effective_rank(scales) == pytest.approx([3, 2, 1], abs=0.02)
+    assert needle(scales) == pytest.approx(1 / 3)
+
+
+def naive_losses(
+    splats: Splats, means: np.ndarray, log_scales: np.ndarray, quats: np.ndarray
+) -> tuple[float, float]:
+    """`eq:anchor` and `eq:shape`, one Gaussian at a time in float64."""
+    anchor = shape = 0.0
+    for i in range(len(splats)):
+        frame, s0 = naive_rotation(splats.quats[i]), splats.scales[i].astype(np.float64)
+        t1, t2, n = np.argsort(-s0)
+        d = frame.T @ (means[i] - splats.means[i].astype(np.float64))
+        parallel, perp = 3 * (s0[t1] + s0[t2]) / 2, s0[n]
+        excess = (d[t1] ** 2 + d[t2] ** 2) / parallel**2 + d[n] ** 2 / perp**2 - 1
+        anchor += math.log1p(max(0.0, excess))
+        s, R = np.exp(log_scales[i]), naive_rotation(quats[i])
+        thick = math.sqrt(frame[:, n] @ R @ np.diag(s**2) @ R.T @ frame[:, n])
+        q = s / s.sum()
+        rank = math.exp(-(q * np.log(q)).sum())
+        shape += max(0.0, -math.log(rank - 1 + 1e-6)) + max(0.0, math.log(thick) - math.log(perp))
+    return anchor / len(splats), shape / len(splats)
+
+
+def moved(splats: Splats, seed: int = 1) -> list[torch.Tensor]:
+    rng = np.random.default_rng(seed)
+    means = splats.means + rng.normal(size=splats.means.shape) * splats.scales.max(1, keepdims=True) * 2
+    log_scales = splats.log_scales + rng.normal(size=splats.scales.shape)
+    quats = splats.quats + 0.3 * rng.normal(size=splats.quats.shape)
+    return [torch.tensor(a, dtype=torch.float64, requires_grad=True) for a in (means, log_scales, quats)]
+
+
+def double_anchors(splats: Splats) -> TorchAnchors:
+    anchors = TorchAnchors(Anchors.of(splats))
+    for name, value in vars(anchors).items():
+        setattr(anchors, name, value.double())
+    return anchors
+
+
+def test_regularisers_equal_their_naive_twins() -> None:
+    splats = random_splats()
+    means, log_scales, quats = moved(splats)
+    anchors = double_anchors(splats)
+    anchor, shape = naive_losses(splats, *(t.detach().numpy() for t in (means, log_scales, quats)))
+    assert anchor_loss(means, anchors).item() == pytest.approx(anchor, rel=1e-4)
+    assert shape_loss(
+        log_scales, quats, anchors, Regularizers(0.5, 0.25, effective_rank=True)
+    ).item() == pytest.approx(shape, rel=1e-4)
+    both = regularization(means, quats, log_scales, anchors, Regularizers(0.5, 0.25, effective_rank=True))
+    assert both.item() == pytest.approx(0.5 * anchor + 0.25 * shape, rel=1e-4)
+
+
+def test_regulariser_gradients_equal_finite_differences() -> None:
+    splats = random_splats(6)
+    means, log_scales, quats = moved(splats)
+    anchors = double_anchors(splats)
+    weights = Regularizers(1.0, 1.0, effective_rank=True)
+    assert torch.autograd.gradcheck(
+        lambda m, q, s: regularization(m, q, s, anchors, weights),
+        (means, quats, log_scales),
+        eps=1e-7,
+        atol=1e-5,
+    )
+
+
+def test_inside_the_trust_region_nothing_pulls() -> None:
+    splats = random_splats()
+    anchors = double_anchors(splats)
+    inside = (
+        torch.tensor(splats.means, dtype=torch.float64)
+        + 0.5 * anchors.r_perp[:, None] * anchors.frames[:, :, 2]
+    )
+    assert anchor_loss(inside, anchors).item() == 0
+
+
+def test_auto_preset_tells_lift_trained_and_noisy_apart() -> None:
+    trained = random_splats()
+    lift = Splats.create(trained.means, scales=np.tile([1.0, 1.0, 0.1], (40, 1)))
+    noisy = Splats.create(
+        trained.means, scales=np.tile([1.0, 1e-3, 1e-3], (40, 1)), logit_opacities=trained.logit_opacities
+    )
+    round_ = Splats.create(trained.means, scales=np.ones((40, 3)), logit_opacities=trained.logit_opacities)
+    assert preset_for("auto", lift)[0] == PRESETS["lift"]
+    assert preset_for("auto", noisy)[0] == PRESETS["noisy"]
+    assert preset_for("auto", round_)[0] == PRESETS["trained"]
+    weights, why, measured = preset_for("lift", noisy)
+    assert weights == PRESETS["lift"]
+    assert why == "lift (as asked)"
+    assert preset_for("auto", lift, paper=True)[0] == PAPER_PRESETS["lift"] == Regularizers(1e-3, 1e-4, True)
+    assert measured.needle == 1
+    assert measured.consistency is None
+    with pytest.raises(InputError, match="preset"):
+        preset_for("gentle", trained)
+
+
+def test_views_that_see_through_each_other_s_surfaces_make_a_prior_noisy() -> None:
+    ball, views = checkered_ball(), around(40, (96, 72))
+    rng = np.random.default_rng(0)
+    strewn = ball.means.copy()
+    rows = rng.permutation(len(ball))[:1200]
+    strewn[rows] = rng.normal(0, 0.8, (1200, 3))
+    foggy = replace(ball, means=strewn, logit_opacities=np.full(len(ball), 3, np.float32))
+    sound, loose = view_consistency(ball, views), view_consistency(foggy, views)
+    assert sound is not None
+    assert loose is not None
+    assert loose < 0.92 < 0.97 < sound
+    assert preset_for("auto", ball, views)[0] == PRESETS["trained"]
+    weights, why, _ = preset_for("auto", foggy, views)
+    assert weights == PRESETS["noisy"]
+    assert "see through" in why
+    far = np.array([447_000.0, 5_411_000.0, 130.0])
+    moved = view_consistency(replace(ball, offset=ball.offset + far), views.recentred(-far))
+    assert moved == pytest.approx(sound, abs=0.01)
+    assert view_consistency(ball, views.take([0])) is None
+
+
+def test_a_scaled_schedule_keeps_its_proportions() -> None:
+    small = schedule_named("paper", 3000)
+    assert (small.steps, small.round_steps) == (3000, 800)
+    assert small.rates == PAPER.rates
+    assert schedule_named("fast", 50).round_steps == 0
+
+
+def test_checkpoint_round_trips_and_refuses_another_run(tmp_path: Path) -> None:
+    path = tmp_path / "c.npz"
+    checkpoint.save(path, "mine", {"done": 3}, {"a": np.arange(4.0)})
+    meta, arrays = checkpoint.load(path, "mine")
+    assert meta == {"done": 3}
+    np.testing.assert_array_equal(arrays["a"], np.arange(4.0))
+    with pytest.raises(InputError, match="another scene or other options"):
+        checkpoint.load(path, "yours")
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(InputError, match="not a checkpoint"):
+        checkpoint.load(path, "mine")

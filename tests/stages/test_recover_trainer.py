@@ -1,0 +1,323 @@
+"""The fused trainer does what rasterize + l1_ssim + torch's Adam do, to rounding; sparse and resumable."""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.errors import InputError
+from g2ard.rendering.renderer import RasterSettings, view_of
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.extent import extents, share_of_rate
+from g2ard.stages.recover.losses import l1_ssim
+from g2ard.stages.recover.rasterize import rasterize
+from g2ard.stages.recover.regularize import TorchAnchors, regularization
+from g2ard.stages.recover.schedule import Rates
+from helpers.raster_cases import NAMES, Params, camera, scene, tensors_of
+
+RATES = {"means": 2e-3, "quats": 1e-2, "log_scales": 2e-2, "logit_opacities": 5e-2, "sh0": 2e-2, "shN": 2e-3}
+BACKGROUND = [0.1, 0.2, 0.3]
+SETTINGS = RasterSettings()
+
+
+def arrays(p: Params) -> tuple[NDArray[np.float32], ...]:
+    return tuple(p[k] for k in NAMES)
+
+
+def trainer_of(p: Params, units: NDArray[np.float32] | None = None, isa: str | None = None) -> _core.Trainer:
+    return _core.Trainer(arrays(p), units, isa)
+
+
+def step(
+    trainer: _core.Trainer, v: Cameras, target: Any, regularizers: Any = None, reach: float | None = None
+) -> tuple[float, int]:
+    view = view_of(v, 0, SETTINGS)
+    rates = Rates(**RATES)
+    return trainer.step(view, SETTINGS, BACKGROUND, target, 0.2, rates, regularizers, None, reach)
+
+
+def problem(n: int = 200, degree: int = 3, views: int = 3) -> tuple[Params, list[Cameras], list[Any]]:
+    rng = np.random.default_rng(1)
+    p = scene(7, n, degree, size=0.15, spread=0.5)
+    cameras = [camera(56, 40, seed=s) for s in range(views)]
+    targets = [rng.random((40, 56, 3)).astype(np.float32) for _ in cameras]
+    return p, cameras, targets
+
+
+def naive_shares(p: dict[str, NDArray[Any]], cameras: Cameras, reach: float) -> dict[str, NDArray[Any]]:
+    """1/(1 + (σ/reach)¹⁶) in float64, one Gaussian at a time: σ by the eigenvalues of J W R S Sᵀ Rᵀ Wᵀ Jᵀ."""
+    W, K = cameras.viewmats[0], cameras.Ks[0]
+    size = np.array([cameras.widths[0], cameras.heights[0]])
+    focal = np.array([K[0, 0], K[1, 1]])
+    low, high = (-K[:2, 2] - 0.15 * size) / focal, (size - K[:2, 2] + 0.15 * size) / focal
+    whole, own = np.ones((len(p["means"]), 1)), np.ones((len(p["means"]), 3))
+    for i in range(len(whole)):
+        x, y, z = W[:3, :3] @ p["means"][i] + W[:3, 3]
+        if z < SETTINGS.near_of(0):
+            continue
+        u, v = np.clip([x / z, y / z], low, high)
+        J = np.array([[focal[0] / z, 0, -focal[0] * u / z], [0, focal[1] / z, -focal[1] * v / z]])
+        a, b, c, d = p["quats"][i] / np.linalg.norm(p["quats"][i])
+        q = np.array([[0, -d, c], [d, 0, -b], [-c, b, 0]])
+        R = np.eye(3) + 2 * a * q + 2 * q @ q
+        M = J @ W[:3, :3] @ R @ np.diag(np.exp(p["log_scales"][i]))
+        whole[i] = 1 / (1 + (math.sqrt(np.linalg.eigvalsh(M @ M.T)[1]) / reach) ** 16)
+        own[i] = 1 / (1 + (np.linalg.norm(M, axis=0) / reach) ** 16)
+    return {"means": whole, "quats": whole, "log_scales": own}
+
+
+class Twin:
+    """Torch's step, but only for rows with a gradient, each with its own count: Adam in float64."""
+
+    def __init__(self, p: Params, units: NDArray[np.float32] | None = None) -> None:
+        self.p = {k: v.astype(np.float64) for k, v in p.items()}
+        self.m = {k: np.zeros_like(v) for k, v in self.p.items()}
+        self.v = {k: np.zeros_like(v) for k, v in self.p.items()}
+        self.t = np.zeros(len(p["means"]))
+        self.units = np.ones(len(self.t)) if units is None else units.astype(np.float64)
+
+    def step(self, cameras: Cameras, target: Any, extra: Any = None, reach: float = math.inf) -> float:
+        shares = naive_shares(self.p, cameras, reach)
+        mine = tensors_of({k: v.astype(np.float32) for k, v in self.p.items()})
+        image, _, _ = rasterize(*mine, cameras, 0, background=BACKGROUND, settings=SETTINGS)
+        loss = l1_ssim(image, torch.from_numpy(target), 0.2)
+        total = loss if extra is None else loss + extra(dict(zip(NAMES, mine, strict=True)))
+        total.backward()
+        grads = {k: m.grad.double().numpy() for k, m in zip(NAMES, mine, strict=True) if m.grad is not None}
+        rows = np.zeros(len(self.t), bool)
+        for g in grads.values():
+            rows |= (g.reshape(len(g), -1) != 0).any(1) if g.size else False
+        self.t += rows
+        for k, g in grads.items():
+            r = rows.reshape(-1, *[1] * (g.ndim - 1))
+            t = np.maximum(self.t, 1).reshape(r.shape)
+            self.m[k] = np.where(r, 0.9 * self.m[k] + 0.1 * g, self.m[k])
+            self.v[k] = np.where(r, 0.999 * self.v[k] + 0.001 * g * g, self.v[k])
+            m, v = self.m[k] / (1 - 0.9**t), self.v[k] / (1 - 0.999**t)
+            unit = self.units.reshape(r.shape) if k == "means" else 1.0
+            unit = unit * shares.get(k, 1.0)
+            self.p[k] = np.where(r, self.p[k] - RATES[k] * unit * m / (np.sqrt(v) + 1e-15), self.p[k])
+        return loss.item()
+
+
+def assert_close(
+    got: list[NDArray[np.float32]], want: dict[str, NDArray[Any]], start: Params, to: float
+) -> None:
+    for name, a in zip(NAMES, got, strict=True):
+        if not a.size:
+            continue
+        moved = np.linalg.norm(want[name] - start[name])
+        # Adam turns a gradient lost in rounding into a full step: a few rows may differ, most may not.
+        close = np.abs(a - want[name]) <= to * np.maximum(np.abs(want[name] - start[name]), RATES[name])
+        assert close.mean() > 0.99, f"{name}: {1 - close.mean():.4f} of the values differ"
+        assert np.linalg.norm(a - want[name]) < 0.1 * moved, name
+
+
+@pytest.mark.parametrize("isa", _core.instruction_sets())
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_steps_are_torch_s(degree: int, isa: str) -> None:
+    p, cameras, targets = problem(degree=degree)
+    units = np.exp(p["log_scales"]).max(1)
+    trainer, twin = trainer_of(p, units, isa), Twin(p, units)
+    for i in range(6):
+        loss, updated = step(trainer, cameras[i % 3], targets[i % 3])
+        want = twin.step(cameras[i % 3], targets[i % 3])
+        assert abs(loss - want) < 1e-4
+        assert 0 < updated <= len(p["means"])
+    assert_close(trainer.arrays(), twin.p, p, to=2e-2)
+    assert trainer.skipped == 0
+
+
+@pytest.mark.parametrize("isa", _core.instruction_sets())
+def test_what_is_large_in_a_view_moves_less(isa: str) -> None:
+    p, cameras, targets = problem()
+    p["log_scales"][::7] += 2
+    p["log_scales"][::7, 1] -= 9
+    reach = 3.0
+    shares = naive_shares(p, cameras[0], reach)
+    assert all((share < 0.2).mean() > 0.1 and (share > 0.8).mean() > 0.1 for share in shares.values())
+    assert ((shares["log_scales"] > 0.9) & (shares["means"] < 0.1)).any()
+    trainer, twin = trainer_of(p, isa=isa), Twin(p)
+    for i in range(6):
+        step(trainer, cameras[i % 3], targets[i % 3], reach=reach)
+        twin.step(cameras[i % 3], targets[i % 3], reach=reach)
+    assert_close(trainer.arrays(), twin.p, p, to=2e-2)
+    free = trainer_of(p, isa=isa)
+    step(free, cameras[0], targets[0])
+    limited = trainer_of(p, isa=isa)
+    step(limited, cameras[0], targets[0], reach=reach)
+    for name, a, b in zip(NAMES, limited.arrays(), free.arrays(), strict=True):
+        if name in shares:  # the first step of Adam is the rate itself
+            want = shares[name] * (b - p[name])
+            assert np.abs(a - p[name] - want).max() < 1e-4 * RATES[name] + 1e-6, name
+        else:
+            assert np.array_equal(a, b), name
+
+
+def test_sizes_on_the_screen_are_the_naive_ones() -> None:
+    p, cameras, _ = problem()
+    p["means"][::9] *= 20  # some far off the image, some behind the camera
+    p["log_scales"][::5, 2] = -25
+    tensors = [torch.from_numpy(p[k].astype(np.float64)) for k in ("means", "quats", "log_scales")]
+    largest, axes = extents(*tensors, cameras[0], 0, SETTINGS.near_of(0))
+    want = naive_shares(p, cameras[0], 3.0)
+    np.testing.assert_allclose(share_of_rate(largest, 3.0)[:, None], want["means"], rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(share_of_rate(axes, 3.0), want["log_scales"], rtol=1e-4, atol=1e-12)
+
+
+def test_dense_steps_are_torch_optim_s() -> None:
+    """With every Gaussian in view, sparse Adam is `torch.optim.Adam`."""
+    p, cameras, targets = problem(n=60)
+    p["means"] *= 0.5
+    p["logit_opacities"] = np.abs(p["logit_opacities"])
+    p["sh0"] = np.abs(
+        p["sh0"]
+    )  # a colour clamped at 0 gets no gradient, and dense Adam goes on with its momentum
+    p["shN"] *= 0
+    mine = tensors_of(copy.deepcopy(p))  # the optimiser writes into them
+    groups = [{"params": [m], "lr": RATES[k]} for k, m in zip(NAMES, mine, strict=True)]
+    adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)
+    trainer = trainer_of(p)
+    for _ in range(4):
+        adam.zero_grad()
+        image, _, _ = rasterize(*mine, cameras[0], 0, background=BACKGROUND)
+        l1_ssim(image, torch.from_numpy(targets[0]), 0.2).backward()
+        adam.step()
+        _, updated = step(trainer, cameras[0], targets[0])
+        assert updated == 60
+    want = {k: m.detach().double().numpy() for k, m in zip(NAMES, mine, strict=True)}
+    assert_close(trainer.arrays(), want, p, to=2e-2)
+
+
+def test_untouched_gaussians_do_not_move() -> None:
+    p, cameras, targets = problem()
+    p["means"][:50] += 100
+    trainer = trainer_of(p)
+    for _ in range(3):
+        _, updated = step(trainer, cameras[0], targets[0])
+        assert updated <= 150
+    for name, a in zip(NAMES, trainer.arrays(), strict=True):
+        assert np.array_equal(a[:50], p[name][:50])
+    assert not np.array_equal(trainer.arrays()[0][50:], p["means"][50:])
+
+
+def test_resume_is_bitwise() -> None:
+    p, cameras, targets = problem()
+    straight = trainer_of(p, np.full(200, 0.5, np.float32))
+    for i in range(6):
+        step(straight, cameras[i % 3], targets[i % 3])
+        if i == 2:
+            state = copy.deepcopy(straight.state())
+            middle = dict(zip(NAMES, straight.arrays(), strict=True))
+    resumed = trainer_of(middle)
+    resumed.load(state)
+    for i in range(3, 6):
+        step(resumed, cameras[i % 3], targets[i % 3])
+    for key, value in straight.state().items():
+        assert value.tobytes() == resumed.state()[key].tobytes(), key
+
+
+def test_bits_do_not_depend_on_threads() -> None:
+    p, cameras, targets = problem(n=5000)
+    before = _core.num_threads()
+    try:
+        states = []
+        for threads in (1, 2, 8):
+            _core.set_num_threads(threads)
+            trainer = trainer_of(p)
+            losses = [step(trainer, cameras[i], targets[i])[0] for i in range(3)]
+            states.append((losses, {k: v.tobytes() for k, v in trainer.state().items()}))
+    finally:
+        _core.set_num_threads(before)
+    assert states[0] == states[1] == states[2]
+
+
+@pytest.mark.parametrize(
+    "weights",
+    [
+        Regularizers(5.0, 0.0, False),
+        Regularizers(0.0, 3.0, False),
+        Regularizers(0.0, 3.0, True),
+        Regularizers(5, 3, True),
+        Regularizers(5, 3, True, thickness=0.2, rank_offset=1e-2),
+        Regularizers(0, 3, True, thickness=0.0),
+    ],
+)
+def test_regularizers_are_torch_s(weights: Regularizers) -> None:
+    """From a scene that has left its anchors, needles among it: the step is that of the summed gradient."""
+    p, cameras, targets = problem(n=100, degree=0)
+    splats = Splats(
+        means=p["means"],
+        quats=p["quats"],
+        scales=np.exp(p["log_scales"]),
+        logit_opacities=p["logit_opacities"],
+        sh0=p["sh0"],
+        shN=p["shN"],
+    )
+    anchors = Anchors.of(splats)
+    rng = np.random.default_rng(3)
+    p["means"] += (0.3 * rng.normal(size=p["means"].shape)).astype(np.float32)
+    p["log_scales"] += rng.normal(size=p["log_scales"].shape).astype(np.float32)
+    p["log_scales"][::5, 1:] -= 6
+    p["quats"] += (0.3 * rng.normal(size=p["quats"].shape)).astype(np.float32)
+    torch_anchors = TorchAnchors(anchors)
+
+    def extra(q: dict[str, torch.Tensor]) -> torch.Tensor:
+        return regularization(q["means"], q["quats"], q["log_scales"], torch_anchors, weights)
+
+    trainer, twin = trainer_of(p), Twin(p)
+    trainer.anchor(anchors.means, np.ascontiguousarray(anchors.frames), anchors.r_parallel, anchors.r_perp)
+    for i in range(3):
+        step(trainer, cameras[i], targets[i], weights)
+        twin.step(cameras[i], targets[i], extra)
+    assert_close(trainer.arrays(), twin.p, p, to=3e-2)
+    # The moments hold the gradients themselves: they show the scale that Adam's steps hide.
+    first = trainer.state()["first"].reshape(100, -1)
+    for name, columns in (("means", slice(0, 3)), ("quats", slice(3, 7)), ("log_scales", slice(7, 10))):
+        error = np.linalg.norm(first[:, columns] - twin.m[name]) / np.linalg.norm(twin.m[name])
+        assert error < 2e-3, f"{name}: {error}"
+
+
+def test_gradients_that_are_not_finite_are_skipped_and_counted() -> None:
+    p, cameras, targets = problem(n=50)
+    target = targets[0].copy()
+    target[20, 28] = np.nan
+    trainer = trainer_of(p)
+    _, updated = step(trainer, cameras[0], target)
+    assert trainer.skipped > 0
+    assert updated + trainer.skipped <= 50
+    assert all(np.isfinite(a).all() for a in trainer.arrays())
+
+
+def test_hundreds_of_steps_stay_finite_and_learn() -> None:
+    p, cameras, targets = problem(n=300)
+    flat = [np.full_like(t, 0.4) for t in targets]
+    trainer = trainer_of(p)
+    losses = [step(trainer, cameras[i % 3], flat[i % 3])[0] for i in range(300)]
+    assert losses[-1] < 0.25 * losses[0]
+    assert all(np.isfinite(a).all() for a in trainer.arrays())
+
+
+def test_bad_input_is_named() -> None:
+    p, cameras, targets = problem(n=10)
+    with pytest.raises(InputError, match="target: expected 6720 values"):
+        step(trainer_of(p), cameras[0], targets[0][:5])
+    with pytest.raises(InputError, match="anchors set before"):
+        step(trainer_of(p), cameras[0], targets[0], Regularizers(1.0, 1.0, True))
+    with pytest.raises(InputError, match="reach: expected pixels, more than 0"):
+        step(trainer_of(p), cameras[0], targets[0], reach=0.0)
+    with pytest.raises(InputError, match="units: expected 10 values"):
+        trainer_of(p, np.ones(9, np.float32))
+    state = trainer_of(p).state()
+    state["order"][:] = 0
+    with pytest.raises(InputError, match="order: expected a permutation"):
+        trainer_of(p).load(state)

@@ -1,0 +1,358 @@
+"""Photos registered: what is kept, what is refused, how it is scored, and the command's contract."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import g2ard
+from g2ard.errors import InputError
+from g2ard.io import ace, read_views, write_splats, write_views
+from g2ard.policy.register import matched, photos_of, read_poses
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.images import write_png
+from g2ard.stages.register import PhotoReport, PoseError, RegisterConfig, pose_error, register
+from g2ard.stages.register.score import summarize
+from helpers.commands import CommandLine
+from helpers.registration import off
+from helpers.scenes import around, checkered_ball
+
+CONFIG = RegisterConfig(size=128, coarsest=32)
+SIZE = (128, 96)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene, photos of it under other light, the true views, and coarse poses as ACE writes them."""
+    folder = tmp_path_factory.mktemp("site")
+    ball = checkered_ball(1500)
+    write_splats(folder / "scene.ply", ball)
+    views = around(4, SIZE, 2.5)
+    renderer = g2ard.Renderer(ball)
+    (folder / "photos").mkdir()
+    lines = ["# name qw qx qy qz tx ty tz error"]
+    for i, view in enumerate(views):
+        write_png(folder / f"photos/{view.name}.png", np.clip(0.8 * renderer.image(view) + 0.05, 0, 1))
+        pose = off(view.viewmat, 0.08, 2, i)
+        w, x, y, z = _quaternion(pose[:3, :3])
+        lines.append(" ".join(map(str, (f"{view.name}.png", w, x, y, z, *pose[:3, 3], 0.1))))
+    (folder / "coarse.txt").write_text("\n".join(lines) + "\n")
+    paths = tuple(folder / f"photos/{name}.png" for name in views.names)
+    views = Cameras.of([Cameras.of([v])[0] for v in views])
+    write_views(folder / "truth.json", views)
+    pictured = Cameras(
+        views.viewmats, views.Ks, views.widths, views.heights, tuple(p.name for p in paths), paths
+    )
+    write_views(folder / "views.json", pictured)
+    return folder
+
+
+def _quaternion(R: np.ndarray) -> list[float]:
+    """wxyz, by the eigenvector of the largest eigenvalue of a symmetric 4×4 matrix (Bar-Itzhack)."""
+    q = np.array(
+        [
+            [R[0, 0] - R[1, 1] - R[2, 2], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[2, 1] - R[1, 2]],
+            [R[0, 1] + R[1, 0], R[1, 1] - R[0, 0] - R[2, 2], R[1, 2] + R[2, 1], R[0, 2] - R[2, 0]],
+            [R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], R[2, 2] - R[0, 0] - R[1, 1], R[1, 0] - R[0, 1]],
+            [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], np.trace(R)],
+        ]
+    )
+    x, y, z, w = np.linalg.eigh(q)[1][:, -1]
+    return [w, x, y, z]
+
+
+def test_poses_as_text_are_camera_from_world(site: Path) -> None:
+    found, truth = ace.read(site / "coarse.txt"), read_poses(site / "truth.json")
+    for i, (name, pose) in enumerate(found.items()):
+        np.testing.assert_allclose(pose, off(truth[name.removesuffix(".png")], 0.08, 2, i), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a 1 0 0 0 1 2", "line 1: expected a name"),
+        ("a 1 0 0 0 1 2 nan", "line 1: expected a name"),
+        ("a 0 0 0 0 1 2 3", "line 1: expected a name"),
+        ("a 1 0 0 0 1 2 3\n\na 1 0 0 0 1 2 3", "line 3: a comes twice"),
+        ("# nothing\n", "no poses found"),
+    ],
+)
+def test_text_that_holds_no_poses_is_refused(text: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "p.txt").write_text(text)
+    with pytest.raises(InputError, match=words):
+        ace.read(tmp_path / "p.txt")
+
+
+def test_names_match_whole_then_by_unambiguous_stems() -> None:
+    assert matched({"a/1.png": 1, "b/1.png": 2}, ["1.png"]) == {}
+    assert matched({"a/1.png": 1, "2": 2}, ["a/1.png", "x/2.jpg", "y/2.jpg"]) == {"a/1.png": 1}
+    assert matched({"1": 1}, ["s/1.jpg"]) == {"s/1.jpg": 1}
+
+
+def test_a_broken_photo_is_one_refused_row(site: Path, tmp_path: Path) -> None:
+    views = read_views(site / "views.json").take([0, 1])
+    (tmp_path / "broken.png").write_bytes(b"\x89PNG nothing")
+    views = Cameras.of([views[0], *(Cameras.of([views[1]]))])
+    broken = Cameras(
+        views.viewmats,
+        views.Ks,
+        views.widths,
+        views.heights,
+        views.names,
+        (views.image_paths[0], tmp_path / "broken.png"),
+    )
+    truth = dict(zip(views.names, views.viewmats, strict=True))
+    starts = {name: off(pose, 0.05, 1, 0) for name, pose in truth.items()}
+    found = register(checkered_ball(1500), broken, starts=starts, truth=truth, config=CONFIG)
+    good, bad = found.report.photos
+    assert good.status == "registered"
+    assert good.error is not None
+    assert good.error.position < 0.002 < (good.start_error or good.error).position
+    assert bad.status == "refused"
+    assert "not an image" in (bad.reason or "")
+    assert found.cameras.names == (views.names[0],)
+    assert pose_error(found.cameras.viewmats[0], views.viewmats[0])[1] < 0.1
+
+
+def test_a_photo_of_something_else_is_refused(site: Path, tmp_path: Path) -> None:
+    views = read_views(site / "views.json").take([0])
+    noise = np.random.default_rng(0).random((12, 16, 3)).repeat(8, 0).repeat(8, 1)
+    write_png(tmp_path / "other.png", noise)
+    other = Cameras(
+        views.viewmats, views.Ks, views.widths, views.heights, views.names, (tmp_path / "other.png",)
+    )
+    found = register(
+        checkered_ball(1500),
+        other,
+        starts={views.names[0]: views.viewmats[0]},
+        config=CONFIG,
+        keep="uncertain",
+    )
+    assert found.report.photos[0].status == "refused"
+    assert "ZNCC" in (found.report.photos[0].reason or "")
+    assert len(found.cameras) == 0
+
+
+def test_a_pool_gives_starts_by_rank(site: Path) -> None:
+    """Four poses beside the true ones: each photo starts from its own neighbour and ends at the truth."""
+    views = read_views(site / "views.json")
+    truth = dict(zip(views.names, views.viewmats, strict=True))
+    near = [off(pose, 0.08, 2, i) for i, pose in enumerate(views.viewmats)]
+    pool = Cameras.from_lists(near, views.Ks, [SIZE] * 4, [f"near {name}" for name in views.names])
+    found = register(checkered_ball(1500), views, pool=pool, truth=truth, config=CONFIG)
+    for row in found.report.photos:
+        assert row.status == "registered", row.reason
+        assert row.start == f"near {row.name}"
+        assert row.rank == 1
+        assert row.error is not None
+        assert row.error.position < 0.002
+
+
+def test_recalls_count_every_photo() -> None:
+    def row(status: str, start: float, end: float) -> PhotoReport:
+        return PhotoReport("a", status, start_error=PoseError(start, 3), error=PoseError(end, 1))  # type: ignore[arg-type]
+
+    rows = [row("registered", 2, 0.04), row("registered", 0.09, 0.09), row("uncertain", 0.3, 0.01)]
+    rows += [PhotoReport("lost", "refused", start_error=PoseError(9, 3))]
+    summary = summarize(rows, true=4, metres_per_unit=1)
+    assert summary.found is not None
+    assert summary.start is not None
+    assert [r.share for r in summary.found.recalls] == [0.25, 0.5, 0.5, 0.5, 0.5]
+    assert [r.share for r in summary.start.recalls] == [0, 0.25, 0, 0.5, 0.75]
+    assert summary.found.photos == 2
+    assert summarize(rows, keep="uncertain", true=4, metres_per_unit=1).found.recalls[0].share == 0.5  # type: ignore[union-attr]
+    assert summarize(rows, true=4).found.recalls == ()  # type: ignore[union-attr]
+    with pytest.raises(InputError, match="metres_per_unit"):
+        summarize(rows, metres_per_unit=-1)
+
+
+def test_the_command_writes_views_and_says_how_good_they_are(
+    site: Path, command_line: CommandLine, tmp_path: Path
+) -> None:
+    common = (
+        "--photos",
+        site / "photos",
+        "--intrinsics",
+        site / "truth.json",
+        "--size",
+        "128",
+        "--json",
+        "-",
+    )
+    common = (*common, "--report", "page.html", "--set", "register.coarsest=32", "-o", "poses.json")
+    scored = ("--truth", site / "truth.json", "--metres-per-unit", "1")
+    arguments = ("register", site / "scene.ply", *common, "--poses", site / "coarse.txt", *scored)
+    status, out, err = command_line(*arguments, cwd=tmp_path)
+    assert status == 0, err
+    result = json.loads(out)
+    assert result["summary"]["registered"] == 4
+    assert result["summary"]["start"]["recalls"][0]["share"] == 0
+    assert result["summary"]["found"]["recalls"][0]["share"] == 1
+    assert len(result["photos"][0]["covariance"]) == 6
+    assert "4 of 4 photos" in err
+    page = (tmp_path / "page.html").read_text()
+    assert page.count('<section class="view">') == 4
+    assert "found: median" in page
+    found = read_views(tmp_path / "poses.json")
+    truth = read_poses(site / "truth.json")
+    for view in found:
+        assert pose_error(view.viewmat, truth[view.name.removesuffix(".png")])[0] < 0.005
+        assert view.image_path is not None
+        assert view.image_path.is_file()
+    again = command_line(*arguments, "-w", "--threads", "1", cwd=tmp_path)[1]
+    poses = [[row["camera_from_world"] for row in json.loads(text)["photos"]] for text in (out, again)]
+    assert poses[0] == poses[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        ("--photos photos --poses coarse.txt", 1, "need their intrinsics"),
+        ("--photos photos --focal 128", 1, "no pose to start from; give --poses or --pool"),
+        ("--photos photos --focal 128 --poses other.txt", 1, "names none of the photos"),
+        ("--photos photos --intrinsics wide.json --poses coarse.txt", 1, "the aspects differ"),
+        ("--photos views.json --truth other.txt", 1, "other.txt: names none of the photos"),
+        ("--photos views.json --focal 100", 1, "these views state their intrinsics"),
+        ("--photos views.json --metres-per-unit 2", 2, "goes with --truth"),
+        ("--photos views.json --keep some", 2, "keep"),
+        ("--photos views.json --protocol gs-cpr --passes 2", 2, "gs-cpr decides --passes"),
+        ("--photos views.json --report page.txt", 2, "a page is written as .html"),
+        ("--photos empty --focal 128", 1, "neither photos nor views in this folder"),
+        ("--photos views.json --protocol gs-cpr --matcher direct", 2, "gs-cpr decides --matcher"),
+        ("--photos views.json --report scene.ply -w", 2, "would be written over"),
+        ("--photos views.json --pool absent.json", 1, "absent.json"),
+        ("--photos views.json --poses away.txt", 1, "none of 4 photos was registered"),
+    ],
+)
+def test_errors_are_one_line(
+    arguments: str, status: int, words: str, site: Path, command_line: CommandLine, tmp_path: Path
+) -> None:
+    (site / "empty").mkdir(exist_ok=True)
+    (site / "other.txt").write_text("elsewhere.png 1 0 0 0 0 0 0\n")
+    (site / "away.txt").write_text("view_000.png 0 1 0 0 0 0 90\n")
+    truth = read_views(site / "truth.json")
+    wide = Cameras(truth.viewmats, truth.Ks, truth.widths * 2, truth.heights, truth.names)
+    write_views(site / "wide.json", wide, overwrite=True)
+    output, report = tmp_path / "poses.json", tmp_path / "report.json"
+    call = ("register", "scene.ply", *arguments.split(), "-o", output, "--json", report)
+    got, _, err = command_line(*call, cwd=site)
+    assert got == status, err
+    assert words in err
+    assert "Traceback" not in err
+    assert not output.exists()
+    if "none of 4" in words:
+        rows = json.loads(report.read_text())["photos"]
+        assert [row["status"] for row in rows] == ["refused"] * 4
+        assert rows[1]["reason"] == "no pose to start from"
+
+
+def test_a_lens_for_all_where_names_differ(site: Path, tmp_path: Path) -> None:
+    one = read_views(site / "truth.json").take([0])
+    write_views(tmp_path / "lens.json", one)
+    taken = photos_of(site / "photos", intrinsics=tmp_path / "lens.json")
+    assert taken.names == tuple(f"view_{i:03d}.png" for i in range(4))
+    np.testing.assert_array_equal(taken.Ks, np.repeat(one.Ks, 4, 0))
+    centred = photos_of(site / "photos", focal=100)
+    assert centred.Ks[0].tolist() == [[100, 0, 64], [0, 100, 48], [0, 0, 1]]
+
+
+def test_photos_to_poses_to_an_adapted_scene(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
+    """`adapt` and `recover` read what `register` writes, and the scene takes on the photos' light."""
+    from g2ard.scene.targets import Photos
+
+    photos = ("--photos", site / "photos", "--intrinsics", site / "views.json", "--size", "128")
+    found = command_line(
+        "register",
+        site / "scene.ply",
+        *photos,
+        "--poses",
+        site / "coarse.txt",
+        "-o",
+        "poses.json",
+        cwd=tmp_path,
+    )
+    assert found[0] == 0, found[2]
+    views = ("--views", "poses.json", "--split", "all")
+    for command, output in (("adapt", "adapted.ply"), ("recover", "recovered.ply")):
+        status, _, err = command_line(
+            command, site / "scene.ply", *views, "--steps", "40", "-o", output, cwd=tmp_path
+        )
+        assert status == 0, err
+    targets = Photos(read_views(site / "views.json"))
+    before, after = (
+        g2ard.evaluate(g2ard.load(path), targets).psnr
+        for path in (site / "scene.ply", tmp_path / "adapted.ply")
+    )
+    assert after > before + 3
+
+
+def test_all_keeps_the_start_of_what_has_no_pose(site: Path) -> None:
+    """As GS-CPR does; the scores count it."""
+    pytest.importorskip("pycolmap")
+    photos = photos_of(site / "views.json")
+    starts = {name: off(pose, 0.05, 1, 3) for name, pose in read_poses(site / "views.json").items()}
+    none = RegisterConfig(size=128, matcher="sift", min_inliers=10_000, fallback=False)
+    found = register(
+        g2ard.io.read_splats(site / "scene.ply"), photos, starts=starts, truth=starts, config=none, keep="all"
+    )
+    assert found.report.count("refused") == 4
+    assert "fewer than 10000 matches" in str(found.report.photos[0].reason)
+    np.testing.assert_array_equal(found.cameras.viewmats, np.stack([starts[n] for n in photos.names]))
+    scored = summarize(found.report.photos, keep="all", true=4).found
+    assert scored is not None
+    assert scored.photos == 4
+
+
+def test_the_protocol_of_gs_cpr(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    arguments = (*("--photos", site / "views.json", "--size", "128", "--protocol", "gs-cpr"),)
+    arguments = (*arguments, "--poses", site / "coarse.txt", "--report", "page.html", "-o", "poses.json")
+    status, out, err = command_line("register", site / "scene.ply", *arguments, "--json", "-", cwd=tmp_path)
+    assert status == 0, err
+    rows = json.loads(out)["photos"]
+    assert all(row["passes"] <= 1 and row["camera_from_world"] for row in rows)
+    assert len(read_views(tmp_path / "poses.json")) == 4
+    assert (tmp_path / "page.html").read_text().count('<figure class="wide">') == sum(
+        row["inliers"] > 0 for row in rows
+    )
+
+
+def test_photos_that_are_all_broken_are_refused_rows(
+    site: Path, command_line: CommandLine, tmp_path: Path
+) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/view_000.png").write_bytes(b"\x89PNG broken")
+    for lens in (("--focal", "128"), ("--intrinsics", site / "truth.json")):
+        status, out, err = command_line(
+            *("register", site / "scene.ply", "--photos", "photos", *lens, "--poses", site / "coarse.txt"),
+            *("-o", "poses.json", "--report", "page.html", "--json", "-", "-w"),
+            cwd=tmp_path,
+        )
+        assert status == 1, err
+        assert "none of 1 photo was registered; view_000.png" in err
+        assert json.loads(out)["photos"][0]["status"] == "refused"
+        assert (tmp_path / "page.html").is_file()
+
+
+def test_what_keeps_its_start_is_in_the_report(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
+    (tmp_path / "wild.py").write_text(
+        "import numpy as np\n"
+        "def match(photo, render):\n"
+        "    a = np.random.default_rng(0).random((40, 2)) * photo.shape[1::-1]\n"
+        "    return a, a[::-1], np.ones(40)\n"
+    )
+    pytest.importorskip("pycolmap")
+    status, out, err = command_line(
+        *("register", site / "scene.ply", "--photos", site / "views.json", "--poses", site / "coarse.txt"),
+        *("--protocol", "gs-cpr", "--matcher", "wild:match", "--size", "128"),
+        *("-o", "poses.json", "--report", "page.html", "--json", "-"),
+        cwd=tmp_path,
+    )
+    assert status == 0, err
+    result = json.loads(out)
+    assert any(row["zncc"] is None for row in result["photos"])
+    assert (result["config"]["passes"], result["config"]["keep"]) == (1, "all")
+    assert "kept where it started" in (tmp_path / "page.html").read_text()

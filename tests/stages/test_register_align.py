@@ -1,0 +1,190 @@
+"""Direct alignment: against a naive twin, against rendered differences, and on poses that are known."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from g2ard import _core
+from g2ard.rendering.renderer import Renderer
+from g2ard.stages.register.align import Shot, align, level_of, normal_equations, shoot
+from g2ard.stages.register.grey import grey_of, local_zncc, zncc
+from g2ard.stages.register.pose import moved, pose_error
+from helpers.project import ROOT
+from helpers.registration import BALL, CONFIG, off, pyramid_of
+from helpers.scenes import around
+from reference import register as twin
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-3, 3), min_size=6, max_size=6), st.floats(1e-9, 1))
+def test_motions_are_the_exponential(xi: list[float], size: float) -> None:
+    motion = np.array(xi) * size
+    twist = np.zeros((4, 4))
+    twist[:3, :3], twist[:3, 3] = twin.cross(motion[3:]), motion[:3]
+    small = np.eye(4) + twist / 2**20 + (twist / 2**20) @ (twist / 2**20) / 2
+    for _ in range(20):  # squared 20 times
+        small = small @ small
+    np.testing.assert_allclose(moved(np.eye(4), motion), small, atol=1e-7)
+    back = moved(moved(np.eye(4), motion), -motion)
+    np.testing.assert_allclose(back, np.eye(4), atol=1e-12)
+
+
+def test_errors_of_poses_are_exact_when_small() -> None:
+    pose = around(3)[1].viewmat
+    distance, angle = pose_error(off(pose, 0.25, 1e-6, 0), pose)
+    assert distance == pytest.approx(0.25, rel=1e-9)
+    assert angle == pytest.approx(1e-6, rel=1e-6)
+    assert pose_error(off(pose, 0, 175, 1), pose)[1] == pytest.approx(175, rel=1e-9)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10_000), st.booleans())
+def test_normal_equations_are_the_twins(seed: int, masked: bool) -> None:
+    rng = np.random.default_rng(seed)
+    shape = int(rng.integers(5, 14)), int(rng.integers(5, 14))
+    K = np.array([[rng.uniform(5, 30), 0, shape[1] / 2], [0, rng.uniform(5, 30), shape[0] / 2], [0, 0, 1]])
+    photo = level_of(rng.random(shape), rng.random(shape) < 0.8 if masked else None)
+    shot = Shot(rng.random(shape), rng.uniform(0.5, 9, shape), rng.random(shape) < 0.9)
+    gain, bias = rng.uniform(0.5, 2), rng.normal(0, 0.1)
+    got = normal_equations(photo, shot, K, gain, bias)
+    matrix, right, cost, weights = twin.normal_equations(photo, shot, K, gain, bias, got.scale)
+    np.testing.assert_allclose(got.matrix, matrix, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(got.right, right, rtol=1e-9, atol=1e-9)
+    assert got.cost == pytest.approx(cost, rel=1e-9)
+    assert got.weights == pytest.approx(weights, rel=1e-9)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10_000))
+def test_what_a_render_is_to_alignment_is_the_twins(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    shape = int(rng.integers(1, 9)), int(rng.integers(1, 12))
+    image = rng.uniform(-0.2, 1.3, (*shape, 3)).astype(np.float32)
+    alpha = rng.uniform(0.3, 1, shape).astype(np.float32)
+    depth = (alpha * rng.uniform(2, 2.3, shape)).astype(np.float32)
+    got = _core.shot(image, alpha, depth, 0.5, 0.1)
+    want = twin.shot(image, alpha, depth, 0.5, 0.1)
+    np.testing.assert_allclose(got[0], want[0], atol=1e-12)
+    np.testing.assert_allclose(got[1], want[1], rtol=1e-12)
+    np.testing.assert_array_equal(got[2], want[2])
+    K = np.array([[7.0, 0, 3], [0, 8, 2.5], [0, 0, 1]])
+    xi = rng.normal(size=6)
+    if want[2].any():
+        flow = _core.flow(got, (7.0, 8.0, 3.0, 2.5), xi.tolist())
+        assert flow == pytest.approx(twin.flow(want[1], want[2], K, xi), rel=1e-9)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10_000))
+def test_local_zncc_is_the_twins(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    shape = int(rng.integers(7, 16)), int(rng.integers(7, 16))
+    a, noise = rng.random((2, *shape))
+    b = 0.6 * a + rng.uniform(0, 0.5) * noise
+    mask = rng.random(shape) < 0.99
+    assert local_zncc(a, b, mask, 5) == pytest.approx(twin.local_zncc(a, b, mask, 5), abs=1e-9)
+
+
+def test_zncc_knows_alike_from_unlike() -> None:
+    rng = np.random.default_rng(0)
+    a, other = rng.random((2, 40, 50))
+    everywhere = np.ones(a.shape, bool)
+    assert local_zncc(a, 0.4 * a + 0.2, everywhere, 15) == pytest.approx(1)
+    assert abs(local_zncc(a, other, everywhere, 15)) < 0.1
+    assert zncc(a, -a, everywhere) == pytest.approx(-1)
+    assert local_zncc(a, np.full_like(a, 0.3), everywhere, 15) == 0
+
+
+def test_predicts_how_renders_change() -> None:
+    """−∇R·∂π/∂X·[I | −[X]ₓ] against central differences of renders of the moved camera, over the whole image
+    as a correlation and a slope: edges, where depth is two depths, are masked. Turning the camera changes the
+    order of splats by depth, at which renders jump: such differences need longer steps, and stay noisier."""
+    camera = around(5, (160, 120), 2.2)[1]
+    renderer = Renderer(BALL.with_sh_degree(0))
+    shot = shoot(renderer, camera, CONFIG)
+    down, right = np.gradient(shot.grey)
+    predicted = -twin.image_rows(shot.depth, camera.K, (right, down))
+    inner = shot.mask.copy()
+    for shift in (-3, 3):
+        for axis in (0, 1):
+            inner &= np.roll(shot.mask, shift, axis)
+    for axis, step in enumerate([0.006] * 6):
+        ahead, behind = (
+            shoot(renderer, replace(camera, viewmat=moved(camera.viewmat, s * np.eye(6)[axis])), CONFIG).grey
+            for s in (step, -step)
+        )
+        measured = ((ahead - behind) / (2 * step))[inner]
+        expected = predicted[axis][inner]
+        slope = (measured @ expected) / (expected @ expected)
+        assert slope == pytest.approx(1, abs=0.06), axis
+        assert np.corrcoef(measured, expected)[0, 1] > 0.94, axis
+
+
+@pytest.mark.parametrize("view", range(5))
+def test_known_errors_are_taken_back(view: int) -> None:
+    """.15 units (a tenth of the distance to the surface) and 4° off, under other light."""
+    camera = around(5, (160, 120), 2.5)[view]
+    renderer = Renderer(BALL)
+    photo = np.clip(0.7 * renderer.image(camera) + 0.1, 0, 1)
+    found = align(renderer, off(camera.viewmat, 0.15, 4, view), pyramid_of(camera, photo, CONFIG), CONFIG)
+    assert found is not None
+    distance, angle = pose_error(found.viewmat, camera.viewmat)
+    assert distance < 1e-3
+    assert angle < 0.03
+    assert found.gain == pytest.approx(0.7, abs=0.01)
+    assert found.bias == pytest.approx(0.1, abs=0.01)
+    assert found.covariance is not None
+    assert np.linalg.eigvalsh(found.covariance)[0] > 0
+
+
+def test_what_is_hidden_does_not_count() -> None:
+    """A mask over a painted block: without it the block pulls, with it the pose is as good as before."""
+    camera = around(5, (160, 120), 2.5)[2]
+    renderer = Renderer(BALL)
+    photo = np.clip(renderer.image(camera), 0, 1)
+    photo[40:80, 60:100] = 1.0
+    mask = np.ones(photo.shape[:2], bool)
+    mask[38:82, 58:102] = False
+    fine = [(camera, level_of(grey_of(photo), mask))]
+    found = align(renderer, off(camera.viewmat, 0.01, 0.3, 0), fine, CONFIG)
+    assert found is not None
+    assert pose_error(found.viewmat, camera.viewmat)[1] < 0.01
+
+
+def test_a_scene_out_of_sight_gives_nothing() -> None:
+    camera = around(5, (160, 120), 2.5)[0]
+    photo = np.random.default_rng(0).random((120, 160, 3)).astype(np.float32)
+    away = camera.viewmat.copy()
+    away[:3, 3] = [0, 0, -20]
+    assert align(Renderer(BALL), away, pyramid_of(camera, photo, CONFIG), CONFIG) is None
+
+
+def test_results_do_not_depend_on_threads() -> None:
+    code = """
+import sys; sys.path[:0] = ["tests"]
+from g2ard import _core; _core.set_num_threads(int(sys.argv[1]))
+import numpy as np
+from g2ard.rendering.renderer import Renderer
+from g2ard.stages.register.align import align
+from helpers import registration as t
+from helpers.scenes import around
+camera = around(5, (160, 120), 2.5)[3]; renderer = Renderer(t.BALL)
+photo = np.clip(renderer.image(camera), 0, 1)
+found = align(renderer, t.off(camera.viewmat, .1, 2, 5), t.pyramid_of(camera, photo, t.CONFIG), t.CONFIG)
+print(found.viewmat.tobytes().hex(), found.covariance.tobytes().hex())
+"""
+    bits = [
+        subprocess.run(
+            [sys.executable, "-c", code, threads], capture_output=True, text=True, check=True, cwd=ROOT
+        ).stdout
+        for threads in ("1", "2")
+    ]
+    assert bits[0] == bits[1]
+    assert len(bits[0]) > 500

@@ -1,0 +1,350 @@
+"""Features: matches against a naive twin, points lifted, poses solved, and matchers that are not."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from g2ard.errors import InputError, MissingDependencyError
+from g2ard.rendering.renderer import Rendered, Renderer
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.images import write_png
+from g2ard.stages.register import PhotoReport, pose_error, register
+from g2ard.stages.register import matchers as module
+from g2ard.stages.register.matchers import checked_pairs, matcher_named, mutual
+from g2ard.stages.register.pose import motion_between, moved
+from g2ard.stages.register.solve import information, lifted, solved
+from helpers.commands import CommandLine
+from helpers.feature_scenes import BALL, CONFIG, _blotched, _photographed
+from helpers.project import ROOT
+from helpers.registration import off
+from helpers.scenes import around
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10_000), st.integers(1, 12), st.integers(2, 12), st.floats(0.5, 1))
+def test_mutual_matches_are_the_twins(seed: int, m: int, n: int, ratio: float) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = (rng.integers(0, 9, (k, 5)).astype(np.float32) for k in (m, n))
+    far = np.linalg.norm(a[:, None].astype(np.float64) - b[None], axis=2)
+    expected = [
+        (i, int(far[i].argmin()))
+        for i in range(m)
+        if far[:, far[i].argmin()].argmin() == i
+        and far[i].min() ** 2 < ratio**2 * np.sort(far[i])[1] ** 2 * (1 - 1e-9)
+    ]
+    i, j = mutual(a, b, ratio)
+    close = [
+        (x, y) for x, y in zip(i.tolist(), j.tolist(), strict=True)
+        if far[x].min() ** 2 < ratio**2 * np.sort(far[x])[1] ** 2 * (1 - 1e-9)
+    ]  # fmt: skip
+    assert close == expected
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.floats(-2.5, 2.5), min_size=6, max_size=6), st.integers(0, 1000))
+def test_the_motion_between_two_poses_moves_one_to_the_other(xi: list[float], seed: int) -> None:
+    motion = np.array(xi)
+    motion[3:] *= min(1.0, 3.0 / max(np.linalg.norm(motion[3:]), 1e-12))
+    first = off(np.eye(4), 3, 100, seed)
+    found = motion_between(first, moved(first, motion))
+    np.testing.assert_allclose(found, motion, atol=1e-7)
+
+
+def test_points_are_lifted_to_where_they_are_seen() -> None:
+    camera = around(5, (160, 120), 2.5)[2]
+    rng = np.random.default_rng(0)
+    uv = rng.uniform(2, [158, 118], (200, 2))
+    K = camera.K
+    # a plane z = 3 + x/4 in the camera's axes, its depth at every pixel's middle
+    slope = 3 / (1 - ((np.arange(160) + 0.5 - K[0, 2]) / K[0, 0]) / 4)
+    depth = np.repeat(slope[None], 120, 0).astype(np.float32)
+    alpha = np.ones_like(depth)
+    alpha[:, :40] = 0.2
+    depth[60:, 100:] *= 2
+    image = np.zeros((120, 160, 3), np.float32)
+    points, known = lifted(Rendered(image, alpha, depth * alpha, depth), camera, uv, CONFIG)
+    seen = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    back = seen[:, :2] / seen[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
+    np.testing.assert_allclose(back[known], uv[known], atol=1e-6)
+    near = known & ~((uv[:, 0] > 99) & (uv[:, 1] > 59))
+    np.testing.assert_allclose(seen[near, 2], 3 + seen[near, 0] / 4, rtol=1e-4)
+    assert not known[uv[:, 0] < 39].any()
+    edge = (np.abs(uv[:, 0] - 100) < 0.4) & (uv[:, 1] > 61)
+    assert not known[edge].any()
+    assert known.mean() > 0.6
+
+
+def test_information_is_that_of_reprojections() -> None:
+    """JᵀWJ/σ² against central differences of the projections."""
+    rng = np.random.default_rng(1)
+    K = np.array([[300, 0, 160], [0, 310, 120], [0, 0, 1.0]])
+    T = off(np.eye(4), 2, 40, 3)
+    seen = rng.uniform([-1, -1, 2], [1, 1, 5], (50, 3))
+    points = (seen - T[:3, 3]) @ T[:3, :3]
+
+    def projected(pose: np.ndarray) -> np.ndarray:
+        X = points @ pose[:3, :3].T + pose[:3, 3]
+        return (X[:, :2] / X[:, 2:]) * [300, 310] + [160, 120]
+
+    uv = projected(T) + rng.normal(0, 0.7, (50, 2))
+    step = 1e-6
+    J = np.stack(
+        [(projected(moved(T, step * e)) - projected(moved(T, -step * e))) / (2 * step) for e in np.eye(6)]
+    )
+    residual = projected(T) - uv
+    sigma = 1.4826 * np.median(np.abs(residual))
+    weight = 1 / (1 + (residual**2).sum(1) / sigma**2)
+    expected = np.einsum("imk,jmk,m->ij", J, J, weight) / sigma**2
+    np.testing.assert_allclose(information(T, K, uv, points), expected, rtol=1e-5, atol=1e-5 * expected.max())
+
+
+def test_pnp_finds_the_pose_in_map_coordinates() -> None:
+    pytest.importorskip("pycolmap")
+    camera = around(5, (320, 240), 2.5)[1]
+    rng = np.random.default_rng(2)
+    offset = np.array([500_000.0, 4_000_000.0, 100.0])
+    seen = np.concatenate([rng.uniform(-1, 1, (80, 2)), rng.uniform(2, 5, (80, 1))], 1)
+    true = camera.viewmat.copy()
+    true[:3, 3] -= true[:3, :3] @ offset
+    points = (seen - true[:3, 3]) @ true[:3, :3]
+    K = camera.K
+    uv = seen[:, :2] / seen[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
+    uv[::5] += rng.uniform(20, 60, (16, 2))
+    found = solved(camera, uv, points, CONFIG)
+    assert found is not None
+    pose, inlying = found
+    assert (~inlying).tolist() == [i % 5 == 0 for i in range(80)]
+    assert pose_error(pose, true)[0] < 1e-3  # of millions
+    assert solved(camera, uv[:5], points[:5], CONFIG) is None
+
+
+def test_features_find_the_pose(tmp_path: Path) -> None:
+    """A quarter of the distance to the surface, and 15°, off, under other light."""
+    pytest.importorskip("pycolmap")
+    views = _photographed(tmp_path)
+    truth = dict(zip(views.names, views.viewmats, strict=True))
+    starts = {name: off(pose, 0.4, 15, i) for i, (name, pose) in enumerate(truth.items())}
+    found = register(BALL, views, starts=starts, truth=truth, config=CONFIG).report.photos
+    direct = register(BALL, views, starts=starts, truth=truth, config=replace(CONFIG, matcher="direct"))
+    for row in found:
+        assert row.status == "registered"
+        assert row.inliers >= CONFIG.min_inliers
+        assert row.error is not None
+        assert row.error.position < 0.005
+        assert row.error.rotation < 0.1
+        assert row.reprojection is not None
+        assert row.reprojection < 1
+    assert all(row.inliers == 0 and row.reprojection is None for row in direct.report.photos)
+
+
+def test_both_are_no_worse_than_the_better_of_two(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    views = _photographed(tmp_path)
+    truth = dict(zip(views.names, views.viewmats, strict=True))
+    starts = {name: off(pose, 0.2, 6, i) for i, (name, pose) in enumerate(truth.items())}
+    errors = {}
+    for refine in ("auto", "none", "photometric"):
+        config = replace(CONFIG, refine=refine)  # type: ignore[arg-type]
+        rows = register(BALL, views, starts=starts, truth=truth, config=config).report.photos
+        errors[refine] = np.median([r.error.position for r in rows if r.error])
+    assert errors["auto"] <= 1.1 * min(errors["none"], errors["photometric"]) + 2e-4
+
+
+def test_results_do_not_depend_on_threads(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    code = f"""
+import sys; sys.path[:0] = ["tests"]
+from g2ard import _core; _core.set_num_threads(int(sys.argv[1]))
+from pathlib import Path
+from helpers import feature_scenes as t
+from helpers.registration import off
+from g2ard.stages.register import register
+views = t._photographed(Path({str(tmp_path)!r}), 1)
+starts = {{views.names[0]: off(views.viewmats[0], .2, 6, 1)}}
+row = register(t.BALL, views, starts=starts, config=t.CONFIG).report.photos[0]
+print(row.camera_from_world, row.covariance, row.matches, row.inliers)
+"""
+    told = []
+    for threads in ("1", "2"):
+        for file in tmp_path.iterdir():
+            file.unlink()
+        call = [sys.executable, "-c", code, threads]
+        told.append(subprocess.run(call, capture_output=True, text=True, check=True, cwd=ROOT).stdout)
+    assert told[0] == told[1]
+    assert len(told[0]) > 500
+
+
+@pytest.mark.parametrize(
+    ("pairs", "words"),
+    [
+        (None, "got NoneType"),
+        (([[1, 2]], [[1, 2], [3, 4]]), r"got shapes \(1, 2\) and \(2, 2\)"),
+        (([[1, 2, 3]], [[1, 2, 3]]), r"got shapes \(1, 3\)"),
+        (([[1, np.nan]], [[1, 2]]), "not finite"),
+        (("ab", "cd"), "got tuple"),
+        (([[1, 2]],), "got tuple"),
+        (([[1e9, 2]], [[1, 2]]), "1 pairs of which none is within the images, 9×9 and 9×9"),
+    ],
+)
+def test_nonsense_of_a_matcher_is_told(pairs: object, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        checked_pairs("matcher m:f", pairs, (9, 9, 3), (9, 9, 3))
+
+
+def test_without_pycolmap_direct_alignment_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    assert matcher_named("auto", 0.85, 100) is None
+    for name in ("sift", "json:dumps"):
+        with pytest.raises(MissingDependencyError, match=r"pip install g2ard\[register\]"):
+            matcher_named(name, 0.85, 100)
+
+
+@pytest.mark.parametrize(
+    ("machine", "words"), [("x86_64", ""), ("aarch64", ", and has no wheel for linux aarch64")]
+)
+def test_where_pycolmap_has_no_wheel_is_told(
+    machine: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    monkeypatch.setattr(module.sys, "platform", "linux")
+    monkeypatch.setattr(module.platform, "machine", lambda: machine)
+    with pytest.raises(MissingDependencyError, match=rf"\(pycolmap is not installed{words}\)"):
+        matcher_named("sift", 0.85, 100)
+
+
+def test_extras_name_pycolmap_where_it_has_wheels() -> None:
+    requirements = pytest.importorskip("packaging.requirements")
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for extra in ("register", "dev"):
+        (found,) = (r for r in extras["optional-dependencies"][extra] if r.startswith("pycolmap"))
+        marker = requirements.Requirement(found).marker
+        for system in ("linux", "darwin", "win32"):
+            for machine in ("x86_64", "AMD64", "aarch64", "arm64", "ARM64"):
+                if (system, machine) not in (("linux", "AMD64"), ("win32", "x86_64")):  # not their names
+                    named = marker.evaluate({"sys_platform": system, "platform_machine": machine})
+                    assert named == ((system, machine) in module._WHEELS)
+
+
+def test_a_pycolmap_that_does_not_load_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pycolmap")
+
+    def broken(name: str) -> None:
+        raise ImportError("libgomp.so.1: cannot open shared object file")
+
+    monkeypatch.setattr(module.importlib, "import_module", broken)
+    assert matcher_named("auto", 0.85, 100) is None
+    with pytest.raises(
+        MissingDependencyError, match="installed and cannot be imported: ImportError: libgomp"
+    ):
+        matcher_named("sift", 0.85, 100)
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        (None, "cannot import plugin: ModuleNotFoundError"),
+        ("def other(a, b): ...", "plugin has no function match"),
+        ("match = 3", "plugin has no function match"),
+        ("def match(a, b): return 5", "expected two (M, 2) arrays"),
+        ("def match(a, b): raise SystemExit(3)", "plugin:match: SystemExit: 3"),
+        ("def match(a, b): raise ValueError('out\\nof luck')", "plugin:match: ValueError: out of luck"),
+    ],
+)
+def test_a_plugin_that_fails_is_one_line(
+    source: str | None, words: str, command_line: CommandLine, tmp_path: Path
+) -> None:
+    pytest.importorskip("pycolmap")
+    _one_view(tmp_path)
+    if source is not None:
+        (tmp_path / "plugin.py").write_text(source + "\n")
+    status, _, err = command_line(*_CALL, "--matcher", "plugin:match", cwd=tmp_path)
+    assert status == 1
+    assert words in err
+    assert "Traceback" not in err
+
+
+def test_a_plugin_matches(command_line: CommandLine, tmp_path: Path) -> None:
+    """One that knows nothing but SIFT: the same pose as --matcher sift."""
+    pytest.importorskip("pycolmap")
+    _one_view(tmp_path)
+    (tmp_path / "plugin.py").write_text(
+        "from g2ard.stages.register.matchers import Sift\nmatch = Sift(0.85, 4096)\n"
+    )
+    for name, output in (("plugin:match", "a.json"), ("sift", "b.json")):
+        call = [output if word == "poses.json" else word for word in _CALL]
+        status, _, err = command_line(*call, "--matcher", name, cwd=tmp_path)
+        assert status == 0, err
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+
+
+_CALL = [
+    *("register", "scene.ply", "--photos", "views.json", "--poses", "coarse.json"),
+    *("--size", "400", "-o", "poses.json"),
+]
+
+
+def _one_view(folder: Path) -> None:
+    from g2ard.io import write_splats, write_views
+
+    views = _photographed(folder, 1)
+    write_splats(folder / "scene.ply", BALL)
+    write_views(folder / "views.json", views)
+    write_views(folder / "coarse.json", replace(views, viewmats=off(views.viewmats[0], 0.1, 3, 0)[None]))
+
+
+@pytest.mark.parametrize(("gain", "bias"), [(0.6, 0.0), (1.6, 0.0), (1.0, 0.1), (1.0, -0.1)])
+def test_light_moves_no_pose(gain: float, bias: float, tmp_path: Path) -> None:
+    """By less than a tenth of what registration takes back."""
+    pytest.importorskip("pycolmap")
+    view = around(2, (400, 300), 2.5)[0]
+    image = 0.5 * Renderer(BALL).image(view)
+    write_png(tmp_path / "photo.png", np.clip(gain * image + bias, 0, 1))
+    row = _registered(view, tmp_path)
+    assert row.status == "registered"
+    assert row.error is not None
+    assert row.start_error is not None
+    assert row.error.position < 0.1 * row.start_error.position
+    assert row.error.rotation < 0.1 * row.start_error.rotation
+
+
+def test_an_occluder_is_no_error_of_the_pose(tmp_path: Path) -> None:
+    """A fifth of the photo is something else, and the pose is right within 2σ."""
+    pytest.importorskip("pycolmap")
+    rng = np.random.default_rng(4)
+    for i in range(2):
+        view = around(2, (400, 300), 2.5)[i]
+        image = np.clip(Renderer(BALL).image(view), 0, 1)
+        image[60:210, 120:280] = rng.random((15, 16, 3)).repeat(10, 0).repeat(10, 1)
+        write_png(tmp_path / "photo.png", image, overwrite=True)
+        row = _registered(view, tmp_path)
+        assert row.status == "registered"
+        assert row.error is not None
+        assert row.sigma is not None
+        assert row.error.position < 2 * row.sigma.position
+        assert row.error.rotation < 2 * row.sigma.rotation
+
+
+def test_a_photo_of_another_scene_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    for i, view in enumerate(around(3, (400, 300), 2.5)):
+        write_png(
+            tmp_path / "photo.png", np.clip(Renderer(_blotched(seed=9)).image(view), 0, 1), overwrite=True
+        )
+        assert _registered(view, tmp_path, seed=i).status != "registered"
+
+
+def _registered(view: Camera, folder: Path, seed: int = 0) -> PhotoReport:
+    """What becomes of `photo.png`, from .1 units and 3° off."""
+    views = Cameras.of([replace(view, image_path=folder / "photo.png", name="photo")])
+    starts = {"photo": off(view.viewmat, 0.1, 3, seed)}
+    truth = {"photo": view.viewmat}
+    return register(BALL, views, starts=starts, truth=truth, config=CONFIG).report.photos[0]

@@ -1,0 +1,433 @@
+"""View selection: depths and greedy choices against naive twins; every policy on pools of all shapes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.synth import city
+from g2ard import _core
+from g2ard.errors import InputError
+from g2ard.io import read_splats, read_view_set, write_splats, write_views
+from g2ard.poses import make_pool
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.splats import Splats
+from g2ard.stages.lift import lift
+from g2ard.stages.select import (
+    POLICIES,
+    CoverageOptions,
+    Surface,
+    poses,
+    select,
+    surface,
+    surfaces,
+    visible_cells,
+)
+from helpers.realdata import real
+from reference import rays
+from reference import select as naive
+
+SIZE = (96, 72)
+FOCAL = 80.0
+K = np.array([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1]])
+
+
+def ball(count=1500, seed=0, offset=(0.0, 0.0, 0.0)) -> Splats:
+    """An opaque sphere of discs with a pillar beside it."""
+    rng = np.random.default_rng(seed)
+    n = rng.standard_normal((count, 3))
+    n /= np.linalg.norm(n, axis=1)[:, None]
+    quats = np.column_stack([1 + n[:, 2], -n[:, 1], n[:, 0], np.zeros(count)])  # z onto n
+    pillar = rng.uniform(-0.2, 0.2, (count // 5, 3)) * [1, 1, 8] + [1.8, 0, 0]
+    return Splats.create(
+        np.concatenate([n, pillar]),
+        quats=np.concatenate([quats, np.tile([1.0, 0, 0, 0], (len(pillar), 1))]),
+        scales=np.concatenate([np.tile([0.08, 0.08, 0.01], (count, 1)), np.full((len(pillar), 3), 0.06)]),
+        logit_opacities=rng.uniform(0, 5, count + len(pillar)),
+        offset=offset,
+    )
+
+
+def views(positions, targets=None) -> Cameras:
+    positions = np.asarray(positions, float)
+    targets = np.zeros_like(positions) if targets is None else targets
+    n = len(positions)
+    return Cameras.from_lists(
+        [look_at(p, t) for p, t in zip(positions, targets, strict=True)],
+        [K] * n,
+        [SIZE] * n,
+        [f"v{i:03d}" for i in range(n)],
+    )
+
+
+def around(count, seed=0, radius=4.0) -> Cameras:
+    rng = np.random.default_rng(seed)
+    d = rng.standard_normal((count, 3))
+    return views(radius * d / np.linalg.norm(d, axis=1)[:, None])
+
+
+def core_view(cameras, i, origin, parts):
+    return surfaces.core_views(cameras.take([i]), origin, parts)[0]
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (4.4e5, 4.4e6, 1e3)])
+def test_depths_are_the_naive_renderers(offset):
+    scene = ball(offset=offset)
+    cameras = around(3).recentred(-np.asarray(offset))
+    parts, origin = surfaces.core_scene(scene)
+    grid = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)
+    for i in range(3):
+        got = _core.select_depth(parts, core_view(cameras, i, origin, parts)).ravel()
+        want = naive.median_depth(scene, cameras.viewmats[i], K, grid)
+        assert (want > 0).sum() > 800
+        near = np.isclose(got, want, rtol=1e-4, atol=1e-6)
+        assert near.mean() > 0.998  # float32 may cross one half a splat later
+
+
+def smooth_depth(scene, cameras, i):
+    """The oracle's depth image, and where it differs from its four neighbours by less than 1 %."""
+    grid = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)
+    depth = naive.median_depth(scene, cameras.viewmats[i], K, grid).reshape(SIZE[::-1])
+    smooth = np.ones_like(depth, bool)
+    for axis in (0, 1):
+        for step in (-1, 1):
+            other = np.roll(depth, step, axis)
+            smooth &= (np.abs(other - depth) < 0.01 * depth) | ((other == 0) & (depth == 0))
+    return depth, smooth
+
+
+@pytest.mark.parametrize("tolerance", [0.01, 0.2])
+def test_visibility_is_the_oracles(tolerance: float) -> None:
+    """99.5 % of the pairs of a cell and a view agree where the depth is smooth around the cell."""
+    scene, cameras = ball(2500), around(3)
+    cells = surface(scene, 1200)
+    seen = visible_cells(scene, cells, cameras, depth_tolerance=tolerance)
+    agree = kept = total = 0
+    for i in range(len(cameras)):
+        depth, smooth = smooth_depth(scene, cameras, i)
+        view = cameras.viewmats[i]
+        camera = (cells.centers + cells.origin) @ view[:3, :3].T + view[:3, 3]
+        u, v = (camera @ K.T)[:, :2].T / camera[:, 2]
+        inside = (u >= 0) & (u < SIZE[0]) & (v >= 0) & (v < SIZE[1])
+        row, column = np.floor(v[inside]).astype(int), np.floor(u[inside]).astype(int)
+        there, z = depth[row, column], camera[inside, 2]
+        want = (there > 0) & (np.abs(z - there) <= np.maximum(cells.size, tolerance * z))
+        use = smooth[row, column]
+        got = np.isin(np.flatnonzero(inside), seen.of(i))
+        agree, kept, total = agree + int((want == got)[use].sum()), kept + int(use.sum()), total + len(use)
+    assert kept > 0.2 * total
+    assert agree / kept >= 0.995
+
+
+def test_a_wider_tolerance_sees_more():
+    scene, cameras = ball(2500), around(3)
+    cells = surface(scene, 1200)
+    counts = [len(visible_cells(scene, cells, cameras, depth_tolerance=t).cells) for t in (0, 0.01, 0.2, 1)]
+    assert counts == sorted(counts)
+    assert counts[-1] > 1.1 * counts[1]
+
+
+@pytest.mark.parametrize(
+    ("parts", "every", "cells"),
+    [(("playbot", "0_0"), 40, 100), (("taebak_park", "0_4"), 50, 100), ((), 1, 300)],
+)
+def test_visibility_on_real_scenes_is_a_ray_oracle_s(parts, every, cells):
+    """Slices of real scenes (the city needs no data) against every Gaussian at every ray."""
+    if parts:
+        scene = read_splats(real(*parts))
+        scene = scene.take(np.arange(0, len(scene), every))  # thinner, so each is larger in its stead
+        scene = replace(scene, scales=scene.scales * np.float32(np.sqrt(every)))
+        pool = make_pool(scene, 24, seed=3).take([0, 9, 17]).resized(240)
+    else:
+        town = city(points=8000, views=24, size=(240, 180))
+        scan, pool = town.points(), town.views["train"].take([0, 6, 15])
+        scene = lift(scan.positions, scan.colors)
+    made = surface(scene, 20_000)
+    seen = visible_cells(scene, made, pool)
+    tried = np.random.default_rng(0).choice(len(made.centers), cells, replace=False)
+    agree, kept, total = rays.agreement(scene, made, pool, seen, tried)
+    assert total > cells / 2
+    assert kept > 0.1 * total
+    assert agree >= 0.995 * kept
+
+
+def random_problem(rng, count=12, cells=60):
+    n = rng.standard_normal((cells, 3))
+    made = Surface(
+        rng.standard_normal((cells, 3)),
+        n / np.linalg.norm(n, axis=1)[:, None],
+        rng.random(cells),
+        rng.random(cells),
+        0.1,
+        np.zeros(3),
+    )
+    seen = [np.flatnonzero(rng.random(cells) < rng.uniform(0.05, 0.6)) for _ in range(count)]
+    return made, seen, rng.standard_normal((count, 3)) * 4
+
+
+def run_greedy(made, seen, positions, k, lazy, **options):
+    starts = np.concatenate([[0], np.cumsum([len(s) for s in seen])]).astype(np.uint64)
+    merged = {
+        "directional": True,
+        "kappa": 20.0,
+        "alpha": 2.0,
+        "lambda_": 1.0,
+        "anchors": 32,
+        "epsilon": 1e-9,
+        **options,
+    }
+    return _core.select_greedy(
+        made.parts, starts, np.concatenate(seen).astype(np.uint32), positions, k, lazy=lazy, **merged
+    )
+
+
+@pytest.mark.parametrize("directional", [True, False])
+@pytest.mark.parametrize("alpha", [2.0, 1.0, 0.5])
+def test_greedy_is_the_naive_greedy(directional, alpha):
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        made, seen, positions = random_problem(rng)
+        order, gains, _ = run_greedy(made, seen, positions, 6, False, directional=directional, alpha=alpha)
+        want, value = naive.greedy(6, made, seen, positions, directional=directional, alpha=alpha)
+        assert order.tolist() == want
+        np.testing.assert_allclose(gains, value, rtol=1e-6, atol=1e-12)
+
+
+def test_directions_and_epsilon_are_options():
+    made, seen, positions = random_problem(np.random.default_rng(5))
+    order, gains, _ = run_greedy(made, seen, positions, 6, False, anchors=48, epsilon=0.1)
+    want, value = naive.greedy(6, made, seen, positions, directional=True, directions=48, epsilon=0.1)
+    assert order.tolist() == want
+    np.testing.assert_allclose(gains, value, rtol=1e-6, atol=1e-12)
+    _, usual, _ = run_greedy(made, seen, positions, 6, False)
+    assert abs(usual[0] - gains[0]) > 1e-3 * abs(usual[0])
+    with pytest.raises(InputError, match="anchors: expected 1 to 64"):
+        run_greedy(made, seen, positions, 6, False, anchors=65)
+
+
+def test_lazy_is_plain_greedy_on_fifty_pools():
+    rng = np.random.default_rng(2)
+    saved = 0.0
+    for trial in range(50):
+        made, seen, positions = random_problem(rng, count=int(rng.integers(2, 40)), cells=200)
+        if trial % 5 == 0:  # twins: ties go to the first
+            seen[-1], positions[-1] = seen[0], positions[0]
+        k = int(rng.integers(1, len(seen) + 1))
+        lazy = run_greedy(made, seen, positions, k, True, directional=trial % 2 == 0)
+        plain = run_greedy(made, seen, positions, k, False, directional=trial % 2 == 0)
+        np.testing.assert_array_equal(lazy[0], plain[0])
+        np.testing.assert_array_equal(lazy[1], plain[1])
+        assert np.all(np.diff(lazy[1]) <= 1e-12)  # submodular: gains never rise
+        assert lazy[2] <= plain[2]
+        saved += 1 - lazy[2] / plain[2]
+    assert saved > 10
+
+
+@pytest.mark.parametrize("count", [30, 9])
+def test_auto_reaches_every_pose_and_then_represents(count):
+    scene, cameras = ball(), around(count)
+    coarse = surface(scene, 1000)
+    depths, shares = poses.outlooks(coarse, cameras)
+    alike = poses.pose_kernel(cameras, depths)
+    wanted = poses.inverse_density(alike)
+    np.testing.assert_array_equal(alike, alike.T)
+    np.testing.assert_array_equal(np.diag(alike), 1.0)
+    order, gains = poses.facility_location(alike, wanted, np.ones(count, bool), shares)
+    assert order.tolist() == naive.represent(count, alike, wanted, shares)
+    assert gains.sum() == pytest.approx(1.0)
+    assert gains.min() >= 0
+    np.testing.assert_allclose(poses.gains_of(order, alike, wanted), gains, atol=1e-15)
+
+
+def test_auto_reaches_first():
+    """Two poses far from a crowd: both are chosen before any second one of the crowd."""
+    rng = np.random.default_rng(8)
+    crowd = np.array([4.0, 0, 0]) + 0.3 * rng.standard_normal((30, 3))
+    far = np.array([[-4.0, 0, 0], [0, 0, 4.0]])
+    chosen = select(ball(), views(np.concatenate([crowd, far])), 3)
+    assert set(chosen.order.tolist()) >= {30, 31}
+    unreached = poses.facility_location(
+        np.eye(5), np.full(5, 0.2), np.array([1, 1, 0, 1, 1], bool), np.ones(5)
+    )
+    assert unreached[0].tolist() == [
+        0,
+        1,
+        3,
+        4,
+    ]  # nothing like anything: in the order given, usable ones only
+
+
+def test_of_views_alike_the_one_that_sees_more_is_taken():
+    """Five pairs of twins, of which the second sees more."""
+    alike = np.kron(np.eye(5), np.ones((2, 2)))
+    shares = np.tile([0.2, 0.3], 5)
+    order, _ = poses.facility_location(alike, np.full(10, 0.1), np.ones(10, bool), shares)
+    assert set(order[:5].tolist()) == {1, 3, 5, 7, 9}
+
+
+def test_outlooks_count_what_lies_in_front():
+    scene = ball()
+    coarse = surface(scene, 2000)
+    facing, back = views([[0, -4.0, 0], [0, -4.0, 0]]), views([[0, -4.0, 0]], targets=[[0, -8.0, 0]])
+    depths, shares = poses.outlooks(coarse, facing)
+    assert depths[0] == depths[1] > 2
+    assert 0.2 < shares[0] < 0.8  # not what the ball's front hides
+    depths, shares = poses.outlooks(coarse, back)
+    assert (depths[0], shares[0]) == (0, 0)
+
+
+def test_auto_and_diverse_leave_the_crowd():
+    """Nine tenths of the pool crowd into one spot: nearly all of 10 chosen views lie elsewhere."""
+    rng = np.random.default_rng(3)
+    crowd = np.array([4.0, 0, 0]) + 0.05 * rng.standard_normal((90, 3))
+    ring = np.linspace(0.5, 2 * np.pi - 0.5, 10)
+    cameras = views(np.concatenate([crowd, 4 * np.stack([np.cos(ring), np.sin(ring), 0 * ring], 1)]))
+    for policy in ("auto", "pose-diverse"):
+        chosen = select(ball(), cameras, 10, policy=policy)
+        assert (chosen.order >= 90).sum() >= 8, policy
+    weights = select(ball(), cameras, 100).weights
+    assert weights.mean() == pytest.approx(1.0)
+    assert weights[0] > 0
+    many = select(ball(), cameras, 100)
+    by_view = np.zeros(100)
+    by_view[many.order] = many.weights
+    assert by_view[90:].mean() > 10 * by_view[:90].mean()  # the crowd is drawn as one
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_every_policy_on_every_pool(policy):
+    scene, options = ball(600), CoverageOptions(cells=300)
+    pool = around(12)
+
+    def run(cameras, k):
+        return select(scene, cameras, k, policy=policy, options=options)
+
+    one = run(pool.take([3]), 1)
+    assert one.order.tolist() == [0]
+    assert one.weights.tolist() == [1.0]
+    everything = run(pool, 99)
+    assert sorted(everything.order.tolist()) == list(range(12))
+    assert everything.left_out == 0
+    assert everything.gains.sum() == pytest.approx(1.0)
+    few = run(pool, 5)
+    assert len(set(few.order.tolist())) == 5
+    if policy != "uniform":
+        np.testing.assert_array_equal(few.order, everything.order[:5])  # best first
+        assert few.left_out == pytest.approx(1 - few.gains.sum())
+    twice = pool.take(np.repeat(np.arange(12), 2))
+    twice = replace(twice, names=tuple(f"{i}" for i in range(24)))
+    assert len(run(twice, 20).order) == 20
+    away = views([[4.0, 0, 0], [0, 4.0, 0], [9.0, 9, 9]], np.array([[0.0, 0, 0], [0, 0, 0], [99, 99, 99]]))
+    partly = run(away, 3)
+    assert sorted(partly.order.tolist()) == [0, 1]
+    assert partly.refused.tolist() == [2]
+    with pytest.raises(InputError, match="none of 1 view sees the scene"):
+        run(away.take([2]), 1)
+
+
+def test_a_view_within_matter_is_refused(tmp_path):
+    rng = np.random.default_rng(5)
+    solid = rng.standard_normal((6000, 3))
+    solid *= (rng.random(6000) ** (1 / 3) / np.linalg.norm(solid, axis=1))[:, None]
+    scene = Splats.create(solid, scales=np.full((6000, 3), 0.04), logit_opacities=np.full(6000, 3.0))
+    pool = views([[4.0, 0, 0], [0.2, 0.1, 0], [0, 4.0, 0]], np.array([[0.0, 0, 0], [3, 0, 0.1], [0, 0, 0]]))
+    for policy in POLICIES:
+        chosen = select(scene, pool, 3, policy=policy, options=CoverageOptions(cells=1000))
+        assert sorted(chosen.order.tolist()) == [0, 2]
+        assert chosen.refused.tolist() == [1]
+    photos = replace(pool, image_paths=(None, tmp_path / "photo.png", None))  # there was a camera
+    assert not len(select(scene, photos, 3).refused)
+    alone = select(scene, pool.take([1]), 1)  # nothing to compare it with
+    assert alone.order.tolist() == [0]
+
+
+def test_auto_k_stops_at_the_bend():
+    ring = np.repeat(np.linspace(0, 2 * np.pi, 6, endpoint=False), 10)
+    rng = np.random.default_rng(4)
+    places = 4 * np.stack([np.cos(ring), np.sin(ring), 0 * ring], 1) + 0.02 * rng.standard_normal((60, 3))
+    chosen = select(ball(), views(places), "auto")
+    assert len(chosen.order) == 6
+    assert len(set((chosen.order // 10).tolist())) == 6
+    assert chosen.left_out < 0.1
+
+
+def test_neither_threads_nor_runs_change_anything():
+    scene, pool = ball(), around(25)
+    options = CoverageOptions(cells=800)
+    results = []
+    try:
+        for threads in (1, 2, 8):
+            _core.set_num_threads(threads)
+            results.append(select(scene, pool, 10, policy="directional", options=options))
+    finally:
+        _core.set_num_threads(0)
+    for other in results[1:]:
+        np.testing.assert_array_equal(other.order, results[0].order)
+        np.testing.assert_array_equal(other.gains, results[0].gains)
+
+
+def test_offset_and_scale_change_nothing():
+    pool = around(20)
+    base = select(ball(), pool, 8)
+    offset = np.array([4.4e5, 4.4e6, 1e3])
+    moved = select(ball(offset=tuple(offset)), pool.recentred(-offset), 8)
+    np.testing.assert_array_equal(moved.order, base.order)
+    scene = ball()
+    large = replace(scene, means=scene.means * 8, scales=scene.scales * 8)
+    far = pool.viewmats.copy()
+    far[:, :3, 3] *= 8
+    np.testing.assert_array_equal(select(large, replace(pool, viewmats=far), 8).order, base.order)
+
+
+@pytest.mark.parametrize(
+    ("k", "policy", "words"),
+    [(0, "auto", "k"), (2.5, "auto", "k"), (3, "best", "policy"), ("auto", "random", "auto")],
+)
+def test_refuses_nonsense(k, policy, words):
+    with pytest.raises(InputError, match=words):
+        select(ball(200), around(5), k, policy=policy)
+
+
+@pytest.mark.parametrize("policy", ["auto", "directional"])
+def test_refuses_images_no_raster_takes(policy):
+    pool = around(3)
+    huge = replace(pool, widths=np.array([64, 60_000, 64]))
+    with pytest.raises(InputError, match=r"v001: 60000×\d+ pixels"):
+        select(ball(200), huge, 2, policy=policy)
+
+
+def test_refuses_empty_scenes():
+    with pytest.raises(InputError, match="empty"):
+        select(ball(200).take(slice(0, 0)), around(5), 2)
+
+
+def test_command_line(tmp_path, command_line):
+    write_splats(tmp_path / "scene.ply", ball(300))
+    write_views(tmp_path / "pool.json", around(16))
+    for policy in ("auto", "directional"):
+        status, out, err = command_line(
+            "select", "scene.ply", "--views", "pool.json", "-k", "25%", "--policy", policy,
+            "-o", f"{policy}.json", "--json", "-", "-q", cwd=tmp_path,
+        )  # fmt: skip
+        assert (status, err) == (0, "")
+        said = json.loads(out)
+        back = read_view_set(tmp_path / f"{policy}.json", split="train")
+        assert back.cameras.names == tuple(view["name"] for view in said["views"])
+        assert len(back.cameras) == 4
+        np.testing.assert_allclose(back.weights, [view["weight"] for view in said["views"]])
+        assert said["policy"] == policy
+        assert set(said) >= {"policy", "views", "seconds", "evaluations"}
+    status, _, err = command_line(
+        "select", "scene.ply", "--views", "pool.json", "-k", "4", "-o", "auto.json", cwd=tmp_path
+    )
+    assert status == 1
+    assert "exists" in err
+    for wrong in (["-k", "0"], ["-k", "4", "--policy", "best"]):
+        status, _, err = command_line(
+            "select", "scene.ply", "--views", "pool.json", *wrong, "-o", "x.json", cwd=tmp_path
+        )
+        assert status == 2
+        assert len(err.strip().splitlines()) == 1

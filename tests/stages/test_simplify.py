@@ -1,0 +1,275 @@
+"""Simplification: what must hold whatever the policy, and the command."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from g2ard import _core
+from g2ard.errors import InputError
+from g2ard.scene.splats import Splats
+from g2ard.stages.simplify import METHODS, SimplifyConfig, schedule, simplify
+from helpers.simplify_cases import ARRAYS, all_alike, assert_same, assert_sound, scene
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("budget", [1, 2, 77, 500, 1234, 1999, 2000])
+def test_exact_count(method, budget):
+    assert_sound(simplify(scene(), budget, method=method), 2000, budget)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("rest", [0, 3, 8, 15])
+def test_any_sh_degree(method, rest):
+    assert simplify(scene(300, rest), 40, method=method).splats.shN.shape == (40, rest, 3)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_threads_do_not_matter(method):
+    prior = scene(20_000)
+    results = []
+    for threads in (1, 2, 8):
+        _core.set_num_threads(threads)
+        results.append(simplify(prior, 3000, method=method))
+    _core.set_num_threads(0)
+    for other in results[1:]:
+        assert_same(results[0].splats, other.splats)
+        np.testing.assert_array_equal(results[0].parents, other.parents)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_row_order_does_not_matter(method):
+    prior = scene()
+    rows = np.random.default_rng(1).permutation(len(prior))
+    here, there = simplify(prior, 300, method=method), simplify(prior.take(rows), 300, method=method)
+    assert_same(here.splats, there.splats)
+    np.testing.assert_array_equal(here.parents[rows], there.parents)
+    np.testing.assert_array_equal(here.protected, there.protected)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("factor", "shift"), [(1.0, 2.0**20), (2.0**-7, 0.0), (2.0**9, -(2.0**15))])
+def test_moving_and_scaling_by_powers_of_two_is_exact(method, factor, shift):
+    prior = scene(dtype=np.float64)
+    moved = replace(prior, means=prior.means * factor + shift, scales=prior.scales * np.float32(factor))
+    here, there = (simplify(s, 300, method=method) for s in (prior, moved))
+    np.testing.assert_array_equal(there.splats.means, here.splats.means * factor + shift)
+    np.testing.assert_array_equal(there.splats.scales, here.splats.scales * np.float32(factor))
+    for name in ("quats", "logit_opacities", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(there.splats, name), getattr(here.splats, name), err_msg=name)
+    np.testing.assert_array_equal(there.parents, here.parents)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_flags_are_inherited_by_or(method):
+    prior = scene()
+    flags = np.random.default_rng(2).random(len(prior)) < 0.2
+    out = simplify(prior, 400, method=method, protected=flags)
+    want = np.zeros(400, bool)
+    alive = out.parents >= 0
+    np.logical_or.at(want, out.parents[alive], flags[alive])
+    np.testing.assert_array_equal(out.protected, want)
+
+
+def odd_scenes():
+    rng = np.random.default_rng(3)
+    base = scene(500)
+    one = np.zeros(1000, int)
+    flat = replace(base, means=base.means * np.float32([1, 1, 0]))
+    line = replace(base, means=base.means * np.float32([1, 0, 0]))
+    far = base.means.copy()
+    far[[3, 77, 400]] = 8 * 20_000 * np.float32([[1, 0, 0], [0, -1, 1], [1, 1, 1]])
+    scales = base.scales.copy()
+    scales[::7] = 3e-10
+    huge = base.scales.astype(np.float64)
+    huge[5] = np.exp(43)  # files' clamp of e^100
+    logits = np.where(rng.random(500) < 0.5, 1e4, -1e4)
+    endless = np.where(np.arange(500) % 3 == 0, np.inf, np.where(np.arange(500) % 3 == 1, -np.inf, 0.3))
+    return {
+        "identical": base.take(one),
+        "one": base.take([0]),
+        "two": base.take([0, 1]),
+        "coplanar": flat,
+        "collinear": line,
+        "floaters": replace(base, means=far),
+        "tiny": replace(base, scales=scales),
+        "huge": replace(base, scales=huge.astype(np.float32)),
+        "logits": replace(base, logit_opacities=logits.astype(np.float32)),
+        "infinite": replace(base, logit_opacities=endless.astype(np.float32)),
+        "transparent": replace(base, logit_opacities=np.full(500, -np.inf, np.float32)),
+    }
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", odd_scenes())
+def test_odd_scenes(method, name):
+    prior = odd_scenes()[name]
+    for budget in {1, max(1, len(prior) // 10), len(prior)}:
+        out = simplify(prior, budget, method=method)
+        assert_sound(out, len(prior), budget)
+        infinite = int(np.isinf(prior.logit_opacities).sum())
+        assert out.report.infinite_logits == infinite
+
+
+@pytest.mark.parametrize("method", ["default", "fast"])
+def test_a_floater_swallows_nothing_that_shows(method):
+    prior = scene(1000)
+    far = prior.means.copy()
+    far[7] = [160_000, 0, 0]
+    out = simplify(replace(prior, means=far), 100, method=method)
+    assert out.report.faded == 0
+    assert (out.parents == out.parents[7]).sum() == 1
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_scales_too_large_to_square(method):
+    prior = scene(300)
+    assert_sound(
+        simplify(replace(prior, scales=np.full((300, 3), 1e30, np.float32)), 30, method=method), 300, 30
+    )
+
+
+def test_floaters_that_fade_are_counted():
+    prior = replace(scene(500), logit_opacities=np.full(500, 3, np.float32))
+    assert simplify(prior, 50).report.faded == 0
+    far = prior.means.copy()
+    far[:40] += 160_000 * np.random.default_rng(5).normal(size=(40, 3)).astype(np.float32)
+    out = simplify(replace(prior, means=far), 12)
+    faint = out.splats.opacities < 1 / 255
+    assert out.report.faded == np.count_nonzero(faint) > 0
+    assert set(np.flatnonzero(faint)) == set(out.parents[:40][faint[out.parents[:40]]])
+
+
+def test_the_paper_says_what_it_skipped():
+    prior = scene(2000)
+    out = simplify(prior, 1500, method="paper")
+    assert out.report.skipped["coverages"] == sum(r.refused["energy"] for r in out.report.rounds)
+    faint = replace(prior, logit_opacities=np.where(np.arange(2000) < 1500, 0, -9).astype(np.float32))
+    dropped = simplify(faint, 1500, method="paper").report.skipped
+    assert (dropped["binnings"], dropped["trims"]) == (1, 1)
+    assert "binnings" not in simplify(prior, 200).report.skipped
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_is_dropped_is_told_where_nothing_merges(method):
+    faint = replace(scene(1000), logit_opacities=np.where(np.arange(1000) < 300, -9, 3).astype(np.float32))
+    out = simplify(faint, 700, method=method)
+    assert (out.parents == -1).tolist() == [True] * 300 + [False] * 700
+    rounds = out.report.rounds
+    assert (rounds[0].before, rounds[-1].after) == (1000, 700)
+    assert (sum(r.dropped for r in rounds), sum(r.merged for r in rounds)) == (300, 0)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_identical_gaussians_keep_their_shape(method):
+    prior = scene(500).take(np.zeros(1000, int))
+    out = simplify(prior, 1, method=method, config=SimplifyConfig(max_growth=1)).splats
+    np.testing.assert_array_equal(out.means, prior.means[:1])
+    np.testing.assert_allclose(np.sort(out.scales[0]), np.sort(prior.scales[0]), rtol=1e-5)
+    np.testing.assert_allclose(out.sh0, prior.sh0[:1], rtol=1e-6)
+    grown = simplify(prior, 1, method=method).splats  # α = 0.99 cannot hold the mass of a thousand
+    factors = np.sort(grown.scales[0]) / np.sort(prior.scales[0])
+    growth = 1.0 if method == "paper" else 1.25**0.5
+    np.testing.assert_allclose(factors, [1, growth, growth], rtol=1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_non_finite_rows_are_dropped_and_counted(method):
+    prior = scene(400)
+    prior.means[5, 0], prior.scales[9, 1], prior.shN[30, 1, 2] = np.nan, np.inf, np.nan
+    out = simplify(prior, 100, method=method)
+    assert_sound(out, 400, 100)
+    assert out.report.nonfinite_rows == 3
+    assert (out.parents[[5, 9, 30]] == -1).all()
+
+
+def test_bad_input_is_named():
+    prior = scene(50)
+    for budget, message in ((0, "at least 1, got 0"), (51, "at most the 50 Gaussians there are, got 51")):
+        with pytest.raises(InputError, match=message):
+            simplify(prior, budget)
+    with pytest.raises(InputError, match="method: expected one of"):
+        simplify(prior, 5, method="best")
+    with pytest.raises(InputError, match=r"protected: expected bool of shape \(50,\)"):
+        simplify(prior, 5, protected=np.zeros(49, bool))
+    with pytest.raises(InputError, match="none of 50 rows is finite"):
+        simplify(replace(prior, means=prior.means * np.nan), 5)
+    with pytest.raises(InputError, match="retention: expected"):
+        SimplifyConfig(retention=1.0)
+
+
+def test_schedule():
+    rounds = schedule(500_000, 50_000)
+    assert len(rounds) == 8
+    assert rounds[-1] == 50_000
+    for before, after in zip([500_000, *rounds], rounds, strict=False):
+        assert after < before
+    assert schedule(100, 1, 0.999)[-1] == 1
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_report_adds_up(method):
+    prior = scene(5000)
+    out = simplify(prior, 600, method=method, visibility=None if method == "paper" else all_alike)
+    rounds = out.report.rounds
+    for r, before in zip(rounds, [5000, *(r.after for r in rounds)], strict=False):
+        assert r.before == before
+        assert r.after == r.before - r.dropped - r.merged - r.trimmed
+    assert rounds[-1].after == 600
+    members = [np.count_nonzero(out.parents == p) for p in range(600)]
+    assert out.report.merged_members == sum(m for m in members if m > 1)
+    assert out.report.skipped["alone"] == members.count(1)
+    assert sum(r.merged for r in rounds) >= out.report.merged_members - sum(m > 1 for m in members)
+
+
+@pytest.mark.parametrize("logit", [-16, -1e4, -np.inf])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_scene_of_which_nothing_shows_shrinks_evenly(method, logit):
+    rng = np.random.default_rng(6)
+    prior = Splats.create(
+        rng.uniform(-1, 1, (2000, 3)), scales=np.full((2000, 3), 0.05), logit_opacities=np.full(2000, logit)
+    )
+    out = simplify(prior, 1000, method=method)
+    assert_sound(out, 2000, 1000)
+    octants = np.bincount((out.splats.means > 0) @ [1, 2, 4], minlength=8)
+    assert octants.min() > 80  # of 125
+
+
+def test_command_line(tmp_path, command_line):
+    from g2ard.io import read_splats, write_splats
+
+    write_splats(tmp_path / "prior.ply", scene(1000))
+
+    def run(*arguments):
+        return command_line("simplify", "prior.ply", *arguments, cwd=tmp_path)
+
+    status, out, err = run("-r", "10", "-o", "small.ply", "--no-views", "--json", "-")
+    assert status == 0, err
+    report = json.loads(out)
+    assert (report["input_count"], report["output_count"]) == (1000, 100)
+    assert set(report["seconds"]) == {"read", "simplify", "write", "total"}
+    assert report["peak_rss_bytes"] > 1e6
+    small, want = (
+        read_splats(tmp_path / "small.ply"),
+        simplify(read_splats(tmp_path / "prior.ply"), 100).splats,
+    )
+    for name in ARRAYS:  # files hold logarithms of the scales
+        np.testing.assert_allclose(getattr(small, name), getattr(want, name), rtol=1e-5, err_msg=name)
+    status, _, err = run("-r", "10", "-o", "seen.ply", "-q")
+    assert status == 0, err
+    assert len(read_splats(tmp_path / "seen.ply")) == 100
+    for arguments, want, part in (
+        (("-r", "10", "-o", "small.ply"), 1, "small.ply"),  # exists
+        (("-n", "5", "-o", "b.ply", "--no-views", "--views", "x"), 2, "exclude"),
+        (("-n", "1001", "-o", "b.ply"), 1, "prior.ply: a budget of 1,001"),
+        (("-n", "0", "-o", "b.ply"), 2, "positive count"),
+        (("-o", "b.ply"), 2, "either -n COUNT or -r RATIO"),
+        (("-n", "5", "-o", "b.ply", "--method", "best"), 2, "method"),
+    ):
+        status, _, err = run(*arguments)
+        assert (status, part in err) == (want, True), (arguments, err)
+        assert len(err.splitlines()) == 1
+        assert not (tmp_path / "b.ply").exists()

@@ -1,0 +1,328 @@
+"""--device: the GPU twins make the same scene and see the same cells; whatever fails, the CPU goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard import _core
+from g2ard.cli.frame import Run
+from g2ard.errors import InputError
+from g2ard.io import read_splats, write_splats, write_views
+from g2ard.poses import make_pool
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+from g2ard.stages.select import surface, visible_cells
+from g2ard.stages.simplify import Simplified, flag, simplify
+from g2ard.system import devices
+from helpers.commands import CommandLine
+from helpers.project import ROOT
+from helpers.realdata import real
+from helpers.scenes import around, checkered_ball
+
+SEEN_ALIKE = 0.9999
+
+
+@pytest.fixture
+def gpu() -> Iterator[None]:
+    """The GPU for a test, software ones too; skips it where there is none."""
+    found = devices.adapters()
+    if not found:
+        pytest.skip("no GPU kernels in this build" if found is None else "no adapter on this machine")
+    devices.use("gpu")
+    yield
+    devices.use("cpu")
+
+
+def served() -> int:
+    """How many kernels ran on the GPU; none of them failed."""
+    assert devices.notes() == []
+    return devices.state().served
+
+
+def assert_same(a: Simplified, b: Simplified) -> None:
+    for name in ("means", "quats", "scales", "logit_opacities", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(a.splats, name), getattr(b.splats, name))
+    np.testing.assert_array_equal(a.parents, b.parents)
+    np.testing.assert_array_equal(a.protected, b.protected)
+    assert a.report == b.report
+
+
+def seen_alike(splats: Splats, cameras: Cameras, cells: int) -> tuple[float, float]:
+    """The share of (view, cell) that CPU and GPU agree on: of all, and of those that either sees."""
+    devices.use("cpu")
+    want_surface = surface(splats, cells)
+    want = visible_cells(splats, want_surface, cameras)
+    devices.use("gpu")
+    got_surface = surface(splats, cells)
+    got = visible_cells(splats, got_surface, cameras)
+    assert served() == 2
+    for a, b in zip(want_surface.parts, got_surface.parts, strict=True):
+        np.testing.assert_array_equal(a, b)
+    pairs = [(set(want.of(v).tolist()), set(got.of(v).tolist())) for v in range(len(cameras))]
+    differ = sum(len(a ^ b) for a, b in pairs)
+    either = sum(len(a | b) for a, b in pairs)
+    assert either > 0
+    return 1 - differ / (len(cameras) * len(want_surface.centers)), 1 - differ / either
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (691234.5, 5334567.25, 512.0)])
+def test_the_papers_policy_makes_the_same_scene(offset: tuple[float, float, float], gpu: None) -> None:
+    ball = checkered_ball(2000)
+    prior = Splats.create(
+        ball.means.astype(np.float64) + offset,
+        quats=ball.quats,
+        scales=ball.scales,
+        logit_opacities=ball.logit_opacities,
+        sh0=ball.sh0,
+        shN=ball.shN,
+    )
+    there = simplify(prior, 300, method="paper")
+    assert served() > 10
+    flags = flag(prior, 300)
+    devices.use("cpu")
+    assert_same(simplify(prior, 300, method="paper"), there)
+    np.testing.assert_array_equal(flag(prior, 300), flags)
+
+
+def test_rows_are_sent_once(gpu: None) -> None:
+    """72 bytes a row when it comes into being; then four for each time it is in a group or a cell's list."""
+    ball = checkered_ball(4000)
+    rounds = simplify(ball, 400, method="paper").report.rounds
+    assert len(rounds) > 3
+    rows = len(ball) + sum(r.merged for r in rounds)  # a group sheds one row at least
+    looked_at = 10 * len(ball) + sum(3 * r.before for r in rounds)  # flags borrow neighbours
+    small = 64 * 1024  # constants of dispatches
+    assert devices.state().uploaded_bytes < 72 * rows + (4 + 8) * looked_at + small * (len(rounds) + 1)
+    assert devices.state().uploaded_bytes > 72 * len(ball)
+
+
+def test_views_see_the_same_cells(gpu: None) -> None:
+    every, seen = seen_alike(checkered_ball(3000), around(12, (120, 90)), 1500)
+    assert min(every, seen) >= SEEN_ALIKE
+
+
+@pytest.mark.parametrize("parts", [("playbot", "0_0"), ("taebak_park", "0_4")])
+def test_real_scenes_are_the_same(parts: tuple[str, str], gpu: None, capsys: pytest.CaptureFixture) -> None:
+    """A slab of each; `python tests/test_devices.py` takes them whole."""
+    prior = read_splats(real(*parts))
+    prior = prior.take(np.argsort(prior.means[:, 0], kind="stable")[:40_000])
+    there = simplify(prior, 4000, method="paper")
+    assert served() > 10
+    devices.use("cpu")
+    assert_same(simplify(prior, 4000, method="paper"), there)
+    every, seen = seen_alike(prior, make_pool(prior, 6).resized(192), 10_000)
+    with capsys.disabled():
+        print(f"\n{'/'.join(parts)}: rows 100 % alike; cells seen {100 * every:.4f} % alike, ", end="")
+        print(f"{100 * seen:.4f} % of those that either sees")
+    assert min(every, seen) >= SEEN_ALIKE
+
+
+def test_small_buffers_go_in_pieces(gpu: None) -> None:
+    ball = checkered_ball(1000)
+    want = simplify(ball, 500, method="paper")
+    _core.set_device("gpu", 1 << 14)
+    assert_same(simplify(ball, 500, method="paper"), want)
+    assert served() > 10
+    few = checkered_ball(60)
+    _core.set_device("gpu", 64)  # too small for the disc that coverage is measured on
+    refused = simplify(few, 20, method="paper")
+    assert devices.notes()[0].endswith("goes on on the CPU")
+    devices.use("cpu")
+    assert_same(simplify(few, 20, method="paper"), refused)
+
+
+def test_software_is_never_chosen_by_itself(gpu: None) -> None:
+    if any(a.kind != "cpu" for a in devices.adapters() or ()):
+        pytest.skip("there is a real GPU")
+    devices.use("auto")
+    rng = np.random.default_rng(0)
+    prior = Splats.create(rng.normal(size=(200_001, 3)), scales=np.full((200_001, 3), 0.01))
+    surface(prior, 1000)
+    assert devices.state() == devices.State(None, 0, 0, {})
+    assert devices.notes() == []
+
+
+def test_refuses_other_names() -> None:
+    with pytest.raises(InputError, match="abacus"):
+        devices.use("abacus")
+    with pytest.raises(ValueError, match="abacus"):
+        _core.set_device("abacus")
+
+
+def test_command_line(tmp_path: Path, command_line: CommandLine, gpu: None) -> None:
+    write_splats(tmp_path / "a.ply", checkered_ball(1000))
+    write_views(tmp_path / "v.json", around(6))
+    paper = ("simplify", "a.ply", "-r", "10", "--method", "paper", "-w", "--json", "-")
+    chosen = (
+        "select",
+        "a.ply",
+        "--views",
+        "v.json",
+        "-k",
+        "3",
+        "--policy",
+        "coverage",
+        "--cells",
+        "300",
+        "-w",
+    )
+    made = {}
+    for device in ("cpu", "gpu"):
+        status, _, told = command_line(*paper, "-o", f"{device}.ply", "--device", device, "-v", cwd=tmp_path)
+        assert status == 0, told
+        assert ("kernels on" in told) == (device == "gpu")
+        status, _, told = command_line(
+            *chosen, "-o", f"{device}.json", "--device", device, "-v", cwd=tmp_path
+        )
+        assert status == 0, told
+        assert ("kernels on" in told) == (device == "gpu")
+        made[device] = [(tmp_path / f"{device}.{kind}").read_bytes() for kind in ("ply", "json")]
+    assert made["cpu"] == made["gpu"]
+
+
+def test_the_report_says_what_was_sent(tmp_path: Path, command_line: CommandLine, gpu: None) -> None:
+    write_splats(tmp_path / "a.ply", checkered_ball(1000))
+    paper = ("simplify", "a.ply", "-r", "10", "--method", "paper", "-o", "b.ply", "-w", "--json", "-")
+    _, out, _ = command_line(*paper, "--device", "gpu", cwd=tmp_path)
+    used = json.loads(out)["device"]
+    assert used["adapter"] == devices.adapters()[0].name  # type: ignore[index]
+    assert used["kernels"] > 10
+    assert used["uploaded_bytes"] > 72_000
+    _, out, _ = command_line(*paper, "--device", "cpu", cwd=tmp_path)
+    assert "device" not in json.loads(out)
+
+
+def test_failures_are_told_when_they_happen(capsys: pytest.CaptureFixture, gpu: None) -> None:
+    common = dict.fromkeys(("overwrite", "verbose", "quiet", "json", "config")) | {"seed": 0, "threads": 0}
+    run = Run("simplify", {**common, "device": "gpu"}, {})
+    _core.set_device("gpu", 64)  # too small for the disc that coverage is measured on
+    simplify(checkered_ball(60), 20, method="paper")
+    run.progress("simplify", 1, 2)
+    assert capsys.readouterr().err.startswith("GPU: ")
+    run.progress("simplify", 2, 2)
+    assert "GPU" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kilobytes", [600_000, 900_000, 1_400_000, 2_000_000, 3_000_000])
+def test_little_address_space_ends_on_the_cpu(kilobytes: int, tmp_path: Path, gpu: None) -> None:
+    """Drivers that run out of it end the process, so they are not asked."""
+    if sys.platform != "linux":
+        pytest.skip("only Linux tells how much is left")
+    write_splats(tmp_path / "a.ply", checkered_ball(1000))
+    command = f'ulimit -v {kilobytes}; exec "$0" -m g2ard simplify a.ply -r 10 --method paper "$@"'
+    outputs = []
+    for device in ("cpu", "gpu"):
+        name = f"{device}.ply"
+        done = subprocess.run(
+            ["sh", "-c", command, sys.executable, "-o", name, "--device", device, "--threads", "2"],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        assert done.returncode == 0, done.stderr
+        outputs.append((tmp_path / name).read_bytes())
+        notes = [line for line in done.stderr.splitlines() if "goes on on the CPU" in line]
+        if device == "gpu" and kilobytes < 1_000_000:
+            assert len(notes) == 1
+            assert "MB of address space" in notes[0]
+    assert outputs[0] == outputs[1]
+
+
+def test_lists_devices(tmp_path: Path, command_line: CommandLine) -> None:
+    status, out, told = command_line("info", "--devices", "--json", "-", cwd=tmp_path)
+    assert status == 0, told
+    assert told.splitlines()[0].strip() == "Devices"
+    assert "--device gpu" in told
+    assert "┡" not in told  # what ends a header
+    found = json.loads(out)
+    names = [a["name"] for a in found["adapters"]]
+    assert found["used"]["gpu"] == (names[0] if names else None)
+    assert all(a["kind"] != "cpu" or a["name"] != found["used"]["auto"] for a in found["adapters"])
+    status, out, _ = command_line("info", "--devices", cwd=tmp_path)
+    assert status == 0
+    assert all(name in out for name in names or ["the CPU"])
+    for wrong in ((), ("a.ply", "--devices")):
+        status, _, told = command_line("info", *wrong, cwd=tmp_path)
+        assert status == 2
+        assert "give a file, or --devices" in told
+
+
+def test_without_an_adapter_one_line_and_the_cpu(
+    tmp_path: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if devices.adapters() is None:
+        pytest.skip("no GPU kernels in this build")
+    for name in ("VK_ICD_FILENAMES", "VK_DRIVER_FILES"):
+        monkeypatch.setitem(os.environ, name, str(tmp_path / "none.json"))
+    write_splats(tmp_path / "a.ply", checkered_ball(500))
+    paper = ("simplify", "a.ply", "-r", "5", "--method", "paper", "-w")
+    status, _, told = command_line(*paper, "-o", "gpu.ply", "--device", "gpu", cwd=tmp_path)
+    if "no adapter" not in told:
+        pytest.skip("this machine's driver is not Vulkan's")
+    assert status == 0
+    lines = told.splitlines()
+    assert [line for line in lines if "goes on on the CPU" in line] == [lines[0]]  # before the summary
+    assert lines[1].startswith("gpu.ply")
+    status, _, told = command_line(*paper, "-o", "cpu.ply", "--device", "auto", cwd=tmp_path)
+    assert status == 0
+    assert "GPU" not in told
+    assert (tmp_path / "cpu.ply").read_bytes() == (tmp_path / "gpu.ply").read_bytes()
+    status, out, _ = command_line("info", "--devices", "--json", "-", cwd=tmp_path)
+    assert status == 0
+    assert json.loads(out) == {**json.loads(out), "adapters": []}
+
+
+def test_nothing_to_do_is_said(tmp_path: Path, command_line: CommandLine) -> None:
+    write_splats(tmp_path / "a.ply", checkered_ball(500))
+    fast = ("simplify", "a.ply", "-r", "5", "--method", "fast", "-o", "b.ply", "--device", "gpu")
+    status, _, told = command_line(*fast, cwd=tmp_path)
+    assert status == 0
+    assert "use one; all ran on the CPU" in told
+
+
+def _whole() -> None:
+    """The real scenes whole, on whatever adapter there is: parity and seconds."""
+    for parts in (("playbot", "0_0"), ("taebak_park", "0_4")):
+        prior = read_splats(real(*parts))
+        budget = len(prior) // 10
+        made, seconds = [], []
+        for device in ("cpu", "gpu"):
+            devices.use(device)
+            began = time.perf_counter()
+            made.append(simplify(prior, budget, method="paper"))
+            seconds.append(time.perf_counter() - began)
+        assert_same(*made)
+        print(
+            f"{'/'.join(parts)}: {len(prior):,} → {budget:,}, all rows, parents and refusals alike; ", end=""
+        )
+        print(f"cpu {seconds[0]:.1f} s, {devices.state().adapter} {seconds[1]:.1f} s", flush=True)
+        every, seen = seen_alike(prior, make_pool(prior, 24).resized(384), min(300_000, len(prior) // 2))
+        print(
+            f"  cells seen: {100 * every:.5f} % alike, {100 * seen:.5f} % of those that either sees",
+            flush=True,
+        )
+
+
+def test_a_gpu_in_software_is_told(command_line: CommandLine, folder: Path) -> None:
+    found = devices.adapters()
+    if not found or found[0].kind != "cpu":
+        pytest.skip("no adapter in software comes first")
+    ask = ("simplify", "ball.ply", "-r", 2, "--method", "paper", "-o", "s.ply", "--device", "gpu")
+    status, _, error = command_line(*ask, cwd=folder)
+    assert status == 0, error
+    assert error.count(f"--device gpu: {found[0].name} is software on this CPU") == 1
+
+
+if __name__ == "__main__":
+    _whole()

@@ -1,0 +1,299 @@
+"""Commands on scenes in tiles: files, refusals, and recovery with frozen surroundings."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard.errors import InputError
+from g2ard.io import read_splats, write_splats, write_views
+from g2ard.policy.tiled import Tiling, bytes_of, check_memory, is_tiled, workers_for
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import TeacherRenders
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.schedule import schedule_named
+from g2ard.stages.simplify import simplify
+from g2ard.tiles.ingest import ingest
+from g2ard.tiles.store import TileStore
+from helpers.commands import CommandLine
+from helpers.project import ROOT
+from helpers.systems import is_worker, needs_proc
+from helpers.tiled_scenes import ring, town
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("town")
+    write_splats(folder / "town.ply", town())
+    write_views(folder / "views.json", ring(8), splits=["train"] * 6 + ["test"] * 2)
+    return folder
+
+
+def good(command_line: CommandLine, cwd: Path, *arguments: object) -> None:
+    code, _, said = command_line(*arguments, cwd=cwd)
+    assert code == 0, said
+
+
+def test_frozen_rows_stay_and_the_others_learn() -> None:
+    dense = town(1500)
+    small = simplify(dense, 300).splats
+    frozen = np.arange(300) % 3 == 0
+    config = RecoverConfig(schedule=schedule_named("fast", 40), steps=40)
+    done = recover(small, TeacherRenders(dense, ring()), config, frozen=frozen)
+    assert done.report.psnr.after > done.report.psnr.before
+    for name in ("means", "scales", "logit_opacities", "sh0"):
+        was, now = (np.asarray(getattr(s, name), np.float32).reshape(300, -1) for s in (small, done.splats))
+        np.testing.assert_allclose(now[frozen], was[frozen], rtol=2e-6, atol=1e-6)
+        assert (np.abs(now - was)[~frozen] > 1e-5).any(axis=1).mean() > 0.9
+    with pytest.raises(InputError, match=r"frozen: expected bool of shape \(300,\)"):
+        recover(small, TeacherRenders(dense, ring()), config, frozen=frozen[:5])
+
+
+def test_simplify_works_in_tiles_and_forgets_them(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
+    out, views = tmp_path / "small_{ratio}x.ply", folder / "views.json"
+    args = ["simplify", folder / "town.ply", "-r", "10,20", "-o", out, "--tile-rows", "2500"]
+    good(command_line, tmp_path, *args, "--views", views, "--workers", "1", "--json", tmp_path / "told.json")
+    told = json.loads((tmp_path / "told.json").read_text())["runs"]
+    for ratio, report in zip((10, 20), told, strict=True):
+        small = read_splats(tmp_path / f"small_{ratio}x.ply")
+        assert len(small) == 9000 // ratio == report["output_count"] == sum(report["tiles"])
+    assert {path.name for path in tmp_path.iterdir()} == {"small_10x.ply", "small_20x.ply", "told.json"}
+
+
+def test_what_lies_hidden_beside_the_output_of_another_run_is_replaced(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
+    args = ["-n", "300", "--no-views", "--workers", "1", "--tile-rows", "700"]
+    write_splats(tmp_path / "other.ply", town(1500, seed=4))
+    write_splats(tmp_path / "own.ply", town(1600))
+    good(command_line, tmp_path, "simplify", "own.ply", "-o", "clean.ply", *args)
+    stale = tmp_path / ".x.ply.tiles"
+    ingest(tmp_path / "other.ply", stale / "tiles", tile_rows=700)
+    (stale / "steps").mkdir()
+    (stale / "steps" / "coarse-00000-0123456789abcdef.npz").write_bytes(b"of another run")
+    (stale / "steps" / ".coarse-00000.0123.npz").write_bytes(b"begun")
+    good(command_line, tmp_path, "simplify", "own.ply", "-o", "x.ply", *args)
+    assert (tmp_path / "x.ply").read_bytes() == (tmp_path / "clean.ply").read_bytes()
+    assert not stale.exists()
+
+
+def test_a_device_that_all_fit_takes_them_all(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
+    args = ["simplify", folder / "town.ply", "--fit", "web", "-o", "all.ply", "--tile-rows", "2500"]
+    good(command_line, tmp_path, *args, "--workers", "1")
+    assert len(read_splats(tmp_path / "all.ply")) == 9000
+
+
+def test_a_folder_of_tiles_is_a_scene(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
+    common = ["-n", "900", "--no-views", "--workers", "1"]
+    good(
+        command_line,
+        tmp_path,
+        "simplify",
+        store.folder,
+        *common,
+        "-o",
+        tmp_path / "a.ply",
+        "--work",
+        tmp_path / "work",
+    )
+    good(
+        command_line,
+        tmp_path,
+        "simplify",
+        folder / "town.ply",
+        *common,
+        "-o",
+        tmp_path / "b.ply",
+        "--tile-rows",
+        "2500",
+    )
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    assert (tmp_path / "work" / "steps").is_dir()  # named by the user, so it stays
+
+
+def test_tiles_are_read_as_one_scene(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    dense = read_splats(folder / "town.ply")
+    for rows in (9000, 2500):
+        store = ingest(folder / "town.ply", tmp_path / f"{rows}", tile_rows=rows)
+        back = read_splats(store.folder)
+        for name in ("means", "scales", "logit_opacities"):
+            got, wanted = (np.sort(getattr(scene, name), axis=0) for scene in (back, dense))
+            np.testing.assert_array_equal(got, wanted)
+    again = ingest(tmp_path / "2500", tmp_path / "again", tile_rows=4000)
+    whole = ingest(folder / "town.ply", tmp_path / "whole", tile_rows=4000)
+    assert [tile.rows for tile in again.tiles] == [tile.rows for tile in whole.tiles]
+    args = ("simplify", tmp_path / "9000", "-n", 300, "--no-views", "-o", "one.ply")
+    good(command_line, tmp_path, *args)
+    good(command_line, tmp_path, "simplify", folder / "town.ply", *args[2:-1], "two.ply")
+    assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "two.ply").read_bytes()
+
+
+def own_path() -> dict[str, str]:
+    """The environment of a process that runs these sources."""
+    paths = filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+
+
+def test_a_killed_command_leaves_no_workers_and_goes_on(folder: Path, tmp_path: Path) -> None:
+    words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
+    command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
+    env = own_path()
+    steps = tmp_path / ".x.ply.tiles" / "steps"
+    with subprocess.Popen(command, env=env, stderr=subprocess.PIPE) as running:
+        children: list[int] = []
+        until = time.monotonic() + 120
+        while running.poll() is None and time.monotonic() < until and len(list(steps.glob("[!.]*.npz"))) < 3:
+            time.sleep(0.01)
+        listed = Path(f"/proc/{running.pid}/task/{running.pid}/children")
+        children = [int(pid) for pid in listed.read_text().split()] if listed.exists() else []
+        running.kill()
+    done = {path.name: path.stat().st_mtime_ns for path in steps.glob("[!.]*.npz")}
+    assert done
+    until = time.monotonic() + 30
+    while any(Path(f"/proc/{pid}").exists() for pid in children) and time.monotonic() < until:
+        time.sleep(0.1)
+    assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]
+    assert subprocess.run([*command, "--work", str(steps.parent)], env=env, check=False).returncode == 0
+    assert len(read_splats(tmp_path / "x.ply")) == 900
+    assert all((steps / name).stat().st_mtime_ns == at for name, at in done.items())
+
+
+@needs_proc
+@pytest.mark.parametrize("seconds", [0.0, 0.2, 0.5])
+def test_workers_that_have_just_begun_end_with_a_killed_command(
+    folder: Path, tmp_path: Path, seconds: float
+) -> None:
+    words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
+    command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
+    with subprocess.Popen(command, env=own_path(), stderr=subprocess.DEVNULL) as running:
+        until = time.monotonic() + 60
+        while not (workers := _workers(running.pid)) and time.monotonic() < until:
+            time.sleep(0.005)
+        time.sleep(seconds)
+        workers |= _workers(running.pid)
+        running.kill()
+    assert workers
+    until = time.monotonic() + 30
+    while (left := {pid for pid in workers if is_worker(pid)}) and time.monotonic() < until:
+        time.sleep(0.1)
+    for pid in left:
+        os.kill(pid, signal.SIGKILL)
+    assert not left
+
+
+def _workers(parent: int) -> set[int]:
+    """Its processes that work on tiles."""
+    listed = Path(f"/proc/{parent}/task/{parent}/children")
+    with suppress(OSError):
+        return {int(pid) for pid in listed.read_text().split() if is_worker(int(pid))}
+    return set()
+
+
+def test_memory_is_a_size(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    words = ("simplify", folder / "town.ply", "-r", 10, "-o", "x.ply", "--memory", "much")
+    status, _, said = command_line(*words, cwd=tmp_path)
+    assert (status, "a size such as 4GB" in " ".join(said.split())) == (2, True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_distill_in_one_piece_heeds_memory(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    call = (
+        "distill",
+        folder / "town.ply",
+        "-r",
+        10,
+        "-o",
+        tmp_path / "run",
+        "--views",
+        folder / "views.json",
+    )
+    status, _, said = command_line(*call, "--memory", "120MB", cwd=tmp_path)
+    assert status == 1
+    said = " ".join(said.split())
+    assert re.search(r"9,000 Gaussians in one piece take about [\d.]+ [MG]B, more than 120 MB", said)
+    assert "in tiles the least that tiles take is about 201 MB, with --tile-rows 1,000" in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_memory_decides_how_many_work_and_nothing_else(folder: Path, tmp_path: Path) -> None:
+    store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
+    need = 10**9
+    assert workers_for(store, Tiling(memory=need, cores=64)) < workers_for(
+        store, Tiling(memory=4 * need, cores=64)
+    )
+    with pytest.raises(
+        InputError, match=r"--workers 9 take about .* GB, more than --memory .*; --workers \d fit"
+    ):
+        workers_for(store, Tiling(memory=need, workers=9))
+    check_memory(folder / "town.ply", Tiling(), 7)
+    check_memory(folder / "town.ply", Tiling(memory=300_000_000), 7)
+    with pytest.raises(InputError, match=r"town.ply: 9,000 Gaussians in one piece take about"):
+        check_memory(folder / "town.ply", Tiling(memory=1_000_000), 7)
+    assert bytes_of("4GB") == 4 * 10**9
+    assert not is_tiled(folder / "town.ply", Tiling())
+    assert is_tiled(folder / "town.ply", Tiling(tile_rows=8999))
+    assert len(TileStore.open(tmp_path / "tiles").tiles) > 1
+
+
+def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    good(
+        command_line,
+        tmp_path,
+        *("distill", folder / "town.ply", "-r", 10, "-o", tmp_path / "run", "--views", folder / "views.json"),
+        *("--tile-rows", 4000, "--steps", 200, "--workers", 1),
+    )
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["scores"]["recovered"] > report["scores"]["simplified"] + 0.2
+    assert report["config"]["ratio"] == [10.0]
+    small = read_splats(tmp_path / "run" / "scene.ply")
+    assert len(small) == 900
+    held_out = TeacherRenders(read_splats(folder / "town.ply"), ring(8).take([6, 7]))
+    assert evaluate(small, held_out).psnr > report["scores"]["simplified"]
+    tiles = report["scores"]["tiles"]
+    assert [tile["count"] for tile in tiles] == report["tiles"]
+    assert sum(tile["pixels"] for tile in tiles) == report["scores"]["pixels"]
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "town.ply: 9,000 → 900" in page
+    assert f"{sum(tile['steps'] for tile in tiles):,} steps of recovery, those of all tiles summed" in page
+    assert all(f"{tile['recovered']:.2f}" in page for tile in tiles)
+    assert not list(tmp_path.glob("run/.*"))
+
+
+def test_recovery_in_tiles_takes_its_options(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    write_splats(tmp_path / "town.ply", town(1500))
+
+    def distilled(name: str, *options: object) -> Splats:
+        args = ("distill", tmp_path / "town.ply", "-r", 10, "-o", tmp_path / name, "--steps", 12)
+        tiled = ("--views", folder / "views.json", "--tile-rows", 800, "--workers", 1)
+        good(command_line, tmp_path, *args, *tiled, *options)
+        return read_splats(tmp_path / name / "scene.ply")
+
+    usual = distilled("usual")
+    others = (
+        ("--background", "1,1,1"),
+        ("--set", "rates.means=0.01"),
+        ("--set", "regularizers.shape=1", "--set", "regularizers.period=1"),
+        ("--seed", 3),
+    )
+    for number, options in enumerate(others):
+        changed = distilled(f"other{number}", *options)
+        assert changed.fingerprint() != usual.fingerprint(), options
+    wider = distilled("wider", "--sh-degree", 1)
+    assert wider.sh_degree == 1
+    assert np.abs(wider.shN).max() > 0

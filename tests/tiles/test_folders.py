@@ -1,0 +1,260 @@
+"""Folders of tiles and of work: one process at a time, damage found or mended, nothing of the user's lost."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from g2ard import io
+from g2ard.errors import InputError, OutputError
+from g2ard.io.lock import LOCK, locked
+from g2ard.levels import Cut, save_levels
+from g2ard.tiles import ingest as ingest_module
+from g2ard.tiles.ingest import ingest
+from g2ard.tiles.store import TileStore
+from g2ard.tiles.stored import StoredScene
+from helpers.commands import CommandLine
+from helpers.level_files import files_of, scattered
+from helpers.project import ROOT
+from helpers.tiled_scenes import reduced, ring, town
+
+BLIND = ("--no-views", "--workers", "1", "--tile-rows", "700")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("folders")
+    io.write_splats(folder / "town.ply", town(1600))
+    io.write_views(folder / "views.json", ring(8), splits=["train"] * 6 + ["test"] * 2)
+    ingest(folder / "town.ply", folder / "tiles", tile_rows=700)
+    return folder
+
+
+def flipped(path: Path) -> None:
+    """One byte changed, none added."""
+    content = bytearray(path.read_bytes())
+    content[100] ^= 1
+    path.write_bytes(content)
+
+
+def test_a_folder_has_one_holder_and_a_dead_one_is_none(tmp_path: Path) -> None:
+    holds = (
+        "import sys, time; from pathlib import Path; from g2ard.io.lock import locked\n"
+        "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", holds, tmp_path], stdout=subprocess.PIPE) as holder:
+        try:
+            assert holder.stdout is not None
+            assert holder.stdout.readline().strip() == b"held"
+            with pytest.raises(OutputError, match=f"in use by process {holder.pid};"), locked(tmp_path):
+                pass
+            assert (tmp_path / LOCK).exists()  # the holder's, not taken by who was refused
+        finally:
+            holder.kill()
+    with locked(tmp_path):
+        assert (tmp_path / LOCK).exists()
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_ingests_do_not_meet(place: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "tiles"
+    folder.mkdir()
+    with locked(folder), pytest.raises(OutputError, match="tiles: in use by process"):
+        ingest(place / "town.ply", folder, tile_rows=700)
+    assert ingest(place / "town.ply", folder, tile_rows=700).count == 1600
+    assert not (folder / LOCK).exists()
+
+
+def test_two_commands_in_one_work_folder_do_not_meet(
+    command_line: CommandLine, place: Path, tmp_path: Path
+) -> None:
+    simplify = ("simplify", place / "town.ply", "-n", 300, *BLIND, "-o", "a.ply", "--work", "work")
+    (tmp_path / "work").mkdir()
+    with locked(tmp_path / "work"):
+        status, _, said = command_line(*simplify, cwd=tmp_path)
+    assert (status, "work: in use by process" in said, said.count("\n")) == (1, True, 1), said
+    status, _, said = command_line(*simplify, cwd=tmp_path)
+    assert status == 0, said
+
+
+@pytest.mark.parametrize("length", [100, 10_000_000])
+def test_tiles_of_another_length_are_poured_again(place: Path, tmp_path: Path, length: int) -> None:
+    folder, said = tmp_path / "tiles", list[str]()
+    whole = ingest(place / "town.ply", folder, tile_rows=700)
+    before = files_of(folder)
+    with (folder / "tile-00000.f32").open("r+b") as file:
+        file.truncate(length)
+    again = ingest(place / "town.ply", folder, tile_rows=700, say=said.append)
+    assert (again.tiles, files_of(folder)) == (whole.tiles, before)
+    assert "damaged" in said[0]
+    with (folder / "tile-00000.f32").open("r+b") as file:
+        file.truncate(length)
+    with pytest.raises(InputError, match="the manifest says"):  # of other settings it is not replaced unasked
+        ingest(place / "town.ply", folder, tile_rows=800)
+
+
+def test_a_step_that_was_cut_is_done_again(place: Path, tmp_path: Path) -> None:
+    store = TileStore.open(place / "tiles")
+    whole = reduced(store, tmp_path, budget=300, blind=True)
+    steps = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    for path in (p for p in steps if p.name.startswith(("costs", "merge-00001"))):
+        path.write_bytes(path.read_bytes()[:100])
+    again = reduced(store, tmp_path, budget=300, blind=True)
+    assert again.fingerprint() == whole.fingerprint()
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == steps
+    for path in (p for p in steps if p.name.startswith("costs")):
+        flipped(path)
+    with pytest.raises(InputError, match=r"costs-00000-\w+\.npz: its contents are not .* once it is removed"):
+        reduced(store, tmp_path, budget=299, blind=True)
+
+
+def test_steps_that_are_done_do_not_hide_damaged_tiles(place: Path, tmp_path: Path) -> None:
+    store = ingest(place / "town.ply", tmp_path / "tiles", tile_rows=700)
+    reduced(store, tmp_path / "steps", budget=300, blind=True)
+    flipped(store.folder / "tile-00001.f32")
+    with pytest.raises(InputError, match=r"tile-00001\.f32: its contents are not"):
+        reduced(store, tmp_path / "steps", budget=299, blind=True)
+    with pytest.raises(InputError, match=r"tile-00001\.f32: its contents are not"):
+        reduced(store, tmp_path / "steps", budget=1600, blind=True)
+
+
+def test_levels_are_not_written_from_damaged_tiles(place: Path, tmp_path: Path) -> None:
+    store, work = ingest(place / "town.ply", tmp_path / "tiles", tile_rows=700), tmp_path / "work"
+    work.mkdir()
+
+    def stop(stage: str, number: int, total: int, info: object = None) -> None:
+        if stage == "write" and number == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        save_levels(tmp_path / "out", [StoredScene(store)], cut=Cut(most=200), work=work, progress=stop)
+    flipped(store.folder / "tile-00001.f32")
+    with pytest.raises(InputError, match=r"tile-00001\.f32: its contents are not"):
+        save_levels(tmp_path / "out", [StoredScene(store)], cut=Cut(most=200), work=work)
+    assert not (tmp_path / "out").exists()
+
+
+def test_killed_levels_leave_nothing_beside_the_output(tmp_path: Path) -> None:
+    levels, work = [scattered(2000), scattered(300, 1)], tmp_path / "work"
+    work.mkdir()
+    save_levels(tmp_path / "whole", levels, cut=Cut(most=200))
+    killed = (
+        "import os, sys; sys.path.insert(0, sys.argv[1])\n"
+        "from pathlib import Path; from helpers.level_files import scattered\n"
+        "from g2ard.levels import Cut, save_levels, write\n"
+        "link, done = write._linked, []\n"
+        "def dies(*names):\n"
+        "    done.append(link(*names))\n"
+        "    if len(done) == 9: os._exit(9)\n"
+        "write._linked = dies\n"
+        "save_levels(Path('out'), [scattered(2000), scattered(300, 1)], cut=Cut(most=200), work=Path('work'))"
+    )
+    call = [sys.executable, "-c", killed, str(ROOT / "tests")]
+    assert subprocess.run(call, cwd=tmp_path, check=False).returncode == 9
+    assert [path.name[:5] for path in tmp_path.iterdir() if path.name.startswith(".")] == [".out."]
+    (work / ".0_9.0123456789ab").mkdir()  # killed within a file
+    before = {path: path.stat().st_mtime_ns for path in work.rglob("*.webp")}
+    with (work / "errors.jsonl").open("r+b") as table:
+        table.seek(30)
+        table.write(b"{")  # damage within a line: measured again from there
+    save_levels(tmp_path / "out", levels, cut=Cut(most=200), work=work)
+    assert files_of(tmp_path / "out") == files_of(tmp_path / "whole")
+    moved = {path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*.webp")}
+    assert set(before.values()) == moved
+    assert {path.name for path in tmp_path.iterdir()} == {"out", "whole", "work"}
+    assert [path.name for path in work.iterdir()] == ["errors.jsonl"]
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--views", "nothere"), "nothere: no such file"),
+        (("--no-views", "--scheduler", "tcp://127.0.0.1:9"), "does not answer"),
+    ],
+)
+def test_what_can_be_refused_first_is(
+    command_line: CommandLine,
+    place: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    options: tuple[str, ...],
+    told: str,
+) -> None:
+    if "--scheduler" in options:
+        distributed = pytest.importorskip("distributed")
+        client = distributed.Client
+
+        def hasty(address: str, **more: object) -> object:
+            return client(address, **{**more, "timeout": "1s"})
+
+        monkeypatch.setattr(distributed, "Client", hasty)
+    monkeypatch.setattr(ingest_module, "pour", lambda *_: pytest.fail("poured"))
+    tiled = ("simplify", place / "town.ply", "-n", 300, "--tile-rows", "700", "-o", "deep/a.ply")
+    status, _, said = command_line(*tiled, *options, cwd=tmp_path)
+    assert (status, told in said, said.count("\n")) == (1, True, 1), said
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_refusal_leaves_no_copy_of_the_scene_or_says_so(
+    command_line: CommandLine, place: Path, tmp_path: Path
+) -> None:
+    tiled = ("simplify", place / "town.ply", *BLIND, "-o", "a.ply", "-n")
+    status, _, said = command_line(*tiled, 9999, cwd=tmp_path)
+    assert status == 1, said
+    assert not list(tmp_path.iterdir())
+    status, _, said = command_line(*tiled, 2, cwd=tmp_path)  # known once the steps are done
+    assert (status, "is the fewest" in said, ".a.ply.tiles keeps what is done" in said) == (1, True, True)
+    assert (tmp_path / ".a.ply.tiles" / "steps").is_dir()
+    status, _, said = command_line(*tiled, 300, cwd=tmp_path)
+    assert status == 0, said
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_work_takes_no_folder_of_the_users_own(
+    command_line: CommandLine, place: Path, tmp_path: Path
+) -> None:
+    tiled = ("simplify", place / "town.ply", "-n", 300, *BLIND)
+    own, tiles = tmp_path / "own", tmp_path / "tiles"
+    own.mkdir()
+    (own / "letter.txt").write_text("dear")
+    ingest(place / "town.ply", tiles, tile_rows=800)
+    for folder, held in ((own, "letter.txt"), (tiles, "halo-00000.f32")):
+        before = files_of(folder)
+        status, _, said = command_line(*tiled, "-o", "a.ply", "--work", folder, cwd=tmp_path)
+        assert (status, f"{folder.name}: holds {held}" in said, said.count("\n")) == (1, True, 1), said
+        assert files_of(folder) == before
+    status, _, said = command_line(*tiled, "-o", "b", "--work", "b", cwd=tmp_path)
+    said = " ".join(said.split())
+    assert (status, "--work: b is an output" in said, "is an input" in said) == (2, True, False), said
+    for _ in range(2):  # one that was made so is taken again
+        status, _, said = command_line(*tiled, "-o", "a.ply", "-w", "--work", "work", cwd=tmp_path)
+        assert status == 0, said
+
+
+def test_an_unfinished_ingest_is_named(command_line: CommandLine, place: Path, tmp_path: Path) -> None:
+    def stop(stage: str, *_: object) -> None:
+        if stage == "tiles":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ingest(place / "town.ply", tmp_path / "begun", tile_rows=700, progress=stop)
+    for call in (("info", "begun"), ("simplify", "begun", "-n", 300, "-o", "a.ply")):
+        status, _, said = command_line(*call, cwd=tmp_path)
+        assert (status, "begun: tiles that `g2ard ingest` has not finished" in said) == (1, True), said
+    (tmp_path / "empty").mkdir()
+    assert "tiles.json" in command_line("info", "empty", cwd=tmp_path)[2]
+    before = files_of(tmp_path / "begun")
+    with pytest.raises(OutputError, match=r"\(tile_rows 700, not 800\); overwrite=True replaces it"):
+        ingest(place / "town.ply", tmp_path / "begun", tile_rows=800)
+    assert files_of(tmp_path / "begun") == before
+
+
+def test_tiles_are_not_too_many(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ingest_module, "MOST_TILES", 10)
+    with pytest.raises(InputError, match="1,600 rows, too many for tiles of 159; at least 160 each"):
+        ingest(place / "town.ply", tmp_path / "tiles", tile_rows=159)
+    assert not (tmp_path / "tiles").exists()
+    assert ingest(place / "town.ply", tmp_path / "tiles", tile_rows=160).count == 1600

@@ -1,0 +1,175 @@
+"""Levels of detail in tiles: the same files as of the whole, exact counts, and nothing done twice."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard import io
+from g2ard.errors import InputError
+from g2ard.io import sog
+from g2ard.levels import Cut, cut, save_levels, tree
+from g2ard.policy.distill_options import DistillOptions
+from g2ard.policy.tiled import Tiling
+from g2ard.policy.tiled_levels import TiledLevels, lod_in_tiles
+from g2ard.scene.splats import Splats
+from g2ard.system.memory import peak_rss
+from g2ard.tiles.ingest import ingest
+from g2ard.tiles.stored import StoredScene
+from helpers.level_files import files_of, leaves_of, scattered
+from helpers.tiled_scenes import ring, town
+
+
+def snapped(count: int, seed: int) -> Splats:
+    """Positions on a grid: many rows share a coordinate, some all three."""
+    scene = scattered(count, seed)
+    return Splats.create(np.round(scene.means * 2) / 2, scales=scene.scales, quats=scene.quats)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("lod")
+    io.write_splats(folder / "town.ply", town(6000))
+    io.write_views(folder / "views.json", ring(8), splits=["train"] * 6 + ["test"] * 2)
+    return folder
+
+
+def sorted_cut(means: np.ndarray, rows: np.ndarray, most: int) -> list[set[int]]:
+    """Naive: stable sorts of all rows, one cut after another."""
+    if len(rows) <= most:
+        return [set(rows.tolist())]
+    axis = int(np.ptp(means[rows], axis=0).argmax())
+    rows = rows[np.argsort(means[rows, axis], kind="stable")]
+    middle = len(rows) // 2
+    return [*sorted_cut(means, rows[:middle], most), *sorted_cut(means, rows[middle:], most)]
+
+
+def test_halves_are_those_of_stable_sorts_where_coordinates_tie(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tree, "_BLOCK", 70)  # so that arrays are files, and blocks many
+    levels = [snapped(900, 0), snapped(300, 1)]
+    leaves = leaves_of(cut(levels, Cut(most=40), tmp_path))
+    means = np.concatenate([level.means for level in levels]).astype(float)
+    naive = sorted_cut(means, np.arange(1200), 40)
+    got = [{*leaf.rows[0].tolist(), *(leaf.rows[1] + 900).tolist()} for leaf in leaves]
+    assert got == naive
+    assert isinstance(leaves[0].rows[0].base, np.memmap) or isinstance(leaves[0].rows[0], np.memmap)
+    assert not list(tmp_path.iterdir())
+
+
+def test_means_that_are_not_finite_are_refused() -> None:
+    broken = scattered(9)
+    broken.means[3, 1] = np.nan
+    with pytest.raises(InputError, match="a mean of level 1 is not finite"):
+        cut([scattered(9), broken])
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_levels_on_disk_give_the_files_of_levels_in_memory(tmp_path: Path, degree: int) -> None:
+    rng = np.random.default_rng(5)
+    stored = []
+    for number, count in enumerate((3000, 700)):
+        shN = rng.normal(size=(count, (degree + 1) ** 2 - 1, 3))
+        scene = Splats.create(rng.normal(size=(count, 3)), scales=rng.uniform(0.02, 0.1, (count, 3)), shN=shN)
+        io.write_splats(tmp_path / f"{number}.ply", scene)
+        stored.append(StoredScene(ingest(tmp_path / f"{number}.ply", tmp_path / f"{number}", tile_rows=800)))
+    held = [Splats(**vars(level.take(np.arange(len(level))))) for level in stored]
+    (tmp_path / "work").mkdir()
+    save_levels(tmp_path / "a", held, cut=Cut(most=300))
+    save_levels(tmp_path / "b", stored, cut=Cut(most=300), work=tmp_path / "work")
+    assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
+
+
+def test_what_is_measured_and_written_is_not_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    levels, work = [scattered(2000), scattered(300, 1)], tmp_path / "work"
+    work.mkdir()
+    save_levels(tmp_path / "whole", levels, cut=Cut(most=200))
+    done: list[int] = []
+
+    def stop(stage: str, number: int, total: int, info: object = None) -> None:
+        done.append(number)
+        if stage == "write" and number == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        save_levels(tmp_path / "out", levels, cut=Cut(most=200), work=work, progress=stop)
+    assert not (tmp_path / "out").exists()
+    before = {path: path.stat().st_mtime_ns for path in work.rglob("*") if path.is_file()}
+    assert sum(path.name == "meta.json" for path in before) == 3
+    with (work / "errors.jsonl").open("a") as table:
+        table.write("[0.0, 0.")  # killed within a line
+    from g2ard.levels import write
+
+    monkeypatch.setattr(write, "leaf_errors", lambda *_: pytest.fail("measured again"))
+    save_levels(tmp_path / "out", levels, cut=Cut(most=200), work=work)
+    assert files_of(tmp_path / "out") == files_of(tmp_path / "whole")
+    moved = {path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    assert {time for path, time in before.items() if path.name != "errors.jsonl"} <= moved
+
+
+def levels_in_tiles(place: Path, folder: Path, **more: object) -> TiledLevels:
+    options = DistillOptions(views=place / "views.json", steps=12)
+    tiling = Tiling(tile_rows=1700, workers=1, folder=folder)
+    return lod_in_tiles(place / "town.ply", (1, 3, 12), tiling, options, **more)  # type: ignore[arg-type]
+
+
+def test_levels_have_exact_counts_and_a_stopped_chain_goes_on(place: Path, tmp_path: Path) -> None:
+    whole = levels_in_tiles(place, tmp_path / "whole")
+    assert [len(level) for level in whole.scenes] == [6000, 2000, 500]
+    assert [len(level.store.tiles) for level in whole.scenes] == [4, 2, 1]
+    for report in whole.reports[1:]:
+        assert report.recovered is not None
+        assert report.simplified is not None
+        assert report.recovered > report.simplified > 15
+
+    class StopError(Exception):
+        pass
+
+    def stop(line: str) -> None:
+        if line.startswith("level 2"):
+            raise StopError
+
+    with pytest.raises(StopError):
+        levels_in_tiles(place, tmp_path / "again", say=stop)
+    steps = tmp_path / "again" / "steps"
+    before = {path: path.stat().st_mtime_ns for path in steps.iterdir()}
+    again = levels_in_tiles(place, tmp_path / "again")
+    assert all(path.stat().st_mtime_ns == time for path, time in before.items())
+    rows = np.arange(500)
+    one, other = (levels.scenes[2].take(rows).fingerprint() for levels in (whole, again))
+    assert one == other
+    assert whole.key(Cut(), True) == again.key(Cut(), True) != whole.key(Cut(most=9), True)
+
+
+def test_the_command_in_tiles(place: Path, tmp_path: Path, command_line) -> None:
+    given = ["lod", place / "town.ply", "-o", "out", "-r", "1,4,16", "--merge-only", "--chunk-count", "1"]
+    tiled = [*given, "--tile-rows", "1700", "--views", place / "views.json"]
+    status, _, said = command_line(*tiled, "--workers", "2", "--json", "told.json", cwd=tmp_path)
+    assert status == 0, said
+    told = json.loads((tmp_path / "told.json").read_text())
+    assert [level["count"] for level in told["levels"]] == [6000, 1500, 375]
+    own = peak_rss()
+    assert own is None or told["peak_rss_bytes"] > own + 2e7  # the workers' too
+    meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
+    files = [sog.read(tmp_path / "out" / name).splats for name in meta["filenames"]]
+    levels = [name.split("_")[0] for name in meta["filenames"]]
+    counts = {at: sum(len(f) for f, of in zip(files, levels, strict=True) if of == at) for at in "012"}
+    assert counts == {"0": 6000, "1": 1500, "2": 375}
+    assert len(io.read_splats(tmp_path / "out")) == 6000
+    assert {path.name for path in tmp_path.iterdir()} == {"out", "told.json"}  # nothing hidden stays
+    status, _, said = command_line(*tiled, "--resume", cwd=tmp_path)
+    assert (status, "finished already" in said) == (0, True)
+    (tmp_path / ".z.tiles" / "steps").mkdir(parents=True)
+    (tmp_path / ".z.tiles" / "steps" / "coarse-00000-0123456789abcdef.npz").write_bytes(b"of another run")
+    status, _, said = command_line(*tiled[:3], "z", *tiled[4:], "--resume", "--workers", "1", cwd=tmp_path)
+    assert (status, "starts anew" in said) == (0, False), said
+    assert files_of(tmp_path / "z") == files_of(tmp_path / "out")  # one worker or two
+    assert not (tmp_path / ".z.tiles").exists()
+    more = [*given[:3], "y", *given[4:], "--tile-rows", "1700", "--memory", "100MB"]
+    status, _, said = command_line(*more, cwd=tmp_path)
+    assert (status, "--tile-rows" in said) == (1, True)
+    assert not (tmp_path / "y").exists()

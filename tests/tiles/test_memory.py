@@ -1,0 +1,86 @@
+"""Memory of tiles: what is refused says what it takes, and what it advises is accepted."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from g2ard.errors import InputError
+from g2ard.io import write_splats
+from g2ard.policy import tiled
+from g2ard.policy.tile_memory import RECOVERY_TIMES, TileMemory
+from g2ard.policy.tiled import LEVELS_TIMES, Tiling, bytes_of, check_memory, workers_for
+from g2ard.tiles.ingest import ingest
+from g2ard.tiles.store import TileStore
+from helpers.tiled_scenes import town
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("town") / "town.ply"
+    write_splats(place, town(12_000))
+    return place
+
+
+def advised(told: str) -> int:
+    found = re.search(r"--tile-rows ([\d,]+)", told)
+    assert found, told
+    return int(found[1].replace(",", ""))
+
+
+def tiles(scene: Path, folder: Path, rows: int) -> tuple[TileStore, Tiling]:
+    return ingest(scene, folder / "tiles", tile_rows=rows), Tiling(folder=folder)
+
+
+@pytest.mark.parametrize("memory", ["201600kB", "202MB", "203MB"])
+def test_tiles_that_are_advised_fit(scene: Path, tmp_path: Path, memory: str) -> None:
+    size = bytes_of(memory)
+    with pytest.raises(
+        InputError, match=r"in one piece take about 20[4-9] MB, 200 MB of it the program"
+    ) as e:
+        check_memory(scene, Tiling(memory=size), LEVELS_TIMES, RECOVERY_TIMES)
+    store, _ = tiles(scene, tmp_path / "a", advised(str(e.value)))
+    assert len(store.tiles) > 1
+    assert workers_for(store, Tiling(memory=size, folder=tmp_path / "a"), RECOVERY_TIMES) == 1
+    store, _ = tiles(scene, tmp_path / "b", 11_000)
+    with pytest.raises(InputError, match=r"a tile of [\d,]+ Gaussians and [\d,]+ around it takes about") as e:
+        workers_for(store, Tiling(memory=size, folder=tmp_path / "b"), RECOVERY_TIMES)
+    again, _ = tiles(scene, tmp_path / "c", advised(str(e.value)))
+    assert workers_for(again, Tiling(memory=size), RECOVERY_TIMES) == 1
+
+
+def test_where_no_tiles_fit_the_least_is_told_and_does(scene: Path, tmp_path: Path) -> None:
+    store, _ = tiles(scene, tmp_path / "a", 6000)
+    for refuse in (
+        lambda: check_memory(scene, Tiling(memory=200_000_000), LEVELS_TIMES, RECOVERY_TIMES),
+        lambda: workers_for(store, Tiling(memory=200_000_000, folder=tmp_path / "a"), RECOVERY_TIMES),
+    ):
+        with pytest.raises(InputError, match="more than --memory 200 MB; the least that tiles take is") as e:
+            refuse()
+        told = re.search(r"tiles take is about (\d+) MB, with --tile-rows 1,000$", str(e.value))
+        assert told, e.value
+        least, _ = tiles(scene, tmp_path / told[1], 1000)
+        assert workers_for(least, Tiling(memory=bytes_of(f"{told[1]}MB")), RECOVERY_TIMES) == 1
+
+
+def test_tiles_of_a_folder_are_not_cut_anew(scene: Path, tmp_path: Path) -> None:
+    store, _ = tiles(scene, tmp_path, 6000)
+    with pytest.raises(InputError, match=r"; `g2ard ingest \S+tiles -o DIR --tile-rows [\d,]+` takes less"):
+        workers_for(store, Tiling(memory=bytes_of("202MB"), folder=tmp_path / ".x.tiles"))
+
+
+def test_memory_that_nobody_gave_is_the_machine_s(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, tiling = tiles(scene, tmp_path, 6000)
+    monkeypatch.setattr(tiled, "_physical_memory", lambda: 4_000_000_000)
+    told = r"--workers 1000 take about 20\d[\d.]* GB, more than the 3\.2 GB that are taken of the machine's"
+    with pytest.raises(InputError, match=told + r" memory; --workers 1\d fit$"):
+        workers_for(store, Tiling(folder=tiling.folder, workers=1000))
+
+
+def test_no_more_tiles_are_advised_than_are_made() -> None:
+    told = TileMemory(100_000_000, 56).advice(200_000_000, 50_000_000, lambda rows: 2 * rows)
+    assert told == "the least that tiles take is about 207 MB, with --tile-rows 10,000"

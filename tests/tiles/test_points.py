@@ -1,0 +1,169 @@
+"""Clouds in blocks, and lifted tile by tile: what `lift` gives of the whole cloud."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard.errors import InputError, OutputError
+from g2ard.io import Points, read_cloud, write_points
+from g2ard.io.point_stream import open_point_stream
+from g2ard.stages.lift import LiftConfig, lift
+from g2ard.tiles.ingest import ingest
+from g2ard.tiles.store import TileStore, packed
+from helpers.ingested import as_set, halos_of, saved, tiles_of, town
+
+UTM = (636_337.8, 5_427_319.25, 40.0)
+
+
+def streets(count: int = 8000, seed: int = 0, offset: tuple[float, ...] = (0, 0, 0)) -> Points:
+    """A ground and two walls, a survey's noise on them."""
+    rng = np.random.default_rng(seed)
+    at = rng.uniform(0, 1, (count, 3)) * [60, 25, 0]
+    wall = rng.integers(0, 4, count)
+    height = rng.uniform(0, 12, count)
+    at[wall == 0] = np.stack([at[:, 0], np.full(count, 25.0), height], 1)[wall == 0]
+    at[wall == 1] = np.stack([np.full(count, 60.0), at[:, 1], height], 1)[wall == 1]
+    return Points(
+        at + rng.normal(0, 0.01, (count, 3)) + offset, rng.uniform(0, 1, (count, 3)).astype(np.float32)
+    )
+
+
+def las(path: Path, points: Points, top: int = 65535, scale: float = 1e-3) -> Path:
+    laspy = pytest.importorskip("laspy")
+    pytest.importorskip("lazrs")
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.scales, header.offsets = [scale] * 3, np.floor(points.positions.min(0))
+    content = laspy.LasData(header)
+    content.x, content.y, content.z = points.positions.T
+    content.red, content.green, content.blue = np.rint(points.colors * top).astype(np.uint16).T
+    content.write(str(path))
+    return path
+
+
+def ply(path: Path, points: Points) -> Path:
+    write_points(path, points)
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.las", "a.laz", "dim.las"])
+def test_blocks_are_the_cloud(tmp_path: Path, name: str) -> None:
+    points = streets(3000, offset=UTM)
+    path = tmp_path / name
+    if name.endswith("ply"):
+        ply(path, points)
+    else:
+        las(path, points, 255 if name == "dim.las" else 65535)
+    whole = read_cloud(path)
+    for rows, start in ((100_000, 0), (700, 0), (64, 2990)):
+        stream = open_point_stream(path)
+        blocks = list(stream.blocks(rows, start))
+        np.testing.assert_array_equal(np.concatenate([b[0] for b in blocks]), whole.points.positions[start:])
+        colors = np.concatenate([b[1] for b in blocks])
+        np.testing.assert_array_equal(colors / np.float32(stream.divisor), whole.points.colors[start:])
+        assert stream.count == 3000
+        assert [n.code for n in stream.all_notes()] == [n.code for n in whole.notes]
+        assert np.abs(whole.points.positions - stream.offset).max() < 100
+
+
+def test_lifted_tiles_are_the_lifted_cloud(tmp_path: Path) -> None:
+    """A halo reaches four spacings here, and two hold a point's ten neighbours."""
+    points = streets(60_000, offset=UTM)
+    path = ply(tmp_path / "cloud.ply", points)
+    store = ingest(path, tmp_path / "tiles", tile_rows=20_000)
+    whole = lift(*vars(read_cloud(path).points).values())
+    assert (store.count, store.sh_degree) == (60_000, 0)
+    assert len(store.tiles) >= 3
+    assert not (tmp_path / "tiles" / ".points").exists()
+
+    near = (points.positions - store.offset).astype(np.float32)
+    right = np.concatenate([core for core, _ in store.cells.route(near)])  # each tile's points, in order
+    parts = [store.read(i) for i in range(len(store.tiles))]
+    world = np.concatenate([p.means + p.offset for p in parts])
+    np.testing.assert_allclose(world, (whole.means + whole.offset)[right], atol=2e-5, rtol=0)
+    colors = np.concatenate([p.sh0 for p in parts])
+    np.testing.assert_allclose(colors, whole.sh0[right], atol=1e-6, rtol=0)
+    scales, quats = (np.concatenate([getattr(p, n) for p in parts]) for n in ("scales", "quats"))
+    same = np.isclose(scales, whole.scales[right], rtol=1e-4).all(1)
+    same &= np.abs((quats * whole.quats[right]).sum(1)) > 1 - 1e-6
+
+    assert same.all()
+    halos = np.concatenate(halos_of(store))
+    assert np.isin(as_set(halos), as_set(np.concatenate(tiles_of(store)))).all()  # of the same discs
+
+
+def test_one_tile_is_the_lifted_cloud(tmp_path: Path) -> None:
+    points = streets(1000)
+    path = ply(tmp_path / "cloud.ply", points)
+    config = LiftConfig(neighbors=6, opacity=0.3)
+    store = ingest(path, tmp_path / "tiles", lift=config)
+    whole = lift(points.positions, read_cloud(path).points.colors, **vars(config))
+    np.testing.assert_array_equal(packed(store.read(0)), packed(whole))
+    assert store.offset.tolist() == [0, 0, 0]
+    with pytest.raises(OutputError, match="other settings"):
+        ingest(path, tmp_path / "tiles")
+
+
+def test_several_clouds_are_one(tmp_path: Path) -> None:
+    whole = streets(4000, offset=UTM)
+    parts = [Points(whole.positions[s], whole.colors[s]) for s in (slice(0, 2500), slice(2500, None))]
+    paths = [las(tmp_path / "a.laz", parts[0], 255), las(tmp_path / "b.las", parts[1])]
+    store = ingest(paths, tmp_path / "tiles", tile_rows=1000, block_rows=333)
+    assert store.count == 4000
+    assert [n.code for n in store.notes] == ["eight_bit_colors"]
+    rows = np.concatenate(tiles_of(store))
+    colors = np.concatenate([read_cloud(path).points.colors for path in paths])
+    expected = np.sort((colors - 0.5) / 0.28209479177387814, axis=0)
+    np.testing.assert_allclose(np.sort(rows[:, 11:14], axis=0), expected, atol=1e-5)
+    with pytest.raises(InputError, match="a Gaussian scene is needed"):
+        ingest([paths[0], saved(tmp_path / "scene.ply", town(50))], tmp_path / "both")
+
+
+@pytest.mark.parametrize("stage", ["sample", "tiles", "lift"])
+def test_an_interruption_costs_a_block_or_a_tile(tmp_path: Path, stage: str) -> None:
+    path, folder = ply(tmp_path / "cloud.ply", streets(3000)), tmp_path / "tiles"
+    whole = ingest(path, tmp_path / "whole", tile_rows=800)
+
+    def interrupt(now: str, done: int, total: int, info: object = None) -> None:
+        if now == stage and done >= 1200:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ingest(path, folder, tile_rows=800, block_rows=300, progress=interrupt)
+    with pytest.raises(InputError, match="no finished tiles"):
+        TileStore.open(folder)
+    if stage != "sample":
+        with pytest.raises(OutputError, match="other settings"):
+            ingest(path, folder, tile_rows=801)
+    seen: dict[str, int] = {}
+    store = ingest(
+        path, folder, tile_rows=800, progress=lambda now, done, total, info=None: seen.setdefault(now, done)
+    )
+    assert store.tiles == whole.tiles
+    assert store.key == whole.key
+    if stage == "lift":
+        assert "tiles" not in seen
+        assert seen["lift"] > 1200
+    manifest = json.loads((folder / "tiles.json").read_text())
+    assert manifest["settings"]["lift"]["neighbors"] == 10
+
+
+def test_bad_points_are_dropped_and_told(tmp_path: Path) -> None:
+    from helpers.ply_files import save
+
+    points = streets(500)
+    properties = {axis: points.positions[:, i].copy() for i, axis in enumerate("xyz")}
+    properties |= {n: points.colors[:, i].astype(float) for i, n in enumerate(("red", "green", "blue"))}
+    properties["y"][[7, 400]] = np.nan
+    path = save(tmp_path / "a.ply", properties, dtype="f8")
+    store = ingest(path, tmp_path / "tiles", tile_rows=100, block_rows=64)
+    assert store.notes == read_cloud(path).notes
+    assert store.count == 498
+    for i in range(3):
+        properties["xyz"[i]][:] = np.nan
+    with pytest.raises(InputError, match="none of its 500 points is finite"):
+        ingest(save(tmp_path / "b.ply", properties, dtype="f8"), tmp_path / "b", tile_rows=100)
+    assert list((tmp_path / "b").iterdir()) == []

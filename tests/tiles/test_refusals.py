@@ -1,0 +1,129 @@
+"""What tiles do not have, and options out of range: one line, in the words that were typed."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from g2ard.errors import InputError
+from g2ard.io import write_splats, write_views
+from g2ard.levels import Cut
+from g2ard.policy.distill_options import DistillOptions
+from g2ard.policy.whole import whole_options
+from g2ard.tiles.ingest import ingest
+from helpers.commands import CommandLine
+from helpers.tiled_scenes import ring, town
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("town")
+    write_splats(folder / "town.ply", town(3000))
+    write_views(folder / "views.json", ring(4))
+    ingest(folder / "town.ply", folder / "tiles", tile_rows=1500)
+    return folder
+
+
+def refused(command_line: CommandLine, cwd: Path, code: int, *words: object) -> str:
+    status, _, said = command_line(*words, cwd=cwd)
+    assert status == code, said
+    return " ".join(said.split())
+
+
+_SIMPLIFY = ("simplify", "-r", "10", "-o", "x.ply")
+_DISTILL = ("distill", "-r", "10", "-o", "x", "--views", "views.json")
+
+
+@pytest.mark.parametrize(
+    ("command", "given", "named"),
+    [
+        (_SIMPLIFY, "--method fast", "--method fast"),
+        (_SIMPLIFY, "--preset paper", "--preset paper"),
+        (_SIMPLIFY, "--parents p.npy", "--parents"),
+        (_DISTILL, "--method fast", "--method fast"),
+        (_DISTILL, "--preset paper-lift", "--preset paper-lift"),
+        (_DISTILL, "--schedule paper", "--schedule paper"),
+        (_DISTILL, "--photos", "--photos"),
+        (_DISTILL, "-k 10", "-k"),
+        (_DISTILL, "--clean", "--clean"),
+        (_DISTILL, "--reselect", "--reselect"),
+        (_DISTILL, "--recovery-time 5m", "--recovery-time"),
+        (_DISTILL, "--dry-run", "--dry-run"),
+        (_DISTILL, "--keep", "--keep"),
+        (_DISTILL, "--crop 0,0,0.5,0.5", "--crop"),
+        (("simplify", "-o", "x.ply"), "--min-ssim 0.9", "--min-ssim 0.9"),
+        (("distill", "-o", "x"), "--fit 50kB", "--fit 50kB"),
+    ],
+)
+def test_what_takes_the_scene_in_one_piece_is_named_as_it_is_typed(
+    command_line: CommandLine, folder: Path, command: tuple[str, ...], given: str, named: str
+) -> None:
+    words = (*command, "town.ply", *given.split(), "--tile-rows", "1500")
+    told = refused(command_line, folder, 1, *words)
+    end = "and it is worked on in tiles; --tile-rows 3,000 gives one piece"
+    assert told == f"g2ard: town.ply: {named} takes the scene in one piece, {end}"
+    assert not (folder / "x").exists()
+
+
+def test_several_are_named_together_and_renders_are_what_tiles_learn_from(
+    command_line: CommandLine, folder: Path
+) -> None:
+    told = refused(command_line, folder, 1, *_DISTILL, "tiles", "--clean", "--reselect")
+    assert "tiles: --clean and --reselect take the scene in one piece" in told
+    assert "`g2ard ingest tiles -o DIR --tile-rows 3,000` gives one piece" in told
+    assert whole_options(DistillOptions(photos=False)) == []
+    assert whole_options(DistillOptions(engine="gsplat")) == ["--device cuda"]
+
+
+def test_rows_of_tiles_that_lie_in_a_folder_are_theirs(command_line: CommandLine, folder: Path) -> None:
+    told = refused(command_line, folder, 2, *_SIMPLIFY, "tiles", "--tile-rows", "1k")
+    assert (
+        "--tile-rows: tiles is in tiles of 1,500 already; `g2ard ingest tiles -o DIR --tile-rows 1,000`"
+        in told
+    )
+    told = refused(command_line, folder, 1, *_SIMPLIFY, "tiles", "--tile-rows", "1500", "--method", "fast")
+    assert "--method fast" in told  # the same rows are no other
+
+
+@pytest.mark.parametrize("rows", ["0", "25%", "200%", "x"])
+def test_rows_of_a_tile_are_no_share(command_line: CommandLine, folder: Path, rows: str) -> None:
+    for words in (_SIMPLIFY, ("ingest", "-o", "other")):
+        told = refused(command_line, folder, 2, *words, "town.ply", "--tile-rows", rows)
+        assert f"'--tile-rows': a positive count such as 250000, 250k or 1.5M, not '{rows}'" in told
+
+
+@pytest.mark.parametrize("extent", ["inf", "nan", "0", "-1"])
+@pytest.mark.parametrize("tiled", [(), ("--tile-rows", "1500")])
+def test_an_extent_is_finite(
+    command_line: CommandLine, folder: Path, extent: str, tiled: tuple[str, ...]
+) -> None:
+    told = refused(command_line, folder, 2, "lod", "town.ply", "-o", "x", "--chunk-extent", extent, *tiled)
+    assert "--chunk-extent: expected a finite number above 0, got" in told
+    with pytest.raises(InputError, match="extent: expected a finite number"):
+        Cut(extent=float(extent))
+
+
+def test_ratios_that_do_not_rise_are_usage(command_line: CommandLine, folder: Path) -> None:
+    told = refused(command_line, folder, 2, "lod", "town.ply", "-o", "x", "-r", "2,1")
+    assert "--ratios: expected rising numbers of at least 1, got 2, 1" in told
+
+
+def test_the_fewest_that_tiles_come_to_are_one_each(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
+    words = ("simplify", folder / "town.ply", "-n", "2", "-o", "x.ply", "--no-views", "--workers", "1")
+    told = refused(command_line, tmp_path, 1, *words, "--tile-rows", "500")
+    assert re.search(
+        r"budget: (\d+) Gaussians is the fewest that the \1 tiles come to \(one a tile\), not 2; greater "
+        r"--tile-rows make fewer tiles",
+        told,
+    )
+
+
+def test_ingest_goes_on_with_resume_too(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+    words = ("ingest", folder / "town.ply", "-o", "tiles", "--resume")
+    for said in ("nothing to go on from (tiles): starts anew", "holds these 3,000 Gaussians already"):
+        status, _, told = command_line(*words, cwd=tmp_path)
+        assert (status, said in told) == (0, True), told

@@ -1,0 +1,245 @@
+"""Simplification in tiles: one exact budget, the same bits wherever tasks run, and one tile is the whole."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard import _core
+from g2ard.errors import InputError
+from g2ard.io import read_splats, write_splats
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.prepared import finite_rows_of
+from g2ard.scene.targets import TeacherRenders
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.simplify import SimplifyConfig, schedule, simplify
+from g2ard.tiles.cut import cheapest
+from g2ard.tiles.ingest import ingest
+from g2ard.tiles.steps import GONE
+from g2ard.tiles.store import TileStore
+from helpers.systems import is_worker, needs_proc
+from helpers.tiled_scenes import reduced, ring, town
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("town") / "town.ply"
+    write_splats(path, town())
+    return path
+
+
+@pytest.fixture(scope="module")
+def store(scene: Path) -> TileStore:
+    return ingest(scene, scene.parent / "tiles", tile_rows=2500)
+
+
+def clusters(of: np.ndarray, a: np.ndarray, b: np.ndarray, runs: int) -> np.ndarray:
+    """Naive: one merge after another."""
+    into = list(range(runs))
+    for x, y in zip(a, b, strict=True):
+        into = [int(x) if i == y else i for i in into]
+    names = {root: name for name, root in enumerate(sorted(set(into)))}
+    return np.array([GONE if run == GONE else names[into[run]] for run in of], np.uint32)
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_one_tile_is_the_whole_to_the_bit(seen: bool) -> None:
+    prepared, _ = finite_rows_of(town(2500))
+    rng = np.random.default_rng(1)
+    budget, config = 250, SimplifyConfig().resolved("default")
+
+    class Seen:
+        weight = rng.gamma(1, 1, len(prepared)).astype(np.float32)
+        pixel_size = np.where(rng.random(len(prepared)) < 0.9, 0.01, np.inf).astype(np.float32)
+
+    whole = simplify(prepared, budget, visibility=Seen() if seen else None).splats
+    frame = _core.TileFrame.of_sample(prepared.core, config.pixel_scale)
+
+    def tile(frame: _core.TileFrame) -> _core.TileMerging:
+        return _core.TileMerging(
+            prepared.core,
+            frame,
+            weight=Seen.weight if seen else None,
+            pixel_size=Seen.pixel_size if seen else None,
+            min_opacity=config.min_opacity_of("default"),
+            neighbors=config.neighbors,
+            geometric_weight=config.geometric_weight,
+            dilation=config.dilation,
+            max_growth=config.max_growth,
+        )
+
+    if seen:
+        frame = frame.with_views(0.01, 1, 1)
+        frame = frame.with_views(0.01, *tile(frame).sums())
+    here = tile(frame)
+    assert len(here.run_costs()) < len(prepared)  # the transparent are not among them
+    rounds = schedule(len(prepared), budget, config.retention_of("default"))
+    counts = [n for n in rounds if n < 3 * budget]
+    of, a, b, costs = here.plan(3 * budget, counts, here.run_costs())
+    assert len(a) == 2 * budget
+    assert (costs >= 0).all()
+    out = here.assemble(clusters(of, a, b, 3 * budget), budget)
+    both = [
+        (np.float32(out["means"]), out["logit_opacities"]),
+        (np.float32(whole.means), whole.logit_opacities),
+    ]
+    rows = [np.column_stack(pair)[np.lexsort(np.column_stack(pair).T)] for pair in both]
+    np.testing.assert_array_equal(*rows)
+
+
+def test_the_cheapest_of_several_arrays_are_those_of_all() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        arrays = [rng.integers(0, 6, rng.integers(0, 40)).astype(np.float32) * 0.3 for _ in range(4)]
+        tagged = sorted((float(v), t, i) for t, array in enumerate(arrays) for i, v in enumerate(array))
+        count = int(rng.integers(0, len(tagged) + 1))
+        naive = [sum(t == tile for _, t, _ in tagged[:count]) for tile in range(4)]
+        assert cheapest([lambda a=a: a for a in arrays], count) == naive
+
+
+@pytest.mark.parametrize("blind", [False, True])
+def test_an_exact_count_about_as_good_as_in_one_piece(
+    store: TileStore, scene: Path, tmp_path: Path, blind: bool
+) -> None:
+    views = ring(8)
+    small = reduced(store, tmp_path, blind=blind, views=views)
+    assert len(store.tiles) >= 4
+    assert len(small) == 900
+    assert small.finite_rows().all()
+    dense = read_splats(scene)
+    from g2ard.rendering.visibility import visibility_source
+
+    whole = simplify(dense, 900, visibility=None if blind else visibility_source(views)).splats
+    targets = TeacherRenders(dense, ring(5))
+    tiled_db, whole_db = (evaluate(splats, targets).psnr for splats in (small, whole))
+    assert tiled_db > whole_db - 0.4  # tiles of 2,300 rows have many borders
+
+
+def test_tiles_that_no_view_sees_keep_their_share(store: TileStore, tmp_path: Path) -> None:
+    K = [[300, 0, 40], [0, 300, 30], [0, 0, 1]]
+    corner = Cameras.from_lists([look_at([-7.5, -3.5, 1.5], [-7.6, -3.4, 0])], [K], [(80, 60)], ["corner"])
+    small = reduced(store, tmp_path, views=corner)
+    assert len(small) == 900
+    rows = [len(core) for core, _ in store.cells.route(small.means)]
+    assert min(rows) > 20
+
+
+def test_neither_workers_nor_the_order_of_rows_change_a_bit(
+    store: TileStore, scene: Path, tmp_path: Path
+) -> None:
+    here = reduced(store, tmp_path / "here", views=ring(), threads=1)
+    two = reduced(store, tmp_path / "two", views=ring(), workers=2)
+    assert here.fingerprint() == two.fingerprint()
+    rows = np.random.default_rng(3).permutation(9000)
+    write_splats(tmp_path / "shuffled.ply", read_splats(scene).take(rows))
+    other = ingest(tmp_path / "shuffled.ply", tmp_path / "tiles", tile_rows=2500)
+    assert reduced(other, tmp_path / "shuffled", views=ring()).fingerprint() == here.fingerprint()
+
+
+def test_a_cluster_of_two_workers_gives_the_same_bits(store: TileStore, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    here = reduced(store, tmp_path / "here", views=ring())
+    cluster = reduced(store, tmp_path / "cluster", views=ring(), workers=2, scheduler="local")
+    assert cluster.fingerprint() == here.fingerprint()
+
+
+@needs_proc
+@pytest.mark.parametrize("scheduler", [None, "local"])
+def test_workers_killed_at_random_cost_time_alone(
+    store: TileStore, tmp_path: Path, scheduler: str | None
+) -> None:
+    if scheduler:
+        pytest.importorskip("distributed")
+    here = reduced(store, tmp_path / "here", views=ring())
+    stop, killed, draw, work = threading.Event(), [], random.Random(0), tmp_path / "killed"
+
+    def kill() -> None:
+        done = 0
+        while not stop.is_set() and len(killed) < 5:
+            time.sleep(0.02)
+            files = len(list(work.glob("[!.]*.npz")))
+            if files >= done + 3 and (children := _children()):
+                time.sleep(draw.uniform(0, 0.05))
+                with suppress(ProcessLookupError):
+                    os.kill(draw.choice(children), signal.SIGKILL)
+                    killed.append(files)
+                done = files
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    try:
+        small = reduced(store, work, views=ring(), workers=2, scheduler=scheduler)
+    finally:
+        stop.set()
+        killer.join()
+    assert len(killed) >= 3
+    assert small.fingerprint() == here.fingerprint()
+    assert len(list(work.glob("[!.]*.npz"))) == len(list((tmp_path / "here").glob("[!.]*.npz")))
+
+
+def _children() -> list[int]:
+    """Worker processes of this one. Threads and processes may end while they are listed."""
+    pids = []
+    for task in Path("/proc/self/task").iterdir():
+        with suppress(OSError):
+            pids += [int(pid) for pid in (task / "children").read_text().split()]
+    return [pid for pid in pids if is_worker(pid)]
+
+
+def test_what_is_done_is_not_done_again(store: TileStore, tmp_path: Path) -> None:
+    class StopError(Exception):
+        pass
+
+    def stop(stage: str, done: int, total: int, info: object = None) -> None:
+        if stage == "plans" and done:
+            raise StopError
+
+    with pytest.raises(StopError):
+        reduced(store, tmp_path, views=ring(), progress=stop)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    assert sum(path.name.startswith("plans") for path in before) == 1
+    again = reduced(store, tmp_path, views=ring())
+    assert all(path.stat().st_mtime_ns == time for path, time in before.items())
+    assert again.fingerprint() == reduced(store, tmp_path / "fresh", views=ring()).fingerprint()
+    looks = {path for path in before if path.name.startswith("look")}
+    reduced(store, tmp_path, budget=450, views=ring())  # another budget looks at the same
+    assert looks == {path for path in tmp_path.iterdir() if path.name.startswith("look-")}
+
+
+def test_all_there_are_stay_as_they_are(store: TileStore, scene: Path, tmp_path: Path) -> None:
+    dense = read_splats(scene)
+    every = [np.sort(s.means, axis=0) for s in (dense, reduced(store, tmp_path, budget=9000))]
+    np.testing.assert_array_equal(*every)
+
+
+def test_an_order_found_before_is_checked(scene: Path) -> None:
+    dense = finite_rows_of(read_splats(scene))[0]
+    order, bounds = dense.core.order, np.array(dense.core.bounds)
+    again = finite_rows_of(read_splats(scene))[0]
+    again.restore(order, bounds)
+    np.testing.assert_array_equal(again.core.order, order)
+    assert again.core.origin == dense.core.origin
+    for broken in (order[:-1], np.where(order == 7, 8, order).astype(np.uint32), order + np.uint32(1)):
+        with pytest.raises(InputError, match="order: expected each of 9000 rows once"):
+            again.restore(broken, bounds)
+
+
+def test_budgets_out_of_reach_are_refused(store: TileStore, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"expected 1 to the 9,000 Gaussians"):
+        reduced(store, tmp_path, budget=9001, blind=True)
+    faint = town(600)
+    faint.logit_opacities[::6] = -9
+    write_splats(tmp_path / "faint.ply", faint)
+    some = ingest(tmp_path / "faint.ply", tmp_path / "faint", tile_rows=250)
+    with pytest.raises(InputError, match="at most the 500 Gaussians that a renderer draws, got 550"):
+        reduced(some, tmp_path, budget=550, blind=True)
+    with pytest.raises(InputError, match=r"is the fewest that the 4 tiles come to \(one a tile\), not 2"):
+        reduced(store, tmp_path, budget=2, blind=True)

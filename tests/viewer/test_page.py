@@ -1,0 +1,273 @@
+"""Pages for the browser: what is in the file, how scenes stand in it, the command.
+
+`test_view_browser.py` opens them.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard import viewer
+from g2ard.cli.run_view import run_view
+from g2ard.errors import InputError, OutputError
+from g2ard.io import read_splats, write_splats, write_views
+from g2ard.policy import budget
+from g2ard.policy.view import stand_of, stand_with
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.splats import Splats
+from g2ard.viewer import Start, check_page_output, page, write_page
+from helpers.commands import CommandLine
+from helpers.scenes import around, checkered_ball
+
+BUNDLE = Path(viewer.__file__).parent / "supersplat"
+
+
+class Parts(HTMLParser):
+    """Scripts by id (or type), labels, and every address that an element names."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.scripts: dict[str, str] = {}
+        self.labels: list[str] = []
+        self.addresses: list[str] = []
+        self._into = ""
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        self.addresses += [value or "" for key, value in attrs if key in ("src", "href", "srcset", "data")]
+        self._into = (given.get("id") or given.get("type") or "") if tag == "script" else ""
+        if given.get("class") == "label":
+            self._into = "label"
+
+    def handle_data(self, data: str) -> None:
+        if self._into == "label":
+            self.labels.append(data)
+        elif self._into:
+            self.scripts[self._into] = self.scripts.get(self._into, "") + data
+
+    def handle_endtag(self, tag: str) -> None:
+        self._into = ""
+
+    def scene(self, index: int, folder: Path) -> Splats:
+        """A scene of the page, read back."""
+        file = folder / f"back{index}.sog"
+        file.write_bytes(base64.b64decode(self.scripts[f"scene{index}"], validate=True))
+        return read_splats(file)
+
+
+def test_the_bundle_is_the_one_its_readme_names() -> None:
+    readme = (BUNDLE / "README.md").read_text(encoding="utf-8")
+    sums = dict(re.findall(r"`public/(\S+)` \| `([0-9a-f]{64})`", readme))
+    script = gzip.decompress((BUNDLE / "index.js.gz").read_bytes())
+    found = {"index.js": script, "index.css": (BUNDLE / "index.css").read_bytes()}
+    assert {name: hashlib.sha256(data).hexdigest() for name, data in found.items()} == sums
+    release = re.search(r"SuperSplat Viewer (\S+)", readme)
+    assert release
+    assert f"SuperSplat Viewer {release[1]} " in page._NOTICE
+    assert f'version = "{release[1]}"'.encode() in script
+
+
+def test_a_page_holds_viewer_and_scene_and_names_no_address(tmp_path: Path) -> None:
+    ball = checkered_ball(200)
+    start = Start((1.0, 2.0, 3.0), (0.0, 0.0, 0.5), 42.0)
+    written = write_page(
+        tmp_path / "a.html", [("a </script> & b", ball)], start=start, background=(1.0, 0.5, 0.25)
+    )
+    parts = Parts(tmp_path / "a.html")
+    assert written.bytes == (tmp_path / "a.html").stat().st_size
+    assert parts.addresses == ["data:,"]
+    assert parts.labels == ["a </script> & b"]
+    view = json.loads(parts.scripts["view"])
+    assert view == {
+        "start": {"position": [1, 2, 3], "target": [0, 0, 0.5], "fov": 42},
+        "background": [1, 0.5, 0.25],
+        "files": ["scene0.sog"],
+    }
+    assert base64.b64decode(parts.scripts["viewer"]) == (BUNDLE / "index.js.gz").read_bytes()
+    back = parts.scene(0, tmp_path)
+    assert len(back) == 200
+    assert back.sh_degree == ball.sh_degree
+    assert written.scenes == ((tmp_path / "back0.sog").stat().st_size,)
+    assert "createViewer" in parts.scripts["module"]
+    text = (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert "Permission is hereby granted" in text
+    assert not re.search(r"url\((?!data:)|@import", text)
+
+
+def test_equal_scenes_give_equal_bytes_and_two_scenes_two_scripts(tmp_path: Path) -> None:
+    scenes = [("left", checkered_ball(150)), ("right", checkered_ball(80, seed=1))]
+    for name in ("a.html", "b.html"):
+        write_page(tmp_path / name, scenes)
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
+    parts = Parts(tmp_path / "a.html")
+    assert [len(parts.scene(index, tmp_path)) for index in (0, 1)] == [150, 80]
+    assert parts.labels == ["left", "right"]
+    assert json.loads(parts.scripts["view"])["start"] is None
+
+
+def test_outputs_are_checked_and_nothing_half_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ball = checkered_ball(20)
+    with pytest.raises(OutputError, match=r"a\.txt: pages are written as \.html"):
+        check_page_output(tmp_path / "a.txt")
+    write_page(tmp_path / "made" / "too" / "a.HTML", [("a", ball)])
+    with pytest.raises(OutputError, match="exists"):
+        write_page(tmp_path / "made" / "too" / "a.HTML", [("a", ball)])
+    with pytest.raises(InputError, match=r"b\.html"):
+        write_page(tmp_path / "b.html", [("a", ball.take(slice(0)))])
+    monkeypatch.setattr(page, "_LARGEST", 100)
+    with pytest.raises(InputError, match="browsers take at most"):
+        write_page(tmp_path / "b.html", [("a", ball)])
+    assert [path.name for path in tmp_path.iterdir()] == ["made"]
+
+
+def in_viewer(points: np.ndarray, start: Start, width: int, height: int) -> np.ndarray:
+    """Twin: (N, 2) pixels of points of a scene's file as the viewer shows them: turned by 180° about z, for
+    a camera with y up and no roll, its field of view along the longer side."""
+    world = points * [-1, -1, 1]
+    eye, target = np.array(start.position), np.array(start.target)
+    back = (eye - target) / np.linalg.norm(eye - target)
+    right = np.cross([0, 1, 0], back)
+    right /= np.linalg.norm(right)
+    x, y, z = np.stack([right, np.cross(back, right), back]) @ (world - eye).T
+    focal = max(width, height) / 2 / np.tan(np.radians(start.fov) / 2)
+    return np.stack([width / 2 - focal * x / z, height / 2 + focal * y / z], 1)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_start_shows_what_the_view_shows(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ball = checkered_ball(300)
+    offset = rng.normal(size=3) * 10.0 ** rng.integers(0, 6)
+    up = rng.normal(size=3) if seed else np.array([0.0, 1.0, 0.0])  # the very opposite of the viewer's
+    size = (int(rng.integers(100, 400)), int(rng.integers(100, 400)))
+    scene = Splats.create(
+        ball.means, quats=ball.quats, scales=ball.scales, sh0=ball.sh0, shN=ball.shN, offset=offset
+    )
+    eye = offset + 3 * rng.normal(size=3)
+    camera = Camera.facing(eye, offset, width=size[0], height=size[1], fov=50, up=up)
+    stand = stand_with(scene, Cameras.of([camera]), up=tuple(up))
+    here = stand.of(scene)
+    assert not here.offset.any()
+    assert np.allclose(stand.up, up / np.linalg.norm(up))
+    world = scene.means.astype(np.float64) + offset
+    x, y, z = camera.viewmat[:3, :3] @ (world - camera.position).T
+    expected = np.stack([camera.K[0, 0] * x / z, camera.K[1, 1] * y / z], 1) + np.array(size) / 2
+    assert stand.start
+    front = z > 0.5
+    found = in_viewer(here.means.astype(np.float64), stand.start, *size)
+    assert np.abs(found - expected)[front].max() < 0.05
+
+
+def test_level_views_tell_up_and_a_single_one_does_not() -> None:
+    ball = checkered_ball(400)
+    views = around(12)  # all level with z
+    stand = stand_with(ball, views)
+    assert np.allclose(stand.up, [0, 0, 1], atol=1e-6)
+    alone = stand_with(ball, views.take([5]))
+    assert np.linalg.norm(alone.up) == pytest.approx(1)
+    assert alone.name == "view_005"
+
+
+def test_the_start_is_the_view_that_holds_most_or_the_one_named() -> None:
+    ball = checkered_ball(400)
+    away = Camera.facing([0, -4, 0], [0, -9, 0], name="away")
+    near = Camera.facing([0, -1.5, 0], [0, 0, 0], fov=30, name="near")
+    whole = Camera.facing([0, -4, 0], [0, 0, 0], name="whole")
+    views = Cameras.of([away, near, whole])
+    assert stand_with(ball, views).name == "whole"
+    assert stand_with(ball, views, start="near").name == "near"
+    assert stand_with(ball, views, start="away").start is not None  # sees nothing, and may still be asked for
+    with pytest.raises(InputError, match="no view 'far'"):
+        stand_with(ball, views, start="far")
+
+
+def test_a_scene_without_views_is_looked_at_from_a_pool_and_one_without_room_as_a_whole() -> None:
+    said: list[str] = []
+    stand = stand_of(checkered_ball(500), None, say=said.append)
+    assert stand.name
+    assert stand.name.startswith("pose_")
+    nothing = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]], logit_opacities=[-20])
+    assert stand_of(nothing, None, say=said.append).start is None
+    assert "no pose to start at" in said[-1]
+    with pytest.raises(InputError):
+        stand_of(nothing, None, start="pose_0000")
+
+
+def test_the_command_shows_a_scene_and_a_run(command_line: CommandLine, tmp_path: Path) -> None:
+    ball = checkered_ball(300)
+    write_splats(tmp_path / "dense.ply", ball)
+    (tmp_path / "run").mkdir()
+    write_splats(tmp_path / "run" / "scene.spz", ball.take(slice(0, 200)))
+    (tmp_path / "run" / "report.json").write_text("{}")
+    write_views(tmp_path / "run" / "views.json", around(6))
+    status, out, err = command_line(
+        "view", "run", "dense.ply", "-o", "pages/two.html", "--json", "-", cwd=tmp_path
+    )
+    assert status == 0, err
+    told = json.loads(out)
+    assert [scene["count"] for scene in told["scenes"]] == [200, 300]
+    assert told["start"].startswith("view_")
+    assert np.allclose(told["up"], [0, 0, 1], atol=1e-6)
+    assert told["bytes"] == (tmp_path / "pages" / "two.html").stat().st_size
+    assert Parts(tmp_path / "pages" / "two.html").labels == [
+        "scene.spz: 200 Gaussians",
+        "dense.ply: 300 Gaussians",
+    ]
+    before = (tmp_path / "pages" / "two.html").read_bytes()
+    status, _, err = command_line("view", "dense.ply", "-o", "pages/two.html", cwd=tmp_path)
+    assert status == 1
+    assert "exists" in err
+    assert (tmp_path / "pages" / "two.html").read_bytes() == before
+    assert command_line("view", "dense.ply", "-o", "pages/two.html", "-w", "-q", cwd=tmp_path)[0] == 0
+    assert len(Parts(tmp_path / "pages" / "two.html").labels) == 1
+
+
+def test_a_run_has_a_page_unless_its_scene_is_too_large(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ball, path = checkered_ball(300), tmp_path / "view.html"
+    size, line = run_view(path, tmp_path / "scene.sog", ball, around(6), (1.0, 1.0, 1.0))
+    assert size == path.stat().st_size
+    assert "view.html" in line
+    assert Parts(path).labels == ["scene.sog: 300 Gaussians"]
+    monkeypatch.setitem(budget.DEVICES, "web", 299)
+    size, line = run_view(path, tmp_path / "scene.sog", ball, around(6), (1.0, 1.0, 1.0))
+    assert size is None
+    assert "over 299 Gaussians" in line
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["none.ply", "-o", "a.html"], "none.ply"),
+        (["dense.ply", "none.ply", "-o", "a.html"], "none.ply"),
+        (["dense.ply", "-o", "a.png"], "a.png: pages are written as .html"),
+        (["dense.ply", "-o", "a.html", "--views", "none.json"], "none.json"),
+        (["dense.ply", "-o", "a.html", "--views", "v.json", "--start", "nope"], "nope"),
+        (["empty", "-o", "a.html"], "empty"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    arguments: list[str], words: str, command_line: CommandLine, tmp_path: Path
+) -> None:
+    write_splats(tmp_path / "dense.ply", checkered_ball(50))
+    write_views(tmp_path / "v.json", around(2))
+    (tmp_path / "empty").mkdir()
+    status, _, err = command_line("view", *arguments, cwd=tmp_path)
+    assert status == 1
+    assert len(err.strip().splitlines()) == 1
+    assert words in err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dense.ply", "empty", "v.json"]

@@ -1,0 +1,126 @@
+"""Pages opened in a real browser, and what they show held against our own rasteriser; see `browser.py`."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard.io import read_splats, write_splats
+from g2ard.policy.view import stand_with
+from g2ard.rendering.metrics import psnr
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.splats import Splats
+from g2ard.viewer import write_page
+from helpers.browser import Browser
+from helpers.pages import FRONT, GREY, HEIGHT, WIDTH, assert_shows, drawn, rendered, show
+from helpers.realdata import real
+from helpers.scenes import checkered_ball
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with Browser(WIDTH, HEIGHT) as page:
+        yield page
+
+
+def save(path: Path, *scenes: Splats, camera: Camera = FRONT, up: tuple[float, ...] = (0, 0, 1)) -> Path:
+    """A page of scenes that opens with a camera."""
+    stand = stand_with(scenes[0], Cameras.of([camera]), up=up)
+    shown = [(f"scene {index}", stand.of(scene)) for index, scene in enumerate(scenes)]
+    write_page(path, shown, start=stand.start, background=GREY, overwrite=True)
+    return path
+
+
+def scattered(count: int = 4000, seed: int = 0) -> Splats:
+    """Gaussians of all shapes and opacities in a ball, some under a pixel, colours by direction."""
+    rng = np.random.default_rng(seed)
+    return Splats.create(
+        rng.normal(size=(count, 3)) * 0.35,
+        quats=rng.normal(size=(count, 4)),
+        scales=np.exp(rng.normal(-4.2, 0.8, (count, 3))),
+        logit_opacities=rng.normal(0, 2, count),
+        sh0=rng.normal(0, 1, (count, 1, 3)),
+        shN=rng.normal(0, 0.1, (count, 8, 3)),
+    )
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.3, -1.0, 0.2)])
+def test_a_page_shows_what_we_render(browser: Browser, tmp_path: Path, up: tuple[float, ...]) -> None:
+    scene = scattered()
+    camera = Camera.facing([1.8, -1.6, 0.9], [0, 0, 0], width=WIDTH, height=HEIGHT, fov=55, up=up)
+    browser.requests.clear()
+    show(browser, save(tmp_path / "one.html", scene, camera=camera, up=up))
+    picture = assert_shows(browser, rendered(scene, camera), 38)
+    assert psnr(picture[:, ::-1], rendered(scene, camera)) < 30  # and would tell another picture apart
+    assert {re.split(r"[:/]", url)[0] for url in browser.requests} <= {"file", "blob", "data"}
+    assert browser.run("document.getElementById('trouble').hidden")
+
+
+def test_an_opaque_surface_shows_its_front(browser: Browser, tmp_path: Path) -> None:
+    scene = checkered_ball(20_000)
+    show(browser, save(tmp_path / "ball.html", scene))
+    assert_shows(browser, rendered(scene), 38)
+
+
+def test_a_real_scene_shows_what_we_render(browser: Browser, tmp_path: Path) -> None:
+    scene = read_splats(real("playbot", "0_0"))
+    camera = Camera.facing([1.6, -0.9, 1.3], [0, -0.35, 0], width=WIDTH, height=HEIGHT, fov=50, up=(0, -1, 0))
+    show(browser, save(tmp_path / "playbot.html", scene, camera=camera, up=(0, -1, 0)))
+    assert_shows(browser, rendered(scene, camera), 45)
+
+
+@pytest.mark.parametrize("suffix", [".sog", ".ply", ".compressed.ply"])
+def test_the_viewer_reads_the_files_we_write(browser: Browser, tmp_path: Path, suffix: str) -> None:
+    scene = scattered()
+    page = save(tmp_path / "page.html", scene)
+    stand = stand_with(scene, Cameras.of([FRONT]), up=(0, 0, 1))
+    write_splats(tmp_path / f"other{suffix}", stand.of(scene))
+    text = page.read_text(encoding="utf-8").replace("scene0.sog", f"scene0{suffix}")
+    other = base64.b64encode((tmp_path / f"other{suffix}").read_bytes()).decode()
+    text, count = re.subn(r'(id="scene0">)[^<]*', lambda match: match[1] + other, text)
+    assert count == 1
+    page.write_text(text, encoding="utf-8")
+    show(browser, page)
+    assert_shows(browser, rendered(scene), 37)
+
+
+def test_two_scenes_share_a_camera_and_a_divider(browser: Browser, tmp_path: Path) -> None:
+    left, right = scattered(), scattered(seed=1)
+    show(browser, save(tmp_path / "two.html", left, right))
+    for index, scene in enumerate((left, right)):
+        assert_shows(browser, rendered(scene), 38, index)
+    sides = [rendered(scene) for scene in (left, right)]
+    browser.run("document.querySelector('.sse-ui').style.display = 'none'")
+    for share in (0.5, 0.25, 0.75):
+        at = browser.run("parseFloat(document.getElementById('divider').style.left) / 100")
+        browser.drag((at * WIDTH, HEIGHT / 2), (share * WIDTH, HEIGHT / 2))
+        browser.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        picture = browser.picture() / np.float32(255)
+        edge, rows = round(share * WIDTH), slice(50, None)  # beside the divider, below the labels
+        parts = (slice(0, edge - 20), slice(edge + 20, WIDTH))
+        for side, part in enumerate(parts):
+            assert psnr(picture[rows, part], sides[side][rows, part]) > 35, (share, side)
+            assert psnr(picture[rows, part], sides[1 - side][rows, part]) < 25, (share, side)
+
+
+def test_the_right_scene_follows_where_the_left_one_is_turned_to(browser: Browser, tmp_path: Path) -> None:
+    scene = scattered()
+    show(browser, save(tmp_path / "two.html", scene, scene))
+    before = assert_shows(browser, rendered(scene), 38)
+    browser.drag((100, 200), (220, 170))
+    assert psnr(drawn(browser, lambda picture: psnr(picture, before) < 25), before) < 25
+    left = before
+
+    def as_the_left(picture: np.ndarray) -> bool:
+        nonlocal left
+        left = drawn(browser, lambda _: True)
+        return psnr(picture, left) > 60
+
+    right = drawn(browser, as_the_left, 1)
+    assert psnr(right, left) > 60
+    assert psnr(right, before) < 25
