@@ -11,7 +11,7 @@ from g2ard.cli.budget_options import Count
 
 if TYPE_CHECKING:
     from g2ard.cli.frame import Run
-    from g2ard.policy.tiled import Tiling
+    from g2ard.policy.tiling import Tiling
 
 __all__ = [
     "MemoryOption",
@@ -65,7 +65,7 @@ def tiling_of(
 ) -> Tiling:
     """The options as the library takes them, after a usage check."""
     from g2ard.errors import InputError
-    from g2ard.policy.tiled import Tiling, bytes_of
+    from g2ard.policy.tiling import Tiling, bytes_of
 
     if tile_rows is not None and scene is not None:
         _check_rows(scene, tile_rows.of(0))
@@ -103,7 +103,7 @@ def _beside(output: Path) -> Path:
 
 def _check_rows(scene: Path, rows: int) -> None:
     """Tiles in a folder have the rows they were made with."""
-    from g2ard.policy.tile_memory import cut_into
+    from g2ard.policy.tiling import cut_into
     from g2ard.tiles.store import MANIFEST, TileStore
 
     if (scene / MANIFEST).is_file() and (made := TileStore.open(scene).settings.get("tile_rows")) != rows:

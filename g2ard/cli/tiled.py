@@ -1,4 +1,4 @@
-"""Commands on scenes in tiles: their outputs, reports and lines."""
+"""`simplify` and `distill` on scenes in tiles: outputs, reports and messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from g2ard.progress import plural
 if TYPE_CHECKING:
     from g2ard.policy.budget import Budget
     from g2ard.policy.distill_options import DistillOptions
-    from g2ard.policy.tiled import Tiling
+    from g2ard.policy.tiling import Tiling
     from g2ard.stages.simplify import SimplifyConfig
     from g2ard.tiles.simplify import TiledScene
     from g2ard.tiles.store import TileStore
@@ -24,8 +24,10 @@ __all__ = ["TiledCommand"]
 
 
 class TiledCommand:
-    """One command on one scene; what is done stays in the tiling's folder until the command has succeeded,
-    longer where the user named the folder."""
+    """A command on one scene.
+
+    Finished steps stay in the work folder until the command succeeds, or longer if the user named it.
+    """
 
     def __init__(
         self, run: Run, scene: Path, outputs: Outputs, tiling: Tiling, budgets: Sequence[Budget]
@@ -34,113 +36,94 @@ class TiledCommand:
         run.kept = [f"what is done stands in {tiling.folder}, and the same command goes on"]
 
     def simplify(self, config: SimplifyConfig, views: Any, blind: bool, up: Sequence[float] | None) -> None:
-        """`g2ard simplify`."""
-        from g2ard.policy.work import working
-
-        with working(self.tiling, views):
-            self._simplify(config, views, blind, up)
-
-    def _simplify(self, config: SimplifyConfig, views: Any, blind: bool, up: Sequence[float] | None) -> None:
+        """Run `g2ard simplify`."""
         from g2ard.config.constants import listed
-        from g2ard.policy.tiled import simplify_in_tiles
-        from g2ard.system.memory import peak_rss_of_all
+        from g2ard.policy.tiled import simplify_in_tiles, working
 
         run, began, reports = self.run, time.perf_counter(), []
-        made = simplify_in_tiles(
-            self.scene,
-            self.budgets,
-            self.tiling,
-            views=views,
-            blind=blind,
-            config=config,
-            up=up,
-            seed=run.seed,
-            progress=run.progress,
-            say=run.say,
-        )
-        for at, (store, small) in enumerate(made):
-            place = self.outputs.paths(store.count)[at]
-            self._write(place, store, small)
-            seconds = time.perf_counter() - began
-            run.say(f"{place}: {len(small):,} of {store.count:,} Gaussians in {seconds:.1f} s")
-            run.kept.append(f"{place} is written")
-            reports.append(
-                {
-                    "input_count": store.count,
-                    "output_count": len(small),
-                    "tiles": list(small.counts),
+        with working(self.tiling, views):
+            made = simplify_in_tiles(
+                self.scene,
+                self.budgets,
+                self.tiling,
+                views=views,
+                blind=blind,
+                config=config,
+                up=up,
+                seed=run.seed,
+                progress=run.progress,
+                say=run.say,
+            )
+            for at, (store, small) in enumerate(made):
+                place = self.outputs.paths(store.count)[at]
+                self._write(place, store, small)
+                report = {
+                    **_report(store, small, began),
                     "views": small.views,
                     "unseen": small.unseen,
                     "method": "default",
                     "constants": listed({"simplify": config.resolved("default")}),
                     "keep_region": config.keep_region,
-                    "notes": {note.code: note.count for note in store.notes},
-                    "seconds": {"total": seconds},
-                    "peak_rss_bytes": peak_rss_of_all(),
                 }
-            )
+                seconds = report["seconds"]["total"]
+                run.say(f"{place}: {len(small):,} of {store.count:,} Gaussians in {seconds:.1f} s")
+                run.kept.append(f"{place} is written")
+                reports.append(report)
         run.result(reports[0] if len(reports) == 1 else {"runs": reports})
 
     def distill(self, options: DistillOptions, name: str, resume: bool) -> None:
-        """`g2ard distill`: in each run's folder the scene, its views and the report; with --resume for those
-        budgets alone that are not finished."""
-        from g2ard.policy.work import working
+        """Run `g2ard distill`: write the scene, its views and the report into each run's folder.
 
-        with working(self.tiling, options.views, options.held_out):
-            self._distill(options, name, resume)
-
-    def _distill(self, options: DistillOptions, name: str, resume: bool) -> None:
+        With `resume`, finished budgets are skipped.
+        """
         from dataclasses import asdict
 
         from g2ard import io
-        from g2ard.policy.tiled_distill import distill_in_tiles
-        from g2ard.policy.whole import refuse_whole, whole_budgets, whole_options
+        from g2ard.policy.tiled import distill_in_tiles, working
+        from g2ard.policy.tiling import refuse_whole, whole_budgets, whole_options
         from g2ard.report.tiled import tiled_report
-        from g2ard.system.memory import peak_rss_of_all
 
-        own = [name for name in ("dry_run", "keep", "crop") if self.run.config[name]]
-        given = [*whole_options(options), *whole_budgets(self.budgets)]
-        refuse_whole(self.scene, given + [f"--{name.replace('_', '-')}" for name in own])
         run, began = self.run, time.perf_counter()
-        run.kept = [f"what is done stands in {self.tiling.folder}; the same command with --resume goes on"]
-        places = [folder / name for folder in self.outputs.paths()]
-        finished = [at for at, place in enumerate(places) if is_done(run, place, resume)]
-        reports = {at: tell_finished(run, places[at]) for at in finished}
-        left = [at for at in range(len(self.budgets)) if at not in reports]
-        made = distill_in_tiles(
-            self.scene,
-            [self.budgets[at] for at in left],
-            self.tiling,
-            options,
-            progress=run.progress,
-            say=run.say,
-        )
-        for at, (store, small, scores, views) in zip(left, made, strict=True):
-            folder = self.outputs.paths(store.count)[at]
-            report = {
-                "input_count": store.count,
-                "output_count": len(small),
-                "tiles": list(small.counts),
-                "scores": asdict(scores),
-                "views": {"train": len(views.train.cameras), "test": len(views.test)},
-                "notes": {note.code: note.count for note in store.notes},
-                "config": run.config,
-                "seconds": {"total": time.perf_counter() - began},
-                "peak_rss_bytes": peak_rss_of_all(),
-            }
-            if (pool := views.pool) is not None:
-                io.write_views(folder / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
-            self._write(folder / name, store, small)
-            title = f"{self.scene.name}: {store.count:,} → {len(small):,}"
-            tiled_report(folder / "report.html", title, report)
-            write_report(folder, report)
-            run.say(
-                f"{folder}: {len(small):,} of {store.count:,} Gaussians; held-out views "
-                f"{scores.simplified:.2f} → {scores.recovered:.2f} dB over the pixels that tiles own; "
-                f"{plural(scores.steps, 'step')}, those of all tiles summed"
+        with working(self.tiling, options.views, options.held_out):
+            own = [name for name in ("dry_run", "keep", "crop") if run.config[name]]
+            given = [*whole_options(options), *whole_budgets(self.budgets)]
+            refuse_whole(self.scene, given + [f"--{name.replace('_', '-')}" for name in own])
+            run.kept = [
+                f"what is done stands in {self.tiling.folder}; the same command with --resume goes on"
+            ]
+            places = [folder / name for folder in self.outputs.paths()]
+            finished = [at for at, place in enumerate(places) if is_done(run, place, resume)]
+            reports = {at: tell_finished(run, places[at]) for at in finished}
+            left = [at for at in range(len(self.budgets)) if at not in reports]
+            made = distill_in_tiles(
+                self.scene,
+                [self.budgets[at] for at in left],
+                self.tiling,
+                options,
+                progress=run.progress,
+                say=run.say,
             )
-            run.kept.append(f"{folder} is finished")
-            reports[at] = report
+            for at, (store, small, scores, views) in zip(left, made, strict=True):
+                folder = self.outputs.paths(store.count)[at]
+                report = {
+                    **_report(store, small, began),
+                    "scores": asdict(scores),
+                    "views": {"train": len(views.train.cameras), "test": len(views.test)},
+                    "config": run.config,
+                }
+                if (pool := views.pool) is not None:
+                    io.write_views(folder / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
+                self._write(folder / name, store, small)
+                title = f"{self.scene.name}: {store.count:,} → {len(small):,}"
+                tiled_report(folder / "report.html", title, report)
+                write_report(folder, report)
+                run.say(
+                    f"{folder}: {len(small):,} of {store.count:,} Gaussians; held-out views "
+                    f"{scores.simplified:.2f} → {scores.recovered:.2f} dB over the pixels that tiles own; "
+                    f"{plural(scores.steps, 'step')}, those of all tiles summed"
+                )
+                run.kept.append(f"{folder} is finished")
+                reports[at] = report
         run.result(reports[0] if len(reports) == 1 else {"runs": [reports[at] for at in sorted(reports)]})
 
     def _write(self, place: Path, store: TileStore, small: TiledScene) -> None:
@@ -153,3 +136,17 @@ class TiledCommand:
             write_parts(place, small, len(small), small.sh_degree, small.offset, overwrite=overwrite)
         else:
             io.write_splats(place, small.whole(), overwrite=self.run.overwrite)
+
+
+def _report(store: TileStore, small: TiledScene, began: float) -> dict[str, Any]:
+    """Return the numbers that both commands report."""
+    from g2ard.system.memory import peak_rss_of_all
+
+    return {
+        "input_count": store.count,
+        "output_count": len(small),
+        "tiles": list(small.counts),
+        "notes": {note.code: note.count for note in store.notes},
+        "seconds": {"total": time.perf_counter() - began},
+        "peak_rss_bytes": peak_rss_of_all(),
+    }

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from g2ard.errors import InputError
-from g2ard.policy.tile_memory import RECOVERY_TIMES, TileMemory, amount
+from g2ard.policy.tiling import RECOVERY_TIMES, TileMemory, amount
 from g2ard.progress import plural
 from g2ard.rendering.visibility import MOST_LOOKS, fewest_looks, visibility_source
 from g2ard.scene.targets import CACHE_BYTES, Targets

@@ -1,177 +1,160 @@
-"""Scenes larger than memory: when a scene is worked on in tiles, by how many workers, and the work itself."""
+"""Simplification, distillation and levels of detail in tiles, and the folder that holds their work."""
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g2ard.errors import InputError
-from g2ard.policy.tile_memory import TASK_BYTES, TileMemory, amount
-from g2ard.policy.whole import refuse_whole, whole_budgets
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.errors import G2ardError, OutputError
+from g2ard.policy.budget import Budget
+from g2ard.policy.levels import LevelReport, check_ratios, level_size
+from g2ard.policy.tiling import RECOVERY_TIMES, Tiling, refuse_whole, whole_options, workers_for
+from g2ard.progress import Progress, Say, plural, silent, unsaid
 
 if TYPE_CHECKING:
-    from g2ard.policy.budget import Budget
+    from g2ard.levels import Cut
+    from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.inputs import Views
+    from g2ard.policy.views import RunViews
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
+    from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.simplify import SimplifyConfig
+    from g2ard.tiles.executor import Executor
+    from g2ard.tiles.recover import TiledScores
+    from g2ard.tiles.sights import Surroundings
     from g2ard.tiles.simplify import TiledScene
     from g2ard.tiles.store import TileStore
+    from g2ard.tiles.stored import StoredScene
 
-__all__ = [
-    "LEVELS_TIMES",
-    "WHOLE_TIMES",
-    "Tiling",
-    "bytes_of",
-    "check_memory",
-    "cores_of",
-    "forget",
-    "is_tiled",
-    "simplify_in_tiles",
-    "tiles_of",
-    "workers_for",
-]
+__all__ = ["TiledLevels", "distill_in_tiles", "lod_in_tiles", "simplify_in_tiles", "working"]
 
-_SMALLEST_ROW = 4
-"""Bytes of a Gaussian in a file, at least: a smaller file need not be opened to know that it is small."""
-
-WHOLE_TIMES, LEVELS_TIMES = 3.6, 7.0
-"""Memory in one piece, over the scene's arrays: of a simplification, and of levels that are merged alone."""
-
-_READ_ROWS = 1 << 18
-"""Positions that are read at a time."""
-
-_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmMgGtT]?)(?:i?[bB])?")
-
-
-@dataclass(frozen=True)
-class Tiling:
-    """How a scene larger than memory is worked on. Only `tile_rows` decides anything of the result.
-
-    Args:
-        tile_rows: a scene of more Gaussians is worked on in tiles of at most so many; None is 5,000,000.
-        memory: bytes that all workers together may take; None is most of the machine's.
-        workers: processes at once; None is as many as cores and memory allow.
-        cores: that workers share; None is all.
-        scheduler: of a Dask cluster, see `g2ard.tiles.executor.executor`.
-        folder: for tiles and the files of tasks.
-        keep: whether it stays after success.
-    """
-
-    tile_rows: int | None = None
-    memory: int | None = None
-    workers: int | None = None
-    cores: int | None = None
-    scheduler: str | None = None
-    folder: Path | None = None
-    keep: bool = True
-
-    @property
-    def most_rows(self) -> int:
-        """Gaussians of a tile at the most."""
-        from g2ard.tiles.ingest import TILE_ROWS
-
-        return self.tile_rows or TILE_ROWS
-
-
-def bytes_of(text: str) -> int:
-    """Bytes of 4GB, 500MB, 2GiB; a unit is a power of 1000, of 1024 with an i.
-
-    Raises:
-        InputError: another text, or less than a megabyte.
-
-    >>> bytes_of("4GB"), bytes_of("1.5 gib")
-    (4000000000, 1610612736)
-    """
-    match = _SIZE.fullmatch(text.strip())
-    base = 1024 if "i" in text.lower() else 1000
-    size = (
-        0.0 if match is None else float(match[1]) * base ** ["", "k", "m", "g", "t"].index(match[2].lower())
-    )
-    if size < 1e6:
-        raise InputError(f"memory: expected a size such as 4GB or 800MB, got {text!r}")
-    return int(size)
-
-
-def is_tiled(scene: Path, tiling: Tiling) -> bool:
-    """Whether a scene is a folder of several tiles, or has too many Gaussians to be worked on in one piece; a
-    cloud of points never is.
-
-    Raises:
-        InputError: a scene that cannot be read.
-    """
-    from g2ard.tiles.store import MANIFEST, TileStore
-
-    if (scene / MANIFEST).is_file():
-        return len(TileStore.open(scene).tiles) > 1
-    if (
-        scene.is_file()
-        and scene.suffix.lower() != ".json"
-        and scene.stat().st_size < _SMALLEST_ROW * tiling.most_rows
-    ):
-        return False
-    from g2ard.io.detect import kind
-    from g2ard.io.stream import open_stream
-
-    return kind(scene) == "splats" and open_stream(scene).count > tiling.most_rows
-
-
-def check_memory(scene: Path, tiling: Tiling, times: float, tile_times: float = 1.0) -> None:
-    """Refuse a scene that in one piece, at so many times its arrays, takes more than `--memory`.
-
-    Raises:
-        InputError: with what would do, where a tile takes `tile_times` what merging it takes; or the scene
-            cannot be read.
-    """
-    from g2ard.io.stream import open_stream
-    from g2ard.tiles.store import MANIFEST, row_width
-
-    if tiling.memory is None:
-        return
-    stream = open_stream(scene)
-    row_bytes = 4 * row_width(stream.sh_degree)
-    need = TASK_BYTES + int(times * stream.count * row_bytes)
-    if need > tiling.memory:
-        tiles = TileMemory(
-            stream.count, row_bytes, tile_times, scene if (scene / MANIFEST).is_file() else None
-        )
-        raise InputError(
-            f"{scene}: {stream.count:,} Gaussians in one piece take about {amount(need, up=True)}, "
-            f"{amount(TASK_BYTES)} of it the program, more than {_allowed(tiling)}; "
-            f"{tiles.advice(tiling.memory, max(1, stream.count // 2), _foretold(scene))}"
-        )
+_OURS = re.compile(r"tiles|steps|(student|merged|level|written)-[0-9a-f]{16}")
+"""Names that commands create in the work folder."""
 
 
 @contextmanager
-def tiles_of(
-    scene: Path, tiling: Tiling, progress: Progress = silent, say: Say = unsaid
-) -> Iterator[TileStore]:
-    """The tiles of a scene: the folder itself, or tiles streamed into `tiling.folder`.
+def working(tiling: Tiling, *views: Views | None) -> Iterator[None]:
+    """Hold `tiling.folder`, created if absent, while a command works on tiles there.
 
-    Tiles of another size that an earlier command left there go, unless the user named the folder.
+    Success removes the folder unless the user named it. An error removes it if this command created it and a
+    resumed run would find nothing in it: no finished task and, after errors of the output, no tiles either.
+
+    Args:
+        tiling: of the command.
+        views: given to the command; they are read now, and the scheduler is tried, because writing tiles
+            takes long.
+
+    Raises:
+        InputError: the views cannot be read, or the scheduler does not answer.
+        OutputError: the folder is a file, holds something else, or another process works there.
     """
+    from g2ard.io.atomic import drop_empty, parents_made
+    from g2ard.io.lock import locked
+
+    folder = _folder(tiling)
+    _check_folder(folder)
+    _check_given(tiling, views)
+    made = not folder.exists()
+    above = parents_made(folder)
+    try:
+        folder.mkdir(exist_ok=True)
+        with locked(folder):
+            try:
+                yield
+            except G2ardError as error:
+                if made and not _worth_keeping(folder, error):
+                    shutil.rmtree(folder, ignore_errors=True)
+                elif not tiling.keep:
+                    raise type(error)(f"{error}; {folder} keeps what is done") from error
+                raise
+            if not tiling.keep:
+                shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):
+            folder.rmdir()  # where the lock had to go first
+    finally:
+        drop_empty(above)
+
+
+def _folder(tiling: Tiling) -> Path:
+    assert tiling.folder is not None
+    return tiling.folder
+
+
+def _check_folder(folder: Path) -> None:
+    """Reject a folder that holds anything but tiled work."""
+    from g2ard.tiles.journal import is_ours
+
+    try:
+        names = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot work there: {error.strerror}; name another folder") from error
+    of_tiles = [name for name in names if is_ours(name)]
+    others = [name for name in names if not name.startswith(".")]
+    if of_tiles or (others and not any(map(_OURS.fullmatch, names))):
+        raise OutputError(
+            f"{folder}: holds {(of_tiles or others)[0]} and is no folder of such work; name another one"
+        )
+
+
+def _check_given(tiling: Tiling, views: tuple[Views | None, ...]) -> None:
+    from g2ard.policy.inputs import load_view_sets
+    from g2ard.policy.views import is_made
+
+    for given in views:
+        if given is not None and not is_made(given):
+            load_view_sets(given, [], None, unpictured=True)
+    if tiling.scheduler not in (None, "local"):
+        from g2ard.tiles.cluster import DaskExecutor
+
+        with DaskExecutor(tiling.scheduler, 1, 1):
+            pass
+
+
+def _worth_keeping(folder: Path, error: G2ardError) -> bool:
+    """Return whether a command that resumes after this error finds something done."""
+    if any((folder / "steps").glob("[!.]*.npz")):
+        return True
+    return isinstance(error, OutputError) and any(path.name != "tiles" for path in folder.glob("[!.]*/[!.]*"))
+
+
+@contextmanager
+def _tiles_and_workers(
+    scene: Path, tiling: Tiling, times: float, progress: Progress, say: Say
+) -> Iterator[tuple[TileStore, Executor]]:
+    """Open the tiles of a scene, streamed into `tiling.folder` if it is a file, and start workers.
+
+    Args:
+        scene: its file, or a folder of tiles.
+        tiling: how. Tiles of another size are replaced unless the user named the folder.
+        times: memory of a tile relative to merging it.
+        progress: receives rows written.
+        say: receives log lines.
+
+    Raises:
+        InputError: the scene cannot be read, or a tile takes too much memory.
+    """
+    from g2ard.tiles.executor import executor
     from g2ard.tiles.ingest import ingest
     from g2ard.tiles.store import MANIFEST, TileStore
 
     if (scene / MANIFEST).is_file():
-        yield TileStore.open(scene)
-        return
-    assert tiling.folder is not None
-    yield ingest(
-        scene,
-        tiling.folder / "tiles",
-        tile_rows=tiling.most_rows,
-        overwrite=not tiling.keep,
-        progress=progress,
-        say=say,
-    )
+        store = TileStore.open(scene)
+    else:
+        folder = _folder(tiling) / "tiles"
+        rows, replace_others = tiling.most_rows, not tiling.keep
+        store = ingest(scene, folder, tile_rows=rows, overwrite=replace_others, progress=progress, say=say)
+    workers = workers_for(store, tiling, times)
+    threads = max(1, tiling.usable_cores // workers)
+    say(f"{len(store.tiles):,} tiles of {store.count:,} Gaussians, {workers} at a time")
+    with executor(workers, threads, tiling.scheduler) as runs:
+        yield store, runs
 
 
 def simplify_in_tiles(
@@ -187,102 +170,44 @@ def simplify_in_tiles(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Iterator[tuple[TileStore, TiledScene]]:
-    """A scene that does not fit into memory at several budgets; each is ready when it is asked for.
+    """Simplify a scene larger than memory to several budgets, each computed when it is requested.
 
     Args:
         scene: its file, or a folder of tiles.
         budgets: counts, ratios or shares.
-        tiling: how; `folder` keeps what is done, so that the same call goes on.
+        tiling: how; `folder` keeps finished steps, so that the same call resumes.
         views: as for `g2ard.simplify`.
         blind: use no cameras at all.
         config: constants.
-        up: (3,) away from the ground, for poses that are made.
-        seed: of poses that are made.
-        progress: told of tasks.
-        say: told in lines what was decided.
+        up: (3,) away from the ground, for generated views.
+        seed: of generated views.
+        progress: receives the number of finished tasks.
+        say: receives log lines.
 
     Raises:
-        InputError: budgets that only the whole scene could tell, too little memory for a tile, or as
-            `g2ard.tiles.simplify.simplify_tiles`.
+        InputError: too little memory for a tile, or as `g2ard.tiles.simplify.simplify_tiles`.
     """
-    from g2ard.tiles.executor import executor
     from g2ard.tiles.simplify import simplify_tiles
 
-    refuse_whole(scene, whole_budgets(budgets))
-    folder = tiling.folder
-    assert folder is not None
-    with tiles_of(scene, tiling, progress, say) as store:
-        workers = workers_for(store, tiling)
-        threads = max(1, cores_of(tiling) // workers)
-        say(f"{len(store.tiles):,} tiles of {store.count:,} Gaussians, {workers} at a time")
-        with executor(workers, threads, tiling.scheduler) as runs:
-            for budget in budgets:
-                yield (
+    with _tiles_and_workers(scene, tiling, 1.0, progress, say) as (store, runs):
+        for budget in budgets:
+            yield (
+                store,
+                simplify_tiles(
                     store,
-                    simplify_tiles(
-                        store,
-                        budget.of(store.count, str(scene)),
-                        executor=runs,
-                        work=folder / "steps",
-                        config=config,
-                        views=_given(views, say),
-                        beside=lambda sample: _found(scene, sample, say) if views is None else None,
-                        blind=blind,
-                        up=up,
-                        seed=seed,
-                        progress=progress,
-                        say=say,
-                    ),
-                )
-
-
-def workers_for(store: TileStore, tiling: Tiling, times: float = 1.0) -> int:
-    """As many workers as memory and cores allow, where a tile takes so many times what merging it takes.
-
-    Raises:
-        InputError: not even one tile fits.
-    """
-    memory = _memory_of(tiling)
-    largest = max(store.tiles, key=lambda tile: tile.rows + tile.halo)
-    rows, most = largest.rows + largest.halo, store.settings.get("tile_rows") or largest.rows
-    made_here = tiling.folder is not None and store.folder.parent == tiling.folder
-    tiles = TileMemory(store.count, store.row_bytes, times, None if made_here else store.folder)
-    need = tiles.of(rows)
-    fit = memory // need
-    if fit > 1:  # several are processes beside this one
-        fit = max(1, (memory - TASK_BYTES) // need)
-    if fit < 1:
-        raise InputError(
-            f"a tile of {largest.rows:,} Gaussians and {largest.halo:,} around it takes about "
-            f"{amount(need, up=True)}, {amount(TASK_BYTES)} of it the program, more than {_allowed(tiling)}; "
-            f"{tiles.advice(memory, most, _foretold(store.folder))}"
-        )
-    if tiling.workers is not None and tiling.scheduler is None and tiling.workers > fit:
-        raise InputError(
-            f"--workers {tiling.workers} take about {amount(tiling.workers * need, up=True)}, more than "
-            f"{_allowed(tiling)}; --workers {fit} fit"
-        )
-    return tiling.workers or max(1, min(fit, cores_of(tiling)))
-
-
-def _foretold(scene: Path) -> Callable[[int], int]:
-    """Rows of the largest tile, halo included, of any `--tile-rows`."""
-    from g2ard.io.stream import open_stream
-    from g2ard.tiles.pour import foretold
-
-    stream = open_stream(scene)
-    return foretold(stream.positions(_READ_ROWS), stream.count)
-
-
-def _memory_of(tiling: Tiling) -> int:
-    """Bytes that all workers together may take."""
-    return tiling.memory or int(0.8 * _physical_memory())
-
-
-def _allowed(tiling: Tiling) -> str:
-    """That in words, and who says so."""
-    size = amount(_memory_of(tiling))
-    return f"--memory {size}" if tiling.memory else f"the {size} that are taken of the machine's memory"
+                    budget.of(store.count, str(scene)),
+                    executor=runs,
+                    work=_folder(tiling) / "steps",
+                    config=config,
+                    views=_given(views, say),
+                    beside=lambda sample: _found(scene, sample, say) if views is None else None,
+                    blind=blind,
+                    up=up,
+                    seed=seed,
+                    progress=progress,
+                    say=say,
+                ),
+            )
 
 
 def _given(views: Views | None, say: Say) -> Cameras | None:
@@ -293,7 +218,7 @@ def _given(views: Views | None, say: Say) -> Cameras | None:
 
 
 def _found(scene: Path, sample: Splats, say: Say) -> Cameras | None:
-    """Cameras that lie beside the scene and see the sample of it."""
+    """Return the cameras beside the scene that see the sample of it."""
     from g2ard.policy.found import as_pool, found_views
     from g2ard.policy.inputs import load_views
 
@@ -301,21 +226,239 @@ def _found(scene: Path, sample: Splats, say: Say) -> Cameras | None:
     return as_pool(load_views(found, "train", None, say)) if found else None
 
 
-def cores_of(tiling: Tiling) -> int:
-    """Cores that workers share."""
-    if tiling.cores:
-        return tiling.cores
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def distill_in_tiles(
+    scene: Path,
+    budgets: Sequence[Budget],
+    tiling: Tiling,
+    options: DistillOptions,
+    *,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Iterator[tuple[TileStore, TiledScene, TiledScores, RunViews]]:
+    """Distil a scene larger than memory to several budgets, each computed when it is requested.
+
+    Targets are the dense scene's own renders, in views that are given, found beside it or generated.
+
+    Args:
+        scene: its file, or a folder of tiles.
+        budgets: counts, ratios or shares.
+        tiling: how; `folder` keeps finished steps, so that the same call resumes.
+        options: as for `g2ard.distill`, without those that `whole_options` returns.
+        progress: receives the number of finished tasks.
+        say: receives log lines.
+
+    Raises:
+        InputError: as `simplify_in_tiles`.
+    """
+    with _job(scene, tiling, options, True, progress, say) as job:
+        for budget in budgets:
+            count = budget.of(job.store.count, str(scene))
+            small = job.simplified(job.store, count, job.views.train.cameras)
+            assert small.surroundings is not None  # views are given
+            done, scores = job.recovered(small, small.surroundings, job.views)
+            yield job.store, done, scores, job.views
 
 
-def _physical_memory() -> int:
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return 8_000_000_000
+@dataclass(frozen=True, eq=False)
+class TiledLevels:
+    """A scene's levels of detail in tiles, the finest first, and a report on each."""
+
+    scenes: tuple[StoredScene, ...]
+    reports: tuple[LevelReport, ...]
+
+    def key(self, rule: Cut, errors: bool) -> str:
+        """Return 16 hexadecimal digits that identify the files they are written to."""
+        from g2ard.tiles.simplify import key_of
+
+        return key_of([[scene.store.key for scene in self.scenes], asdict(rule), errors])
 
 
-def forget(tiling: Tiling) -> None:
-    """Remove the folder of a command that has succeeded, unless it is to be kept."""
-    if tiling.folder is not None and not tiling.keep:
-        shutil.rmtree(tiling.folder, ignore_errors=True)
+def lod_in_tiles(
+    scene: Path,
+    ratios: Sequence[float],
+    tiling: Tiling,
+    options: DistillOptions,
+    *,
+    recover: bool = True,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> TiledLevels:
+    """Make levels of detail of a scene larger than memory.
+
+    As in `g2ard.lod`, a level is merged from the one before, which lies in tiles of its own, and recovered
+    against the dense scene's renders in views shrunk by √√r.
+
+    Args:
+        scene: its file, or a folder of tiles.
+        ratios: how many times fewer Gaussians each level has, rising; 1 is the scene as it is.
+        tiling: how; `folder` keeps finished steps, so that the same call resumes.
+        options: as for `g2ard.distill`.
+        recover: optimise each level; otherwise levels are only merged.
+        progress: receives the number of finished tasks.
+        say: receives log lines.
+
+    Returns:
+        The levels, of exactly round(N/r) Gaussians each.
+
+    Raises:
+        InputError: ratios that do not rise, options that need the whole scene, or as `distill_in_tiles`.
+    """
+    from g2ard.tiles.stored import StoredScene
+
+    check_ratios(ratios)
+    refuse_whole(scene, whole_options(options))
+    levels: list[StoredScene] = []
+    reports: list[LevelReport] = []
+    around: Surroundings | None = None
+    with _job(scene, tiling, options, recover, progress, say) as job:
+        finer = job.store
+        for number, ratio in enumerate(ratios):
+            if ratio == 1:
+                size = level_size(job.views.train.cameras, 1)
+                level, report = job.store, LevelReport(job.store.count, 1.0, size, 0.0)
+            else:
+                count = Budget(ratio=ratio).of(job.store.count, str(scene))
+                say(f"level {number}: {plural(count, 'Gaussian')}")
+                level, finer, around, report = _level(job, finer, around, count, ratio)
+            levels.append(StoredScene(level))
+            reports.append(report)
+    return TiledLevels(tuple(levels), tuple(reports))
+
+
+def _level(
+    job: _Job, finer: TileStore, around: Surroundings | None, count: int, ratio: float
+) -> tuple[TileStore, TileStore, Surroundings, LevelReport]:
+    """Return the level, its unrecovered version, the placement of the dense tiles and a report."""
+    began = time.perf_counter()
+    longest = level_size(job.views.train.cameras, ratio)
+    views = job.views.resized(longest)
+    small = job.simplified(finer, count, (views if job.learn else job.views).train.cameras)
+    around = around or small.surroundings  # the first level is merged from the dense scene itself
+    assert around is not None  # views are given
+    merged = job.stored(small, "merged")
+    done, scores = job.recovered(small, around, views)
+    level = job.stored(done, "level") if job.learn else merged
+    seconds = time.perf_counter() - began
+    recovered = scores.recovered if job.learn else None
+    return level, merged, around, LevelReport(count, ratio, longest, seconds, scores.simplified, recovered)
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A distillation in tiles with everything decided.
+
+    Args:
+        store: the dense scene in tiles.
+        sample: a fair sample of it.
+        views: for training and scoring.
+        config: of recovery.
+        merging: of simplification.
+        learn: whether anything is recovered, or only scored.
+        executor: runs the tasks.
+        tiling: how; `folder` keeps finished steps.
+        options: as they were given.
+        progress: receives the number of finished tasks.
+        say: receives log lines.
+    """
+
+    store: TileStore
+    sample: Splats
+    views: RunViews
+    config: RecoverConfig
+    merging: SimplifyConfig
+    learn: bool
+    executor: Executor
+    tiling: Tiling
+    options: DistillOptions
+    progress: Progress
+    say: Say
+
+    def simplified(self, store: TileStore, count: int, cameras: Cameras) -> TiledScene:
+        """Simplify a scene in tiles: the dense one, or one derived from it."""
+        from g2ard.tiles.simplify import simplify_tiles
+
+        return simplify_tiles(
+            store,
+            count,
+            executor=self.executor,
+            work=_folder(self.tiling) / "steps",
+            config=self.merging,
+            views=cameras,
+            seed=self.options.seed,
+            progress=self.progress,
+            say=self.say,
+        )
+
+    def recovered(
+        self, small: TiledScene, around: Surroundings, views: RunViews
+    ) -> tuple[TiledScene, TiledScores]:
+        """Recover a simplified scene, unless nothing is to be learned, and score it."""
+        from g2ard.policy.views import pool_times
+        from g2ard.stages.recover.need import steps_for
+        from g2ard.tiles.recover import recover_tiles
+
+        needed = steps_for(self.sample, views.train.cameras, self.config.schedule.steps)
+        steps = self.options.steps or round(needed * pool_times(self.store.count))
+        return recover_tiles(
+            self.store,
+            self.stored(small, "student", like=self.store),
+            around,
+            views,
+            self.config,
+            steps if self.learn else 0,
+            executor=self.executor,
+            work=_folder(self.tiling) / "steps",
+            progress=self.progress,
+        )
+
+    def stored(self, scene: TiledScene, name: str, like: TileStore | None = None) -> TileStore:
+        """Write a derived scene in tiles of its own, or in those of another."""
+        from g2ard.tiles.ingest import ingest
+
+        folder = _folder(self.tiling) / f"{name}-{scene.key}"
+        return ingest(scene.stream(), folder, tile_rows=self.tiling.most_rows, like=like)
+
+
+@contextmanager
+def _job(
+    scene: Path, tiling: Tiling, options: DistillOptions, learn: bool, progress: Progress, say: Say
+) -> Iterator[_Job]:
+    """Open the tiles, start workers, and decide views and constants of a distillation."""
+    from g2ard.config.constants import changed, full_names
+    from g2ard.policy.views import views_of
+    from g2ard.scene.regions import as_regions
+    from g2ard.stages.recover import RecoverConfig
+    from g2ard.stages.recover.presets import preset_for
+    from g2ard.stages.recover.schedule import schedule_named
+    from g2ard.stages.simplify import SimplifyConfig
+    from g2ard.tiles.simplify import sample_of
+
+    with _tiles_and_workers(scene, tiling, RECOVERY_TIMES, progress, say) as (store, runs):
+        sample = sample_of(store, runs, _folder(tiling) / "steps", progress)
+        views = views_of(
+            sample,
+            options.views,
+            options.held_out,
+            beside=options.beside or scene,
+            size=options.size,
+            up=options.up,
+            seed=options.seed,
+            represents=store.count / len(sample),
+            progress=progress,
+            say=say,
+        )
+        regularizers, why, _ = preset_for(options.preset, sample)
+        if learn:
+            say(f"regularisers: {why}")
+        config = RecoverConfig(
+            schedule=schedule_named(options.schedule or "default", options.steps),
+            regularizers=regularizers,
+            background=options.background,
+            sh_degree=options.sh_degree,
+            seed=options.seed,
+        )
+        merging = SimplifyConfig(keep_region=as_regions(options.keep_region))
+        constants = full_names(options.constants or {}, {"recover": config, "simplify": merging})
+        config = changed(config, "recover", constants)
+        merging = changed(merging, "simplify", constants)
+        yield _Job(store, sample, views, config, merging, learn, runs, tiling, options, progress, say)

@@ -55,6 +55,11 @@ class RunViews:
     pool: ViewSet | None = None
     unseen: float | None = None
 
+    def resized(self, longest: int) -> RunViews:
+        """Return the same views for training and scoring, shrunk."""
+        apart = self.apart and self.apart.resized(longest)
+        return replace(self, train=self.train.resized(longest), test=self.test.resized(longest), apart=apart)
+
 
 def is_made(views: object) -> bool:
     """Whether views are asked to be made, rather than given."""

@@ -9,9 +9,16 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import write_splats
-from g2ard.policy import tiled
-from g2ard.policy.tile_memory import RECOVERY_TIMES, TileMemory
-from g2ard.policy.tiled import LEVELS_TIMES, Tiling, bytes_of, check_memory, workers_for
+from g2ard.policy import tiling as policy
+from g2ard.policy.tiling import (
+    LEVELS_TIMES,
+    RECOVERY_TIMES,
+    TileMemory,
+    Tiling,
+    bytes_of,
+    check_memory,
+    workers_for,
+)
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.store import TileStore
 from helpers.tiled_scenes import town
@@ -75,7 +82,7 @@ def test_memory_that_nobody_gave_is_the_machine_s(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store, tiling = tiles(scene, tmp_path, 6000)
-    monkeypatch.setattr(tiled, "_physical_memory", lambda: 4_000_000_000)
+    monkeypatch.setattr(policy, "_physical_memory", lambda: 4_000_000_000)
     told = r"--workers 1000 take about 20\d[\d.]* GB, more than the 3\.2 GB that are taken of the machine's"
     with pytest.raises(InputError, match=told + r" memory; --workers 1\d fit$"):
         workers_for(store, Tiling(folder=tiling.folder, workers=1000))

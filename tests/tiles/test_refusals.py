@@ -11,7 +11,7 @@ from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
 from g2ard.levels import Cut
 from g2ard.policy.distill_options import DistillOptions
-from g2ard.policy.whole import whole_options
+from g2ard.policy.tiling import whole_options
 from g2ard.tiles.ingest import ingest
 from helpers.commands import CommandLine
 from helpers.tiled_scenes import ring, town

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from g2ard.io import read_splats, write_splats, write_views
-from g2ard.policy.tiled import Tiling, is_tiled
+from g2ard.policy.tiling import Tiling, is_tiled
 from helpers.commands import CommandLine
 from helpers.tiled_scenes import ring, town
 

@@ -187,7 +187,7 @@ def distill(
     from g2ard.policy.distill import prepare
     from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.estimate import check_memory
-    from g2ard.policy.tiled import is_tiled
+    from g2ard.policy.tiling import is_tiled
     from g2ard.report.distilled import check_crops
 
     began = time.monotonic()

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from g2ard.levels import Cut
     from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.levels import Levels
-    from g2ard.policy.tiled import Tiling
-    from g2ard.policy.tiled_levels import TiledLevels
+    from g2ard.policy.tiled import TiledLevels
+    from g2ard.policy.tiling import Tiling
 
 
 @command("lod", example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/")
@@ -109,9 +109,8 @@ def lod(
     from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.levels import check_ratios
     from g2ard.policy.levels import lod as levels_of
-    from g2ard.policy.tile_memory import RECOVERY_TIMES
-    from g2ard.policy.tiled import LEVELS_TIMES, check_memory, is_tiled
-    from g2ard.policy.work import working
+    from g2ard.policy.tiled import working
+    from g2ard.policy.tiling import LEVELS_TIMES, RECOVERY_TIMES, check_memory, is_tiled
 
     if kind(scene) == "points":
         raise typer.BadParameter(
@@ -183,7 +182,7 @@ def _in_tiles(
 ) -> None:
     """What is done stays in the tiling's folder until all is, longer where the user named the folder."""
     from g2ard.levels import save_levels
-    from g2ard.policy.tiled_levels import lod_in_tiles
+    from g2ard.policy.tiled import lod_in_tiles
     from g2ard.system.memory import peak_rss_of_all
 
     assert tiling.folder is not None

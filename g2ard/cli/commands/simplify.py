@@ -91,8 +91,14 @@ def simplify(
     from g2ard.policy.fit import aim_of
     from g2ard.policy.inputs import say_notes
     from g2ard.policy.simplify import Reduction
-    from g2ard.policy.tiled import WHOLE_TIMES, check_memory, is_tiled
-    from g2ard.policy.whole import refuse_whole, whole_budgets, whole_method
+    from g2ard.policy.tiling import (
+        WHOLE_TIMES,
+        check_memory,
+        is_tiled,
+        refuse_whole,
+        whole_budgets,
+        whole_method,
+    )
 
     config = SimplifyConfig(retention=retention, keep_region=tuple(keep_region or ()))
     config = changed(config, "simplify", values)
