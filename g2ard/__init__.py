@@ -40,6 +40,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
+    from g2ard._core import __version__
     from g2ard.config.presets import preset
     from g2ard.errors import G2ardError, InputError, MissingDependencyError, OutputError
     from g2ard.io import Points
@@ -70,8 +71,6 @@ if TYPE_CHECKING:
     from g2ard.stages.simplify import Simplified, SimplifyConfig
     from g2ard.tiles.ingest import ingest
     from g2ard.tiles.store import TileStore
-
-__version__ = "0.1.0"
 
 __all__ = [
     "AdaptConfig",
@@ -128,6 +127,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "_core": ("__version__",),
     "scene.cameras": ("Camera", "Cameras", "look_at"),
     "errors": ("G2ardError", "InputError", "MissingDependencyError", "OutputError"),
     "io.types": ("Points",),

@@ -20,7 +20,6 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from g2ard import __version__
 from g2ard.cli.budget_options import Counts, Ratios
 from g2ard.cli.config import load_config, printed
 from g2ard.cli.console import Console
@@ -42,6 +41,8 @@ app = typer.Typer(
 
 def _version(show: bool) -> None:
     if show:
+        from g2ard import __version__
+
         typer.echo(f"g2ard {__version__}")
         raise typer.Exit
 
