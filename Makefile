@@ -21,7 +21,12 @@ $(VENV)/.maturin:
 	test -x $(BIN)/maturin || { $(PYTHON) -m venv $(VENV) && $(BIN)/pip install --quiet "maturin>=1.9,<2"; }
 	touch $@
 
-demo: setup
+# The package with its plain dependencies: neither torch nor what the tests need.
+$(VENV)/.plain: pyproject.toml $(RUST) | $(VENV)/.maturin
+	$(BIN)/maturin develop --release --quiet
+	touch $@
+
+demo: $(VENV)/.plain
 	$(BIN)/python examples/01_distill_a_scene.py
 
 test: setup

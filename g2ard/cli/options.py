@@ -317,6 +317,9 @@ def recovery_engine(run: Run) -> Engine:
     """
     if run.device != "cuda":
         return "fused"
+    from g2ard.system.extras import require_torch
+
+    require_torch("--device cuda")
     from g2ard.stages.recover.gsplat_engine import check_cuda
 
     check_cuda()

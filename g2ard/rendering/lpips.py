@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.system.extras import require_torch
 
 __all__ = ["Lpips", "load_lpips"]
 
@@ -99,7 +100,9 @@ def load_lpips(folder: Path, *, scaled: bool = True) -> dict[str, Lpips]:
 
     Raises:
         InputError: the folder holds neither pair, or a file that is no state dict.
+        MissingDependencyError: torch is not installed.
     """
+    require_torch("LPIPS")
     import torch
 
     out = {}

@@ -26,6 +26,7 @@ from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.probe import MULTIPLIERS, Probe, calm, search_multiplier, trial_steps
 from g2ard.stages.recover.schedule import multiplier_for, reach_for
 from g2ard.stages.recover.sizes import typical_share
+from g2ard.system.extras import require_torch
 
 __all__ = ["Loop", "Watch", "engine_class", "finite"]
 
@@ -324,6 +325,8 @@ def engine_class(name: str) -> Callable[[Objective], Engine]:
         from g2ard.stages.recover.fused_engine import FusedEngine
 
         return FusedEngine
+    if name in ("torch", "gsplat"):
+        require_torch(f"engine '{name}'")
     if name == "torch":
         from g2ard.stages.recover.torch_engine import TorchEngine
 

@@ -1,0 +1,19 @@
+"""Optional packages."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from g2ard.errors import MissingDependencyError
+
+__all__ = ["require_torch"]
+
+
+def require_torch(feature: str) -> None:
+    """Check that torch can be imported, without importing it.
+
+    Raises:
+        MissingDependencyError: torch is not installed.
+    """
+    if find_spec("torch") is None:
+        raise MissingDependencyError(f"{feature} needs torch: pip install 'g2ard[torch]'")
