@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.tiling import Tiling
     from g2ard.stages.simplify import SimplifyConfig
-    from g2ard.tiles.simplify import TiledScene
+    from g2ard.tiles.merging import TiledScene
     from g2ard.tiles.store import TileStore
 
 __all__ = ["TiledCommand"]

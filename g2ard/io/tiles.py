@@ -16,11 +16,11 @@ def read(path: Path) -> Scene:
     Raises:
         InputError: the manifest or a tile is broken.
     """
-    from g2ard.tiles.scenes import joined
+    from g2ard.scene.transform import join
     from g2ard.tiles.store import TileStore
 
     store = TileStore.open(path)
-    return Scene(joined([store.read(tile.index) for tile in store.tiles]), store.notes)
+    return Scene(join([store.read(tile.index) for tile in store.tiles]), store.notes)
 
 
 def stream(path: Path) -> PartsStream:

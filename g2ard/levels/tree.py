@@ -17,7 +17,7 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import rotation_matrices
 
 if TYPE_CHECKING:
-    from g2ard.tiles.stored import StoredScene
+    from g2ard.tiles.store import StoredScene
 
     Level = Splats | StoredScene
     """A level of detail: a scene in memory, or rows on disk."""

@@ -27,11 +27,10 @@ if TYPE_CHECKING:
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.simplify import SimplifyConfig
     from g2ard.tiles.executor import Executor
+    from g2ard.tiles.merging import TiledScene
     from g2ard.tiles.recover import TiledScores
     from g2ard.tiles.sights import Surroundings
-    from g2ard.tiles.simplify import TiledScene
-    from g2ard.tiles.store import TileStore
-    from g2ard.tiles.stored import StoredScene
+    from g2ard.tiles.store import StoredScene, TileStore
 
 __all__ = ["TiledLevels", "distill_in_tiles", "lod_in_tiles", "simplify_in_tiles", "working"]
 
@@ -111,7 +110,7 @@ def _check_given(tiling: Tiling, views: tuple[Views | None, ...]) -> None:
         if given is not None and not is_made(given):
             load_view_sets(given, [], None, unpictured=True)
     if tiling.scheduler not in (None, "local"):
-        from g2ard.tiles.cluster import DaskExecutor
+        from g2ard.tiles.executor import DaskExecutor
 
         with DaskExecutor(tiling.scheduler, 1, 1):
             pass
@@ -185,9 +184,9 @@ def simplify_in_tiles(
         say: receives log lines.
 
     Raises:
-        InputError: too little memory for a tile, or as `g2ard.tiles.simplify.simplify_tiles`.
+        InputError: too little memory for a tile, or as `g2ard.tiles.merging.simplify_tiles`.
     """
-    from g2ard.tiles.simplify import simplify_tiles
+    from g2ard.tiles.merging import simplify_tiles
 
     with _tiles_and_workers(scene, tiling, 1.0, progress, say) as (store, runs):
         for budget in budgets:
@@ -268,7 +267,7 @@ class TiledLevels:
 
     def key(self, rule: Cut, errors: bool) -> str:
         """Return 16 hexadecimal digits that identify the files they are written to."""
-        from g2ard.tiles.simplify import key_of
+        from g2ard.tiles.merging import key_of
 
         return key_of([[scene.store.key for scene in self.scenes], asdict(rule), errors])
 
@@ -303,7 +302,7 @@ def lod_in_tiles(
     Raises:
         InputError: ratios that do not rise, options that need the whole scene, or as `distill_in_tiles`.
     """
-    from g2ard.tiles.stored import StoredScene
+    from g2ard.tiles.store import StoredScene
 
     check_ratios(ratios)
     refuse_whole(scene, whole_options(options))
@@ -375,7 +374,7 @@ class _Job:
 
     def simplified(self, store: TileStore, count: int, cameras: Cameras) -> TiledScene:
         """Simplify a scene in tiles: the dense one, or one derived from it."""
-        from g2ard.tiles.simplify import simplify_tiles
+        from g2ard.tiles.merging import simplify_tiles
 
         return simplify_tiles(
             store,
@@ -431,7 +430,7 @@ def _job(
     from g2ard.stages.recover.presets import preset_for
     from g2ard.stages.recover.schedule import schedule_named
     from g2ard.stages.simplify import SimplifyConfig
-    from g2ard.tiles.simplify import sample_of
+    from g2ard.tiles.merging import sample_of
 
     with _tiles_and_workers(scene, tiling, RECOVERY_TIMES, progress, say) as (store, runs):
         sample = sample_of(store, runs, _folder(tiling) / "steps", progress)

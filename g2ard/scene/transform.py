@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.errors import InputError
 from g2ard.scene.splats import Splats
 
-__all__ = ["in_box", "in_sphere", "merge", "rotate_harmonics", "similarity", "transform"]
+__all__ = ["in_box", "in_sphere", "join", "rotate_harmonics", "similarity", "transform"]
 
 _FAR = 16.0
 """Extents from the origin past which a move goes into `offset`: float32 means keep their precision."""
@@ -139,19 +139,19 @@ def _basis(d: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack(columns, axis=1)
 
 
-def merge(scenes: Sequence[Splats]) -> Splats:
-    """Several scenes as one, in world coordinates: relative to the first one's offset, at the highest degree.
+def join(scenes: Sequence[Splats]) -> Splats:
+    """Join scenes into one, relative to the first one's offset and at the highest SH degree.
 
     Raises:
         InputError: no scene.
 
     >>> a = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]], offset=[100, 0, 0])
     >>> b = Splats.create([[1, 0, 0]], scales=[[1, 1, 1]])
-    >>> merge([a, b]).means.tolist()
+    >>> join([a, b]).means.tolist()
     [[0.0, 0.0, 0.0], [-99.0, 0.0, 0.0]]
     """
     if not scenes:
-        raise InputError("merge: no scenes")
+        raise InputError("join: no scenes")
     degree = max(scene.sh_degree for scene in scenes)
     parts = [scene.recentred(scenes[0].offset).with_sh_degree(degree) for scene in scenes]
     names = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")

@@ -1,4 +1,4 @@
-"""Where tasks run: in this process, in processes of this machine, or on a Dask cluster."""
+"""Executors of tasks: this process, processes of this machine, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from multiprocessing import get_context, parent_process
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.system.memory import forget_workers, note_worker, peak_rss
-from g2ard.tiles.task import Task, run_task
+from g2ard.tiles.tasks import Task, run_task
 
-__all__ = ["Executor", "executor"]
+__all__ = ["DaskExecutor", "Executor", "executor"]
 
 _TRIES = 5
-"""How often in a row workers may die with no task done between, before it is no accident."""
+"""How often in a row workers may die with no task done between. Dask gives up a task after four deaths."""
 
 _MANAGER = 5.0
 """Seconds for the pool's own thread to end once its workers are dead. It removes semaphores, of which Python
@@ -53,8 +53,6 @@ def executor(
     forget_workers()
     threads = threads or max(1, (os.cpu_count() or 1) // workers)
     if scheduler:
-        from g2ard.tiles.cluster import DaskExecutor
-
         with DaskExecutor(scheduler, workers, threads) as cluster:
             yield cluster
     elif workers == 1:
@@ -170,3 +168,97 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
     os._exit(1)
+
+
+class DaskExecutor:
+    """Runs tasks on the workers of a scheduler, which must see the same files under the same paths.
+
+    Results are paths: what workers hold in memory is Rust's, which Dask's spilling does not know of.
+
+    Raises:
+        InputError: Dask is not installed, or the scheduler does not answer.
+    """
+
+    def __init__(self, scheduler: str, workers: int, threads: int):
+        try:
+            from distributed import Client, LocalCluster
+        except ImportError:
+            raise InputError(
+                '--scheduler: Dask is not installed; pip install "g2ard[distributed]" brings it'
+            ) from None
+        self._threads = threads
+        self._cluster: Any = None
+        if scheduler == "local":
+            self._cluster = LocalCluster(  # type: ignore[no-untyped-call]
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=None,
+                memory_limit=0,
+            )
+            scheduler = self._cluster.scheduler_address
+        try:
+            self.client: Any = Client(  # type: ignore[no-untyped-call]
+                scheduler, timeout="10s", set_as_default=False
+            )
+        except (OSError, TimeoutError, ValueError) as error:
+            raise InputError(
+                f"--scheduler {scheduler}: does not answer ({error}); `dask scheduler` starts one and prints "
+                "its address"
+            ) from None
+
+    def __enter__(self) -> DaskExecutor:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.client.close()
+        if self._cluster is not None:
+            self._cluster.close()
+
+    def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
+        """As `Executor.run`; a worker's death costs a retry."""
+        from distributed import KilledWorker
+
+        deaths = 0
+        while todo := {task.key: task for task in tasks if not task.done}:
+            before = len(todo)
+            try:
+                self._round(todo, sum(task.cost for task in tasks), stage, progress)
+            except KilledWorker:
+                left = sum(not task.done for task in tasks)
+                deaths = deaths + 1 if left == before else 0
+                if deaths == _TRIES:
+                    raise InputError(
+                        f"{stage}: workers die before they finish anything; give them memory"
+                    ) from None
+                continue
+            if missing := [task.output for task in tasks if not task.done]:
+                raise InputError(
+                    f"{missing[0]}: a worker made it, but it is not here; share that folder with all workers"
+                )
+        return [task.output for task in tasks]
+
+    def _round(self, todo: dict[str, Task], total: int, stage: str, progress: Progress) -> None:
+        from distributed import as_completed
+
+        done = total - sum(task.cost for task in todo.values())
+        futures = [
+            self.client.submit(_work, task, self._threads, key=f"g2ard-{key}", pure=True)
+            for key, task in todo.items()
+        ]
+        try:
+            progress(stage, done, total)
+            for future in as_completed(futures, loop=self.client.loop):  # type: ignore[no-untyped-call]
+                future.result()
+                done += todo[future.key.removeprefix("g2ard-")].cost
+                progress(stage, done, total)
+        except BaseException:
+            self.client.cancel(futures, force=True)
+            raise
+
+
+def _work(task: Task, threads: int) -> str:
+    from g2ard import _core
+
+    _core.set_num_threads(threads)
+    return str(run_task(task))

@@ -4,28 +4,23 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
 from g2ard.errors import InputError, OutputError
 from g2ard.io import kind
 from g2ard.io.lock import LOCK, locked
 from g2ard.io.point_stream import open_point_stream
-from g2ard.io.sanitize import Tally
 from g2ard.io.stream import SceneStream, open_stream
 from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig
-from g2ard.tiles.cells import Points
 from g2ard.tiles.journal import JOURNAL, POINTS, Journal, clear, is_ours
-from g2ard.tiles.points import PointFeed, lift_tiles
-from g2ard.tiles.pour import pour
-from g2ard.tiles.store import MANIFEST, VERSION, TileStore, packed, row_width
+from g2ard.tiles.pour import PointFeed, SceneFeed, lift_tiles, pour
+from g2ard.tiles.store import MANIFEST, VERSION, TileStore
 
 __all__ = ["MOST_TILES", "TILE_ROWS", "ingest"]
 
@@ -37,36 +32,6 @@ MOST_TILES = 10_000
 
 _BLOCK_BYTES = 1 << 24
 """Bytes of rows in memory at a time; some five copies of them are made on the way."""
-
-
-class _SceneFeed:
-    """A scene's Gaussians as rows of its tiles."""
-
-    def __init__(self, stream: SceneStream) -> None:
-        self._stream, self.path, self.count = stream, stream.path, stream.count
-        self.row_bytes = self.room = 4 * row_width(stream.sh_degree)
-        self.sh_degree, self.offset = stream.sh_degree, stream.offset
-        self.settings: dict[str, Any] = {}
-
-    @property
-    def tally(self) -> Tally:
-        return self._stream.tally
-
-    @tally.setter
-    def tally(self, tally: Tally) -> None:
-        self._stream.tally = tally
-
-    def positions(self, rows: int) -> Iterator[Points]:
-        return self._stream.positions(rows)
-
-    def rows(self, rows: int, start: int) -> Iterator[tuple[NDArray[Any], Points]]:
-        return ((packed(splats), splats.means) for splats in self._stream.blocks(rows, start))
-
-    def all_notes(self) -> tuple[Note, ...]:
-        return self._stream.all_notes()
-
-    def identity(self) -> list[Any]:
-        return self._stream.identity()
 
 
 def ingest(
@@ -125,16 +90,16 @@ def ingest(
     if tile_rows < 1 or (block_rows is not None and block_rows < 1):
         raise InputError(f"tile_rows and block_rows: expected at least 1, got {tile_rows}, {block_rows}")
     feed, sources = _feed(source, lift or LiftConfig())
-    fewest = -(-feed.count // MOST_TILES)
+    fewest = -(-feed.stream.count // MOST_TILES)
     if like is None and tile_rows < fewest:
         raise InputError(
-            f"tile_rows: {feed.path} is {feed.count:,} rows, too many for tiles of {tile_rows:,}; "
-            f"at least {fewest:,} each are needed"
+            f"tile_rows: {feed.stream.path} is {feed.stream.count:,} rows, too many for tiles of "
+            f"{tile_rows:,}; at least {fewest:,} each are needed"
         )
     settings: dict[str, Any] = {"tile_rows": tile_rows} if like is None else {"like": like.key}
     if isinstance(feed, PointFeed):
         settings["lift"] = asdict(feed.config)
-    feed.settings, key = settings, _key(feed.identity(), settings)
+    feed.settings, key = settings, _key(feed.stream.identity(), settings)
     done = _done(folder, key, overwrite)
     if done is not None:
         say(f"{folder}: holds these {plural(done.count, 'Gaussian')} already; skipped")
@@ -153,10 +118,10 @@ def ingest(
         except InputError:
             clear(folder)
             raise
-        notes = [*feed.all_notes(), *([] if like else _overfull_note(journal, tile_rows))]
+        notes = [*feed.stream.all_notes(), *([] if like else _overfull_note(journal, tile_rows))]
         manifest = {
             "sh_degree": feed.sh_degree,
-            "offset": feed.offset.tolist(),
+            "offset": feed.stream.offset.tolist(),
             "source": sources,
             "settings": settings,
             "notes": [asdict(note) for note in notes],
@@ -167,15 +132,15 @@ def ingest(
 
 def _feed(
     source: str | Path | Sequence[str | Path] | SceneStream, config: LiftConfig
-) -> tuple[_SceneFeed | PointFeed, list[str]]:
+) -> tuple[SceneFeed | PointFeed, list[str]]:
     """What is poured, and the names of where it comes from."""
     if isinstance(source, SceneStream):
-        return _SceneFeed(source), [str(source.path)]
+        return SceneFeed(source), [str(source.path)]
     sources: list[str | Path] = [source] if isinstance(source, str | Path) else list(source)
     names = [str(path) for path in sources]
     if sources and all(kind(path) == "points" for path in sources):
         return PointFeed(open_point_stream(sources), config), names
-    return _SceneFeed(open_stream(sources)), names
+    return SceneFeed(open_stream(sources)), names
 
 
 def _key(identity: list[Any], settings: dict[str, Any]) -> str:

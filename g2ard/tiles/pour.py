@@ -1,24 +1,29 @@
-"""Rows of any kind poured into the files of tiles: cells by a sample, then every row to where it belongs."""
+"""Writing rows of scenes and clouds into the files of tiles, cut by a sample of their positions."""
 
 from __future__ import annotations
 
 import math
 import shutil
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import OutputError
-from g2ard.io.types import Note
+from g2ard.io.point_stream import PointStream, PointTally
+from g2ard.io.stream import SceneStream
 from g2ard.progress import Progress, Say, plural
+from g2ard.scene.splats import Splats
+from g2ard.stages.lift import LiftConfig, lift
 from g2ard.tiles.cells import Cell, Points, Sampler, cut_cells, margin_of
-from g2ard.tiles.journal import Journal, clear
-from g2ard.tiles.store import TileStore, tile_name
+from g2ard.tiles.journal import POINTS, Journal, clear
+from g2ard.tiles.store import TileStore, halo_name, packed, row_width, tile_name
 
-__all__ = ["Feed", "foretold", "pour"]
+__all__ = ["PointFeed", "SceneFeed", "foretold", "lift_tiles", "pour"]
 
 _SAMPLE = 1 << 20
 """Positions that tiles are cut by: 12 MB."""
@@ -26,37 +31,79 @@ _SAMPLE = 1 << 20
 _SIGMAS = 4.0
 """A tile with its halo may hold more than the sample foretells, by so many standard deviations."""
 
+_POINT = np.dtype([("near", "<f4", 3), ("rgb", "<f4", 3), ("far", "<f8", 3)])
+"""A point: relative to the offset in float32, which decides its tile; colour as stored; world position."""
 
-class Feed(Protocol):
-    """What is poured: rows of bytes, each with a position.
+_AT_ONCE = 1 << 16
+"""Rows of a lifted tile that are written at a time."""
+
+
+class Feed(ABC):
+    """Rows of bytes to pour into tiles, each with a position.
 
     Attributes:
-        path: names the source in messages.
-        count: rows of the source.
-        tally: a dataclass of what was counted while rows were read.
-        row: the dtype of a row, whose positions are float32 (x, y, z) or float64 less `offset`.
-        room: bytes on disk that a row takes in the end, all copies counted.
-        settings: by which it is poured, beside what `pour` takes.
+        stream: the source.
+        row_bytes: bytes of a row, which begins with its float32 position.
+        room: bytes on disk that a row finally takes, with all copies.
+        settings: what it is poured with, beside the arguments of `pour`.
     """
 
-    path: Path
-    count: int
-    tally: Any
+    stream: SceneStream | PointStream
     row_bytes: int
     room: int
-    settings: dict[str, Any]
+    sh_degree = 0
+
+    def __init__(self) -> None:
+        self.settings: dict[str, Any] = {}
+
+    @abstractmethod
+    def positions(self, rows: int) -> Iterator[Points]:
+        """Yield the (n, 3) positions of all rows, in blocks."""
+
+    @abstractmethod
+    def rows(self, rows: int, start: int) -> Iterator[tuple[NDArray[Any], Points]]:
+        """Yield the rows to keep from the source's row `start` on, with their positions."""
+
+
+class SceneFeed(Feed):
+    """A scene's Gaussians as rows of its tiles."""
+
+    def __init__(self, stream: SceneStream) -> None:
+        super().__init__()
+        self.stream: SceneStream = stream
+        self.row_bytes = self.room = 4 * row_width(stream.sh_degree)
+        self.sh_degree = stream.sh_degree
 
     def positions(self, rows: int) -> Iterator[Points]:
-        """(n, 3) positions of all rows, in blocks."""
-        ...
+        return self.stream.positions(rows)
 
     def rows(self, rows: int, start: int) -> Iterator[tuple[NDArray[Any], Points]]:
-        """The rows to be kept from the source's row `start` on, and their positions; counted in `tally`."""
-        ...
+        return ((packed(splats), splats.means) for splats in self.stream.blocks(rows, start))
 
-    def all_notes(self) -> tuple[Note, ...]:
-        """What was noticed, after the last row."""
-        ...
+
+class PointFeed(Feed):
+    """A cloud's points as rows of tiles that are still to be lifted."""
+
+    row_bytes = _POINT.itemsize
+    room = _POINT.itemsize + 4 * row_width(0)
+
+    def __init__(self, stream: PointStream, config: LiftConfig) -> None:
+        super().__init__()
+        self.stream: PointStream = stream
+        self.config = config
+
+    def positions(self, rows: int) -> Iterator[Points]:
+        return (self._near(far) for far, _ in self.stream.raw(rows, 0))
+
+    def rows(self, rows: int, start: int) -> Iterator[tuple[NDArray[Any], Points]]:
+        for far, colors in self.stream.blocks(rows, start):
+            block = np.empty(len(far), _POINT)
+            block["near"], block["rgb"], block["far"] = self._near(far), colors, far
+            yield block, np.ascontiguousarray(block["near"])
+
+    def _near(self, far: NDArray[np.float64]) -> Points:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return (far - self.stream.offset).astype(np.float32)
 
 
 def pour(
@@ -85,20 +132,21 @@ def pour(
         InputError: the source is broken, or has no row to be kept.
         OutputError: the disk has too little room.
     """
-    journal = Journal.open(folder, feed.row_bytes, type(feed.tally))
+    stream: Any = feed.stream
+    journal = Journal.open(folder, feed.row_bytes, type(feed.stream.tally))
     if journal is None:
         journal = _started(folder, key, feed, tile_rows, rows, progress, like)
     else:
         journal.cut()
         say(f"{folder}: goes on after row {journal.next_row:,}")
     while True:
-        feed.tally = journal.tally
+        stream.tally = journal.tally
         for block, positions in feed.rows(rows, journal.next_row):
             journal.add(block, positions)
-            journal.next_row = feed.tally.rows
+            journal.next_row = stream.tally.rows
             journal.save()
-            progress("tiles", journal.next_row, feed.count)
-        feed.all_notes()
+            progress("tiles", journal.next_row, stream.count)
+        stream.all_notes()
         parts = {} if like else _overfull(journal, tile_rows)
         if not parts:
             return journal
@@ -122,14 +170,14 @@ def _started(
 ) -> Journal:
     """Cut the tiles, and see to it that there is room for them."""
     cells, points, each = like.cells if like else Cell(), np.empty((0, 3), np.float32), 1.0
-    if like or feed.count > tile_rows:
+    if like or feed.stream.count > tile_rows:
         points, each = _sampled(feed, rows, progress)
     if not like:
         cells = cut_cells(points, each, tile_rows)
     margin = like.margin if like else margin_of(cells, points)
     journal = _empty(folder, key, cells, margin, feed)
     around = each * sum(len(halo) for _, halo in cells.route(points, journal.margin))
-    needed, free = int((feed.count + around) * feed.room), shutil.disk_usage(folder).free
+    needed, free = int((feed.stream.count + around) * feed.room), shutil.disk_usage(folder).free
     if needed > free:
         raise OutputError(
             f"{folder}: the tiles need {needed / 1e9:,.1f} GB, the disk has {free / 1e9:,.1f} GB free"
@@ -140,15 +188,15 @@ def _started(
 
 
 def _empty(folder: Path, key: str, cells: Cell, margin: float, feed: Feed) -> Journal:
-    return Journal(folder, key, cells, margin, feed.row_bytes, type(feed.tally)(), feed.settings)
+    return Journal(folder, key, cells, margin, feed.row_bytes, type(feed.stream.tally)(), feed.settings)
 
 
 def _sampled(feed: Feed, rows: int, progress: Progress) -> tuple[Points, float]:
-    sampler, done = Sampler(feed.count, _SAMPLE), 0
+    sampler, done = Sampler(feed.stream.count, _SAMPLE), 0
     for points in feed.positions(rows):
         sampler.add(points)
         done += len(points)
-        progress("sample", done, feed.count)
+        progress("sample", done, feed.stream.count)
     return sampler.result()
 
 
@@ -161,6 +209,64 @@ def _overfull(journal: Journal, tile_rows: int) -> dict[int, Cell]:
             if cells.leaves > 1:
                 parts[index] = cells
     return parts
+
+
+def lift_tiles(
+    folder: Path, key: str, feed: PointFeed, tile_rows: int, rows: int, progress: Progress, say: Say
+) -> Journal:
+    """Pour points into a subfolder, then lift each tile among the points around it and pour the result.
+
+    Args:
+        folder: there already; empty or with the journals of this very key.
+        key: of the content.
+        feed: the points.
+        tile_rows: points of a tile at the most.
+        rows: points in memory at a time while they are read.
+        progress: told of points read, then of points lifted.
+        say: told what was decided.
+
+    Raises:
+        InputError: the source is broken, or has no point to be kept.
+        OutputError: the disk has too little room.
+    """
+    within, row_bytes = folder / POINTS, 4 * row_width(0)
+    within.mkdir(exist_ok=True)
+    points = pour(within, key, feed, tile_rows, rows, progress, say)
+    feed.stream.tally = points.tally
+    journal = Journal.open(folder, row_bytes, PointTally)
+    if journal is None:
+        journal = Journal(folder, key, points.cells, points.margin, row_bytes, points.tally, feed.settings)
+        journal.save()
+    else:
+        say(f"{folder}: goes on after tile {journal.next_row:,}")
+    journal.cut()
+    total = sum(points.tiles.rows)
+    for index in range(journal.next_row, points.cells.leaves):
+        splats = _lifted(points, index, feed)
+        for start in range(0, len(splats), _AT_ONCE):
+            part = splats.take(slice(start, start + _AT_ONCE))
+            journal.add(packed(part), part.means)
+        journal.next_row = index + 1
+        journal.save()
+        progress("lift", sum(journal.tiles.rows), total)
+    shutil.rmtree(within)
+    return journal
+
+
+def _lifted(points: Journal, index: int, feed: PointFeed) -> Splats:
+    """A tile's own points, lifted among those of its halo."""
+    core = _read(points.folder / tile_name(index), points.tiles.rows[index])
+    if not len(core):
+        return Splats.create(np.empty((0, 3)), scales=np.empty((0, 3)))
+    halo = _read(points.folder / halo_name(index), points.halos.rows[index])
+    both = np.concatenate([core, halo])
+    colors = np.clip(both["rgb"] / np.float32(feed.stream.divisor), 0, 1)
+    discs = lift(both["far"], colors, **vars(feed.config)).take(slice(0, len(core)))
+    return replace(discs, means=np.ascontiguousarray(core["near"]), offset=feed.stream.offset)
+
+
+def _read(path: Path, count: int) -> NDArray[Any]:
+    return np.fromfile(path, _POINT, count)
 
 
 def foretold(positions: Iterable[Points], count: int) -> Callable[[int], int]:

@@ -17,25 +17,27 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.targets import TeacherRenders
+from g2ard.scene.transform import join
 from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.anchors import Anchors
 from g2ard.tiles.executor import Executor
-from g2ard.tiles.scenes import (
+from g2ard.tiles.merging import TiledScene, finished, key_of
+from g2ard.tiles.sights import Surroundings, in_sight, light_of, written
+from g2ard.tiles.store import TileStore
+from g2ard.tiles.tasks import (
     Arguments,
+    Arrays,
     Inputs,
     Places,
+    Task,
     arrays_of,
     cameras_of,
     cropped,
     far_around,
-    joined,
+    load,
     scene_of,
     tile_of,
 )
-from g2ard.tiles.sights import Surroundings, in_sight, light_of, written
-from g2ard.tiles.simplify import TiledScene, finished, key_of
-from g2ard.tiles.store import TileStore
-from g2ard.tiles.task import Arrays, Task, load
 
 if TYPE_CHECKING:
     from g2ard.policy.views import RunViews
@@ -135,10 +137,10 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
     store = TileStore.open(places["store"])
     core, far = tile_of(arguments, inputs, places), far_around(store, arguments, inputs)
     # The tile's own Gaussians first, in teacher and student: masks and `frozen` count on it.
-    teacher = joined([part for part in (core, store.read_halo(arguments["tile"]), *far) if len(part)])
+    teacher = join([part for part in (core, store.read_halo(arguments["tile"]), *far) if len(part)])
     smaller = TileStore.open(places["student"])
     small, beside = smaller.read(arguments["tile"]), smaller.read_halo(arguments["tile"])
-    student = joined([part for part in (small, beside, *far) if len(part)])
+    student = join([part for part in (small, beside, *far) if len(part)])
     frozen = np.arange(len(student)) >= len(small)
     config = changed(RecoverConfig(), "recover", arguments["config"])
     background = config.background
@@ -162,7 +164,7 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
         frozen=frozen,
     )
     result = done.splats.take(slice(len(small)))
-    after = _errors(joined([result, student.take(frozen)]), held_out, background)
+    after = _errors(join([result, student.take(frozen)]), held_out, background)
     return {
         **arrays_of(result, "scene"),
         "errors": np.array([before, after]),

@@ -17,11 +17,9 @@ from g2ard.progress import Progress
 from g2ard.rendering.visibility import LONGEST, MOST_LOOKS, NEAR
 from g2ard.scene.cameras import Cameras
 from g2ard.tiles.executor import Executor
-from g2ard.tiles.run import TiledRun
-from g2ard.tiles.scenes import scene_of
-from g2ard.tiles.steps import COARSE
+from g2ard.tiles.steps import COARSE, TiledRun
 from g2ard.tiles.store import TileStore
-from g2ard.tiles.task import Task, is_whole, load
+from g2ard.tiles.tasks import Task, is_whole, load, scene_of
 
 __all__ = ["Sights", "Surroundings", "in_sight", "light_of", "written"]
 

@@ -1,7 +1,7 @@
-"""Simplification of one tile, step by step: each function reads files and makes arrays (`g2ard.tiles.task`).
+"""Simplification of one tile, step by step: each function reads files and makes arrays (`g2ard.tiles.tasks`).
 
 Between the steps tiles agree on a frame that costs are measured in, and on what each of them keeps
-(`g2ard.tiles.simplify`). What several steps take:
+(`g2ard.tiles.merging`). What several steps take:
 
 - arguments: `tile`, its number; `config`, the fields of a `SimplifyConfig`; `frame`, the values of the
   `_core.TileFrame` of all tiles; `levels`, for each tile by which of its coarse scenes ("near", "far") it
@@ -17,33 +17,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
+from g2ard.progress import Progress
 from g2ard.rendering.renderer import RasterSettings, view_of
 from g2ard.rendering.visibility import CONVERGED, NEAR, ROUND, spread
-from g2ard.scene.prepared import PreparedScene, as_prepared
+from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import join
 from g2ard.stages.simplify import SimplifyConfig, schedule, simplify
 from g2ard.stages.simplify.pairs import emphasised
-from g2ard.tiles.scenes import (
+from g2ard.tiles.executor import Executor
+from g2ard.tiles.store import TileStore
+from g2ard.tiles.tasks import (
     Arguments,
+    Arrays,
     Inputs,
     Places,
+    Task,
     arrays_of,
     cameras_of,
     cropped,
-    joined,
+    load,
     scene_of,
     tile_of,
     with_surroundings,
 )
-from g2ard.tiles.task import Arrays, load
 
-__all__ = ["COARSE", "coarse", "glance", "look", "look_again", "merge", "pair_plan", "run_costs"]
+__all__ = ["COARSE", "TiledRun", "coarse", "glance", "look", "look_again", "merge", "pair_plan", "run_costs"]
 
 COARSE = (32, 512)
 """How many times fewer Gaussians stand for a tile near the one that is looked at, and for one far."""
@@ -56,6 +63,9 @@ _THINNED = 8
 
 GONE = np.uint32(0xFFFFFFFF)
 """The cluster of a row that is dropped."""
+
+_SAMPLED = 1_000_000
+"""Gaussians of a scene by which its frame is found, at most."""
 
 
 def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
@@ -99,7 +109,7 @@ def glance(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """
     parts = [scene_of(path, arguments["level"]) for path in inputs["coarse"]]
     tiles = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    scene = as_prepared(joined(parts))
+    scene = as_prepared(join(parts))
     cameras = cameras_of(inputs["views"]).recentred(scene.offset)
     settings = RasterSettings(near=arguments["near"])
     weights = np.zeros((len(arguments["views"]), len(parts)))
@@ -314,3 +324,57 @@ def _widened(scene: Splats, times: int) -> Splats:
     longer = np.arange(3) != np.argmin(scene.scales, axis=1)[:, None]
     factor = np.where(longer, np.float32(math.sqrt(times)), np.float32(1))
     return replace(scene, scales=scene.scales * factor)
+
+
+class TiledRun:
+    """What all steps of a simplification in tiles share."""
+
+    def __init__(
+        self, store: TileStore, executor: Executor, work: Path, config: SimplifyConfig, progress: Progress
+    ):
+        self.store, self.executor, self.work, self.progress = store, executor, work, progress
+        self.config = asdict(config.resolved("default"))
+        self.sizes = [tile.rows for tile in store.tiles]
+        self.coarse: list[Path] = []
+
+    def each(
+        self,
+        function: str,
+        stage: str,
+        *,
+        frame: tuple[float, ...] | None = None,
+        per_tile: list[dict[str, Any]] | None = None,
+        inputs: list[dict[str, Any]] | None = None,
+    ) -> list[Path]:
+        """One task a tile, which reads what the first step made of it."""
+        tasks = []
+        for tile, rows in enumerate(self.sizes):
+            own = {"own": self.coarse[tile]} if self.coarse else {}
+            arguments: dict[str, Any] = {"store": self.store.key, "tile": tile, "config": self.config}
+            if frame is not None:
+                arguments["frame"] = list(frame)
+            arguments |= per_tile[tile] if per_tile else {}
+            tasks.append(
+                Task(
+                    f"{__name__}:{function}",
+                    f"{stage}-{tile:05}",
+                    self.work,
+                    arguments,
+                    {**own, **(inputs[tile] if inputs else {})},
+                    {"store": self.store.folder},
+                    rows,
+                )
+            )
+        return self.executor.run(tasks, stage, self.progress)
+
+    def begin(self) -> list[Path]:
+        """The first step: what `g2ard.tiles.steps.coarse` makes of each tile."""
+        self.coarse = self.each("coarse", "coarse")
+        return self.coarse
+
+    def sampled_frame(self) -> tuple[float, ...]:
+        """The frame of a fair sample of the scene, without views."""
+        sample = join([scene_of(path, "sample").with_sh_degree(0) for path in self.coarse])
+        every = -(-len(sample) // _SAMPLED)
+        scene, _ = finite_rows_of(sample.take(slice(None, None, every)))
+        return _core.TileFrame.of_sample(scene.core, self.config["pixel_scale"]).values()

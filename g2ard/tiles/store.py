@@ -9,7 +9,7 @@ beside each other).
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,16 @@ from g2ard.io.types import Note
 from g2ard.scene.splats import Splats
 from g2ard.tiles.cells import Cell
 
-__all__ = ["MANIFEST", "Tile", "TileStore", "halo_name", "packed", "row_width", "tile_name", "unpacked"]
+__all__ = [
+    "MANIFEST",
+    "StoredScene",
+    "Tile",
+    "TileStore",
+    "halo_name",
+    "packed",
+    "row_width",
+    "tile_name",
+]
 
 MANIFEST = "tiles.json"
 FORMAT, VERSION = "g2ard tiles", 1
@@ -59,7 +68,7 @@ def packed(splats: Splats) -> NDArray[np.float32]:
     return rows
 
 
-def unpacked(rows: NDArray[np.float32], offset: NDArray[np.float64]) -> Splats:
+def _unpacked(rows: NDArray[np.float32], offset: NDArray[np.float64]) -> Splats:
     """The scene of which `packed` gives these rows."""
     rest = (rows.shape[1] - 14) // 3
     return Splats(
@@ -268,3 +277,38 @@ class TileStore:
                 shN[at] = rows[:, 14 : 14 + 3 * rest].reshape(len(rows), rest, 3)
         self._check_contents(name, crc, check)
         return Splats(means, quats, scales, logits, sh0, shN, self.offset.copy())
+
+
+class StoredScene:
+    """All tiles' own rows, tile after tile, of which `take` reads some; `positions` checks the contents.
+
+    Args:
+        store: the scene in tiles.
+    """
+
+    def __init__(self, store: TileStore) -> None:
+        self.store, self.offset = store, store.offset
+        self._starts = np.cumsum([0, *(tile.rows for tile in store.tiles)])
+
+    def __len__(self) -> int:
+        return self.store.count
+
+    def positions(self) -> Iterator[NDArray[np.float32]]:
+        """(n, 3) means of each tile in order, views of its file.
+
+        Raises:
+            InputError: a file's contents changed.
+        """
+        for tile in self.store.tiles:
+            self.store.check(tile.index)
+            yield self.store.rows(tile.index)[:, :3]
+
+    def take(self, index: NDArray[np.integer]) -> Splats:
+        """The rows of these numbers, in their order."""
+        index = np.asarray(index)
+        tiles = np.searchsorted(self._starts, index, "right") - 1
+        rows = np.empty((len(index), self.store.row_bytes // 4), "<f4")
+        for tile in np.unique(tiles):
+            here = tiles == tile
+            rows[here] = self.store.rows(tile)[index[here] - self._starts[tile]]
+        return _unpacked(rows, self.offset)

@@ -11,7 +11,7 @@ import numpy as np
 import g2ard
 from g2ard.io import read_splats, write_splats
 from g2ard.scene.splats import Splats
-from g2ard.scene.transform import merge, transform
+from g2ard.scene.transform import join, transform
 from helpers.commands import CommandLine, refused
 from helpers.scenes import checkered_ball
 
@@ -44,7 +44,7 @@ def test_convert_merges_crops_moves(tmp_path: Path, command_line: CommandLine) -
     words = ["a.ply", "b.glb", "c.ply", "--box", "-9,-9,0,9,9,9", "--transform", "m.json"]
     code, _, told = command_line("convert", *words, cwd=tmp_path)
     assert code == 0, told
-    whole = merge([a, b])
+    whole = join([a, b])
     expected = transform(whole.take(whole.means[:, 2] >= 0), matrix(1, turn(), [0, 0, 1]))
     found = read_splats(out)
     np.testing.assert_allclose(found.means, expected.means, atol=1e-6)

@@ -9,7 +9,7 @@ import numpy as np
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
 from g2ard.tiles.executor import executor
-from g2ard.tiles.simplify import simplify_tiles
+from g2ard.tiles.merging import simplify_tiles
 from g2ard.tiles.store import TileStore
 
 

@@ -15,7 +15,7 @@ from g2ard.rendering.renderer import render
 from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
-from g2ard.scene.transform import merge
+from g2ard.scene.transform import join
 from g2ard.stages.clean import KINDS, find_clutter, within_reach
 from helpers.commands import CommandLine
 from helpers.scenes import around, checkered_ball
@@ -25,7 +25,7 @@ def junk() -> tuple[Splats, np.ndarray]:
     """A ball with some of every kind, and which kind each row is; −1 for the ball."""
     ball = checkered_ball(2500)
     shells = [replace(ball, means=ball.means * np.float32(1 - 0.02 * i)) for i in range(3)]
-    ball = merge([replace(shell, logit_opacities=np.full(2500, 5, np.float32)) for shell in shells])
+    ball = join([replace(shell, logit_opacities=np.full(2500, 5, np.float32)) for shell in shells])
     rng = np.random.default_rng(0)
     within = replace(ball.take(slice(0, 200)), means=ball.means[:200] * 0.3)
     faint = replace(ball.take(slice(0, 50)), logit_opacities=np.full(50, -7, np.float32))
@@ -41,7 +41,7 @@ def junk() -> tuple[Splats, np.ndarray]:
     )
     parts = [ball, within, faint, giant, needles, floaters]
     kinds = np.repeat([-1, 0, 0, 1, 2, 3], [len(part) for part in parts])
-    return merge(parts), kinds
+    return join(parts), kinds
 
 
 def find(splats: Splats, **options: object):
@@ -89,7 +89,7 @@ def test_what_lies_behind_a_wall_stays() -> None:
     beyond = replace(checkered_ball(500), logit_opacities=np.full(500, 5, np.float32))
     beyond = replace(beyond, means=beyond.means + np.float32([0, 3, 0]))
     before = replace(wall.take([0]), means=np.float32([[0, -1, 0]]), logit_opacities=np.float32([-5.4]))
-    scene = merge([wall, beyond, before])
+    scene = join([wall, beyond, before])
     K = [[60, 0, 32], [0, 60, 24], [0, 0, 1]]
     view = Cameras.from_lists([look_at([0, -4, 0], [0, 0, 0])], [K], [(64, 48)], ["front"])
     reached = within_reach(scene, view)
@@ -105,7 +105,7 @@ def test_a_chain_of_thin_ones_is_no_needle() -> None:
     """A string: each end lies in the next one."""
     along = np.linspace(-1, 1, 21)[:, None] * [1, 0, 0]
     string = Splats.create(along, scales=np.tile([0.05, 0.001, 0.001], (21, 1)), logit_opacities=[3] * 21)
-    scene = merge([checkered_ball(500), replace(string, means=string.means + np.float32([0, 0, 2]))])
+    scene = join([checkered_ball(500), replace(string, means=string.means + np.float32([0, 0, 2]))])
     found = find(scene, kinds=("needle",))
     assert found.counts["needle"] <= 2  # the string's own ends
 

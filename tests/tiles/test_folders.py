@@ -14,8 +14,7 @@ from g2ard.io.lock import LOCK, locked
 from g2ard.levels import Cut, save_levels
 from g2ard.tiles import ingest as ingest_module
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.store import TileStore
-from g2ard.tiles.stored import StoredScene
+from g2ard.tiles.store import StoredScene, TileStore
 from helpers.commands import CommandLine
 from helpers.level_files import files_of, scattered
 from helpers.project import ROOT

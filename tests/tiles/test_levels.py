@@ -18,7 +18,7 @@ from g2ard.policy.tiling import Tiling
 from g2ard.scene.splats import Splats
 from g2ard.system.memory import peak_rss
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.stored import StoredScene
+from g2ard.tiles.store import StoredScene
 from helpers.level_files import files_of, leaves_of, scattered
 from helpers.tiled_scenes import ring, town
 

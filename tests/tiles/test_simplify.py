@@ -21,8 +21,8 @@ from g2ard.scene.prepared import finite_rows_of
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.simplify import SimplifyConfig, schedule, simplify
-from g2ard.tiles.cut import cheapest
 from g2ard.tiles.ingest import ingest
+from g2ard.tiles.merging import cheapest
 from g2ard.tiles.steps import GONE
 from g2ard.tiles.store import TileStore
 from helpers.systems import is_worker, needs_proc

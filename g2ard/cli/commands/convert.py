@@ -61,7 +61,7 @@ def convert(
     from g2ard import io
     from g2ard.io.scene_formats import check_options
     from g2ard.policy.inputs import load_scene
-    from g2ard.scene.transform import in_box, in_sphere, merge
+    from g2ard.scene.transform import in_box, in_sphere, join
     from g2ard.scene.transform import transform as moved
 
     scenes, output = _parted(run, scenes, output)
@@ -71,7 +71,7 @@ def convert(
     matrix = None if transform is None else _matrix(transform)
     check_options(output, options)
     io.check_scene_output(output, run.overwrite)
-    splats = merge([load_scene(path, run.say) for path in scenes])
+    splats = join([load_scene(path, run.say) for path in scenes])
     read = len(splats)
     if corners is not None:
         splats = splats.take(in_box(splats, corners[:3], corners[3:]))

@@ -17,25 +17,26 @@ from g2ard.io.stream import PartsStream
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.regions import Region, in_any
 from g2ard.scene.splats import Splats, unit_quats
+from g2ard.scene.transform import join
 from g2ard.stages.simplify import SimplifyConfig
-from g2ard.tiles.cut import cheapest
 from g2ard.tiles.executor import Executor
-from g2ard.tiles.run import TiledRun
-from g2ard.tiles.scenes import joined, scene_of, small_scene
 from g2ard.tiles.sights import Sights, Surroundings
+from g2ard.tiles.steps import TiledRun
 from g2ard.tiles.store import TileStore
-from g2ard.tiles.task import load
+from g2ard.tiles.tasks import load, scene_of, small_scene
 
 if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
 
-__all__ = ["TiledScene", "finished", "key_of", "sample_of", "simplify_tiles"]
+__all__ = ["TiledScene", "cheapest", "finished", "key_of", "sample_of", "simplify_tiles"]
 
 _POOL, _POOL_ROWS = 96, 4_000_000
 """Poses to look from for so many Gaussians; more of these, more of those."""
 
 _PLANNED_ON = 100_000
 """Gaussians of a fair sample that so many poses are planned on."""
+
+_HALF = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +76,7 @@ class TiledScene:
 
     def whole(self) -> Splats:
         """All tiles as one scene in memory."""
-        return joined(list(self))
+        return join(list(self))
 
 
 def simplify_tiles(
@@ -136,7 +137,7 @@ def simplify_tiles(
     everything = budget == store.count
     sights: Sights | None = None
     if not (blind or (everything and views is None)):
-        sample = joined([scene_of(path, "sample") for path in coarse])
+        sample = join([scene_of(path, "sample") for path in coarse])
         _check_regions(sample, run.config["keep_region"])
         cameras = views or beside(sample) or _planned(run, sample, up, seed, say)
         sights = None if cameras is None else Sights(run, coarse, cameras, frame)
@@ -181,7 +182,7 @@ def sample_of(store: TileStore, executor: Executor, work: Path, progress: Progre
     """A fair sample of a scene in tiles; its task is one of `simplify_tiles`, which does not do it again."""
     work.mkdir(parents=True, exist_ok=True)
     run = TiledRun(store, executor, work, SimplifyConfig(), progress)
-    return joined([scene_of(path, "sample") for path in run.begin()])
+    return join([scene_of(path, "sample") for path in run.begin()])
 
 
 def _scene(
@@ -276,3 +277,51 @@ def _check_reached(count: int, budget: int, tiles: int) -> None:
             f"budget: {count:,} Gaussians is the fewest that the {tiles:,} tiles come to ({each}), not "
             f"{budget:,}; greater --tile-rows make fewer tiles"
         )
+
+
+def cheapest(costs: Sequence[Callable[[], NDArray[np.float32]]], count: int) -> list[int]:
+    """How many of the `count` smallest of all costs lie in each array; of equals the earlier ones count.
+
+    Non-negative floats sort as their bits do: two histograms, of the upper and of the lower 16 bits, find the
+    count-th without more than one array in memory.
+
+    Args:
+        costs: functions that give arrays of float32 ≥ 0, asked three times each.
+        count: at most as many as there are.
+
+    >>> few = [np.array([3, 1, 1], np.float32), np.array([1, 0, 2], np.float32)]
+    >>> cheapest([lambda a=a: a for a in few], 3)
+    [2, 1]
+    """
+    if count <= 0:
+        return [0] * len(costs)
+    upper = sum((_histogram(_bits(make) >> 16) for make in costs), np.zeros(_HALF, np.int64))
+    first, below = _rank(upper, count)
+    lower = sum(
+        (_histogram(bits[bits >> 16 == first] & np.uint32(0xFFFF)) for bits in map(_bits, costs)),
+        np.zeros(_HALF, np.int64),
+    )
+    second, under = _rank(lower, count - below)
+    limit = np.uint32(first << 16 | second)
+    ties = count - below - under
+    counts = []
+    for bits in map(_bits, costs):
+        equal = min(ties, int(np.count_nonzero(bits == limit)))
+        ties -= equal
+        counts.append(int(np.count_nonzero(bits < limit)) + equal)
+    return counts
+
+
+def _bits(make: Callable[[], NDArray[np.float32]]) -> NDArray[np.uint32]:
+    return np.ascontiguousarray(make(), np.float32).view(np.uint32)
+
+
+def _histogram(values: NDArray[Any]) -> NDArray[np.int64]:
+    return np.bincount(values, minlength=_HALF)
+
+
+def _rank(histogram: NDArray[np.int64], count: int) -> tuple[int, int]:
+    """The bin that holds the count-th value, and how many lie before that bin."""
+    sums = np.cumsum(histogram)
+    at = min(int(np.searchsorted(sums, count)), len(sums) - 1)
+    return at, int(sums[at - 1]) if at else 0
