@@ -1,27 +1,139 @@
-"""What g2ard raises. Each message is one line that names the file, the property and the index at fault."""
+"""Exceptions of g2ard. What they say is kept in fields; `str()` joins the fields to one line."""
 
 from __future__ import annotations
 
-__all__ = ["G2ardError", "InputError", "MissingDependencyError", "OutputError", "require"]
+import copy
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Self
+
+__all__ = [
+    "DAMAGED",
+    "G2ardError",
+    "InputError",
+    "MissingDependencyError",
+    "OutputError",
+    "missing",
+    "require",
+]
+
+DAMAGED = "the file is damaged: copy or export it again"
+"""Hint for files that are not as their writer left them."""
+
+_PARAMETER = re.compile(r"\{(\w+)(?:=([^{}]*))?\}")
+
+
+def _as_argument(name: str, value: str | None = None) -> str:
+    return name if value is None else f"{name}={value}"
 
 
 class G2ardError(Exception):
-    """Base of every error the command line turns into one line and exit status 1."""
+    """Base of all exceptions of g2ard.
+
+    Args:
+        message: what is wrong; after `property` or `index` the rest of a sentence ("is missing").
+        parameter: the argument or constant at fault, by its Python name.
+        path: the file or folder.
+        property: the property, column or key at fault in the file.
+        index: which row, line or view.
+        item: what `index` counts.
+        hint: what to do. `{name}` and `{name=VALUE}` stand for arguments; the command line prints flags.
+
+    >>> str(InputError("is missing", path="a.ply", property="scale_2", hint="export the scene again"))
+    "a.ply: property 'scale_2' is missing; export the scene again"
+    >>> str(InputError("is not finite", path="a.ply", property="x", index=7))
+    "a.ply: property 'x' of row 7 is not finite"
+    >>> str(InputError("expected at least 1, got 0", parameter="count"))
+    'count: expected at least 1, got 0'
+    >>> str(OutputError("exists", path="a.ply", hint="{overwrite=True} replaces it"))
+    'a.ply: exists; overwrite=True replaces it'
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        parameter: str | None = None,
+        path: str | Path | None = None,
+        property: str | None = None,
+        index: int | None = None,
+        item: str = "row",
+        hint: str | None = None,
+    ) -> None:
+        super().__init__(message)
+        self.message = message
+        self.parameter = parameter
+        self.path = None if path is None else Path(path)
+        self.property = property
+        self.index = index
+        self.item = item
+        self.hint = hint
+
+    def __str__(self) -> str:
+        return self.line()
+
+    def line(self, spelled: Callable[[str, str | None], str] = _as_argument) -> str:
+        """Return the fields as one line.
+
+        Args:
+            spelled: how to write a parameter, and a value for it or None.
+        """
+        parts = [] if self.parameter is None else [spelled(self.parameter, None)]
+        if self.path is not None:
+            parts.append(str(self.path))
+        at = [] if self.property is None else [f"property {self.property!r}"]
+        if self.index is not None:
+            at.append(f"{self.item} {self.index}")
+        parts.append(" ".join([*filter(None, [" of ".join(at)]), self.message]))
+        line = ": ".join(parts)
+        if self.hint is None:
+            return line
+        return f"{line}; {_PARAMETER.sub(lambda found: spelled(found[1], found[2]), self.hint)}"
+
+    def at(self, **fields: Any) -> Self:
+        """Return a copy with other fields, for callers that know more than the code that raised it.
+
+        >>> str(InputError("is empty").at(path="a.ply"))
+        'a.ply: is empty'
+        """
+        if fields.get("path") is not None:
+            fields["path"] = Path(fields["path"])
+        error = copy.copy(self)
+        error.__dict__.update(fields)
+        return error
 
 
 class InputError(G2ardError, ValueError):
-    """The input is not what it should be: a bad file, shape, dtype or value."""
+    """Invalid input: a bad file, shape, dtype or value."""
 
 
 class OutputError(G2ardError, OSError):
     """The output cannot be written, or exists and may not be overwritten."""
 
 
-class MissingDependencyError(G2ardError, ImportError):
-    """An optional package is needed for this input; the message names the extra to install."""
+class MissingDependencyError(G2ardError, ImportError):  # type: ignore[misc]  # ImportError.path is a string
+    """An optional package is not installed; the hint names the command that installs it."""
+
+
+def missing(what: str, package: str, **fields: Any) -> MissingDependencyError:
+    """Return the error for a feature whose optional package is not installed.
+
+    Args:
+        what: the feature.
+        package: what to install with pip.
+        fields: of the error.
+
+    >>> str(missing("the engine 'torch'", "g2ard[torch]"))
+    "the engine 'torch' needs a package that is not installed; pip install 'g2ard[torch]'"
+    """
+    quoted = f"'{package}'" if "[" in package else package
+    return MissingDependencyError(
+        f"{what} needs a package that is not installed", hint=f"pip install {quoted}", **fields
+    )
 
 
 def require(name: str, value: object, fits: bool, expected: str) -> None:
-    """Raise an `InputError` for the value of a field unless it fits."""
+    """Raise an `InputError` for the value of a parameter unless it fits."""
     if not fits:
-        raise InputError(f"{name}: expected {expected}, got {value}")
+        raise InputError(f"expected {expected}, got {value}", parameter=name)

@@ -9,7 +9,7 @@ from typing import Any
 import typer
 
 from g2ard.cli.budget_options import Count
-from g2ard.cli.usage import meant, present_name
+from g2ard.cli.usage import meant
 
 __all__ = ["load_config", "printed"]
 
@@ -117,8 +117,7 @@ def _meant(keys: Iterable[str], command: Any) -> str:
 
 
 def _dashed(key: str) -> str:
-    """A key as the flag of that name has it today."""
-    return present_name(key.replace("_", "-"))
+    return key.replace("_", "-")
 
 
 def _flat(table: Any, prefix: str = "") -> dict[str, Any]:

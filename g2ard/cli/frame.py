@@ -10,12 +10,12 @@ from __future__ import annotations
 import contextlib
 import inspect
 import os
-import re
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -23,7 +23,7 @@ import typer
 from g2ard.cli.budget_options import Counts, Ratios
 from g2ard.cli.config import load_config, printed
 from g2ard.cli.console import Console
-from g2ard.cli.usage import in_flags, present_name, typed
+from g2ard.cli.usage import flags_of, in_flags, typed
 from g2ard.errors import G2ardError
 from g2ard.progress import plural
 from g2ard.system import interrupt
@@ -35,7 +35,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"], "token_normalize_func": present_name},
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 
@@ -55,9 +55,6 @@ def _root(
 ) -> None:
     pass
 
-
-_LONG_WORD = re.compile(r"(\S{160})\S{160,}(\S{40})")
-"""What no path is: a value of a damaged file. Its ends are enough."""
 
 _RIVALS = (
     *combinations(("count", "ratio", "fit", "min_psnr"), 2),
@@ -125,8 +122,15 @@ _SET = Annotated[
 class Run:
     """One invocation of a command: its common options, its console and its result."""
 
-    def __init__(self, name: str, common: dict[str, Any], options: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        name: str,
+        common: dict[str, Any],
+        options: dict[str, Any],
+        flags: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
         self.name = name
+        self.flags = flags  # parameter → flag
         self.overwrite: bool = common["overwrite"]
         self.seed: int = common["seed"]
         self.threads: int = common["threads"]
@@ -288,14 +292,16 @@ def command(
             shared = {key: values.pop(key) for key in shared_options}
             if typed(ctx, "set"):  # after those of the config file, for the last counts
                 shared["set"] = [*(ctx.default_map or {}).get("set", []), *shared["set"]]
-            if shared.pop("print_config"):
+            printing = shared.pop("print_config")
+            run = Run(name, shared, dict(values), flags_of(ctx.command))
+            if printing:
                 if shared.get("set"):
-                    _check_constants(Run(name, shared, dict(values)), fn, values)
+                    _check_constants(run, fn, values)
                 typer.echo(printed(ctx, {**values, **shared}), nl=False)
                 return
             ours = interrupt.raises()
             try:
-                _execute(Run(name, shared, dict(values)), fn, values, cuda)
+                _execute(run, fn, values, cuda)
             finally:
                 if ours:
                     interrupt.ends_the_program()
@@ -352,7 +358,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
         run.console.error(f"interrupted; {'; '.join(run.kept) or 'nothing was written'}")
         raise typer.Exit(interrupt.status()) from None
     except (G2ardError, OSError, MemoryError) as e:
-        run.console.error(one_line(e))
+        run.console.error(one_line(e, run.flags))
         raise typer.Exit(1) from None
     except (typer.Exit, typer.BadParameter):
         raise
@@ -387,10 +393,12 @@ def _device(run: Run) -> Iterator[None]:
             run.say(f"GPU: {plural(state.served, 'kernel')} on {state.adapter}{took}")
 
 
-def one_line(error: BaseException) -> str:
-    """An error in the words of the command line."""
+def one_line(error: BaseException, flags: Mapping[str, str]) -> str:
+    """Return the line that the command line prints for an error."""
+    if isinstance(error, G2ardError):
+        return " ".join(in_flags(error, flags).split())
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, MemoryError):
         return f"out of memory{f': {error}' if str(error) else ''}"
-    return in_flags(_LONG_WORD.sub(r"\1…\2", " ".join(str(error).split())))
+    return " ".join(str(error).split())

@@ -153,7 +153,7 @@ def _spot(text: str) -> Spot:
     try:
         return Spot(check_region([float(word) for word in text.replace(",", " ").split()]))
     except InputError as error:
-        raise typer.BadParameter(str(error)) from None
+        raise typer.BadParameter(error.message) from None
     except ValueError:
         raise typer.BadParameter(f"expected X,Y,Z,R or X,Y,Z,X,Y,Z, not {text!r}") from None
 
@@ -210,7 +210,7 @@ def _crop(text: str) -> Crop:
     try:
         return Crop.parse(text)
     except InputError as error:
-        raise typer.BadParameter(str(error)) from None
+        raise typer.BadParameter(error.message) from None
 
 
 CropOption = Annotated[

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from g2ard.cli.frame import Run
+from g2ard.cli.usage import in_flags
 
 if TYPE_CHECKING:
     from g2ard.cli.budget_options import Counts, Ratios
@@ -38,7 +39,9 @@ def budgets_of(
         try:
             return [Budget(fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)]
         except InputError as error:
-            raise typer.BadParameter(f"--{error}") from None
+            raise typer.BadParameter(
+                in_flags(error, {"fit": "--fit", "min_psnr": "--min-psnr", "min_ssim": "--min-ssim"})
+            ) from None
     if counts:
         return [count.budget() for several in counts for count in several]
     return [Budget(ratio=ratio) for several in ratios or [] for ratio in several]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from g2ard.cli.budget_options import Count
+from g2ard.cli.usage import in_flags
 
 if TYPE_CHECKING:
     from g2ard.cli.frame import Run
@@ -72,7 +73,7 @@ def tiling_of(
     try:
         size = None if memory is None else bytes_of(memory)
     except InputError as error:
-        raise typer.BadParameter(f"--{error}") from None
+        raise typer.BadParameter(in_flags(error, run.flags)) from None
     if scheduler is not None and scheduler != "local" and "://" not in scheduler:
         raise typer.BadParameter(f"--scheduler: tcp://HOST:PORT or local, not {scheduler!r}")
     return Tiling(

@@ -1,69 +1,52 @@
-"""What is said of a bad option: its name, what it takes and what it was given, in one line of our own."""
+"""One-line messages about options: usage errors, and errors of the library with flags for parameters."""
 
 from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import typer
 
-__all__ = ["in_flags", "meant", "present_name", "typed", "usage_line"]
+from g2ard.errors import G2ardError
 
-_FLAGS = {
-    "overwrite=True replaces it": "give -w (--overwrite) to replace it",
-    "another checkpoint or folder of work starts anew": "-w without --resume starts anew",
-    "engine 'gsplat'": "--device cuda",
-    "engine 'fused' needs none": "--device cpu needs none",
-    "count, ratio:": "-n, -r:",
-    "to take a ratio of: give a count": "to take a ratio of: give a count, -n COUNT",
-    "that fit could be measured on: give a count": "that --fit could be measured on: give -n COUNT",
-    "that min_psnr could be measured on: give a count": "that --min-psnr could be measured on: give -n COUNT",
-    "that min_ssim could be measured on: give a count": "that --min-ssim could be measured on: give -n COUNT",
-    "photos=True: a pool": "--photos: a pool",
-    "its photos are needed as views": "give its photos with --views",
-    "TeacherRenders of a scene can stand in": "--teacher SCENE stands in with its renders",
-    "views that hold them, or focal=PIXELS": "--intrinsics VIEWS or --focal PIXELS",
-    "photos=None takes renders there": "without --photos the scene's render stands in for it",
-    "crop ": "--crop ",
-}
-"""What the library calls by the name of a parameter → what a shell calls it."""
+__all__ = ["flags_of", "in_flags", "meant", "typed", "usage_line"]
+
+_FLAGS = {"overwrite=True": "-w (--overwrite)", "engine": "--device cuda", "engine='fused'": "--device cpu"}
+"""Parameters, or parameters with a value, whose flag has another name."""
 
 
-_DAMAGED = re.compile(r": (truncated|not a whole|broken|stream \d+ (holds|unpacks))|cut off")
-"""What readers say of a file that is not as its writer left it."""
+def flags_of(command: Any) -> dict[str, str]:
+    """Return the long flag of each option of a command by the name of its parameter."""
+    options = (p for p in command.params if p.param_type_name == "option")
+    return {str(option.name): max(option.opts, key=len) for option in options}
 
 
-def in_flags(message: str) -> str:
-    """An error of the library in the words of the command line, with what to do about a damaged file.
+def in_flags(error: G2ardError, flags: Mapping[str, str]) -> str:
+    """Return the line of an error with flags for parameters, and Python's names for those without one.
 
-    >>> in_flags("a.ply: exists; overwrite=True replaces it")
-    'a.ply: exists; give -w (--overwrite) to replace it'
-    >>> in_flags("a.spz: truncated in stream 2")
-    'a.spz: truncated in stream 2; the file is damaged: copy or export it again'
+    >>> from g2ard.errors import InputError, OutputError
+    >>> in_flags(OutputError("exists", path="a.ply", hint="{overwrite=True} replaces it"), {})
+    'a.ply: exists; -w (--overwrite) replaces it'
+    >>> error = InputError("has no focal length", path="a.jpg", hint="give {focal=PIXELS}")
+    >>> in_flags(error, {"focal": "--focal"})
+    'a.jpg: has no focal length; give --focal PIXELS'
     """
-    for words, flag in _FLAGS.items():
-        if words != "crop " or message.startswith(words):
-            message = message.replace(words, flag)
-    return f"{message}; the file is damaged: copy or export it again" if _DAMAGED.search(message) else message
 
+    def spelled(name: str, value: str | None) -> str:
+        full = name if value is None else f"{name}={value}"
+        if full in _FLAGS:
+            return _FLAGS[full]
+        if name not in flags:
+            return full
+        return flags[name] if value in (None, "True") else f"{flags[name]} {value}"
 
-_RENAMED = {"time-limit": "recovery-time"}
-"""What options were called before → what they are called; the old names are still taken, and not shown."""
-
-
-def present_name(name: str) -> str:
-    """What an option is called now, as it stands after its dashes.
-
-    >>> present_name("time-limit"), present_name("ratio")
-    ('recovery-time', 'ratio')
-    """
-    return _RENAMED.get(name, name)
+    return error.line(spelled)
 
 
 def meant(words: Iterable[str], known: Iterable[str]) -> str:
-    """Words that nothing is called, each with those near to it that something is.
+    """List unknown words, each with the known words that are close to it.
 
     >>> meant(["rato", "zzz"], ["ratio", "count"])
     'rato (did you mean ratio?), zzz'
@@ -78,7 +61,7 @@ def meant(words: Iterable[str], known: Iterable[str]) -> str:
 
 
 def usage_line(error: typer.TyperException) -> str:
-    """Typer's message for a usage error; where it quotes the library that checks values, ours."""
+    """Return the line for a usage error: typer's message, or a shorter one for a value of the wrong kind."""
     refused = getattr(error.__cause__, "errors", None)
     parameter: Any = getattr(error, "param", None)
     if (long := _of_one_dash(error)) is not None:
@@ -93,7 +76,7 @@ def usage_line(error: typer.TyperException) -> str:
 
 
 def _of_one_dash(error: typer.TyperException) -> str | None:
-    """The long option that stands on the command line with one dash, which reads as several letters."""
+    """Return a long option that was typed with one dash, which typer reads as several letters."""
     command: Any = getattr(getattr(error, "ctx", None), "command", None)
     long = {flag for parameter in getattr(command, "params", ()) for flag in parameter.opts}
     words = (f"-{word.partition('=')[0]}" for word in sys.argv[1:] if len(word) > 2)
@@ -101,7 +84,7 @@ def _of_one_dash(error: typer.TyperException) -> str | None:
 
 
 def typed(ctx: typer.Context, name: str) -> bool:
-    """Whether an option stands on the command line, rather than in a config file or nowhere."""
+    """Return whether an option was typed, rather than read from a config file or left at its default."""
     return _source(ctx, name) == "COMMANDLINE"
 
 
@@ -115,7 +98,7 @@ def _config_of(error: typer.TyperException, name: str) -> str:
 
 
 def _allowed(parameter: Any) -> str:
-    """What an option takes: one of several words, yes or no, or a number within bounds."""
+    """Describe the values an option takes: one of several words, a truth value, or a number within bounds."""
     descriptor = parameter.type_descriptor
     if descriptor.choices is not None:
         return f"one of {', '.join(map(str, descriptor.choices))}"

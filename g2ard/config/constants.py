@@ -103,8 +103,9 @@ def changed(config: Config, root: str, values: Mapping[str, Any]) -> Config:
     try:
         return replace(config, **new)  # type: ignore[type-var]
     except InputError as error:
-        name, _, reason = str(error).partition(": ")
-        raise InputError(f"{root}.{name}: {reason}" if name in new else str(error)) from None
+        if error.parameter not in new:
+            raise
+        raise error.at(parameter=f"{root}.{error.parameter}") from None
 
 
 def listed(configs: Mapping[str, Any], without: Iterable[str] = ()) -> dict[str, dict[str, Any]]:
@@ -178,7 +179,7 @@ def _read(name: str, text: str, kind: Any) -> Any:
             return _as(option, text)
         except ValueError:
             continue
-    raise InputError(f"{name}: expected {_described(kind)}, not {text!r}")
+    raise InputError(f"expected {_described(kind)}, not {text!r}", parameter=name)
 
 
 def _as(kind: Any, text: str) -> Any:

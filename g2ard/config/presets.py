@@ -65,9 +65,9 @@ def preset(name: str = "paper", prior: str = "trained") -> Preset:
     ('paper', 0.001, 8000)
     """
     if name != "paper":
-        raise InputError(f"preset: expected paper, got {name!r}")
+        raise InputError(f"expected paper, got {name!r}", parameter="preset")
     if prior not in PAPER_PRESETS:
-        raise InputError(f"prior: expected {', '.join(PAPER_PRESETS)}, got {prior!r}")
+        raise InputError(f"expected {', '.join(PAPER_PRESETS)}, got {prior!r}", parameter="prior")
     recover = RecoverConfig(schedule=PAPER, regularizers=PAPER_PRESETS[prior], sh_degree=3)
     distill = DistillConfig(
         method="paper",

@@ -132,7 +132,7 @@ def check_scene(path: str | Path) -> tuple[Path, str]:
             "views": ", no scene; name the scene's own file",
         }
         hint = hints.get(kind(path), "")
-        raise InputError(f"{path}: a Gaussian scene is needed, this is {what}{hint}")
+        raise InputError(f"a Gaussian scene is needed, this is {what}{hint}", path=path)
     return path, found
 
 
@@ -142,7 +142,7 @@ def _named(path: str | Path, suffixes: tuple[str, ...], rule: str) -> Path:
 
     path = Path(path)
     if path.suffix.lower() not in suffixes:
-        raise OutputError(f"{path}: {rule}")
+        raise OutputError(f"{rule}", path=path)
     return path
 
 
@@ -234,7 +234,7 @@ def read_cloud(path: str | Path) -> Cloud:
         scene = kind(path) == "splats"
         what = "a Gaussian scene" if scene else found
         hint = ", ready for `simplify` and `distill`" if scene else "; name the cloud's own file"
-        raise InputError(f"{path}: a coloured point cloud is needed, this is {what}{hint}")
+        raise InputError(f"a coloured point cloud is needed, this is {what}{hint}", path=path)
     return import_module(f"g2ard.io.{modules[found]}").read(path)
 
 
@@ -255,7 +255,7 @@ def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -
 
     path = Path(path)
     if path.suffix.lower() != ".ply":
-        raise OutputError(f"{path}: clouds are written as .ply")
+        raise OutputError("clouds are written as .ply", path=path)
     cloud_ply.write(path, points, overwrite=overwrite)
 
 
@@ -311,14 +311,14 @@ def read_view_set(
     if KINDS[found] != "views":
         what = "a Gaussian scene" if KINDS[found] == "splats" else "a cloud"
         raise InputError(
-            f"{path}: views are needed (a COLMAP folder, transforms.json, g2ard's .json), this is {what}"
+            f"views are needed (a COLMAP folder, transforms.json, g2ard's .json), this is {what}", path=path
         )
     if images is not None and not Path(images).is_dir():
         raise InputError(f"{images}: no such folder of photos")
     try:
         views = import_module(f"g2ard.io.{found}").read(path, Path(images) if images else None)
     except OSError as error:  # a photo's name that no file system takes, a folder that may not be read
-        raise InputError(f"{path}: {error.strerror or error}") from error
+        raise InputError(f"{error.strerror or error}", path=path) from error
     views = views if unpictured else pictured(views)
     return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
 

@@ -27,9 +27,9 @@ def read(path: Path) -> dict[str, NDArray[np.float64]]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from error
+        raise InputError(f"{error.strerror}", path=path) from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file") from error
+        raise InputError("not a text file", path=path) from error
     out: dict[str, NDArray[np.float64]] = {}
     for number, line in enumerate(lines, 1):
         words = line.split()
@@ -40,11 +40,13 @@ def read(path: Path) -> dict[str, NDArray[np.float64]]:
         except ValueError:
             pose = np.zeros(0)
         if len(pose) != 7 or not np.isfinite(pose).all() or not np.linalg.norm(pose[:4]) > 0:
-            raise InputError(f"{path}: line {number}: expected a name, a quaternion wxyz and a translation")
+            raise InputError(
+                f"line {number}: expected a name, a quaternion wxyz and a translation", path=path
+            )
         if words[0] in out:
-            raise InputError(f"{path}: line {number}: {words[0]} comes twice")
+            raise InputError(f"line {number}: {words[0]} comes twice", path=path)
         out[words[0]] = np.eye(4)
         out[words[0]][:3, :3], out[words[0]][:3, 3] = rotation(pose[:4].tolist()), pose[4:]
     if not out:
-        raise InputError(f"{path}: no poses found")
+        raise InputError("no poses found", path=path)
     return out

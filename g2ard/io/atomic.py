@@ -35,14 +35,14 @@ def check_output(path: str | Path, overwrite: bool = False, *, folder: bool = Fa
         parent = path.absolute().parent
         there = next(folder for folder in (parent, *parent.parents) if folder.exists())
         if not there.is_dir():
-            raise OutputError(f"{path}: {there} is a file; a folder is needed there")
+            raise OutputError(f"{there} is a file; a folder is needed there", path=path)
         probe = _beside(there / path.name)
         probe.mkdir()
         probe.rmdir()
     except OutputError:
         raise
     except OSError as error:
-        raise OutputError(f"{path}: cannot write there: {error.strerror}; name another place") from error
+        raise OutputError(f"cannot write there: {error.strerror}; name another place", path=path) from error
     return path
 
 
@@ -50,11 +50,11 @@ def _refuse_existing(path: Path, overwrite: bool, folder: bool) -> None:
     if not path.exists():
         return
     if path.is_dir() and not folder:
-        raise OutputError(f"{path}: is a folder; a file is to be written there: name one in it")
+        raise OutputError("is a folder; a file is to be written there: name one in it", path=path)
     if folder and not path.is_dir():
-        raise OutputError(f"{path}: is a file; a folder is to be written there: name another")
+        raise OutputError("is a file; a folder is to be written there: name another", path=path)
     if not overwrite and (not folder or any(path.iterdir())):
-        raise OutputError(f"{path}: exists; overwrite=True replaces it")
+        raise OutputError("exists", path=path, hint="{overwrite=True} replaces it")
 
 
 def _beside(path: Path) -> Path:
@@ -95,7 +95,7 @@ def atomic_output(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
     except OSError as error:
         if isinstance(error, OutputError) or error.filename not in (None, str(temporary), temporary):
             raise
-        raise OutputError(f"{path}: cannot write: {error.strerror or error}") from error
+        raise OutputError(f"cannot write: {error.strerror or error}", path=path) from error
     finally:
         temporary.unlink(missing_ok=True)
         drop_empty(made)
@@ -123,7 +123,7 @@ def atomic_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
     except OSError as error:
         if isinstance(error, OutputError) or not str(error.filename or "").startswith(str(temporary)):
             raise
-        raise OutputError(f"{path}: cannot write: {error.strerror or error}") from error
+        raise OutputError(f"cannot write: {error.strerror or error}", path=path) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         drop_empty(made)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from g2ard.errors import InputError
+from g2ard.errors import DAMAGED, InputError
 from g2ard.io.colmap import parsing
 from g2ard.io.photos import Frame, photo_size, rotation, view_set
 from g2ard.io.types import Note, ViewSet
@@ -84,14 +84,14 @@ def _lenses(path: Path) -> dict[str, _Lens]:
     with parsing(path):
         lines = path.read_text(encoding="utf-8").splitlines()
         if not lines or not lines[0].startswith("NVM_V3"):
-            raise InputError(f"{path}: not VisualSFM's NVM_V3")
+            raise InputError("not VisualSFM's NVM_V3", path=path)
         at = next((i for i, line in enumerate(lines[1:], 1) if line.strip()), None)
         if at is None:
-            raise InputError(f"{path}: truncated: nothing follows its first line")
+            raise InputError("truncated: nothing follows its first line", path=path, hint=DAMAGED)
         rows = [line.replace("\t", " ").split() for line in lines[at + 1 : at + 1 + int(lines[at])]]
         lenses = {_stem(row[0]): _Lens(float(row[1]), float(row[9])) for row in rows}
     if not lenses:
-        raise InputError(f"{path}: lists no camera")
+        raise InputError("lists no camera", path=path)
     return lenses
 
 
@@ -105,10 +105,10 @@ def _poses(path: Path) -> list[tuple[str, list[float]]]:
                 continue
             if len(words) != 8:
                 raise InputError(
-                    f"{path}: line {number}: expected a name and 7 numbers, got {len(words)} words"
+                    f"line {number}: expected a name and 7 numbers, got {len(words)} words", path=path
                 )
             pose = [float(word) for word in words[1:]]
             if not np.isfinite(pose).all() or not np.linalg.norm(pose[3:]) > 0:
-                raise InputError(f"{path}: line {number}: not a pose")
+                raise InputError(f"line {number}: not a pose", path=path)
             out.append((words[0], pose))
     return out

@@ -77,13 +77,13 @@ def _unit(path: Path, values: NDArray[Any], name: str) -> NDArray[np.float32]:
     if values.dtype.kind in "iu":
         least, most = int(values.min(initial=0)), int(np.iinfo(values.dtype).max)
         if least < 0:
-            raise InputError(f"{path}: colour {name!r} falls to {least}; expected values in [0, {most}]")
+            raise InputError(f"colour {name!r} falls to {least}; expected values in [0, {most}]", path=path)
         return (values / np.float32(most)).astype(np.float32)
     finite = values[np.isfinite(values)]
     low, top = float(finite.min(initial=0.0)), float(finite.max(initial=0.0))
     if low < -0.5 or top > 1.5:
         beyond = f"reaches {top:g}" if top > 1.5 else f"falls to {low:g}"
-        raise InputError(f"{path}: float colour {name!r} {beyond}; expected values in [0, 1]")
+        raise InputError(f"float colour {name!r} {beyond}; expected values in [0, 1]", path=path)
     with np.errstate(invalid="ignore"):  # a signalling NaN
         return values.astype(np.float32)
 
@@ -97,11 +97,11 @@ def finite_cloud(
         InputError: no point is left.
     """
     if not len(positions):
-        raise InputError(f"{path}: holds no points")
+        raise InputError("holds no points", path=path)
     good = np.all(np.isfinite(positions), axis=1) & np.all(np.isfinite(colors), axis=1)
     dropped = len(good) - int(np.count_nonzero(good))
     if dropped == len(good):
-        raise InputError(f"{path}: none of its {plural(dropped, 'point')} is finite")
+        raise InputError(f"none of its {plural(dropped, 'point')} is finite", path=path)
     if dropped:
         text = f"{plural(dropped, 'non-finite point')} dropped (the first is row {int(np.argmin(good))})"
         notes = (*notes, Note("dropped_rows", dropped, text))
@@ -136,7 +136,7 @@ def write_blocks(path: Path, count: int, blocks: Iterable[Points], *, overwrite:
         file.write(header.encode("ascii") + b"\n")
         for points in blocks:
             if not (np.isfinite(points.positions).all() and np.isfinite(points.colors).all()):
-                raise InputError(f"{path}: not written: a non-finite point")
+                raise InputError("not written: a non-finite point", path=path)
             rows = np.empty(len(points), names)
             for axis in range(3):
                 rows[_POSITION[axis]] = points.positions[:, axis]
@@ -144,4 +144,4 @@ def write_blocks(path: Path, count: int, blocks: Iterable[Points], *, overwrite:
             file.write(rows.data)
             written += len(rows)
         if written != count or not count:
-            raise InputError(f"{path}: not written: {written:,} points of {count:,}")
+            raise InputError(f"not written: {written:,} points of {count:,}", path=path)

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from g2ard.errors import InputError
+from g2ard.errors import DAMAGED, InputError
 from g2ard.io.records import Record
 
 if TYPE_CHECKING:
@@ -85,9 +85,9 @@ def parsing(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except (ValueError, IndexError, KeyError, OverflowError) as error:
-        raise InputError(f"{path}: malformed ({error})") from error
+        raise InputError(f"malformed ({error})", path=path) from error
     except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from error
+        raise InputError(f"{error.strerror}", path=path) from error
 
 
 def read(path: Path, images: Path | None = None) -> ViewSet:
@@ -121,7 +121,7 @@ def frames(path: Path, images: Path | None = None) -> tuple[Path, list[Frame]]:
     folder = model_folder(path)
     tables = _tables(folder) if folder else None
     if folder is None or tables is None:
-        raise InputError(f"{path}: no COLMAP model there (cameras and images, .bin or .txt)")
+        raise InputError("no COLMAP model there (cameras and images, .bin or .txt)", path=path)
     binary = tables[0].suffix == ".bin"
     with parsing(tables[0]):
         cameras = (_cameras_bin if binary else _cameras_txt)(tables[0])
@@ -158,7 +158,7 @@ def _viewmat(path: Path, image: _Image) -> NDArray[np.float64]:
     from g2ard.io.photos import rotation
 
     if not any(image.quat):
-        raise InputError(f"{path}: {image.name!r}: its quaternion is zero")
+        raise InputError(f"{image.name!r}: its quaternion is zero", path=path)
     view = np.eye(4)
     view[:3, :3] = rotation(image.quat)
     view[:3, 3] = image.translation
@@ -171,14 +171,16 @@ def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...])
     if model not in _PARAMETERS:
         known = ", ".join(_PARAMETERS)
         raise InputError(
-            f"{path}: camera model {model} is not supported ({known} are); undistort with COLMAP"
+            f"camera model {model} is not supported ({known} are); undistort with COLMAP", path=path
         )
     if len(p) != _PARAMETERS[model]:
-        raise InputError(f"{path}: {model} takes {_PARAMETERS[model]} parameters, got {len(p)}")
+        raise InputError(f"{model} takes {_PARAMETERS[model]} parameters, got {len(p)}", path=path)
     single_focal = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
     fx, fy, cx, cy, *k = (p[0], *p) if single_focal else p
     if min(size) < 1 or min(fx, fy) <= 0:
-        raise InputError(f"{path}: a camera of {size[0]:,}×{size[1]:,} pixels and focal lengths {fx}, {fy}")
+        raise InputError(
+            f"a camera of {size[0]:,}×{size[1]:,} pixels and focal lengths {fx}, {fy}", path=path
+        )
     k1, k2, p1, p2 = (*k, 0.0, 0.0, 0.0, 0.0)[:4]
     return _Camera(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), (k1, k2, p1, p2, 0.0))
 
@@ -218,16 +220,16 @@ def _images_bin(path: Path) -> list[_Image]:
         start = at + _IMAGE.size
         end = data.find(b"\0", start)
         if end < 0:
-            raise InputError(f"{path}: truncated in NAME of image {i:,}")
+            raise InputError(f"truncated in NAME of image {i:,}", path=path, hint=DAMAGED)
         try:
             name = data[start:end].decode()
         except UnicodeDecodeError:
-            raise InputError(f"{path}: malformed image {i:,}: NAME is no UTF-8") from None
+            raise InputError(f"malformed image {i:,}: NAME is no UTF-8", path=path) from None
         (points,) = _POINTS.read(path, "image", i, data, end + 1)
         images.append(_Image(name, camera, tuple(pose[:4]), tuple(pose[4:])))
         at = end + 1 + _POINTS.size + 24 * points
         if at > len(data):
-            raise InputError(f"{path}: truncated in POINTS2D of image {i:,}, {name!r}")
+            raise InputError(f"truncated in POINTS2D of image {i:,}, {name!r}", path=path, hint=DAMAGED)
     return images
 
 
@@ -258,14 +260,14 @@ def number(
 ) -> float:
     """A column of a text table."""
     if at >= len(words):
-        raise InputError(f"{path}: malformed {entry}: lacks {name}")
+        raise InputError(f"malformed {entry}: lacks {name}", path=path)
     word = words[at]
     try:
         if "_" in word or not word.isascii():  # which Python's own numbers may have
             raise ValueError(word)
         return kind(word)
     except ValueError:
-        raise InputError(f"{path}: malformed {entry}: {name} is {word!r}") from None
+        raise InputError(f"malformed {entry}: {name} is {word!r}", path=path) from None
 
 
 def _finite(word: str) -> float:
@@ -286,6 +288,6 @@ def _images_txt(path: Path) -> list[_Image]:
             pose = tuple(number(path, where, words, name, at, _finite) for name, at in _POSE_COLUMNS)
             camera = int(number(path, where, words, "CAMERA_ID", 8))
             if len(words) < 10:
-                raise InputError(f"{path}: malformed {where}: lacks NAME")
+                raise InputError(f"malformed {where}: lacks NAME", path=path)
             images.append(_Image(words[9].strip(), camera, pose[:4], pose[4:]))
     return images

@@ -85,18 +85,18 @@ def _layout(path: Path) -> _Layout:
         bounds += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
     missing = [name for name in bounds if name not in chunk_properties]
     if missing:
-        raise InputError(f"{path}: its 'chunk' element lacks {', '.join(map(repr, missing))}")
+        raise InputError(f"its 'chunk' element lacks {', '.join(map(repr, missing))}", path=path)
     rest = [p for p in header.properties.get("sh", []) if re.fullmatch(r"f_rest_\d+", p)]
     if len(rest) not in (0, 9, 24, 45) or set(rest) != {f"f_rest_{k}" for k in range(len(rest))}:
-        raise InputError(f"{path}: its 'sh' element has {len(rest)} coefficients; expected 9, 24 or 45")
+        raise InputError(f"its 'sh' element has {len(rest)} coefficients; expected 9, 24 or 45", path=path)
 
     names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")
     vertex, chunk, *sh = read_element(path, header, *names)
     if len(chunk) * _CHUNK < len(vertex) or (sh and len(sh[0]) != len(vertex)):
-        raise InputError(f"{path}: {len(chunk)} chunks and {plural(len(vertex), 'Gaussian')} do not fit")
+        raise InputError(f"{len(chunk)} chunks and {plural(len(vertex), 'Gaussian')} do not fit", path=path)
     for name in _PACKED:
         if vertex.dtype[name] != np.uint32:
-            raise InputError(f"{path}: {name!r} is of {vertex.dtype[name]}, not uint")
+            raise InputError(f"{name!r} is of {vertex.dtype[name]}, not uint", path=path)
     bands, colored = sh[0] if sh else None, "min_r" in chunk_properties
     offset = offset_of(path, header)
     return _Layout(vertex, np.array(chunk), bands, len(rest) // 3, colored, offset)

@@ -70,8 +70,8 @@ def file_format(path: str | Path) -> Format:
         return _folder_format(path)
     if not path.exists():
         if path.is_symlink():
-            raise InputError(f"{path}: a link that leads to no file")
-        raise InputError(f"{path}: no such file or folder{_near(path)}")
+            raise InputError("a link that leads to no file", path=path)
+        raise InputError(f"no such file or folder{_near(path)}", path=path)
     check_regular(str(path), path)
     name, suffix = path.name.lower(), path.suffix.lower()
     if name in ("meta.json", "lod-meta.json"):
@@ -97,8 +97,9 @@ def file_format(path: str | Path) -> Format:
     if suffix == ".json":
         return _json_format(path)
     raise InputError(
-        f"{path}: unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .splat; clouds: .ply .las "
-        ".laz; views: a COLMAP folder, a .json, or a trainer's run)"
+        f"unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .splat; clouds: .ply .las "
+        ".laz; views: a COLMAP folder, a .json, or a trainer's run)",
+        path=path,
     )
 
 
@@ -156,8 +157,8 @@ def _folder_format(path: Path) -> Format:
     if gsplat_run.is_run(path / gsplat_run.NAME):
         return "gsplat_run"
     if _is_begun(path):
-        raise InputError(f"{path}: tiles that `g2ard ingest` has not finished; the same call goes on")
-    raise InputError(f"{path}: nothing known in this folder{_instead(path)}")
+        raise InputError("tiles that `g2ard ingest` has not finished; the same call goes on", path=path)
+    raise InputError(f"nothing known in this folder{_instead(path)}", path=path)
 
 
 def _is_begun(path: Path) -> bool:
@@ -220,7 +221,7 @@ def _ply_format(path: Path) -> Format:
     header = read_header(path)
     properties = header.properties.get("vertex")
     if properties is None:
-        raise InputError(f"{path}: the PLY has no 'vertex' element")
+        raise InputError("the PLY has no 'vertex' element", path=path)
     if "packed_position" in properties:
         return "compressed_ply"
     scene_words = ("f_dc_", "rot_", "scale_", "opacity")
@@ -239,7 +240,7 @@ def _json_format(path: Path) -> Format:
         return "nerfstudio_export"
     if not isinstance(content, dict):
         raise InputError(
-            f"{path}: a JSON list, but neither INRIA's cameras nor those of nerfstudio's ns-export"
+            "a JSON list, but neither INRIA's cameras nor those of nerfstudio's ns-export", path=path
         )
     if isinstance(content.get("views"), list) or ("views" in content and "format" in content):
         return "views"
@@ -247,4 +248,4 @@ def _json_format(path: Path) -> Format:
         return "transforms"
     if {"transform", "scale"} <= set(content):
         return "nerfstudio"
-    raise InputError(f"{path}: neither a transforms.json ('frames') nor g2ard's views ('views')")
+    raise InputError("neither a transforms.json ('frames') nor g2ard's views ('views')", path=path)

@@ -29,7 +29,7 @@ def read(path: Path) -> dict[str, NDArray[np.float64]]:
         except (TypeError, ValueError, OverflowError):
             matrix = np.zeros(0)
         if matrix.shape != (3, 4) or not np.isfinite(matrix).all():
-            raise InputError(f"{path}: {name!r} is not a finite 3×4 matrix")
+            raise InputError(f"{name!r} is not a finite 3×4 matrix", path=path)
         found[name] = matrix
     return found
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import InputError
+from g2ard.errors import DAMAGED, InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import (
     Fields,
@@ -82,7 +82,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + 8 + start
     if total >= 1 << 32:
-        raise InputError(f"{path}: not written: {total:,} bytes are more than a .glb holds")
+        raise InputError(f"not written: {total:,} bytes are more than a .glb holds", path=path)
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         file.write(struct.pack("<III", _MAGIC, 2, total))
         file.write(struct.pack("<II", len(text), _JSON) + text)
@@ -166,17 +166,17 @@ def _chunks(path: Path) -> tuple[Any, bytes]:
     """The document, which should be an object, and the binary chunk."""
     data = path.read_bytes()
     if len(data) < 20 or struct.unpack_from("<II", data) != (_MAGIC, 2):
-        raise InputError(f"{path}: not a .glb of glTF 2.0 (begins with {data[:4]!r})")
+        raise InputError(f"not a .glb of glTF 2.0 (begins with {data[:4]!r})", path=path)
     found: dict[int, bytes] = {}
     at = 12
     while at + 8 <= len(data):
         size, kind = struct.unpack_from("<II", data, at)
         if at + 8 + size > len(data):
-            raise InputError(f"{path}: truncated: a chunk of {size:,} bytes is cut off")
+            raise InputError(f"truncated: a chunk of {size:,} bytes is cut off", path=path, hint=DAMAGED)
         found.setdefault(kind, data[at + 8 : at + 8 + size])
         at += 8 + size
     if _JSON not in found:
-        raise InputError(f"{path}: holds no JSON chunk")
+        raise InputError("holds no JSON chunk", path=path)
     return parse_json(f"{path}: glTF", found[_JSON]), found.get(_BIN, b"")
 
 
@@ -184,18 +184,18 @@ def _scene(path: Path, document: Fields, binary: bytes) -> Scene:
     primitives = [objects(mesh, "primitives") for mesh in objects(document, "meshes")]
     splatting = [(at, p) for at, held in enumerate(primitives) for p in held if EXTENSION in _extensions(p)]
     if len(splatting) != 1:
-        raise InputError(f"{path}: holds {len(splatting)} primitives of {EXTENSION}; one is read")
+        raise InputError(f"holds {len(splatting)} primitives of {EXTENSION}; one is read", path=path)
     mesh, primitive = splatting[0]
     splats = object_of(_extensions(primitive), EXTENSION)
     if packed := sorted(_extensions(splats)):
-        raise InputError(f"{path}: {packed[0]!r} is not read")
+        raise InputError(f"{packed[0]!r} is not read", path=path)
     if splats.get("kernel") != "ellipse":
-        raise InputError(f"{path}: kernels other than 'ellipse' are not read")
+        raise InputError("kernels other than 'ellipse' are not read", path=path)
     names = object_of(primitive, "attributes")
 
     def values(name: str, width: int) -> NDArray[np.float32]:
         if name not in names:
-            raise InputError(f"{path}: its splats lack the attribute {name!r}")
+            raise InputError(f"its splats lack the attribute {name!r}", path=path)
         return _accessor(path, document, binary, names, name, width)
 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names)
@@ -233,17 +233,19 @@ def _accessor(
     accessor = _pointed(document, "accessors", names, name)
     kind = accessor["componentType"]
     if kind not in _DTYPES or _TYPES.get(accessor["type"]) != width or "sparse" in accessor:
-        raise InputError(f"{path}: attribute {name!r} is of a form that is not read")
+        raise InputError(f"attribute {name!r} is of a form that is not read", path=path)
     view = _pointed(document, "bufferViews", accessor, "bufferView")
     if view["buffer"] != 0 or "uri" in _pointed(document, "buffers", view, "buffer"):
-        raise InputError(f"{path}: attribute {name!r} lies outside the file")
+        raise InputError(f"attribute {name!r} lies outside the file", path=path)
     dtype, count = np.dtype(_DTYPES[kind]), whole(accessor, "count")
     step = whole(view, "byteStride", width * dtype.itemsize)
     start = whole(view, "byteOffset", 0) + whole(accessor, "byteOffset", 0)
     if step < width * dtype.itemsize:
-        raise InputError(f"{path}: attribute {name!r} takes {step} bytes each, less than its elements have")
+        raise InputError(
+            f"attribute {name!r} takes {step} bytes each, less than its elements have", path=path
+        )
     if count and start + step * (count - 1) + width * dtype.itemsize > len(binary):
-        raise InputError(f"{path}: truncated: attribute {name!r} ends past the file")
+        raise InputError(f"truncated: attribute {name!r} ends past the file", path=path, hint=DAMAGED)
     rows = np.ndarray((count, width), dtype, binary, start, (step, dtype.itemsize))
     if not accessor.get("normalized"):
         return rows.astype(np.float32)
@@ -265,12 +267,12 @@ def _translation(path: Path, document: Fields, mesh: int) -> NDArray[np.float64]
             parents.setdefault(index_of(children, k, len(nodes)), []).append(i)
     at = [i for i, node in enumerate(nodes) if node.get("mesh") == mesh]
     if len(at) > 1:
-        raise InputError(f"{path}: {len(at)} nodes show its splats; one is read")
+        raise InputError(f"{len(at)} nodes show its splats; one is read", path=path)
     total = np.zeros(3)
     seen: set[int] = set()
     while at:
         if at[0] in seen:
-            raise InputError(f"{path}: node {at[0]} is its own ancestor")
+            raise InputError(f"node {at[0]} is its own ancestor", path=path)
         seen.add(at[0])
         node = nodes[at[0]]
         moved = _numbers(node, "translation", (0, 0, 0))
@@ -278,14 +280,14 @@ def _translation(path: Path, document: Fields, mesh: int) -> NDArray[np.float64]
         turned = (_numbers(node, "rotation", (0, 0, 0, 1)) != (0, 0, 0, 1)).any()
         scaled = (_numbers(node, "scale", (1, 1, 1)) != 1).any()
         if turned or scaled or (matrix[:3, :3] != np.eye(3)).any():
-            raise InputError(f"{path}: a node turns or scales its splats, which is not read")
+            raise InputError("a node turns or scales its splats, which is not read", path=path)
         with np.errstate(over="ignore", invalid="ignore"):
             total += moved + matrix[:3, 3]
         at = parents.get(at[0], [])
         if len(at) > 1:
-            raise InputError(f"{path}: a node has {len(at)} parents")
+            raise InputError(f"a node has {len(at)} parents", path=path)
     if not np.isfinite(total).all():
-        raise InputError(f"{path}: its nodes move it by {tuple(total.tolist())}")
+        raise InputError(f"its nodes move it by {tuple(total.tolist())}", path=path)
     return total * _TURN
 
 

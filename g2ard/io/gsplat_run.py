@@ -38,22 +38,25 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     file = path / NAME if path.is_dir() else path
     settings = read_settings(file)
     if settings.word("data_type") not in (None, "colmap"):
-        raise InputError(f"{file}: data of type {settings.word('data_type')!r} are not supported (colmap is)")
+        raise InputError(
+            f"data of type {settings.word('data_type')!r} are not supported (colmap is)", path=file
+        )
     if settings.word("normalize_world_space") != "false":
         raise InputError(
-            f"{file}: trained in a normalised world, and the run does not say how it was moved there "
-            "(train with --no-normalize-world-space, or give cameras of the scene's own world)"
+            "trained in a normalised world, and the run does not say how it was moved there "
+            "(train with --no-normalize-world-space, or give cameras of the scene's own world)",
+            path=file,
         )
     named = settings.path("data_dir")
     data = below(file, named) if named is not None else None
     if named is None or data is None:
-        raise InputError(f"{file}: its data_dir {named and named.as_posix()} is not there")
+        raise InputError(f"its data_dir {named and named.as_posix()} is not there", path=file)
     smaller = data / f"images_{settings.word('data_factor')}"
     photos = images or (smaller if smaller.is_dir() else None)
     try:
         model, frames = colmap.frames(data, photos)
     except InputError as error:
-        raise InputError(f"{file}: its data_dir: {error}") from error
+        raise InputError(f"its data_dir: {error}", path=file) from error
     every = _whole(file, "test_every", settings.word("test_every") or "8")
     words = ["train" if i % every else "test" for i in range(len(frames))]
     found = view_set(model, [f._replace(split=word) for f, word in zip(frames, words, strict=True)])
@@ -65,5 +68,5 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
 
 def _whole(path: Path, key: str, text: str) -> int:
     if not text.isdigit() or int(text) < 1:
-        raise InputError(f"{path}: {key!r} is {text!r}, not a whole number ≥ 1")
+        raise InputError(f"{key!r} is {text!r}, not a whole number ≥ 1", path=path)
     return int(text)

@@ -43,7 +43,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     content = read_any_json(path)
     if not isinstance(content, dict):
-        raise InputError(f"{path}: expected a JSON object")
+        raise InputError("expected a JSON object", path=path)
     return content
 
 
@@ -55,7 +55,7 @@ def read_json_list(path: Path) -> list[Any]:
     """
     content = read_any_json(path)
     if not isinstance(content, list):
-        raise InputError(f"{path}: expected a JSON list")
+        raise InputError("expected a JSON list", path=path)
     return content
 
 
@@ -68,7 +68,7 @@ def read_any_json(path: Path) -> Any:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from error
+        raise InputError(f"{error.strerror}", path=path) from error
     return parse_json(str(path), data)
 
 
@@ -81,13 +81,13 @@ def parse_json(where: str, data: bytes) -> Any:
     try:
         return json.loads(data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
-        raise InputError(f"{where}: not a text file") from error
+        raise InputError("not a text file", path=where) from error
     except json.JSONDecodeError as error:
-        raise InputError(f"{where}: not JSON: {error.msg} (line {error.lineno})") from error
+        raise InputError(f"not JSON: {error.msg} (line {error.lineno})", path=where) from error
     except RecursionError as error:
-        raise InputError(f"{where}: JSON nested too deeply") from error
+        raise InputError("JSON nested too deeply", path=where) from error
     except ValueError as error:  # an integer of thousands of digits
-        raise InputError(f"{where}: not JSON: {error}") from error
+        raise InputError(f"not JSON: {error}", path=where) from error
 
 
 class _Asked:
@@ -212,18 +212,18 @@ def fields_of(where: str, entry: Any) -> Iterator[Fields]:
         InputError: `entry` is no object, or a property is absent or is not what it should be.
     """
     if not isinstance(entry, dict):
-        raise InputError(f"{where}: malformed: expected an object, found {_found(entry)}")
+        raise InputError(f"malformed: expected an object, found {_found(entry)}", path=where)
     fields = entry if isinstance(entry, Fields) else Fields(entry)
     try:
         yield fields
     except InputError:
         raise
     except _AbsentError as error:
-        raise InputError(f"{where}: lacks {fields.last!r}") from error
+        raise InputError(f"lacks {fields.last!r}", path=where) from error
     except _UnexpectedError as error:
-        raise InputError(f"{where}: malformed {fields.last!r}: {error}") from error
+        raise InputError(f"malformed {fields.last!r}: {error}", path=where) from error
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise InputError(f"{where}: malformed {_told(fields.asked, error)}") from error
+        raise InputError(f"malformed {_told(fields.asked, error)}", path=where) from error
 
 
 def numbers(holder: Fields, key: str, *shape: int, most: float = _LARGEST, gaps: bool = False) -> Any:

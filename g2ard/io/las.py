@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from g2ard.errors import InputError, MissingDependencyError
+from g2ard.errors import DAMAGED, InputError, MissingDependencyError
 from g2ard.io.cloud_ply import finite_cloud
 from g2ard.io.limits import check_unpacked
 from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
@@ -32,7 +32,9 @@ def read(path: Path) -> Cloud:
     with _opened(path) as reader:
         las, promised = reader.read(), reader.header.point_count
     if len(las.points) < promised:
-        raise InputError(f"{path}: truncated: {promised:,} points promised, {len(las.points):,} there")
+        raise InputError(
+            f"truncated: {promised:,} points promised, {len(las.points):,} there", path=path, hint=DAMAGED
+        )
     positions, rgb = _points(las)
     notes, divisor = _depth(len(rgb), float(rgb.max(initial=0)))
     return finite_cloud(path, positions, rgb / np.float32(divisor), notes)
@@ -72,7 +74,8 @@ class _LasPoints(PointStream):
                 if len(las) < wanted:
                     there = first + len(las)
                     raise InputError(
-                        f"{self.path}: truncated: {self.count:,} points promised, {there:,} there"
+                        f"{self.path}: truncated: {self.count:,} points promised, {there:,} there",
+                        hint=DAMAGED,
                     )
                 yield _points(las)
 
@@ -97,7 +100,7 @@ def _opened(path: Path) -> Iterator[Any]:
         import laspy
         import lazrs  # noqa: F401 - what laspy reads .laz with; its absence is told here
     except ImportError as error:
-        raise MissingDependencyError(f"{path}: .las and .laz need `pip install g2ard[las]`") from error
+        raise MissingDependencyError(".las and .laz need `pip install g2ard[las]`", path=path) from error
     _check_records(path)
     try:
         with laspy.open(path) as reader:
@@ -105,8 +108,9 @@ def _opened(path: Path) -> Iterator[Any]:
             names = set(header.point_format.dimension_names)
             if not {"red", "green", "blue"} <= names:
                 raise InputError(
-                    f"{path}: its point format {header.point_format.id} has no 'red', 'green', 'blue'; "
-                    "points must be coloured (as by PDAL's filters.colorization)"
+                    f"its point format {header.point_format.id} has no 'red', 'green', 'blue'; "
+                    "points must be coloured (as by PDAL's filters.colorization)",
+                    path=path,
                 )
             if header.are_points_compressed:
                 _check_chunk_table(path, header.offset_to_point_data, header.point_count)
@@ -119,7 +123,7 @@ def _opened(path: Path) -> Iterator[Any]:
     except BaseException as error:  # on damage laspy raises whatever it stumbles over, and lazrs may panic
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
-        raise InputError(f"{path}: cannot be read as LAS: {str(error) or type(error).__name__}") from error
+        raise InputError(f"cannot be read as LAS: {str(error) or type(error).__name__}", path=path) from error
 
 
 def _check_records(path: Path) -> None:
@@ -127,20 +131,24 @@ def _check_records(path: Path) -> None:
     with path.open("rb") as file:
         head = file.read(375).ljust(375, b"\0")
     if head[:4] != b"LASF":
-        raise InputError(f"{path}: cannot be read as LAS (begins with {head[:4]!r})")
+        raise InputError(f"cannot be read as LAS (begins with {head[:4]!r})", path=path)
     points_at, records = struct.unpack_from("<II", head, 96)
     (extended,) = struct.unpack_from("<I", head, 243) if head[25] >= 4 else (0,)
     size = path.stat().st_size
     if points_at > size:
-        raise InputError(f"{path}: truncated: its points begin at byte {points_at:,} of {size:,}")
+        raise InputError(
+            f"truncated: its points begin at byte {points_at:,} of {size:,}", path=path, hint=DAMAGED
+        )
     if records * 54 > points_at or extended * 60 > size:
-        raise InputError(f"{path}: broken header: {records + extended:,} variable-length records")
+        raise InputError(
+            f"broken header: {records + extended:,} variable-length records", path=path, hint=DAMAGED
+        )
 
 
 def _check_size(path: Path, points_at: int, promised: int, point_size: int) -> None:
     there = max(0, path.stat().st_size - points_at) // point_size
     if there < promised:
-        raise InputError(f"{path}: truncated: {promised:,} points promised, {there:,} there")
+        raise InputError(f"truncated: {promised:,} points promised, {there:,} there", path=path, hint=DAMAGED)
 
 
 def _check_chunk_table(path: Path, points_at: int, promised: int) -> None:
@@ -154,13 +162,17 @@ def _check_chunk_table(path: Path, points_at: int, promised: int) -> None:
             file.seek(-8, 2)
             (table,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
         if not points_at < table <= size - 8:
-            raise InputError(f"{path}: truncated: its chunk table is cut off")
+            raise InputError("truncated: its chunk table is cut off", path=path, hint=DAMAGED)
         file.seek(table)
         _version, chunks = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     if chunks > max(promised, 1):
-        raise InputError(f"{path}: broken chunk table: {chunks:,} chunks for {promised:,} points")
+        raise InputError(
+            f"broken chunk table: {chunks:,} chunks for {promised:,} points", path=path, hint=DAMAGED
+        )
     if chunks > table - points_at:
-        raise InputError(f"{path}: broken chunk table: {chunks:,} chunks in {table - points_at:,} bytes")
+        raise InputError(
+            f"broken chunk table: {chunks:,} chunks in {table - points_at:,} bytes", path=path, hint=DAMAGED
+        )
 
 
 def _check_chunks(path: Path, header: Any) -> None:
@@ -169,24 +181,28 @@ def _check_chunks(path: Path, header: Any) -> None:
 
     records = header.vlrs.get("LasZipVlr")
     if not records:
-        raise InputError(f"{path}: broken header: nothing says how its points are compressed")
+        raise InputError("broken header: nothing says how its points are compressed", path=path, hint=DAMAGED)
     layout = lazrs.LazVlr(records[0].record_data)
     size, wanted = layout.item_size(), header.point_format.size
     if size != wanted:
-        raise InputError(f"{path}: broken header: compressed points of {size} bytes, not {wanted}")
+        raise InputError(
+            f"broken header: compressed points of {size} bytes, not {wanted}", path=path, hint=DAMAGED
+        )
     if not layout.uses_variable_size_chunks():
         chunk = layout.chunk_size()
         if not 0 < chunk * size <= max(_LARGEST_CHUNK, header.point_count * size):
-            raise InputError(f"{path}: broken header: chunks of {chunk:,} points")
+            raise InputError(f"broken header: chunks of {chunk:,} points", path=path, hint=DAMAGED)
     with path.open("rb") as file:
         file.seek(header.offset_to_point_data)
         table = lazrs.read_chunk_table(file, layout)
     room, taken = (sum(column) for column in zip(*table, strict=True)) if table else (0, 0)
     there = path.stat().st_size
     if min((packed for _, packed in table), default=0) < 0 or taken > there - header.offset_to_point_data:
-        raise InputError(f"{path}: broken chunk table: chunks of {taken:,} bytes")
+        raise InputError(f"broken chunk table: chunks of {taken:,} bytes", path=path, hint=DAMAGED)
     if room < header.point_count:
         raise InputError(
-            f"{path}: truncated: {header.point_count:,} points promised, at most {room:,} in its chunks"
+            f"truncated: {header.point_count:,} points promised, at most {room:,} in its chunks",
+            path=path,
+            hint=DAMAGED,
         )
     check_unpacked(str(path), there, header.point_count * size)

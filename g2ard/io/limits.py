@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
-from g2ard.errors import InputError
+from g2ard.errors import DAMAGED, InputError
 from g2ard.io.paths import check_regular
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def check_unpacked(where: str, packed: int, unpacked: int) -> None:
     most = max(_ALWAYS_UNPACKED, _LARGEST_RATIO * packed)
     if unpacked > most:
         raise InputError(
-            f"{where}: {packed:,} bytes would unpack to {unpacked:,}; at most {most:,} are taken"
+            f"{packed:,} bytes would unpack to {unpacked:,}; at most {most:,} are taken", path=where
         )
 
 
@@ -55,7 +55,7 @@ def check_image(where: str, width: int, height: int) -> None:
     """
     if width * height > LARGEST_IMAGE:
         raise InputError(
-            f"{where}: an image of {width:,}×{height:,} pixels; at most {LARGEST_IMAGE:,} are taken"
+            f"an image of {width:,}×{height:,} pixels; at most {LARGEST_IMAGE:,} are taken", path=where
         )
 
 
@@ -80,8 +80,10 @@ def opened_image(where: str, file: Path | IO[bytes]) -> Iterator[Image]:
     except (InputError, FileNotFoundError):
         raise
     except Image.DecompressionBombError as error:
-        raise InputError(f"{where}: an image of more than {LARGEST_IMAGE:,} pixels") from error
+        raise InputError(f"an image of more than {LARGEST_IMAGE:,} pixels", path=where) from error
     except UnidentifiedImageError as error:
-        raise InputError(f"{where}: not an image") from error
+        raise InputError("not an image", path=where) from error
     except Exception as error:  # on damage Pillow's decoders raise whatever they stumble over
-        raise InputError(f"{where}: not a whole image ({str(error) or type(error).__name__})") from error
+        raise InputError(
+            f"not a whole image ({str(error) or type(error).__name__})", path=where, hint=DAMAGED
+        ) from error

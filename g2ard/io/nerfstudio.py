@@ -53,7 +53,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     settings = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else None
     frames, A, applied_scale = _data(folder, settings, images)
     if not (math.isfinite(scale) and scale > 0):
-        raise InputError(f"{file}: 'scale' is {content['scale']!r}, not a number > 0")
+        raise InputError(f"'scale' is {content['scale']!r}, not a number > 0", path=file)
     scale /= applied_scale
     trained_from_saved = rigid(f"{file}: 'transform'", D @ np.linalg.inv(A))
     found = view_set(file, [_moved(frame, trained_from_saved, scale) for frame in frames])
@@ -91,15 +91,16 @@ def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
     manager = pipeline and pipeline[1].block("datamanager")
     parser = manager and manager[1].block("dataparser")
     if not parser or not manager:
-        raise InputError(f"{path}: lacks 'pipeline.datamanager.dataparser'")
+        raise InputError("lacks 'pipeline.datamanager.dataparser'", path=path)
     name = parser[0].rsplit(".", 1)[-1].removesuffix("Config")
     if name not in _PARSERS:
         raise InputError(
-            f"{path}: data read by {name or 'no known parser'} are not supported ({', '.join(_PARSERS)} are)"
+            f"data read by {name or 'no known parser'} are not supported ({', '.join(_PARSERS)} are)",
+            path=path,
         )
     data = settings.path("data") or manager[1].path("data") or parser[1].path("data")
     if data is None:
-        raise InputError(f"{path}: 'data' names no folder")
+        raise InputError("'data' names no folder", path=path)
     return name, parser[1], data
 
 
@@ -115,7 +116,7 @@ def _saved(
     given = content.get("applied_transform")
     if given is None and options is not None and (file.parent / "colmap" / "sparse" / "0").is_dir():
         raise InputError(
-            f"{file}: lacks 'applied_transform', and versions of nerfstudio differ in what they take for it"
+            "lacks 'applied_transform', and versions of nerfstudio differ in what they take for it", path=file
         )
     A = _EYE if given is None else _affine(file, "applied_transform", given)
     if options is not None and not any(frame.split for frame in frames):
@@ -128,7 +129,7 @@ def _saved(
     except (TypeError, ValueError, OverflowError):
         applied_scale = math.nan
     if not (math.isfinite(applied_scale) and applied_scale > 0):
-        raise InputError(f"{file}: 'applied_scale' is {content['applied_scale']!r}, not a number > 0")
+        raise InputError(f"'applied_scale' is {content['applied_scale']!r}, not a number > 0", path=file)
     return frames, A, applied_scale
 
 
@@ -179,9 +180,9 @@ def _affine(path: Path, key: str, rows: Any) -> NDArray[np.float64]:
     except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
-        raise InputError(f"{path}: {key!r} is not a finite 3×4 matrix")
+        raise InputError(f"{key!r} is not a finite 3×4 matrix", path=path)
     out = np.eye(4)
     out[:3] = matrix[:3]
     if not 0.99 < abs(np.linalg.det(out[:3, :3])) < 1.01:
-        raise InputError(f"{path}: {key!r} is no rotation")
+        raise InputError(f"{key!r} is no rotation", path=path)
     return out

@@ -96,8 +96,9 @@ def _lens(where: str, named: Path, place: Path | None, known: dict[Path, dict[st
         if named.name in known[folder]:
             return known[folder][named.name]
     raise InputError(
-        f"{where}: ns-export writes no intrinsics, and no transforms.json or COLMAP model above "
-        f"{named.as_posix()} tells them; give the run's folder (with its dataparser_transforms.json) instead"
+        f"ns-export writes no intrinsics, and no transforms.json or COLMAP model above "
+        f"{named.as_posix()} tells them; give the run's folder (with its dataparser_transforms.json) instead",
+        path=where,
     )
 
 
@@ -110,5 +111,7 @@ def _lenses(folder: Path) -> dict[str, _Lens]:
         return {}
     names = [Path(frame.photo.name if frame.photo else frame.name).name for frame in frames]
     if len(set(names)) < len(names):
-        raise InputError(f"{folder}: photos of one name in several folders: which is whose is not to be told")
+        raise InputError(
+            "photos of one name in several folders: which is whose is not to be told", path=folder
+        )
     return {name: _Lens(f.K, f.size, f.distortion) for name, f in zip(names, frames, strict=True)}

@@ -32,10 +32,10 @@ def writable(path: Path, splats: Splats) -> Splats:
         InputError: it is empty or has a value that is not finite.
     """
     if not len(splats):
-        raise InputError(f"{path}: a scene without Gaussians is not written")
+        raise InputError("a scene without Gaussians is not written", path=path)
     bad = np.flatnonzero(~splats.finite_rows())
     if len(bad):
-        raise InputError(f"{path}: not written: Gaussian {bad[0]} is not finite")
+        raise InputError(f"not written: Gaussian {bad[0]} is not finite", path=path)
     return splats
 
 
@@ -51,8 +51,9 @@ def world_means(path: Path, splats: Splats, what: str) -> NDArray[np.float64]:
         thin = float(np.median(splats.scales.min(axis=1)))
         if step > thin:
             raise InputError(
-                f"{path}: {what} stores no offset, and steps of {step:g} at these coordinates; write "
-                ".ply, .compressed.ply, .sog or .glb, or drop the offset with `g2ard convert --recentre`"
+                f"{what} stores no offset, and steps of {step:g} at these coordinates; write "
+                ".ply, .compressed.ply, .sog or .glb, or drop the offset with `g2ard convert --recentre`",
+                path=path,
             )
     return means
 

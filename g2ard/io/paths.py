@@ -31,7 +31,7 @@ def check_regular(where: str, path: Path) -> None:
         InputError: it is something else.
     """
     if path.exists() and not (path.is_file() or path.is_dir()):
-        raise InputError(f"{where}: not a regular file")
+        raise InputError("not a regular file", path=where)
 
 
 def output_names(where: str, names: Sequence[str]) -> list[str]:
@@ -55,7 +55,7 @@ def output_names(where: str, names: Sequence[str]) -> list[str]:
     times = Counter(places)
     for name, place in zip(names, places, strict=True):
         if times[place] > 1:
-            raise InputError(f"{where}: {name!r} and another view would both be written as {str(place)!r}")
+            raise InputError(f"{name!r} and another view would both be written as {str(place)!r}", path=where)
     return [str(place) for place in places]
 
 
@@ -64,5 +64,5 @@ def _inside(where: str, i: int, name: str) -> PurePosixPath:
     kept = [part for part in parts if part not in ("..", "/", "//") and not part.endswith((":", ":/"))]
     if not kept or "\0" in name or max(len(part.encode(errors="replace")) for part in kept) > _LONGEST:
         short = name if len(name) <= _LONGEST else f"{name[:_LONGEST]}…"
-        raise InputError(f"{where}: view {i}: {short!r} cannot be a file's name")
+        raise InputError(f"view {i}: {short!r} cannot be a file's name", path=where)
     return PurePosixPath(*kept)

@@ -76,7 +76,7 @@ def pixels(where: str, values: Mapping[str, Any], key: str) -> int:
     """
     value = float(values[key])
     if not value.is_integer():
-        raise InputError(f"{where}: {key!r} is {values[key]!r}, not a whole number of pixels")
+        raise InputError(f"{key!r} is {values[key]!r}, not a whole number of pixels", path=where)
     return int(value)
 
 
@@ -100,11 +100,11 @@ def rigid(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
         InputError: it is not finite, mirrored, or further than 1 % from a rotation.
     """
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
-        raise InputError(f"{where}: its pose is not a finite 4×4 matrix")
+        raise InputError("its pose is not a finite 4×4 matrix", path=where)
     U, s, Vt = np.linalg.svd(matrix[:3, :3])
     R = U @ Vt
     if not s[0] > 0 or s[2] < 0.99 * s[0] or np.linalg.det(R) < 0:
-        raise InputError(f"{where}: its pose is not a rotation and a translation")
+        raise InputError("its pose is not a rotation and a translation", path=where)
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = R, matrix[:3, 3]
     return out
@@ -130,7 +130,7 @@ def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
             [_mask(f) for f in frames],
         )
     except (InputError, OverflowError) as error:
-        raise InputError(f"{path}: {error}") from error
+        raise InputError(f"{error}", path=path) from error
 
 
 def _mask(frame: Frame) -> Path | None:
@@ -149,10 +149,10 @@ def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
         InputError: no frame, or two of one name.
     """
     if not frames:
-        raise InputError(f"{path}: no views found")
+        raise InputError("no views found", path=path)
     name, times = Counter(frame.name for frame in frames).most_common(1)[0]
     if times > 1:
-        raise InputError(f"{path}: {times} views are named {name!r}; names must be unique")
+        raise InputError(f"{times} views are named {name!r}; names must be unique", path=path)
     listed = [frame for frame in frames if frame.photo is not None]
     present = [frame for frame in frames if frame.photo is not None and frame.photo.is_file()]
     notes = []

@@ -111,7 +111,7 @@ def _bands(path: Path, rest: list[str]) -> tuple[int, int]:
     """How many higher-band coefficients a channel are stored, and how many of them are kept."""
     if [int(p[7:]) for p in rest] != list(range(len(rest))) or len(rest) not in (0, 9, 24, 45, 72):
         raise InputError(
-            f"{path}: expected f_rest_0 to f_rest_n with 0, 9, 24 or 45 of them, got {len(rest)}"
+            f"expected f_rest_0 to f_rest_n with 0, 9, 24 or 45 of them, got {len(rest)}", path=path
         )
     return len(rest) // 3, min(len(rest) // 3, 15)
 
@@ -206,7 +206,7 @@ def write_parts(
     from plyfile import PlyData, PlyElement
 
     if not count:
-        raise InputError(f"{path}: a scene without Gaussians is not written")
+        raise InputError("a scene without Gaussians is not written", path=path)
     names = [*_MEANS, *(_NORMALS if normals else []), *_DC]
     rest = 3 * ((sh_degree + 1) ** 2 - 1)
     names += [f"f_rest_{k}" for k in range(rest)] + ["opacity", *_SCALES, *_QUATS]
@@ -224,7 +224,7 @@ def write_parts(
                 file.write(block.data)
             first += len(part)
         if first != count:
-            raise InputError(f"{path}: not written: {first:,} Gaussians came, {count:,} were announced")
+            raise InputError(f"not written: {first:,} Gaussians came, {count:,} were announced", path=path)
 
 
 def _blocks(
@@ -249,6 +249,6 @@ def _blocks(
         if not finite.all():
             row, column = np.argwhere(~finite)[0]
             raise InputError(
-                f"{path}: not written: {names[column]!r} of Gaussian {first + start + row} is not finite"
+                f"not written: {names[column]!r} of Gaussian {first + start + row} is not finite", path=path
             )
         yield block

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from g2ard.errors import InputError
+from g2ard.errors import DAMAGED, InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,25 +43,28 @@ def read_header(path: Path) -> PlyHeader:
         with path.open("rb") as file:
             head = file.read(_HEADER_LIMIT)
     except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from error
+        raise InputError(f"{error.strerror}", path=path) from error
     if not head:
-        raise InputError(f"{path}: the file is empty")
+        raise InputError("the file is empty", path=path)
     if head[:3] != b"ply" or head[3:4] not in b"\r\n":
         raise InputError(
-            f"{path}: not a PLY file (begins with {head[:8]!r}, expected 'ply'); export the scene as .ply "
-            "again, or give the file the suffix of what it is"
+            f"not a PLY file (begins with {head[:8]!r}, expected 'ply'); export the scene as .ply "
+            "again, or give the file the suffix of what it is",
+            path=path,
         )
     end = _END.search(head)  # a line of its own: comments may hold the word
     if end is None:
-        raise InputError(f"{path}: broken PLY: its header has no end_header line")
+        raise InputError("broken PLY: its header has no end_header line", path=path, hint=DAMAGED)
     header = PlyHeader()
     for number, line in enumerate(re.split(r"\r\n|\r|\n", head[: end.start()].decode("latin-1")), 1):
         if not line.isascii():  # PLY is ASCII, and plyfile insists
-            raise InputError(f"{path}: PLY header, line {number}: a character that is not ASCII")
+            raise InputError(f"PLY header, line {number}: a character that is not ASCII", path=path)
         try:
             _header_line(header, line.split())
         except (IndexError, ValueError, KeyError) as error:
-            raise InputError(f"{path}: broken PLY header, line {number}: {line.strip()[:80]!r}") from error
+            raise InputError(
+                f"broken PLY header, line {number}: {line.strip()[:80]!r}", path=path, hint=DAMAGED
+            ) from error
     return header
 
 
@@ -93,9 +96,9 @@ def offset_of(path: Path, header: PlyHeader) -> NDArray[np.float64]:
             try:
                 offset = np.array([float(word) for word in match.groups()])
             except ValueError as error:
-                raise InputError(f"{path}: broken comment {comment!r}") from error
+                raise InputError(f"broken comment {comment!r}", path=path, hint=DAMAGED) from error
             if not np.isfinite(offset).all():
-                raise InputError(f"{path}: broken comment {comment!r}")
+                raise InputError(f"broken comment {comment!r}", path=path, hint=DAMAGED)
             return offset
     return np.zeros(3)
 
@@ -112,8 +115,9 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
     for name, count in header.counts.items():  # before room is made for them: a row takes a byte at least
         if count > size:
             raise InputError(
-                f"{path}: truncated: the header promises {count:,} rows of {name!r}, "
-                f"the file has {size:,} bytes"
+                f"truncated: the header promises {count:,} rows of {name!r}, the file has {size:,} bytes",
+                path=path,
+                hint=DAMAGED,
             )
     triangles = {name: dict.fromkeys(lists, 3) for name, lists in header.lists.items() if lists}
     try:
@@ -126,7 +130,7 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
     except PlyElementParseError as error:
         raise InputError(_parse_failure(path, header, error)) from error
     except (PlyParseError, ValueError, OSError, OverflowError, MemoryError) as error:
-        raise InputError(f"{path}: cannot be read as a PLY: {error}") from error
+        raise InputError(f"cannot be read as a PLY: {error}", path=path) from error
     return [ply[name].data for name in names]
 
 
@@ -150,7 +154,7 @@ def row_blocks(
             continue
         block = np.fromfile(path, every.dtype, count, offset=every.offset + first * every.itemsize)
         if len(block) < count:
-            raise InputError(f"{path}: became shorter while it was read")
+            raise InputError("became shorter while it was read", path=path)
         yield first, block
 
 
@@ -184,4 +188,4 @@ def require(path: Path, present: list[str], wanted: list[str], what: str) -> Non
     """Raise InputError naming the `wanted` properties that are not `present`."""
     missing = [name for name in wanted if name not in present]
     if missing:
-        raise InputError(f"{path}: {what} needs the vertex property {', '.join(map(repr, missing))}")
+        raise InputError(f"{what} needs the vertex property {', '.join(map(repr, missing))}", path=path)

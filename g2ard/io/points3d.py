@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import InputError
+from g2ard.errors import DAMAGED, InputError
 from g2ard.io.cloud_ply import finite_cloud
 from g2ard.io.colmap import model_folder, number, parsing, text_lines
 from g2ard.io.records import Record
@@ -30,7 +30,7 @@ def read(path: Path) -> Cloud:
         folder = model_folder(path) or path
         found = next((p for s in (".bin", ".txt") if (p := folder / f"points3D{s}").is_file()), None)
         if found is None:
-            raise InputError(f"{folder}: no points3D.bin or points3D.txt")
+            raise InputError("no points3D.bin or points3D.txt", path=folder)
         path = found
     with parsing(path):
         positions, rgb = (_binary if path.suffix == ".bin" else _text)(path)
@@ -42,14 +42,14 @@ def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     data = path.read_bytes()
     (count,) = _COUNT.read(path, "table", 0, data, 0)
     if count * _POINT.size > len(data):
-        raise InputError(f"{path}: truncated: {count:,} points promised")
+        raise InputError(f"truncated: {count:,} points promised", path=path, hint=DAMAGED)
     positions, rgb, at = np.empty((count, 3)), np.empty((count, 3), np.uint8), _COUNT.size
     for i in range(count):
         _key, x, y, z, r, g, b, _error, track = _POINT.read(path, "point", i, data, at)
         positions[i], rgb[i] = (x, y, z), (r, g, b)
         at += _POINT.size + 8 * track
         if at > len(data):
-            raise InputError(f"{path}: truncated in TRACK of point {i:,} of {count:,}")
+            raise InputError(f"truncated in TRACK of point {i:,} of {count:,}", path=path, hint=DAMAGED)
     return positions, rgb
 
 
@@ -60,7 +60,7 @@ def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         if "_" in line or not line.isascii():  # float() takes 1_0, and digits of other scripts
             for name, word in zip(_COLUMNS, rows[i][1:7], strict=False):
                 if "_" in word or not word.isascii():
-                    raise InputError(f"{path}: malformed point {i}: {name} is {word!r}")
+                    raise InputError(f"malformed point {i}: {name} is {word!r}", path=path)
     try:
         values = np.array([words[1:7] for words in rows], np.float64).reshape(-1, 6)
     except ValueError:
@@ -72,5 +72,5 @@ def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     if not inside.all():
         i, channel = (int(at) for at in np.argwhere(~inside)[0])
         found = f"{_COLUMNS[3 + channel]} is {rows[i][4 + channel]!r}"
-        raise InputError(f"{path}: malformed point {i}: {found}, expected 0 to 255")
+        raise InputError(f"malformed point {i}: {found}, expected 0 to 255", path=path)
     return values[:, :3], values[:, 3:].astype(np.uint8)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from g2ard.errors import InputError
+from g2ard.errors import DAMAGED, InputError
 
 __all__ = ["Record"]
 
@@ -41,7 +41,7 @@ class Record:
         except struct.error:
             ends = zip(self._names, self._ends, strict=True)
             name = next(name for name, end in ends if at + end > len(data))
-            raise InputError(f"{path}: truncated in {name} of {entry} {i:,}") from None
+            raise InputError(f"truncated in {name} of {entry} {i:,}", path=path, hint=DAMAGED) from None
 
     def read_finite(self, path: Path, entry: str, i: int, data: bytes, at: int) -> tuple[Any, ...]:
         """As `read`.
@@ -52,5 +52,5 @@ class Record:
         values = self.read(path, entry, i, data, at)
         for name, value in zip(self._names, values, strict=True):
             if not math.isfinite(value):
-                raise InputError(f"{path}: malformed {entry} {i:,}: {name} is {value}")
+                raise InputError(f"malformed {entry} {i:,}: {name} is {value}", path=path)
         return values

@@ -134,10 +134,11 @@ class Tally:
             InputError: there were none, or none is left.
         """
         if not self.rows:
-            raise InputError(f"{path}: holds no Gaussians")
+            raise InputError("holds no Gaussians", path=path)
         if self.dropped == self.rows:
             raise InputError(
-                f"{path}: none of its {plural(self.rows, 'Gaussian')} is finite; take an earlier state of it"
+                f"none of its {plural(self.rows, 'Gaussian')} is finite; take an earlier state of it",
+                path=path,
             )
         notes = []
         if self.dropped:

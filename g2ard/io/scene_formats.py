@@ -56,7 +56,7 @@ def scene_format(path: str | Path) -> SceneFormat:
         if name.endswith(found.suffix):
             return found
     known = ", ".join(f.suffix for f in FORMATS.values())
-    raise OutputError(f"{path}: scenes are written as {known}, or as a SOG folder (NAME/meta.json)")
+    raise OutputError(f"scenes are written as {known}, or as a SOG folder (NAME/meta.json)", path=path)
 
 
 def check_options(path: str | Path, options: dict[str, object]) -> SceneFormat:
@@ -68,5 +68,5 @@ def check_options(path: str | Path, options: dict[str, object]) -> SceneFormat:
     found = scene_format(path)
     for name in options:
         if name not in found.options:
-            raise OutputError(f"{path}: {found.suffix} has no option {name!r}")
+            raise OutputError(f"{found.suffix} has no option {name!r}", path=path)
     return found

@@ -98,9 +98,9 @@ def read_settings(path: Path) -> Settings:
     try:
         return Settings(path.read_text(encoding="utf-8").splitlines())
     except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from error
+        raise InputError(f"{error.strerror}", path=path) from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file") from error
+        raise InputError("not a text file", path=path) from error
 
 
 def below(start: Path, path: Path) -> Path | None:

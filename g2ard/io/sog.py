@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g2ard.errors import InputError
+from g2ard.errors import DAMAGED, InputError
 from g2ard.io.paths import check_regular
 from g2ard.io.sog_chunk import Chunk, Decoder, count_of, meta_errors, rest_of
 
@@ -160,17 +160,17 @@ def _opened(path: Path) -> Iterator[list[Chunk]]:
         with zipfile.ZipFile(path) as bundle:
             inside = [name for name in bundle.namelist() if name.rpartition("/")[2] == "meta.json"]
             if not inside:
-                raise InputError(f"{path}: no meta.json in it")
+                raise InputError("no meta.json in it", path=path)
             prefix = min(inside, key=len).removesuffix("meta.json")
             load = _bundle_loader(path, bundle, prefix)
             meta = parse_json(f"{path}: meta.json", load("meta.json"))
             if not isinstance(meta, dict):
-                raise InputError(f"{path}: meta.json: expected a JSON object")
+                raise InputError("meta.json: expected a JSON object", path=path)
             yield [Chunk(f"{path}: ", Fields(meta), load)]
     except InputError:
         raise
     except (zipfile.BadZipFile, EOFError, OSError, ValueError, struct.error, OverflowError) as error:
-        raise InputError(f"{path}: not a whole .sog archive ({error})") from error
+        raise InputError(f"not a whole .sog archive ({error})", path=path, hint=DAMAGED) from error
 
 
 def _bundle_loader(path: Path, bundle: zipfile.ZipFile, prefix: str) -> Callable[[str], bytes]:
@@ -183,7 +183,7 @@ def _bundle_loader(path: Path, bundle: zipfile.ZipFile, prefix: str) -> Callable
         try:
             return bundle.read(info)
         except (zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError, zlib.error) as error:
-            raise InputError(f"{path}: {name}: not whole in the .sog archive ({error})") from error
+            raise InputError(f"{name}: not whole in the .sog archive ({error})", path=path) from error
 
     return load
 

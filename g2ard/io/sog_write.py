@@ -147,7 +147,7 @@ def _size(path: Path, count: int) -> tuple[int, int]:
     width = math.ceil(math.sqrt(count) / 4) * 4
     height = math.ceil(count / width / 4) * 4
     if max(width, height) > _LONGEST:
-        raise InputError(f"{path}: not written: {count:,} Gaussians are more than an image of SOG holds")
+        raise InputError(f"not written: {count:,} Gaussians are more than an image of SOG holds", path=path)
     return width, height
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import InputError
+from g2ard.errors import DAMAGED, InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.packing import world_means, writable
 from g2ard.io.sanitize import Raw, cleaned
@@ -58,7 +58,9 @@ class _SplatStream(SceneStream):
 def _count(path: Path) -> int:
     size = path.stat().st_size
     if not size or size % _ROW.itemsize:
-        raise InputError(f"{path}: not a whole .splat: {size:,} bytes are not a multiple of 32")
+        raise InputError(
+            f"not a whole .splat: {size:,} bytes are not a multiple of 32", path=path, hint=DAMAGED
+        )
     return size // _ROW.itemsize
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import InputError, MissingDependencyError
+from g2ard.errors import DAMAGED, InputError, MissingDependencyError
 from g2ard.io.limits import check_unpacked
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
@@ -48,9 +48,11 @@ def read(path: Path) -> Scene:
     if data[:2] == b"\x1f\x8b":
         data = _gunzip(path, data)
     if data[:4] == MAGIC and len(data) < _HEADER:
-        raise InputError(f"{path}: truncated: its header has {_HEADER} bytes, {len(data)} are there")
+        raise InputError(
+            f"truncated: its header has {_HEADER} bytes, {len(data)} are there", path=path, hint=DAMAGED
+        )
     if data[:4] != MAGIC:
-        raise InputError(f"{path}: not an SPZ file (begins with {data[:4]!r})")
+        raise InputError(f"not an SPZ file (begins with {data[:4]!r})", path=path)
     sizes = _sizes(path, data)
     version, count, degree, fraction_bits, flags, stream_count = struct.unpack_from("<IIBBBB", data, 4)
     stored = _COEFFICIENTS[degree]
@@ -86,7 +88,7 @@ def _gunzip(path: Path, data: bytes) -> bytes:
         check_unpacked(str(path), len(data), promised)
         body = stream.decompress(stream.unconsumed_tail, promised) if promised else b""
     except zlib.error as error:
-        raise InputError(f"{path}: truncated or broken gzip stream ({error})") from error
+        raise InputError(f"truncated or broken gzip stream ({error})", path=path, hint=DAMAGED) from error
     return head + body
 
 
@@ -94,14 +96,14 @@ def _sizes(path: Path, head: bytes) -> list[int]:
     """Bytes of the positions, alphas, colours, scales, rotations and harmonics that a header promises."""
     version, count, degree, fraction_bits = struct.unpack_from("<IIBB", head, 4)
     if head[:4] != MAGIC:
-        raise InputError(f"{path}: not an SPZ file (begins with {head[:4]!r})")
+        raise InputError(f"not an SPZ file (begins with {head[:4]!r})", path=path)
     if version not in (2, 3, 4):
-        raise InputError(f"{path}: SPZ version {version} is not known (2, 3 and 4 are)")
+        raise InputError(f"SPZ version {version} is not known (2, 3 and 4 are)", path=path)
     if degree >= len(_COEFFICIENTS):
-        raise InputError(f"{path}: SH degree {degree} is not known (0 to 4 are)")
+        raise InputError(f"SH degree {degree} is not known (0 to 4 are)", path=path)
     if fraction_bits > _POSITION_BITS:
         raise InputError(
-            f"{path}: fractionalBits is {fraction_bits}, more than the {_POSITION_BITS} bits of a position"
+            f"fractionalBits is {fraction_bits}, more than the {_POSITION_BITS} bits of a position", path=path
         )
     rotation = 3 if version == 2 else 4
     return [9 * count, count, 3 * count, 3 * count, rotation * count, 3 * _COEFFICIENTS[degree] * count]
@@ -111,7 +113,9 @@ def _slices(path: Path, data: bytes, sizes: list[int]) -> list[bytes]:
     """Versions 2 and 3: the attributes follow the 16-byte header one after the other."""
     ends = 16 + np.cumsum(sizes)
     if len(data) < ends[-1]:
-        raise InputError(f"{path}: truncated: {ends[-1]:,} bytes promised, {len(data):,} there")
+        raise InputError(
+            f"truncated: {ends[-1]:,} bytes promised, {len(data):,} there", path=path, hint=DAMAGED
+        )
     return [data[end - size : end] for end, size in zip(ends, sizes, strict=True)]
 
 
@@ -123,19 +127,23 @@ def _zstd_streams(path: Path, data: bytes, stream_count: int, sizes: list[int]) 
         (table,) = struct.unpack_from("<I", data, 16)
         entries = [struct.unpack_from("<QQ", data, table + 16 * i) for i in range(stream_count)]
     except struct.error as error:
-        raise InputError(f"{path}: truncated: its table of streams is cut off") from error
+        raise InputError("truncated: its table of streams is cut off", path=path, hint=DAMAGED) from error
     streams, start = [], table + 16 * stream_count
     for i, size in enumerate(sizes):
         packed, unpacked = entries[i] if i < stream_count else (0, 0)
         if unpacked != size:
-            raise InputError(f"{path}: stream {i} holds {unpacked:,} bytes, expected {size:,}")
+            raise InputError(
+                f"stream {i} holds {unpacked:,} bytes, expected {size:,}", path=path, hint=DAMAGED
+            )
         if start + packed > len(data):
-            raise InputError(f"{path}: truncated in stream {i}")
+            raise InputError(f"truncated in stream {i}", path=path, hint=DAMAGED)
         streams.append(decompress(data[start : start + packed], size) if size else b"")
         start += packed
     for i, (stream, size) in enumerate(zip(streams, sizes, strict=True)):
         if len(stream) != size:
-            raise InputError(f"{path}: stream {i} unpacks to {len(stream):,} bytes, expected {size:,}")
+            raise InputError(
+                f"stream {i} unpacks to {len(stream):,} bytes, expected {size:,}", path=path, hint=DAMAGED
+            )
     return streams
 
 
@@ -151,7 +159,7 @@ def zstandard(path: Path) -> Any:
         else:
             from backports import zstd
     except ImportError as error:
-        raise MissingDependencyError(f"{path}: SPZ version 4 needs `pip install g2ard[spz]`") from error
+        raise MissingDependencyError("SPZ version 4 needs `pip install g2ard[spz]`", path=path) from error
     return zstd
 
 
@@ -163,7 +171,7 @@ def _zstd(path: Path) -> Callable[[bytes, int], bytes]:
         try:
             return bytes(zstd.ZstdDecompressor().decompress(frame, max_length=size + 1))
         except zstd.ZstdError as error:
-            raise InputError(f"{path}: broken Zstandard stream ({error})") from error
+            raise InputError(f"broken Zstandard stream ({error})", path=path, hint=DAMAGED) from error
 
     return decompress
 

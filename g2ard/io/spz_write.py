@@ -51,7 +51,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False, version: int =
         MissingDependencyError: version 4 before Python 3.14 without `pip install g2ard[spz]`.
     """
     if version not in VERSIONS:
-        raise InputError(f"{path}: SPZ version {version} is not written (2, 3 and 4 are)")
+        raise InputError(f"SPZ version {version} is not written (2, 3 and 4 are)", path=path)
     splats = writable(path, splats)
     splats = splats.take(morton_order(splats.means))
     means = world_means(path, splats, ".spz")
@@ -85,8 +85,9 @@ def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats) -> int
     bits = min(max(_USUAL_BITS, wanted), _MOST_BITS, room)
     if bits < 0 or 2.0**-bits > max(float(np.median(middle)), 2.0**-_USUAL_BITS):
         raise InputError(
-            f"{path}: .spz holds steps of {2.0**-bits:g} at {farthest:g} from the origin; "
-            "write another format, or drop the offset with `g2ard convert --recentre`"
+            f".spz holds steps of {2.0**-bits:g} at {farthest:g} from the origin; "
+            "write another format, or drop the offset with `g2ard convert --recentre`",
+            path=path,
         )
     return bits
 

@@ -119,7 +119,7 @@ def open_stream(path: str | Path | Sequence[str | Path]) -> SceneStream:
         stream: SceneStream = import_module(f"g2ard.io.{_STREAMED[found]}").stream(path)
         return stream
     if kind(path) != "splats":
-        raise InputError(f"{path}: a Gaussian scene is needed, this is {kind(path)}")
+        raise InputError(f"a Gaussian scene is needed, this is {kind(path)}", path=path)
     return _whole(path)
 
 
@@ -245,6 +245,6 @@ def file_identity(files: Sequence[Path]) -> list[Any]:
                 file.seek(max(0, state.st_size - _ENDS))
                 digest.update(file.read(_ENDS))
         except OSError as error:
-            raise InputError(f"{path}: {error.strerror}") from error
+            raise InputError(f"{error.strerror}", path=path) from error
         identity.append([path.name, state.st_size, state.st_mtime_ns, digest.hexdigest()])
     return identity

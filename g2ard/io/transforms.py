@@ -65,7 +65,7 @@ def _frames(path: Path, images: Path | None, split: str | None = None) -> list[F
     content = read_json(path)
     listed = content.get("frames")
     if not isinstance(listed, list) or not listed:
-        raise InputError(f"{path}: no views found ('frames' is empty)")
+        raise InputError("no views found ('frames' is empty)", path=path)
     found = [_frame(path, i, content, frame, images) for i, frame in enumerate(listed)]
     stated = _stated(path, content)
     if not stated:
@@ -80,11 +80,11 @@ def _stated(path: Path, content: dict[str, Any]) -> dict[str, str]:
     for split in ("train", "val", "test"):
         names = content.get(f"{split}_filenames", ())
         if not isinstance(names, list | tuple):
-            raise InputError(f"{path}: '{split}_filenames' is not a list")
+            raise InputError(f"'{split}_filenames' is not a list", path=path)
         for listed in names:
             name = Path(str(listed)).as_posix()
             if stated.setdefault(name, split) != split and stated[name] == "train":
-                raise InputError(f"{path}: {name!r} is in both train_filenames and {split}_filenames")
+                raise InputError(f"{name!r} is in both train_filenames and {split}_filenames", path=path)
     return stated
 
 
@@ -119,7 +119,7 @@ def _from_matrix_city(path: Path, frame: dict[str, Any]) -> dict[str, Any]:
 
 def _there(where: str, mask: Path) -> Path:
     if not mask.is_file():
-        raise InputError(f"{where}: its mask {mask} does not exist")
+        raise InputError(f"its mask {mask} does not exist", path=where)
     return mask
 
 
@@ -133,13 +133,13 @@ def _intrinsics(where: str, values: dict[str, Any], photo: Path) -> dict[str, An
     if model not in _MODELS or values.get("is_fisheye"):
         known = ", ".join(_MODELS)
         raise InputError(
-            f"{where}: a {model} lens, or a fisheye, is not supported ({known} are); undistort the photos"
+            f"a {model} lens, or a fisheye, is not supported ({known} are); undistort the photos", path=where
         )
     width, height = _size(where, values, photo)
     fx = _focal(values, "x", width)
     fy = _focal(values, "y", height) or fx
     if fx is None or fy is None:
-        raise InputError(f"{where}: no focal length (fl_x or camera_angle_x)")
+        raise InputError("no focal length (fl_x or camera_angle_x)", path=where)
     cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
     return {
         "K": np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
@@ -166,4 +166,4 @@ def _size(where: str, values: dict[str, Any], photo: Path) -> tuple[int, int]:
         return pixels(where, values, "w"), pixels(where, values, "h")
     if photo.is_file():
         return photo_size(where, photo)
-    raise InputError(f"{where}: neither w and h nor its photo is there to tell the size")
+    raise InputError("neither w and h nor its photo is there to tell the size", path=where)

@@ -52,9 +52,11 @@ class Points:
 
     def __post_init__(self) -> None:
         if self.positions.ndim != 2 or self.positions.shape[1] != 3:
-            raise InputError(f"positions: expected shape (N, 3), got {self.positions.shape}")
+            raise InputError(f"expected shape (N, 3), got {self.positions.shape}", parameter="positions")
         if self.colors.shape != self.positions.shape:
-            raise InputError(f"colors: expected shape {self.positions.shape}, got {self.colors.shape}")
+            raise InputError(
+                f"expected shape {self.positions.shape}, got {self.colors.shape}", parameter="colors"
+            )
 
     def __len__(self) -> int:
         return len(self.positions)

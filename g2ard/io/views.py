@@ -38,12 +38,12 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     """
     content = read_json(path)
     if content.get("format") != _FORMAT:
-        raise InputError(f"{path}: not g2ard's views ('format' is {content.get('format')!r})")
+        raise InputError(f"not g2ard's views ('format' is {content.get('format')!r})", path=path)
     if content.get("version") != _VERSION:
-        raise InputError(f"{path}: version {content.get('version')!r} is not known ({_VERSION} is)")
+        raise InputError(f"version {content.get('version')!r} is not known ({_VERSION} is)", path=path)
     views = content.get("views")
     if not isinstance(views, list) or not views:
-        raise InputError(f"{path}: no views found ('views' is empty)")
+        raise InputError("no views found ('views' is empty)", path=path)
     return view_set(path, [_frame(path, i, view, images) for i, view in enumerate(views)])
 
 
@@ -56,12 +56,12 @@ def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
         mask = view.get("mask")
         weight = view.get("weight")
         if weight is not None and not (np.isfinite(weight) and weight >= 0):
-            raise InputError(f"{where}: weight {weight!r} is not a number ≥ 0")
+            raise InputError(f"weight {weight!r} is not a number ≥ 0", path=where)
         split, name = view.get("split"), view["name"]
         if not isinstance(name, str):
-            raise InputError(f"{where}: name {name!r} is not a string")
+            raise InputError(f"name {name!r} is not a string", path=where)
         if split is not None and not isinstance(split, str):
-            raise InputError(f"{where}: split {split!r} is not a string")
+            raise InputError(f"split {split!r} is not a string", path=where)
         return Frame(
             name=name,
             viewmat=_exact(where, np.array(view["camera_from_world"], np.float64)),
@@ -108,7 +108,7 @@ def write(
     parts = list(splits) or [None] * count
     if not count or len(parts) != count or len(drawn) != count:
         raise InputError(
-            f"{path}: {plural(count, 'view')}, {len(parts)} splits and {len(drawn)} weights do not fit"
+            f"{plural(count, 'view')}, {len(parts)} splits and {len(drawn)} weights do not fit", path=path
         )
     lines = []
     for i in range(count):

@@ -107,9 +107,9 @@ def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None =
     ([[1, 0], [1, 1]], [-1.0, -1.0, -2.0], [10.0, 1.0, 2.0])
     """
     if not levels or not all(len(level) for level in levels):
-        raise InputError("levels: expected at least one, and none of them empty")
+        raise InputError("expected at least one, and none of them empty", parameter="levels")
     if any((level.offset != levels[0].offset).any() for level in levels):
-        raise InputError("levels: their offsets differ")
+        raise InputError("their offsets differ", parameter="levels")
     tree = _Tree(levels, rule or Cut(), scratch)
     rows = tree.room(len(tree.means))
     for at in _blocks(len(rows)):
@@ -148,7 +148,7 @@ class _Tree:
         for number, level in enumerate(self.levels):
             for block in [level.means] if isinstance(level, Splats) else level.positions():
                 if not np.isfinite(block).all():
-                    raise InputError(f"levels: a mean of level {number} is not finite")
+                    raise InputError(f"a mean of level {number} is not finite", parameter="levels")
                 self.means[at : at + len(block)] = block
                 at += len(block)
 

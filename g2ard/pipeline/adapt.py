@@ -66,14 +66,22 @@ class AdaptConfig:
 
     def __post_init__(self) -> None:
         if self.steps < 1 or not self.tolerance >= 0:
-            raise InputError(f"adapt: {self.steps} steps, tolerance {self.tolerance}: expected ≥ 1 and ≥ 0")
+            raise InputError(
+                f"{self.steps} steps, tolerance {self.tolerance}: expected ≥ 1 and ≥ 0", parameter="steps"
+            )
         if not 0 <= self.prior_views < float("inf"):
-            raise InputError(f"prior_views: expected a number of views, at least 0, got {self.prior_views}")
+            raise InputError(
+                f"expected a number of views, at least 0, got {self.prior_views}", parameter="prior_views"
+            )
         if self.schedule not in ADAPT_SCHEDULES:
-            raise InputError(f"schedule: expected {' or '.join(ADAPT_SCHEDULES)}, got {self.schedule!r}")
+            raise InputError(
+                f"expected {' or '.join(ADAPT_SCHEDULES)}, got {self.schedule!r}", parameter="schedule"
+            )
         require("first_stretch", self.first_stretch, self.first_stretch >= 1, "at least 1")
         if self.recovery is not None and self.recovery != appearance_only(self.recovery):
-            raise InputError("adapt: geometry stays: the rates of means, log_scales and quats are 0")
+            raise InputError(
+                "geometry stays: the rates of means, log_scales and quats are 0", parameter="recovery"
+            )
 
     def stretches(self) -> list[int]:
         """Steps of each stretch, doubling; what would be left over for a shorter one joins the last.

@@ -52,25 +52,28 @@ class Budget:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if isinstance(value, list | tuple):
-                raise InputError(f"{name}: one a call, got {value!r}; several take a call each, in a loop")
+                raise InputError(
+                    f"one a call, got {value!r}; several take a call each, in a loop", parameter=name
+                )
             if name != "fit" and value is not None and not isinstance(value, Real):
-                raise InputError(f"{name}: expected a number, got {value!r}")
+                raise InputError(f"expected a number, got {value!r}", parameter=name)
         quality = self.min_psnr if self.min_ssim is None else self.min_ssim
         if (self.count, self.ratio, self.share, self.fit, quality).count(None) != 4:
-            raise InputError("count, ratio, fit, min_psnr or min_ssim: expected exactly one kind of budget")
+            raise InputError("expected exactly one kind of budget: count, ratio, fit, min_psnr or min_ssim")
         if self.count is not None and self.count < 1:
-            raise InputError(f"count: expected at least 1, got {self.count}")
+            raise InputError(f"expected at least 1, got {self.count}", parameter="count")
         if self.ratio is not None and not (math.isfinite(self.ratio) and self.ratio >= 1):
-            raise InputError(f"ratio: expected at least 1, got {self.ratio}")
+            raise InputError(f"expected at least 1, got {self.ratio}", parameter="ratio")
         if self.share is not None and not 0 < self.share <= 1:
-            raise InputError(f"share: expected a number in (0, 1], got {self.share}")
+            raise InputError(f"expected a number in (0, 1], got {self.share}", parameter="share")
         if self.min_psnr is not None and not (math.isfinite(self.min_psnr) and self.min_psnr > 0):
-            raise InputError(f"min_psnr: expected decibels above 0, got {self.min_psnr}")
+            raise InputError(f"expected decibels above 0, got {self.min_psnr}", parameter="min_psnr")
         if self.min_ssim is not None and not 0 < self.min_ssim < 1:
-            raise InputError(f"min_ssim: expected a number in (0, 1), got {self.min_ssim}")
+            raise InputError(f"expected a number in (0, 1), got {self.min_ssim}", parameter="min_ssim")
         if self.fit is not None and self.fit.lower() not in DEVICES and not self.bytes:
             raise InputError(
-                f"fit: expected bytes such as 5MB or 800kB, or {', '.join(DEVICES)}, got {self.fit!r}"
+                f"expected bytes such as 5MB or 800kB, or {', '.join(DEVICES)}, got {self.fit!r}",
+                parameter="fit",
             )
 
     @property
@@ -106,7 +109,7 @@ class Budget:
         assert self.count is not None
         if self.count > total:
             raise InputError(
-                f"{name}: a budget of {self.count:,} is above its {plural(total, 'Gaussian')}; "
-                f"{total:,} at most"
+                f"a budget of {self.count:,} is above its {plural(total, 'Gaussian')}; {total:,} at most",
+                path=name,
             )
         return self.count

@@ -122,7 +122,9 @@ def prepare(
         scene = _points(budgets, options, progress, say)
     prior, lifted, beside, name = _prior(scene, options.beside, lifting, progress, say)
     if lifted and (options.views is None or is_made(options.views)):
-        raise InputError(f"{name}: a cloud is no teacher: its photos are needed as views")
+        raise InputError(
+            "a point cloud cannot render training images", path=name, hint="give its photos with {views}"
+        )
     cleaned, seed = None, options.seed
     if options.clean:
         found, _ = clutter_seen(prior, seed=seed, progress=progress, say=say)
@@ -225,10 +227,11 @@ def _aims(
 def _all_pictured(pictured: Sequence[bool], names: Sequence[str], lifted: bool) -> None:
     """Refuse a view without a photo where only photos can be targets."""
     if not all(pictured):
-        instead = (
-            "give views with photos, or a trained scene" if lifted else "photos=None takes renders there"
+        scene = "a trained scene" if lifted else "leave out {photos} to render the scene there"
+        raise InputError(
+            f"view {names[list(pictured).index(False)]} has no photo",
+            hint=f"give views with photos, or {scene}",
         )
-        raise InputError(f"view {names[list(pictured).index(False)]} has no photo; {instead}")
 
 
 def _config(
@@ -260,7 +263,7 @@ def _config(
 def _points(budgets: Sequence[Budget], options: DistillOptions, progress: Progress, say: Say) -> Points:
     """A start from photos alone."""
     if options.views is None or is_made(options.views):
-        raise InputError("scene: without one, photos with poses are needed as views")
+        raise InputError("without one, photos with poses are needed as views", parameter="scene")
     from g2ard.policy.photos import points_of_photos
 
     wanted = max((budget.count for budget in budgets if budget.count is not None), default=None)

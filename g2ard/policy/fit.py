@@ -144,7 +144,7 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
     if fits[0]:
         return fits[0]
     if over[0] <= fewest:
-        raise InputError(f"{name}: {wanted:,} bytes hold hardly a Gaussian; {over[1]:,} hold {over[0]:,}")
+        raise InputError(f"{wanted:,} bytes hold hardly a Gaussian; {over[1]:,} hold {over[0]:,}", path=name)
     return max(fewest, int(over[0] * _AIM * wanted / over[1]))
 
 

@@ -67,8 +67,9 @@ def say_regions(splats: Splats, config: SimplifyConfig, name: str, say: Say) -> 
         inside = int(in_any(splats, config.keep_region).sum())
         if not inside:
             raise InputError(
-                f"keep_region: none of the {len(splats):,} Gaussians of {name} lies there; "
-                "`g2ard info` tells where they are"
+                f"none of the {len(splats):,} Gaussians of {name} lies there; "
+                "`g2ard info` tells where they are",
+                parameter="keep_region",
             )
         share = inside / len(splats)
         times = f"{config.keep_times:g} times"

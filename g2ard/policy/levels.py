@@ -160,7 +160,7 @@ def check_ratios(ratios: Sequence[float]) -> None:
     rising = all(a < b for a, b in pairwise(ratios))
     if not ratios or not rising or not all(1 <= ratio < math.inf for ratio in ratios):
         given = ", ".join(f"{ratio:g}" for ratio in ratios)
-        raise InputError(f"ratios: expected rising numbers of at least 1, got {given}")
+        raise InputError(f"expected rising numbers of at least 1, got {given}", parameter="ratios")
 
 
 def _level(

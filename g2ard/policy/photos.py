@@ -71,8 +71,12 @@ def points_of_photos(
     sparse = None if not isinstance(views, str | Path) else sparse_points(Path(views))
     found = len(sparse) if sparse is not None else 0
     if count is None and sparse is None:
-        what = "to take a ratio of" if asked in ("ratio", "share") else f"that {asked} could be measured on"
-        raise InputError(f"{views}: no sparse points {what}: give a count")
+        raise InputError(
+            "has no sparse points to measure that on",
+            parameter=asked,
+            path=str(views),
+            hint="give {count=COUNT}",
+        )
     wanting = max(0, (count or 0) - found)
     parts = [] if sparse is None else [sparse]
     if wanting:

@@ -71,7 +71,9 @@ def photos_of(
         )
     if (intrinsics is None) == (focal is None):
         raise InputError(
-            f"{path}: photos without views need their intrinsics: views that hold them, or focal=PIXELS"
+            "photos without views need their intrinsics",
+            path=path,
+            hint="give {intrinsics=VIEWS} or {focal=PIXELS}",
         )
     names = [file.relative_to(path).as_posix() for file in files]
     sizes = _sizes(files)

@@ -199,7 +199,7 @@ def bytes_of(text: str) -> int:
         0.0 if match is None else float(match[1]) * base ** ["", "k", "m", "g", "t"].index(match[2].lower())
     )
     if size < 1e6:
-        raise InputError(f"memory: expected a size such as 4GB or 800MB, got {text!r}")
+        raise InputError(f"expected a size such as 4GB or 800MB, got {text!r}", parameter="memory")
     return int(size)
 
 

@@ -139,7 +139,7 @@ def _estimated(scene: Splats, up: Sequence[float] | None) -> NDArray[np.float64]
     if up is not None:
         axis = np.asarray(up, np.float64)
         if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
-            raise InputError(f"up: expected three finite numbers, not all zero, got {up!r}")
+            raise InputError(f"expected three finite numbers, not all zero, got {up!r}", parameter="up")
         return axis / np.linalg.norm(axis)
     try:
         return Site.of(scene, None, _ROWS).up.axis
@@ -175,7 +175,7 @@ def _chosen(cameras: Cameras, points: NDArray[np.float64], name: str | None) -> 
     if name is None:
         return int(np.argmax([view.holds(points).mean() for view in cameras]))
     if name not in cameras.names:
-        raise InputError(f"start: no view {name!r} among {', '.join(cameras.names[:4])}, …")
+        raise InputError(f"no view {name!r} among {', '.join(cameras.names[:4])}, …", parameter="start")
     return cameras.names.index(name)
 
 

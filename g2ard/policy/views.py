@@ -124,7 +124,9 @@ def views_of(
         apart = _near(prior, size, up, seed, progress, represents) if teach else None
         return RunViews(train, test.cameras, apart)
     if not teach:
-        raise InputError("photos=True: a pool of made views has no photos; give views that have them")
+        raise InputError(
+            "generated views have no photos", parameter="photos", hint="give {views} that have them"
+        )
     held = None if held_out is None else load_held_out(held_out, size, say, unpictured=teach)
     planned = _planned(prior, _POOL, up, seed, progress, _GROW, represents)
     apart = planned.apart and planned.apart.resized(size)

@@ -105,11 +105,11 @@ def plan_pool(
     """
     lens = _lens(size, _FOV if fov is None else fov)
     if count < 1:
-        raise InputError(f"count: expected at least 1 pose, got {count}")
+        raise InputError(f"expected at least 1 pose, got {count}", parameter="count")
     if rows is not None and rows < 1:
-        raise InputError(f"rows: expected at least 1, got {rows}")
+        raise InputError(f"expected at least 1, got {rows}", parameter="rows")
     if kind not in POOL_KINDS:
-        raise InputError(f"kind: expected one of {', '.join(POOL_KINDS)}, got {kind!r}")
+        raise InputError(f"expected one of {', '.join(POOL_KINDS)}, got {kind!r}", parameter="kind")
     progress("scene", 0, 1)
     site = Site.of(splats, up, rows, represents)
     progress("scene", 1, 1)
@@ -197,9 +197,9 @@ def _planned(
 
 def _lens(size: tuple[int, int], fov: float) -> Lens:
     if min(size) < 1:
-        raise InputError(f"size: expected at least 1×1 pixels, got {size[0]}×{size[1]}")
+        raise InputError(f"expected at least 1×1 pixels, got {size[0]}×{size[1]}", parameter="size")
     if not 0 < fov < 180:
-        raise InputError(f"fov: expected degrees between 0 and 180, got {fov}")
+        raise InputError(f"expected degrees between 0 and 180, got {fov}", parameter="fov")
     return Lens((int(size[0]), int(size[1])), float(fov))
 
 

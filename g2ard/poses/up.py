@@ -61,7 +61,7 @@ def given_up(sample: Sample, up: ArrayLike) -> Up:
     """
     axis = np.asarray(up, np.float64)
     if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
-        raise InputError(f"up: expected three finite numbers, not all zero, got {up!r}")
+        raise InputError(f"expected three finite numbers, not all zero, got {up!r}", parameter="up")
     axis = axis / np.linalg.norm(axis)
     layer, _ = _layer(sample, axis)
     return Up(axis, _is_flat(sample)[0] or layer > _GROUND_GIVEN, "up as given")

@@ -57,9 +57,11 @@ class RasterSettings:
 
     def __post_init__(self) -> None:
         if self.convention not in CONVENTIONS:
-            raise InputError(f"convention: expected {' or '.join(CONVENTIONS)}, got {self.convention!r}")
+            raise InputError(
+                f"expected {' or '.join(CONVENTIONS)}, got {self.convention!r}", parameter="convention"
+            )
         if not 1 / 255 <= self.alpha_max < 1:
-            raise InputError(f"alpha_max: expected a value in [1/255, 1), got {self.alpha_max}")
+            raise InputError(f"expected a value in [1/255, 1), got {self.alpha_max}", parameter="alpha_max")
 
     def near_of(self, index: int) -> float:
         """The near plane of camera `index`."""
@@ -181,9 +183,9 @@ class Renderer:
     ) -> None:
         self._background = [float(c) for c in background]
         if len(self._background) != 3:
-            raise InputError(f"background: expected 3 numbers, got {len(self._background)}")
+            raise InputError(f"expected 3 numbers, got {len(self._background)}", parameter="background")
         if settings is not None and not isinstance(settings.near, int | float | None):
-            raise InputError("near: expected one distance, for all views of a renderer")
+            raise InputError("expected one distance, for all views of a renderer", parameter="near")
         self._offset, middle = splats.offset, middle_of(splats)
         if middle is not None:
             splats = splats.recentred(splats.offset + middle)

@@ -117,7 +117,8 @@ def check_crops(crops: Sequence[Crop], names: Sequence[str]) -> None:
         if crop.view is not None and crop.view not in names:
             few = ", ".join(names[:4]) + (", …" if len(names) > 4 else "")
             raise InputError(
-                f"crop {crop.view}: not among the {plural(len(names), 'view')} that are scored ({few})"
+                f"{crop.view} is not among the {plural(len(names), 'view')} that are scored ({few})",
+                parameter="crop",
             )
 
 

@@ -44,7 +44,7 @@ def painted(splats: Splats, colors: ArrayLike) -> Splats:
     """
     paint = np.asarray(colors, np.float64)
     if paint.shape != (len(splats), 3):
-        raise InputError(f"colors: expected shape ({len(splats)}, 3), got {paint.shape}")
+        raise InputError(f"expected shape ({len(splats)}, 3), got {paint.shape}", parameter="colors")
     luma = np.clip(splats.colors.astype(np.float64) @ _LUMA, 0, 1)
     shaded = paint * (1 - _SHADE + _SHADE * luma[:, None])
     sh0 = np.ascontiguousarray(((shaded - 0.5) / SH_C0)[:, None], np.float32)
@@ -89,7 +89,9 @@ def cell_labels(splats: Splats, count: int) -> NDArray[np.int64]:
         InputError: no Gaussian, or a count below 1.
     """
     if count < 1 or not len(splats):
-        raise InputError(f"cells: {count} of {len(splats)} Gaussians: expected at least one of each")
+        raise InputError(
+            f"{count} of {len(splats)} Gaussians: expected at least one of each", parameter="cells"
+        )
     means = splats.means.astype(np.float64)
     origin, radius = _frame(means)
     arrays = (means - origin, splats.quats, splats.scales, splats.opacities)

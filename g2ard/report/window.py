@@ -29,7 +29,9 @@ class Window:
         spans = ((self.left, self.width), (self.top, self.height))
         if not all(start >= 0 and extent > 0 and start + extent <= 1 + 1e-6 for start, extent in spans):
             given = ",".join(f"{value:g}" for value in (self.left, self.top, self.width, self.height))
-            raise InputError(f"crop {given}: expected left, top, width and height in shares of the image")
+            raise InputError(
+                f"expected left, top, width and height in shares of the image, got {given}", parameter="crop"
+            )
 
     def pixels(self, height: int, width: int) -> tuple[slice, slice]:
         """Rows and columns of an image of that size; at least one of each."""
@@ -63,7 +65,9 @@ class Crop:
         try:
             left, top, width, height = (float(part) for part in numbers.split(","))
         except ValueError:
-            raise InputError(f"crop {text!r}: expected [VIEW:]LEFT,TOP,WIDTH,HEIGHT") from None
+            raise InputError(
+                f"expected [VIEW:]LEFT,TOP,WIDTH,HEIGHT, got {text!r}", parameter="crop"
+            ) from None
         return cls(Window(left, top, width, height), view or None)
 
     def __str__(self) -> str:

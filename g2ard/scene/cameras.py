@@ -71,7 +71,7 @@ class Camera:
             InputError: position and target coincide, or a field of view that is not between 0 and 180°.
         """
         if not 0 < fov < 180:
-            raise InputError(f"fov: expected degrees between 0 and 180, got {fov}")
+            raise InputError(f"expected degrees between 0 and 180, got {fov}", parameter="fov")
         focal = width / 2 / np.tan(np.radians(fov) / 2)
         K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
         return cls(look_at(position, target, up), K, width, height, name)
@@ -141,10 +141,10 @@ class Cameras:
         ):
             got = getattr(self, name).shape
             if got != shape:
-                raise InputError(f"{name}: expected shape {shape}, got {got}")
+                raise InputError(f"expected shape {shape}, got {got}", parameter=name)
         for name in ("names", "image_paths", "mask_paths"):
             if len(getattr(self, name)) != n:
-                raise InputError(f"{name}: expected {n}, got {len(getattr(self, name))}")
+                raise InputError(f"expected {n}, got {len(getattr(self, name))}", parameter=name)
         for i in range(n):
             given = (self.viewmats[i], self.Ks[i], self.distortions[i])
             if not all(np.isfinite(values).all() for values in given):
@@ -329,7 +329,7 @@ def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
     forward = np.asarray(target, np.float64) - eye
     length = np.linalg.norm(forward)
     if not length > 0:
-        raise InputError("look_at: position and target coincide")
+        raise InputError("position and target coincide", parameter="look_at")
     z = forward / length
     x = np.cross(z, np.asarray(up, np.float64))
     if np.linalg.norm(x) < 1e-9 * np.linalg.norm(up):  # looking along `up`: any right axis will do

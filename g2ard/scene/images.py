@@ -126,7 +126,7 @@ def _open(where: str, path: Path) -> NDArray[np.float32]:
                 return rgba[..., :3] * rgba[..., 3:]
             return np.asarray(image.convert("RGB"), np.float32) / np.float32(255)
     except FileNotFoundError as error:
-        raise InputError(f"{where}: no such photo; it must lie where its views name it") from error
+        raise InputError("no such photo; it must lie where its views name it", path=where) from error
 
 
 def _undistorted(
@@ -238,7 +238,7 @@ def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) ->
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if not values.size or not (values.ndim == 2 or (values.ndim == 3 and values.shape[2] in (3, 4))):
-        raise InputError(f"{path}: an array of shape {values.shape} is not an image")
+        raise InputError(f"an array of shape {values.shape} is not an image", path=path)
     with atomic_output(path, overwrite) as temporary:
         Image.fromarray(np.ascontiguousarray(values)).save(temporary, format="PNG")
 

@@ -75,7 +75,7 @@ def finite_rows_of(splats: Splats) -> tuple[PreparedScene, NDArray[np.bool_] | s
     everything = all(_all_finite(a) for a in arrays) and not np.isnan(splats.logit_opacities).any()
     finite = np.ones(len(splats), bool) if everything else splats.finite_rows()
     if not finite.any():
-        raise InputError(f"splats: none of {len(splats)} rows is finite")
+        raise InputError(f"none of {len(splats)} rows is finite", parameter="splats")
     scene = splats if everything else splats.take(finite)
     kind = np.float64 if scene.means.dtype == np.float64 else np.float32
     scales = np.ascontiguousarray(scene.scales, np.float32)

@@ -31,12 +31,12 @@ def check_region(region: Sequence[float]) -> Region:
     numbers = tuple(float(value) for value in region)
     if len(numbers) not in (4, 6) or not all(map(math.isfinite, numbers)):
         raise InputError(
-            f"region: expected X,Y,Z,R or X,Y,Z,X,Y,Z, got {', '.join(f'{n:g}' for n in numbers)}"
+            f"expected X,Y,Z,R or X,Y,Z,X,Y,Z, got {', '.join(f'{n:g}' for n in numbers)}", parameter="region"
         )
     if len(numbers) == 4 and not numbers[3] > 0:
-        raise InputError(f"region: expected a radius > 0, got {numbers[3]:g}")
+        raise InputError(f"expected a radius > 0, got {numbers[3]:g}", parameter="region")
     if len(numbers) == 6 and not all(low < high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
-        raise InputError("region: a box with nothing in it; the lower corner comes first")
+        raise InputError("a box with nothing in it; the lower corner comes first", parameter="region")
     return numbers
 
 
@@ -53,7 +53,9 @@ def as_regions(given: Sequence[Any]) -> tuple[Region, ...]:
         alone = len(given) > 0 and not np.ndim(given[0])
         return tuple(check_region(region) for region in ([given] if alone else given))
     except (TypeError, ValueError):
-        raise InputError(f"keep_region: expected (x, y, z, r) or (x, y, z, x, y, z), got {given!r}") from None
+        raise InputError(
+            f"expected (x, y, z, r) or (x, y, z, x, y, z), got {given!r}", parameter="keep_region"
+        ) from None
 
 
 def in_any(splats: Splats, regions: Sequence[Region]) -> NDArray[np.bool_]:

@@ -56,7 +56,7 @@ class Splats:
 
     def __post_init__(self) -> None:
         if self.means.ndim != 2 or self.means.shape[1] != 3:
-            raise InputError(f"means: expected shape (N, 3), got {self.means.shape}")
+            raise InputError(f"expected shape (N, 3), got {self.means.shape}", parameter="means")
         n = len(self.means)
         rest = self.shN.shape[1] if self.shN.ndim == 3 else -1
         for name, shape in (
@@ -68,9 +68,9 @@ class Splats:
         ):
             got = getattr(self, name).shape
             if got != shape:
-                raise InputError(f"{name}: expected shape {shape}, got {got}")
+                raise InputError(f"expected shape {shape}, got {got}", parameter=name)
         if rest not in _DEGREE_OF_REST:
-            raise InputError(f"shN: expected 0, 3, 8 or 15 coefficients, got {rest}")
+            raise InputError(f"expected 0, 3, 8 or 15 coefficients, got {rest}", parameter="shN")
 
     @classmethod
     def create(

@@ -58,10 +58,10 @@ def split_mask(
         return np.ones(len(names), bool)
     masks = _masks(views, names, stated)
     if which not in masks:
-        raise InputError(f"{views}: no split {which!r} (there are {', '.join(sorted(masks))})")
+        raise InputError(f"no split {which!r} (there are {', '.join(sorted(masks))})", path=views)
     if not masks[which].any():
         of = "its only view is not" if len(names) == 1 else f"none of its {len(names)} views is"
-        raise InputError(f"{views}: {of} in split {which!r}; a split.json beside them can say which are")
+        raise InputError(f"{of} in split {which!r}; a split.json beside them can say which are", path=views)
     return masks[which]
 
 
@@ -140,8 +140,9 @@ def for_scores(
     mask = np.array([split != "train" for split in splits_of(views, names, stated)], bool)
     if not mask.any():
         raise InputError(
-            f"{views}: all of its {len(names)} views are for training, none is left to score on; name views "
-            "with a test split"
+            f"all of its {len(names)} views are for training, none is left to score on; name views "
+            "with a test split",
+            path=views,
         )
     return mask
 
@@ -170,7 +171,9 @@ def _masks(
     masks = {word: _listed(names, wanted) for word, wanted in listed.items()}
     both = masks["train"] & masks["test"] if {"train", "test"} <= set(masks) else np.zeros(len(names), bool)
     if both.any():
-        raise InputError(f"{views}: split.json lists {names[int(np.argmax(both))]!r} as both train and test")
+        raise InputError(
+            f"split.json lists {names[int(np.argmax(both))]!r} as both train and test", path=views
+        )
     return masks
 
 
@@ -184,7 +187,9 @@ def _split_file(views: Path) -> dict[str, list[str]] | None:
     content: dict[str, Any] = read_json(path)
     lists = {key: value for key, value in content.items() if isinstance(value, list)}
     if not lists or not all(isinstance(name, str) for value in lists.values() for name in value):
-        raise InputError(f'{path}: expected lists of names, as in {{"train": ["a.jpg"], "test": ["b.jpg"]}}')
+        raise InputError(
+            'expected lists of names, as in {{"train": ["a.jpg"], "test": ["b.jpg"]}}', path=path
+        )
     return lists
 
 

@@ -165,7 +165,10 @@ class Photos(_Cached):
             (n for n, p in zip(cameras.names, cameras.image_paths, strict=True) if p is None), None
         )
         if missing is not None:
-            raise InputError(f"view {missing}: has no photo; TeacherRenders of a scene can stand in")
+            raise InputError(
+                f"view {missing} has no photo",
+                hint="give views with photos, or render them from {teacher=SCENE}",
+            )
         super().__init__(cameras, limit)
         self.source = "photos " + " ".join(str(path) for path in cameras.image_paths)
         if any(cameras.mask_paths):

@@ -64,15 +64,18 @@ def similarity(matrix: ArrayLike) -> tuple[float, NDArray[np.float64], NDArray[n
     """
     m = np.asarray(matrix, np.float64)
     if m.shape != (4, 4) or not np.isfinite(m).all() or not np.allclose(m[3], [0, 0, 0, 1]):
-        raise InputError("transform: expected 4×4 finite numbers, row-major, the last row 0 0 0 1")
+        raise InputError(
+            "expected 4×4 finite numbers, row-major, the last row 0 0 0 1", parameter="transform"
+        )
     det = float(np.linalg.det(m[:3, :3]))
     if det <= 0:
-        raise InputError(f"transform: mirrors or flattens the scene (its determinant is {det:g})")
+        raise InputError(f"mirrors or flattens the scene (its determinant is {det:g})", parameter="transform")
     scale = det ** (1 / 3)
     rotation = m[:3, :3] / scale
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
         raise InputError(
-            "transform: shears, or scales differently along different axes; Gaussians cannot follow"
+            "shears, or scales differently along different axes; Gaussians cannot follow",
+            parameter="transform",
         )
     u, _, v = np.linalg.svd(rotation)
     return scale, u @ v, m[:3, 3]
@@ -151,7 +154,7 @@ def join(scenes: Sequence[Splats]) -> Splats:
     [[0.0, 0.0, 0.0], [-99.0, 0.0, 0.0]]
     """
     if not scenes:
-        raise InputError("join: no scenes")
+        raise InputError("no scenes", parameter="scenes")
     degree = max(scene.sh_degree for scene in scenes)
     parts = [scene.recentred(scenes[0].offset).with_sh_degree(degree) for scene in scenes]
     names = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
@@ -168,7 +171,8 @@ def in_box(splats: Splats, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]
     low, high = (np.asarray(v, np.float64) for v in (low, high))
     if not (low <= high).all():
         raise InputError(
-            f"box: from {low.tolist()} to {high.tolist()} holds nothing; the lower corner comes first"
+            f"from {low.tolist()} to {high.tolist()} holds nothing; the lower corner comes first",
+            parameter="box",
         )
     world = splats.means.astype(np.float64) + splats.offset
     inside: NDArray[np.bool_] = np.all((world >= low) & (world <= high), axis=1)
@@ -182,7 +186,7 @@ def in_sphere(splats: Splats, center: ArrayLike, radius: float) -> NDArray[np.bo
         InputError: a radius that is not positive.
     """
     if not radius > 0:
-        raise InputError(f"sphere: expected a radius > 0, got {radius:g}")
+        raise InputError(f"expected a radius > 0, got {radius:g}", parameter="sphere")
     world = splats.means.astype(np.float64) + splats.offset
     away = world - np.asarray(center, np.float64)
     return (away * away).sum(axis=1) <= radius * radius

@@ -79,10 +79,10 @@ def find_clutter(
         InputError: an unknown kind, or `seen` or `looked` of another length.
     """
     if unknown := sorted(set(kinds) - set(KINDS)):
-        raise InputError(f"kinds: expected some of {', '.join(KINDS)}, got {unknown[0]!r}")
+        raise InputError(f"expected some of {', '.join(KINDS)}, got {unknown[0]!r}", parameter="kinds")
     for name, rows in (("seen", seen.weight), ("looked", looked)):
         if len(rows) != len(splats):
-            raise InputError(f"{name}: expected {len(splats)} rows, got {len(rows)}")
+            raise InputError(f"expected {len(splats)} rows, got {len(rows)}", parameter=name)
     kind = np.full(len(splats), -1, np.int8)
     hidden = _invisible(splats, seen, looked, pixels)
     finders = {

@@ -72,14 +72,14 @@ def lift(
     xyz = np.ascontiguousarray(points, np.float64)
     rgb = np.asarray(colors, np.float64)
     if xyz.ndim != 2 or xyz.shape[1] != 3:
-        raise InputError(f"points: expected shape (N, 3), got {xyz.shape}")
+        raise InputError(f"expected shape (N, 3), got {xyz.shape}", parameter="points")
     if rgb.shape != xyz.shape:
-        raise InputError(f"colors: expected shape {xyz.shape}, got {rgb.shape}")
+        raise InputError(f"expected shape {xyz.shape}, got {rgb.shape}", parameter="colors")
     if not 0 < opacity < 1:
-        raise InputError(f"opacity: expected a number between 0 and 1, got {opacity}")
+        raise InputError(f"expected a number between 0 and 1, got {opacity}", parameter="opacity")
     finite = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
     if not finite.any():
-        raise InputError(f"points: none of {len(xyz)} is finite")
+        raise InputError(f"none of {len(xyz)} is finite", parameter="points")
     if not finite.all():
         xyz, rgb = xyz[finite], rgb[finite]
     middle = _middle(xyz)

@@ -80,7 +80,7 @@ def use(device: str, *, timed: bool = False) -> None:
     True
     """
     if device not in ("cpu", "gpu", "auto"):
-        raise InputError(f"device: expected cpu, gpu or auto, got {device!r}")
+        raise InputError(f"expected cpu, gpu or auto, got {device!r}", parameter="device")
     _hush()
     _core.set_device(device, timed=timed)
 

@@ -93,8 +93,9 @@ def ingest(
     fewest = -(-feed.stream.count // MOST_TILES)
     if like is None and tile_rows < fewest:
         raise InputError(
-            f"tile_rows: {feed.stream.path} is {feed.stream.count:,} rows, too many for tiles of "
-            f"{tile_rows:,}; at least {fewest:,} each are needed"
+            f"{feed.stream.path} is {feed.stream.count:,} rows, too many for tiles of {tile_rows:,}; "
+            f"at least {fewest:,} each are needed",
+            parameter="tile_rows",
         )
     settings: dict[str, Any] = {"tile_rows": tile_rows} if like is None else {"like": like.key}
     if isinstance(feed, PointFeed):
@@ -183,8 +184,9 @@ def _check_tiles(folder: Path, key: str, settings: dict[str, Any], overwrite: bo
     known = {each for each in (manifest, *begun) if each is not None}
     if known - {key} and not overwrite:
         raise OutputError(
-            f"{folder}: holds tiles of another scene or of other settings{_differing(found, settings)}; "
-            "overwrite=True replaces it"
+            f"holds tiles of another scene or of other settings{_differing(found, settings)}",
+            path=folder,
+            hint="{overwrite=True} replaces it",
         )
     if manifest == key:
         say(f"{folder}: its tiles are damaged; written anew")

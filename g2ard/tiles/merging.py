@@ -129,7 +129,9 @@ def simplify_tiles(
         InputError: a budget below 1 or above what a renderer draws of the scene.
     """
     if not 1 <= budget <= store.count:
-        raise InputError(f"budget: expected 1 to the {store.count:,} Gaussians there are, got {budget:,}")
+        raise InputError(
+            f"expected 1 to the {store.count:,} Gaussians there are, got {budget:,}", parameter="budget"
+        )
     work.mkdir(parents=True, exist_ok=True)
     run = TiledRun(store, executor, work, config or SimplifyConfig(), progress)
     coarse = run.begin()
@@ -222,7 +224,8 @@ def finished(small: Splats, sh_degree: int) -> Splats:
 def _check_regions(sample: Splats, regions: Sequence[Region]) -> None:
     if regions and not in_any(sample, regions).any():
         raise InputError(
-            f"keep_region: none of {len(sample):,} Gaussians, a fair sample of the scene, lies there"
+            f"none of {len(sample):,} Gaussians, a fair sample of the scene, lies there",
+            parameter="keep_region",
         )
 
 
@@ -255,7 +258,8 @@ def _runs(run: TiledRun, costs: list[Path], budget: int) -> list[int]:
     kept = [_length(path) + 1 for path in costs]
     if sum(kept) < budget:
         raise InputError(
-            f"budget: expected at most the {sum(kept):,} Gaussians that a renderer draws, got {budget:,}"
+            f"expected at most the {sum(kept):,} Gaussians that a renderer draws, got {budget:,}",
+            parameter="budget",
         )
     target = min(sum(kept), int(run.config["morton_premerge_ratio"] * budget))
     closed = cheapest([_costs_of(path) for path in costs], sum(kept) - max(target, len(kept)))
@@ -274,8 +278,9 @@ def _check_reached(count: int, budget: int, tiles: int) -> None:
     if count != budget:
         each = "one a tile" if count == tiles else "each keeps one or more"
         raise InputError(
-            f"budget: {count:,} Gaussians is the fewest that the {tiles:,} tiles come to ({each}), not "
-            f"{budget:,}; greater --tile-rows make fewer tiles"
+            f"{count:,} Gaussians is the fewest that the {tiles:,} tiles come to ({each}), not "
+            f"{budget:,}; greater --tile-rows make fewer tiles",
+            parameter="budget",
         )
 
 

@@ -37,13 +37,13 @@ def test_the_wrong_kind_of_input_is_told_what_takes_it(command_line: CommandLine
         (
             ("distill", "ball.ply", "--photos", "-n", 9, "-o", "run"),
             1,
-            "--photos: a pool of made views has no photos; give views that have them",
+            "--photos: generated views have no photos; give --views that have them",
         ),
-        (("distill", "--views", "views.json", "--fit", "1kB", "-o", "run"), 1, "--fit could be measured on"),
+        (("distill", "--views", "views.json", "--fit", "1kB", "-o", "run"), 1, "--fit: views.json: "),
         (
             ("distill", "--views", "views.json", "--min-psnr", 30, "-o", "run"),
             1,
-            "--min-psnr could be measured on: give -n COUNT",
+            "--min-psnr: views.json: has no sparse points to measure that on; give --count COUNT",
         ),
         (
             ("render", "ball.ply", "-n", 4, "--views", "views.json", "--sheet", "a.png"),
@@ -118,10 +118,10 @@ def test_views_without_photos_say_what_stands_in(command_line: CommandLine, fold
     write_points(folder / "cloud.ply", Points(BALL.means.astype(np.float64), colors))
     to = ("-r", 4, "-o", "x", "--views", "views.json")
     for ask, words in (
-        (("distill", "ball.ply", *to, "--photos"), "without --photos the scene's render stands in for it"),
+        (("distill", "ball.ply", *to, "--photos"), "leave out --photos to render the scene there"),
         (("distill", "cloud.ply", *to), "give views with photos, or a trained scene"),
         (("distill", *to[2:], "-n", 50), "give views with photos, or a scene beside them"),
-        (("recover", "ball.ply", "-o", "x.ply", *to[4:]), "--teacher SCENE stands in"),
+        (("recover", "ball.ply", "-o", "x.ply", *to[4:]), "render them from --teacher SCENE"),
     ):
         status, _, error = command_line(*ask, cwd=folder)
         last = error.splitlines()[-1]

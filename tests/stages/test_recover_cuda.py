@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from g2ard import io
-from g2ard.errors import InputError
+from g2ard.errors import InputError, MissingDependencyError
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig, gsplat_engine, recover
 from g2ard.stages.recover.losses import l1_ssim, l1_ssim_anywhere
@@ -98,14 +98,14 @@ def test_without_cuda_one_line_says_so(tmp_path: Path, command_line: CommandLine
     asked = ("recover", "b.ply", "--views", "v.json", "--teacher", "b.ply", "-o", "o.ply", "--device", "cuda")
     status, _, told = command_line(*asked, cwd=tmp_path)
     assert status == 1
-    assert "--device cuda: torch sees no CUDA device here; " in told.strip().splitlines()[-1]
+    assert "--device cuda: torch sees no CUDA device; " in told.strip().splitlines()[-1]
     assert not (tmp_path / "o.ply").exists()
 
 
 def test_a_missing_gsplat_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(gsplat_engine, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"gsplat is not installed \(pip install 'g2ard\[cuda\]'\)"):
+    with pytest.raises(MissingDependencyError, match=r"pip install 'g2ard\[cuda\]'"):
         gsplat_engine.check_cuda()
 
 

@@ -42,7 +42,7 @@ def info(
         except (InputError, OSError) as error:
             if len(paths) == 1:
                 raise
-            run.console.error(one_line(error))
+            run.console.error(one_line(error, run.flags))
             failed.append(str(path))
             continue
         _show(run, str(path), rows)

@@ -19,6 +19,7 @@ from g2ard.cli.tile_options import (
     WorkOption,
     tiling_of,
 )
+from g2ard.cli.usage import in_flags
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -120,8 +121,7 @@ def lod(
         check_ratios(ratios)
         rule = Cut(most * 1024, extent, least * 1024)
     except InputError as error:
-        told = str(error).replace("extent:", "chunk-extent:", 1)
-        raise typer.BadParameter(f"--{told}") from None
+        raise typer.BadParameter(in_flags(error, run.flags)) from None
     meta, stopped = output / "lod-meta.json", output.with_name(f".{output.name}.unfinished")
     run.spare_inputs(meta)
     tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)

@@ -20,7 +20,7 @@ from g2ard.system import interrupt
 
 __all__ = ["PERIOD", "deferred_interrupt", "load", "save"]
 
-_ANEW = "another checkpoint or folder of work starts anew"
+_ANEW = "{overwrite=True} starts again"
 
 PERIOD = 60.0
 """Seconds between two checkpoints."""
@@ -46,9 +46,9 @@ def load(path: Path, key: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]
         meta: dict[str, Any] = json.loads(str(arrays.pop("meta")))
         known = meta.pop("key")
     except Exception:  # numpy and zipfile raise whatever their parsing stumbles over
-        raise InputError(f"{path}: not a checkpoint of g2ard, or a damaged one; {_ANEW}") from None
+        raise InputError("not a checkpoint of g2ard, or a damaged one", path=path, hint=_ANEW) from None
     if known != key:
-        raise InputError(f"{path}: belongs to a run with another scene or other options; {_ANEW}")
+        raise InputError("belongs to a run with another scene or other options", path=path, hint=_ANEW)
     return meta, arrays
 
 

@@ -47,11 +47,13 @@ class RecoverConfig:
 
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 1:
-            raise InputError(f"steps: expected at least 1, got {self.steps}")
+            raise InputError(f"expected at least 1, got {self.steps}", parameter="steps")
         if self.recovery_time is not None and not 0 < self.recovery_time < float("inf"):
-            raise InputError(f"recovery_time: expected seconds, more than 0, got {self.recovery_time}")
+            raise InputError(
+                f"expected seconds, more than 0, got {self.recovery_time}", parameter="recovery_time"
+            )
         if not 0 <= self.ssim_weight <= 1:
-            raise InputError(f"ssim_weight: expected a value in [0, 1], got {self.ssim_weight}")
+            raise InputError(f"expected a value in [0, 1], got {self.ssim_weight}", parameter="ssim_weight")
 
     @property
     def horizon(self) -> int:

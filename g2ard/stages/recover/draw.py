@@ -20,12 +20,14 @@ def checked_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64
         return None
     values = np.asarray(weights, np.float64)
     if values.shape != (count,):
-        raise InputError(f"weights: expected {count} of them, one a view, got shape {values.shape}")
+        raise InputError(
+            f"expected {count} of them, one a view, got shape {values.shape}", parameter="weights"
+        )
     bad = np.flatnonzero(~(np.isfinite(values) & (values >= 0)))
     if len(bad):
-        raise InputError(f"weights: view {bad[0]}: {values[bad[0]]} is not a number ≥ 0")
+        raise InputError(f"view {bad[0]}: {values[bad[0]]} is not a number ≥ 0", parameter="weights")
     if not values.any():
-        raise InputError("weights: all are zero, so that no view could be drawn")
+        raise InputError("all are zero, so that no view could be drawn", parameter="weights")
     values = values / values.max()  # their sum must not overflow
     return values / values.mean()
 

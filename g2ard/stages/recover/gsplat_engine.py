@@ -7,7 +7,7 @@ from importlib.util import find_spec
 import torch
 from torch import Tensor
 
-from g2ard.errors import InputError
+from g2ard.errors import InputError, missing
 from g2ard.stages.recover.engine import Objective
 from g2ard.stages.recover.losses import l1_ssim_anywhere
 from g2ard.stages.recover.torch_engine import TorchEngine
@@ -19,15 +19,17 @@ def check_cuda() -> None:
     """See to it that gsplat can run.
 
     Raises:
-        InputError: torch sees no CUDA device, or gsplat is not installed.
+        InputError: torch sees no CUDA device.
+        MissingDependencyError: gsplat is not installed.
     """
     if not torch.cuda.is_available():
         raise InputError(
-            "engine 'gsplat': torch sees no CUDA device here; it takes an NVIDIA GPU, torch for CUDA and "
-            "g2ard[cuda]; engine 'fused' needs none"
+            "torch sees no CUDA device",
+            parameter="engine",
+            hint="gsplat needs an NVIDIA GPU, torch for CUDA and g2ard[cuda]; {engine='fused'} needs none",
         )
     if find_spec("gsplat") is None:
-        raise InputError("engine 'gsplat': gsplat is not installed (pip install 'g2ard[cuda]')")
+        raise missing("the engine 'gsplat'", "g2ard[cuda]", parameter="engine")
 
 
 class GsplatEngine(TorchEngine):

@@ -335,4 +335,4 @@ def engine_class(name: str) -> Callable[[Objective], Engine]:
         from g2ard.stages.recover.gsplat_engine import GsplatEngine
 
         return GsplatEngine
-    raise InputError(f"engine: expected {', '.join(ENGINES)}, got {name!r}")
+    raise InputError(f"expected {', '.join(ENGINES)}, got {name!r}", parameter="engine")

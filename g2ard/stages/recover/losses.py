@@ -55,8 +55,9 @@ def l1_ssim(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
     for name, tensor in (("image", image), ("target", target)):
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu" or tensor.ndim != 3:
             raise InputError(
-                f"{name}: expected (H, W, C) float32 on the CPU, "
-                f"got {tuple(tensor.shape)} {tensor.dtype} on {tensor.device}"
+                f"expected (H, W, C) float32 on the CPU, "
+                f"got {tuple(tensor.shape)} {tensor.dtype} on {tensor.device}",
+                parameter=name,
             )
     loss: Tensor = _L1Ssim.apply(image, target, ssim_weight)
     return loss

@@ -94,13 +94,14 @@ def recover(
     """
     config = config or RecoverConfig()
     if not len(student) or not len(targets.cameras):
-        raise InputError(f"recover: {len(student)} Gaussians and {len(targets.cameras)} views: nothing to do")
+        raise InputError(f"{len(student)} Gaussians and {len(targets.cameras)} views: nothing to recover")
     if not targets.cameras.facing(student.means.astype(np.float64) + student.offset).any():
-        raise InputError(f"recover: {unseeing(targets.cameras, 'the scene')}")
+        raise InputError(unseeing(targets.cameras, "the scene"))
     if frozen is not None and (config.engine != "fused" or frozen.shape != (len(student),)):
         raise InputError(
-            f"frozen: expected bool of shape ({len(student)},) and the engine fused, got {frozen.shape} and "
-            f"{config.engine}"
+            f"expected bool of shape ({len(student)},) and the engine fused, got {frozen.shape} and "
+            f"{config.engine}",
+            parameter="frozen",
         )
     if config.sh_degree is not None:
         student = student.with_sh_degree(config.sh_degree)

@@ -152,7 +152,7 @@ def preset_for(
     """
     kind = {"paper": "auto"}.get(name, name.removeprefix("paper-"))
     if kind != "auto" and kind not in PRESETS:
-        raise InputError(f"preset: expected auto, paper, {', '.join(PRESETS)}, got {name!r}")
+        raise InputError(f"expected auto, paper, {', '.join(PRESETS)}, got {name!r}", parameter="preset")
     paper = paper or name.startswith("paper")
     found = measure_prior(prior, cameras)
     kind, why = (kind, "as asked") if kind != "auto" else _judged(found)

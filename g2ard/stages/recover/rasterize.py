@@ -119,7 +119,9 @@ def rasterize(
     params = (means, quats, log_scales, logit_opacities, sh0, shN)
     for name, tensor in zip(_NAMES, params, strict=True):
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            raise InputError(f"{name}: expected float32 on the CPU, got {tensor.dtype} on {tensor.device}")
+            raise InputError(
+                f"expected float32 on the CPU, got {tensor.dtype} on {tensor.device}", parameter=name
+            )
     colour = [float(c) for c in background]
     out: tuple[Tensor, Tensor, Tensor] = _Rasterize.apply(
         view_of(cameras, index, settings), settings, colour, *params

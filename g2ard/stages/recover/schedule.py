@@ -181,7 +181,7 @@ def schedule_named(name: str, steps: int | None = None) -> Schedule:
     1000
     """
     if name not in SCHEDULES:
-        raise InputError(f"schedule: expected one of {', '.join(SCHEDULES)}, got {name!r}")
+        raise InputError(f"expected one of {', '.join(SCHEDULES)}, got {name!r}", parameter="schedule")
     return SCHEDULES[name] if steps is None else SCHEDULES[name].scaled(steps)
 
 

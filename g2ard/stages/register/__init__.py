@@ -100,11 +100,11 @@ def register(
     if not len(photos):
         raise InputError("photos: there are none")
     if keep not in KEPT:
-        raise InputError(f"keep: expected {', '.join(KEPT)}, got {keep!r}")
+        raise InputError(f"expected {', '.join(KEPT)}, got {keep!r}", parameter="keep")
     given = _poses("starts", starts, photos)
     true = _poses("truth", truth, photos)
     if not given and pool is None:
-        raise InputError("starts: no photo has a pose, and there is no pool to look for one in")
+        raise InputError("no photo has a pose, and there is no pool to look for one in", parameter="starts")
     renderer = Renderer(scene, background=background)
     renders = None if pool is None else PoolRenders(renderer, pool, config)
     search = Search(renderer, config, matcher_named(config.matcher, config.ratio, config.features))
@@ -140,7 +140,7 @@ def _poses(what: str, poses: Mapping[str, ArrayLike] | None, photos: Cameras) ->
             pose = np.asarray(poses[name], np.float64)
             rigid = pose.shape == (4, 4) and np.isfinite(pose).all()
             if not (rigid and np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6)):
-                raise InputError(f"{what}: {name}: not a rigid 4×4 pose")
+                raise InputError(f"{name}: not a rigid 4×4 pose", parameter=what)
             out[name] = pose
     return out
 

@@ -57,7 +57,7 @@ def matcher_named(name: str, ratio: float, most: int) -> Matcher | None:
     if name == "direct" or (name == "auto" and absent):
         return None
     if name not in ("auto", "sift") and not all(name.partition(":")):
-        raise InputError(f"matcher: expected auto, sift, direct or MODULE:FUNCTION, got {name!r}")
+        raise InputError(f"expected auto, sift, direct or MODULE:FUNCTION, got {name!r}", parameter="matcher")
     if absent:
         raise MissingDependencyError(
             f"matcher {name}: poses from matches need `pip install g2ard[register]` ({absent})"

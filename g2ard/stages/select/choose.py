@@ -101,18 +101,18 @@ def select(
     [1, 3]
     """
     if policy not in POLICIES:
-        raise InputError(f"policy: expected {', '.join(POLICIES)}, got {policy!r}")
+        raise InputError(f"expected {', '.join(POLICIES)}, got {policy!r}", parameter="policy")
     if k == "auto" and policy in UNMEASURED:
-        raise InputError(f"k: 'auto' needs a policy that measures what views add, not {policy!r}")
+        raise InputError(f"'auto' needs a policy that measures what views add, not {policy!r}", parameter="k")
     if k != "auto" and not isinstance(k, int | np.integer):
-        raise InputError(f"k: expected 'auto' or a whole number of views, got {k!r}")
+        raise InputError(f"expected 'auto' or a whole number of views, got {k!r}", parameter="k")
     large = np.maximum(cameras.widths, cameras.heights) > _LARGEST
     if large.any():
         i = int(np.argmax(large))
         size = f"{cameras.widths[i]}×{cameras.heights[i]}"
         raise InputError(f"view {cameras.names[i]}: {size} pixels; at most {_LARGEST} a side")
     if k != "auto" and k < 1:
-        raise InputError(f"k: expected at least 1 view, got {k}")
+        raise InputError(f"expected at least 1 view, got {k}", parameter="k")
     if not len(cameras):
         raise InputError("no candidate views to select from")
     began = time.perf_counter()

@@ -115,7 +115,7 @@ def surface(splats: Splats, cells: int = 300_000) -> Surface:
         InputError: the scene is empty or not finite.
     """
     if cells < 1:
-        raise InputError(f"cells: expected at least 1, got {cells}")
+        raise InputError(f"expected at least 1, got {cells}", parameter="cells")
     scene, origin = core_scene(splats)
     found = _core.select_surface(scene, cells)
     return Surface(

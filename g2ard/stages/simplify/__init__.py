@@ -158,7 +158,7 @@ def simplify(
     (100, (1000,), 99)
     """
     if method not in METHODS:
-        raise InputError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+        raise InputError(f"expected one of {', '.join(METHODS)}, got {method!r}", parameter="method")
     scene, finite = finite_rows_of(splats)
     _check_budget(budget, len(scene))
     flags = _check_flags(protected, len(splats))
@@ -167,7 +167,9 @@ def simplify(
     if not (scene.opacities >= config.min_opacity_of(method)).any():
         scene, config = with_some_opacity(scene), replace(config, min_opacity=0.0)
     if config.keep_region and (method == "paper" or visibility is None):
-        raise InputError("keep_region: needs views; `paper` looks from none, `fast` from given ones alone")
+        raise InputError(
+            "needs views; `paper` looks from none, `fast` from given ones alone", parameter="keep_region"
+        )
     if method == "paper":
         out = _paper(scene, budget, flags, final_budget or budget, config, progress)
     else:
@@ -219,9 +221,11 @@ def _paper(
 
 def _check_budget(budget: int, count: int | None) -> None:
     if budget < 1:
-        raise InputError(f"budget: expected at least 1, got {budget}")
+        raise InputError(f"expected at least 1, got {budget}", parameter="budget")
     if count is not None and budget > count:
-        raise InputError(f"budget: expected at most the {count} Gaussians there are, got {budget}")
+        raise InputError(
+            f"expected at most the {count} Gaussians there are, got {budget}", parameter="budget"
+        )
 
 
 def _check_flags(protected: NDArray[np.bool_] | None, count: int) -> NDArray[np.bool_] | None:
@@ -229,7 +233,9 @@ def _check_flags(protected: NDArray[np.bool_] | None, count: int) -> NDArray[np.
         return None
     flags = np.asarray(protected)
     if flags.dtype != np.bool_ or flags.shape != (count,):
-        raise InputError(f"protected: expected bool of shape ({count},), got {flags.dtype} {flags.shape}")
+        raise InputError(
+            f"expected bool of shape ({count},), got {flags.dtype} {flags.shape}", parameter="protected"
+        )
     return flags
 
 

@@ -93,22 +93,28 @@ class SimplifyConfig:
 
     def __post_init__(self) -> None:
         if self.retention is not None and not 0 < self.retention < 1:
-            raise InputError(f"retention: expected a number between 0 and 1, got {self.retention}")
+            raise InputError(
+                f"expected a number between 0 and 1, got {self.retention}", parameter="retention"
+            )
         if not 0 <= self.fold < 1:
-            raise InputError(f"fold: expected a number in [0, 1), got {self.fold}")
+            raise InputError(f"expected a number in [0, 1), got {self.fold}", parameter="fold")
         if not self.max_growth >= 1:
-            raise InputError(f"max_growth: expected at least 1, got {self.max_growth}")
+            raise InputError(f"expected at least 1, got {self.max_growth}", parameter="max_growth")
         if self.morton_premerge_ratio is not None and not self.morton_premerge_ratio >= 1:
-            raise InputError(f"morton_premerge_ratio: expected at least 1, got {self.morton_premerge_ratio}")
+            raise InputError(
+                f"expected at least 1, got {self.morton_premerge_ratio}", parameter="morton_premerge_ratio"
+            )
         if self.morton_premerge_steps is not None and self.morton_premerge_steps < 1:
-            raise InputError(f"morton_premerge_steps: expected at least 1, got {self.morton_premerge_steps}")
+            raise InputError(
+                f"expected at least 1, got {self.morton_premerge_steps}", parameter="morton_premerge_steps"
+            )
         if self.neighbors < 1:
-            raise InputError(f"neighbors: expected at least 1, got {self.neighbors}")
+            raise InputError(f"expected at least 1, got {self.neighbors}", parameter="neighbors")
         object.__setattr__(self, "keep_region", tuple(check_region(region) for region in self.keep_region))
         for name in ("color_bin", "pixel_scale", "support", "keep_times"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
-                raise InputError(f"{name}: expected a positive number, got {value}")
+                raise InputError(f"expected a positive number, got {value}", parameter=name)
         for name in (
             "min_opacity",
             "geometric_weight",
@@ -121,9 +127,9 @@ class SimplifyConfig:
         ):
             value = getattr(self, name)
             if value is not None and not value >= 0:
-                raise InputError(f"{name}: expected a number ≥ 0, got {value}")
+                raise InputError(f"expected a number ≥ 0, got {value}", parameter=name)
         if self.min_opacity is not None and self.min_opacity > 1:
-            raise InputError(f"min_opacity: expected a number in [0, 1], got {self.min_opacity}")
+            raise InputError(f"expected a number in [0, 1], got {self.min_opacity}", parameter="min_opacity")
 
     def resolved(self, method: str) -> SimplifyConfig:
         """The same with the method's own constants where None stands for them.
