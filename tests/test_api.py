@@ -17,10 +17,9 @@ from g2ard.io import Points
 from g2ard.report.base import Report
 from g2ard.scene.splats import Splats
 from helpers.commands import CommandLine
-from helpers.scenes import checkered_ball
+from helpers.scenes import ARRAYS, checkered_ball
 
 BALL = checkered_ball(1500)
-ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 
 
 @pytest.fixture

@@ -3,36 +3,17 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 import g2ard
 from g2ard.io import read_splats, write_splats
-from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join, transform
 from helpers.commands import CommandLine, refused
-from helpers.scenes import checkered_ball
+from helpers.similarities import directional, matrix, turn
 
 # ── the command ──────────────────────────────────────────────────────────────────────────────────────
-
-
-def directional(degree: int = 3) -> Splats:
-    ball = checkered_ball(800)
-    rng = np.random.default_rng(5)
-    return replace(ball, shN=rng.normal(0, 0.2, (800, (degree + 1) ** 2 - 1, 3)).astype(np.float32))
-
-
-def matrix(scale: float, rotation: np.ndarray, shift: list[float]) -> np.ndarray:
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = scale * rotation, shift
-    return out
-
-
-def turn(seed: int = 0) -> np.ndarray:
-    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
-    return q * np.sign(np.linalg.det(q))
 
 
 def test_convert_merges_crops_moves(tmp_path: Path, command_line: CommandLine) -> None:

@@ -9,6 +9,14 @@ import numpy as np
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
 
+ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+"""A scene's arrays."""
+
+
+def assert_same_bits(a: Splats, b: Splats) -> None:
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
 
 def checkered_ball(n: int = 3000, seed: int = 0) -> Splats:
     """Discs on a unit sphere, coloured in squares, nearly opaque; view-dependent a little."""
@@ -41,9 +49,8 @@ def under_a_sky(scene: Splats, count: int = 300, seed: int = 0) -> Splats:
         logit_opacities=rng.normal(-2, 1, count),
         sh0=rng.normal(0, 0.6, (count, 1, 3)),
     ).with_sh_degree(scene.sh_degree)
-    names = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
     return replace(
-        scene, **{name: np.concatenate([getattr(scene, name), getattr(layers, name)]) for name in names}
+        scene, **{name: np.concatenate([getattr(scene, name), getattr(layers, name)]) for name in ARRAYS}
     )
 
 

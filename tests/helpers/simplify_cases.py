@@ -23,14 +23,6 @@ def scene(n=2000, rest=3, seed=0, dtype=np.float32):
     )
 
 
-ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
-
-
-def assert_same(a, b):
-    for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
-
-
 def assert_sound(result, count, budget):
     """What every result must be, on any input."""
     out = result.splats

@@ -17,9 +17,8 @@ from g2ard.levels import Cut, save_levels
 from g2ard.scene.splats import Splats
 from helpers.ply_files import columns, save, scene
 from helpers.realdata import real
+from helpers.scenes import ARRAYS
 from helpers.sog_files import folder, parts
-
-ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 
 
 def joined(blocks: list[Splats]) -> Splats:

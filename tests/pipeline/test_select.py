@@ -18,10 +18,9 @@ from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover.schedule import TUNED
 from g2ard.stages.select import select
 from helpers.commands import CommandLine
-from helpers.scenes import around, checkered_ball
+from helpers.scenes import ARRAYS, around, assert_same_bits, checkered_ball
 
 PRIOR = checkered_ball(1500)
-ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 SHORT = DistillConfig(method="paper", steps=20)
 
 
@@ -122,8 +121,7 @@ def test_a_stopped_run_goes_on_with_the_same_views(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         distill(PRIOR, 600, targets, config, work=tmp_path, progress=stop)
     again = distill(PRIOR, 600, targets, config, work=tmp_path)
-    for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(whole.splats, name), getattr(again.splats, name))
+    assert_same_bits(whole.splats, again.splats)
     assert whole.report.views == again.report.views
     with pytest.raises(InputError, match="another scene or other options"):
         distill(PRIOR, 600, targets, replace(config, views=7), work=tmp_path)

@@ -9,26 +9,9 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.rendering.renderer import render
-from g2ard.scene.splats import Splats
 from g2ard.scene.transform import in_box, in_sphere, rotate_harmonics, similarity, transform
-from helpers.scenes import around, checkered_ball
-
-
-def turn(seed: int = 0) -> np.ndarray:
-    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
-    return q * np.sign(np.linalg.det(q))
-
-
-def matrix(scale: float, rotation: np.ndarray, shift: list[float]) -> np.ndarray:
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = scale * rotation, shift
-    return out
-
-
-def directional(degree: int = 3) -> Splats:
-    ball = checkered_ball(800)
-    rng = np.random.default_rng(5)
-    return replace(ball, shN=rng.normal(0, 0.2, (800, (degree + 1) ** 2 - 1, 3)).astype(np.float32))
+from helpers.scenes import around
+from helpers.similarities import directional, matrix, turn
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

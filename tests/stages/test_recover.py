@@ -30,9 +30,8 @@ from g2ard.stages.recover.guard import Guard, blended
 from g2ard.stages.recover.outcome import outcome
 from g2ard.stages.recover.schedule import PAPER, TUNED
 from g2ard.stages.simplify import simplify
-from helpers.scenes import around, checkered_ball, under_a_sky
+from helpers.scenes import around, assert_same_bits, checkered_ball, under_a_sky
 
-ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 VIEWS = around()
 TEACHER = checkered_ball()
 
@@ -45,11 +44,6 @@ def targets() -> TeacherRenders:
 @pytest.fixture(scope="module")
 def student() -> Splats:
     return simplify(TEACHER, 500, method="paper").splats  # leaves recovery more to do than the default
-
-
-def assert_same_bits(a: Splats, b: Splats) -> None:
-    for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
 
 
 @pytest.mark.parametrize("engine", ["fused", "torch"])

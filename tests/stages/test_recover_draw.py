@@ -18,9 +18,8 @@ from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.draw import checked_weights, drawn
 from g2ard.stages.simplify import simplify
-from helpers.scenes import around, checkered_ball
+from helpers.scenes import ARRAYS, around, checkered_ball
 
-ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 VIEWS = around()
 TEACHER = checkered_ball(1500)
 WEIGHTS = np.linspace(0, 3, len(VIEWS)) ** 2

@@ -12,7 +12,8 @@ from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import METHODS, SimplifyConfig, schedule, simplify
-from helpers.simplify_cases import ARRAYS, all_alike, assert_same, assert_sound, scene
+from helpers.scenes import ARRAYS, assert_same_bits
+from helpers.simplify_cases import all_alike, assert_sound, scene
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -36,7 +37,7 @@ def test_threads_do_not_matter(method):
         results.append(simplify(prior, 3000, method=method))
     _core.set_num_threads(0)
     for other in results[1:]:
-        assert_same(results[0].splats, other.splats)
+        assert_same_bits(results[0].splats, other.splats)
         np.testing.assert_array_equal(results[0].parents, other.parents)
 
 
@@ -45,7 +46,7 @@ def test_row_order_does_not_matter(method):
     prior = scene()
     rows = np.random.default_rng(1).permutation(len(prior))
     here, there = simplify(prior, 300, method=method), simplify(prior.take(rows), 300, method=method)
-    assert_same(here.splats, there.splats)
+    assert_same_bits(here.splats, there.splats)
     np.testing.assert_array_equal(here.parents[rows], there.parents)
     np.testing.assert_array_equal(here.protected, there.protected)
 

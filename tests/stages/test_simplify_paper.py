@@ -7,7 +7,8 @@ import pytest
 
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.simplify import SimplifyConfig, flag, schedule, simplify
-from helpers.simplify_cases import ARRAYS, assert_sound, scene
+from helpers.scenes import ARRAYS
+from helpers.simplify_cases import assert_sound, scene
 from reference import simplify as naive
 
 
@@ -260,15 +261,6 @@ def test_refused_groups_keep_their_originals():
         )
 
 
-def test_flags_are_inherited_by_or():
-    prior = discs(sheet(60))
-    flags = np.random.default_rng(1).random(3600) < 0.05
-    out = simplify(prior, 360, method="paper", protected=flags)
-    want = np.zeros(360, bool)
-    want[out.parents[flags & (out.parents >= 0)]] = True
-    np.testing.assert_array_equal(out.protected, want)
-
-
 # The table's constants (tab:s_config), each from both sides. E_j sums over channels: a checker of ±d: 3·d².
 
 
@@ -306,13 +298,6 @@ def thinned(areas, alphas, budget, flags=None):
     flags = np.zeros(len(areas), bool) if flags is None else flags
     out = simplify(prior, budget, method="paper", config=ALONE, protected=flags)
     return out.parents >= 0
-
-
-def test_the_trim_ranks_by_opacity_and_footprint():
-    rng = np.random.default_rng(4)
-    areas, alphas = rng.uniform(0.1, 1, 200), rng.uniform(0.05, 0.95, 200)
-    priority = -np.log(1 - alphas) * areas
-    np.testing.assert_array_equal(thinned(areas, alphas, 80), priority >= np.sort(priority)[-80])
 
 
 @pytest.mark.parametrize("by", ["area", "opacity"])

@@ -41,6 +41,18 @@ def store(scene: Path) -> TileStore:
     return ingest(scene, scene.parent / "tiles", tile_rows=2500)
 
 
+@pytest.fixture(scope="module")
+def work(store: TileStore, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The work folder of a reduction on one thread."""
+    return tmp_path_factory.mktemp("work")
+
+
+@pytest.fixture(scope="module")
+def fingerprint(store: TileStore, work: Path) -> str:
+    """The hash of what that reduction gives."""
+    return reduced(store, work, views=ring(), threads=1).fingerprint()
+
+
 def clusters(of: np.ndarray, a: np.ndarray, b: np.ndarray, runs: int) -> np.ndarray:
     """Naive: one merge after another."""
     into = list(range(runs))
@@ -133,39 +145,29 @@ def test_tiles_that_no_view_sees_keep_their_share(store: TileStore, tmp_path: Pa
 
 
 def test_neither_workers_nor_the_order_of_rows_change_a_bit(
-    store: TileStore, scene: Path, tmp_path: Path
+    store: TileStore, scene: Path, tmp_path: Path, fingerprint: str
 ) -> None:
-    here = reduced(store, tmp_path / "here", views=ring(), threads=1)
-    two = reduced(store, tmp_path / "two", views=ring(), workers=2)
-    assert here.fingerprint() == two.fingerprint()
+    assert reduced(store, tmp_path / "two", views=ring(), workers=2).fingerprint() == fingerprint
     rows = np.random.default_rng(3).permutation(9000)
     write_splats(tmp_path / "shuffled.ply", read_splats(scene).take(rows))
     other = ingest(tmp_path / "shuffled.ply", tmp_path / "tiles", tile_rows=2500)
-    assert reduced(other, tmp_path / "shuffled", views=ring()).fingerprint() == here.fingerprint()
-
-
-def test_a_cluster_of_two_workers_gives_the_same_bits(store: TileStore, tmp_path: Path) -> None:
-    pytest.importorskip("distributed")
-    here = reduced(store, tmp_path / "here", views=ring())
-    cluster = reduced(store, tmp_path / "cluster", views=ring(), workers=2, scheduler="local")
-    assert cluster.fingerprint() == here.fingerprint()
+    assert reduced(other, tmp_path / "shuffled", views=ring()).fingerprint() == fingerprint
 
 
 @needs_proc
 @pytest.mark.parametrize("scheduler", [None, "local"])
 def test_workers_killed_at_random_cost_time_alone(
-    store: TileStore, tmp_path: Path, scheduler: str | None
+    store: TileStore, tmp_path: Path, scheduler: str | None, fingerprint: str, work: Path
 ) -> None:
     if scheduler:
         pytest.importorskip("distributed")
-    here = reduced(store, tmp_path / "here", views=ring())
-    stop, killed, draw, work = threading.Event(), [], random.Random(0), tmp_path / "killed"
+    stop, killed, draw = threading.Event(), [], random.Random(0)
 
     def kill() -> None:
         done = 0
         while not stop.is_set() and len(killed) < 5:
             time.sleep(0.02)
-            files = len(list(work.glob("[!.]*.npz")))
+            files = len(list(tmp_path.glob("[!.]*.npz")))
             if files >= done + 3 and (children := _children()):
                 time.sleep(draw.uniform(0, 0.05))
                 with suppress(ProcessLookupError):
@@ -176,13 +178,13 @@ def test_workers_killed_at_random_cost_time_alone(
     killer = threading.Thread(target=kill)
     killer.start()
     try:
-        small = reduced(store, work, views=ring(), workers=2, scheduler=scheduler)
+        small = reduced(store, tmp_path, views=ring(), workers=2, scheduler=scheduler)
     finally:
         stop.set()
         killer.join()
     assert len(killed) >= 3
-    assert small.fingerprint() == here.fingerprint()
-    assert len(list(work.glob("[!.]*.npz"))) == len(list((tmp_path / "here").glob("[!.]*.npz")))
+    assert small.fingerprint() == fingerprint
+    assert len(list(tmp_path.glob("[!.]*.npz"))) == len(list(work.glob("[!.]*.npz")))
 
 
 def _children() -> list[int]:
@@ -194,7 +196,7 @@ def _children() -> list[int]:
     return [pid for pid in pids if is_worker(pid)]
 
 
-def test_what_is_done_is_not_done_again(store: TileStore, tmp_path: Path) -> None:
+def test_what_is_done_is_not_done_again(store: TileStore, tmp_path: Path, fingerprint: str) -> None:
     class StopError(Exception):
         pass
 
@@ -208,7 +210,7 @@ def test_what_is_done_is_not_done_again(store: TileStore, tmp_path: Path) -> Non
     assert sum(path.name.startswith("plans") for path in before) == 1
     again = reduced(store, tmp_path, views=ring())
     assert all(path.stat().st_mtime_ns == time for path, time in before.items())
-    assert again.fingerprint() == reduced(store, tmp_path / "fresh", views=ring()).fingerprint()
+    assert again.fingerprint() == fingerprint
     looks = {path for path in before if path.name.startswith("look")}
     reduced(store, tmp_path, budget=450, views=ring())  # another budget looks at the same
     assert looks == {path for path in tmp_path.iterdir() if path.name.startswith("look-")}
