@@ -25,11 +25,7 @@ FOUNDATIONS = {
     "system",
 }
 
-UNRESOLVED = {
-    *("g2ard.cli.config", "g2ard.cli.frame"),
-    *(f"g2ard.io{name}" for name in ("", ".cloud_ply", ".detect", ".point_stream")),
-    *(f"g2ard.io.{name}" for name in ("sog", "sog_stream", "stream")),
-}
+UNRESOLVED = {"g2ard.cli.config", "g2ard.cli.frame"}
 """Modules that still import each other in a circle; remove a name once its circle is gone."""
 
 

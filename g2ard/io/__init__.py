@@ -23,9 +23,12 @@ from g2ard.io.find import find_views
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from types import ModuleType
 
     from numpy.typing import ArrayLike
 
+    from g2ard.io.point_stream import PointStream
+    from g2ard.io.stream import SceneStream
     from g2ard.io.types import Cloud, Note, Points, Scene, ViewSet
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
@@ -44,6 +47,8 @@ __all__ = [
     "check_views_output",
     "find_views",
     "kind",
+    "open_point_stream",
+    "open_stream",
     "read_cloud",
     "read_points",
     "read_scene",
@@ -106,6 +111,38 @@ def read_scene(path: str | Path) -> Scene:
     return import_module(f"g2ard.io.{found}").read(path)
 
 
+def open_stream(path: str | Path | Sequence[str | Path]) -> SceneStream:
+    """Open a scene, or several as one, to be read block by block.
+
+    Args:
+        path: a scene in any format that `read_scene` reads, or several. A .ply, .compressed.ply or .splat is
+            held a block at a time, a SOG a chunk at a time, tiles one at a time, other formats as a whole.
+            Several scenes get the offset of the first and the highest of their SH degrees.
+
+    Raises:
+        InputError: nothing is there, or its header is broken.
+    """
+    from importlib import import_module
+
+    from g2ard.errors import InputError
+    from g2ard.io.stream import JoinedScenes, PartsStream, file_identity
+
+    if not isinstance(path, str | Path):
+        streams = [open_stream(part) for part in path]
+        if not streams:
+            raise InputError("no scene was given")
+        return streams[0] if len(streams) == 1 else JoinedScenes(streams)
+    path, found = check_scene(path)
+    module = import_module(f"g2ard.io.{found}")
+    if hasattr(module, "stream"):
+        stream: SceneStream = module.stream(path)
+        return stream
+    scene: Scene = module.read(path)
+    splats = scene.splats
+    parts = [len(splats)], lambda _: splats, splats.sh_degree, splats.offset
+    return PartsStream(path, *parts, file_identity([path]), scene.notes)
+
+
 def check_scene(path: str | Path) -> tuple[Path, str]:
     """Refuse what `read_scene` would refuse for its kind, before any work; damage is found by reading.
 
@@ -127,12 +164,9 @@ def check_scene(path: str | Path) -> tuple[Path, str]:
             "views": "g2ard's views",
         }
         what = words.get(found, found)
-        hints = {
-            "points": "; `g2ard lift` makes a scene of it",
-            "views": ", no scene; name the scene's own file",
-        }
-        hint = hints.get(kind(path), "")
-        raise InputError(f"a Gaussian scene is needed, this is {what}{hint}", path=path)
+        is_cloud = KINDS[found] == "points"
+        hint = "`g2ard lift` makes a scene of it" if is_cloud else "name the scene's own file"
+        raise InputError(f"a Gaussian scene is needed, this is {what}", path=path, hint=hint)
     return path, found
 
 
@@ -142,7 +176,7 @@ def _named(path: str | Path, suffixes: tuple[str, ...], rule: str) -> Path:
 
     path = Path(path)
     if path.suffix.lower() not in suffixes:
-        raise OutputError(f"{rule}", path=path)
+        raise OutputError(rule, path=path)
     return path
 
 
@@ -177,13 +211,14 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
             NAME/meta.json for a SOG folder. What each holds: `docs/formats.md`.
         splats: the scene.
         overwrite: whether an existing file may be replaced.
-        **options: of the format; `normals=True` adds nx ny nz to a .ply, `version=2` (or 3) is an older .spz.
+        **options: of the format; `normals=True` adds nx ny nz to a .ply, `spz_version=4` writes that version
+            of .spz rather than 3.
 
     Raises:
         OutputError: the file exists, its folder is absent or not writable, or the extension is no format that
             g2ard writes, or has no such option.
         InputError: the scene is empty, has a value that is not finite, or one that the format cannot hold.
-        MissingDependencyError: .spz of version 4 before Python 3.14 without `pip install g2ard[spz]`.
+        MissingDependencyError: .spz of version 4 before Python 3.14 without `pip install backports.zstd`.
     """
     from importlib import import_module
 
@@ -223,6 +258,13 @@ def read_cloud(path: str | Path) -> Cloud:
         InputError: as for `read_points`.
         MissingDependencyError: as for `read_points`.
     """
+    path, module = _cloud_reader(path)
+    cloud: Cloud = module.read(path)
+    return cloud
+
+
+def _cloud_reader(path: str | Path) -> tuple[Path, ModuleType]:
+    """Return the path of a cloud and the module that reads it."""
     from importlib import import_module
 
     from g2ard.errors import InputError
@@ -233,9 +275,35 @@ def read_cloud(path: str | Path) -> Cloud:
     if found not in modules:
         scene = kind(path) == "splats"
         what = "a Gaussian scene" if scene else found
-        hint = ", ready for `simplify` and `distill`" if scene else "; name the cloud's own file"
-        raise InputError(f"a coloured point cloud is needed, this is {what}{hint}", path=path)
-    return import_module(f"g2ard.io.{modules[found]}").read(path)
+        hint = "it is ready for `simplify` and `distill`" if scene else "name the cloud's own file"
+        raise InputError(f"a coloured point cloud is needed, this is {what}", path=path, hint=hint)
+    return path, import_module(f"g2ard.io.{modules[found]}")
+
+
+def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
+    """Open a coloured cloud, or several as one, to be read block by block.
+
+    Args:
+        path: a cloud in any format that `read_cloud` reads, or several. A .ply, .las or .laz is held a block
+            at a time, other formats as a whole. Several clouds get the offset of the first.
+
+    Raises:
+        InputError: nothing is there, or its header is broken.
+        MissingDependencyError: .las or .laz without `pip install g2ard[las]`.
+    """
+    from g2ard.errors import InputError
+    from g2ard.io.point_stream import JoinedClouds, WholeCloud
+
+    if not isinstance(path, str | Path):
+        streams = [open_point_stream(part) for part in path]
+        if not streams:
+            raise InputError("no cloud was given")
+        return streams[0] if len(streams) == 1 else JoinedClouds(streams)
+    path, module = _cloud_reader(path)
+    if hasattr(module, "stream"):
+        stream: PointStream = module.stream(path)
+        return stream
+    return WholeCloud(path, module.read(path))
 
 
 def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -> None:
@@ -318,7 +386,7 @@ def read_view_set(
     try:
         views = import_module(f"g2ard.io.{found}").read(path, Path(images) if images else None)
     except OSError as error:  # a photo's name that no file system takes, a folder that may not be read
-        raise InputError(f"{error.strerror or error}", path=path) from error
+        raise InputError(error.strerror or str(error), path=path) from error
     views = views if unpictured else pictured(views)
     return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
 

@@ -11,7 +11,19 @@ from typing import Literal
 from g2ard.errors import InputError
 from g2ard.io.paths import check_regular
 
-__all__ = ["KINDS", "Format", "Kind", "file_format", "is_photo", "kind", "run_scene", "run_views"]
+__all__ = [
+    "JOURNAL",
+    "KINDS",
+    "MANIFEST",
+    "POINTS",
+    "Format",
+    "Kind",
+    "file_format",
+    "is_photo",
+    "kind",
+    "run_scene",
+    "run_views",
+]
 
 Format = Literal[
     "ply",
@@ -42,6 +54,8 @@ KINDS: dict[str, Kind] = {
     **dict.fromkeys(("inria", "nerfstudio", "nerfstudio_export", "gsplat_run"), "views"),
 }
 
+MANIFEST, JOURNAL, POINTS = "tiles.json", "journal.json", ".points"
+"""Files of a folder of tiles, finished and unfinished, and its folder for points to be lifted."""
 
 _LOOKED_INTO = 64
 """Files of a folder at most, for what may be meant of them."""
@@ -129,7 +143,7 @@ def is_photo(path: Path) -> bool:
 def _folder_format(path: Path) -> Format:
     from g2ard.io.sog import chunks_of
 
-    if (path / "tiles.json").is_file():
+    if (path / MANIFEST).is_file():
         return "tiles"
     if chunks_of(path):
         return "sog"
@@ -156,16 +170,9 @@ def _folder_format(path: Path) -> Format:
         return "inria"
     if gsplat_run.is_run(path / gsplat_run.NAME):
         return "gsplat_run"
-    if _is_begun(path):
+    if any((path / journal).is_file() for journal in (JOURNAL, f"{POINTS}/{JOURNAL}")):
         raise InputError("tiles that `g2ard ingest` has not finished; the same call goes on", path=path)
     raise InputError(f"nothing known in this folder{_instead(path)}", path=path)
-
-
-def _is_begun(path: Path) -> bool:
-    """Whether a folder holds tiles that are being written, or were until that was stopped."""
-    from g2ard.tiles.journal import JOURNAL, POINTS
-
-    return any((path / journal).is_file() for journal in (JOURNAL, f"{POINTS}/{JOURNAL}"))
 
 
 def _near(path: Path) -> str:

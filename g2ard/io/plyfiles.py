@@ -123,12 +123,12 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
     try:
         try:
             ply = PlyData.read(path, mmap="r", known_list_len=triangles)
-        except PlyElementParseError as error:
-            if error.message != "unexpected list length":
+        except PlyElementParseError:
+            if not triangles:
                 raise
             ply = PlyData.read(path, mmap="r")  # a mesh of polygons: slow, but its vertices are wanted
     except PlyElementParseError as error:
-        raise InputError(_parse_failure(path, header, error)) from error
+        raise _parse_error(path, header, error) from error
     except (PlyParseError, ValueError, OSError, OverflowError, MemoryError) as error:
         raise InputError(f"cannot be read as a PLY: {error}", path=path) from error
     return [ply[name].data for name in names]
@@ -173,15 +173,16 @@ def spread_rows(rows: NDArray[Any]) -> NDArray[Any]:
     return np.frombuffer(b"".join(parts), rows.dtype)
 
 
-def _parse_failure(path: Path, header: PlyHeader, error: Any) -> str:
+def _parse_error(path: Path, header: PlyHeader, error: Any) -> InputError:
     name = error.element.name
-    if error.message.startswith("early end-of-file"):
-        return (
-            f"{path}: truncated: the header promises {header.counts.get(name, 0):,} rows of {name!r}, "
-            f"the file ends after row {error.row:,}"
-        )
-    where = f", property {error.prop.name!r}" if error.prop is not None else ""
-    return f"{path}: {error.message} in {name!r}, row {error.row:,}{where}"
+    return InputError(
+        f"of {header.counts.get(name, 0)} cannot be read ({error.message})",
+        path=path,
+        property=error.prop and error.prop.name,
+        index=error.row,
+        item=f"{name} row",
+        hint=DAMAGED,
+    )
 
 
 def require(path: Path, present: list[str], wanted: list[str], what: str) -> None:

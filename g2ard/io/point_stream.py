@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,10 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.stream import file_identity
-from g2ard.io.types import Note
+from g2ard.io.types import Cloud, Note
 from g2ard.progress import plural
 
-__all__ = ["PointStream", "PointTally", "RawPoints", "cloud_middle", "open_point_stream"]
-
-_STREAMED = {"cloud_ply": "cloud_ply", "las": "las"}
-"""Format → the module with its `stream(path)`; clouds of other formats are held as a whole."""
+__all__ = ["JoinedClouds", "PointStream", "PointTally", "RawPoints", "WholeCloud", "cloud_middle"]
 
 RawPoints = tuple[NDArray[np.float64], NDArray[np.float32]]
 """(n, 3) positions, world units, and (n, 3) colours as stored: in [0, 1] once divided by `divisor`."""
@@ -100,31 +96,6 @@ class PointStream(ABC):
         return (*self.notes(), Note("dropped_rows", tally.dropped, text))
 
 
-def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
-    """A cloud, or several as one, to be read block by block.
-
-    Args:
-        path: a cloud in any format that `g2ard.io.read_cloud` reads, or several. Of .ply, .las and .laz
-            (COPC is one) a block at a time is held, of others all. Several take the offset of the first.
-
-    Raises:
-        InputError: nothing is there, or it is broken as far as its header tells.
-        MissingDependencyError: .las or .laz without `pip install g2ard[las]`.
-    """
-    from g2ard.io.detect import file_format
-
-    if not isinstance(path, str | Path):
-        streams = [open_point_stream(part) for part in path]
-        if not streams:
-            raise InputError("no cloud was given")
-        return streams[0] if len(streams) == 1 else _Joined(streams)
-    path, found = Path(path), file_format(path)
-    if found in _STREAMED:
-        stream: PointStream = import_module(f"g2ard.io.{_STREAMED[found]}").stream(path)
-        return stream
-    return _Whole(path)
-
-
 def cloud_middle(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
     """The whole-unit middle of a cloud's bounds; zero where the cloud lies around the origin as it is."""
     middle = (low + high) / 2
@@ -132,14 +103,11 @@ def cloud_middle(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray
     return np.where(np.isfinite(middle).all() and far.any(), np.rint(middle), 0.0)
 
 
-class _Whole(PointStream):
-    """A cloud that is held as a whole."""
+class WholeCloud(PointStream):
+    """A cloud that is in memory."""
 
-    def __init__(self, path: Path) -> None:
-        from g2ard.io import read_cloud
-
-        self._cloud = read_cloud(path)
-        at = self._cloud.points.positions
+    def __init__(self, path: Path, cloud: Cloud) -> None:
+        self._cloud, at = cloud, cloud.points.positions
         super().__init__(path, len(at), cloud_middle(at.min(axis=0), at.max(axis=0)))
 
     def identity(self) -> list[Any]:
@@ -156,7 +124,7 @@ class _Whole(PointStream):
         return self._cloud.notes
 
 
-class _Joined(PointStream):
+class JoinedClouds(PointStream):
     """Several clouds, one after the other; each one's colours are brought to [0, 1] as they are read."""
 
     def __init__(self, streams: list[PointStream]) -> None:

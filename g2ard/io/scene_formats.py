@@ -28,10 +28,10 @@ class SceneFormat(NamedTuple):
 
 
 FORMATS: dict[FormatName, SceneFormat] = {
-    "compressed.ply": SceneFormat(".compressed.ply", "compressed_ply_write"),
+    "compressed.ply": SceneFormat(".compressed.ply", "compressed_ply"),
     "ply": SceneFormat(".ply", "ply", options=("normals",)),
     "sog": SceneFormat(".sog", "sog_write"),
-    "spz": SceneFormat(".spz", "spz_write", options=("version",)),
+    "spz": SceneFormat(".spz", "spz", options=("spz_version",)),
     "glb": SceneFormat(".glb", "glb"),
     "splat": SceneFormat(".splat", "splat"),
 }
@@ -47,7 +47,7 @@ def scene_format(path: str | Path) -> SceneFormat:
         OutputError: it names none.
 
     >>> scene_format("a.COMPRESSED.PLY").module, scene_format("room/meta.json").function
-    ('compressed_ply_write', 'write_folder')
+    ('compressed_ply', 'write_folder')
     """
     name = Path(path).name.lower()
     if name == "meta.json":

@@ -12,20 +12,32 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from g2ard.errors import DAMAGED, InputError
+from g2ard.io.jsonfile import (
+    Fields,
+    fields_of,
+    index_of,
+    listed,
+    names_of,
+    numbers,
+    object_of,
+    objects,
+    parse_json,
+    read_json,
+)
+from g2ard.io.limits import check_unpacked
 from g2ard.io.paths import check_regular
-from g2ard.io.sog_chunk import Chunk, Decoder, count_of, meta_errors, rest_of
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from g2ard.io.stream import SceneStream
-    from g2ard.io.types import Note, Scene
+from g2ard.io.sanitize import Raw, cleaned
+from g2ard.io.sog_chunk import Chunk, Decoder, count_of, means_of, meta_errors, rest_of
+from g2ard.io.stream import SceneStream, file_identity
+from g2ard.io.types import Note, Scene
 
 __all__ = ["chunks_of", "read", "stream"]
 
@@ -57,8 +69,6 @@ def chunks_of(path: Path) -> list[Path]:
 
 def _listed(index: Path) -> list[Path]:
     """The chunks that lod-meta.json's tree uses at level 0, in the order of its list."""
-    from g2ard.io.jsonfile import fields_of, index_of, listed, names_of, object_of, objects, read_json
-
     with fields_of(str(index), read_json(index)) as content:
         names = names_of(content, "filenames", len(listed(content, "filenames")))
         files = [index.parent / Path(name).parent for name in names]
@@ -89,8 +99,6 @@ def read(path: Path) -> Scene:
     Raises:
         InputError: a part is missing or broken, or nothing in it is finite.
     """
-    from g2ard.io.sanitize import Raw, cleaned
-
     with _opened(path) as chunks:
         counts = [count_of(chunk) for chunk in chunks]
         raw = Raw.empty(sum(counts), max(map(rest_of, chunks), default=0))
@@ -108,8 +116,6 @@ def stream(path: Path) -> SceneStream:
     Raises:
         InputError: a part is missing or broken; images are looked at later.
     """
-    from g2ard.io.sog_stream import SogStream
-
     with _opened(path) as chunks:
         counts = [count_of(chunk) for chunk in chunks]
         rest = max(map(rest_of, chunks), default=0)
@@ -117,15 +123,11 @@ def stream(path: Path) -> SceneStream:
     files = [path]
     if path.suffix.lower() != ".sog":
         files = sorted(file for folder in chunks_of(path) for file in folder.iterdir() if file.is_file())
-    return SogStream(path, counts, rest, offset, notes, files, lambda: _opened(path))
+    return _SogStream(path, counts, rest, offset, notes, files, lambda: _opened(path))
 
 
 def _offset(chunks: list[Chunk]) -> NDArray[np.float64]:
     """What g2ard's own writer left under "g2ard"; zeros without it, or where chunks differ."""
-    import numpy as np
-
-    from g2ard.io.jsonfile import Fields, numbers, object_of
-
     found = set()
     for chunk in chunks:
         with meta_errors(chunk):
@@ -136,8 +138,6 @@ def _offset(chunks: list[Chunk]) -> NDArray[np.float64]:
 
 def _left_out(path: Path, read_count: int) -> list[Note]:
     """Say that coarser levels, or an environment, lie beside the chunks that were read."""
-    from g2ard.io.types import Note
-
     folder = path if path.is_dir() else path.parent
     if path.suffix.lower() == ".sog" or (folder / "meta.json").is_file():
         return []
@@ -146,10 +146,57 @@ def _left_out(path: Path, read_count: int) -> list[Note]:
     return [Note("ignored_chunks", others, text)] if others > 0 else []
 
 
+class _SogStream(SceneStream):
+    """A scene of one or many chunks; blocks end where chunks do.
+
+    Args:
+        path: names the scene.
+        counts: Gaussians of each chunk.
+        rest: coefficients past band 0, the most of any chunk.
+        offset: (3,) float64.
+        notes: what was noticed so far.
+        files: what the scene is made of.
+        opened: gives the chunks, open to be read.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        counts: list[int],
+        rest: int,
+        offset: NDArray[np.float64],
+        notes: tuple[Note, ...],
+        files: list[Path],
+        opened: Callable[[], AbstractContextManager[list[Chunk]]],
+    ) -> None:
+        super().__init__(path, sum(counts), rest, offset, notes)
+        self._counts, self._rest, self._files, self._opened = counts, rest, files, opened
+
+    def identity(self) -> list[Any]:
+        return file_identity(self._files)
+
+    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+        with self._opened() as chunks:
+            for chunk, count in zip(chunks, self._counts, strict=True):
+                yield means_of(chunk, count)
+
+    def raw(self, rows: int, start: int) -> Iterator[Raw]:
+        with self._opened() as chunks:
+            for chunk, count in zip(chunks, self._counts, strict=True):
+                if start >= count:
+                    start -= count
+                    continue
+                decoder = Decoder(chunk, count)
+                for at in range(start, count, rows):
+                    raw = Raw.empty(min(rows, count - at), self._rest)
+                    raw.offset = self.offset
+                    decoder.fill(slice(at, at + len(raw.means)), raw)
+                    yield raw
+                start = 0
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[list[Chunk]]:
-    from g2ard.io.jsonfile import Fields, parse_json, read_json
-
     if path.suffix.lower() != ".sog":
         yield [
             Chunk(f"{f}{os.sep}", Fields(read_json(f / "meta.json")), _folder_loader(f))
@@ -175,7 +222,6 @@ def _opened(path: Path) -> Iterator[list[Chunk]]:
 
 def _bundle_loader(path: Path, bundle: zipfile.ZipFile, prefix: str) -> Callable[[str], bytes]:
     """Reads a file of the archive: whole, and of a size within `check_unpacked`."""
-    from g2ard.io.limits import check_unpacked
 
     def load(name: str) -> bytes:
         info = bundle.getinfo(prefix + name)

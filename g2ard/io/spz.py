@@ -1,4 +1,4 @@
-"""Niantic's .spz: 8-bit attributes in streams, gzipped whole (versions 2, 3) or Zstandard each (version 4).
+"""Niantic's .spz: 8-bit attributes, gzipped as a whole (versions 2, 3) or in Zstandard frames (version 4).
 
 SPZ stores right-up-back axes; a 3DGS .ply is right-down-forward. Both y and z change sign, and with them the
 quaternion's y and z and every harmonic odd in them.
@@ -6,6 +6,8 @@ quaternion's y and z and every harmonic odd in them.
 
 from __future__ import annotations
 
+import gzip
+import math
 import struct
 import sys
 import zlib
@@ -16,25 +18,40 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import DAMAGED, InputError, MissingDependencyError
+from g2ard.errors import DAMAGED, InputError, missing
+from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import check_unpacked
+from g2ard.io.packing import (
+    coded,
+    log_scales,
+    morton_order,
+    smallest_three,
+    unit_quats,
+    world_means,
+    writable,
+)
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
+from g2ard.scene.splats import Splats
 
-__all__ = ["COLOR_SCALE", "FLIPS", "MAGIC", "read", "zstandard"]
+__all__ = ["FLIPS", "fraction_bits", "read", "write"]
 
-MAGIC = b"NGSP"
+_MAGIC = b"NGSP"
 _HEADER = 16
 """Bytes."""
 
 _POSITION_BITS = 24
 _COEFFICIENTS = (0, 3, 8, 15, 24)
 _HAS_EXTENSIONS = 0x2
-COLOR_SCALE = 0.15
+_COLOR_SCALE = 0.15
 """SPZ's own factor for band 0, wider than the harmonic's so that colours past [0, 1] survive."""
 
 FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 """Sign of each harmonic of bands 1–3 when y and z change sign (PLY order: y z x | xy yz z² xz x²−y² | …)."""
+
+_USUAL_BITS, _MOST_BITS = 12, 20
+_BUCKETS = (8, 16)
+"""Steps that band 1, and bands past it, are rounded to: 5 and 4 of their 8 bits, as SPZ's own packer does."""
 
 
 def read(path: Path) -> Scene:
@@ -42,16 +59,16 @@ def read(path: Path) -> Scene:
 
     Raises:
         InputError: not an SPZ, an unknown version, truncated, or nothing in it finite.
-        MissingDependencyError: version 4 before Python 3.14 without `pip install g2ard[spz]`.
+        MissingDependencyError: version 4 before Python 3.14 without `pip install backports.zstd`.
     """
     data = path.read_bytes()
     if data[:2] == b"\x1f\x8b":
         data = _gunzip(path, data)
-    if data[:4] == MAGIC and len(data) < _HEADER:
+    if data[:4] == _MAGIC and len(data) < _HEADER:
         raise InputError(
             f"truncated: its header has {_HEADER} bytes, {len(data)} are there", path=path, hint=DAMAGED
         )
-    if data[:4] != MAGIC:
+    if data[:4] != _MAGIC:
         raise InputError(f"not an SPZ file (begins with {data[:4]!r})", path=path)
     sizes = _sizes(path, data)
     version, count, degree, fraction_bits, flags, stream_count = struct.unpack_from("<IIBBBB", data, 4)
@@ -66,7 +83,7 @@ def read(path: Path) -> Scene:
     raw.quats[:] = (_quats_xyz if version == 2 else _quats_packed)(rotations) * (1, 1, -1, -1)
     with np.errstate(divide="ignore"):
         raw.logit_opacities[:] = np.log(alphas / 255) - np.log1p(-(alphas / 255))
-    raw.sh0[:, 0] = (colors.reshape(-1, 3) / 255 - 0.5) / COLOR_SCALE
+    raw.sh0[:, 0] = (colors.reshape(-1, 3) / 255 - 0.5) / _COLOR_SCALE
     bands = sh.reshape(count, stored, 3)[:, :kept]
     raw.shN[:] = (bands.astype(np.float32) - 128) / 128 * FLIPS[:kept, None]
     notes = []
@@ -95,7 +112,7 @@ def _gunzip(path: Path, data: bytes) -> bytes:
 def _sizes(path: Path, head: bytes) -> list[int]:
     """Bytes of the positions, alphas, colours, scales, rotations and harmonics that a header promises."""
     version, count, degree, fraction_bits = struct.unpack_from("<IIBB", head, 4)
-    if head[:4] != MAGIC:
+    if head[:4] != _MAGIC:
         raise InputError(f"not an SPZ file (begins with {head[:4]!r})", path=path)
     if version not in (2, 3, 4):
         raise InputError(f"SPZ version {version} is not known (2, 3 and 4 are)", path=path)
@@ -147,8 +164,8 @@ def _zstd_streams(path: Path, data: bytes, stream_count: int, sizes: list[int]) 
     return streams
 
 
-def zstandard(path: Path) -> Any:
-    """The module that packs and unpacks Zstandard frames.
+def _zstandard(path: Path) -> Any:
+    """Return the module that packs and unpacks Zstandard frames.
 
     Raises:
         MissingDependencyError: there is none.
@@ -159,13 +176,13 @@ def zstandard(path: Path) -> Any:
         else:
             from backports import zstd
     except ImportError as error:
-        raise MissingDependencyError("SPZ version 4 needs `pip install g2ard[spz]`", path=path) from error
+        raise missing("SPZ version 4", "backports.zstd", path=path) from error
     return zstd
 
 
 def _zstd(path: Path) -> Callable[[bytes, int], bytes]:
     """What unpacks a frame of a size: no more than one byte past it."""
-    zstd = zstandard(path)
+    zstd = _zstandard(path)
 
     def decompress(frame: bytes, size: int) -> bytes:
         try:
@@ -205,3 +222,106 @@ def _quats_packed(codes: NDArray[np.uint8]) -> NDArray[np.float64]:
     rest = np.sqrt(np.maximum(0, 1 - (xyzw**2).sum(1)))
     xyzw[np.arange(len(packed)), largest] = rest
     return xyzw[:, [3, 0, 1, 2]]
+
+
+def write(path: Path, splats: Splats, *, overwrite: bool = False, spz_version: int = 3) -> None:
+    """Write an .spz; equal scenes give equal bytes.
+
+    Scales are held to e^−10 … e^5.94, harmonics to ±1, colours to a little past [0, 1].
+
+    Args:
+        path: the file to write.
+        splats: the scene.
+        overwrite: whether an existing file may be replaced.
+        spz_version: 3 (gzip), 4 (Zstandard streams: smaller files) or 2 (gzip, coarser rotations).
+
+    Raises:
+        OutputError: see `atomic_output`.
+        InputError: the scene is empty, has a non-finite value, or an offset that 24 bits do not hold.
+        MissingDependencyError: version 4 before Python 3.14 without `pip install backports.zstd`.
+    """
+    if spz_version not in (2, 3, 4):
+        raise InputError(f"expected 2, 3 or 4, got {spz_version}", parameter="spz_version")
+    splats = writable(path, splats)
+    splats = splats.take(morton_order(splats.means))
+    means = world_means(path, splats, ".spz")
+    bits = fraction_bits(path, means, splats)
+    streams = _streams(splats, means, bits, spz_version)
+    head = _MAGIC + struct.pack("<IIBBB", spz_version, len(splats), splats.sh_degree, bits, 0)
+    if spz_version < 4:
+        content = gzip.compress(head + b"\0" + b"".join(streams), 9, mtime=0)
+    else:
+        zstd = _zstandard(path)
+        packed = [zstd.compress(stream, 19) for stream in streams]
+        sizes = zip(packed, streams, strict=True)
+        table = b"".join(struct.pack("<QQ", len(p), len(stream)) for p, stream in sizes)
+        content = head + struct.pack("<BI12x", len(streams), 32) + table + b"".join(packed)
+    with atomic_output(path, overwrite) as temporary:
+        temporary.write_bytes(content)
+
+
+def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats) -> int:
+    """Fractional bits of the 24 of a coordinate: the usual 12, more where a step of 2^−12 would be more than
+    a quarter of the middle scale of one Gaussian in a hundred, as many as the extent leaves.
+
+    Raises:
+        InputError: the steps left are coarser than half of the Gaussians are thin.
+    """
+    farthest = float(np.abs(means).max())
+    room = 23 - math.ceil(math.log2(max(farthest, 2.0**-20) * (1 + 2**-20)))
+    middle = np.sort(splats.scales, axis=1)[:, 1].astype(np.float64)
+    fine = max(float(np.percentile(middle, 1)), 1e-12)
+    wanted = math.ceil(-math.log2(fine / 4))
+    bits = min(max(_USUAL_BITS, wanted), _MOST_BITS, room)
+    if bits < 0 or 2.0**-bits > max(float(np.median(middle)), 2.0**-_USUAL_BITS):
+        raise InputError(
+            f".spz holds steps of {2.0**-bits:g} at {farthest:g} from the origin; "
+            "write another format, or drop the offset with `g2ard convert --recentre`",
+            path=path,
+        )
+    return bits
+
+
+def _streams(splats: Splats, means: NDArray[np.float64], bits: int, version: int) -> list[bytes]:
+    """Positions, alphas, colours, scales, rotations and, where there are any, harmonics."""
+    fixed = np.rint(means * (1, -1, -1) * (1 << bits)).astype("<i4")
+    quats = unit_quats(splats.quats) * (1, 1, -1, -1)
+    streams = [
+        fixed.reshape(-1, 1).view(np.uint8)[:, :3].tobytes(),
+        _bytes(splats.opacities.astype(np.float64) * 255),
+        _bytes((splats.sh0[:, 0].astype(np.float64) * _COLOR_SCALE + 0.5) * 255),
+        _bytes((log_scales(splats) + 10) * 16),
+        _xyz(quats) if version == 2 else _packed(quats),
+    ]
+    if splats.sh_degree:
+        streams.append(_harmonics(splats))
+    return streams
+
+
+def _bytes(values: NDArray[Any]) -> bytes:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8).tobytes()
+
+
+def _xyz(quats: NDArray[np.float64]) -> bytes:
+    """Version 2: x y z of the sign that makes w ≥ 0."""
+    return _bytes(quats[:, 1:] * np.where(quats[:, :1] < 0, -1, 1) * 127.5 + 127.5)
+
+
+def _packed(quats: NDArray[np.float64]) -> bytes:
+    """2 bits name the largest of x y z w; then sign and 9 bits of |q|·√2 of the others, in order."""
+    largest, others = smallest_three(quats[:, [1, 2, 3, 0]])
+    words = largest.astype(np.uint32)
+    for k in range(3):
+        part = (others[:, k] < 0).astype(np.uint32) << 9 | coded(
+            np.abs(others[:, k]) * math.sqrt(2), 511
+        ).astype(np.uint32)
+        words = (words << np.uint32(10) | part).astype(np.uint32)
+    return words.astype("<u4").tobytes()
+
+
+def _harmonics(splats: Splats) -> bytes:
+    """128x + 128, rounded to the buckets' middles."""
+    rest = splats.shN.shape[1]
+    codes = np.rint(splats.shN.astype(np.float64) * FLIPS[:rest, None] * 128 + 128)
+    bucket = np.where(np.arange(rest) < 3, *_BUCKETS)[:, None]
+    return _bytes(np.floor((codes + bucket // 2) / bucket) * bucket)

@@ -6,7 +6,6 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +17,7 @@ from g2ard.io.sanitize import BLOCK, Raw, Tally
 from g2ard.io.types import Note
 from g2ard.scene.splats import Splats
 
-__all__ = ["PartsStream", "SceneStream", "file_identity", "open_stream"]
-
-_STREAMED = {
-    "ply": "ply",
-    "compressed_ply": "compressed_ply",
-    "sog": "sog",
-    "splat": "splat",
-    "tiles": "tiles",
-}
-"""Format → the module with its `stream(path)`; scenes of other formats are held as a whole."""
+__all__ = ["JoinedScenes", "PartsStream", "SceneStream", "file_identity"]
 
 _ENDS = 1 << 16
 """Bytes at each end of a file that tell it from others of its name, size and time."""
@@ -95,34 +85,6 @@ class SceneStream(ABC):
         return (*self.notes, *self.tally.notes(self.path))
 
 
-def open_stream(path: str | Path | Sequence[str | Path]) -> SceneStream:
-    """A scene, or several as one, to be read block by block.
-
-    Args:
-        path: a scene in any format that `g2ard.io.read_scene` reads, or several. Of .ply, .compressed.ply,
-            .splat, SOG and tiles a block at a time is held (of SOG also the images of one chunk, of tiles one
-            tile), of others all. Several take the offset of the first and the highest of their SH degrees.
-
-    Raises:
-        InputError: nothing is there, or it is broken as far as its header tells.
-    """
-    from g2ard.io.detect import file_format, kind, run_scene
-
-    if not isinstance(path, str | Path):
-        streams = [open_stream(part) for part in path]
-        if not streams:
-            raise InputError("no scene was given")
-        return streams[0] if len(streams) == 1 else _Joined(streams)
-    path = run_scene(path)
-    found = file_format(path)
-    if found in _STREAMED:
-        stream: SceneStream = import_module(f"g2ard.io.{_STREAMED[found]}").stream(path)
-        return stream
-    if kind(path) != "splats":
-        raise InputError(f"a Gaussian scene is needed, this is {kind(path)}", path=path)
-    return _whole(path)
-
-
 class PartsStream(SceneStream):
     """A scene of parts that are there as a whole when they are asked for, clean already.
 
@@ -182,19 +144,7 @@ class PartsStream(SceneStream):
         return self.notes
 
 
-def _whole(path: Path) -> SceneStream:
-    """A scene that is held as a whole."""
-    from g2ard.io import read_scene
-
-    scene = read_scene(path)
-    splats = scene.splats
-    identity = file_identity([path])
-    return PartsStream(
-        path, [len(splats)], lambda _: splats, splats.sh_degree, splats.offset, identity, scene.notes
-    )
-
-
-class _Joined(SceneStream):
+class JoinedScenes(SceneStream):
     """Several scenes, one after the other."""
 
     def __init__(self, streams: list[SceneStream]) -> None:

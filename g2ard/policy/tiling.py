@@ -221,8 +221,8 @@ def is_tiled(scene: Path, tiling: Tiling) -> bool:
         and scene.stat().st_size < _SMALLEST_ROW * tiling.most_rows
     ):
         return False
+    from g2ard.io import open_stream
     from g2ard.io.detect import kind
-    from g2ard.io.stream import open_stream
 
     return kind(scene) == "splats" and open_stream(scene).count > tiling.most_rows
 
@@ -239,7 +239,7 @@ def check_memory(scene: Path, tiling: Tiling, times: float, tile_times: float = 
     Raises:
         InputError: too little memory, with what would do; or the scene cannot be read.
     """
-    from g2ard.io.stream import open_stream
+    from g2ard.io import open_stream
     from g2ard.tiles.store import row_width
 
     if tiling.memory is None:
@@ -298,7 +298,7 @@ def _folder_of_tiles(scene: Path) -> Path | None:
 
 def _foretold(scene: Path) -> Callable[[int], int]:
     """Return a function from `--tile-rows` to the rows of the largest tile, halo included."""
-    from g2ard.io.stream import open_stream
+    from g2ard.io import open_stream
     from g2ard.tiles.pour import foretold
 
     stream = open_stream(scene)
@@ -317,7 +317,7 @@ def refuse_whole(scene: Path, options: Sequence[str]) -> None:
     """
     if not options:
         return
-    from g2ard.io.stream import open_stream
+    from g2ard.io import open_stream
 
     one = cut_into(_folder_of_tiles(scene), open_stream(scene).count)
     takes = "takes" if len(options) == 1 else "take"

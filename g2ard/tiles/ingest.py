@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from g2ard.errors import InputError, OutputError
-from g2ard.io import kind
+from g2ard.io import kind, open_point_stream, open_stream
 from g2ard.io.lock import LOCK, locked
-from g2ard.io.point_stream import open_point_stream
-from g2ard.io.stream import SceneStream, open_stream
+from g2ard.io.stream import SceneStream
 from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig
@@ -59,8 +58,8 @@ def ingest(
     Where it was interrupted the same call goes on from the last block, and where all is done it returns.
 
     Args:
-        source: a scene, or several as one, as `g2ard.io.stream.open_stream` takes them; or coloured clouds,
-            as `g2ard.io.point_stream.open_point_stream` does; or a stream of a scene.
+        source: a scene, or several as one, as `g2ard.io.open_stream` takes them; or coloured clouds,
+            as `g2ard.io.open_point_stream` does; or a stream of a scene.
         folder: where the tiles go; absent, empty, or holding these tiles in part or whole.
         tile_rows: Gaussians of a tile at the most; only Gaussians of one position are never parted.
         block_rows: rows in memory at a time; None takes 16 MiB of them.

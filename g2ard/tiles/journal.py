@@ -15,15 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, OutputError
+from g2ard.io.detect import JOURNAL, POINTS
 from g2ard.io.jsonfile import read_json
 from g2ard.tiles.cells import Cell, Points
 from g2ard.tiles.store import FORMAT, MANIFEST, VERSION, halo_name, tile_name
 
 __all__ = ["JOURNAL", "POINTS", "Journal", "clear", "is_ours"]
-
-JOURNAL = "journal.json"
-POINTS = ".points"
-"""The folder within for points that are still to be lifted."""
 
 _OURS = re.compile(r"(tile|halo)-\d{5,}\.f32|\.?(tiles|journal)\.json(\.new)?|\.points")
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import read_json
 from g2ard.io.types import Note
 from g2ard.scene.splats import Splats
@@ -34,7 +35,6 @@ __all__ = [
     "tile_name",
 ]
 
-MANIFEST = "tiles.json"
 FORMAT, VERSION = "g2ard tiles", 1
 
 _AT_ONCE = 1 << 16

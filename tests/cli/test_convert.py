@@ -36,7 +36,7 @@ def test_convert_says_what_is_wrong(tmp_path: Path, command_line: CommandLine) -
     write_splats(tmp_path / "a.ply", directional())
     for words, code, message in (
         (("b.ksplat",), 1, "scenes are written as"),
-        (("b.ply", "--spz-version", "3"), 1, "no option 'version'"),
+        (("b.ply", "--spz-version", "3"), 1, "no option 'spz_version'"),
         (("b.ply", "--box", "1,2"), 2, "expected 6 numbers"),
         (("b.ply", "--box", "8,8,8,9,9,9"), 1, "nothing is left"),
         (("b.ply", "--transform", "1 2 3"), 2, "expected 16 numbers"),

@@ -93,7 +93,7 @@ def make(folder: Path, what: str) -> str:
     content = path.read_bytes()
     if what == "truncated":
         path.write_bytes(content[:-1000])
-        return "promises 400 rows"
+        return "vertex row 393 of 400 cannot be read"
     if what == "property":
         path.write_bytes(content.replace(b"property float rot_3\n", b"property float other\n"))
         return "'rot_3'"

@@ -129,7 +129,7 @@ def test_views_without_photos_say_what_stands_in(command_line: CommandLine, fold
 
 
 def test_what_is_of_the_wrong_kind_says_what_it_is(folder: Path) -> None:
-    with pytest.raises(InputError, match="g2ard's views, no scene; name the scene's own file"):
+    with pytest.raises(InputError, match="g2ard's views; name the scene's own file"):
         g2ard.load(folder / "views.json")
     with pytest.raises(InputError, match=r"views are needed .*, this is a Gaussian scene"):
         g2ard.load_views(folder / "ball.ply")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from g2ard.errors import InputError
+from g2ard.errors import DAMAGED, InputError
 from g2ard.io import kind, read_points, read_views
 from helpers.realdata import real
 from helpers.view_files import MODELS, colmap, orbit, photo
@@ -83,8 +83,9 @@ def test_the_column_that_is_cut_is_named(tmp_path: Path, name: str, keep: int, c
     folder = colmap(tmp_path / "project", orbit(3), text=False)
     path = folder / "sparse" / "0" / name
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(InputError, match=rf"{name}: truncated in ({column})$"):
+    with pytest.raises(InputError, match=rf"{name}: .*truncated in ({column});") as caught:
         (read_points if "points" in name else read_views)(folder)
+    assert (caught.value.path, caught.value.hint) == (path, DAMAGED)
 
 
 @pytest.mark.parametrize(

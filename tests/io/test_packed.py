@@ -49,7 +49,7 @@ def test_compressed_ply_with_too_few_chunks(tmp_path: Path) -> None:
 def test_truncated_compressed_ply(tmp_path: Path) -> None:
     path = compressed(tmp_path / "a.ply", truth(300, 0))
     path.write_bytes(path.read_bytes()[:-10])
-    with pytest.raises(InputError, match=r"truncated: .* 300 rows"):
+    with pytest.raises(InputError, match="of 300 cannot be read"):
         read_splats(path)
 
 
@@ -116,7 +116,7 @@ def test_spz_without_zstandard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     path = save_spz(tmp_path / "a.spz", truth(3, 0), 4)
     for name in ("backports", "backports.zstd", "compression.zstd"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(MissingDependencyError, match=r"pip install g2ard\[spz\]"):
+    with pytest.raises(MissingDependencyError, match=r"pip install backports.zstd"):
         read_splats(path)
 
 

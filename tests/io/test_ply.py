@@ -197,7 +197,7 @@ def test_gap_in_f_rest(tmp_path: Path) -> None:
 def test_truncated(tmp_path: Path, text: bool) -> None:
     path = save(tmp_path / "a.ply", columns(scene(count=100, degree=0)), text=text)
     path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(InputError, match=r"a\.ply: (truncated: .*promises 100 rows|early end-of-line)"):
+    with pytest.raises(InputError, match=r"a\.ply: .*vertex row \d+ of 100 cannot be read"):
         read_splats(path)
 
 

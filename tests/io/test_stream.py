@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import read_cloud, read_scene, write_splats
-from g2ard.io.point_stream import open_point_stream
-from g2ard.io.stream import open_stream
+from g2ard.io import open_point_stream, open_stream, read_cloud, read_scene, write_splats
 from g2ard.levels import Cut, save_levels
 from g2ard.scene.splats import Splats
 from helpers.ply_files import columns, save, scene

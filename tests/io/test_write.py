@@ -16,7 +16,7 @@ from g2ard.io import check_scene_output, read_scene, read_splats, write_splats
 from g2ard.io.glb import EXTENSION
 from g2ard.io.packing import morton_order, unit_quats
 from g2ard.io.sog_write import nearest, palette_size, sog_files
-from g2ard.io.spz_write import fraction_bits
+from g2ard.io.spz import fraction_bits
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import transform
 from helpers.glb_files import glb_parts
@@ -105,8 +105,8 @@ def test_names_and_options(tmp_path: Path) -> None:
     for name in ("b.ksplat", "b", "meta.txt"):
         with pytest.raises(OutputError, match=r"scenes are written as .*\.sog"):
             write_splats(tmp_path / name, scene(5))
-    with pytest.raises(OutputError, match=r"\.sog has no option 'version'"):
-        write_splats(tmp_path / "c.sog", scene(5), version=3)
+    with pytest.raises(OutputError, match=r"\.sog has no option 'spz_version'"):
+        write_splats(tmp_path / "c.sog", scene(5), spz_version=3)
     with pytest.raises(OutputError, match="exists"):
         check_scene_output(tmp_path / "b.PLY")
     write_splats(tmp_path / "room" / "meta.json", scene(5))
@@ -165,7 +165,7 @@ def test_sog(tmp_path: Path, name: str, degree: int) -> None:
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_spz(tmp_path: Path, version: int, degree: int) -> None:
     truth = in_order(scene(700, degree))
-    path = saved(tmp_path, "spz", truth, version=version)
+    path = saved(tmp_path, "spz", truth, spz_version=version)
     found = read_splats(path)
     bits = fraction_bits(path, truth.means.astype(float), truth)
     np.testing.assert_allclose(found.means, truth.means, atol=0.5 / (1 << bits) + 1e-6)
@@ -178,6 +178,14 @@ def test_spz(tmp_path: Path, version: int, degree: int) -> None:
         assert turned(found.quats, truth.quats).max() <= math.sqrt(2 * 3 * 0.5 / 127.5)
     else:
         assert turned(found.quats, truth.quats).max() <= 3 / (511 * math.sqrt(2)) / 2 + 1e-6
+
+
+def test_spz_version_3_is_the_default_and_holds_what_version_4_does(tmp_path: Path) -> None:
+    truth = scene(700, 3)
+    three, four = saved(tmp_path, "spz", truth), saved(tmp_path, "4.spz", truth, spz_version=4)
+    assert three.read_bytes()[:2] == b"\x1f\x8b"
+    for name in ("means", "quats", "scales", "logit_opacities", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(read_splats(three), name), getattr(read_splats(four), name))
 
 
 def test_spz_bits_follow_the_extent(tmp_path: Path) -> None:
@@ -380,7 +388,7 @@ def test_splat_transform_reads_it_as_we_do(tmp_path: Path, name: str) -> None:
 
 
 def test_splat_transform_reads_spz_3_and_splat(tmp_path: Path) -> None:
-    path = saved(tmp_path, "spz", scene(500, 2), version=3)
+    path = saved(tmp_path, "spz", scene(500, 2))
     splat_transform(path, tmp_path / "peer.ply")
     agree(about_x(read_splats(path)), read_splats(tmp_path / "peer.ply"))
     path = saved(tmp_path, "splat", scene(500, 0))
@@ -390,7 +398,7 @@ def test_splat_transform_reads_spz_3_and_splat(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("version", [2, 3, 4])
 def test_adobe_reads_spz_as_we_do(tmp_path: Path, version: int) -> None:
-    path = saved(tmp_path, "spz", scene(500, 3), version=version)
+    path = saved(tmp_path, "spz", scene(500, 3), spz_version=version)
     ours, theirs = read_splats(path), adobe_spz(path)
     np.testing.assert_allclose(theirs["positions"].reshape(-1, 3), ours.means, atol=1e-6)
     np.testing.assert_allclose(theirs["scales"].reshape(-1, 3), ours.log_scales, atol=1e-5)

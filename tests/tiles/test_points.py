@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError, OutputError
-from g2ard.io import Points, read_cloud, write_points
-from g2ard.io.point_stream import open_point_stream
+from g2ard.io import Points, open_point_stream, read_cloud, write_points
 from g2ard.stages.lift import LiftConfig, lift
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.store import TileStore, packed

@@ -50,7 +50,7 @@ def convert(
     ] = False,
     sh_degree: ShDegreeOption = None,
     spz_version: Annotated[
-        int | None, typer.Option(min=2, max=4, help="Of an .spz: 4, or 3 or 2 for older programs.")
+        int | None, typer.Option(min=2, max=4, help="Version of an .spz: 3 if not given; 4 is smaller.")
     ] = None,
 ) -> None:
     """Write scenes in another format: merged, cropped, moved, with fewer harmonics."""
@@ -65,7 +65,7 @@ def convert(
     from g2ard.scene.transform import transform as moved
 
     scenes, output = _parted(run, scenes, output)
-    options: dict[str, Any] = {} if spz_version is None else {"version": spz_version}
+    options: dict[str, Any] = {} if spz_version is None else {"spz_version": spz_version}
     corners = None if box is None else numbers("--box", box, 6)
     ball = None if sphere is None else numbers("--sphere", sphere, 4)
     matrix = None if transform is None else _matrix(transform)
