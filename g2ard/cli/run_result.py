@@ -60,8 +60,7 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
 def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
     """What recovery kept, where it lost, and what no view saw, a line each; if `verbose`, regularisers that
     never acted too."""
-    from g2ard.stages.recover.outcome import outcome, unregularized_rounds
-    from g2ard.stages.recover.report import RecoverReport
+    from g2ard.stages.recover.report import RecoverReport, outcome, unregularized_rounds
 
     rounds = [[RecoverReport.of(done) for done in entry.get("recover", [])] for entry in report["rounds"]]
     lines = [outcome(one) for entry in rounds for one in entry]

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from g2ard.levels.earlier import named_in, remove
 from g2ard.levels.error import leaf_errors
 from g2ard.levels.tree import Cut, Leaf, Node
 from g2ard.levels.tree import cut as cut_tree
@@ -35,6 +36,9 @@ _ERRORS = "errors.jsonl"
 
 _BESIDE = "beside.txt"
 """There too: the hidden folder that becomes the output, for a killed call leaves it."""
+
+_PART, _IMAGE = re.compile(r"\d+_\d+/meta\.json"), re.compile(r"\w+\.webp")
+"""What a file of a level is called, and what the images that it names are."""
 
 
 def save_levels(
@@ -94,7 +98,7 @@ def save_levels(
         "filenames": list(files.parts),
         "tree": root,
     }
-    before = named_in(Path(path))
+    before = _named_in(Path(path))
     if work is not None:
         _sweep(work)
         files.write(work, Path(path), progress)
@@ -111,7 +115,7 @@ def save_levels(
         written = {
             file.relative_to(folder): file.stat().st_size for file in folder.rglob("*") if file.is_file()
         }
-    remove(Path(path), before - written.keys())
+    _remove(Path(path), before - written.keys())
     if work is not None:
         for name in files.parts:
             shutil.rmtree((work / name).parent, ignore_errors=True)
@@ -235,3 +239,35 @@ def _lines(table: Path) -> list[list[float]]:
 def _rounded(values: Sequence[float] | NDArray[np.float64]) -> list[float]:
     """Seven digits, those of a float32."""
     return [float(f"{float(value):.7g}") for value in values]
+
+
+def _named_in(path: Path) -> set[Path]:
+    """The files of all levels, relative to the folder; none where there is no folder of ours."""
+    named: set[Path] = set()
+    for part in map(Path, _names(_json(path / "lod-meta.json"), "filenames", _PART)):
+        entries = [entry for entry in _json(path / part).values() if isinstance(entry, dict)]
+        images = [image for entry in entries for image in _names(entry, "files", _IMAGE)]
+        named |= {part, *map(part.with_name, images)}
+    return named
+
+
+def _remove(path: Path, files: Collection[Path]) -> None:
+    """Remove files of the folder, and the folders in it that they leave empty."""
+    for file in files:
+        (path / file).unlink(missing_ok=True)
+    for folder in {(path / file).parent for file in files}:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def _names(content: dict[str, Any], key: str, pattern: re.Pattern[str]) -> list[str]:
+    found = content.get(key)
+    return [name for name in map(str, found) if pattern.fullmatch(name)] if isinstance(found, list) else []
+
+
+def _json(file: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

@@ -46,7 +46,7 @@ class DistillConfig:
         schedule: recovery's; one with `round_steps` recovers after every round of 75 % (the paper), without
             them the reduction is one shot and all recovery happens at the target count.
         steps: the final horizon; None means the schedule's, more where a view holds little of the scene
-            (`g2ard.stages.recover.need`).
+            (`g2ard.stages.recover.schedule`).
         recovery_time: seconds for all recovery, shared out over rounds in proportion to their steps; horizons
             become what fits into them.
         regularizers: weights of L_anchor and L_shape.
@@ -165,7 +165,7 @@ def final_steps(config: DistillConfig, scene: Splats, cameras: Cameras, *, photo
         cameras: the views it learns from.
         photos: whether those are photos.
     """
-    from g2ard.stages.recover.need import steps_for
+    from g2ard.stages.recover.schedule import steps_for
 
     schedule = config.schedule
     if config.steps is not None:

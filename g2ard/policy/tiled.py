@@ -393,7 +393,7 @@ class _Job:
     ) -> tuple[TiledScene, TiledScores]:
         """Recover a simplified scene, unless nothing is to be learned, and score it."""
         from g2ard.policy.views import pool_times
-        from g2ard.stages.recover.need import steps_for
+        from g2ard.stages.recover.schedule import steps_for
         from g2ard.tiles.recover import recover_tiles
 
         needed = steps_for(self.sample, views.train.cameras, self.config.schedule.steps)

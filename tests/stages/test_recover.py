@@ -27,7 +27,7 @@ from g2ard.stages.recover import RecoverConfig, loop, probe, recover
 from g2ard.stages.recover import checkpoint as checkpoint_module
 from g2ard.stages.recover.anchors import PRESETS, Anchors, Regularizers
 from g2ard.stages.recover.guard import Guard, blended
-from g2ard.stages.recover.outcome import outcome
+from g2ard.stages.recover.report import outcome
 from g2ard.stages.recover.schedule import PAPER, TUNED
 from g2ard.stages.simplify import simplify
 from helpers.scenes import around, assert_same_bits, checkered_ball, under_a_sky

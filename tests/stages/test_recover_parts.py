@@ -22,8 +22,8 @@ from g2ard.stages.recover.anchors import (
     effective_rank,
     needle,
 )
+from g2ard.stages.recover.losses import TorchAnchors, anchor_loss, regularization, shape_loss
 from g2ard.stages.recover.presets import preset_for, view_consistency
-from g2ard.stages.recover.regularize import TorchAnchors, anchor_loss, regularization, shape_loss
 from g2ard.stages.recover.schedule import PAPER, TUNED, schedule_named
 from helpers.scenes import around, checkered_ball
 

@@ -18,9 +18,8 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, Regularizers
 from g2ard.stages.recover.extent import extents, share_of_rate
-from g2ard.stages.recover.losses import l1_ssim
+from g2ard.stages.recover.losses import TorchAnchors, l1_ssim, regularization
 from g2ard.stages.recover.rasterize import rasterize
-from g2ard.stages.recover.regularize import TorchAnchors, regularization
 from g2ard.stages.recover.schedule import Rates
 from helpers.raster_cases import NAMES, Params, camera, scene, tensors_of
 

@@ -83,8 +83,8 @@ def recover(
     from g2ard.scene.targets import kinds_of
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover import recover as optimize
-    from g2ard.stages.recover.outcome import outcome, unregularized
     from g2ard.stages.recover.presets import preset_for
+    from g2ard.stages.recover.report import outcome, unregularized
     from g2ard.stages.recover.schedule import schedule_named
 
     values = run.constants(recover=RecoverConfig())

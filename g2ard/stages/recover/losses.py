@@ -1,4 +1,4 @@
-"""The photometric loss: fused in Rust on the CPU, in plain torch elsewhere."""
+"""Losses of recovery in torch: the photometric loss, L_shape and L_anchor (`eq:shape`, `eq:anchor`)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from torch.nn.functional import conv2d
 
 from g2ard import _core
 from g2ard.errors import InputError
+from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.extent import rotations
 
-__all__ = ["l1_ssim", "l1_ssim_anywhere"]
+__all__ = ["TorchAnchors", "anchor_loss", "l1_ssim", "l1_ssim_anywhere", "regularization", "shape_loss"]
 
 _WINDOW, _SIGMA = 11, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
@@ -87,3 +89,53 @@ def l1_ssim_anywhere(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
     above = (2 * mean_x * mean_y + _C1) * (2 * both + _C2)
     ssim = above / ((mean_x**2 + mean_y**2 + _C1) * (var_x + var_y + _C2))
     return (1 - ssim_weight) * (x - y).abs().mean() + ssim_weight * (1 - ssim.mean())
+
+
+class TorchAnchors:
+    """`Anchors` as tensors."""
+
+    def __init__(self, anchors: Anchors) -> None:
+        self.means = torch.from_numpy(anchors.means)
+        self.frames = torch.from_numpy(anchors.frames)
+        self.r_parallel = torch.from_numpy(anchors.r_parallel)
+        self.r_perp = torch.from_numpy(anchors.r_perp)
+
+    def to(self, device: torch.device) -> TorchAnchors:
+        """Itself, moved."""
+        for name, value in vars(self).items():
+            setattr(self, name, value.to(device))
+        return self
+
+
+def anchor_loss(means: Tensor, anchors: TorchAnchors) -> Tensor:
+    """(1/N) Σ log(1 + [D² − 1]₊): nothing inside the trust region, robust outside it."""
+    local = torch.einsum("nji,nj->ni", anchors.frames, means - anchors.means)
+    inside = (local[:, :2] / anchors.r_parallel[:, None]).square().sum(1)
+    squared = inside + (local[:, 2] / anchors.r_perp).square()
+    return torch.log1p((squared - 1).clamp_min(0)).mean()
+
+
+def shape_loss(log_scales: Tensor, quats: Tensor, anchors: TorchAnchors, weights: Regularizers) -> Tensor:
+    """(1/N) Σ max(0, −log(r_eff − 1 + ε)) + β[log s⊥ − log s̄⊥]₊; s⊥ is taken along the anchor's normal."""
+    normal = anchors.frames[:, :, 2]
+    extent = torch.einsum("nji,nj->ni", rotations(quats), normal) * log_scales.exp()
+    thickness = extent.square().sum(1).clamp_min(1e-38).log() / 2 - anchors.r_perp.log()
+    total = weights.thickness * thickness.clamp_min(0)
+    if weights.effective_rank:
+        log_q = torch.log_softmax(log_scales, dim=1)  # log(s / Σs)
+        rank = torch.exp(-(log_q.exp() * log_q).sum(1))
+        total = total + (-torch.log((rank - 1).clamp_min(0) + weights.rank_offset)).clamp_min(0)
+    return total.mean()
+
+
+def regularization(
+    means: Tensor, quats: Tensor, log_scales: Tensor, anchors: TorchAnchors, weights: Regularizers
+) -> Tensor:
+    """λ_a·L_anchor + λ_s·L_shape."""
+    total = means.new_zeros(())
+    if weights.anchor > 0:
+        total = total + weights.anchor * anchor_loss(means, anchors)
+    if weights.shape > 0:
+        shape = shape_loss(log_scales, quats, anchors, weights)
+        total = total + weights.shape * shape
+    return total

@@ -1,19 +1,30 @@
-"""How fast each attribute learns, and for how long."""
+"""Learning rates of each attribute, and numbers of steps."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 from g2ard.errors import InputError, require
 
-__all__ = ["PAPER", "SCHEDULES", "TUNED", "Rates", "Schedule", "schedule_named"]
+if TYPE_CHECKING:
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
+
+__all__ = ["PAPER", "SCHEDULES", "TUNED", "Rates", "Schedule", "schedule_named", "steps_for"]
 
 _REACH = 0.01
 """Gaussians larger than a hundredth of the image hardly move, unless that is the scene's typical size."""
 
 _UNTRAINED_RMSE = 0.1
 """A start further from its targets must yet become surfaces: large Gaussians have to move."""
+
+_POINTS = 4096
+"""Gaussians by which `steps_for` measures views."""
+
+_MOST_TIMES = 2.25
+"""Times the schedule's steps, at most: recovery must end in minutes."""
 
 
 @dataclass(frozen=True)
@@ -208,3 +219,32 @@ def reach_for(start_rmse: float, typical: float) -> float:
     (0.01, 0.04, inf)
     """
     return max(_REACH, typical) if start_rmse < _UNTRAINED_RMSE else math.inf
+
+
+def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
+    """Return `steps` times 1/√share for views that hold a share of the scene.
+
+    An object is whole in every view of an orbit; in a room or on a path a view holds a tenth. At equal steps
+    its Gaussians would learn a tenth as often; the root is the middle between that and equal time.
+
+    Args:
+        scene: what is to be recovered.
+        cameras: the views it learns from, in world coordinates.
+        steps: the schedule's.
+
+    Returns:
+        Between `steps` and 2.25 times that.
+
+    >>> from g2ard.scene.cameras import Cameras, look_at
+    >>> from g2ard.scene.splats import Splats
+    >>> line = Splats.create([[0, 0, 0], [9, 0, 0], [0, 0, 9], [-9, 0, 0]], scales=np.ones((4, 3)))
+    >>> K = [[50, 0, 32], [0, 50, 32], [0, 0, 1]]
+    >>> view = Cameras.from_lists([look_at([0, -3, 0], [0, 0, 0])], [K], [(64, 64)], ["a"])
+    >>> steps_for(line, view, 1000)
+    2000
+    """
+    import numpy as np
+
+    some = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), _POINTS)).round().astype(int))
+    points = scene.means[some].astype(np.float64) + scene.offset
+    return round(steps / math.sqrt(max(cameras.usual_share(points), 1 / _MOST_TIMES**2)))

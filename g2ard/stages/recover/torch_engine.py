@@ -15,9 +15,8 @@ from g2ard.rendering.renderer import settings_for
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.engine import Objective
 from g2ard.stages.recover.extent import extents, share_of_rate
-from g2ard.stages.recover.losses import l1_ssim
+from g2ard.stages.recover.losses import TorchAnchors, l1_ssim, regularization
 from g2ard.stages.recover.rasterize import rasterize
-from g2ard.stages.recover.regularize import TorchAnchors, regularization
 from g2ard.stages.recover.schedule import Rates
 from g2ard.stages.recover.selective_adam import SelectiveAdam
 from g2ard.stages.recover.sizes import radii
