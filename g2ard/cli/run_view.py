@@ -23,21 +23,21 @@ def run_view(
         path: the .html; what an earlier run left there is replaced, or goes.
         scene: the scene's file, whose name labels it.
         splats: the scene.
-        cameras: one of them is the start, see `g2ard.policy.view.stand_with`.
+        cameras: one of them is the start, see `g2ard.policy.viewer_frame.frame_with`.
         background: RGB in [0, 1].
 
     Returns:
         Bytes of the page, None if there is none, and what to say of it.
     """
     from g2ard.policy.budget import DEVICES
-    from g2ard.policy.view import stand_with
+    from g2ard.policy.viewer_frame import frame_with
     from g2ard.viewer import write_page
 
     count, most = len(splats), DEVICES["web"]
     if count > most:
         path.unlink(missing_ok=True)
         return None, f"no {path}: over {most:,} Gaussians (`g2ard view` writes one all the same)"
-    stand = stand_with(splats, cameras)
+    stand = frame_with(splats, cameras)
     shown = [(f"{scene.name}: {plural(count, 'Gaussian')}", stand.of(splats))]
     written = write_page(path, shown, start=stand.start, background=background, overwrite=True)
     return written.bytes, f"view: {path} ({written.bytes / 1e6:.2f} MB)"

@@ -81,7 +81,7 @@ class TiledCommand:
         from g2ard import io
         from g2ard.policy.tiled import distill_in_tiles, working
         from g2ard.policy.tiling import refuse_whole, whole_budgets, whole_options
-        from g2ard.report.tiled import tiled_report
+        from g2ard.report.distilled import tiled_report
 
         run, began = self.run, time.perf_counter()
         with working(self.tiling, options.views, options.held_out):

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from g2ard.errors import InputError
 from g2ard.policy.budget import Budget
 from g2ard.policy.distill_options import DistillOptions, takes_options
-from g2ard.policy.found import warn_of_photos
 from g2ard.policy.inputs import load_scene, say_regions
 from g2ard.policy.job import DistillJob
+from g2ard.policy.view_checks import warn_of_photos
 from g2ard.policy.views import is_made, views_of
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.regions import as_regions
@@ -110,7 +110,7 @@ def prepare(
     """
     from g2ard.config.constants import changed, full_names
     from g2ard.pipeline import DistillConfig
-    from g2ard.policy.clean import clutter_seen
+    from g2ard.policy.inputs import clutter_seen
     from g2ard.stages.lift import LiftConfig
     from g2ard.stages.recover.presets import preset_for
 

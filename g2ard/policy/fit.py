@@ -46,8 +46,8 @@ _PROBES, _FULL, _AIM = 6, 0.98, 0.99
 """The most files written to find a count of bytes; shares of the bytes that are enough, and aimed at."""
 _MARGIN = 0.985
 """Of the bytes asked for, where the result is not what the files were written of: recovery is to come."""
-_LOOKS = 8
-"""Counts that the quality is looked at for, at the most."""
+_TRIALS = 8
+"""Most counts at which the quality is measured."""
 _CLOSE_ENOUGH = 0.25
 """Decibels above what is wanted that are close enough to stop."""
 _SLOPE = 4.0
@@ -184,7 +184,7 @@ def count_for_quality(
     met, good, missed = len(splats), Quality(float("inf"), 1.0), 0
     excesses: dict[int, float] = {}
     count = max(_FEWEST, len(splats) // 4)
-    while len(excesses) < _LOOKS and missed < count < met:
+    while len(excesses) < _TRIALS and missed < count < met:
         found = quality(renders, reduce(count), cameras)
         excesses[count] = excess = found.over(wanted)
         if excess >= 0:

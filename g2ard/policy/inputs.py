@@ -18,11 +18,13 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
     from g2ard.scene.targets import Targets
+    from g2ard.stages.clean import Cleaning
     from g2ard.stages.simplify import SimplifyConfig
 
     Views = Cameras | ViewSet | str | Path  # read already, or where they lie
 
 __all__ = [
+    "clutter_seen",
     "drop_held_out",
     "load_for_training",
     "load_held_out",
@@ -35,6 +37,13 @@ __all__ = [
     "say_notes",
     "say_regions",
 ]
+
+_CLUTTER_VIEWS, _CLUTTER_SIDE = 96, 400
+"""Generated views that clutter is found by, and their longer side, pixels."""
+_CLUTTER_ROWS = 100_000
+"""Gaussians that those views are planned on."""
+_CLUTTER_NEAR = 0.25
+"""Share of nearer views among them."""
 
 
 def load_scene(path: str | Path, say: Say = unsaid) -> Splats:
@@ -234,3 +243,50 @@ def make_targets(
         lazy=lazy,
         progress=progress,
     )
+
+
+def clutter_seen(
+    splats: Splats,
+    kinds: tuple[str, ...] | None = None,
+    *,
+    seed: int = 0,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> tuple[Cleaning, Cameras]:
+    """Find clutter from generated views, and say how much there is of each kind.
+
+    Args:
+        splats: the scene.
+        kinds: looked for; None for all of `g2ard.stages.clean.KINDS`.
+        seed: of the generated views.
+        progress: receives planning and renders.
+        say: receives log lines.
+
+    Returns:
+        The clutter, and the views it was found by.
+
+    Raises:
+        InputError: an unknown kind, or a scene with no room for poses.
+    """
+    from g2ard.poses import plan_pool
+    from g2ard.rendering.visibility import visibility
+    from g2ard.stages.clean import KINDS, find_clutter, within_reach
+
+    kinds = kinds or KINDS
+    pool = plan_pool(
+        splats,
+        _CLUTTER_VIEWS,
+        seed=seed,
+        rows=_CLUTTER_ROWS,
+        near=_CLUTTER_NEAR,
+        looks=True,
+        progress=progress,
+    )
+    cameras = pool.cameras.resized(_CLUTTER_SIDE)
+    seen = visibility(splats, cameras, progress)
+    pixels = int((cameras.widths.astype(int) * cameras.heights).sum())
+    found = find_clutter(splats, seen, within_reach(splats, cameras, progress), pixels, kinds)
+    parts = [f"{count:,} {name}" for name, count in found.counts.items() if name in kinds]
+    gone = len(splats) - int(found.keep.sum())
+    say(f"{gone:,} of {plural(len(splats), 'Gaussian')} can go: {', '.join(parts)}")
+    return found, cameras

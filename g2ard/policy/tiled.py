@@ -218,8 +218,8 @@ def _given(views: Views | None, say: Say) -> Cameras | None:
 
 def _found(scene: Path, sample: Splats, say: Say) -> Cameras | None:
     """Return the cameras beside the scene that see the sample of it."""
-    from g2ard.policy.found import as_pool, found_views
     from g2ard.policy.inputs import load_views
+    from g2ard.policy.view_checks import as_pool, found_views
 
     found = found_views(scene, sample, ["train"], say)
     return as_pool(load_views(found, "train", None, say)) if found else None

@@ -67,7 +67,7 @@ class Site:
     def of(
         cls, splats: Splats, up: ArrayLike | None = None, rows: int | None = None, represents: float = 1.0
     ) -> Site:
-        """Stand a scene upright, looking at `rows` of its Gaussians at most; each represents so many.
+        """ViewerFrame a scene upright, looking at `rows` of its Gaussians at most; each represents so many.
 
         Raises:
             InputError: nothing visible, or an `up` that is no direction.

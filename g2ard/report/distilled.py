@@ -1,4 +1,4 @@
-"""A distillation's report: how close it came and what it took, then the views that came out worst."""
+"""Reports of a distillation: the page, the page of a run in tiles, and the before/after picture."""
 
 from __future__ import annotations
 
@@ -10,19 +10,25 @@ import numpy as np
 
 from g2ard.errors import InputError
 from g2ard.progress import plural
+from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.report.charts import Point, chart
 from g2ard.report.page import Comparison, Page, Shown, legend
 from g2ard.report.window import Crop
-from g2ard.scene.images import to_bytes
+from g2ard.scene.images import contact_sheet, to_bytes, write_png
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Targets
 
-__all__ = ["check_crops", "distill_report"]
+__all__ = ["check_crops", "distill_report", "preview", "tiled_report"]
 
 _VIEWS = 6
 _STRETCHES = 25
 """Of the loss: single views differ more than steps do."""
+
+_PREVIEWED = 3
+"""Rows of the before/after picture."""
+
+_STAGES = ("simplified", "recovered")
 
 
 def distill_report(
@@ -152,3 +158,87 @@ def _loss_charts(rounds: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
         Point((k + 1) / len(curve) * steps, value, 1, 0, f"{value:.4f}") for k, value in enumerate(curve)
     ]
     return [("Loss of the last recovery", chart(points, x_label="step", y_label="loss", joined=True))]
+
+
+def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:
+    """Write an HTML page about one run in tiles.
+
+    Args:
+        path: the file.
+        title: of the page.
+        report: what `g2ard distill` writes of a run in tiles as report.json.
+    """
+    scores, views = report["scores"], report["views"]
+    unseen, tiles = plural(views["test"], "unseen view"), plural(len(scores["tiles"]), "tile")
+    page = Page(title, f"{unseen} against teacher renders, in {tiles}")
+    page.table(
+        ["scene", "Gaussians", "PSNR"],
+        [[stage, f"{report['output_count']:,}", f"{scores[stage]:.2f}"] for stage in _STAGES],
+        set(),
+    )
+    page.paragraph(
+        f"From {plural(report['input_count'], 'Gaussian')}, in {report['seconds']['total']:,.0f} s and "
+        f"{scores['steps']:,} steps of recovery, those of all tiles summed; {plural(views['train'], 'view')} "
+        f"to learn from. PSNR is over the {scores['pixels']:,} pixels that tiles own."
+    )
+    shown = [tile for tile in scores["tiles"] if tile["pixels"]]
+    page.html(legend(_STAGES))
+    page.charts([("Error of each tile against its Gaussians", _tile_chart(shown))])
+    page.heading("Tiles, the worst first")
+    page.table(
+        ["tile", "Gaussians", "simplified, dB", "recovered, dB", "steps", "pixels"],
+        [
+            [
+                str(tile["tile"]),
+                f"{tile['count']:,}",
+                *(f"{tile[stage]:.2f}" for stage in _STAGES),
+                f"{tile['steps']:,}",
+                f"{tile['pixels']:,}",
+            ]
+            for tile in sorted(shown, key=lambda tile: (tile["recovered"], tile["tile"]))
+        ],
+        set(),
+    )
+    if others := len(scores["tiles"]) - len(shown):
+        page.paragraph(f"No held-out view has a pixel that is owned by the {plural(others, 'other tile')}.")
+    page.write(path)
+
+
+def _tile_chart(tiles: list[dict[str, Any]]) -> str:
+    points = [
+        Point(max(1, tile["count"]), tile[stage], i, 0, f"tile {tile['tile']}, {stage}: {tile[stage]:.2f} dB")
+        for tile in tiles
+        for i, stage in enumerate(_STAGES)
+    ]
+    return chart(points, x_label="Gaussians", y_label="PSNR, dB", log=True) if points else ""
+
+
+def preview(
+    path: Path,
+    targets: Targets,
+    scenes: list[tuple[str, Splats]],
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> None:
+    """Write a PNG with a row for each of three evenly spaced views: target, then each scene with its PSNR.
+
+    Args:
+        path: where the PNG goes.
+        targets: photos or teacher renders with their cameras.
+        scenes: (label, scene), left to right after the target.
+        background: RGB behind the scenes.
+    """
+    count = len(targets.cameras)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _PREVIEWED)).round().astype(int))
+    rows, captions = [], []
+    renderers = [Renderer(splats, background=background) for _, splats in scenes]
+    for view in map(int, chosen):
+        target = targets[view]
+        images = [renderer.image(targets.cameras[view]) for renderer in renderers]
+        rows.append([target, *(np.clip(image, 0, 1) for image in images)])
+        scores = [
+            f"{name} {psnr(image, target):.2f} dB"
+            for (name, _), image in zip(scenes, rows[-1][1:], strict=True)
+        ]
+        captions.append(", ".join([targets.cameras.names[view], *scores]))
+    labels = ["target", *(f"{name}: {plural(len(splats), 'Gaussian')}" for name, splats in scenes)]
+    write_png(path, contact_sheet(rows, labels, row_labels=captions), overwrite=True)

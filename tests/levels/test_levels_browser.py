@@ -14,7 +14,7 @@ import pytest
 
 from g2ard.levels import Cut, save_levels
 from g2ard.policy.levels import lod
-from g2ard.policy.view import stand_with
+from g2ard.policy.viewer_frame import frame_with
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.viewer import write_page
@@ -54,7 +54,7 @@ def browser() -> Iterator[Browser]:
 
 def streaming(folder: Path, name: str, levels: tuple[Splats, ...], camera: Camera) -> None:
     """A page beside streamed levels, which it loads as they are needed."""
-    stand = stand_with(levels[0], Cameras.of([camera]), up=(0, 0, 1))
+    stand = frame_with(levels[0], Cameras.of([camera]), up=(0, 0, 1))
     save_levels(folder / name, [stand.of(level) for level in levels], cut=Cut(4096, 1.0, 512), overwrite=True)
     page = folder / f"{name}.html"
     write_page(page, [("scene", stand.of(levels[0]))], start=stand.start, background=GREY, overwrite=True)

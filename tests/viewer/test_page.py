@@ -21,7 +21,7 @@ from g2ard.cli.run_view import run_view
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.policy import budget
-from g2ard.policy.view import stand_of, stand_with
+from g2ard.policy.viewer_frame import frame_of, frame_with
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.viewer import Start, check_page_output, page, write_page
@@ -157,7 +157,7 @@ def test_the_start_shows_what_the_view_shows(seed: int) -> None:
     )
     eye = offset + 3 * rng.normal(size=3)
     camera = Camera.facing(eye, offset, width=size[0], height=size[1], fov=50, up=up)
-    stand = stand_with(scene, Cameras.of([camera]), up=tuple(up))
+    stand = frame_with(scene, Cameras.of([camera]), up=tuple(up))
     here = stand.of(scene)
     assert not here.offset.any()
     assert np.allclose(stand.up, up / np.linalg.norm(up))
@@ -173,9 +173,9 @@ def test_the_start_shows_what_the_view_shows(seed: int) -> None:
 def test_level_views_tell_up_and_a_single_one_does_not() -> None:
     ball = checkered_ball(400)
     views = around(12)  # all level with z
-    stand = stand_with(ball, views)
+    stand = frame_with(ball, views)
     assert np.allclose(stand.up, [0, 0, 1], atol=1e-6)
-    alone = stand_with(ball, views.take([5]))
+    alone = frame_with(ball, views.take([5]))
     assert np.linalg.norm(alone.up) == pytest.approx(1)
     assert alone.name == "view_005"
 
@@ -186,23 +186,23 @@ def test_the_start_is_the_view_that_holds_most_or_the_one_named() -> None:
     near = Camera.facing([0, -1.5, 0], [0, 0, 0], fov=30, name="near")
     whole = Camera.facing([0, -4, 0], [0, 0, 0], name="whole")
     views = Cameras.of([away, near, whole])
-    assert stand_with(ball, views).name == "whole"
-    assert stand_with(ball, views, start="near").name == "near"
-    assert stand_with(ball, views, start="away").start is not None  # sees nothing, and may still be asked for
+    assert frame_with(ball, views).name == "whole"
+    assert frame_with(ball, views, start="near").name == "near"
+    assert frame_with(ball, views, start="away").start is not None  # sees nothing, and may still be asked for
     with pytest.raises(InputError, match="no view 'far'"):
-        stand_with(ball, views, start="far")
+        frame_with(ball, views, start="far")
 
 
 def test_a_scene_without_views_is_looked_at_from_a_pool_and_one_without_room_as_a_whole() -> None:
     said: list[str] = []
-    stand = stand_of(checkered_ball(500), None, say=said.append)
+    stand = frame_of(checkered_ball(500), None, say=said.append)
     assert stand.name
     assert stand.name.startswith("pose_")
     nothing = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]], logit_opacities=[-20])
-    assert stand_of(nothing, None, say=said.append).start is None
+    assert frame_of(nothing, None, say=said.append).start is None
     assert "no pose to start at" in said[-1]
     with pytest.raises(InputError):
-        stand_of(nothing, None, start="pose_0000")
+        frame_of(nothing, None, start="pose_0000")
 
 
 def test_the_command_shows_a_scene_and_a_run(command_line: CommandLine, tmp_path: Path) -> None:

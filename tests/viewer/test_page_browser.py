@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from g2ard.io import read_splats, write_splats
-from g2ard.policy.view import stand_with
+from g2ard.policy.viewer_frame import frame_with
 from g2ard.rendering.metrics import psnr
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
@@ -30,7 +30,7 @@ def browser() -> Iterator[Browser]:
 
 def save(path: Path, *scenes: Splats, camera: Camera = FRONT, up: tuple[float, ...] = (0, 0, 1)) -> Path:
     """A page of scenes that opens with a camera."""
-    stand = stand_with(scenes[0], Cameras.of([camera]), up=up)
+    stand = frame_with(scenes[0], Cameras.of([camera]), up=up)
     shown = [(f"scene {index}", stand.of(scene)) for index, scene in enumerate(scenes)]
     write_page(path, shown, start=stand.start, background=GREY, overwrite=True)
     return path
@@ -78,7 +78,7 @@ def test_a_real_scene_shows_what_we_render(browser: Browser, tmp_path: Path) -> 
 def test_the_viewer_reads_the_files_we_write(browser: Browser, tmp_path: Path, suffix: str) -> None:
     scene = scattered()
     page = save(tmp_path / "page.html", scene)
-    stand = stand_with(scene, Cameras.of([FRONT]), up=(0, 0, 1))
+    stand = frame_with(scene, Cameras.of([FRONT]), up=(0, 0, 1))
     write_splats(tmp_path / f"other{suffix}", stand.of(scene))
     text = page.read_text(encoding="utf-8").replace("scene0.sog", f"scene0{suffix}")
     other = base64.b64encode((tmp_path / f"other{suffix}").read_bytes()).decode()

@@ -55,8 +55,8 @@ def adapt(
     from g2ard.io import check_scene_output, write_splats
     from g2ard.pipeline.adapt import AdaptConfig, appearance_only
     from g2ard.pipeline.adapt import adapt as refit
-    from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import load_scene, load_trained, make_targets
+    from g2ard.policy.view_checks import warn_of_sight
     from g2ard.stages.recover.schedule import schedule_named
 
     if schedule == "paper" and prior_views:

@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import SceneArgument, picture
 from g2ard.progress import plural
+
+if TYPE_CHECKING:
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
+    from g2ard.stages.clean import Cleaning
+
+_WORDS = ("blue", "yellow", "pink", "red")
+_COLORS = {
+    "invisible": (0.20, 0.45, 0.95),
+    "giant": (0.95, 0.85, 0.10),
+    "needle": (0.90, 0.15, 0.75),
+    "floater": (0.95, 0.25, 0.10),
+}
 
 
 @command("clean", example="g2ard clean garden.ply -o garden_clean.ply --preview found.png")
@@ -36,10 +49,8 @@ def clean(
     What is seen is measured from a pool of poses of the scene's own.
     """
     from g2ard import io
-    from g2ard.cli.cleaning import paint_clutter
     from g2ard.errors import InputError
-    from g2ard.policy.clean import clutter_seen
-    from g2ard.policy.inputs import load_scene
+    from g2ard.policy.inputs import clutter_seen, load_scene
     from g2ard.stages.clean import KINDS
 
     kinds = KINDS if only is None else tuple(word.strip() for word in only.split(","))
@@ -58,7 +69,7 @@ def clean(
     splats = load_scene(scene, run.say)
     found, cameras = clutter_seen(splats, kinds, seed=run.seed, progress=run.progress, say=run.say)
     if preview is not None:
-        paint_clutter(preview, splats, found, cameras, run.overwrite)
+        _paint(preview, splats, found, cameras, run.overwrite)
         run.kept.append(f"{preview} is written")
         run.say(f"picture: {preview}")
     kept = int(found.keep.sum())
@@ -68,3 +79,22 @@ def clean(
         io.write_splats(output, splats.take(found.keep), overwrite=run.overwrite)
         run.say(f"{output}: {plural(kept, 'Gaussian')}")
     run.result({"input_count": len(splats), "output_count": kept, "found": found.counts})
+
+
+def _paint(path: Path, splats: Splats, found: Cleaning, cameras: Cameras, overwrite: bool) -> None:
+    """Three views: as it is, what would go in the colour of its kind on grey, and what stays."""
+    import numpy as np
+
+    from g2ard.rendering.renderer import Renderer
+    from g2ard.report.paint import painted
+    from g2ard.scene.images import contact_sheet, write_png
+    from g2ard.stages.clean import KINDS
+
+    colors = np.array([*_COLORS.values(), (0.45, 0.48, 0.52)])[found.kind]
+    scenes = [splats, painted(splats, colors), splats.take(found.keep)]
+    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(3, len(cameras))).astype(int))
+    renderers = [Renderer(scene) for scene in scenes]
+    rows = [[np.clip(r.image(cameras[int(view)]), 0, 1) for r in renderers] for view in chosen]
+    legend = ", ".join(f"{name} {word}" for name, word in zip(KINDS, _WORDS, strict=True))
+    labels = [f"{plural(len(splats), 'Gaussian')}", legend, f"{len(scenes[2]):,} stay"]
+    write_png(path, contact_sheet(rows, labels), overwrite=overwrite)

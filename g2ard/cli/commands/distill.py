@@ -364,7 +364,7 @@ def _write(
 ) -> None:
     """The picture, the scene and, last, what is said of both."""
     from g2ard.io import write_splats
-    from g2ard.report.preview import preview
+    from g2ard.report.distilled import preview
 
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
     preview(place.parent / "preview.png", unseen, scenes, colour)

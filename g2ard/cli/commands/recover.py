@@ -74,12 +74,12 @@ def recover(
     from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.config.constants import changed, listed
     from g2ard.io import check_scene_output, write_splats
-    from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import (
         load_scene,
         load_trained,
         make_targets,
     )
+    from g2ard.policy.view_checks import warn_of_sight
     from g2ard.scene.targets import kinds_of
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover import recover as optimize

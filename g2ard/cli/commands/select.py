@@ -48,8 +48,8 @@ def select(
     """
     from g2ard.config.constants import changed, listed
     from g2ard.io import check_views_output
-    from g2ard.policy.found import warn_of_sight
     from g2ard.policy.inputs import load_scene, load_split_views
+    from g2ard.policy.view_checks import warn_of_sight
     from g2ard.stages.select import CoverageOptions
     from g2ard.stages.select import select as choose
 

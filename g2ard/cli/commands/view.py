@@ -37,7 +37,7 @@ def view(
     """Write a page that shows a scene, or two under one camera, in any browser, offline."""
     from g2ard.io.detect import run_scene
     from g2ard.policy.inputs import load_scene
-    from g2ard.policy.view import stand_of
+    from g2ard.policy.viewer_frame import frame_of
     from g2ard.viewer import check_page_output, write_page
 
     check_page_output(output, run.overwrite)
@@ -46,7 +46,7 @@ def view(
     loaded = [load_scene(path, run.say) for path in paths]
     if views is None and scene.is_dir() and (scene / "views.json").is_file():
         views = scene / "views.json"
-    stand = stand_of(
+    stand = frame_of(
         loaded[0],
         views,
         start=start,

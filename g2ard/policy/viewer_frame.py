@@ -1,4 +1,4 @@
-"""How scenes stand in a page, and the camera that it opens with."""
+"""Frame of the browser viewer around scenes, and the camera that it opens with."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.policy.inputs import load_views
+from g2ard.policy.view_checks import opaque_points
 from g2ard.policy.views import is_made, views_or_pool
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.viewer import Start
@@ -21,14 +22,13 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Camera, Cameras
     from g2ard.scene.splats import Splats
 
-__all__ = ["Stand", "stand_of", "stand_with"]
+__all__ = ["ViewerFrame", "frame_of", "frame_with"]
 
 _POOL = 32
 """Poses of which one is the start, where there are no views."""
 
 _ROWS = 100_000
-"""Gaussians that up is estimated on, and 4,096 of the opaque ones that a start is chosen by."""
-_SAMPLE = 4096
+"""Gaussians that up is estimated on."""
 
 _ROLL = 0.1
 """Views tell which way is up where their x axes spread this many times less along it than across it."""
@@ -38,7 +38,7 @@ _FOV = (10.0, 120.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Stand:
+class ViewerFrame:
     """A frame for the viewer, x right, y down, z ahead: here = rotation · (world − origin).
 
     Args:
@@ -67,7 +67,7 @@ class Stand:
         return transform(replace(splats.recentred(self.origin), offset=np.zeros(3)), turn)
 
 
-def stand_of(
+def frame_of(
     scene: Splats,
     views: Views | None,
     *,
@@ -77,7 +77,7 @@ def stand_of(
     seed: int = 0,
     progress: Progress = silent,
     say: Say = unsaid,
-) -> Stand:
+) -> ViewerFrame:
     """A frame and a start for a scene: from views given, else from those beside the scene, else from a pool.
 
     Args:
@@ -101,22 +101,22 @@ def stand_of(
         if start is not None or not (views is None or is_made(views)):
             raise
         say(f"no pose to start at: {error}")
-        return Stand(_turn(_estimated(scene, up)), _middle(scene))
+        return ViewerFrame(_turn(_estimated(scene, up)), _middle(scene))
     cameras = load_views(found, "all", None, say)
-    return stand_with(scene, cameras, start=start, up=up)
+    return frame_with(scene, cameras, start=start, up=up)
 
 
-def stand_with(
+def frame_with(
     scene: Splats, cameras: Cameras, *, start: str | None = None, up: Sequence[float] | None = None
-) -> Stand:
-    """As `stand_of`, with cameras that are there already.
+) -> ViewerFrame:
+    """As `frame_of`, with cameras that are there already.
 
     Raises:
         InputError: no view of that name, or an `up` that is no direction.
     """
     axis = _level(cameras) if up is None else None
-    stand = Stand(_turn(_estimated(scene, up) if axis is None else axis), _middle(scene))
-    points = _opaque(scene)
+    stand = ViewerFrame(_turn(_estimated(scene, up) if axis is None else axis), _middle(scene))
+    points = opaque_points(scene)
     view = cameras[_chosen(cameras, points, start)]
     return replace(stand, start=_start(stand, view, points), name=view.name)
 
@@ -158,16 +158,8 @@ def _turn(up: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.eye(3) + k + k @ k / (1 + c)
 
 
-def _opaque(scene: Splats) -> NDArray[np.float64]:
-    """(K, 3) means in the world of a sample of the Gaussians that are opaque by half or more, else of all."""
-    rows = np.flatnonzero(scene.opacities >= 0.5)
-    rows = rows if len(rows) else np.arange(len(scene))
-    some = rows[np.linspace(0, len(rows) - 1, min(_SAMPLE, len(rows))).astype(int)]
-    return scene.means[some].astype(np.float64) + scene.offset
-
-
 def _middle(scene: Splats) -> NDArray[np.float64]:
-    return np.median(_opaque(scene), axis=0)
+    return np.median(opaque_points(scene), axis=0)
 
 
 def _chosen(cameras: Cameras, points: NDArray[np.float64], name: str | None) -> int:
@@ -179,7 +171,7 @@ def _chosen(cameras: Cameras, points: NDArray[np.float64], name: str | None) -> 
     return cameras.names.index(name)
 
 
-def _start(stand: Stand, view: Camera, points: NDArray[np.float64]) -> Start:
+def _start(stand: ViewerFrame, view: Camera, points: NDArray[np.float64]) -> Start:
     """A view as the viewer takes it, its roll left out; it turns about the median depth of what it holds."""
     held = points[view.holds(points)]
     if not len(held):

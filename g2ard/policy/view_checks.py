@@ -1,4 +1,4 @@
-"""Cameras that lie beside a scene, for runs that were given none."""
+"""Checks whether views show a scene: those found beside it, and those that were given."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
 
-__all__ = ["as_pool", "check_sight", "found_views", "warn_of_photos", "warn_of_sight"]
+__all__ = ["as_pool", "check_sight", "found_views", "opaque_points", "warn_of_photos", "warn_of_sight"]
 
 _SIDE = 800
 """Pixels of the longer side, as a pool has."""
@@ -59,7 +59,7 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
         say(f"views beside the scene are not used: {error}")
         return None
     count = len(views.cameras)
-    seeing = int(views.cameras.facing(_opaque(splats)).sum())
+    seeing = int(views.cameras.facing(opaque_points(splats)).sum())
     if seeing < _SEEING * count:
         say(f"views beside the scene are not used: {path}: {seeing} of {plural(count, 'camera')} see it")
         return None
@@ -70,7 +70,7 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
 
 def warn_of_sight(splats: Splats, cameras: Cameras, say: Say) -> None:
     """Say in one line that more than a tenth of the views given for a scene have nothing of it in sight."""
-    blind = int((~cameras.facing(_opaque(splats))).sum())
+    blind = int((~cameras.facing(opaque_points(splats))).sum())
     if blind > _BLIND * len(cameras):
         say(
             f"warning: {blind} of {plural(len(cameras), 'view')} have nothing of the scene in sight: are "
@@ -127,9 +127,8 @@ def as_pool(cameras: Cameras) -> Cameras:
     return cameras if any(cameras.image_paths) else cameras.resized(_SIDE)
 
 
-def _opaque(splats: Splats) -> NDArray[np.float64]:
-    """Means in the world of some of the Gaussians that are opaque by half or more, evenly by row; of some of
-    all where there are none."""
+def opaque_points(splats: Splats) -> NDArray[np.float64]:
+    """Return (K, 3) world means of a sample of the Gaussians of opacity 0.5 or more, otherwise of all."""
     import numpy as np
 
     opaque = np.flatnonzero(splats.opacities >= 0.5)
