@@ -18,7 +18,7 @@ from g2ard import io
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.presets import preset_for
 from g2ard.stages.simplify import METHODS as SIMPLIFIERS
-from g2ard.stages.simplify import schedule as paper_rounds
+from g2ard.stages.simplify import round_counts
 
 __all__ = ["Cell", "Pipeline", "Spent"]
 
@@ -110,7 +110,7 @@ class Pipeline:
             return []
         rounds = self.cell.method.rounds
         if rounds == "paper":
-            return paper_rounds(self.count, self.budget) or [self.budget]
+            return round_counts(self.count, self.budget) or [self.budget]
         return pup_rounds(self.count, self.budget) if rounds == "pup" else [self.budget]
 
     def run(self) -> Stage:

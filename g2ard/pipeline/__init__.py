@@ -141,12 +141,12 @@ def distill(
         InputError: the budget does not fit, no view sees the prior, or `work` belongs to another run.
         KeyboardInterrupt: after Ctrl-C, with `work` ready for a resume.
     """
-    from g2ard.stages.simplify import schedule as counts_of
+    from g2ard.stages.simplify import round_counts
 
     config = config or DistillConfig()
     many = config.schedule.round_steps > 0
     kept, fold = config.simplify.retention or 0.75, config.simplify.fold
-    counts = counts_of(len(prior), budget, kept, fold) if many else [budget]
+    counts = round_counts(len(prior), budget, kept, fold) if many else [budget]
     rounds = _Rounds(prior, budget, targets, config, len(counts), weights, validation, work, progress, watch)
     for number, count in enumerate(counts, start=1):
         rounds.advance(number, count, final=number == len(counts))

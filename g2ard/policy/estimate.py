@@ -289,10 +289,10 @@ def _steps(job: DistillJob, student: Splats) -> int:
 
 def _rounds(job: DistillJob, student: Splats) -> int:
     """How many recoveries there are before the last; 0 where the schedule has no rounds."""
-    from g2ard.stages.simplify import schedule as counts_of
+    from g2ard.stages.simplify import round_counts
 
     config = job.config
     if not config.schedule.round_steps:
         return 0
     kept, fold = config.simplify.retention or 0.75, config.simplify.fold
-    return len(counts_of(len(job.prior), len(student), kept, fold))
+    return len(round_counts(len(job.prior), len(student), kept, fold))

@@ -31,7 +31,7 @@ from g2ard.rendering.visibility import CONVERGED, NEAR, ROUND, spread
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
-from g2ard.stages.simplify import SimplifyConfig, schedule, simplify
+from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
 from g2ard.stages.simplify.pairs import emphasised
 from g2ard.tiles.executor import Executor
 from g2ard.tiles.store import TileStore
@@ -208,7 +208,7 @@ def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     config = _config(arguments).resolved("default")
     runs, expected = arguments["runs"], arguments["expected"]
     last = max(1, min(runs, round(_DEEPER * expected)))
-    counts = schedule(runs, last, config.retention_of("default"), config.fold)
+    counts = round_counts(runs, last, config.retention_of("default"), config.fold)
     tile = _seen_tile(scene, arguments, inputs)
     of, a, b, costs = tile.plan(runs, counts, load(inputs["costs"], "costs")[0])
     return {"of": of, "a": a, "b": b, "costs": np.maximum.accumulate(costs) if len(costs) else costs}

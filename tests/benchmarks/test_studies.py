@@ -21,7 +21,7 @@ from g2ard.rendering.renderer import RasterSettings
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS, Anchors, drift95
-from g2ard.stages.simplify import schedule
+from g2ard.stages.simplify import round_counts
 from helpers.commands import CommandLine
 from helpers.project import ROOT
 from helpers.scenes import around, checkered_ball
@@ -58,7 +58,7 @@ def run(folder: Path, text: str) -> tuple[Definition, list[Row], Path]:
 def test_the_last_round_recovers_twice_and_stays_anchored_where_it_was_built(tmp_path: Path) -> None:
     text = HEAD.replace("[12]", "[60]") + 'methods = ["g2ard-paper"]\n' + SCENE
     _, (row,), out = run(tmp_path, text)
-    counts = schedule(1200, 300)
+    counts = round_counts(1200, 300)
     recoveries = {job["output"]: job for job in jobs(out, "recover")}
     assert len(recoveries) == len(counts) + 1
     share = 8_000 / (8_000 * len(counts) + 30_000)
@@ -116,7 +116,7 @@ def test_policies_go_on_from_one_checkpoint(tmp_path: Path) -> None:
         policy = "random" if name == "own" else name
         text += f'[method.{name}]\nbase = "{base}"\npolicy = "{policy}"\nk = 0.5\nshared_start = true\n'
     _, rows, out = run(tmp_path, text + SCENE)
-    counts = schedule(1200, 300)
+    counts = round_counts(1200, 300)
     assert len(jobs(out, "reduce")) == len(counts) + 1  # once for all rows, and once for g2ard's own
     recoveries = jobs(out, "recover")
     early = [job for job in recoveries if not job["final"]]

@@ -11,7 +11,7 @@ import pytest
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.scene.splats import Splats
-from g2ard.stages.simplify import METHODS, SimplifyConfig, schedule, simplify
+from g2ard.stages.simplify import METHODS, SimplifyConfig, round_counts, simplify
 from helpers.scenes import ARRAYS, assert_same_bits
 from helpers.simplify_cases import all_alike, assert_sound, scene
 
@@ -203,12 +203,12 @@ def test_bad_input_is_named():
 
 
 def test_schedule():
-    rounds = schedule(500_000, 50_000)
+    rounds = round_counts(500_000, 50_000)
     assert len(rounds) == 8
     assert rounds[-1] == 50_000
     for before, after in zip([500_000, *rounds], rounds, strict=False):
         assert after < before
-    assert schedule(100, 1, 0.999)[-1] == 1
+    assert round_counts(100, 1, 0.999)[-1] == 1
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from g2ard.scene.splats import Splats, unit_quats
-from g2ard.stages.simplify import SimplifyConfig, flag, schedule, simplify
+from g2ard.stages.simplify import SimplifyConfig, flag, round_counts, simplify
 from helpers.scenes import ARRAYS
 from helpers.simplify_cases import assert_sound, scene
 from reference import simplify as naive
@@ -19,7 +19,7 @@ def one_round(prior, budget, flags, **options):
 
 def test_paper_goes_by_the_schedule():
     out = simplify(scene(5000), 600, method="paper")
-    assert [r.after for r in out.report.rounds] == schedule(5000, 600)
+    assert [r.after for r in out.report.rounds] == round_counts(5000, 600)
 
 
 def test_paper_merges_as_the_naive_twin_and_conserves_moments():

@@ -20,7 +20,7 @@ from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.prepared import finite_rows_of
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.simplify import SimplifyConfig, schedule, simplify
+from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.merging import cheapest
 from g2ard.tiles.steps import GONE
@@ -93,7 +93,7 @@ def test_one_tile_is_the_whole_to_the_bit(seen: bool) -> None:
         frame = frame.with_views(0.01, *tile(frame).sums())
     here = tile(frame)
     assert len(here.run_costs()) < len(prepared)  # the transparent are not among them
-    rounds = schedule(len(prepared), budget, config.retention_of("default"))
+    rounds = round_counts(len(prepared), budget, config.retention_of("default"))
     counts = [n for n in rounds if n < 3 * budget]
     of, a, b, costs = here.plan(3 * budget, counts, here.run_costs())
     assert len(a) == 2 * budget

@@ -14,7 +14,7 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
 from g2ard.scene.prepared import PreparedScene, finite_rows_of, with_some_opacity
 from g2ard.scene.splats import DRAWN_LOGIT, Splats, unit_quats
-from g2ard.stages.simplify.config import METHODS, SimplifyConfig, schedule
+from g2ard.stages.simplify.config import METHODS, SimplifyConfig, round_counts
 from g2ard.stages.simplify.pairs import (
     Visibility,
     VisibilitySource,
@@ -33,7 +33,7 @@ __all__ = [
     "Visibility",
     "VisibilitySource",
     "flag",
-    "schedule",
+    "round_counts",
     "simplify",
 ]
 
@@ -204,7 +204,7 @@ def _paper(
 ) -> dict[str, Any]:
     return _core.simplify_paper(
         scene.core,
-        schedule(len(scene), budget, config.retention_of("paper"), config.fold),
+        round_counts(len(scene), budget, config.retention_of("paper"), config.fold),
         cells,
         protected=flags,
         min_opacity=config.min_opacity_of("paper"),

@@ -10,7 +10,7 @@ from g2ard.config.choices import METHODS
 from g2ard.errors import InputError
 from g2ard.scene.regions import Region, check_region
 
-__all__ = ["METHODS", "SimplifyConfig", "schedule"]
+__all__ = ["METHODS", "SimplifyConfig", "round_counts"]
 
 _RETENTION: dict[str, float] = {"default": 0.65, "fast": 0.65, "paper": 0.75}
 
@@ -153,12 +153,12 @@ class SimplifyConfig:
         return self.resolved(method).min_opacity or 0.0
 
 
-def schedule(count: int, budget: int, retention: float = 0.75, fold: float = 0.05) -> list[int]:
+def round_counts(count: int, budget: int, retention: float = 0.75, fold: float = 0.05) -> list[int]:
     """Counts after each round: N_r = max(N_S, ⌈retention·N_{r−1}⌉), a last cut by less than `fold` folded in.
 
-    >>> schedule(500_000, 50_000)
+    >>> round_counts(500_000, 50_000)
     [375000, 281250, 210938, 158204, 118653, 88990, 66743, 50000]
-    >>> schedule(10, 10)
+    >>> round_counts(10, 10)
     []
     """
     rounds: list[int] = []

@@ -16,7 +16,7 @@ from g2ard.progress import Progress, counter
 from g2ard.scene.prepared import PreparedScene
 from g2ard.scene.regions import in_any
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
-from g2ard.stages.simplify.config import SimplifyConfig, schedule
+from g2ard.stages.simplify.config import SimplifyConfig, round_counts
 
 __all__ = [
     "Visibility",
@@ -113,7 +113,7 @@ def merge(
         weight, pixel_size = emphasised(scene, visibility.weight, visibility.pixel_size, config)
     return _core.simplify_pairwise(
         scene.core,
-        schedule(len(scene), budget, config.retention_of(method), config.fold),
+        round_counts(len(scene), budget, config.retention_of(method), config.fold),
         protected=flags,
         weight=weight,
         pixel_size=pixel_size,
