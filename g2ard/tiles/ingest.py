@@ -48,7 +48,7 @@ def ingest(
     """Write a scene as tiles of at most `tile_rows` Gaussians, each with a halo of its neighbours.
 
     A kd tree cuts at medians of a sample of positions, along the longest side. A halo holds the Gaussians of
-    other tiles that lie in the tile's cell once its sides are moved outwards by 3 % of the median over tiles
+    other tiles that lie in the tile's box once its sides are moved outwards by 3 % of the median over tiles
     of √(ab), a and b a tile's two longer sides. Which tile a Gaussian comes to depends neither on the order
     of the rows nor on `block_rows`; within a tile the rows keep their order.
 
@@ -64,7 +64,7 @@ def ingest(
         tile_rows: Gaussians of a tile at the most; only Gaussians of one position are never parted.
         block_rows: rows in memory at a time; None takes 16 MiB of them.
         lift: how points are lifted; None is `LiftConfig()`.
-        like: tiles whose cells and margin are taken, however many rows they come to hold.
+        like: tiles whose tree and margin are taken, however many rows they come to hold.
         overwrite: whether tiles of another scene, or of other settings, may be replaced.
         progress: told of rows done.
         say: told what was noticed.

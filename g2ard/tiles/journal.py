@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError, OutputError
 from g2ard.io.detect import JOURNAL, POINTS
 from g2ard.io.jsonfile import read_json
-from g2ard.tiles.cells import Cell, Points
+from g2ard.tiles.kdtree import KdTree, Points
 from g2ard.tiles.store import FORMAT, MANIFEST, VERSION, halo_name, tile_name
 
 __all__ = ["JOURNAL", "POINTS", "Journal", "clear", "is_ours"]
@@ -64,7 +64,7 @@ class Journal:
     Args:
         folder: where the tiles are.
         key: of their content.
-        cells: the kd tree.
+        tree: the kd tree.
         margin: of halos.
         row_bytes: bytes of a row.
         tally: a dataclass of what the source counts while it is read.
@@ -74,7 +74,7 @@ class Journal:
 
     folder: Path
     key: str
-    cells: Cell
+    tree: KdTree
     margin: float
     row_bytes: int
     tally: Any
@@ -86,7 +86,7 @@ class Journal:
     halos: _Files = field(init=False)
 
     def __post_init__(self) -> None:
-        count = self.cells.leaves
+        count = self.tree.leaves
         self.tiles, self.halos = (_Files([0] * count, [0] * count) for _ in range(2))
 
     @classmethod
@@ -101,16 +101,16 @@ class Journal:
             return None
         content = read_json(path)
         try:
-            cells = Cell.from_json(content["cells"])
+            tree = KdTree.from_json(content["cells"])
             key, margin = str(content["key"]), float(content["margin"])
-            journal = cls(folder, key, cells, margin, row_bytes, tally(**content["tally"]), {})
+            journal = cls(folder, key, tree, margin, row_bytes, tally(**content["tally"]), {})
             journal.settings = dict(content.get("settings", {}))
             journal.next_row = int(content["next_row"])
             journal.low, journal.high = content["low"], content["high"]
             for kind in ("tiles", "halos"):
                 files = _Files(**content[kind])
-                if len(files.rows) != cells.leaves or len(files.checks) != cells.leaves:
-                    raise ValueError(f"{len(files.rows)} {kind} of {cells.leaves}")
+                if len(files.rows) != tree.leaves or len(files.checks) != tree.leaves:
+                    raise ValueError(f"{len(files.rows)} {kind} of {tree.leaves}")
                 setattr(journal, kind, files)
         except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
             raise InputError(f"{path}: malformed journal ({error!r})") from error
@@ -150,7 +150,7 @@ class Journal:
             return
         self.low = np.minimum(self.low, means.min(axis=0).astype(np.float64)).tolist()
         self.high = np.maximum(self.high, means.max(axis=0).astype(np.float64)).tolist()
-        for index, (core, halo) in enumerate(self.cells.route(means, self.margin)):
+        for index, (core, halo) in enumerate(self.tree.route(means, self.margin)):
             self._append(self.tiles, index, tile_name(index), rows, core)
             self._append(self.halos, index, halo_name(index), rows, halo)
 
@@ -173,7 +173,7 @@ class Journal:
         content = {
             "key": self.key,
             "settings": self.settings,
-            "cells": self.cells.to_json(),
+            "cells": self.tree.to_json(),
             "margin": self.margin,
             "next_row": self.next_row,
             "tally": asdict(self.tally),
@@ -195,7 +195,7 @@ class Journal:
                 "high": np.clip(box[1], low, high).tolist(),
                 "crc32": [self.tiles.checks[i], self.halos.checks[i]],
             }
-            for i, box in enumerate(self.cells.boxes())
+            for i, box in enumerate(self.tree.boxes())
         ]
         content = {
             "format": FORMAT,
@@ -204,7 +204,7 @@ class Journal:
             "count": sum(self.tiles.rows),
             **manifest,
             "margin": self.margin,
-            "cells": self.cells.to_json(),
+            "cells": self.tree.to_json(),
             "tiles": tiles,
         }
         _write_json(self.folder / MANIFEST, content)

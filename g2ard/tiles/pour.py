@@ -19,8 +19,8 @@ from g2ard.io.stream import SceneStream
 from g2ard.progress import Progress, Say, plural
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import LiftConfig, lift
-from g2ard.tiles.cells import Cell, Points, Sampler, cut_cells, margin_of
 from g2ard.tiles.journal import POINTS, Journal, clear
+from g2ard.tiles.kdtree import KdTree, Points, Sampler, cut_tree, margin_of
 from g2ard.tiles.store import TileStore, halo_name, packed, row_width, tile_name
 
 __all__ = ["PointFeed", "SceneFeed", "foretold", "lift_tiles", "pour"]
@@ -126,7 +126,7 @@ def pour(
         rows: rows in memory at a time.
         progress: told of rows read.
         say: told what was decided.
-        like: tiles whose cells and margin are taken, however many rows they come to hold.
+        like: tiles whose tree and margin are taken, however many rows they come to hold.
 
     Raises:
         InputError: the source is broken, or has no row to be kept.
@@ -151,10 +151,10 @@ def pour(
         if not parts:
             return journal
         say(f"{plural(len(parts), 'tile')} hold more than {tile_rows:,} rows; cut once more")
-        cells = journal.cells.refined(parts)
+        tree = journal.tree.refined(parts)
         points, _ = _sampled(feed, rows, progress)
         clear(folder)
-        journal = _empty(folder, key, cells, margin_of(cells, points), feed)
+        journal = _empty(folder, key, tree, margin_of(tree, points), feed)
         journal.cut()
         journal.save()
 
@@ -169,14 +169,14 @@ def _started(
     like: TileStore | None,
 ) -> Journal:
     """Cut the tiles, and see to it that there is room for them."""
-    cells, points, each = like.cells if like else Cell(), np.empty((0, 3), np.float32), 1.0
+    tree, points, each = like.tree if like else KdTree(), np.empty((0, 3), np.float32), 1.0
     if like or feed.stream.count > tile_rows:
         points, each = _sampled(feed, rows, progress)
     if not like:
-        cells = cut_cells(points, each, tile_rows)
-    margin = like.margin if like else margin_of(cells, points)
-    journal = _empty(folder, key, cells, margin, feed)
-    around = each * sum(len(halo) for _, halo in cells.route(points, journal.margin))
+        tree = cut_tree(points, each, tile_rows)
+    margin = like.margin if like else margin_of(tree, points)
+    journal = _empty(folder, key, tree, margin, feed)
+    around = each * sum(len(halo) for _, halo in tree.route(points, journal.margin))
     needed, free = int((feed.stream.count + around) * feed.room), shutil.disk_usage(folder).free
     if needed > free:
         raise OutputError(
@@ -187,8 +187,8 @@ def _started(
     return journal
 
 
-def _empty(folder: Path, key: str, cells: Cell, margin: float, feed: Feed) -> Journal:
-    return Journal(folder, key, cells, margin, feed.row_bytes, type(feed.stream.tally)(), feed.settings)
+def _empty(folder: Path, key: str, tree: KdTree, margin: float, feed: Feed) -> Journal:
+    return Journal(folder, key, tree, margin, feed.row_bytes, type(feed.stream.tally)(), feed.settings)
 
 
 def _sampled(feed: Feed, rows: int, progress: Progress) -> tuple[Points, float]:
@@ -200,14 +200,14 @@ def _sampled(feed: Feed, rows: int, progress: Progress) -> tuple[Points, float]:
     return sampler.result()
 
 
-def _overfull(journal: Journal, tile_rows: int) -> dict[int, Cell]:
+def _overfull(journal: Journal, tile_rows: int) -> dict[int, KdTree]:
     """How tiles are to be cut that came to hold more rows than the sample foretold."""
     parts = {}
     for index, count in enumerate(journal.tiles.rows):
         if count > tile_rows:
-            cells = cut_cells(journal.positions(tile_name(index), count), 1.0, tile_rows)
-            if cells.leaves > 1:
-                parts[index] = cells
+            tree = cut_tree(journal.positions(tile_name(index), count), 1.0, tile_rows)
+            if tree.leaves > 1:
+                parts[index] = tree
     return parts
 
 
@@ -235,13 +235,13 @@ def lift_tiles(
     feed.stream.tally = points.tally
     journal = Journal.open(folder, row_bytes, PointTally)
     if journal is None:
-        journal = Journal(folder, key, points.cells, points.margin, row_bytes, points.tally, feed.settings)
+        journal = Journal(folder, key, points.tree, points.margin, row_bytes, points.tally, feed.settings)
         journal.save()
     else:
         say(f"{folder}: goes on after tile {journal.next_row:,}")
     journal.cut()
     total = sum(points.tiles.rows)
-    for index in range(journal.next_row, points.cells.leaves):
+    for index in range(journal.next_row, points.tree.leaves):
         splats = _lifted(points, index, feed)
         for start in range(0, len(splats), _AT_ONCE):
             part = splats.take(slice(start, start + _AT_ONCE))
@@ -287,8 +287,8 @@ def foretold(positions: Iterable[Points], count: int) -> Callable[[int], int]:
     sample, each = sampler.result()
 
     def largest(tile_rows: int) -> int:
-        cells = cut_cells(sample, each, tile_rows) if count > tile_rows else Cell()
-        most = max(len(core) + len(halo) for core, halo in cells.route(sample, margin_of(cells, sample)))
+        tree = cut_tree(sample, each, tile_rows) if count > tile_rows else KdTree()
+        most = max(len(core) + len(halo) for core, halo in tree.route(sample, margin_of(tree, sample)))
         return math.ceil((most + (_SIGMAS * math.sqrt(most) if each > 1 else 0)) * each)
 
     return largest

@@ -126,7 +126,7 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
         inputs: `coarse`, what `coarse` made of each tile, `own`, of this one; `train`, `test` and `apart`,
             cameras in world coordinates.
         places: `store`, the folder of the dense scene in tiles; `student`, of the scene to recover in the
-            same cells.
+            same boxes.
 
     Returns:
         `scene` (`scene_of`), the tile's Gaussians; `errors`, (2, 2) before and after: the squared error in
@@ -215,7 +215,7 @@ def recover_tiles(
 
     Args:
         store: the dense scene.
-        student: what is to be recovered, in the same cells (`ingest(…, like=store)`).
+        student: what is to be recovered, in the same boxes (`ingest(…, like=store)`).
         around: where the dense scene's tiles stand, as `simplify_tiles` with views tells.
         views: to learn from, to score on, and of another kind to judge by.
         config: of recovery; its steps are not read.

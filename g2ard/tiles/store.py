@@ -22,7 +22,7 @@ from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import read_json
 from g2ard.io.types import Note
 from g2ard.scene.splats import Splats
-from g2ard.tiles.cells import Cell
+from g2ard.tiles.kdtree import KdTree
 
 __all__ = [
     "MANIFEST",
@@ -88,9 +88,9 @@ class Tile:
 
     Args:
         index: its place, along the kd tree.
-        rows: Gaussians whose mean lies in its cell.
-        halo: Gaussians of other tiles within the margin around the cell.
-        low: corner of the cell, cut to the bounds of the whole scene's means, relative to the offset.
+        rows: Gaussians whose mean lies in its box.
+        halo: Gaussians of other tiles within the margin around the box.
+        low: corner of the box, cut to the bounds of the whole scene's means, relative to the offset.
         high: the other corner.
         checks: CRC-32 of both files.
     """
@@ -113,8 +113,8 @@ class TileStore:
         count: Gaussians in all, halos not counted.
         sh_degree: 0–3.
         offset: (3,) float64, world = means + offset.
-        margin: how far halos reach beyond a cell's sides, scene units.
-        cells: the kd tree.
+        margin: how far halos reach beyond a box's sides, scene units.
+        tree: the kd tree.
         notes: what was noticed while ingesting.
         key: SHA-256 of all that decides the content: which source, which settings.
         settings: those settings.
@@ -126,7 +126,7 @@ class TileStore:
     sh_degree: int
     offset: NDArray[np.float64]
     margin: float
-    cells: Cell
+    tree: KdTree
     notes: tuple[Note, ...]
     key: str
     settings: Mapping[str, Any]
@@ -166,7 +166,7 @@ class TileStore:
             first, second = map(int, tile["crc32"])
             tiles.append(Tile(index, rows, halo, (x, y, z), (X, Y, Z), (first, second)))
         offset = np.array(content["offset"], np.float64)
-        cells = Cell.from_json(content["cells"])
+        tree = KdTree.from_json(content["cells"])
         notes = tuple(Note(str(n["code"]), int(n["count"]), str(n["text"])) for n in content["notes"])
         store = cls(
             folder,
@@ -175,12 +175,12 @@ class TileStore:
             int(content["sh_degree"]),
             offset,
             float(content["margin"]),
-            cells,
+            tree,
             notes,
             str(content["key"]),
             dict(content["settings"]),
         )
-        fits = offset.shape == (3,) and store.sh_degree in range(4) and cells.leaves == len(tiles)
+        fits = offset.shape == (3,) and store.sh_degree in range(4) and tree.leaves == len(tiles)
         finite = np.isfinite([*offset.ravel(), store.margin, *(x for t in tiles for x in (*t.low, *t.high))])
         if not fits or not finite.all() or sum(tile.rows for tile in tiles) != store.count:
             raise ValueError("its numbers contradict each other")

@@ -211,7 +211,7 @@ def far_around(store: TileStore, arguments: Arguments, inputs: Inputs) -> list[S
 
 
 def within_halo(store: TileStore, tile: int, means: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(N,) whether positions lie in a tile's cell or within the margin around it."""
+    """(N,) whether positions lie in a tile's box or within the margin around it."""
     low = np.array(store.tiles[tile].low) - store.margin
     high = np.array(store.tiles[tile].high) + store.margin
     return np.asarray(((means >= low) & (means <= high)).all(axis=1))

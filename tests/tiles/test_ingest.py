@@ -17,8 +17,8 @@ import pytest
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_scene, write_splats
-from g2ard.tiles.cells import Cell, Sampler, cut_cells
 from g2ard.tiles.ingest import ingest
+from g2ard.tiles.kdtree import KdTree, Sampler, cut_tree
 from g2ard.tiles.store import TileStore, packed
 from helpers.ingested import as_set, assert_same_sets, halos_of, saved, tiles_of, town
 from helpers.ply_files import columns, save
@@ -112,7 +112,7 @@ def test_neither_blocks_nor_order_decide(tmp_path: Path) -> None:
     first = ingest(source, tmp_path / "a", tile_rows=500, block_rows=6000)
     for name, path, rows in (("b", source, 64), ("c", source, 4999), ("d", shuffled, 1000)):
         store = ingest(path, tmp_path / name, tile_rows=500, block_rows=rows)
-        assert (store.margin, store.cells) == (first.margin, first.cells)
+        assert (store.margin, store.tree) == (first.margin, first.tree)
         assert [t.low for t in store.tiles] == [t.low for t in first.tiles]
         if path == source:
             assert store.tiles == first.tiles  # bit by bit: checksums are part of them
@@ -130,7 +130,7 @@ def test_a_sample_decides_no_more_by_order(tmp_path: Path, monkeypatch: pytest.M
     assert len(first.tiles) < 30  # the sample's uncertainty costs tiles, but not many
     second = ingest(mixed, tmp_path / "b", tile_rows=2000, block_rows=333)
     assert max(t.rows for t in first.tiles) <= 2000
-    assert first.cells == second.cells
+    assert first.tree == second.tree
     assert_same_sets(tiles_of(first), tiles_of(second))
     assert_same_sets(halos_of(first), halos_of(second))
 
@@ -139,7 +139,7 @@ def test_tiles_that_a_sample_left_too_full_are_cut_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("g2ard.tiles.pour._SAMPLE", 60)
-    monkeypatch.setattr("g2ard.tiles.cells._SIGMAS", 0.0)
+    monkeypatch.setattr("g2ard.tiles.kdtree._SIGMAS", 0.0)
     source = saved(tmp_path / "town.ply", town(20_000))
     said: list[str] = []
     store = ingest(source, tmp_path / "a", tile_rows=2000, say=said.append)
@@ -150,7 +150,7 @@ def test_tiles_that_a_sample_left_too_full_are_cut_again(
 
 def test_halos_against_a_naive_twin(tmp_path: Path) -> None:
     store = ingest(saved(tmp_path / "town.ply", town()), tmp_path / "tiles", tile_rows=700)
-    tiles, boxes = tiles_of(store), store.cells.boxes()
+    tiles, boxes = tiles_of(store), store.tree.boxes()
     assert store.margin > 0
     sides = []
     for rows in tiles:
@@ -183,12 +183,12 @@ def test_equal_positions_stay_together(tmp_path: Path) -> None:
     assert [note.code for note in store.notes] == ["overfull_tiles"]
 
 
-def test_cells_survive_their_json() -> None:
+def test_trees_survive_their_json() -> None:
     points = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32)
-    cells = cut_cells(points, 1, 60)
-    assert cells.leaves >= 9
-    assert Cell.from_json(json.loads(json.dumps(cells.to_json()))) == cells
-    assert sum(len(core) for core, _ in cells.route(points)) == 500
+    tree = cut_tree(points, 1, 60)
+    assert tree.leaves >= 9
+    assert KdTree.from_json(json.loads(json.dumps(tree.to_json()))) == tree
+    assert sum(len(core) for core, _ in tree.route(points)) == 500
 
 
 def test_a_sample_keeps_its_size_though_points_repeat() -> None:

@@ -79,7 +79,7 @@ def test_lifted_tiles_are_the_lifted_cloud(tmp_path: Path) -> None:
     assert not (tmp_path / "tiles" / ".points").exists()
 
     near = (points.positions - store.offset).astype(np.float32)
-    right = np.concatenate([core for core, _ in store.cells.route(near)])  # each tile's points, in order
+    right = np.concatenate([core for core, _ in store.tree.route(near)])  # each tile's points, in order
     parts = [store.read(i) for i in range(len(store.tiles))]
     world = np.concatenate([p.means + p.offset for p in parts])
     np.testing.assert_allclose(world, (whole.means + whole.offset)[right], atol=2e-5, rtol=0)

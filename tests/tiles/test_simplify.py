@@ -140,7 +140,7 @@ def test_tiles_that_no_view_sees_keep_their_share(store: TileStore, tmp_path: Pa
     corner = Cameras.from_lists([look_at([-7.5, -3.5, 1.5], [-7.6, -3.4, 0])], [K], [(80, 60)], ["corner"])
     small = reduced(store, tmp_path, views=corner)
     assert len(small) == 900
-    rows = [len(core) for core, _ in store.cells.route(small.means)]
+    rows = [len(core) for core, _ in store.tree.route(small.means)]
     assert min(rows) > 20
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Cell", "Sampler", "cut_cells", "margin_of"]
+__all__ = ["KdTree", "Sampler", "cut_tree", "margin_of"]
 
 _SIGMAS = 4.0
 """A tile may hold more than a sample foretells; by so many standard deviations at the most, it is taken."""
@@ -18,20 +18,20 @@ _HALO = 0.03
 """The margin of a halo, in sides of a tile."""
 
 _TAILS = 1, 99
-"""Percentiles between which a cell's sides are measured, so that stray floaters decide nothing."""
+"""Percentiles between which a box's sides are measured, so that stray floaters decide nothing."""
 
 Points = NDArray[np.float32]
 Rows = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Cell:
+class KdTree:
     """A node: points with `x[axis] < at` are `below`'s. A leaf has neither."""
 
     axis: int = -1
     at: float = 0.0
-    below: Cell | None = None
-    above: Cell | None = None
+    below: KdTree | None = None
+    above: KdTree | None = None
 
     @property
     def leaves(self) -> int:
@@ -49,9 +49,9 @@ class Cell:
         return np.stack(boxes)
 
     def route(self, points: Points, margin: float = 0.0) -> Iterator[tuple[Rows, Rows]]:
-        """For each leaf in order: the rows in its cell, and those of other cells within `margin`.
+        """For each leaf in order: the rows in its box, and those of other boxes within `margin`.
 
-        A point is within the margin where it lies in the cell after all of its sides moved outwards by it.
+        A point is within the margin where it lies in the box after all of its sides moved outwards by it.
 
         Args:
             points: (N, 3) float32, finite.
@@ -79,14 +79,14 @@ class Cell:
         yield from self.below._route(columns, left, halo_left, margin)
         yield from self.above._route(columns, right, halo_right, margin)
 
-    def refined(self, parts: dict[int, Cell]) -> Cell:
+    def refined(self, parts: dict[int, KdTree]) -> KdTree:
         """The same tree with some leaves, by number, replaced by trees."""
         numbers = iter(range(self.leaves))
 
-        def build(cell: Cell) -> Cell:
-            if cell.below and cell.above:
-                return Cell(cell.axis, cell.at, build(cell.below), build(cell.above))
-            return parts.get(next(numbers), cell)
+        def build(node: KdTree) -> KdTree:
+            if node.below and node.above:
+                return KdTree(node.axis, node.at, build(node.below), build(node.above))
+            return parts.get(next(numbers), node)
 
         return build(self)
 
@@ -97,7 +97,7 @@ class Cell:
         return None
 
     @classmethod
-    def from_json(cls, content: Any) -> Cell:
+    def from_json(cls, content: Any) -> KdTree:
         """What `to_json` gave.
 
         Raises:
@@ -111,7 +111,7 @@ class Cell:
         return cls(int(axis), float(at), cls.from_json(below), cls.from_json(above))
 
 
-def cut_cells(points: Points, rows_each: float, most: int) -> Cell:
+def cut_tree(points: Points, rows_each: float, most: int) -> KdTree:
     """Cut until no leaf is expected to hold more than `most` rows.
 
     Along the longest side, at the quantile that leaves both parts with whole tiles. The order of the points
@@ -127,7 +127,7 @@ def cut_cells(points: Points, rows_each: float, most: int) -> Cell:
     """
     parts = _parts(len(points), rows_each, most)
     if parts == 1 or len(points) < 2:
-        return Cell()
+        return KdTree()
     low, high = np.percentile(points, _TAILS, axis=0)
     spans = np.ptp(points, axis=0)
     for axis in sorted(range(3), key=lambda a: (-(high[a] - low[a]), -spans[a], a)):
@@ -135,9 +135,9 @@ def cut_cells(points: Points, rows_each: float, most: int) -> Cell:
         at = _between(values, len(values) * (parts // 2) / parts)
         if at is not None:
             inside = points[:, axis] < at
-            below, above = (cut_cells(points[side], rows_each, most) for side in (inside, ~inside))
-            return Cell(axis, float(at), below, above)
-    return Cell()
+            below, above = (cut_tree(points[side], rows_each, most) for side in (inside, ~inside))
+            return KdTree(axis, float(at), below, above)
+    return KdTree()
 
 
 def _parts(points: int, rows_each: float, most: int) -> int:
@@ -161,17 +161,17 @@ def _between(values: Points, rank: float) -> np.float32 | None:
     return value
 
 
-def margin_of(cells: Cell, points: Points) -> float:
+def margin_of(tree: KdTree, points: Points) -> float:
     """How far halos reach: 3 % of the median over tiles of √(ab), a and b a tile's two longer sides.
 
     Args:
-        cells: the tiles.
+        tree: the tiles.
         points: (N, 3) float32, all rows or a sample of them.
     """
-    if cells.leaves == 1:
+    if tree.leaves == 1:
         return 0.0
     sizes = []
-    for core, _ in cells.route(points):
+    for core, _ in tree.route(points):
         if len(core):
             low, high = np.percentile(points[core], _TAILS, axis=0)
             sides = np.sort(high.astype(np.float64) - low)
