@@ -47,13 +47,12 @@ class Comparison:
     crops: Sequence[Window] = ()
 
 
-def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8], count: int = _CROPS) -> list[Window]:
+def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> list[Window]:
     """The windows that differ most, worst first, none of which overlap.
 
     Args:
         image: (H, W, 3).
         target: of the same shape.
-        count: how many, at most.
 
     >>> target = np.zeros((100, 100, 3), np.uint8)
     >>> image = target.copy()
@@ -70,7 +69,7 @@ def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8], count: in
         total[rows:, columns:] - total[:-rows, columns:] - total[rows:, :-columns] + total[:-rows, :-columns]
     )
     found: list[Window] = []
-    while len(found) < count and sums.max() >= 0:
+    while len(found) < _CROPS and sums.max() >= 0:
         top, left = (int(k) for k in np.unravel_index(int(np.argmax(sums)), sums.shape))
         found.append(Window(left / width, top / height, columns / width, rows / height))
         sums[max(0, top - rows + 1) : top + rows, max(0, left - columns + 1) : left + columns] = -1

@@ -20,8 +20,11 @@ from g2ard.scene.splats import Splats
 
 __all__ = ["registration_report"]
 
-_VIEWS = 12
+_VIEWS, _SIZE = 12, 640
+"""Photos shown, and pixels of the longer side of their pictures."""
+
 _LINES = 80
+"""Matches drawn per photo."""
 
 
 def registration_report(
@@ -36,7 +39,6 @@ def registration_report(
     side: int = 1000,
     told: Sequence[str] = (),
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    size: int = 640,
 ) -> None:
     """Write an HTML page about one registration, the least alike photos first.
 
@@ -51,7 +53,6 @@ def registration_report(
         side: pixels of the longer side that they count.
         told: what the command says of the run.
         background: RGB behind the scene.
-        size: pixels of the longer side of the pictures.
     """
     page = Page(title, f"{plural(len(photos), 'photo')} against {plural(len(scene), 'Gaussian')}")
     for line in told:
@@ -65,7 +66,7 @@ def registration_report(
     seen = [i for i, row in enumerate(rows) if row.camera_from_world is not None]
     renderer = Renderer(scene, background=background)
     for i in sorted(seen, key=lambda i: -1.0 if rows[i].zncc is None else rows[i].zncc)[:_VIEWS]:
-        row, one = rows[i], photos.take([i]).resized(size)
+        row, one = rows[i], photos.take([i]).resized(_SIZE)
         try:
             photo = to_bytes(load_image(one, 0))
         except InputError:
@@ -85,7 +86,7 @@ def registration_report(
 
 
 def matches_drawn(
-    photo: NDArray[np.uint8], render: NDArray[np.uint8], matches: NDArray[np.float64], most: int = _LINES
+    photo: NDArray[np.uint8], render: NDArray[np.uint8], matches: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
     """Photo and render side by side, (H, 2 W, 3), and a line from each pixel to the one it matches.
 
@@ -93,13 +94,12 @@ def matches_drawn(
         photo: (H, W, 3).
         render: likewise.
         matches: (M, 4) pixels of both.
-        most: lines, evenly among the matches.
     """
     from PIL import Image, ImageDraw
 
     pair = Image.fromarray(np.concatenate([photo, render], 1))
     pen, width = ImageDraw.Draw(pair), photo.shape[1]
-    every = max(1, -(-len(matches) // most))
+    every = max(1, -(-len(matches) // _LINES))
     for k, (u, v, u_seen, v_seen) in enumerate(matches[::every].tolist()):
         colour = f"hsl({137 * k % 360}, 90%, 55%)"  # turned by the golden angle: neighbours differ
         pen.line((u, v, width + u_seen, v_seen), fill=colour)

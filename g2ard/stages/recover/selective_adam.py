@@ -10,6 +10,7 @@ from torch import Tensor
 
 __all__ = ["SelectiveAdam"]
 
+_BETAS, _EPS = (0.9, 0.999), 1e-15
 _LARGEST = 1e18
 """Beyond this the square of a gradient leaves float32."""
 
@@ -24,8 +25,6 @@ class SelectiveAdam(torch.optim.Optimizer):
 
     Args:
         parameters: by name, (N, …) each; parameter groups are in this order, with the name and lr 0.
-        betas: β₁ and β₂.
-        eps: ε.
 
     >>> p = torch.zeros(3, 2, requires_grad=True)
     >>> adam = SelectiveAdam({"p": p})
@@ -39,15 +38,9 @@ class SelectiveAdam(torch.optim.Optimizer):
     skipped = 0
     """Steps of single rows left out because a gradient was not finite; not part of `state_dict`."""
 
-    def __init__(
-        self,
-        parameters: Mapping[str, Tensor],
-        *,
-        betas: tuple[float, float] = (0.9, 0.999),
-        eps: float = 1e-15,
-    ) -> None:
+    def __init__(self, parameters: Mapping[str, Tensor]) -> None:
         groups = [{"params": [p], "name": name} for name, p in parameters.items()]
-        super().__init__(groups, {"lr": 0.0, "betas": betas, "eps": eps})
+        super().__init__(groups, {"lr": 0.0})
         rows = len(next(iter(parameters.values())))
         for p in parameters.values():
             count = torch.zeros(rows, dtype=torch.int64, device=p.device)
@@ -73,14 +66,14 @@ class SelectiveAdam(torch.optim.Optimizer):
             self._step_rows(group, rows)
 
     def _step_rows(self, group: dict[str, Any], rows: Tensor) -> None:
-        (p,), (beta1, beta2) = group["params"], group["betas"]
+        (p,), (beta1, beta2) = group["params"], _BETAS
         grad, (m, v, count) = p.grad[rows], (self.state[p][key] for key in ("m", "v", "count"))
         count[rows] += 1
         steps = count[rows].double().reshape(-1, *[1] * (grad.ndim - 1))
         bias1, bias2 = ((1 / (1 - beta**steps)).to(p.dtype) for beta in (beta1, beta2))
         m[rows] = m[rows].lerp_(grad, 1 - beta1)
         v[rows] = v[rows].mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
-        step = (m[rows] * bias1) / ((v[rows] * bias2).sqrt_() + group["eps"])
+        step = (m[rows] * bias1) / ((v[rows] * bias2).sqrt_() + _EPS)
         if group.get("share") is not None:
             step *= group["share"][rows]
         p[rows] -= group["lr"] * step

@@ -138,9 +138,9 @@ class Search:
             found = self._polished(found, photo, None)
         return None if found is None else Candidate(start, found, self._likeness(found.viewmat, photo))
 
-    def by_features(self, start: Start, photo: Photo, passes: int | None = None) -> Candidate | None:
+    def by_features(self, start: Start, photo: Photo) -> Candidate | None:
         """Matches and PnP, then what `refine` says; None where there is no matcher, or too few inliers."""
-        solved = self.solved(start.begins, photo, passes or self.config.passes)
+        solved = self.solved(start.begins, photo, self.config.passes)
         return None if solved is None else self._refined(start, solved, photo)
 
     def solved(self, pose: Float, photo: Photo, passes: int) -> Solved | None:

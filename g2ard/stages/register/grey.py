@@ -26,6 +26,9 @@ Float = NDArray[np.float64]
 
 LUMA = np.array([0.299, 0.587, 0.114])
 
+_BAND = 9
+"""Side of the window whose mean `band_passed` removes, pixels."""
+
 
 def grey_of(image: NDArray[Any]) -> Float:
     """(H, W) float64 luma of an (H, W, 3) image, .299 R + .587 G + .114 B."""
@@ -69,10 +72,9 @@ def box_mean(image: Float, side: int) -> Float:
     return whole / (side * side)
 
 
-def band_passed(image: Float, side: int = 9) -> Float:
+def band_passed(image: Float) -> Float:
     """Blurred a little less its mean over a window: what neither light nor noise decides; (H, W)."""
-    half = side // 2
-    return blurred(image) - box_mean(np.pad(image, half, mode="edge"), side)
+    return blurred(image) - box_mean(np.pad(image, _BAND // 2, mode="edge"), _BAND)
 
 
 def zncc(a: Float, b: Float, mask: NDArray[np.bool_]) -> float:
