@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.simplify import SimplifyConfig
-    from g2ard.tiles.executor import Executor
+    from g2ard.tiles.executor import Workers
     from g2ard.tiles.merging import TiledScene
     from g2ard.tiles.recover import TiledScores
     from g2ard.tiles.sights import Surroundings
@@ -126,7 +126,7 @@ def _worth_keeping(folder: Path, error: G2ardError) -> bool:
 @contextmanager
 def _tiles_and_workers(
     scene: Path, tiling: Tiling, times: float, progress: Progress, say: Say
-) -> Iterator[tuple[TileStore, Executor]]:
+) -> Iterator[tuple[TileStore, Workers]]:
     """Open the tiles of a scene, streamed into `tiling.folder` if it is a file, and start workers.
 
     Args:
@@ -139,7 +139,7 @@ def _tiles_and_workers(
     Raises:
         InputError: the scene cannot be read, or a tile takes too much memory.
     """
-    from g2ard.tiles.executor import executor
+    from g2ard.tiles.executor import Workers, executor
     from g2ard.tiles.ingest import ingest
     from g2ard.tiles.store import MANIFEST, TileStore
 
@@ -153,7 +153,7 @@ def _tiles_and_workers(
     threads = max(1, tiling.usable_cores // workers)
     say(f"{len(store.tiles):,} tiles of {store.count:,} Gaussians, {workers} at a time")
     with executor(workers, threads, tiling.scheduler) as runs:
-        yield store, runs
+        yield store, Workers(runs, _folder(tiling) / "steps", progress)
 
 
 def simplify_in_tiles(
@@ -188,22 +188,20 @@ def simplify_in_tiles(
     """
     from g2ard.tiles.merging import simplify_tiles
 
-    with _tiles_and_workers(scene, tiling, 1.0, progress, say) as (store, runs):
+    with _tiles_and_workers(scene, tiling, 1.0, progress, say) as (store, workers):
         for budget in budgets:
             yield (
                 store,
                 simplify_tiles(
                     store,
                     budget.of(store.count, str(scene)),
-                    executor=runs,
-                    work=_folder(tiling) / "steps",
+                    workers=workers,
                     config=config,
                     views=_given(views, say),
                     beside=lambda sample: _found(scene, sample, say) if views is None else None,
                     blind=blind,
                     up=up,
                     seed=seed,
-                    progress=progress,
                     say=say,
                 ),
             )
@@ -353,10 +351,9 @@ class _Job:
         config: of recovery.
         merging: of simplification.
         learn: whether anything is recovered, or only scored.
-        executor: runs the tasks.
+        workers: run the tasks.
         tiling: how; `folder` keeps finished steps.
         options: as they were given.
-        progress: receives the number of finished tasks.
         say: receives log lines.
     """
 
@@ -366,10 +363,9 @@ class _Job:
     config: RecoverConfig
     merging: SimplifyConfig
     learn: bool
-    executor: Executor
+    workers: Workers
     tiling: Tiling
     options: DistillOptions
-    progress: Progress
     say: Say
 
     def simplified(self, store: TileStore, count: int, cameras: Cameras) -> TiledScene:
@@ -379,12 +375,10 @@ class _Job:
         return simplify_tiles(
             store,
             count,
-            executor=self.executor,
-            work=_folder(self.tiling) / "steps",
+            workers=self.workers,
             config=self.merging,
             views=cameras,
             seed=self.options.seed,
-            progress=self.progress,
             say=self.say,
         )
 
@@ -405,9 +399,7 @@ class _Job:
             views,
             self.config,
             steps if self.learn else 0,
-            executor=self.executor,
-            work=_folder(self.tiling) / "steps",
-            progress=self.progress,
+            self.workers,
         )
 
     def stored(self, scene: TiledScene, name: str, like: TileStore | None = None) -> TileStore:
@@ -432,8 +424,8 @@ def _job(
     from g2ard.stages.simplify import SimplifyConfig
     from g2ard.tiles.merging import sample_of
 
-    with _tiles_and_workers(scene, tiling, RECOVERY_TIMES, progress, say) as (store, runs):
-        sample = sample_of(store, runs, _folder(tiling) / "steps", progress)
+    with _tiles_and_workers(scene, tiling, RECOVERY_TIMES, progress, say) as (store, workers):
+        sample = sample_of(store, workers)
         views = views_of(
             sample,
             options.views,
@@ -460,4 +452,4 @@ def _job(
         constants = full_names(options.constants or {}, {"recover": config, "simplify": merging})
         config = changed(config, "recover", constants)
         merging = changed(merging, "simplify", constants)
-        yield _Job(store, sample, views, config, merging, learn, runs, tiling, options, progress, say)
+        yield _Job(store, sample, views, config, merging, learn, workers, tiling, options, say)

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,7 +19,7 @@ from g2ard.progress import Progress, silent
 from g2ard.system.memory import forget_workers, note_worker, peak_rss
 from g2ard.tiles.tasks import Task, run_task
 
-__all__ = ["DaskExecutor", "Executor", "executor"]
+__all__ = ["DaskExecutor", "Executor", "Workers", "executor"]
 
 _TRIES = 5
 """How often in a row workers may die with no task done between. Dask gives up a task after four deaths."""
@@ -33,6 +34,19 @@ class Executor(Protocol):
 
     def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
         """The tasks' files, in the tasks' order; those that are there are not made again."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """An executor, the folder for its tasks' files, and a callback for progress."""
+
+    executor: Executor
+    folder: Path
+    progress: Progress = silent
+
+    def run(self, tasks: Sequence[Task], stage: str) -> list[Path]:
+        """Run tasks; return their files, in the tasks' order."""
+        return self.executor.run(tasks, stage, self.progress)
 
 
 @contextmanager

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.stream import PartsStream
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.progress import Say, unsaid
 from g2ard.scene.regions import Region, in_any
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify import SimplifyConfig
-from g2ard.tiles.executor import Executor
+from g2ard.tiles.executor import Workers
 from g2ard.tiles.sights import Sights, Surroundings
 from g2ard.tiles.steps import TiledRun
 from g2ard.tiles.store import TileStore
@@ -83,15 +83,13 @@ def simplify_tiles(
     store: TileStore,
     budget: int,
     *,
-    executor: Executor,
-    work: Path,
+    workers: Workers,
     config: SimplifyConfig | None = None,
     views: Cameras | None = None,
     beside: Callable[[Splats], Cameras | None] = lambda sample: None,
     blind: bool = False,
     up: Any = None,
     seed: int = 0,
-    progress: Progress = silent,
     say: Say = unsaid,
 ) -> TiledScene:
     """Reduce a scene in tiles to exactly `budget` Gaussians with the method `default`; all there are stay as
@@ -105,15 +103,14 @@ def simplify_tiles(
        the cheapest merges are done, down to the budget.
     4. Opacities are fitted to what the same views see of the result.
 
-    Every step is a task whose file stays in `work`: the same call goes on where it was interrupted. The
+    Every step is a task whose file stays in the folder of `workers`, so that the same call resumes. The
     result depends on the scene, the tiles and the seed alone, not on where, in which order or how often
     tasks ran.
 
     Args:
         store: the scene.
         budget: Gaussians to keep.
-        executor: runs the tasks.
-        work: a folder for their files.
+        workers: run the tasks, one stage after another.
         config: constants; None means the method's own.
         views: cameras to look from; None takes those that `beside` finds for a fair sample of the scene, else
             plans a pool.
@@ -122,7 +119,6 @@ def simplify_tiles(
         blind: use no cameras at all.
         up: (3,) away from the ground, for poses that are made; None to estimate it.
         seed: of poses that are made.
-        progress: told of tasks done, step by step.
         say: told in lines what was decided.
 
     Raises:
@@ -132,8 +128,7 @@ def simplify_tiles(
         raise InputError(
             f"expected 1 to the {store.count:,} Gaussians there are, got {budget:,}", parameter="budget"
         )
-    work.mkdir(parents=True, exist_ok=True)
-    run = TiledRun(store, executor, work, config or SimplifyConfig(), progress)
+    run = TiledRun(store, workers, config or SimplifyConfig())
     coarse = run.begin()
     frame = run.sampled_frame()
     everything = budget == store.count
@@ -180,10 +175,9 @@ def simplify_tiles(
     return replace(scene, views=len(sights.cameras), unseen=unseen, surroundings=sights.surroundings)
 
 
-def sample_of(store: TileStore, executor: Executor, work: Path, progress: Progress = silent) -> Splats:
+def sample_of(store: TileStore, workers: Workers) -> Splats:
     """A fair sample of a scene in tiles; its task is one of `simplify_tiles`, which does not do it again."""
-    work.mkdir(parents=True, exist_ok=True)
-    run = TiledRun(store, executor, work, SimplifyConfig(), progress)
+    run = TiledRun(store, workers, SimplifyConfig())
     return join([scene_of(path, "sample") for path in run.begin()])
 
 
@@ -244,7 +238,7 @@ def _planned(run: TiledRun, sample: Splats, up: Any, seed: int, say: Say) -> Cam
             near=0.25,
             looks=True,
             represents=run.store.count / len(sample),
-            progress=run.progress,
+            progress=run.workers.progress,
         )
     except InputError as e:
         say(f"goes on without views: {e}")

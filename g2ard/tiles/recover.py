@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.constants import changed, values_of
-from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene
@@ -20,7 +19,7 @@ from g2ard.scene.targets import TeacherRenders
 from g2ard.scene.transform import join
 from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.anchors import Anchors
-from g2ard.tiles.executor import Executor
+from g2ard.tiles.executor import Workers
 from g2ard.tiles.merging import TiledScene, finished, key_of
 from g2ard.tiles.sights import Surroundings, in_sight, light_of, written
 from g2ard.tiles.store import TileStore
@@ -201,10 +200,7 @@ def recover_tiles(
     views: RunViews,
     config: RecoverConfig,
     steps: int,
-    *,
-    executor: Executor,
-    work: Path,
-    progress: Progress = silent,
+    workers: Workers,
 ) -> tuple[TiledScene, TiledScores]:
     """Recover each tile against the dense scene's renders, as if it were part of one recovery of all.
 
@@ -220,12 +216,10 @@ def recover_tiles(
         views: to learn from, to score on, and of another kind to judge by.
         config: of recovery; its steps are not read.
         steps: of a recovery of all; 0 only scores.
-        executor: runs the tasks.
-        work: a folder for their files.
-        progress: told of tiles done.
+        workers: run the tasks.
     """
     sight = {
-        name: (written(work, cameras), _seen(store, around, cameras, executor, work, progress))
+        name: (written(workers.folder, cameras), _seen(store, around, cameras, workers))
         for name, cameras in (
             ("train", views.train.cameras),
             ("test", views.test),
@@ -233,10 +227,19 @@ def recover_tiles(
         )
     }
     tasks = [
-        _task(store, student, around, tile, sight, steps / max(1, len(views.train.cameras)), config, work)
+        _task(
+            store,
+            student,
+            around,
+            tile,
+            sight,
+            steps / max(1, len(views.train.cameras)),
+            config,
+            workers.folder,
+        )
         for tile in range(len(store.tiles))
     ]
-    paths = executor.run(tasks, "recover" if steps else "score", progress)
+    paths = workers.run(tasks, "recover" if steps else "score")
     errors = [load(path, "errors")[0] for path in paths]
     taken = [int(load(path, "steps")[0]) for path in paths]
     parts = tuple(
@@ -263,18 +266,11 @@ def _psnr(errors: NDArray[np.float64]) -> tuple[float, float]:
     return before, after
 
 
-def _seen(
-    store: TileStore,
-    around: Surroundings,
-    cameras: Cameras,
-    executor: Executor,
-    work: Path,
-    progress: Progress,
-) -> list[list[int]]:
+def _seen(store: TileStore, around: Surroundings, cameras: Cameras, workers: Workers) -> list[list[int]]:
     """For each tile the views that have it in sight."""
     if not len(cameras):
         return [[] for _ in store.tiles]
-    light = light_of(store, around.coarse, cameras, executor, work, progress)
+    light = light_of(store, around.coarse, cameras, workers)
     return [in_sight(light, tile).tolist() for tile in range(len(store.tiles))]
 
 

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.io.atomic import atomic_output
-from g2ard.progress import Progress
 from g2ard.rendering.visibility import LONGEST, MOST_LOOKS, NEAR
 from g2ard.scene.cameras import Cameras
-from g2ard.tiles.executor import Executor
+from g2ard.tiles.executor import Workers
 from g2ard.tiles.steps import COARSE, TiledRun
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.tasks import Task, is_whole, load, scene_of
@@ -55,9 +54,9 @@ class Sights:
     def __init__(self, run: TiledRun, coarse: list[Path], cameras: Cameras, frame: tuple[float, ...]):
         self.run, self.coarse, self.cameras = run, coarse, cameras.resized(LONGEST)
         self.shrunk = float((self.cameras.widths / cameras.widths).mean())
-        self.views = written(run.work, self.cameras)
+        self.views = written(run.workers.folder, self.cameras)
         self.boxes = boxes_of(coarse)
-        light = light_of(run.store, coarse, self.cameras, run.executor, run.work, run.progress)
+        light = light_of(run.store, coarse, self.cameras, run.workers)
         self.arguments = [
             {
                 **self._chosen(light, tile),
@@ -145,18 +144,11 @@ def written(work: Path, cameras: Cameras) -> Path:
     return path
 
 
-def light_of(
-    store: TileStore,
-    coarse: list[Path],
-    cameras: Cameras,
-    executor: Executor,
-    work: Path,
-    progress: Progress,
-) -> NDArray[np.float64]:
+def light_of(store: TileStore, coarse: list[Path], cameras: Cameras, workers: Workers) -> NDArray[np.float64]:
     """(V, T) Σ αT that each view gets from each tile, of the tiles' coarse Gaussians, in small renders."""
     level = "near" if store.count // COARSE[0] <= _GLANCED else "far"
     small = cameras.resized(LONGEST)
-    views = written(work, small)
+    views = written(workers.folder, small)
     here = small.recentred(store.offset)
     middles = boxes_of(coarse).mean(axis=1)
     away = np.linalg.norm(here.positions[:, None] - middles, axis=2).min(axis=1)
@@ -166,14 +158,14 @@ def light_of(
         Task(
             "g2ard.tiles.steps:glance",
             f"glance-{number:05}",
-            work,
+            workers.folder,
             {"views": list(chunk), "level": level, "near": near},
             {"coarse": coarse, "views": views},
             cost=len(chunk),
         )
         for number, chunk in enumerate(chunks)
     ]
-    paths = executor.run(tasks, "glance", progress)
+    paths = workers.run(tasks, "glance")
     return np.concatenate([load(path, "weights")[0] for path in paths])
 
 

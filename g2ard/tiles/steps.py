@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.progress import Progress
 from g2ard.rendering.renderer import RasterSettings, view_of
 from g2ard.rendering.visibility import CONVERGED, NEAR, ROUND, spread
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
@@ -33,7 +32,7 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
 from g2ard.stages.simplify.pairs import emphasised
-from g2ard.tiles.executor import Executor
+from g2ard.tiles.executor import Workers
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.tasks import (
     Arguments,
@@ -329,10 +328,9 @@ def _widened(scene: Splats, times: int) -> Splats:
 class TiledRun:
     """What all steps of a simplification in tiles share."""
 
-    def __init__(
-        self, store: TileStore, executor: Executor, work: Path, config: SimplifyConfig, progress: Progress
-    ):
-        self.store, self.executor, self.work, self.progress = store, executor, work, progress
+    def __init__(self, store: TileStore, workers: Workers, config: SimplifyConfig):
+        self.store, self.workers = store, workers
+        workers.folder.mkdir(parents=True, exist_ok=True)
         self.config = asdict(config.resolved("default"))
         self.sizes = [tile.rows for tile in store.tiles]
         self.coarse: list[Path] = []
@@ -358,14 +356,14 @@ class TiledRun:
                 Task(
                     f"{__name__}:{function}",
                     f"{stage}-{tile:05}",
-                    self.work,
+                    self.workers.folder,
                     arguments,
                     {**own, **(inputs[tile] if inputs else {})},
                     {"store": self.store.folder},
                     rows,
                 )
             )
-        return self.executor.run(tasks, stage, self.progress)
+        return self.workers.run(tasks, stage)
 
     def begin(self) -> list[Path]:
         """The first step: what `g2ard.tiles.steps.coarse` makes of each tile."""

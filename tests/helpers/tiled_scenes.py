@@ -8,7 +8,7 @@ import numpy as np
 
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
-from g2ard.tiles.executor import executor
+from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.merging import simplify_tiles
 from g2ard.tiles.store import TileStore
 
@@ -48,4 +48,4 @@ def ring(count: int = 6) -> Cameras:
 def reduced(store: TileStore, work: Path, budget: int = 900, **options: object) -> Splats:
     where = {key: options.pop(key) for key in ("workers", "threads", "scheduler") if key in options}
     with executor(**where) as runs:  # type: ignore[arg-type]
-        return simplify_tiles(store, budget, executor=runs, work=work, **options).whole()  # type: ignore[arg-type]
+        return simplify_tiles(store, budget, workers=Workers(runs, work), **options).whole()  # type: ignore[arg-type]
