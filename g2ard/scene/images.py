@@ -15,14 +15,12 @@ from PIL import Image, ImageDraw, ImageFont
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import opened_image
-from g2ard.progress import Progress, silent
 from g2ard.scene.cameras import Cameras
 
 __all__ = [
     "as_saved",
     "contact_sheet",
     "load_image",
-    "load_images",
     "load_mask",
     "resized",
     "to_bytes",
@@ -92,26 +90,6 @@ def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
         return None
     image = load_image(replace(cameras, image_paths=cameras.mask_paths), index)
     return np.ascontiguousarray(image.mean(2) > 0.5)
-
-
-def load_images(cameras: Cameras, progress: Progress = silent) -> list[NDArray[np.float32]]:
-    """Every view's photo; see `load_image`.
-
-    Args:
-        cameras: C views, all with photos.
-        progress: told of each photo.
-
-    Returns:
-        C arrays (H, W, 3), float32 in [0, 1]: 12 bytes a pixel.
-
-    Raises:
-        InputError: as `load_image`.
-    """
-    images = []
-    for i in range(len(cameras)):
-        images.append(load_image(cameras, i))
-        progress("photos", i + 1, len(cameras))
-    return images
 
 
 def _open(where: str, path: Path) -> NDArray[np.float32]:

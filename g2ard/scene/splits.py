@@ -22,7 +22,6 @@ __all__ = [
     "for_training",
     "not_held_out",
     "split_mask",
-    "split_names",
     "splits_of",
     "states_splits",
 ]
@@ -145,16 +144,6 @@ def for_scores(
             path=views,
         )
     return mask
-
-
-def split_names(views: str | Path | None, names: Sequence[str], which: str) -> list[str]:
-    """The names of a split, in the order of `names`; see `split_mask`.
-
-    >>> split_names("nowhere", ["b", "a", "c"], "train")
-    ['b', 'c']
-    """
-    mask = split_mask(views, names, which)
-    return [name for name, chosen in zip(names, mask, strict=True) if chosen]
 
 
 def _masks(
