@@ -21,7 +21,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.register import RegisterConfig, register
 from g2ard.stages.register.pose import rotation_of
-from g2ard.stages.register.score import Accuracy, summarize
+from g2ard.stages.register.report import Accuracy, summarize
 from g2ard.stages.simplify import simplify
 
 __all__ = ["STARTS", "Cell", "bench_register", "displaced"]

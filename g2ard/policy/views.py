@@ -158,13 +158,9 @@ def views_or_pool(
 
     Args:
         scene: the dense scene.
-        views: as for `views_of`.
-        beside: as for `views_of`.
-        count: poses of a pool that is made; None for as many as `distill` makes.
-        up: as for `views_of`.
-        seed: as for `views_of`.
-        progress: as for `views_of`.
-        say: as for `views_of`.
+        count: poses of a generated pool; None for as many as `distill` makes.
+
+    The others are as for `views_of`.
 
     Raises:
         InputError: a scene with no room for poses.
@@ -208,12 +204,9 @@ def cameras_for_looks(
     Args:
         scene: the dense scene.
         views: as for `views_of`; of a split, those for training.
-        method: `fast` looks from views that are given or asked for alone, `paper` from none.
-        beside: as for `views_of`.
-        up: as for `views_of`.
-        seed: as for `views_of`.
-        progress: as for `views_of`.
-        say: as for `views_of`.
+        method: `fast` uses only views that are given or requested, `paper` none.
+
+    The others are as for `views_of`.
 
     Raises:
         InputError: a file without views, or an empty split.

@@ -15,7 +15,7 @@ from g2ard.policy.register import matched, photos_of, read_poses
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.images import write_png
 from g2ard.stages.register import PhotoReport, PoseError, RegisterConfig, pose_error, register
-from g2ard.stages.register.score import summarize
+from g2ard.stages.register.report import summarize
 from helpers.commands import CommandLine
 from helpers.registration import off
 from helpers.scenes import around, checkered_ball

@@ -13,7 +13,7 @@ from g2ard.config.choices import Keep, Refinement
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
-    from g2ard.stages.register.score import Accuracy, Summary
+    from g2ard.stages.register.report import Accuracy, Summary
 
 
 @command(
@@ -114,7 +114,7 @@ def register(
     from g2ard.policy.register import photos_of, pool_of, poses_for
     from g2ard.stages.register import RegisterConfig
     from g2ard.stages.register import register as find
-    from g2ard.stages.register.score import summarize
+    from g2ard.stages.register.report import summarize
 
     config = RegisterConfig(size=size, accept=accept, matcher=matcher, refine=refine, passes=passes)
     if protocol == "gs-cpr":

@@ -19,7 +19,9 @@ from g2ard.stages.register.attempts import Candidate, Photo, Search, Start, load
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import band_passed
 from g2ard.stages.register.matchers import matcher_named
-from g2ard.stages.register.outcome import (
+from g2ard.stages.register.pool import PoolRenders, small_render, turned
+from g2ard.stages.register.pose import pose_error
+from g2ard.stages.register.report import (
     KEPT,
     PhotoReport,
     PoseError,
@@ -27,8 +29,6 @@ from g2ard.stages.register.outcome import (
     RegisterReport,
     Status,
 )
-from g2ard.stages.register.pool import PoolRenders, small_render, turned
-from g2ard.stages.register.pose import pose_error
 
 __all__ = [
     "PhotoReport",
