@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.methods import METHODS, Matched, MethodSpec
-from g2ard.config.choices import ADAPT_SCHEDULES, CONVENTIONS, LPIPS_INPUTS, SCHEDULE_NAMES
+from g2ard.config.choices import ADAPT_SCHEDULES, BLACK, CONVENTIONS, LPIPS_INPUTS, SCHEDULE_NAMES, Colour
 from g2ard.errors import InputError
 
 __all__ = ["METHODS", "Definition", "Matched", "MethodSpec", "SceneSpec", "read_definition"]
@@ -52,7 +52,7 @@ class SceneSpec:
     adapt: str | None = None
     adapt_last: int = 0
     targets: str = "teacher"
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: Colour = BLACK
     indoor: bool = False
     train_prior: int = 0
     synth: Mapping[str, Any] | None = None

@@ -16,6 +16,7 @@ from benchmarks.recover_studies import STUDIES, Plan
 from benchmarks.simplify import machine, scene_label
 from benchmarks.standing import check_protocol, standing_targets
 from g2ard import __version__, io
+from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.pipeline import DistillConfig, distill
 from g2ard.poses import make_pool
@@ -62,7 +63,7 @@ class RecoverBench:
     held_out: Path | None = None
     photos: bool | None = None
     size: int | None = None
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: Colour = BLACK
     pool_seed: int = 0
     protocol: str = "pool"
     _starts: dict[int, tuple[Splats, float]] = field(default_factory=dict, repr=False, compare=False)
@@ -293,7 +294,7 @@ class _Run:
     def _chain(self, progress: Progress) -> tuple[Splats, Splats, list[RecoverReport]]:
         plan, bench = self.plan, self.bench
         assert plan.regularizers is not None
-        config = DistillConfig(
+        how = RecoverConfig(
             schedule=plan.schedule,
             steps=plan.steps,
             recovery_time=plan.recovery_time,
@@ -302,6 +303,7 @@ class _Run:
             background=bench.background,
             seed=self.key[3],
         )
+        config = DistillConfig(recover=how)
         done = distill(
             bench.prior, self.budget, bench.targets[0], config, progress=progress, watch=self._watch
         )

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from benchmarks.simplify import scene_label
 from benchmarks.synth import CityConfig, city
 from g2ard import io
+from g2ard.config.choices import BLACK, Colour
 from g2ard.io.atomic import atomic_output
 from g2ard.poses import make_pool, plan_pool
 from g2ard.progress import Progress, silent
@@ -75,7 +76,7 @@ class Workspace:
     regularizers: Regularizers
     candidates: int
     sh_degree: int | None = None
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: Colour = BLACK
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from g2ard import io
+from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.poses import plan_pool
 from g2ard.poses.lattice import halton
@@ -87,7 +88,7 @@ def standing_targets(
     seed: int = 0,
     *,
     size: int | None = None,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Colour = BLACK,
 ) -> dict[str, TeacherRenders]:
     """What `standing_views` show of the scene, shrunk to `size`; views that show nothing of it are left out.
 

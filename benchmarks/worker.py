@@ -24,7 +24,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.images import to_bytes
 from g2ard.scene.targets import CACHE_BYTES, Targets, against_of, mask_of
 from g2ard.stages.recover.anchors import Anchors, Regularizers
-from g2ard.stages.recover.schedule import Rates, Schedule, schedule_named
+from g2ard.stages.recover.schedule import Rates, Schedule
 
 __all__ = ["StoredTargets", "store_targets"]
 
@@ -168,7 +168,7 @@ def _adapt(job: Job) -> dict[str, Any]:
 def _schedule(name: str, cameras: Cameras) -> Schedule:
     """3DGS's rates at the end of its training, where fine-tuning goes on, beside those of recovery."""
     if name != "3dgs":
-        return schedule_named(name)
+        return Schedule.named(name)
     positions = cameras.positions
     extent = 1.1 * float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
     return Schedule(

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from g2ard.io import write_splats as save
     from g2ard.io import write_views as save_views
     from g2ard.levels import save_levels
-    from g2ard.pipeline import DistillConfig, Distilled
+    from g2ard.pipeline import DistillConfig, Distilled, SelectConfig
     from g2ard.pipeline import distill as distill_against
     from g2ard.pipeline.adapt import AdaptConfig, Adapted, adapt
     from g2ard.policy.distill import distill
@@ -96,6 +96,7 @@ __all__ = [
     "Regularizers",
     "Rendered",
     "Renderer",
+    "SelectConfig",
     "Selection",
     "Simplified",
     "SimplifyConfig",
@@ -131,7 +132,7 @@ _HOMES = {
     "scene.cameras": ("Camera", "Cameras", "look_at"),
     "errors": ("G2ardError", "InputError", "MissingDependencyError", "OutputError"),
     "io.types": ("Points",),
-    "pipeline": ("DistillConfig", "Distilled"),
+    "pipeline": ("DistillConfig", "Distilled", "SelectConfig"),
     "levels": ("save_levels",),
     "policy.distill": ("distill",),
     "policy.distill_options": ("DistillOptions",),

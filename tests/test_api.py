@@ -78,7 +78,7 @@ def test_simplify_does_what_the_shell_does(
         (["--fit", "30kB", "--clean", "--steps", 10], {"fit": "30kB", "clean": True, "steps": 10}),
         (
             ["-r", 10, "--preset", "paper", "--steps", 30, "--set", "schedule.round_steps=4"],
-            {"ratio": 10, "preset": "paper", "steps": 30, "constants": {"schedule.round_steps": 4}},
+            {"ratio": 10, "preset": "paper", "steps": 30, "settings": {"schedule.round_steps": 4}},
         ),
     ],
 )

@@ -207,5 +207,7 @@ def test_scripts_need_no_deep_imports() -> None:
     with pytest.raises(InputError, match="one of trained, lift, noisy, got 'lifted'"):
         g2ard.Regularizers.of("lifted")
     targets = g2ard.TeacherRenders(BALL, around(4, (32, 24)))
-    found = g2ard.distill_against(BALL, 50, targets, g2ard.DistillConfig(steps=2))
+    found = g2ard.distill_against(
+        BALL, 50, targets, g2ard.DistillConfig(recover=g2ard.RecoverConfig(steps=2))
+    )
     assert len(found.splats) == 50

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from g2ard.cli.panels import BUDGET
+
 if TYPE_CHECKING:
     from g2ard.policy.budget import Budget
 
@@ -152,6 +154,7 @@ CountsOption = Annotated[
         parser=Counts.parse,
         metavar="COUNT",
         help="Budget: 250000, 250k, 1.5M or 25%; several, 10k,20k, want {count} in the output's name.",
+        rich_help_panel=BUDGET,
     ),
 ]
 RatiosOption = Annotated[
@@ -162,6 +165,7 @@ RatiosOption = Annotated[
         parser=Ratios.parse,
         metavar="RATIO",
         help="Budget as a ratio: 10 keeps a tenth; several, 5,10,20, want {ratio} in the output's name.",
+        rich_help_panel=BUDGET,
     ),
 ]
 LooksOption = Annotated[
@@ -182,14 +186,24 @@ RatioOption = Annotated[
 ]
 FitOption = Annotated[
     str | None,
-    typer.Option("--fit", metavar="5MB|quest3|mobile|web", help="Budget: bytes of the file, or a device."),
+    typer.Option(
+        "--fit",
+        metavar="5MB|quest3|mobile|web",
+        help="Budget: bytes of the file, or a device.",
+        rich_help_panel=BUDGET,
+    ),
 ]
 MinPsnrOption = Annotated[
     float | None,
-    typer.Option(min=1, help="Budget: the fewest that keep this PSNR, dB, against the scene itself."),
+    typer.Option(
+        min=1,
+        help="Budget: the fewest that keep this PSNR, dB, against the scene itself.",
+        rich_help_panel=BUDGET,
+    ),
 ]
 MinSsimOption = Annotated[
-    float | None, typer.Option(min=0.01, max=0.9999, help="Budget: the fewest that keep this SSIM.")
+    float | None,
+    typer.Option(min=0.01, max=0.9999, help="Budget: the fewest that keep this SSIM.", hidden=True),
 ]
 
 

@@ -40,7 +40,7 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     if constants:
         found["set"] = [f"{name}={_as_typed(value)}" for name, value in constants.items()]
         if "set" not in params:
-            raise typer.BadParameter(f"{path}: `{ctx.info_name}` has no constants to set")
+            raise typer.BadParameter(f"{path}: `{ctx.info_name}` has no settings")
     ctx.default_map = {**(ctx.default_map or {}), **found}
     return path
 
@@ -84,8 +84,8 @@ def _of_command(ctx: typer.Context, path: Path, values: dict[str, Any]) -> dict[
 
 def _check_others(path: Path, tables: dict[str, Any]) -> set[str]:
     """The options of the other commands that a file has tables of; a table's keys are among its command's."""
+    from g2ard.cli.app import app
     from g2ard.cli.commands import register_commands
-    from g2ard.cli.frame import app
 
     for name in tables:
         register_commands(name)
@@ -121,9 +121,9 @@ def _dashed(key: str) -> str:
 
 
 def _flat(table: Any, prefix: str = "") -> dict[str, Any]:
-    """A table of constants by their dotted names: `simplify.max_energy = 0.02` is a table within one."""
+    """Return a table of settings by dotted path: `simplify.max_energy = 0.02` is a table within one."""
     if not isinstance(table, dict):
-        raise typer.BadParameter("set: a table of constants, such as set = { simplify.max_energy = 0.02 }")
+        raise typer.BadParameter("set: a table of settings, such as set = { simplify.max_energy = 0.02 }")
     out: dict[str, Any] = {}
     for key, value in table.items():
         out |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}

@@ -20,40 +20,17 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from g2ard.cli.app import app
 from g2ard.cli.budget_options import Counts, Ratios
 from g2ard.cli.config import load_config, printed
 from g2ard.cli.console import Console
+from g2ard.cli.panels import COMMON
 from g2ard.cli.usage import flags_of, in_flags, typed
 from g2ard.errors import G2ardError
 from g2ard.progress import plural
 from g2ard.system import interrupt
 
 __all__ = ["Run", "app", "command", "group", "one_line"]
-
-app = typer.Typer(
-    help="Distil a dense 3D Gaussian scene into a compact, standard 3DGS model at an exact budget.",
-    no_args_is_help=True,
-    add_completion=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-
-
-def _version(show: bool) -> None:
-    if show:
-        from g2ard import __version__
-
-        typer.echo(f"g2ard {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def _root(
-    version: Annotated[
-        bool, typer.Option("-V", "--version", callback=_version, is_eager=True, help="Print the version.")
-    ] = False,
-) -> None:
-    pass
 
 
 _RIVALS = (
@@ -74,23 +51,56 @@ def _flags_win(ctx: typer.Context, values: dict[str, Any], defaults: dict[str, A
 
 
 _COMMON: dict[str, tuple[Any, Any]] = {
-    "quiet": (Annotated[bool, typer.Option("-q", "--quiet", help="Print errors only.")], False),
-    "verbose": (Annotated[bool, typer.Option("-v", "--verbose", help="Say more.")], False),
+    "quiet": (
+        Annotated[bool, typer.Option("-q", "--quiet", help="Print errors only.", rich_help_panel=COMMON)],
+        False,
+    ),
+    "verbose": (
+        Annotated[bool, typer.Option("-v", "--verbose", help="Say more.", rich_help_panel=COMMON)],
+        False,
+    ),
     "overwrite": (
-        Annotated[bool, typer.Option("-w", "--overwrite", help="Replace existing outputs.")],
+        Annotated[
+            bool,
+            typer.Option("-w", "--overwrite", help="Replace existing outputs.", rich_help_panel=COMMON),
+        ],
         False,
     ),
     "json": (
-        Annotated[str | None, typer.Option("--json", metavar="FILE|-", help="Write the result as JSON.")],
+        Annotated[
+            str | None,
+            typer.Option(
+                "--json", metavar="FILE|-", help="Write the result as JSON.", rich_help_panel=COMMON
+            ),
+        ],
         None,
     ),
-    "seed": (Annotated[int, typer.Option(min=0, help="Seed of everything random.")], 0),
-    "threads": (Annotated[int, typer.Option(min=0, max=256, help="Threads; 0 means every core.")], 0),
-    "device": (Annotated[str, typer.Option(metavar="auto|cpu|gpu|cuda", help="Where to compute.")], "auto"),
+    "seed": (
+        Annotated[int, typer.Option(min=0, help="Seed of everything random.", rich_help_panel=COMMON)],
+        0,
+    ),
+    "threads": (
+        Annotated[
+            int,
+            typer.Option(min=0, max=256, help="Threads; 0 means every core.", rich_help_panel=COMMON),
+        ],
+        0,
+    ),
+    "device": (
+        Annotated[
+            str,
+            typer.Option(metavar="auto|cpu|gpu|cuda", help="Where to compute.", rich_help_panel=COMMON),
+        ],
+        "auto",
+    ),
     "print_config": (
         Annotated[
             bool,
-            typer.Option("--print-config", help="Print the options as a file for --config, and do nothing."),
+            typer.Option(
+                "--print-config",
+                help="Print the options as a file for --config, and do nothing.",
+                rich_help_panel=COMMON,
+            ),
         ],
         False,
     ),
@@ -102,6 +112,7 @@ _COMMON: dict[str, tuple[Any, Any]] = {
                 callback=load_config,
                 is_eager=True,
                 help="Defaults; flags win.",
+                rich_help_panel=COMMON,
             ),
         ],
         None,
@@ -113,8 +124,9 @@ _SET = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
-        metavar="NAME=VALUE",
-        help="A constant, such as rates.means=1e-3; reports list all. Repeatable.",
+        metavar="PATH=VALUE",
+        help="A setting, such as recover.schedule.steps=300 (docs/options.md); reports list all. Repeatable.",
+        rich_help_panel=COMMON,
     ),
 ]
 
@@ -138,7 +150,7 @@ class Run:
         self.verbose: bool = common["verbose"]
         self.json: str | None = common["json"]
         self.console = Console(quiet=common["quiet"])
-        self.only_checks = False  # whether the call ends once its constants are known to be right
+        self.only_checks = False  # whether the call ends once its settings are checked
         self.noted = False  # whether a GPU failed
         self._adapter: str | None = None  # the last that was in use
         self.kept: list[str] = []  # what a Ctrl-C leaves, in words
@@ -151,24 +163,29 @@ class Run:
         if "set" in common:
             self.config["set"] = common["set"]
 
-    def constants(self, *, over_options: bool = False, **configs: Any) -> dict[str, Any]:
-        """What --set and the config file say of configs' constants (`g2ard.config.constants.parsed`), as a
-        usage check: names and types, and values as far as the other constants' defaults allow to say.
+    def settings(self, config: Any, *names: str, preset: str | None = None) -> dict[str, Any]:
+        """Collect values of a config by path, as a usage check: --set, and under it the options `names`.
 
         Args:
-            over_options: constants that are options of the command too may be set; they win.
-            configs: prefix → a dataclass that holds constants.
+            config: the defaults.
+            names: options called like a field, or like the tail of its path; those not given are left out.
+            preset: under which the values of --set are checked as far as they can be alone.
         """
-        from g2ard.config.constants import changed, parsed
+        from g2ard.config.paths import full_paths, parsed
+        from g2ard.config.presets import configured
         from g2ard.errors import InputError
 
+        given = {name: self.config[name] for name in names if self.config[name] not in (None, [], ())}
         try:
-            without = () if over_options else self.config
-            values = parsed(self.config["set"] or [], configs, without)
-            for root, config in configs.items():
-                changed(config, root, values)
+            typed = parsed(self.config["set"] or [], config)
+            configured(config, preset or "auto", typed)
         except InputError as e:
             raise typer.BadParameter(f"--set: {e}") from None
+        values = full_paths(given, config) | typed
+        for other in ("recover.recovery_time", "recover.schedule.steps"):
+            if "recover.steps" in values and other in values:
+                flag = "--recovery-time" if "time" in other else f"--set {other}"
+                raise typer.BadParameter(f"--steps and {flag} exclude each other; give one")
         if self.only_checks:
             raise _Checked
         return values
@@ -267,7 +284,7 @@ def group(name: str, text: str) -> typer.Typer:
 
 
 def command(
-    name: str, *, example: str, parent: typer.Typer = app, cuda: bool = False, constants: bool = False
+    name: str, *, example: str, parent: typer.Typer = app, cuda: bool = False, settings: bool = False
 ) -> Callable[[Any], Any]:
     """Register `fn(run, **options)` as a command; `example` ends its help.
 
@@ -276,12 +293,12 @@ def command(
         example: a line.
         parent: the group it belongs to.
         cuda: it knows --device cuda.
-        constants: it takes --set, see `Run.constants`.
+        settings: it takes --set, see `Run.settings`.
     """
 
     def register(fn: Callable[..., None]) -> Callable[..., None]:
         own = list(inspect.signature(fn, eval_str=True).parameters.values())[1:]
-        shared_options = {**_COMMON, "set": (_SET, None)} if constants else _COMMON
+        shared_options = {**_COMMON, "set": (_SET, None)} if settings else _COMMON
         common = [
             inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
             for key, (kind, default) in shared_options.items()
@@ -296,7 +313,7 @@ def command(
             run = Run(name, shared, dict(values), flags_of(ctx.command))
             if printing:
                 if shared.get("set"):
-                    _check_constants(run, fn, values)
+                    _check_settings(run, fn, values)
                 typer.echo(printed(ctx, {**values, **shared}), nl=False)
                 return
             ours = interrupt.raises()
@@ -318,11 +335,11 @@ def command(
 
 
 class _Checked(Exception):
-    """The constants are known and in range."""
+    """The settings are known and in range."""
 
 
-def _check_constants(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None:
-    """Refuse constants that the command does not have, as far as it asks for them, and do nothing else."""
+def _check_settings(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None:
+    """Check the values of --set, and do nothing else."""
     run.only_checks = True
     with contextlib.suppress(_Checked):
         fn(run, **options)

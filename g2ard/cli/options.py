@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from g2ard.cli.budget_options import Count
+from g2ard.cli.panels import METHOD, OUTPUT, RECOVERY, VIEWS
 from g2ard.config.choices import (
-    UNMEASURED,
+    BLACK,
     Convention,
     Engine,
     FormatName,
+    Method,
     PaperPresetName,
     Policy,
     PresetName,
+    ScheduleName,
 )
 from g2ard.report.window import Crop
 
@@ -42,7 +44,6 @@ __all__ = [
     "ViewsOption",
     "ViewsOrMadeOption",
     "can_be_made",
-    "can_judge",
     "is_made",
     "picture",
     "recovery_engine",
@@ -88,11 +89,15 @@ ViewsOrMadeOption = Annotated[
         parser=_views_or_made,
         metavar="VIEWS|made",
         help="A COLMAP folder, transforms.json, cameras.json, a trainer's run or g2ard's own .json; "
-        "what lies beside the scene if not given; made: a pool of its own instead.",
+        "what lies beside the scene if not given; made: generated views instead.",
+        rich_help_panel=VIEWS,
     ),
 ]
 LookOption = Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")]
-OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Where the result goes.")]
+OutputOption = Annotated[
+    Path,
+    typer.Option("-o", "--output", metavar="OUT", help="Where the result goes.", rich_help_panel=OUTPUT),
+]
 
 
 def picture(text: str) -> Path:
@@ -107,7 +112,7 @@ class Triple(tuple[float, float, float]):
 
 
 def _colour(text: str) -> Triple:
-    named = {"black": Triple((0.0, 0.0, 0.0)), "white": Triple((1.0, 1.0, 1.0))}
+    named = {"black": Triple(BLACK), "white": Triple((1.0, 1.0, 1.0))}
     if text in named:
         return named[text]
     try:
@@ -134,7 +139,8 @@ UpOption = Annotated[
     typer.Option(
         parser=_direction,
         metavar="X,Y,Z",
-        help="Away from the ground, for poses that are made; estimated unless given.",
+        help="Away from the ground, for generated views; estimated unless given.",
+        rich_help_panel=VIEWS,
     ),
 ]
 
@@ -166,6 +172,7 @@ KeepRegionOption = Annotated[
         metavar="X,Y,Z,R|X,Y,Z,X,Y,Z",
         help="More of the budget for a sphere or a box, scene units, as if views stood twice as near "
         "(--set keep_times=4); may be repeated.",
+        rich_help_panel=METHOD,
     ),
 ]
 SplitOption = Annotated[
@@ -177,15 +184,25 @@ ShDegreeOption = Annotated[
 ]
 FormatOption = Annotated[
     FormatName,
-    typer.Option("--format", case_sensitive=False, help="Of the scene's file in RUN."),
+    typer.Option(
+        "--format", case_sensitive=False, help="Of the scene's file in RUN.", rich_help_panel=OUTPUT
+    ),
 ]
-ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on with a stopped run.")]
+ResumeOption = Annotated[
+    bool, typer.Option("--resume", help="Resume an interrupted run.", rich_help_panel=OUTPUT)
+]
 SizeOption = Annotated[
-    int | None, typer.Option(min=16, metavar="PIXELS", help="Shrink views to this longer side.")
+    int | None,
+    typer.Option(min=16, metavar="PIXELS", help="Shrink views to this longer side.", rich_help_panel=VIEWS),
 ]
 BackgroundOption = Annotated[
     Triple | None,
-    typer.Option(parser=_colour, metavar="COLOUR", help="black (the default), white or R,G,B in [0, 1]."),
+    typer.Option(
+        parser=_colour,
+        metavar="COLOUR",
+        help="black (the default), white or R,G,B in [0, 1].",
+        rich_help_panel=VIEWS,
+    ),
 ]
 SkyOption = Annotated[
     Triple | None,
@@ -221,51 +238,43 @@ CropOption = Annotated[
         metavar="[VIEW:]X,Y,W,H",
         help="Magnify this in the report: left, top, width, height in shares of the image "
         "(front.png:0.4,0.3,0.2,0.2); may be repeated.",
+        hidden=True,
     ),
 ]
-
-_PAPER = {
-    "method": "paper",
-    "schedule": "paper",
-    "policy": "directional",
-    "k": "50%",
-    "weighted": "false",
-    "reselect": "false",
-    "sh_degree": "3",
-    "tolerance": "0",
-}
-"""What `--preset paper` makes of the options that a command has, as they would be typed; in Python it is
-`g2ard.preset`."""
-
-
-def _whole_paper(ctx: typer.Context, preset: str | None) -> str | None:
-    """Make the paper's options the defaults: what the command line or a config file says stands."""
-    if (preset or "").startswith("paper"):
-        own = {parameter.name for parameter in ctx.command.params}
-        options = {name: value for name, value in _PAPER.items() if name in own}
-        ctx.default_map = {**options, **(ctx.default_map or {})}
-    return preset
-
 
 PresetOption = Annotated[
     PresetName,
     typer.Option(
-        callback=_whole_paper,
-        is_eager=True,
-        help="Which regularisers hold the geometry; auto measures the scene. paper: the paper's, measured"
-        " alike, and all else as in the paper, but for what other options say.",
+        help="Settings by name: regularisers that hold the geometry, measured by auto; or all as in the"
+        " paper, except what other options say.",
+        rich_help_panel=METHOD,
     ),
 ]
 PaperOption = Annotated[
     PaperPresetName | None,
     typer.Option(
         "--preset",
-        callback=_whole_paper,
-        is_eager=True,
         help="paper, or with a row of its regularisers paper-trained, paper-lift, paper-noisy: all as in the"
-        " paper, but for what other options say.",
+        " paper, except what other options say.",
         metavar="[paper|paper-…]",
+        rich_help_panel=METHOD,
     ),
+]
+ScheduleOption = Annotated[
+    ScheduleName | None,
+    typer.Option(
+        help="Rates and horizon: fast, 300 steps, default, 1,000, or best, 6,000; paper also goes by rounds.",
+        rich_help_panel=RECOVERY,
+    ),
+]
+StepsOption = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Steps of the last recovery, instead of the schedule's.", rich_help_panel=RECOVERY
+    ),
+]
+MethodOption = Annotated[
+    Method | None, typer.Option(help="How to simplify: default unless given.", rich_help_panel=METHOD)
 ]
 
 
@@ -283,6 +292,7 @@ RecoveryTimeOption = Annotated[
         parser=_duration,
         metavar="TIME",
         help="Fit recovery, and no other part, into 90s, 2m or 1h.",
+        rich_help_panel=RECOVERY,
     ),
 ]
 
@@ -292,21 +302,7 @@ def views_count(text: str) -> Count | str:
     return "auto" if text.strip() == "auto" else Count.parse(text)
 
 
-PolicyOption = Annotated[Policy, typer.Option("--policy", help="What makes views good.")]
-
-
-def can_judge(k: Count | str | None, policy: str) -> None:
-    """Usage check: `-k auto` needs a policy that measures what views add."""
-    if k == "auto" and policy in UNMEASURED:
-        raise typer.BadParameter(f"-k auto: --policy {policy} does not measure what views add; give a count")
-
-
-def one_horizon(steps: int | None, recovery_time: float | None, constants: Mapping[str, object]) -> None:
-    """Usage check: --steps, --recovery-time and --set schedule.steps all set the horizon."""
-    if steps is not None and recovery_time is not None:
-        raise typer.BadParameter("--steps and --recovery-time exclude each other; give one")
-    if steps is not None and "schedule.steps" in constants:
-        raise typer.BadParameter("--steps and --set schedule.steps exclude each other; give one")
+PolicyOption = Annotated[Policy | None, typer.Option("--policy", help="What makes views good.")]
 
 
 def recovery_engine(run: Run) -> Engine:

@@ -120,7 +120,7 @@ def say_weight(run: Run, source: Path, output: Path, splats: Splats, *, lifted: 
     share = splats.shN.nbytes / splats.nbytes
     hint = "packed formats are smaller than .ply"
     if share:
-        hint = f"{share:.0%} of it is SH above degree 0 (--sh-degree 0 on distill and recover leaves it out)"
+        hint = f"{share:.0%} of it is SH above degree 0 (--set recover.sh_degree=0 leaves it out)"
     run.say(f"{sizes}: {hint}")
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from g2ard.cli.budget_options import Count
+from g2ard.cli.panels import LARGE
 from g2ard.cli.usage import in_flags
 
 if TYPE_CHECKING:
@@ -29,19 +30,31 @@ TileRowsOption = Annotated[
         parser=Count.parse_absolute,
         metavar="COUNT",
         help="A scene of more Gaussians is worked on in tiles of at most so many; 5M if not given.",
+        hidden=True,
     ),
 ]
 MemoryOption = Annotated[
-    str | None, typer.Option(metavar="SIZE", help="What all workers together may take, such as 4GB.")
+    str | None,
+    typer.Option(
+        metavar="SIZE",
+        help="Memory that all workers together may take, such as 4GB.",
+        rich_help_panel=LARGE,
+    ),
 ]
 WorkersOption = Annotated[
     int | None,
-    typer.Option(min=1, help="Processes that work on tiles; as many as cores and memory allow if not given."),
+    typer.Option(
+        min=1,
+        help="Processes that work on tiles; as many as cores and memory allow if not given.",
+        rich_help_panel=LARGE,
+    ),
 ]
 SchedulerOption = Annotated[
     str | None,
     typer.Option(
-        metavar="ADDRESS", help="Tiles on a Dask cluster: tcp://HOST:PORT, or local (extra distributed)."
+        metavar="ADDRESS",
+        help="Tiles on a Dask cluster: tcp://HOST:PORT, or local (extra distributed).",
+        hidden=True,
     ),
 ]
 WorkOption = Annotated[
@@ -50,6 +63,7 @@ WorkOption = Annotated[
         metavar="DIR",
         help="Keep tiles and steps here, for other budgets; else, until all is done, beside the output "
         "in .NAME.tiles.",
+        hidden=True,
     ),
 ]
 

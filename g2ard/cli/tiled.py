@@ -37,7 +37,7 @@ class TiledCommand:
 
     def simplify(self, config: SimplifyConfig, views: Any, blind: bool, up: Sequence[float] | None) -> None:
         """Run `g2ard simplify`."""
-        from g2ard.config.constants import listed
+        from g2ard.config.paths import listed
         from g2ard.policy.tiled import simplify_in_tiles, working
 
         run, began, reports = self.run, time.perf_counter(), []
@@ -62,8 +62,7 @@ class TiledCommand:
                     "views": small.views,
                     "unseen": small.unseen,
                     "method": "default",
-                    "constants": listed({"simplify": config.resolved("default")}),
-                    "keep_region": config.keep_region,
+                    "settings": listed(config.resolved("default")),
                 }
                 seconds = report["seconds"]["total"]
                 run.say(f"{place}: {len(small):,} of {store.count:,} Gaussians in {seconds:.1f} s")

@@ -9,6 +9,7 @@ from typing import Literal, get_args
 
 __all__ = [
     "ADAPT_SCHEDULES",
+    "BLACK",
     "CONVENTIONS",
     "ENGINES",
     "LPIPS_INPUTS",
@@ -19,6 +20,7 @@ __all__ = [
     "SCHEDULE_NAMES",
     "UNMEASURED",
     "AdaptSchedule",
+    "Colour",
     "Convention",
     "Engine",
     "FormatName",
@@ -32,6 +34,11 @@ __all__ = [
     "Refinement",
     "ScheduleName",
 ]
+
+Colour = tuple[float, float, float]
+"""RGB in [0, 1]."""
+BLACK: Colour = (0.0, 0.0, 0.0)
+"""The background behind a scene unless another is given."""
 
 Method = Literal["default", "fast", "paper"]
 """Of simplification."""

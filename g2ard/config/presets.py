@@ -1,48 +1,77 @@
-"""Whole configurations by name: what every stage is to do so that together they are a published method."""
+"""Presets: settings by path that together make a method, and configurations made from them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from typing import Any, TypeVar
 
+from g2ard.config.paths import changed, full_paths
 from g2ard.errors import InputError
-from g2ard.pipeline import DistillConfig
-from g2ard.pipeline.adapt import AdaptConfig
-from g2ard.stages.recover.anchors import PAPER_PRESETS
-from g2ard.stages.recover.config import RecoverConfig
-from g2ard.stages.recover.schedule import PAPER
-from g2ard.stages.select.surfaces import CoverageOptions
-from g2ard.stages.simplify.config import SimplifyConfig
 
-__all__ = ["Preset", "preset"]
+__all__ = ["PRESETS", "configured", "preset"]
+
+Config = TypeVar("Config")
+
+_PAPER: dict[str, Any] = {
+    "select.policy": "directional",
+    "select.views_count": 0.5,
+    "select.weighted": False,
+    "select.reselect": False,
+    "simplify.method": "paper",
+    "recover.schedule": "paper",
+    "recover.sh_degree": 3,
+    "adapt.schedule": "paper",
+    "adapt.tolerance": 0.0,
+    "adapt.prior_views": 0.0,
+    "adapt.sh_degree": 3,
+}
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "auto": {},
+    **{kind: {"recover.regularizers": kind} for kind in ("trained", "lift", "noisy")},
+    **{
+        kind: {**_PAPER, "recover.regularizers": kind}
+        for kind in ("paper", "paper-trained", "paper-lift", "paper-noisy")
+    },
+}
+"""Name → values by path. `auto` measures the scene to choose its regularisers, `paper` likewise among the
+paper's."""
 
 
-@dataclass(frozen=True)
-class Preset:
-    """A configuration of every stage; each field is what the function of its name takes.
+def configured(config: Config, preset: str = "auto", settings: Mapping[str, Any] | None = None) -> Config:
+    """Return a config with a preset's values, and over them with settings.
+
+    A schedule that is set by name is scaled to `recover.steps`. The paper's schedule means SH of degree 3.
 
     Args:
-        method: simplification's, for `simplify(method=…)`.
-        simplify: its constants.
-        policy: of view selection, for `select(policy=…)`.
-        views: the share of the candidates that it keeps.
-        select: its constants.
-        recover: of one recovery at the target count; those of rounds have `final=False`.
-        distill: of the pipeline, all of the above in it.
-        adapt: of new appearance on frozen geometry.
+        config: of a stage, or of several.
+        preset: see `PRESETS`; values that are not of the config are ignored.
+        settings: by path, or by the tail of one.
+
+    Raises:
+        InputError: an unknown preset or setting, or a value out of its range.
+
+    >>> from g2ard.stages.recover.config import RecoverConfig
+    >>> config = configured(RecoverConfig(), "paper", {"steps": 3000})
+    >>> config.schedule.steps, config.schedule.round_steps, config.sh_degree
+    (3000, 800, 3)
     """
+    from g2ard.stages.recover.schedule import Schedule
 
-    method: str
-    policy: str
-    views: float
-    recover: RecoverConfig
-    distill: DistillConfig
-    adapt: AdaptConfig
-    simplify: SimplifyConfig = field(default_factory=SimplifyConfig)
-    select: CoverageOptions = field(default_factory=CoverageOptions)
+    if preset not in PRESETS:
+        raise InputError(f"expected one of {', '.join(PRESETS)}, got {preset!r}", parameter="preset")
+    values = {**PRESETS[preset], **full_paths(settings or {}, config)}
+    schedule, steps = values.get("recover.schedule", "default"), values.get("recover.steps")
+    if isinstance(schedule, str):
+        if schedule == "paper":
+            values.setdefault("recover.sh_degree", 3)
+        named = Schedule.named(schedule)
+        values["recover.schedule"] = named if steps is None else named.scaled(steps)
+    return changed(config, values)
 
 
-def preset(name: str = "paper", prior: str = "trained") -> Preset:
-    """A preset; `dataclasses.replace` changes what is wanted otherwise.
+def preset(name: str = "paper", config: Any = None) -> Any:
+    """Return a configuration as a preset has it; `dataclasses.replace` changes it further.
 
     `paper` is the paper (`tab:s_config`, `tab:s_avs`, `tab:s_recovery`): simplification in rounds of 75 %;
     half of the views, by directional selection, once, from the raw prior; an even draw of them; 8,000 steps
@@ -50,33 +79,17 @@ def preset(name: str = "paper", prior: str = "trained") -> Preset:
     degree 3; 7,000 steps of adaptation. Where it is silent `docs/decisions.md` says what we read.
 
     Args:
-        name: "paper".
-        prior: the row of `tab:s_recovery`: trained, lift (an untrained cloud's), or noisy (trained and less
-            regular). `g2ard.stages.recover.presets.preset_for("paper", …)` measures which.
-
-    Returns:
-        A `Preset`: the configurations of simplify, select, recover, distill and adapt.
+        name: auto, trained, lift, noisy, paper, paper-trained, paper-lift or paper-noisy. `auto` and `paper`
+            have the weights of a trained scene here; `g2ard.distill` measures which the scene needs.
+        config: the config to change, such as `AdaptConfig()`; `DistillConfig()` if None.
 
     Raises:
-        InputError: no such preset, or prior.
+        InputError: an unknown name.
 
-    >>> paper = preset("paper", prior="lift")
-    >>> paper.distill.method, paper.distill.regularizers.anchor, paper.recover.schedule.round_steps
+    >>> paper = preset("paper-lift")
+    >>> paper.simplify.method, paper.recover.regularizers.anchor, paper.recover.schedule.round_steps
     ('paper', 0.001, 8000)
     """
-    if name != "paper":
-        raise InputError(f"expected paper, got {name!r}", parameter="preset")
-    if prior not in PAPER_PRESETS:
-        raise InputError(f"expected {', '.join(PAPER_PRESETS)}, got {prior!r}", parameter="prior")
-    recover = RecoverConfig(schedule=PAPER, regularizers=PAPER_PRESETS[prior], sh_degree=3)
-    distill = DistillConfig(
-        method="paper",
-        schedule=PAPER,
-        regularizers=recover.regularizers,
-        sh_degree=3,
-        views=0.5,
-        policy="directional",
-        weighted=False,
-    )
-    adapt = replace(AdaptConfig(), schedule="paper", tolerance=0.0, prior_views=0.0, sh_degree=3)
-    return Preset("paper", "directional", 0.5, recover, distill, adapt)
+    from g2ard.pipeline import DistillConfig
+
+    return configured(DistillConfig() if config is None else config, name)

@@ -3,88 +3,30 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from g2ard.config.choices import Engine
-from g2ard.errors import require
+from g2ard.pipeline.config import DistillConfig, SelectConfig
 from g2ard.pipeline.report import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.progress import Progress, silent
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Photos, PhotosOrRenders, Subset, Targets, fingerprint_of
 from g2ard.stages.recover import checkpoint as checkpoints
-from g2ard.stages.recover.anchors import Anchors, Regularizers
-from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.anchors import Anchors
 from g2ard.stages.recover.draw import checked_weights
-from g2ard.stages.recover.schedule import Schedule
-from g2ard.stages.select.surfaces import CoverageOptions
-from g2ard.stages.simplify.config import SimplifyConfig
 
 if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
     from g2ard.stages.recover.optimize import Watch
 
-__all__ = ["DistillConfig", "Distilled", "distill"]
+__all__ = ["DistillConfig", "Distilled", "SelectConfig", "distill", "final_steps"]
 
 _ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
-
-
-@dataclass(frozen=True)
-class DistillConfig:
-    """How a scene is distilled; the paper's way is `g2ard.preset("paper").distill`.
-
-    What recovery has too has its default from `RecoverConfig`.
-
-    Args:
-        method: simplification's: default, fast or paper.
-        schedule: recovery's; one with `round_steps` recovers after every round of 75 % (the paper), without
-            them the reduction is one shot and all recovery happens at the target count.
-        steps: the final horizon; None means the schedule's, more where a view holds little of the scene
-            (`g2ard.stages.recover.schedule`).
-        recovery_time: seconds for all recovery, shared out over rounds in proportion to their steps; horizons
-            become what fits into them.
-        regularizers: weights of L_anchor and L_shape.
-        sh_degree: of the result; None keeps the prior's.
-        background: RGB behind the scene.
-        views: how many of the targets' views recovery looks at, best first; a float is a share of them,
-            rounded up; "auto" takes as many as the curve of gains asks for, None all that see the scene.
-        policy: how views are chosen, see `g2ard.stages.select`.
-        weighted: draw views by the weights of the selection, so that crowded poses do not rule: on a
-            crowded pool all views drawn so beat an even draw, and every choice of a tenth of them.
-        reselect: choose again from every round's scene; else once, from the raw prior.
-        seed: of the order of views, and of the policy "random".
-        engine: what takes recovery's steps, see `RecoverConfig`.
-        ssim_weight: λ of the photometric loss, see `RecoverConfig`.
-        simplify: simplification's constants; its retention also sets the counts of rounds, 0.75 if None.
-        select: those of the policies that look at surfaces.
-    """
-
-    method: str = "default"
-    schedule: Schedule = RecoverConfig.schedule
-    steps: int | None = None
-    recovery_time: float | None = None
-    regularizers: Regularizers = RecoverConfig.regularizers
-    sh_degree: int | None = None
-    background: tuple[float, float, float] = RecoverConfig.background
-    views: int | float | Literal["auto"] | None = None
-    policy: str = "auto"
-    weighted: bool = True
-    reselect: bool = False
-    seed: int = 0
-    engine: Engine = RecoverConfig.engine
-    ssim_weight: float = RecoverConfig.ssim_weight
-    simplify: SimplifyConfig = field(default_factory=SimplifyConfig)
-    select: CoverageOptions = field(default_factory=CoverageOptions)
-
-    def __post_init__(self) -> None:
-        share = not isinstance(self.views, float) or 0 < self.views <= 1
-        require("views", self.views, share, "a count, auto, none, or a share in (0, 1]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +86,7 @@ def distill(
     from g2ard.stages.simplify import round_counts
 
     config = config or DistillConfig()
-    many = config.schedule.round_steps > 0
+    many = config.recover.schedule.round_steps > 0
     kept, fold = config.simplify.retention or 0.75, config.simplify.fold
     counts = round_counts(len(prior), budget, kept, fold) if many else [budget]
     rounds = _Rounds(prior, budget, targets, config, len(counts), weights, validation, work, progress, watch)
@@ -167,9 +109,9 @@ def final_steps(config: DistillConfig, scene: Splats, cameras: Cameras, *, photo
     """
     from g2ard.stages.recover.schedule import steps_for
 
-    schedule = config.schedule
-    if config.steps is not None:
-        return config.steps
+    schedule = config.recover.schedule
+    if config.recover.steps is not None:
+        return config.recover.steps
     if not schedule.means_in_scales or photos:
         return schedule.steps
     return steps_for(scene, cameras, schedule.steps)
@@ -191,25 +133,24 @@ class _Supervision:
         from g2ard.stages.select import select
 
         cameras = targets.cameras
-        if config.views is None and (weights is not None or not config.weighted):
+        how = config.select
+        if how.views_count is None and (weights is not None or not how.weighted):
             return cls(targets, weights, None)
-        wanted = 1.0 if config.views is None else config.views
-        k = math.ceil(wanted * len(cameras) - 1e-9) if isinstance(wanted, float) else wanted
-        policy = config.policy if config.views is not None else "auto"
+        policy = how.policy if how.views_count is not None else "auto"
         chosen = select(
             scene,
             cameras,
-            k,
+            how.count_of(len(cameras)),
             policy=policy,
-            seed=config.seed,
-            options=config.select,
+            seed=config.recover.seed,
+            options=how,
             progress=progress,
         )
         rows = np.argsort(chosen.order)
         subset = Subset(targets, chosen.order[rows])
         if weights is not None:
             weights = weights[chosen.order[rows]]
-        elif config.weighted:
+        elif how.weighted:
             weights = chosen.weights[rows]
         report = ViewsReport(
             policy=policy,
@@ -259,10 +200,10 @@ class _Rounds:
     def advance(self, number: int, count: int, *, final: bool) -> None:
         """One round: simplify to `count`, recover; the final one recovers for the final horizon as well."""
         entry: dict[str, Any] = {"count": count}
-        if self.config.reselect and number > 1:
+        if self.config.select.reselect and number > 1:
             self._select(self.state)
         self._simplify(number, count, entry)
-        if self.config.schedule.round_steps > 0:
+        if self.config.recover.schedule.round_steps > 0:
             self._recover(f"round-{number}", entry, final=False)
         if final:
             self._recover("final", entry, final=True)
@@ -272,7 +213,7 @@ class _Rounds:
         began = time.monotonic()
         self.supervision = _Supervision.of(scene, self.targets, self.config, self.weights, self.progress)
         self.seconds["select"] += time.monotonic() - began
-        if self.config.views is not None:
+        if self.config.select.views_count is not None:
             self.supervision.fill(self.progress)
 
     def _simplify(self, number: int, count: int, entry: dict[str, Any]) -> None:
@@ -288,9 +229,8 @@ class _Rounds:
                 self.state,
                 count,
                 config=self.config.simplify,
-                method=self.config.method,
                 visibility=None
-                if self.config.method == "paper"
+                if self.config.simplify.method == "paper"
                 else visibility_source(self.targets.cameras, progress=self.progress),
                 protected=self.protected,
                 final_budget=self.budget,
@@ -300,8 +240,8 @@ class _Rounds:
             entry["simplify"] = {**done.report.as_dict(), "seconds": time.monotonic() - began}
             self._save(name, entry)
         self.seconds["simplify"] += entry["simplify"]["seconds"]
-        if self.config.sh_degree is not None:
-            self.state = self.state.with_sh_degree(self.config.sh_degree)
+        if self.config.recover.sh_degree is not None:
+            self.state = self.state.with_sh_degree(self.config.recover.sh_degree)
         self.simplified = self.state
 
     def _recover(self, name: str, entry: dict[str, Any], *, final: bool) -> None:
@@ -310,16 +250,11 @@ class _Rounds:
         if self._restore(name, entry):
             self._resumed(entry["recover"][-1]["seconds"])
         else:
-            config = RecoverConfig(
-                schedule=self.config.schedule,
+            config = replace(
+                self.config.recover,
                 steps=self._steps() if final else None,
                 recovery_time=self._seconds(final),
-                regularizers=self.config.regularizers,
-                ssim_weight=self.config.ssim_weight,
-                background=self.config.background,
                 final=final,
-                seed=self.config.seed,
-                engine=self.config.engine,
             )
             checkpoint = self.work / f"{name}.checkpoint.npz" if self.work else None
             done = recover(
@@ -327,7 +262,7 @@ class _Rounds:
                 self.supervision.targets,
                 config,
                 weights=self.supervision.weights,
-                anchors=Anchors.of(self.simplified, self.config.regularizers.in_plane),
+                anchors=Anchors.of(self.simplified, config.regularizers.in_plane),
                 validation=self.validation,
                 checkpoint=checkpoint,
                 progress=self.progress,
@@ -350,12 +285,12 @@ class _Rounds:
 
     def _seconds(self, final: bool) -> float | None:
         """This recovery's part of the time limit."""
-        if self.config.recovery_time is None:
+        config, schedule = self.config.recover, self.config.recover.schedule
+        if config.recovery_time is None:
             return None
-        schedule = self.config.schedule
-        last = schedule.steps if self.config.steps is None else self.config.steps
+        last = schedule.steps if config.steps is None else config.steps
         whole = last + self.count * schedule.round_steps
-        return self.config.recovery_time * (last if final else schedule.round_steps) / whole
+        return config.recovery_time * (last if final else schedule.round_steps) / whole
 
     def _resumed(self, seconds: float) -> None:
         self.seconds["resumed"] = self.seconds.get("resumed", 0.0) + seconds

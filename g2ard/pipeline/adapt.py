@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from g2ard.config.choices import ADAPT_SCHEDULES, AdaptSchedule
+from g2ard.config.choices import ADAPT_SCHEDULES, BLACK, AdaptSchedule, Colour
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, silent
 from g2ard.report.base import Report
@@ -57,12 +57,12 @@ class AdaptConfig:
     schedule: AdaptSchedule = "default"
     prior_views: float = 1.0
     sh_degree: int | None = None
-    background: tuple[float, float, float] = RecoverConfig.background
+    background: Colour = BLACK
     seed: int = 0
     first_stretch: int = 500
     colour_worth: float = 0.3
     ssim_weight: float = RecoverConfig.ssim_weight
-    recovery: Schedule | None = field(default=None, metadata={"prefix": "schedule"})
+    recovery: Schedule | None = None
 
     def __post_init__(self) -> None:
         if self.steps < 1 or not self.tolerance >= 0:
@@ -82,6 +82,16 @@ class AdaptConfig:
             raise InputError(
                 "geometry stays: the rates of means, log_scales and quats are 0", parameter="recovery"
             )
+
+    @classmethod
+    def scheduled(cls, schedule: AdaptSchedule) -> AdaptConfig:
+        """Return the config of a schedule, its rates and decay included.
+
+        >>> AdaptConfig.scheduled("paper").prior_views
+        0.0
+        """
+        rates = appearance_only(PAPER if schedule == "paper" else TUNED)
+        return cls(schedule=schedule, prior_views=0.0 if schedule == "paper" else 1.0, recovery=rates)
 
     def stretches(self) -> list[int]:
         """Steps of each stretch, doubling; what would be left over for a shorter one joins the last.

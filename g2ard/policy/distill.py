@@ -3,35 +3,32 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from g2ard.errors import InputError
 from g2ard.policy.budget import Budget
-from g2ard.policy.distill_options import DistillOptions, takes_options
+from g2ard.policy.distill_options import DistillOptions
 from g2ard.policy.inputs import load_scene, say_regions
 from g2ard.policy.job import DistillJob
 from g2ard.policy.view_checks import warn_of_photos
 from g2ard.policy.views import is_made, views_of
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.scene.regions import as_regions
 from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:
     from g2ard.io.types import Points
-    from g2ard.pipeline import DistillConfig, Distilled
+    from g2ard.pipeline import Distilled
     from g2ard.policy.fit import Aim
-    from g2ard.stages.lift import LiftConfig
-    from g2ard.stages.recover.anchors import Regularizers
+    from g2ard.policy.inputs import Views
 
     Scene = Splats | Points | str | Path | None
 
 __all__ = ["distill", "prepare"]
 
 
-@takes_options
 def distill(
     scene: Scene,
     *,
@@ -40,14 +37,24 @@ def distill(
     fit: str | None = None,
     min_psnr: float | None = None,
     min_ssim: float | None = None,
+    views: Views | None = None,
+    photos: bool | None = None,
+    held_out: Views | None = None,
+    beside: str | Path | None = None,
+    up: Sequence[float] | None = None,
+    size: int | None = None,
+    clean: bool = False,
+    format: str = "ply",
+    preset: str = "auto",
+    settings: Mapping[str, Any] | None = None,
     work: Path | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
-    **options: Any,
+    **fields: Any,
 ) -> Distilled:
     """Distil a dense scene, or a coloured cloud with photos, as `g2ard distill` does, to the bit.
 
-    Views are chosen or made, the scene is simplified, its geometry frozen as anchors, and what is left is
+    Views are chosen or made, the scene is simplified, its geometry frozen as anchors, and the rest is
     recovered against the views' photos or the dense scene's own renders. `g2ard.pipeline.distill` is the same
     for a caller who has targets and a `DistillConfig` of their own.
 
@@ -62,18 +69,22 @@ def distill(
         min_psnr: instead, about the fewest that simplification alone keeps this PSNR with, dB, against the
             scene in views of its own.
         min_ssim: the same of SSIM; with `min_psnr` both hold. `say` tells what the result has.
-        work: a folder for finished rounds and checkpoints; the same call goes on there after a Ctrl-C.
+        views, photos, held_out, beside, up, size, clean, format, preset: see `g2ard.DistillOptions`.
+        settings: values of `g2ard.DistillConfig` by path, such as {"recover.schedule.rates.means": 1e-3};
+            they win over the preset's.
+        work: a folder for finished rounds and checkpoints; the same call resumes there after a Ctrl-C.
         progress: told of all stages.
         say: told in lines what was noticed and decided.
-        options: all else, see `g2ard.DistillOptions`.
+        fields: settings by the name of their field, as flags have them: `steps=100`, `background=(1, 1, 1)`,
+            `method="fast"`. None keeps the preset's value.
 
     Returns:
         The compact scene, the same before recovery, a report, and the targets that were held out.
 
     Raises:
         InputError: not exactly one kind of budget, one that does not fit, a cloud without views,
-            files that cannot be read, or a value out of its range.
-        KeyboardInterrupt: after Ctrl-C; what is in `work` can be gone on from.
+            files that cannot be read, an unknown setting, or a value out of its range.
+        KeyboardInterrupt: after Ctrl-C; what is in `work` can be resumed.
 
     >>> import numpy as np
     >>> ball = np.random.default_rng(0).normal(size=(900, 3))
@@ -84,7 +95,19 @@ def distill(
     (90, 90, 1)
     """
     budget = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
-    job = prepare(scene, [budget], DistillOptions(**options), progress=progress, say=say)
+    options = DistillOptions(
+        views=views,
+        photos=photos,
+        held_out=held_out,
+        beside=beside,
+        up=up,
+        size=size,
+        clean=clean,
+        format=format,
+        preset=preset,
+        settings={name: value for name, value in fields.items() if value is not None} | dict(settings or {}),
+    )
+    job = prepare(scene, [budget], options, progress=progress, say=say)
     done = job.run(work=work)
     if judgement := job.aims[0].judge(done.splats):
         say(judgement[1])
@@ -108,30 +131,26 @@ def prepare(
     Raises:
         InputError: as `distill`.
     """
-    from g2ard.config.constants import changed, full_names
-    from g2ard.pipeline import DistillConfig
     from g2ard.policy.inputs import clutter_seen
-    from g2ard.stages.lift import LiftConfig
     from g2ard.stages.recover.presets import preset_for
 
     began = time.monotonic()
-    chosen = options.by_preset()
-    values = full_names(options.constants or {}, {"recover": DistillConfig(), "lift": LiftConfig()})
-    lifting = changed(LiftConfig(), "lift", values)
+    seed, background = options.config.recover.seed, options.config.recover.background
     if scene is None:
         scene = _points(budgets, options, progress, say)
-    prior, lifted, beside, name = _prior(scene, options.beside, lifting, progress, say)
+    prior, lifted, beside, name = _prior(scene, options, progress, say)
     if lifted and (options.views is None or is_made(options.views)):
         raise InputError(
             "a point cloud cannot render training images", path=name, hint="give its photos with {views}"
         )
-    cleaned, seed = None, options.seed
+    cleaned = None
     if options.clean:
         found, _ = clutter_seen(prior, seed=seed, progress=progress, say=say)
         prior, cleaned = prior.take(found.keep), found.counts
     if counted is not None:
         counted(len(prior))
-    degree = _sh_degree(options, chosen, lifted)
+    lift_degree = 3 if lifted else None
+    degree = options.configured(sh_degree=lift_degree).recover.sh_degree
     aims = _aims(prior, budgets, options, degree, name, progress, say)
     views = views_of(
         prior,
@@ -151,15 +170,19 @@ def prepare(
         _all_pictured(pictured, (*train.names, *views.test.names), lifted)
     use_photos = lifted or (any(pictured) if options.photos is None else options.photos)
     needs_teacher = not (use_photos and all(pictured))
-    kind = "paper-lift" if lifted and options.preset == "paper" else options.preset
-    photographed = train if use_photos else None
-    regularizers, why, measured = preset_for(kind, prior, photographed, paper=chosen["schedule"] == "paper")
+    kind = options.named("recover.regularizers") or "auto"
+    regularizers, why, measured = preset_for(
+        "paper-lift" if lifted and kind == "paper" else kind,
+        prior,
+        train if use_photos else None,
+        paper=options.named("recover.schedule") == "paper",
+    )
     if use_photos and not lifted:
-        warn_of_photos(prior, train, options.background, say)
+        warn_of_photos(prior, train, background, say)
     shown = sum(pictured[: len(train)]) if use_photos else 0
     say(_task(prior, aims, shown, len(train) - shown))
     say(f"regularisers: {why}")
-    config = changed(_config(options, chosen, degree, regularizers), "recover", values)
+    config = options.configured(regularizers, lift_degree)
     say_regions(prior, config.simplify, name, say)
     return DistillJob(
         prior=prior,
@@ -168,8 +191,8 @@ def prepare(
         teacher=prior if needs_teacher else None,
         photos_over_renders=use_photos and needs_teacher,
         config=config,
-        weights=views.train.weights if chosen["weighted"] else None,
-        lifting=lifting if lifted else None,
+        weights=views.train.weights if config.select.weighted else None,
+        lifted=lifted,
         preset=why,
         measured=measured,
         seconds=time.monotonic() - began,
@@ -188,12 +211,6 @@ def _task(prior: Splats, aims: Sequence[Aim], photos: int, renders: int) -> str:
     return f"{len(prior):,} → {counts}; {views} against {kinds_told(photos, renders)}"
 
 
-def _sh_degree(options: DistillOptions, chosen: dict[str, Any], lifted: bool) -> int | None:
-    """Of the result: 3 from a cloud or for the paper's if none is asked for; None is the scene's own."""
-    whole = lifted or chosen["schedule"] == "paper" or options.preset.startswith("paper")
-    return 3 if options.sh_degree is None and whole else options.sh_degree
-
-
 def _aims(
     prior: Splats,
     budgets: Sequence[Budget],
@@ -207,6 +224,7 @@ def _aims(
     from g2ard.policy.fit import aim_of
     from g2ard.policy.simplify import Reduction
 
+    seed = options.config.recover.seed
     written = prior if degree is None else prior.with_sh_degree(degree)
     return tuple(
         aim_of(
@@ -214,9 +232,9 @@ def _aims(
             prior if budget.bytes is None else written,
             name,
             file=f"scene.{options.format}",
-            reduce=Reduction(prior, seed=options.seed, progress=progress),
+            reduce=Reduction(prior, seed=seed, progress=progress),
             recovered=True,
-            seed=options.seed,
+            seed=seed,
             progress=progress,
             say=say,
         )
@@ -234,32 +252,6 @@ def _all_pictured(pictured: Sequence[bool], names: Sequence[str], lifted: bool) 
         )
 
 
-def _config(
-    options: DistillOptions, chosen: dict[str, Any], degree: int | None, regularizers: Regularizers
-) -> DistillConfig:
-    """The pipeline's; `chosen` is what the preset had to decide."""
-    from g2ard.pipeline import DistillConfig
-    from g2ard.stages.recover.schedule import schedule_named
-    from g2ard.stages.simplify.config import SimplifyConfig
-
-    return DistillConfig(
-        method=chosen["method"],
-        schedule=schedule_named(chosen["schedule"], options.steps),
-        steps=options.steps,
-        recovery_time=options.recovery_time,
-        regularizers=regularizers,
-        sh_degree=degree,
-        background=options.background,
-        views=chosen["views_count"],
-        policy=chosen["policy"],
-        simplify=SimplifyConfig(keep_region=as_regions(options.keep_region)),
-        weighted=chosen["weighted"],
-        reselect=options.reselect,
-        seed=options.seed,
-        engine=options.engine,
-    )
-
-
 def _points(budgets: Sequence[Budget], options: DistillOptions, progress: Progress, say: Say) -> Points:
     """A start from photos alone."""
     if options.views is None or is_made(options.views):
@@ -272,8 +264,8 @@ def _points(budgets: Sequence[Budget], options: DistillOptions, progress: Progre
         options.held_out,
         wanted,
         asked=budgets[0].kind,
-        background=options.background,
-        seed=options.seed,
+        background=options.config.recover.background,
+        seed=options.config.recover.seed,
         progress=progress,
         say=say,
     )
@@ -281,8 +273,7 @@ def _points(budgets: Sequence[Budget], options: DistillOptions, progress: Progre
 
 def _prior(
     scene: Splats | Points | str | Path,
-    beside: str | Path | None,
-    lifting: LiftConfig,
+    options: DistillOptions,
     progress: Progress,
     say: Say,
 ) -> tuple[Splats, bool, str | Path | None, str]:
@@ -291,8 +282,8 @@ def _prior(
     from g2ard.stages.lift import lift
 
     if isinstance(scene, Splats):
-        return scene, False, beside, "scene"
-    name = "cloud"
+        return scene, False, options.beside, "scene"
+    name, beside = "cloud", options.beside
     if isinstance(scene, str | Path):
         if kind(scene) == "splats":
             return load_scene(scene, say), False, beside or scene, str(scene)
@@ -300,5 +291,5 @@ def _prior(
         for note in cloud.notes:
             say(f"{scene}: {note}")
         scene = cloud.points
-    lifted = lift(scene.positions, scene.colors, **vars(lifting), progress=progress)
+    lifted = lift(scene.positions, scene.colors, **vars(options.config.lift), progress=progress)
     return lifted, True, beside, name

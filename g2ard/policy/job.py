@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from g2ard.policy.fit import Aim
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.targets import Targets
-    from g2ard.stages.lift import LiftConfig
     from g2ard.stages.recover.presets import PriorMeasures
 
 __all__ = ["DistillJob"]
@@ -37,7 +36,7 @@ class DistillJob:
             others; always False without a teacher.
         config: of the pipeline.
         weights: (C,) how often each view is drawn, where the views say so.
-        lifting: constants of the lift; None where nothing was lifted.
+        lifted: whether `prior` is the lift of a cloud.
         preset: which regularisers, and why.
         measured: what decided it.
         seconds: that preparing it took, reading included.
@@ -53,7 +52,7 @@ class DistillJob:
     photos_over_renders: bool
     config: DistillConfig
     weights: Any
-    lifting: LiftConfig | None
+    lifted: bool
     preset: str
     measured: PriorMeasures
     seconds: float = 0.0
@@ -74,7 +73,7 @@ class DistillJob:
     @cached_property
     def targets(self) -> Targets:
         """What recovery learns from."""
-        return self._targets(self.views.train.cameras, lazy=self.config.views is not None)
+        return self._targets(self.views.train.cameras, lazy=self.config.select.views_count is not None)
 
     @cached_property
     def held_out(self) -> Targets:
@@ -103,7 +102,7 @@ class DistillJob:
         return make_targets(
             cameras,
             self.teacher,
-            self.config.background,
+            self.config.recover.background,
             lazy=lazy,
             photos=self.photos_over_renders,
             progress=self.progress,

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from g2ard.config.choices import BLACK, Colour
 from g2ard.policy.budget import Budget
 from g2ard.policy.inputs import make_targets
 from g2ard.progress import Progress, Say, plural, silent, unsaid
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.targets import Targets
 
-__all__ = ["RATIOS", "LevelReport", "Levels", "check_ratios", "level_size", "lod"]
+__all__ = ["RATIOS", "LevelReport", "Levels", "check_ratios", "level_size", "lod", "recovery_settings"]
 
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """A level is half of the one before, as viewers' own tools make them."""
@@ -68,7 +69,7 @@ def lod(
     photos: bool | None = False,
     steps: int | None = None,
     size: int | None = None,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Colour = BLACK,
     beside: str | Path | None = None,
     up: Sequence[float] | None = None,
     seed: int = 0,
@@ -123,12 +124,10 @@ def lod(
         DistillOptions(
             views=views,
             photos=photos,
-            steps=steps,
             size=size,
-            background=background,
             beside=beside,
             up=up,
-            seed=seed,
+            settings=recovery_settings(steps, background, seed),
         ),
         progress=progress,
         say=say,
@@ -147,6 +146,12 @@ def lod(
         splats.append(level)
         reports.append(report)
     return Levels(tuple(splats), tuple(reports))
+
+
+def recovery_settings(steps: int | None, background: Colour, seed: int) -> dict[str, Any]:
+    """Return the settings of a level's recovery by path."""
+    found = {"recover.background": background, "recover.seed": seed}
+    return found if steps is None else {**found, "recover.steps": steps}
 
 
 def check_ratios(ratios: Sequence[float]) -> None:
@@ -191,7 +196,7 @@ def _level(
     else:
         level = merged = _merged(job, finer, count)
     scores = [
-        evaluate(splats, held_out, background=job.config.background, progress=job.progress).psnr
+        evaluate(splats, held_out, background=job.config.recover.background, progress=job.progress).psnr
         for splats in ((merged, level) if recover else (merged,))
     ]
     seconds = time.perf_counter() - began
@@ -213,7 +218,11 @@ def _merged(job: DistillJob, finer: Splats, count: int) -> Splats:
 
 def _targets(job: DistillJob, cameras: Cameras, longest: int) -> Targets:
     return make_targets(
-        cameras.resized(longest), job.teacher, job.config.background, progress=job.progress, say=job.say
+        cameras.resized(longest),
+        job.teacher,
+        job.config.recover.background,
+        progress=job.progress,
+        say=job.say,
     )
 
 

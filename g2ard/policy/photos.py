@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.types import Points
 from g2ard.policy.inputs import load_for_training, load_view_sets
@@ -47,7 +48,7 @@ def points_of_photos(
     count: int | None,
     *,
     asked: str = "ratio",
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Colour = BLACK,
     seed: int = 0,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -125,7 +126,7 @@ def points_within_sight(
     cameras: Cameras,
     count: int,
     *,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Colour = BLACK,
     seed: int = 0,
     progress: Progress = silent,
 ) -> Points:

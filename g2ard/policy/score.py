@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,28 +16,21 @@ if TYPE_CHECKING:
 __all__ = ["report_of"]
 
 
-def report_of(job: DistillJob, done: Distilled, options: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
     """Both scenes scored in views that recovery did not learn from, beside what the run was and did.
 
     Args:
         job: what was to be done.
         done: what came of it.
-        options: names that are not listed among the constants, for they are told as options.
 
     Returns:
         Counts, bytes, scores in each kind of views (None where there are none of a kind), rounds, seconds by
-        stage, and every constant.
+        stage, and every setting by its path.
     """
-    from g2ard.config.constants import listed
+    from g2ard.config.paths import listed
 
     kinds = {"scores": job.held_out, "apart": job.apart[1]}
-    config = job.config
-    config = replace(
-        config,
-        simplify=config.simplify.resolved(config.method),
-        schedule=replace(config.schedule, steps=config.steps or config.schedule.steps),
-    )
-    used: dict[str, Any] = {"recover": config} | ({"lift": job.lifting} if job.lifting else {})
+    config = replace(job.config, simplify=job.config.simplify.resolved())
     found = done.report.as_dict()
     return {
         "input_count": len(job.prior),
@@ -52,7 +44,7 @@ def report_of(job: DistillJob, done: Distilled, options: Mapping[str, Any] | Non
         "prior": job.measured.as_dict(),
         "rounds": found["rounds"],
         "views": found["views"],
-        "constants": listed(used, options or ()),
+        "settings": listed(config),
         "seconds": found["seconds"],
     }
 
@@ -68,7 +60,11 @@ def _scores(
     scenes: dict[str, Splats] = {"simplified": done.simplified, "recovered": done.splats}
     return {
         name: evaluate(
-            splats, targets, background=job.config.background, progress=progress, stage=f"score {name}"
+            splats,
+            targets,
+            background=job.config.recover.background,
+            progress=progress,
+            stage=f"score {name}",
         ).as_dict()
         for name, splats in scenes.items()
     }

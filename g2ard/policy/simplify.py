@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,6 @@ from g2ard.policy.budget import Budget
 from g2ard.policy.inputs import load_scene, say_regions
 from g2ard.policy.views import cameras_for_looks
 from g2ard.progress import Progress, Say, silent, unsaid
-from g2ard.scene.regions import as_regions
 from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:
@@ -33,10 +31,10 @@ def simplify(
     format: str = "ply",
     views: Views | None = None,
     blind: bool = False,
-    method: str = "default",
-    keep_region: Sequence[Sequence[float]] = (),
+    method: str | None = None,
+    keep_region: Sequence[Sequence[float]] | None = None,
     config: SimplifyConfig | None = None,
-    constants: Mapping[str, Any] | None = None,
+    settings: Mapping[str, Any] | None = None,
     beside: str | Path | None = None,
     up: Sequence[float] | None = None,
     seed: int = 0,
@@ -63,9 +61,8 @@ def simplify(
         method: default, fast or paper; `g2ard.stages.simplify.simplify` says what they do.
         keep_region: spheres (x, y, z, r) and boxes (x, y, z, x, y, z), world coordinates, which get more of
             the budget, as if views stood √keep_times times as near.
-        config: constants; None means the method's own.
-        constants: by full name, as `--set` has them, such as {"simplify.max_energy": 0.02}; they win over
-            `config`'s.
+        config: None means the method's own; `method` and `keep_region`, if given, win over it.
+        settings: values of `config` by path, such as {"simplify.max_energy": 0.02}; they win over all.
         beside: where to look for cameras, if `scene` is no path; its folder and its trainer's are looked in.
         up: (3,) away from the ground, for poses that are made; None to estimate it.
         seed: of poses that are made.
@@ -86,22 +83,19 @@ def simplify(
     >>> len(small.splats), small.parents.shape, small.report.output_count
     (90, (900,), 90)
     """
-    from g2ard.config.constants import changed, full_names
+    from g2ard.config.presets import configured
     from g2ard.policy.fit import aim_of
     from g2ard.stages.simplify import SimplifyConfig
 
-    if constants:
-        values = full_names(constants, {"simplify": SimplifyConfig()})
-        config = changed(config or SimplifyConfig(), "simplify", values)
-    if keep_region:
-        config = replace(config or SimplifyConfig(), keep_region=as_regions(keep_region))
+    fields = {"method": method, "keep_region": keep_region}
+    given = {name: value for name, value in fields.items() if value is not None}
+    config = configured(config or SimplifyConfig(), settings=given | dict(settings or {}))
     wanted = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     splats, beside, name = _scene(scene, beside, say)
     reduce = Reduction(
         splats,
         views=views,
         blind=blind,
-        method=method,
         config=config,
         beside=beside,
         up=up,
@@ -139,7 +133,6 @@ class Reduction:
         *,
         views: Views | None = None,
         blind: bool = False,
-        method: str = "default",
         config: SimplifyConfig | None = None,
         beside: str | Path | None = None,
         up: Sequence[float] | None = None,
@@ -152,14 +145,14 @@ class Reduction:
 
         if views is not None and blind:
             raise InputError("views, blind: blind uses no views")
-        self.splats, self.blind, self.method = splats, blind, method
+        self.splats, self.blind = splats, blind
         self.config, self.progress = config or SimplifyConfig(), progress
         say_regions(splats, self.config, "the scene", say)
         self._plan = partial(
             cameras_for_looks,
             splats,
             views,
-            method,
+            self.config.method,
             beside=beside,
             up=up,
             seed=seed,
@@ -176,7 +169,6 @@ class Reduction:
             made = reduce(
                 self.splats,
                 count,
-                method=self.method,
                 visibility=self._look if count < len(self.splats) else None,
                 config=self.config,
                 progress=self.progress,

@@ -19,12 +19,12 @@ from g2ard.progress import Progress, Say, plural, silent, unsaid
 
 if TYPE_CHECKING:
     from g2ard.levels import Cut
+    from g2ard.pipeline import DistillConfig
     from g2ard.policy.distill_options import DistillOptions
     from g2ard.policy.inputs import Views
     from g2ard.policy.views import RunViews
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
-    from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.simplify import SimplifyConfig
     from g2ard.tiles.executor import Workers
     from g2ard.tiles.merging import TiledScene
@@ -360,12 +360,10 @@ class _Job:
     store: TileStore
     sample: Splats
     views: RunViews
-    config: RecoverConfig
-    merging: SimplifyConfig
+    config: DistillConfig
     learn: bool
     workers: Workers
     tiling: Tiling
-    options: DistillOptions
     say: Say
 
     def simplified(self, store: TileStore, count: int, cameras: Cameras) -> TiledScene:
@@ -376,9 +374,9 @@ class _Job:
             store,
             count,
             workers=self.workers,
-            config=self.merging,
+            config=self.config.simplify,
             views=cameras,
-            seed=self.options.seed,
+            seed=self.config.recover.seed,
             say=self.say,
         )
 
@@ -390,14 +388,14 @@ class _Job:
         from g2ard.stages.recover.schedule import steps_for
         from g2ard.tiles.recover import recover_tiles
 
-        needed = steps_for(self.sample, views.train.cameras, self.config.schedule.steps)
-        steps = self.options.steps or round(needed * pool_times(self.store.count))
+        needed = steps_for(self.sample, views.train.cameras, self.config.recover.schedule.steps)
+        steps = self.config.recover.steps or round(needed * pool_times(self.store.count))
         return recover_tiles(
             self.store,
             self.stored(small, "student", like=self.store),
             around,
             views,
-            self.config,
+            self.config.recover,
             steps if self.learn else 0,
             self.workers,
         )
@@ -415,13 +413,8 @@ def _job(
     scene: Path, tiling: Tiling, options: DistillOptions, learn: bool, progress: Progress, say: Say
 ) -> Iterator[_Job]:
     """Open the tiles, start workers, and decide views and constants of a distillation."""
-    from g2ard.config.constants import changed, full_names
     from g2ard.policy.views import views_of
-    from g2ard.scene.regions import as_regions
-    from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover.presets import preset_for
-    from g2ard.stages.recover.schedule import schedule_named
-    from g2ard.stages.simplify import SimplifyConfig
     from g2ard.tiles.merging import sample_of
 
     with _tiles_and_workers(scene, tiling, RECOVERY_TIMES, progress, say) as (store, workers):
@@ -433,23 +426,13 @@ def _job(
             beside=options.beside or scene,
             size=options.size,
             up=options.up,
-            seed=options.seed,
+            seed=options.config.recover.seed,
             represents=store.count / len(sample),
             progress=progress,
             say=say,
         )
-        regularizers, why, _ = preset_for(options.preset, sample)
+        regularizers, why, _ = preset_for(options.named("recover.regularizers") or "auto", sample)
         if learn:
             say(f"regularisers: {why}")
-        config = RecoverConfig(
-            schedule=schedule_named(options.schedule or "default", options.steps),
-            regularizers=regularizers,
-            background=options.background,
-            sh_degree=options.sh_degree,
-            seed=options.seed,
-        )
-        merging = SimplifyConfig(keep_region=as_regions(options.keep_region))
-        constants = full_names(options.constants or {}, {"recover": config, "simplify": merging})
-        config = changed(config, "recover", constants)
-        merging = changed(merging, "simplify", constants)
-        yield _Job(store, sample, views, config, merging, learn, workers, tiling, options, say)
+        config = options.configured(regularizers)
+        yield _Job(store, sample, views, config, learn, workers, tiling, say)

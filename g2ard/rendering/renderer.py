@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.config.choices import CONVENTIONS, Convention
+from g2ard.config.choices import BLACK, CONVENTIONS, Convention
 from g2ard.errors import InputError
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS
@@ -178,7 +178,7 @@ class Renderer:
         self,
         splats: Splats,
         *,
-        background: Sequence[float] = (0.0, 0.0, 0.0),
+        background: Sequence[float] = BLACK,
         settings: RasterSettings | None = None,
     ) -> None:
         self._background = [float(c) for c in background]
@@ -244,7 +244,7 @@ def render(
     splats: Splats,
     camera: Camera,
     *,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    background: Sequence[float] = BLACK,
     settings: RasterSettings | None = None,
     median: bool = False,
 ) -> Rendered:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.progress import plural
 from g2ard.rendering.metrics import psnr
@@ -37,7 +38,7 @@ def distill_report(
     scenes: Sequence[tuple[str, Splats]],
     targets: Targets,
     report: dict[str, Any],
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Colour = BLACK,
     *,
     told: Sequence[str] = (),
     crops: Sequence[Crop] = (),
@@ -217,7 +218,7 @@ def preview(
     path: Path,
     targets: Targets,
     scenes: list[tuple[str, Splats]],
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Colour = BLACK,
 ) -> None:
     """Write a PNG with a row for each of three evenly spaced views: target, then each scene with its PSNR.
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.progress import plural
 from g2ard.rendering.renderer import Renderer
@@ -38,7 +39,7 @@ def registration_report(
     matches: Mapping[str, NDArray[np.float64]] | None = None,
     side: int = 1000,
     told: Sequence[str] = (),
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Colour = BLACK,
 ) -> None:
     """Write an HTML page about one registration, the least alike photos first.
 

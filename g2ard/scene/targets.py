@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.cameras import Cameras
@@ -239,7 +240,7 @@ class TeacherRenders(_Cached):
         teacher: Splats,
         cameras: Cameras,
         *,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        background: Colour = BLACK,
         settings: RasterSettings | None = None,
         limit: int = CACHE_BYTES,
         lazy: bool = False,
@@ -294,7 +295,7 @@ class PhotosOrRenders:
         cameras: Cameras,
         teacher: Splats,
         *,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        background: Colour = BLACK,
         exposures: Mapping[str, NDArray[np.float64]] | None = None,
         settings: RasterSettings | None = None,
         limit: int = CACHE_BYTES,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from g2ard.config.choices import BLACK, Colour
 from g2ard.progress import Progress, silent
 from g2ard.rendering.lpips import Lpips
 from g2ard.rendering.metrics import psnr, ssim
@@ -82,7 +83,7 @@ def evaluate(
     splats: Splats,
     targets: Targets,
     *,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Colour = BLACK,
     lpips: Mapping[str, Lpips] | None = None,
     settings: RasterSettings | None = None,
     eight_bit: bool = False,

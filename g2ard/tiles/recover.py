@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.constants import changed, values_of
+from g2ard.config.paths import changed, values_of
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene
@@ -141,7 +141,7 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
     small, beside = smaller.read(arguments["tile"]), smaller.read_halo(arguments["tile"])
     student = join([part for part in (small, beside, *far) if len(part)])
     frozen = np.arange(len(student)) >= len(small)
-    config = changed(RecoverConfig(), "recover", arguments["config"])
+    config = changed(RecoverConfig(), arguments["config"])
     background = config.background
 
     def targets(name: str) -> TileTargets | None:
@@ -295,7 +295,7 @@ def _task(
             "tile": tile,
             "levels": around.levels[tile],
             "steps": round(steps_a_view * len(views["train"])),
-            "config": values_of({"recover": config}),
+            "config": values_of(config),
             **views,
         },
         {

@@ -10,6 +10,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from g2ard.config.choices import BLACK
 from g2ard.errors import InputError, OutputError
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def write_page(
     scenes: Sequence[tuple[str, Splats]],
     *,
     start: Start | None = None,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    background: Sequence[float] = BLACK,
     overwrite: bool = False,
 ) -> Written:
     """Write a page of one scene, or of two under one camera with a divider between.

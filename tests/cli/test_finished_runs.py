@@ -53,7 +53,7 @@ def test_a_finished_run_is_not_taken_for_another(command_line: CommandLine, fold
     assert told["scores"] == ran["scores"]
     others = (
         ((*ask, "--seed", 3), "seed"),
-        ((*ask, "--sh-degree", 0), "sh-degree"),
+        ((*ask, "--set", "sh_degree=0"), "set"),
         ((*begin, "-r", 5), "budget"),
     )
     for other, words in others:

@@ -29,7 +29,7 @@ def folder(tmp_path: Path) -> Path:
     ("option", "value", "words"),
     [
         ("--method", "best", "'--method': one of default, fast, paper, not 'best'"),
-        ("--retention", "x", "'--retention': a number, not 'x'"),
+        ("--min-psnr", "x", "'--min-psnr': a number of at least 1, not 'x'"),
         ("--seed", "-1", "'--seed': a whole number of at least 0, not '-1'"),
         ("--seed", "1.5", "'--seed': a whole number of at least 0, not '1.5'"),
         ("--threads", "1000", "'--threads': a whole number from 0 to 256, not '1000'"),
@@ -52,7 +52,7 @@ def test_a_bad_value_is_named_with_what_is_allowed(
         (("distill", "a.ply", "-n", 5, "-o", "run", "--views", "made", "--photos"), "--photos: views that"),
         (
             ("distill", "a.ply", "-n", 5, "-o", "run", "--steps", 5, "--set", "schedule.steps=9"),
-            "--steps and --set schedule.steps exclude each other",
+            "--steps and --set recover.schedule.steps exclude each other",
         ),
         (
             ("bench", "simplify", "a.ply", "--protocol", "x"),
@@ -100,12 +100,12 @@ def test_a_scene_that_lies_down_is_seen_upright_if_told(folder: Path, command_li
 
 
 def test_a_config_that_is_none_is_named(folder: Path, command_line: CommandLine) -> None:
-    (folder / "c.toml").write_text("[simplify]\nretention = true\n")
+    (folder / "c.toml").write_text("[simplify]\nmin-psnr = true\n")
     (folder / "d.toml").write_text("[simplify\n")
     for name, words in (
         ("absent.toml", "absent.toml: No such file"),
         ("a.ply", "a.ply: not a text file"),
-        ("c.toml", "'--retention': a number, not 'true'"),
+        ("c.toml", "'--min-psnr': a number of at least 1, not 'true'"),
         ("d.toml", "d.toml: Expected"),
     ):
         error = refused(command_line, folder, "simplify", "a.ply", "-n", 5, "-o", "o.ply", "--config", name)
@@ -157,9 +157,12 @@ def test_an_input_is_not_written_over(
 
 @pytest.mark.parametrize("policy", ["random", "uniform"])
 def test_auto_needs_a_policy_that_measures(folder: Path, command_line: CommandLine, policy: str) -> None:
-    for ask in (("select", "absent.ply", "--views", "v"), ("distill", "absent.ply", "-r", 2)):
-        error = refused(command_line, folder, *ask, "-k", "auto", "--policy", policy, "-o", "out")
-        assert f"--policy {policy} does not measure" in error
+    for ask in (
+        ("select", "absent.ply", "--views", "v", "-k", "auto", "--policy", policy),
+        ("distill", "absent.ply", "-r", 2, "--set", "views_count=auto", "--set", f"policy={policy}"),
+    ):
+        error = refused(command_line, folder, *ask, "-o", "out")
+        assert f"policy {policy} does not measure" in error
 
 
 def test_the_folder_one_is_in_can_be_an_output(folder: Path, command_line: CommandLine) -> None:

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import g2ard
-from g2ard.config.constants import listed
+from g2ard.config.paths import changed, listed
 from g2ard.config.presets import preset
 from g2ard.errors import InputError
 from g2ard.io import Points, read_splats, write_points, write_splats, write_views
-from g2ard.pipeline import DistillConfig, distill
+from g2ard.pipeline import SelectConfig, distill
 from g2ard.rendering.renderer import render
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.images import write_png
@@ -59,13 +59,10 @@ SHORT = (*DISTILL, "--steps", 8)
 
 def test_distill_does_all_that_the_paper_says(folder: Path, command_line: CommandLine) -> None:
     report = run(command_line, folder, *DISTILL, "--preset", "paper")
-    whole = preset("paper").distill
-    used = replace(whole, simplify=whole.simplify.resolved("paper"), schedule=FEW)
-    wanted = json.loads(json.dumps(listed({"recover": used}, report["config"])))
-    assert report["constants"] == wanted
-    config = report["config"]
-    options = ("method", "schedule", "policy", "weighted", "reselect", "sh_degree")
-    assert [config[key] for key in options] == ["paper", "paper", whole.policy, False, False, 3]
+    whole = preset("paper")
+    used = changed(whole, {"recover.schedule": FEW, "recover.steps": 75})
+    wanted = listed(replace(used, simplify=whole.simplify.resolved()))
+    assert report["settings"] == json.loads(json.dumps(wanted))
     views = report["views"]
     assert (views["policy"], len(views["chosen"]), views["weighted"]) == ("directional", 10, False)
     assert [entry["count"] for entry in report["rounds"]] == [2250, 1688, 1266, 1000]
@@ -85,18 +82,20 @@ def test_rounds_without_regularisers_are_named_once(folder: Path, command_line: 
 
 
 def test_what_is_said_beside_the_preset_stands(folder: Path, command_line: CommandLine) -> None:
-    (folder / "c.toml").write_text('[distill]\npolicy = "pose-diverse"\nmethod = "default"\n')
-    said = ("--config", "c.toml", "--method", "fast", "-k", 4, "--set", "regularizers.anchor=0.3")
-    report = run(command_line, folder, *SHORT, "--preset", "paper", *said, "--sh-degree", 1)
+    (folder / "c.toml").write_text('[distill]\nmethod = "default"\n[distill.set]\npolicy = "pose-diverse"\n')
+    said = ("--config", "c.toml", "--method", "fast", "--set", "views_count=4", "--set", "anchor=0.3")
+    report = run(command_line, folder, *SHORT, "--preset", "paper", *said, "--set", "sh_degree=1")
     assert (report["views"]["policy"], len(report["views"]["chosen"])) == ("pose-diverse", 4)
-    assert (report["config"]["method"], report["config"]["schedule"]) == ("fast", "paper")
-    assert report["constants"]["regularizers"]["anchor"] == 0.3
+    settings = report["settings"]
+    assert (settings["simplify.method"], settings["recover.schedule.guarded"]) == ("fast", False)
+    assert settings["recover.regularizers.anchor"] == 0.3
     assert read_splats(folder / "run" / "scene.ply").sh_degree == 1
     (folder / "c.toml").write_text('[distill]\npreset = "paper-noisy"\n[distill.set]\nperiod = 7\n')
-    report = run(command_line, folder, *SHORT, "--config", "c.toml", "--weights")
-    assert (report["config"]["method"], report["views"]["weighted"]) == ("paper", True)
-    regularizers = report["constants"]["regularizers"]
-    assert (regularizers["shape"], regularizers["period"]) == (1e-3, 7)
+    report = run(command_line, folder, *SHORT, "--config", "c.toml", "--set", "weighted=true")
+    settings = report["settings"]
+    assert (settings["simplify.method"], report["views"]["weighted"]) == ("paper", True)
+    assert settings["recover.regularizers.shape"] == 1e-3
+    assert settings["recover.regularizers.period"] == 7
 
 
 def test_a_cloud_takes_the_lift_s_row(folder: Path, command_line: CommandLine) -> None:
@@ -109,21 +108,23 @@ def test_a_cloud_takes_the_lift_s_row(folder: Path, command_line: CommandLine) -
     write_views(folder / "photos.json", replace(views, image_paths=paths))
     ask = ("distill", "cloud.ply", "-r", 3, "--views", "photos.json", "-o", "run", "--steps", 8)
     report = run(command_line, folder, *ask, "--preset", "paper", "--set", "lift.neighbors=8")
-    regularizers = report["constants"]["regularizers"]
-    assert [regularizers[key] for key in ("anchor", "shape", "effective_rank")] == [1e-3, 1e-4, True]
+    regularizers = [f"recover.regularizers.{key}" for key in ("anchor", "shape", "effective_rank")]
+    assert [report["settings"][path] for path in regularizers] == [1e-3, 1e-4, True]
     assert report["preset"].startswith("the paper's for lift (as asked)")
-    assert report["constants"]["lift"]["neighbors"] == 8
+    assert report["settings"]["lift.neighbors"] == 8
 
 
 def test_recover_raises_sh_for_the_schedule_and_the_rest_for_the_preset(
     folder: Path, command_line: CommandLine
 ) -> None:
-    ask = ("recover", "ball.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "o.ply", "--steps", 4)
+    write_views(folder / "w.json", around(24), weights=[1.0] * 24)
+    ask = ("recover", "ball.ply", "--views", "w.json", "--teacher", "ball.ply", "-o", "o.ply", "--steps", 4)
     for option, weighted in (("--schedule", True), ("--preset", False)):
         report = run(command_line, folder, *ask, option, "paper")
         assert read_splats(folder / "o.ply").sh_degree == 3
-        assert report["config"]["weighted"] is weighted
-        assert report["constants"]["schedule"]["guarded"] is False
+        error = command_line(*ask, option, "paper", "-w", cwd=folder)[2]
+        assert ("drawn by their weights" in error) is weighted
+        assert report["settings"]["recover.schedule.guarded"] is False
     run(command_line, folder, *ask, "--preset", "paper", "--sh-degree", 0)
     assert read_splats(folder / "o.ply").sh_degree == 0
 
@@ -138,11 +139,10 @@ def test_the_other_commands_know_it(folder: Path, command_line: CommandLine) -> 
     assert (found["policy"], len(found["views"])) == ("directional", 10)
     ask = ("adapt", "ball.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "o.ply", "--steps", 6)
     done = run(command_line, folder, *ask, "--preset", "paper")
-    assert done["constants"]["rates"] == {
-        **listed({"rates": PAPER.rates})["rates"],
-        **dict.fromkeys(("means", "log_scales", "quats"), 0.0),
-    }
-    assert (done["steps"], done["config"]["tolerance"], done["colour_change"]) == (6, 0.0, None)
+    rates = {**vars(PAPER.rates), **dict.fromkeys(("means", "log_scales", "quats"), 0.0)}
+    for name in ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN"):
+        assert done["settings"][f"adapt.recovery.rates.{name}"] == rates[name]
+    assert (done["steps"], done["settings"]["adapt.tolerance"], done["colour_change"]) == (6, 0.0, None)
 
 
 def test_a_study_takes_it_in_g2ard_s_place() -> None:
@@ -202,25 +202,27 @@ def test_two_priors_take_it_alike() -> None:
 
 
 def test_in_python() -> None:
-    noisy = g2ard.preset("paper", prior="noisy")
-    assert noisy.distill.regularizers == noisy.recover.regularizers == PAPER_PRESETS["noisy"]
-    assert noisy.adapt.stretches() == [7000]
-    for wrong in ({"name": "peer"}, {"prior": "gentle"}):
-        with pytest.raises(InputError, match="expected"):
-            preset(**wrong)
+    noisy = g2ard.preset("paper-noisy")
+    assert noisy.recover.regularizers == PAPER_PRESETS["noisy"]
+    assert g2ard.preset("paper", g2ard.AdaptConfig()).stretches() == [7000]
+    with pytest.raises(InputError, match="expected"):
+        preset("peer")
     with pytest.raises(InputError, match="share"):
-        DistillConfig(views=1.5)
+        SelectConfig(views_count=1.5)
 
 
 def test_anchors_hold_from_construction_to_the_end(targets: TeacherRenders) -> None:
-    config = DistillConfig(method="paper", schedule=FEW, regularizers=FREE)
+    config = changed(
+        preset("paper"), {"recover.schedule": FEW, "recover.regularizers": FREE, "select.views_count": None}
+    )
     result = distill(PRIOR, 1000, targets, config)
     first, last = result.report.rounds[-1].recover
     anchors = Anchors.of(result.simplified)
     assert last.drift95 == drift95(anchors, result.splats.means)
     # The round's drift is not forgotten.
     assert last.geometry[0].drift95 > 0.5 * first.drift95 > 0.05
-    held = replace(config, regularizers=Regularizers(100.0, 0.0, effective_rank=False, period=1))
+    tight = Regularizers(100.0, 0.0, effective_rank=False, period=1)
+    held = changed(config, {"recover.regularizers": tight})
     assert distill(PRIOR, 1000, targets, held).report.rounds[-1].recover[-1].drift95 < last.drift95
 
 
@@ -295,7 +297,7 @@ def test_the_paper_s_adaptation_blends_nothing(folder: Path, command_line: Comma
         status, out, error = command_line(*ask, *paper, cwd=folder)
         assert status == 0, error
         assert json.loads(out)["prior_share"] == 0
-    assert g2ard.preset("paper").adapt.prior_views == 0
+    assert g2ard.preset("paper", g2ard.AdaptConfig()).prior_views == 0
     status, out, error = command_line(*ask, cwd=folder)
     assert status == 0, error
     assert json.loads(out)["prior_share"] > 0
@@ -314,4 +316,4 @@ def test_a_preset_above_the_tables_is_for_all_commands(
     assert json.loads(out)["policy"] == "directional"
     status, out, error = command_line("simplify", "ball.ply", "-r", 9, "-o", "s.ply", *config, cwd=folder)
     assert status == 0, error
-    assert json.loads(out)["config"]["method"] == "paper"
+    assert json.loads(out)["method"] == "paper"

@@ -11,21 +11,25 @@ import numpy as np
 import pytest
 
 import g2ard
+from g2ard.config.paths import changed
 from g2ard.errors import InputError
 from g2ard.io import Points, read_splats, write_points, write_splats, write_views
-from g2ard.pipeline import DistillConfig, distill
+from g2ard.pipeline import DistillConfig, SelectConfig, distill
 from g2ard.progress import silent
 from g2ard.rendering.renderer import render
 from g2ard.scene.images import write_png
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.targets import Targets, TeacherRenders
 from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.schedule import PAPER, TUNED
+from g2ard.stages.simplify import SimplifyConfig
 from helpers.commands import CommandLine, refused
 from helpers.scenes import around, assert_same_bits, checkered_ball
 
 PRIOR = checkered_ball()
 ROUNDS = replace(TUNED, steps=20, round_steps=10)
+PAPER_ROUNDS = DistillConfig(SelectConfig(), SimplifyConfig(method="paper"), RecoverConfig(schedule=ROUNDS))
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +39,7 @@ def targets() -> TeacherRenders:
 
 def test_views_of_another_kind_are_handed_on(targets: TeacherRenders, tmp_path: Path) -> None:
     near = TeacherRenders(PRIOR, around(4, (64, 48), 2.0))
-    config = DistillConfig(steps=20)
+    config = DistillConfig(recover=RecoverConfig(steps=20))
     done = distill(PRIOR, 300, targets, config, validation=near, work=tmp_path)
     assert done.report.rounds[0].recover[0].validation.looks
     with pytest.raises(InputError, match="other options"):
@@ -43,20 +47,20 @@ def test_views_of_another_kind_are_handed_on(targets: TeacherRenders, tmp_path: 
 
 
 def test_one_shot_reaches_the_budget_and_recovers(targets: TeacherRenders) -> None:
-    result = distill(PRIOR, 300, targets, DistillConfig(steps=120))
+    result = distill(PRIOR, 300, targets, DistillConfig(recover=RecoverConfig(steps=120)))
     assert len(result.splats) == len(result.simplified) == 300
     assert [entry.count for entry in result.report.rounds] == [300]
     assert evaluate(result.splats, targets).psnr > evaluate(result.simplified, targets).psnr + 3
 
 
 def test_rounds_follow_the_paper_s_counts(targets: TeacherRenders) -> None:
-    result = distill(PRIOR, 1000, targets, DistillConfig(method="paper", schedule=ROUNDS))
+    result = distill(PRIOR, 1000, targets, PAPER_ROUNDS)
     assert [entry.count for entry in result.report.rounds] == [2250, 1688, 1266, 1000]
     assert [len(entry.recover) for entry in result.report.rounds] == [1, 1, 1, 2]
 
 
 def test_an_interrupted_run_goes_on_to_the_same_bits(targets: TeacherRenders, tmp_path: Path) -> None:
-    config = DistillConfig(method="paper", schedule=ROUNDS)
+    config = PAPER_ROUNDS
     whole = distill(PRIOR, 1000, targets, config)
     calls = 0
 
@@ -77,7 +81,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(targets: TeacherRenders, tm
     assert resumed.report.seconds.resumed == pytest.approx(sum(earlier))
     assert_same_bits(whole.splats, resumed.splats)
     with pytest.raises(InputError, match="belongs to a run with another scene"):
-        distill(PRIOR, 1000, targets, replace(config, seed=1), work=tmp_path)
+        distill(PRIOR, 1000, targets, changed(config, {"recover.seed": 1}), work=tmp_path)
 
 
 def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -> None:
@@ -155,11 +159,14 @@ def test_steps_by_need_are_for_teachers() -> None:
     def horizon(targets: Targets, config: DistillConfig) -> int | None:
         return _Rounds(PRIOR, 300, targets, config, 1, None, None, None, silent, None)._steps()
 
-    teacher, config = TeacherRenders(PRIOR, part, lazy=True), DistillConfig(schedule=TUNED)
+    teacher, config = (
+        TeacherRenders(PRIOR, part, lazy=True),
+        DistillConfig(recover=RecoverConfig(schedule=TUNED)),
+    )
     assert horizon(teacher, config) > 1.5 * TUNED.steps
     assert horizon(TeacherRenders(PRIOR, around(12), lazy=True), config) < 1.2 * TUNED.steps
-    assert horizon(teacher, replace(config, steps=7)) == 7
-    assert horizon(teacher, replace(config, schedule=PAPER)) == PAPER.steps
+    assert horizon(teacher, changed(config, {"recover.steps": 7})) == 7
+    assert horizon(teacher, changed(config, {"recover.schedule": PAPER})) == PAPER.steps
 
 
 def cloud_with_photos(folder: Path) -> None:

@@ -10,18 +10,21 @@ from typing import Any
 import numpy as np
 import pytest
 
+from g2ard.config.paths import changed
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
 from g2ard.pipeline import DistillConfig, distill
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.targets import TeacherRenders
+from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.schedule import TUNED
 from g2ard.stages.select import select
+from g2ard.stages.simplify import SimplifyConfig
 from helpers.commands import CommandLine
 from helpers.scenes import ARRAYS, around, assert_same_bits, checkered_ball
 
 PRIOR = checkered_ball(1500)
-SHORT = DistillConfig(method="paper", steps=20)
+SHORT = DistillConfig(simplify=SimplifyConfig(method="paper"), recover=RecoverConfig(steps=20))
 
 
 def crowded() -> Cameras:
@@ -53,14 +56,14 @@ def test_all_views_are_drawn_by_weight_unless_told_otherwise() -> None:
     assert (said.candidates, len(said.chosen), said.refused) == (33, 32, ["v32"])
     assert said.weighted
     assert said.left_out == 0
-    plain = distill(PRIOR, 200, targets, replace(SHORT, weighted=False))
+    plain = distill(PRIOR, 200, targets, changed(SHORT, {"select.weighted": False}))
     assert plain.report.views is None
     assert any(not np.array_equal(getattr(done.splats, a), getattr(plain.splats, a)) for a in ARRAYS)
 
 
 def test_only_chosen_views_are_looked_at_and_the_rest_is_accounted_for() -> None:
     targets = Watched(crowded())
-    report = distill(PRIOR, 200, targets, replace(SHORT, views=8)).report
+    report = distill(PRIOR, 200, targets, changed(SHORT, {"select.views_count": 8})).report
     chosen = select(PRIOR, targets.cameras, 8)
     assert report.views.chosen == [targets.cameras.names[i] for i in chosen.order]
     assert targets.asked == set(chosen.order.tolist())
@@ -70,7 +73,9 @@ def test_only_chosen_views_are_looked_at_and_the_rest_is_accounted_for() -> None
 
 def test_auto_takes_as_many_as_the_curve_asks_for() -> None:
     targets = TeacherRenders(PRIOR, crowded())
-    report = distill(PRIOR, 200, targets, replace(SHORT, views="auto", policy="coverage")).report
+    report = distill(
+        PRIOR, 200, targets, changed(SHORT, {"select.views_count": "auto", "select.policy": "coverage"})
+    ).report
     assert 1 < len(report.views.chosen) < 20
     assert report.views.policy == "coverage"
 
@@ -83,7 +88,7 @@ def test_given_weights_stand() -> None:
     with pytest.raises(InputError, match="expected 12"):
         distill(PRIOR, 200, targets, SHORT, weights=[1.0])
     with pytest.raises(InputError, match="policy"):
-        distill(PRIOR, 200, targets, replace(SHORT, views=3, policy="best"))
+        distill(PRIOR, 200, targets, changed(SHORT, {"select.views_count": 3, "select.policy": "best"}))
 
 
 def test_selects_once_unless_asked(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,17 +102,26 @@ def test_selects_once_unless_asked(monkeypatch: pytest.MonkeyPatch) -> None:
         return whole(splats, *rest, **options)
 
     monkeypatch.setattr(stage, "select", counted)
-    config = replace(SHORT, schedule=replace(TUNED, steps=10, round_steps=5), views=6)
+    config = changed(
+        SHORT, {"select.views_count": 6, "recover.schedule": replace(TUNED, steps=10, round_steps=5)}
+    )
     targets = TeacherRenders(PRIOR, crowded())
     distill(PRIOR, 600, targets, config)
     assert counts == [1500]
     counts.clear()
-    distill(PRIOR, 600, targets, replace(config, reselect=True))
+    distill(PRIOR, 600, targets, changed(config, {"select.reselect": True}))
     assert counts == [1500, 1125, 844, 633]
 
 
 def test_a_stopped_run_goes_on_with_the_same_views(tmp_path: Path) -> None:
-    config = replace(SHORT, schedule=replace(TUNED, steps=20, round_steps=10), views=6, reselect=True)
+    config = changed(
+        SHORT,
+        {
+            "select.views_count": 6,
+            "select.reselect": True,
+            "recover.schedule": replace(TUNED, steps=20, round_steps=10),
+        },
+    )
     targets = TeacherRenders(PRIOR, crowded())
     whole = distill(PRIOR, 600, targets, config)
     calls = 0
@@ -124,14 +138,16 @@ def test_a_stopped_run_goes_on_with_the_same_views(tmp_path: Path) -> None:
     assert_same_bits(whole.splats, again.splats)
     assert whole.report.views == again.report.views
     with pytest.raises(InputError, match="another scene or other options"):
-        distill(PRIOR, 600, targets, replace(config, views=7), work=tmp_path)
+        distill(PRIOR, 600, targets, changed(config, {"select.views_count": 7}), work=tmp_path)
 
 
 def test_the_command_reports_what_it_left_out(command_line: CommandLine, tmp_path: Path) -> None:
     write_splats(tmp_path / "ball.ply", PRIOR)
     write_views(tmp_path / "pool.json", crowded())
     ask = ("distill", "ball.ply", "-n", 200, "--views", "pool.json", "--method", "paper", "--steps", 20)
-    status, out, error = command_line(*ask, "-k", "25%", "-o", "run", "--json", "-", cwd=tmp_path)
+    status, out, error = command_line(
+        *ask, "--set", "views_count=0.25", "-o", "run", "--json", "-", cwd=tmp_path
+    )
     assert status == 0, error
     report = json.loads(out)
     assert len(report["views"]["chosen"]) == 7  # of 28 that are not held out
@@ -139,8 +155,8 @@ def test_the_command_reports_what_it_left_out(command_line: CommandLine, tmp_pat
     assert f"views: 7 of 28 by auto; those left out would have added {share}" in error
     stored = json.loads((tmp_path / "run" / "report.json").read_text())
     assert stored["views"] == report["views"]
-    for wrong, words in ((["-k", "0"], "'0'"), (["-k", "3", "--policy", "best"], "best")):
-        status, _, error = command_line(*ask, *wrong, "-o", "bad", cwd=tmp_path)
+    for wrong, words in (("views_count=0.0", "views_count"), ("select.policy=best", "best")):
+        status, _, error = command_line(*ask, "--set", wrong, "-o", "bad", cwd=tmp_path)
         assert status == 2
         assert words in error
         assert not (tmp_path / "bad").exists()

@@ -155,7 +155,20 @@ def test_no_command_trains_on_what_a_selection_holds_out(folder: Path, g2ard: Pr
 
 def test_no_command_trains_on_what_a_split_file_holds_out(folder: Path, g2ard: Program, watch: Watch) -> None:
     g2ard("recover", "small.ply", "--views", "photos", "--steps", 4, "-o", "recovered.ply")
-    g2ard("distill", "ball.ply", "-n", 200, "--views", "photos", "-k", 5, "--steps", 4, "-o", "run")
+    g2ard(
+        "distill",
+        "ball.ply",
+        "-n",
+        200,
+        "--views",
+        "photos",
+        "--steps",
+        4,
+        "-o",
+        "run",
+        "--set",
+        "views_count=5",
+    )
     g2ard("distill", "cloud.ply", "-n", 200, "--views", "photos", "--steps", 4, "-o", "lifted")
     assert len(watch.trained) == 3
     assert set().union(*watch.trained, *watch.looked) <= TRAIN

@@ -60,7 +60,7 @@ def test_simplify_looks_from_the_cameras_beside_the_model(command_line: CommandL
 
 
 def test_distill_trains_and_scores_on_them(command_line: CommandLine, folder: Path) -> None:
-    status, out, error = command_line(*DISTILL, "-o", "run", "-k", 14, cwd=folder)
+    status, out, error = command_line(*DISTILL, "-o", "run", "--set", "views_count=14", cwd=folder)
     assert status == 0, error
     assert SAID in error
     report = json.loads(out)

@@ -101,7 +101,9 @@ def test_the_commands(command_line: CommandLine, tmp_path: Path) -> None:
     assert "in the regions to keep" in run(
         "simplify", *common, *spot, "-o", "kept.ply", "--json", "kept.json"
     )
-    assert json.loads((tmp_path / "kept.json").read_text())["keep_region"] == [[2.5, 0, 0, 2]]
+    assert json.loads((tmp_path / "kept.json").read_text())["settings"]["simplify.keep_region"] == [
+        [2.5, 0, 0, 2]
+    ]
     run("simplify", *common, *spot, "--tile-rows", 1000, "--workers", 1, "-o", "tiles.ply")
     run("distill", *common, *spot, "--steps", 5, "-o", "run", "--no-view")
     plain = share(read_splats(tmp_path / "plain.ply"), BALL)

@@ -24,7 +24,7 @@ from g2ard.stages.recover.anchors import (
 )
 from g2ard.stages.recover.losses import TorchAnchors, anchor_loss, regularization, shape_loss
 from g2ard.stages.recover.presets import preset_for, view_consistency
-from g2ard.stages.recover.schedule import PAPER, TUNED, schedule_named
+from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
 from helpers.scenes import around, checkered_ball
 
 
@@ -64,7 +64,7 @@ def test_paper_decays_appearance_only_and_differently_in_rounds() -> None:
     assert end_of_round.sh0 == pytest.approx(0.36 * 2.5e-3)
     assert end.logit_opacities == pytest.approx(0.1 * 5e-3)
     with pytest.raises(InputError, match="schedule"):
-        schedule_named("hasty")
+        Schedule.named("hasty")
 
 
 def test_anchor_frames_put_the_thinnest_axis_last() -> None:
@@ -207,10 +207,10 @@ def test_views_that_see_through_each_other_s_surfaces_make_a_prior_noisy() -> No
 
 
 def test_a_scaled_schedule_keeps_its_proportions() -> None:
-    small = schedule_named("paper", 3000)
+    small = Schedule.named("paper").scaled(3000)
     assert (small.steps, small.round_steps) == (3000, 800)
     assert small.rates == PAPER.rates
-    assert schedule_named("fast", 50).round_steps == 0
+    assert Schedule.named("fast").scaled(50).round_steps == 0
 
 
 def test_checkpoint_round_trips_and_refuses_another_run(tmp_path: Path) -> None:

@@ -171,8 +171,8 @@ def test_command_line(tmp_path: Path, command_line: CommandLine, gpu: None) -> N
         "3",
         "--policy",
         "coverage",
-        "--cells",
-        "300",
+        "--set",
+        "cells=300",
         "-w",
     )
     made = {}

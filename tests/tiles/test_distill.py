@@ -22,7 +22,7 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, recover
-from g2ard.stages.recover.schedule import schedule_named
+from g2ard.stages.recover.schedule import Schedule
 from g2ard.stages.simplify import simplify
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.store import TileStore
@@ -49,7 +49,7 @@ def test_frozen_rows_stay_and_the_others_learn() -> None:
     dense = town(1500)
     small = simplify(dense, 300).splats
     frozen = np.arange(300) % 3 == 0
-    config = RecoverConfig(schedule=schedule_named("fast", 40), steps=40)
+    config = RecoverConfig(schedule=Schedule.named("fast").scaled(40), steps=40)
     done = recover(small, TeacherRenders(dense, ring()), config, frozen=frozen)
     assert done.report.psnr.after > done.report.psnr.before
     for name in ("means", "scales", "logit_opacities", "sh0"):
@@ -294,6 +294,6 @@ def test_recovery_in_tiles_takes_its_options(command_line: CommandLine, folder: 
     for number, options in enumerate(others):
         changed = distilled(f"other{number}", *options)
         assert changed.fingerprint() != usual.fingerprint(), options
-    wider = distilled("wider", "--sh-degree", 1)
+    wider = distilled("wider", "--set", "sh_degree=1")
     assert wider.sh_degree == 1
     assert np.abs(wider.shN).max() > 0

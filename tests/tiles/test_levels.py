@@ -112,7 +112,7 @@ def test_what_is_measured_and_written_is_not_again(tmp_path: Path, monkeypatch: 
 
 
 def levels_in_tiles(place: Path, folder: Path, **more: object) -> TiledLevels:
-    options = DistillOptions(views=place / "views.json", steps=12)
+    options = DistillOptions(views=place / "views.json", settings={"steps": 12})
     tiling = Tiling(tile_rows=1700, workers=1, folder=folder)
     return lod_in_tiles(place / "town.ply", (1, 3, 12), tiling, options, **more)  # type: ignore[arg-type]
 

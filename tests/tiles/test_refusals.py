@@ -46,9 +46,9 @@ _DISTILL = ("distill", "-r", "10", "-o", "x", "--views", "views.json")
         (_DISTILL, "--preset paper-lift", "--preset paper-lift"),
         (_DISTILL, "--schedule paper", "--schedule paper"),
         (_DISTILL, "--photos", "--photos"),
-        (_DISTILL, "-k 10", "-k"),
+        (_DISTILL, "--set views_count=10", "--set select.views_count"),
         (_DISTILL, "--clean", "--clean"),
-        (_DISTILL, "--reselect", "--reselect"),
+        (_DISTILL, "--set reselect=true", "--set select.reselect"),
         (_DISTILL, "--recovery-time 5m", "--recovery-time"),
         (_DISTILL, "--dry-run", "--dry-run"),
         (_DISTILL, "--keep", "--keep"),
@@ -70,11 +70,11 @@ def test_what_takes_the_scene_in_one_piece_is_named_as_it_is_typed(
 def test_several_are_named_together_and_renders_are_what_tiles_learn_from(
     command_line: CommandLine, folder: Path
 ) -> None:
-    told = refused(command_line, folder, 1, *_DISTILL, "tiles", "--clean", "--reselect")
-    assert "tiles: --clean and --reselect take the scene in one piece" in told
+    told = refused(command_line, folder, 1, *_DISTILL, "tiles", "--clean", "--photos")
+    assert "tiles: --clean and --photos take the scene in one piece" in told
     assert "`g2ard ingest tiles -o DIR --tile-rows 3,000` gives one piece" in told
     assert whole_options(DistillOptions(photos=False)) == []
-    assert whole_options(DistillOptions(engine="gsplat")) == ["--device cuda"]
+    assert whole_options(DistillOptions(settings={"engine": "gsplat"})) == ["--device cuda"]
 
 
 def test_rows_of_tiles_that_lie_in_a_folder_are_theirs(command_line: CommandLine, folder: Path) -> None:

@@ -20,26 +20,39 @@ from g2ard.cli.options import (
     TeacherOption,
     trained_on,
 )
+from g2ard.cli.panels import RECOVERY
 from g2ard.config.choices import AdaptSchedule
 from g2ard.progress import plural
 
 
-@command("adapt", example="g2ard adapt small.ply --views winter/ -o winter.ply", constants=True)
+@command("adapt", example="g2ard adapt small.ply --views winter/ -o winter.ply", settings=True)
 def adapt(
     run: Run,
     compact: Annotated[Path, typer.Argument(metavar="COMPACT", help="The scene whose geometry stays.")],
     views: LookOption,
     output: OutputOption,
     teacher: TeacherOption = None,
-    steps: Annotated[int, typer.Option(min=1, help="At most.")] = 7000,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Steps at most, 7,000.", rich_help_panel=RECOVERY)
+    ] = None,
     tolerance: Annotated[
-        float, typer.Option(min=0, help="Stop when a stretch gains less, dB; 0 takes all steps.")
-    ] = 0.05,
-    schedule: Annotated[AdaptSchedule, typer.Option(help="Rates and decay.")] = "default",
+        float | None,
+        typer.Option(
+            min=0,
+            help="Stop when a stretch gains less than this, 0.05 dB; 0 takes all steps.",
+            rich_help_panel=RECOVERY,
+        ),
+    ] = None,
+    schedule: Annotated[
+        AdaptSchedule | None,
+        typer.Option(help="Rates and decay.", rich_help_panel=RECOVERY),
+    ] = None,
     prior_views: Annotated[
         float | None,
         typer.Option(
-            min=0, help="Weight of the old appearance, in views, 1; 0 takes the fit as it is, as paper does."
+            min=0,
+            help="Weight of the old appearance, in views, 1; 0 takes the fit as it is, as paper does.",
+            rich_help_panel=RECOVERY,
         ),
     ] = None,
     sh_degree: ShDegreeOption = None,
@@ -51,30 +64,22 @@ def adapt(
 ) -> None:
     """Refit colours and opacities to new images; means, rotations and scales stay as they are."""
     from g2ard.cli.resume import check_stopped, left_at, stoppable
-    from g2ard.config.constants import changed, listed
+    from g2ard.config.paths import listed
+    from g2ard.config.presets import PRESETS, configured
     from g2ard.io import check_scene_output, write_splats
-    from g2ard.pipeline.adapt import AdaptConfig, appearance_only
+    from g2ard.pipeline.adapt import AdaptConfig
     from g2ard.pipeline.adapt import adapt as refit
     from g2ard.policy.inputs import load_scene, load_trained, make_targets
     from g2ard.policy.view_checks import warn_of_sight
-    from g2ard.stages.recover.schedule import schedule_named
 
+    schedule = schedule or PRESETS[preset or "auto"].get("adapt.schedule", "default")
     if schedule == "paper" and prior_views:
         raise typer.BadParameter(
             "--prior-views: the paper's schedule takes the fit as it is; leave one of them out"
         )
-    recovery = appearance_only(schedule_named(schedule))
-    config = AdaptConfig(
-        steps=steps,
-        tolerance=tolerance,
-        schedule=schedule,
-        prior_views=prior_views if prior_views is not None else 1.0 if schedule == "default" else 0.0,
-        sh_degree=sh_degree,
-        background=background or (0.0, 0.0, 0.0),
-        seed=run.seed,
-        recovery=recovery,
-    )
-    config = changed(config, "adapt", run.constants(adapt=config))
+    start = AdaptConfig.scheduled(schedule)
+    names = ("steps", "tolerance", "schedule", "prior_views", "sh_degree", "background", "seed")
+    config = configured(start, preset or "auto", run.settings(start, *names, preset=preset))
     work = output.parent / f".{output.name}.work"
     if left_at(work) or not (resume and output.exists()):
         check_scene_output(output, run.overwrite)
@@ -93,5 +98,4 @@ def adapt(
         f"{output}: {plural(len(splats), 'Gaussian')}, {plural(result.report.steps, 'step')} ({end}), "
         f"{trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB"
     )
-    constants = listed({"adapt": config}, run.config)
-    run.result({**result.report.as_dict(), "output": str(output), "constants": constants})
+    run.result({**result.report.as_dict(), "output": str(output), "settings": listed(config)})

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from g2ard.cli.budget_options import (
-    Count,
     CountsOption,
     FitOption,
     MinPsnrOption,
@@ -24,20 +23,20 @@ from g2ard.cli.options import (
     CropOption,
     FormatOption,
     KeepRegionOption,
-    PolicyOption,
+    MethodOption,
     PresetOption,
     RecoveryTimeOption,
     ResumeOption,
+    ScheduleOption,
     SizeOption,
+    StepsOption,
     UpOption,
     ViewsOrMadeOption,
-    can_judge,
     is_made,
-    one_horizon,
     recovery_engine,
-    views_count,
 )
 from g2ard.cli.outputs import Outputs, budgets_of
+from g2ard.cli.panels import METHOD, OUTPUT, VIEWS
 from g2ard.cli.run_folder import (
     KEPT,
     WORK,
@@ -59,7 +58,6 @@ from g2ard.cli.tile_options import (
     tiling_of,
 )
 from g2ard.cli.tiled import TiledCommand
-from g2ard.config.choices import Method, ScheduleName
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -73,10 +71,10 @@ if TYPE_CHECKING:
     Colour = tuple[float, float, float]
 
 
-@command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True, constants=True)
+@command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True, settings=True)
 def distill(
     run: Run,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN", help="Folder of the run.")],
+    *,
     scene: Annotated[
         Path | None,
         typer.Argument(
@@ -94,59 +92,48 @@ def distill(
         bool | None,
         typer.Option(
             "--photos/--renders",
-            help="Targets: photos, or the scene's renders; else each view's photo if it has one.",
+            help="Targets: photos, or the scene's renders; by default each view's photo if it has one.",
+            rich_help_panel=VIEWS,
         ),
     ] = None,
     held_out: Annotated[
         Path | None,
         typer.Option(
             metavar="VIEWS",
-            help="Score on these; --views is then for recovery, but for what it holds out itself.",
+            help="Views to score on. --views is then used for training only, without its own test split.",
+            rich_help_panel=VIEWS,
         ),
     ] = None,
-    k: Annotated[
-        Count | None,
-        typer.Option(
-            "-k",
-            "--views-count",
-            parser=views_count,
-            metavar="K",
-            help="Views that recovery looks at: 100, 25% or auto; all if not given.",
-        ),
-    ] = None,
-    policy: PolicyOption = "auto",
-    weighted: Annotated[
-        bool,
-        typer.Option("--weights/--no-weights", help="Draw views by weight: their own, or the selection's."),
-    ] = True,
-    reselect: Annotated[
-        bool,
-        typer.Option("--reselect", help="Choose views again from every round's scene, not just the first."),
-    ] = False,
-    method: Annotated[Method, typer.Option(help="How to simplify.")] = "default",
+    method: MethodOption = None,
     keep_region: KeepRegionOption = None,
     preset: PresetOption = "auto",
-    schedule: Annotated[
-        ScheduleName, typer.Option(help="Recovery; paper also goes round by round.")
-    ] = "default",
-    steps: Annotated[int | None, typer.Option(min=1, help="Overrides the final horizon.")] = None,
+    schedule: ScheduleOption = None,
+    steps: StepsOption = None,
     recovery_time: RecoveryTimeOption = None,
-    sh_degree: Annotated[
-        int | None,
-        typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own, 3 from a cloud."),
-    ] = None,
     keep: Annotated[
         bool,
         typer.Option(
-            "--keep", help="Keep the simplified scene too, in RUN/simplified: it takes as many bytes again."
+            "--keep",
+            help="Keep the simplified scene too, in RUN/simplified: it takes as many bytes again.",
+            hidden=True,
         ),
     ] = False,
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="RUN", help="Folder of the run.", rich_help_panel=OUTPUT),
+    ],
     format: FormatOption = "ply",
     clean: Annotated[
-        bool, typer.Option("--clean", help="First take out what no picture needs, as `g2ard clean` does.")
+        bool,
+        typer.Option(
+            "--clean",
+            help="First remove what no picture needs, as `g2ard clean` does.",
+            rich_help_panel=METHOD,
+        ),
     ] = False,
     view: Annotated[
-        bool, typer.Option("--view/--no-view", help="Write view.html, the scene for any browser.")
+        bool,
+        typer.Option("--view/--no-view", help="Write view.html, the scene for any browser.", hidden=True),
     ] = True,
     resume: ResumeOption = False,
     crop: CropOption = None,
@@ -155,7 +142,11 @@ def distill(
     up: UpOption = None,
     dry_run: Annotated[
         bool,
-        typer.Option("--dry-run", help="Only tell about how long it will take, and what memory."),
+        typer.Option(
+            "--dry-run",
+            help="Only estimate the time and the memory.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = False,
     tile_rows: TileRowsOption = None,
     memory: MemoryOption = None,
@@ -169,11 +160,10 @@ def distill(
     A scene larger than memory, or a folder of tiles, is distilled tile by tile.
     """
     from g2ard.pipeline import DistillConfig
-    from g2ard.stages.lift import LiftConfig
 
-    values = run.constants(recover=DistillConfig(), lift=LiftConfig())
+    names = ("method", "keep_region", "schedule", "steps", "recovery_time", "background", "seed")
+    settings = run.settings(DistillConfig(), *names, preset=preset)
     budgets = budgets_of(count, ratio, fit, min_psnr, min_ssim)
-    can_judge(k, policy)
     if is_made(str(held_out)):
         raise typer.BadParameter("--held-out: a file of views; those that are made hold out every 8th anyway")
     given = views is not None and not is_made(views)
@@ -191,8 +181,7 @@ def distill(
     from g2ard.report.distilled import check_crops
 
     began = time.monotonic()
-    one_horizon(steps, recovery_time, values)
-    engine = recovery_engine(run)
+    settings.setdefault("recover.engine", recovery_engine(run))
     name = f"scene.{format}"
     outputs = Outputs(run, output, budgets)
 
@@ -212,28 +201,15 @@ def distill(
     if scene is not None and kind(scene) != "splats" and not given:
         raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
     options = DistillOptions(
-        format=format,
-        clean=clean,
         views=views,
         photos=photos,
         held_out=held_out,
-        views_count=k.number if isinstance(k, Count) else "auto" if k else None,
-        policy=policy,
-        weighted=weighted,
-        reselect=reselect,
-        method=method,
-        keep_region=keep_region or (),
-        preset=preset,
-        schedule=schedule,
-        steps=steps,
-        recovery_time=recovery_time,
-        sh_degree=sh_degree,
-        size=size,
-        background=background or (0.0, 0.0, 0.0),
-        constants=values,
         up=up,
-        seed=run.seed,
-        engine=engine,
+        size=size,
+        clean=clean,
+        format=format,
+        preset=preset,
+        settings=settings,
     )
     tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)
     if scene is not None and is_tiled(scene, tiling):
@@ -324,10 +300,10 @@ def _distil(
     from g2ard.policy.score import report_of
     from g2ard.report.distilled import distill_report
 
-    output, colour = place.parent, job.config.background
+    output, colour = place.parent, job.config.recover.background
     with work_folder(run, output, resume, (len(job.prior), budget)) as work:
         result = job.run(budget, work=work)
-        report = report_of(job, result, run.config)
+        report = report_of(job, result)
         report["seconds"]["total"] = time.monotonic() - began + report["seconds"].get("resumed", 0.0)
         distill_report(
             output / "report.html",
@@ -350,8 +326,8 @@ def _distil(
     write_table(run, report)
     for line in told(report, verbose=run.verbose):
         run.say(line)
-    say_views(run, report["views"], job.config.views is not None)
-    say_weight(run, source, place, result.splats, lifted=None if job.lifting is None else job.prior)
+    say_views(run, report["views"], job.config.select.views_count is not None)
+    say_weight(run, source, place, result.splats, lifted=job.prior if job.lifted else None)
     run.say(
         f"scene: {place} ({place.stat().st_size / 1e6:.2f} MB)\npicture: {output / 'preview.png'}\n"
         f"report: {output / 'report.html'}, {output / 'report.json'}" + (f"\n{page}" if page else "")
@@ -383,7 +359,7 @@ def _view(place: Path, scene: Splats | None, job: DistillJob, report: dict[str, 
         page.unlink(missing_ok=True)
         return None
     seen = job.views.train.cameras
-    report["bytes"]["view"], line = run_view(page, place, scene, seen, job.config.background)
+    report["bytes"]["view"], line = run_view(page, place, scene, seen, job.config.recover.background)
     return line
 
 

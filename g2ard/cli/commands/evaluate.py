@@ -18,7 +18,7 @@ from g2ard.cli.options import (
     can_be_made,
     views_or_teacher,
 )
-from g2ard.config.choices import LpipsInput
+from g2ard.config.choices import BLACK, LpipsInput
 from g2ard.progress import plural
 
 
@@ -72,7 +72,7 @@ def evaluate(
     can_be_made(views, teacher)
     for path in scenes:
         check_scene(path)
-    colour, settings = background or (0.0, 0.0, 0.0), RasterSettings(convention=convention)
+    colour, settings = background or BLACK, RasterSettings(convention=convention)
     dense = load_scene(teacher, run.say) if teacher else None
     frozen = load_scene(anchors, run.say) if anchors else None
     views = views_or_teacher(run, views, teacher, dense)

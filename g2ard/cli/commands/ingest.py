@@ -12,7 +12,7 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.options import ResumeOption
 
 
-@command("ingest", example="g2ard ingest city.ply -o tiles/ --tile-rows 2M", constants=True)
+@command("ingest", example="g2ard ingest city.ply -o tiles/ --tile-rows 2M", settings=True)
 def ingest(
     run: Run,
     scenes: Annotated[
@@ -36,7 +36,7 @@ def ingest(
     --resume or without."""
     import time
 
-    from g2ard.config.constants import changed
+    from g2ard.config.paths import changed
     from g2ard.stages.lift import LiftConfig
     from g2ard.system.memory import peak_rss
     from g2ard.tiles.ingest import TILE_ROWS
@@ -45,7 +45,7 @@ def ingest(
     if resume and not (output.is_dir() and any(output.iterdir())):
         run.say(f"nothing to go on from ({output}): starts anew")
     config = LiftConfig()
-    config = changed(config, "lift", run.constants(lift=config))
+    config = changed(config, run.settings(config))
     run.kept = [f"what is in {output} stands, and the same command goes on"]
     began = time.perf_counter()
     store = into_tiles(

@@ -20,6 +20,7 @@ from g2ard.cli.tile_options import (
     tiling_of,
 )
 from g2ard.cli.usage import in_flags
+from g2ard.config.choices import BLACK
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ def lod(
     from g2ard.io.atomic import check_output
     from g2ard.levels import Cut, save_levels
     from g2ard.policy.distill_options import DistillOptions
-    from g2ard.policy.levels import check_ratios
+    from g2ard.policy.levels import check_ratios, recovery_settings
     from g2ard.policy.levels import lod as levels_of
     from g2ard.policy.tiled import working
     from g2ard.policy.tiling import LEVELS_TIMES, RECOVERY_TIMES, check_memory, is_tiled
@@ -135,11 +136,9 @@ def lod(
     if tiled:
         options = DistillOptions(
             views=views,
-            steps=steps,
             size=size,
-            background=background or (0.0, 0.0, 0.0),
             up=up,
-            seed=run.seed,
+            settings=recovery_settings(steps, background or BLACK, run.seed),
         )
         with working(tiling, views):
             _in_tiles(run, scene, output, ratios, tiling, options, recover, rule, errors)
@@ -156,7 +155,7 @@ def lod(
             views=views,
             steps=steps,
             size=size,
-            background=background or (0.0, 0.0, 0.0),
+            background=background or BLACK,
             up=up,
             seed=run.seed,
             work=stopped,

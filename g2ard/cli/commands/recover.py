@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,18 +14,19 @@ from g2ard.cli.options import (
     PresetOption,
     RecoveryTimeOption,
     ResumeOption,
+    ScheduleOption,
     ShDegreeOption,
     SizeOption,
     SplitOption,
+    StepsOption,
     TeacherOption,
     ViewsOrMadeOption,
     can_be_made,
-    one_horizon,
     recovery_engine,
     trained_on,
     views_or_teacher,
 )
-from g2ard.config.choices import ScheduleName
+from g2ard.cli.panels import METHOD, VIEWS
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     "recover",
     example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply",
     cuda=True,
-    constants=True,
+    settings=True,
 )
 def recover(
     run: Run,
@@ -48,31 +48,42 @@ def recover(
     teacher: TeacherOption = None,
     photos: Annotated[
         bool,
-        typer.Option("--photos", help="With --teacher: each view's photo where it has one, else the render."),
+        typer.Option(
+            "--photos",
+            help="With --teacher: each view's photo where it has one, else the render.",
+            rich_help_panel=VIEWS,
+        ),
     ] = False,
     anchors: Annotated[
         Path | None,
         typer.Option(
             metavar="SCENE",
             help="The same Gaussians as they were simplified, where the student has been recovered since.",
+            rich_help_panel=METHOD,
         ),
     ] = None,
     preset: PresetOption = "auto",
-    schedule: Annotated[ScheduleName, typer.Option(help="Rates, decay and horizon.")] = "default",
-    steps: Annotated[int | None, typer.Option(min=1, help="Overrides the schedule's horizon.")] = None,
+    schedule: ScheduleOption = None,
+    steps: StepsOption = None,
     recovery_time: RecoveryTimeOption = None,
     sh_degree: ShDegreeOption = None,
     resume: ResumeOption = False,
     split: SplitOption = "train",
     weighted: Annotated[
-        bool, typer.Option("--weights/--no-weights", help="Draw views by the weights they carry, if any.")
-    ] = True,
+        bool | None,
+        typer.Option(
+            "--weights/--no-weights",
+            help="Draw views by the weights they carry, if any.",
+            rich_help_panel=VIEWS,
+        ),
+    ] = None,
     size: SizeOption = None,
     background: BackgroundOption = None,
 ) -> None:
     """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
     from g2ard.cli.resume import check_stopped, left_at, stoppable
-    from g2ard.config.constants import changed, listed
+    from g2ard.config.paths import listed
+    from g2ard.config.presets import PRESETS, configured
     from g2ard.io import check_scene_output, write_splats
     from g2ard.policy.inputs import (
         load_scene,
@@ -85,10 +96,12 @@ def recover(
     from g2ard.stages.recover import recover as optimize
     from g2ard.stages.recover.presets import preset_for
     from g2ard.stages.recover.report import outcome, unregularized
-    from g2ard.stages.recover.schedule import schedule_named
 
-    values = run.constants(recover=RecoverConfig())
-    one_horizon(steps, recovery_time, values)
+    names = ("schedule", "steps", "recovery_time", "sh_degree", "background", "seed")
+    settings = run.settings(RecoverConfig(), *names, preset=preset)
+    named = {**PRESETS[preset], **settings}
+    if weighted is None:
+        weighted = named.get("select.weighted", True)
     if photos and teacher is None:
         raise typer.BadParameter("--photos goes with --teacher: without a teacher all targets are photos")
     can_be_made(views, teacher)
@@ -96,35 +109,32 @@ def recover(
     if left_at(checkpoint) or not (resume and output.exists()):
         check_scene_output(output, run.overwrite)
     check_stopped(run, checkpoint, resume, output)
-    engine = recovery_engine(run)
-    colour = background or (0.0, 0.0, 0.0)
+    settings.setdefault("recover.engine", recovery_engine(run))
     splats = load_scene(student, run.say)
     dense = load_scene(teacher, run.say) if teacher else None
     views = views_or_teacher(run, views, teacher, dense)
     chosen = load_trained(views, split, size, run.say, unpictured=dense is not None)
     warn_of_sight(splats, chosen.cameras, run.say)
-    targets = make_targets(chosen.cameras, dense, colour, photos=photos, progress=run.progress, say=run.say)
+    targets = make_targets(
+        chosen.cameras,
+        dense,
+        configured(RecoverConfig(), preset, settings).background,
+        photos=photos,
+        progress=run.progress,
+        say=run.say,
+    )
     run.say(f"{plural(len(chosen.cameras), 'view')} against {kinds_of(targets)}")
     weights = chosen.weights if weighted else None
     if weights is not None:
         run.say(f"views are drawn by their weights ({len(weights)})")
-    regularizers, why, measured = preset_for(
-        preset, dense or splats, None if dense else chosen.cameras, paper=schedule == "paper"
+    settings["recover.regularizers"], why, measured = preset_for(
+        named.get("recover.regularizers", "auto"),
+        dense or splats,
+        None if dense else chosen.cameras,
+        paper=named.get("recover.schedule") == "paper",
     )
     run.say(f"regularisers: {why}")
-    if sh_degree is None and schedule == "paper":
-        sh_degree = 3
-    config = RecoverConfig(
-        schedule=schedule_named(schedule),
-        steps=steps,
-        recovery_time=recovery_time,
-        regularizers=regularizers,
-        sh_degree=sh_degree,
-        background=colour,
-        seed=run.seed,
-        engine=engine,
-    )
-    config = changed(config, "recover", values)
+    config = configured(RecoverConfig(), preset, settings)
     frozen = _anchors(run, anchors, splats, config.regularizers.in_plane) if anchors else None
     with stoppable(run, checkpoint, resume):
         result = optimize(
@@ -143,9 +153,8 @@ def recover(
         run.say(told)
     gain, count = result.report.psnr, plural(len(splats), "Gaussian")
     run.say(f"{output}: {count}, {trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB")
-    used = replace(config, schedule=replace(config.schedule, steps=config.steps or config.schedule.steps))
     report = {**result.report.as_dict(), "preset": why, "prior": measured.as_dict()}
-    report["constants"] = listed({"recover": used}, run.config)
+    report["settings"] = listed(config)
     run.result({**report, "output": str(output)})
 
 

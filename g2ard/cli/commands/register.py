@@ -9,7 +9,7 @@ import typer
 
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import BackgroundOption, OutputOption, SceneArgument
-from g2ard.config.choices import Keep, Refinement
+from g2ard.config.choices import BLACK, Keep, Refinement
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 @command(
     "register",
     example="g2ard register small.ply --photos new/ --focal 1200 --poses coarse.txt -o poses.json",
-    constants=True,
+    settings=True,
 )
 def register(
     run: Run,
@@ -106,7 +106,7 @@ def register(
     """
     from dataclasses import replace
 
-    from g2ard.config.constants import changed, listed
+    from g2ard.config.paths import changed, listed
     from g2ard.errors import InputError
     from g2ard.io import check_views_output, write_views
     from g2ard.io.atomic import check_output
@@ -131,7 +131,7 @@ def register(
         config = replace(config, passes=1, refine="none", fallback=False, min_inliers=6, matcher=features)
         keep = "all"
         run.config |= {"passes": 1, "refine": "none", "keep": keep, "matcher": features}
-    config = changed(config, "register", run.constants(register=config))
+    config = changed(config, run.settings(config))
     if metres_per_unit is not None and truth is None:
         raise typer.BadParameter("--metres-per-unit goes with --truth")
     if intrinsics is not None and focal is not None:
@@ -166,7 +166,7 @@ def register(
         truth=true,
         config=config,
         keep=keep,
-        background=background or (0.0, 0.0, 0.0),
+        background=background or BLACK,
         progress=run.progress,
     )
     rows = found.report.photos
@@ -177,7 +177,7 @@ def register(
     if report is not None:
         from g2ard.report.registered import registration_report
 
-        colour = background or (0.0, 0.0, 0.0)
+        colour = background or BLACK
         registration_report(
             report,
             f"Photos in {scene.name}",
@@ -192,10 +192,14 @@ def register(
         )
     if len(found.cameras):
         write_views(output, found.cameras, overwrite=run.overwrite)
-    constants = listed({"register": config}, run.config)
     written = str(output) if len(found.cameras) else None
     run.result(
-        {**found.report.as_dict(), "summary": summary.as_dict(), "output": written, "constants": constants}
+        {
+            **found.report.as_dict(),
+            "summary": summary.as_dict(),
+            "output": written,
+            "settings": listed(config),
+        }
     )
     if not len(found.cameras):
         first = next(row for row in rows if row.status != "registered")

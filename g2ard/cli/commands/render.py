@@ -21,7 +21,7 @@ from g2ard.cli.options import (
     is_made,
     picture,
 )
-from g2ard.config.choices import Method
+from g2ard.config.choices import BLACK, Method
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def render(
     warn_of_sight(splats, cameras, run.say)
     places = output_names(str(cameras.source or views), cameras.names) if output is not None else []
     shown: list[NDArray[np.float32]] = []
-    renderer = Renderer(splats, background=background or (0.0, 0.0, 0.0), settings=settings)
+    renderer = Renderer(splats, background=background or BLACK, settings=settings)
     with _folder(output, run.overwrite) as folder:
         for view in range(len(cameras)):
             rendered = renderer.render(cameras[view])

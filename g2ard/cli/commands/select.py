@@ -16,7 +16,6 @@ from g2ard.cli.options import (
     SceneArgument,
     SplitOption,
     ViewsOption,
-    can_judge,
     views_count,
 )
 from g2ard.progress import plural
@@ -25,39 +24,46 @@ if TYPE_CHECKING:
     from g2ard.io import ViewSet
 
 
-@command("select", example="g2ard select scene.ply --views poses.json -k 100 -o chosen.json", constants=True)
+@command("select", example="g2ard select scene.ply --views poses.json -k 100 -o chosen.json", settings=True)
 def select(
     run: Run,
     scene: SceneArgument,
     output: OutputOption,
     k: Annotated[
-        Count,
+        Count | None,
         typer.Option(
             "-k", parser=views_count, metavar="K", help="How many: 100, 25%, or auto (where the curve bends)."
         ),
-    ],
+    ] = None,
     views: ViewsOption = None,
-    policy: PolicyOption = "auto",
+    policy: PolicyOption = None,
     split: SplitOption = "train",
-    cells: Annotated[int, typer.Option(min=1, help="Surface cells, of directional and coverage.")] = 300_000,
     preset: PaperOption = None,
 ) -> None:
     """Choose the views worth having, best first, with a weight for how often to draw each.
 
     Views that are not for training follow after them, with their split and no weight, to score on.
     """
-    from g2ard.config.constants import changed, listed
+    from g2ard.config.paths import listed
+    from g2ard.config.presets import configured
+    from g2ard.errors import InputError
     from g2ard.io import check_views_output
+    from g2ard.pipeline import SelectConfig
     from g2ard.policy.inputs import load_scene, load_split_views
     from g2ard.policy.view_checks import warn_of_sight
-    from g2ard.stages.select import CoverageOptions
     from g2ard.stages.select import select as choose
 
-    values = run.constants(select=CoverageOptions(), over_options=True)
+    settings = run.settings(SelectConfig(), "policy", preset=preset)
+    if k is not None:
+        settings["select.views_count"] = k.number if isinstance(k, Count) else k
     if views is None:
         raise typer.BadParameter("--views VIEWS: the candidates to select from")
-    can_judge(k, policy)
-    options = changed(CoverageOptions(cells=cells), "select", values)
+    try:
+        config = configured(SelectConfig(), preset or "auto", settings)
+    except InputError as error:
+        raise typer.BadParameter(str(error)) from None
+    if config.views_count is None:
+        raise typer.BadParameter("-k K: how many views to choose")
     check_views_output(output, run.overwrite)
     splats = load_scene(scene, run.say)
     pool, candidates = load_split_views(views, split, run.say)
@@ -66,10 +72,10 @@ def select(
     chosen = choose(
         splats,
         cameras,
-        k.of(len(cameras)) if isinstance(k, Count) else "auto",
-        policy=policy,
+        config.count_of(len(cameras)),
+        policy=config.policy,
         seed=run.seed,
-        options=options,
+        options=config,
         progress=run.progress,
     )
     kept = cameras.take(chosen.order)
@@ -78,12 +84,12 @@ def select(
         count = plural(len(chosen.refused), "view")
         run.say(f"{count} refused: nothing of the scene in sight, or within its matter")
     run.say(
-        f"{output}: {len(kept)} of {plural(len(cameras), 'view')} by {policy};"
+        f"{output}: {len(kept)} of {plural(len(cameras), 'view')} by {config.policy};"
         f" those left out would add {100 * chosen.left_out:.1f} %"
     )
     run.result(
         {
-            "policy": policy,
+            "policy": config.policy,
             "views": [
                 {"name": name, "gain": gain, "weight": weight}
                 for name, gain, weight in zip(
@@ -95,7 +101,7 @@ def select(
             "refused": [cameras.names[i] for i in chosen.refused],
             "evaluations": chosen.evaluations,
             "seconds": chosen.seconds,
-            "constants": listed({"select": options}),
+            "settings": listed(config),
         }
     )
 

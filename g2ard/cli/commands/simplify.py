@@ -12,6 +12,7 @@ from g2ard.cli.budget_options import CountsOption, FitOption, MinPsnrOption, Min
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     KeepRegionOption,
+    MethodOption,
     OutputOption,
     PaperOption,
     SceneArgument,
@@ -20,6 +21,7 @@ from g2ard.cli.options import (
     is_made,
 )
 from g2ard.cli.outputs import Outputs, budgets_of
+from g2ard.cli.panels import OUTPUT, VIEWS
 from g2ard.cli.run_result import say_weight, tell_quality
 from g2ard.cli.tile_options import (
     MemoryOption,
@@ -30,7 +32,6 @@ from g2ard.cli.tile_options import (
     tiling_of,
 )
 from g2ard.cli.tiled import TiledCommand
-from g2ard.config.choices import Method
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -38,11 +39,11 @@ if TYPE_CHECKING:
     from g2ard.stages.simplify import Simplified, SimplifyConfig
 
 
-@command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply", constants=True)
+@command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply", settings=True)
 def simplify(
     run: Run,
+    *,
     scene: SceneArgument,
-    output: OutputOption,
     count: CountsOption = None,
     ratio: RatiosOption = None,
     fit: FitOption = None,
@@ -51,20 +52,23 @@ def simplify(
     views: ViewsOrMadeOption = None,
     no_views: Annotated[
         bool,
-        typer.Option("--no-views", help="Use no cameras at all, neither found ones nor a pool of its own."),
+        typer.Option(
+            "--no-views", help="Use no cameras at all, neither found nor generated.", rich_help_panel=VIEWS
+        ),
     ] = False,
-    parents: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.npy", help="Also write the row that each Gaussian went to; -1 is none."),
-    ] = None,
     preset: PaperOption = None,
-    method: Annotated[Method, typer.Option(help="The policy.")] = "default",
-    retention: Annotated[
-        float | None,
-        typer.Option(help="Share of the Gaussians that a round keeps; the method's own if absent."),
-    ] = None,
+    method: MethodOption = None,
     keep_region: KeepRegionOption = None,
     up: UpOption = None,
+    output: OutputOption,
+    parents: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.npy",
+            help="Also write the row that each Gaussian went to; -1 is none.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
     tile_rows: TileRowsOption = None,
     memory: MemoryOption = None,
     workers: WorkersOption = None,
@@ -77,17 +81,18 @@ def simplify(
     scene, else from a pool of poses of its own. The fast one looks only at given views, the paper's at none.
     A scene larger than memory, or a folder of tiles, is worked on tile by tile, at one exact budget.
     """
+    from g2ard.config.presets import configured
     from g2ard.stages.simplify import SimplifyConfig
 
-    values = run.constants(simplify=SimplifyConfig(), over_options=True)
+    settings = run.settings(SimplifyConfig(), "method", "keep_region", preset=preset)
+    config = configured(SimplifyConfig(), preset or "auto", settings)
     budgets = budgets_of(count, ratio, fit, min_psnr, min_ssim)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other; give one")
-    if keep_region and (no_views or method == "paper"):
+    if keep_region and (no_views or config.method == "paper"):
         raise typer.BadParameter("--keep-region: needs views, which --no-views and --method paper do without")
     tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)
     from g2ard import io
-    from g2ard.config.constants import changed
     from g2ard.policy.fit import aim_of
     from g2ard.policy.inputs import say_notes
     from g2ard.policy.simplify import Reduction
@@ -100,12 +105,14 @@ def simplify(
         whole_method,
     )
 
-    config = SimplifyConfig(retention=retention, keep_region=tuple(keep_region or ()))
-    config = changed(config, "simplify", values)
     outputs = Outputs(run, output, budgets)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite))
     if is_tiled(scene, tiling):
-        given = [*whole_method(method, preset), *(["--parents"] if parents else []), *whole_budgets(budgets)]
+        given = [
+            *whole_method(config.method, preset),
+            *(["--parents"] if parents else []),
+            *whole_budgets(budgets),
+        ]
         refuse_whole(scene, given)
         tiled = TiledCommand(run, scene, outputs, tiling, budgets)
         tiled.simplify(config, views, no_views, up)
@@ -124,7 +131,6 @@ def simplify(
         found.splats,
         views=views,
         blind=no_views,
-        method=method,
         config=config,
         beside=scene,
         up=up,
@@ -154,7 +160,7 @@ def simplify(
         if rows is not None:
             _write_parents(run, rows, small)
         clock.append(time.perf_counter())
-        reports.append(_report(run, found, small, config.resolved(method), method, clock))
+        reports.append(_report(found, small, config.resolved(), clock))
         _tell(run, scene, small, place, total, clock[-1] - clock[0])
         if aim.bytes is not None:
             run.say(f"{place}: {_bytes_of(place):,} of {aim.bytes:,} bytes")
@@ -170,18 +176,15 @@ def _bytes_of(place: Path) -> int:
     return sum(file.stat().st_size for file in files)
 
 
-def _report(
-    run: Run, found: Scene, small: Simplified, config: SimplifyConfig, method: str, clock: list[float]
-) -> dict[str, Any]:
-    from g2ard.config.constants import listed
+def _report(found: Scene, small: Simplified, config: SimplifyConfig, clock: list[float]) -> dict[str, Any]:
+    from g2ard.config.paths import listed
     from g2ard.system.memory import peak_rss
 
     began, read, simplified, written = clock
     return {
         **small.report.as_dict(),
-        "method": method,
-        "constants": listed({"simplify": config}),
-        "keep_region": config.keep_region,
+        "method": config.method,
+        "settings": listed(config),
         "notes": {note.code: note.count for note in found.notes},
         "seconds": {
             "read": read - began,

@@ -9,6 +9,7 @@ import typer
 
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import BackgroundOption, OutputOption, UpOption, ViewsOrMadeOption
+from g2ard.config.choices import BLACK
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def view(
         output,
         [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
         start=stand.start,
-        background=background or (0.0, 0.0, 0.0),
+        background=background or BLACK,
         overwrite=run.overwrite,
     )
     sizes = " and ".join(f"{size / 1e6:.2f}" for size in written.scenes)

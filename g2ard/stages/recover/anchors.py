@@ -77,6 +77,18 @@ class Regularizers:
         require("prior", repr(prior), prior in rows, f"one of {', '.join(rows)}")
         return rows[prior]
 
+    @classmethod
+    def named(cls, name: str) -> Regularizers:
+        """Return the weights of a kind of dense scene, or with `paper-` before it the paper's.
+
+        `auto` and `paper` stand for what measuring the scene says; without one they are a trained scene's.
+
+        >>> Regularizers.named("lift").anchor, Regularizers.named("paper-lift").anchor
+        (0.1, 0.001)
+        """
+        kind = name.removeprefix("paper-")
+        return cls.of("trained" if kind in ("auto", "paper") else kind, paper=name.startswith("paper"))
+
     @property
     def active(self) -> bool:
         """Whether any term has weight."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from g2ard.config.choices import Engine
+from g2ard.config.choices import BLACK, Colour, Engine
 from g2ard.errors import InputError
 from g2ard.stages.recover.anchors import PRESETS, Regularizers
 from g2ard.stages.recover.schedule import TUNED, Schedule
@@ -40,8 +40,8 @@ class RecoverConfig:
     regularizers: Regularizers = PRESETS["trained"]
     sh_degree: int | None = None
     ssim_weight: float = 0.2
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    final: bool = True
+    background: Colour = BLACK
+    final: bool = field(default=True, metadata={"setting": False})
     seed: int = 0
     engine: Engine = "fused"
 

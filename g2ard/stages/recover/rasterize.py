@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from g2ard import _core
+from g2ard.config.choices import BLACK
 from g2ard.errors import InputError
 from g2ard.rendering.renderer import RasterSettings, View, view_of
 from g2ard.scene.cameras import Cameras
@@ -75,7 +76,7 @@ def rasterize(
     shN: Tensor,
     cameras: Cameras,
     index: int,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    background: Sequence[float] = BLACK,
     settings: RasterSettings | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Render view `index` on the CPU, differentiably in all six parameter tensors.

@@ -6,13 +6,13 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from g2ard.errors import InputError, require
+from g2ard.errors import require
 
 if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
 
-__all__ = ["PAPER", "SCHEDULES", "TUNED", "Rates", "Schedule", "schedule_named", "steps_for"]
+__all__ = ["PAPER", "SCHEDULES", "TUNED", "Rates", "Schedule", "steps_for"]
 
 _REACH = 0.01
 """Gaussians larger than a hundredth of the image hardly move, unless that is the scene's typical size."""
@@ -55,7 +55,7 @@ class Rates:
     logit_opacities: float
     sh0: float
     shN: float
-    reach: float = field(default=math.inf, metadata={"constant": False})
+    reach: float = field(default=math.inf, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         for name in ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN"):
@@ -121,6 +121,19 @@ class Schedule:
             value = getattr(self, name)
             require(name, value, value is None or value > 0, "more than 0, or none")
 
+    @classmethod
+    def named(cls, name: str) -> Schedule:
+        """Return a schedule of `SCHEDULES`.
+
+        Raises:
+            InputError: an unknown name.
+
+        >>> Schedule.named("default").steps
+        1000
+        """
+        require("schedule", repr(name), name in SCHEDULES, f"one of {', '.join(SCHEDULES)}")
+        return SCHEDULES[name]
+
     def within(self, extent: float) -> Schedule:
         """The schedule for cameras of this extent; where they all stand in one place the rate stays as it is.
 
@@ -180,20 +193,6 @@ SCHEDULES: dict[str, Schedule] = {
     "best": replace(TUNED, steps=6000),
     "paper": PAPER,
 }
-
-
-def schedule_named(name: str, steps: int | None = None) -> Schedule:
-    """A schedule of `SCHEDULES`, scaled to a final horizon of `steps` if given.
-
-    Raises:
-        InputError: there is none of that name.
-
-    >>> schedule_named("default").steps
-    1000
-    """
-    if name not in SCHEDULES:
-        raise InputError(f"expected one of {', '.join(SCHEDULES)}, got {name!r}", parameter="schedule")
-    return SCHEDULES[name] if steps is None else SCHEDULES[name].scaled(steps)
 
 
 def multiplier_for(start_rmse: float, least: float = 1 / 3) -> float:

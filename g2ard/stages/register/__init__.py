@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.config.choices import Keep
+from g2ard.config.choices import BLACK, Keep
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import Renderer
@@ -55,7 +55,7 @@ def register(
     truth: Mapping[str, ArrayLike] | None = None,
     config: RegisterConfig | None = None,
     keep: Keep = "registered",
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    background: Sequence[float] = BLACK,
     progress: Progress = silent,
 ) -> Registered:
     """Find the poses of photos by features and direct alignment with renders of the scene.

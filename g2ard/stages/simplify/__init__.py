@@ -103,7 +103,7 @@ def simplify(
     splats: Splats,
     budget: int,
     *,
-    method: str = "default",
+    method: str | None = None,
     visibility: Visibility | VisibilitySource | None = None,
     protected: NDArray[np.bool_] | None = None,
     final_budget: int | None = None,
@@ -134,7 +134,7 @@ def simplify(
         splats: the scene. Infinite logits mean α = 0 or 1, scales over e⁴³ count as that; rows with other
             non-finite values are dropped and counted.
         budget: Gaussians to keep, at most as many as there are.
-        method: the policy.
+        method: overrides the config's.
         visibility: for `default` and `fast`: what views see of each Gaussian (`g2ard.rendering.visibility`),
             or a function that finds it for a scene, asked again for the result, whose opacities it fits.
         protected: (N,) bool flags to inherit. With None, `paper` computes them (see `flag`), the others,
@@ -157,6 +157,7 @@ def simplify(
     >>> len(small.splats), small.parents.shape, int(small.parents.max())
     (100, (1000,), 99)
     """
+    method = config.method if method is None else method
     if method not in METHODS:
         raise InputError(f"expected one of {', '.join(METHODS)}, got {method!r}", parameter="method")
     scene, finite = finite_rows_of(splats)

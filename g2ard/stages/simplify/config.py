@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import cast
 
 from g2ard import _core
-from g2ard.config.choices import METHODS
-from g2ard.errors import InputError
-from g2ard.scene.regions import Region, check_region
+from g2ard.config.choices import METHODS, Method
+from g2ard.errors import InputError, require
+from g2ard.scene.regions import Region, as_regions
 
 __all__ = ["METHODS", "SimplifyConfig", "round_counts"]
 
@@ -30,6 +31,7 @@ class SimplifyConfig:
     them, the others are measured (`docs/paper.md`, `docs/decisions.md`).
 
     Args:
+        method: "default", "fast" or "paper", see `g2ard.stages.simplify.simplify`.
         retention: share of the Gaussians that a round keeps; None means the method's own, 0.75 in the paper,
             0.65 for the others (fewer rounds, as good).
         fold: a last cut by less than this share is folded into the round before, in 0–1; not in the paper. A
@@ -71,6 +73,7 @@ class SimplifyConfig:
             `tab:s_config`).
     """
 
+    method: Method = "default"
     retention: float | None = None
     fold: float = 0.05
     min_opacity: float | None = None
@@ -81,7 +84,7 @@ class SimplifyConfig:
     dilation: float = _PAIRWISE["dilation"]
     pixel_scale: float = _PAIRWISE["pixel_scale"]
     max_growth: float = _PAIRWISE["max_growth"]
-    keep_region: tuple[Region, ...] = field(default=(), metadata={"constant": False})
+    keep_region: tuple[Region, ...] = ()
     keep_times: float = 4.0
     color_bin: float = _PAPER["color_bin"]
     max_energy: float = _PAPER["max_energy"]
@@ -92,6 +95,7 @@ class SimplifyConfig:
     protection: float = _PAPER["protection"]
 
     def __post_init__(self) -> None:
+        require("method", repr(self.method), self.method in METHODS, f"one of {', '.join(METHODS)}")
         if self.retention is not None and not 0 < self.retention < 1:
             raise InputError(
                 f"expected a number between 0 and 1, got {self.retention}", parameter="retention"
@@ -110,7 +114,7 @@ class SimplifyConfig:
             )
         if self.neighbors < 1:
             raise InputError(f"expected at least 1, got {self.neighbors}", parameter="neighbors")
-        object.__setattr__(self, "keep_region", tuple(check_region(region) for region in self.keep_region))
+        object.__setattr__(self, "keep_region", as_regions(self.keep_region))
         for name in ("color_bin", "pixel_scale", "support", "keep_times"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
@@ -131,18 +135,19 @@ class SimplifyConfig:
         if self.min_opacity is not None and self.min_opacity > 1:
             raise InputError(f"expected a number in [0, 1], got {self.min_opacity}", parameter="min_opacity")
 
-    def resolved(self, method: str) -> SimplifyConfig:
-        """The same with the method's own constants where None stands for them.
+    def resolved(self, method: str | None = None) -> SimplifyConfig:
+        """Return the config of a method, its own unless named, with the method's constants in place of None.
 
         >>> SimplifyConfig().resolved("paper").retention
         0.75
         """
+        method = cast(Method, method or self.method)
         own = {
             name: value
             for name, value in _CORE[method].items()
             if name in _OF_METHOD and getattr(self, name) is None
         }
-        return replace(self, retention=self.retention_of(method), **own)
+        return replace(self, method=method, retention=self.retention_of(method), **own)
 
     def retention_of(self, method: str) -> float:
         """The share a round of `method` keeps."""

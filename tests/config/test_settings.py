@@ -1,9 +1,9 @@
-"""Constants by name: any dataclass's fields, checked, in config files and reports as on the command line."""
+"""Settings by dotted path: any config's fields, in config files and reports as on the command line."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 import g2ard
-from g2ard.config.constants import changed, listed, parsed
+from g2ard.config.paths import changed, listed, parsed
 from g2ard.config.presets import preset
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.pipeline import DistillConfig
-from g2ard.stages.lift import LiftConfig
+from g2ard.stages.recover.anchors import PRESETS
+from g2ard.stages.recover.schedule import PAPER
 from g2ard.stages.simplify import SimplifyConfig
 from helpers.commands import CommandLine
 from helpers.scenes import around, checkered_ball
@@ -26,7 +27,7 @@ from helpers.scenes import around, checkered_ball
 class Inner:
     brand_new: float = 1.0
     edges: tuple[float, float] = (1.0, 2.0)
-    worked_out: int = field(default=0, metadata={"constant": False})
+    worked_out: int = field(default=0, metadata={"setting": False})
 
 
 @dataclass(frozen=True)
@@ -38,53 +39,68 @@ class Outer:
     brand_new: float = 3.0
 
 
-def test_a_field_of_any_dataclass_is_a_constant_at_once() -> None:
+def test_a_field_of_any_dataclass_is_a_setting_at_once() -> None:
     texts = ["outer.cells=7", "edges=0.5,4", "exact=true", "mode=hard", "inner.brand_new=1e-3", "cells=none"]
-    values = parsed(texts, {"outer": Outer()})
-    assert changed(Outer(cells=3), "outer", values) == Outer(None, "hard", True, Inner(1e-3, (0.5, 4.0)))
-    assert changed(Outer(), "other", values).cells is None
-    assert changed(Outer(), "outer", {}) == Outer()
+    values = parsed(texts, Outer())
+    assert changed(Outer(cells=3), values) == Outer(None, "hard", True, Inner(1e-3, (0.5, 4.0)))
+    assert changed(Inner(), values) == Inner()
+    assert changed(Outer(), {}) == Outer()
+
+
+def test_the_path_nearest_the_root_is_meant() -> None:
+    assert parsed(["brand_new=2"], Outer()) == {"outer.brand_new": 2.0}
+    assert parsed(["steps=3"], DistillConfig()) == {"recover.steps": 3}
+    with pytest.raises(InputError, match=r"could be simplify\.neighbors or lift\.neighbors"):
+        parsed(["neighbors=3"], DistillConfig())
+
+
+def test_a_config_is_set_as_a_whole_by_its_name_and_its_fields_after_it() -> None:
+    texts = ["schedule.rates.sh0=1", "recover.schedule=paper", "regularizers=lift"]
+    found = changed(DistillConfig(), parsed(texts, DistillConfig())).recover
+    assert found.schedule == replace(PAPER, rates=replace(PAPER.rates, sh0=1.0))
+    assert found.regularizers == PRESETS["lift"]
+    with pytest.raises(InputError, match="schedule: expected one of fast"):
+        changed(DistillConfig(), {"recover.schedule": "slow"})
+
+
+def test_regions_are_read_as_text() -> None:
+    values = parsed(["keep_region=0,0,0,1;0,0,0,1,1,2"], DistillConfig())
+    assert values == {"simplify.keep_region": ((0, 0, 0, 1), (0, 0, 0, 1, 1, 2))}
+    with pytest.raises(InputError, match="keep_region"):
+        changed(DistillConfig(), {"simplify.keep_region": ((0, 0, 0),)})
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("outer.cells", "NAME=VALUE"),
+        ("outer.cells", "PATH=VALUE"),
         ("outer.cells=7.5", "outer.cells: expected a whole number or none, not '7.5'"),
         ("outer.exact=1", "true or false"),
-        ("inner.edges=1", "2 numbers"),
+        ("edges=1", "2 numbers"),
         ("inner.brand_new=nan", "a number"),
         ("outer.mode=loud", "one of soft, hard"),
-        ("brand_new=2", "'brand_new' could be inner.brand_new or outer.brand_new"),
-        ("inner.brandnew=2", "did you mean inner.brand_new"),
-        ("egdes=1,2", "did you mean inner.edges"),
-        ("inner.worked_out=1", "no constant 'inner.worked_out'"),
+        ("inner.brandnew=2", "did you mean outer.inner.brand_new"),
+        ("egdes=1,2", "did you mean outer.inner.edges"),
+        ("inner.worked_out=1", "unknown setting 'inner.worked_out'"),
         ("qqqqqq=1", "there are outer.cells, outer.mode"),
-        ("outer.qqqqqq=1", "there are outer.cells, outer.mode, outer.exact, outer.brand_new"),
+        ("outer.inner.qqqqqq=1", "there are outer.inner.brand_new, outer.inner.edges"),
     ],
 )
-def test_what_is_refused_of_a_constant(text: str, words: str) -> None:
+def test_what_is_refused_of_a_setting(text: str, words: str) -> None:
     with pytest.raises(InputError, match=r"^[^\n]*$") as error:
-        parsed([text], {"outer": Outer()})
+        parsed([text], Outer())
     assert words in str(error.value)
 
 
-def test_what_has_an_option_is_not_set_by_name() -> None:
-    with pytest.raises(InputError, match="there is an option for that"):
-        parsed(["outer.cells=7"], {"outer": Outer()}, without=["cells"])
-    assert "cells" not in listed({"outer": Outer()}, without=["cells"])["outer"]
-
-
-def test_a_report_s_constants_can_be_typed_again() -> None:
-    paper = preset("paper", prior="lift").distill
+def test_a_report_s_settings_can_be_typed_again() -> None:
+    paper = preset("paper-lift")
     lines = [
-        f"{prefix}.{name}={','.join(map(str, value)) if isinstance(value, tuple) else str(value).lower()}"
-        for prefix, constants in listed({"recover": paper}).items()
-        for name, value in constants.items()
+        f"{path}={','.join(map(str, value)) if isinstance(value, tuple) else str(value).lower()}"
+        for path, value in listed(paper).items()
     ]
-    assert len(lines) > 40
-    assert changed(DistillConfig(), "recover", parsed(lines, {"recover": DistillConfig()})) == paper
-    json.dumps(listed({"recover": paper, "lift": LiftConfig()}), allow_nan=False)
+    assert len(lines) > 60
+    assert changed(DistillConfig(), parsed(lines, DistillConfig())) == paper
+    json.dumps(listed(paper), allow_nan=False)
 
 
 @pytest.fixture
@@ -104,18 +120,18 @@ COMMANDS = [
 SOME = {
     "simplify": "simplify.max_growth=1.5",
     "select": "select.kappa=12.5",
-    "recover": "rates.sh0=0.0125",
-    "adapt": "rates.sh0=0.0125",
+    "recover": "recover.schedule.rates.sh0=0.0125",
+    "adapt": "adapt.recovery.rates.sh0=0.0125",
     "distill": "simplify.neighbors=5",
 }
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda c: c[0])
-def test_commands_take_constants_and_report_them(
+def test_commands_take_settings_and_report_them(
     command: tuple[object, ...], folder: Path, command_line: CommandLine
 ) -> None:
     for wrong, words in (
-        ("nothing.of_the_kind=1", "no constant"),
+        ("nothing.of_the_kind=1", "unknown setting"),
         (SOME[str(command[0])].replace("=", "x="), f"did you mean {SOME[str(command[0])].split('=')[0]}"),
         (SOME[str(command[0])] + "?", "expected a"),
         (SOME[str(command[0])].split("=")[0] + "=-1", SOME[str(command[0])].split("=")[0] + ": expected"),
@@ -125,27 +141,27 @@ def test_commands_take_constants_and_report_them(
         assert words in error
         assert "--set" in error
     name, _, value = SOME[str(command[0])].partition("=")
-    prefix, _, key = name.partition(".")
     status, out, error = command_line(*command, "--set", f"{name}={value}", "--json", "-", cwd=folder)
     assert status == 0, error
-    constants = json.loads(out)["constants"]
-    assert constants[prefix][key] == float(value)
+    settings = json.loads(out)["settings"]
+    assert settings[name] == float(value)
     if command[0] in ("recover", "distill"):
-        assert constants["schedule"]["steps"] == 3  # what --steps made of it
+        assert settings["recover.schedule.steps"] == 3  # what --steps made of it
 
 
-def test_constants_in_a_config_file_and_over_it(folder: Path, command_line: CommandLine) -> None:
+def test_settings_in_a_config_file_and_over_it(folder: Path, command_line: CommandLine) -> None:
     ask = ("simplify", "a.ply", "-o", "out.ply", "--config", "c.toml", "--json", "-", "-w")
     for tables in ("[simplify]\nratio = 4\n[simplify.set]\n", "ratio = 4\n[set]\n"):
         (folder / "c.toml").write_text(f"{tables}simplify.max_growth = 1.5\nneighbors = 5\n")
         status, out, error = command_line(*ask, "--set", "neighbors=4", cwd=folder)
         assert status == 0, error
-        constants = json.loads(out)["constants"]["simplify"]
-        assert (constants["max_growth"], constants["neighbors"], constants["retention"]) == (1.5, 4, 0.65)
+        settings = json.loads(out)["settings"]
+        found = [settings[f"simplify.{name}"] for name in ("max_growth", "neighbors", "retention")]
+        assert found == [1.5, 4, 0.65]
     for content, words in (
         ("[simplify.set]\nmax_grow = 1.5\n", "did you mean simplify.max_growth"),
-        ("[simplify]\nset = 3\n", "a table of constants"),
-        ("[simplify]\nretentoin = 0.5\n", "no option of `simplify` is called retentoin"),
+        ("[simplify]\nset = 3\n", "a table of settings"),
+        ("[simplify]\nparentz = 0.5\n", "no option of `simplify` is called parentz"),
     ):
         (folder / "c.toml").write_text(content)
         status, _, error = command_line(*ask, "-r", 4, cwd=folder)
@@ -153,7 +169,7 @@ def test_constants_in_a_config_file_and_over_it(folder: Path, command_line: Comm
         assert words in error
 
 
-def test_a_constant_does_what_it_says(folder: Path, command_line: CommandLine) -> None:
+def test_a_setting_does_what_it_says(folder: Path, command_line: CommandLine) -> None:
     for growth in (1, 2):
         ask = ("simplify", "a.ply", "-r", 10, "-o", f"{growth}.ply", "--set", f"max_growth={growth}")
         status, _, error = command_line(*ask, "--no-views", cwd=folder)
@@ -174,7 +190,7 @@ PRIOR = checkered_ball()
         (("recover", "a.ply", "-o", "o.ply", "--set", "nothing=1"), "nothing"),
     ],
 )
-def test_a_printed_config_has_no_constant_that_is_not_known(
+def test_a_printed_config_has_no_setting_that_is_not_known(
     folder: Path, command_line: CommandLine, arguments: tuple[object, ...], told: str
 ) -> None:
     status, out, error = command_line(*arguments, "--print-config", cwd=folder)
@@ -188,15 +204,15 @@ def test_a_printed_config_has_no_constant_that_is_not_known(
         assert not (folder / "o").exists()
 
 
-def test_simplify_takes_constants_in_python() -> None:
+def test_simplify_takes_settings_in_python() -> None:
     whole = g2ard.simplify(PRIOR, ratio=5, method="paper", config=SimplifyConfig(min_coverage=2))
-    named = g2ard.simplify(PRIOR, ratio=5, method="paper", constants={"simplify.min_coverage": 2})
-    short = g2ard.simplify(PRIOR, ratio=5, method="paper", constants={"min_coverage": 2})
+    named = g2ard.simplify(PRIOR, ratio=5, method="paper", settings={"simplify.min_coverage": 2})
+    short = g2ard.simplify(PRIOR, ratio=5, method="paper", settings={"min_coverage": 2})
     usual = g2ard.simplify(PRIOR, ratio=5, method="paper")
     np.testing.assert_array_equal(whole.parents, named.parents)
     np.testing.assert_array_equal(whole.parents, short.parents)
     assert not np.array_equal(whole.parents, usual.parents)
-    with pytest.raises(InputError, match=r"no constant 'simplify\.min_cover'"):
-        g2ard.simplify(PRIOR, ratio=5, constants={"simplify.min_cover": 2})
-    with pytest.raises(InputError, match=r"no constant 'rates\.mean'"):
-        g2ard.distill(PRIOR, ratio=5, constants={"rates.mean": 2})
+    with pytest.raises(InputError, match=r"unknown setting 'simplify\.min_cover'"):
+        g2ard.simplify(PRIOR, ratio=5, settings={"simplify.min_cover": 2})
+    with pytest.raises(InputError, match=r"unknown setting 'rates\.mean'"):
+        g2ard.distill(PRIOR, ratio=5, settings={"rates.mean": 2})
