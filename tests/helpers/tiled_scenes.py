@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from g2ard.progress import Progress, silent
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
 from g2ard.tiles.executor import Workers, executor
@@ -45,7 +46,9 @@ def ring(count: int = 6) -> Cameras:
     )
 
 
-def reduced(store: TileStore, work: Path, budget: int = 900, **options: object) -> Splats:
+def reduced(
+    store: TileStore, work: Path, budget: int = 900, *, progress: Progress = silent, **options: object
+) -> Splats:
     where = {key: options.pop(key) for key in ("workers", "threads", "scheduler") if key in options}
     with executor(**where) as runs:  # type: ignore[arg-type]
-        return simplify_tiles(store, budget, workers=Workers(runs, work), **options).whole()  # type: ignore[arg-type]
+        return simplify_tiles(store, budget, workers=Workers(runs, work, progress), **options).whole()  # type: ignore[arg-type]
