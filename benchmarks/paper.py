@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from benchmarks.definition import Definition
 from benchmarks.methods import METHODS, MethodSpec
+from g2ard.config.presets import PRESETS
 
 __all__ = ["as_in_the_paper", "with_released"]
 
@@ -35,7 +36,8 @@ def as_in_the_paper(study: Definition, released: bool | None = None, row: str | 
     if others and not chosen:
         rates = "at the study's own rates in equal steps and seconds, on all training views"
         lines.append(f"{', '.join(others)} {rates}")
-    whole = study.narrowed(methods=rows, sh_degree=3).run_with("preset", *(lines if papers else ()))
+    degree = _PAPER["recover.sh_degree"]
+    whole = study.narrowed(methods=rows, sh_degree=degree).run_with("preset", *(lines if papers else ()))
     return with_released(whole, released is not False)
 
 
@@ -47,6 +49,7 @@ def with_released(study: Definition, released: bool) -> Definition:
     return study.narrowed(released=released).run_with("released" if released else "matched", *lines)
 
 
+_PAPER = PRESETS["paper"]
 _HALF = "50 % of the training views by directional selection"
 _BESIDE = "rows of equal steps or seconds, for all methods, stand beside each method's released schedule"
 
@@ -59,9 +62,10 @@ def _rows(methods: Sequence[MethodSpec], chosen: bool) -> Iterator[MethodSpec]:
                 continue
             method = _papers(method)
         if method.reduce == "paper":
-            method = replace(method, schedule="paper")
+            method = replace(method, schedule=_PAPER["recover.schedule"])
             if not chosen:
-                method = replace(method, policy="directional", k=0.5)
+                policy, k = _PAPER["select.policy"], _PAPER["select.views_count"]
+                method = replace(method, policy=policy, k=k)
         yield method
 
 

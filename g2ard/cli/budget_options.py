@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from g2ard.cli.panels import BUDGET
-
 if TYPE_CHECKING:
     from g2ard.policy.budget import Budget
 
@@ -154,7 +152,6 @@ CountsOption = Annotated[
         parser=Counts.parse,
         metavar="COUNT",
         help="Budget: 250000, 250k, 1.5M or 25%; several, 10k,20k, want {count} in the output's name.",
-        rich_help_panel=BUDGET,
     ),
 ]
 RatiosOption = Annotated[
@@ -165,7 +162,6 @@ RatiosOption = Annotated[
         parser=Ratios.parse,
         metavar="RATIO",
         help="Budget as a ratio: 10 keeps a tenth; several, 5,10,20, want {ratio} in the output's name.",
-        rich_help_panel=BUDGET,
     ),
 ]
 LooksOption = Annotated[
@@ -186,20 +182,11 @@ RatioOption = Annotated[
 ]
 FitOption = Annotated[
     str | None,
-    typer.Option(
-        "--fit",
-        metavar="5MB|quest3|mobile|web",
-        help="Budget: bytes of the file, or a device.",
-        rich_help_panel=BUDGET,
-    ),
+    typer.Option("--fit", metavar="5MB|quest3|mobile|web", help="Budget: bytes of the file, or a device."),
 ]
 MinPsnrOption = Annotated[
     float | None,
-    typer.Option(
-        min=1,
-        help="Budget: the fewest that keep this PSNR, dB, against the scene itself.",
-        rich_help_panel=BUDGET,
-    ),
+    typer.Option(min=1, help="Budget: the fewest that keep this PSNR, dB, against the scene itself."),
 ]
 MinSsimOption = Annotated[
     float | None,

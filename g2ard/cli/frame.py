@@ -24,7 +24,7 @@ from g2ard.cli.app import app
 from g2ard.cli.budget_options import Counts, Ratios
 from g2ard.cli.config import load_config, printed
 from g2ard.cli.console import Console
-from g2ard.cli.panels import COMMON
+from g2ard.cli.panels import COMMON, GROUPED, into_panels
 from g2ard.cli.usage import flags_of, in_flags, typed
 from g2ard.errors import G2ardError
 from g2ard.progress import plural
@@ -50,85 +50,32 @@ def _flags_win(ctx: typer.Context, values: dict[str, Any], defaults: dict[str, A
                 values[other] = defaults[other]
 
 
-_COMMON: dict[str, tuple[Any, Any]] = {
-    "quiet": (
-        Annotated[bool, typer.Option("-q", "--quiet", help="Print errors only.", rich_help_panel=COMMON)],
-        False,
-    ),
-    "verbose": (
-        Annotated[bool, typer.Option("-v", "--verbose", help="Say more.", rich_help_panel=COMMON)],
-        False,
-    ),
-    "overwrite": (
-        Annotated[
-            bool,
-            typer.Option("-w", "--overwrite", help="Replace existing outputs.", rich_help_panel=COMMON),
-        ],
-        False,
-    ),
-    "json": (
-        Annotated[
-            str | None,
-            typer.Option(
-                "--json", metavar="FILE|-", help="Write the result as JSON.", rich_help_panel=COMMON
-            ),
-        ],
-        None,
-    ),
-    "seed": (
-        Annotated[int, typer.Option(min=0, help="Seed of everything random.", rich_help_panel=COMMON)],
-        0,
-    ),
-    "threads": (
-        Annotated[
-            int,
-            typer.Option(min=0, max=256, help="Threads; 0 means every core.", rich_help_panel=COMMON),
-        ],
-        0,
-    ),
-    "device": (
-        Annotated[
-            str,
-            typer.Option(metavar="auto|cpu|gpu|cuda", help="Where to compute.", rich_help_panel=COMMON),
-        ],
-        "auto",
-    ),
+_COMMON: dict[str, tuple[Any, Any, Any]] = {
+    "quiet": (bool, False, typer.Option("-q", "--quiet", help="Print errors only.")),
+    "verbose": (bool, False, typer.Option("-v", "--verbose", help="Say more.")),
+    "overwrite": (bool, False, typer.Option("-w", "--overwrite", help="Replace existing outputs.")),
+    "json": (str | None, None, typer.Option("--json", metavar="FILE|-", help="Write the result as JSON.")),
+    "seed": (int, 0, typer.Option(min=0, help="Seed of everything random.")),
+    "threads": (int, 0, typer.Option(min=0, max=256, help="Threads; 0 means every core.")),
+    "device": (str, "auto", typer.Option(metavar="auto|cpu|gpu|cuda", help="Where to compute.")),
     "print_config": (
-        Annotated[
-            bool,
-            typer.Option(
-                "--print-config",
-                help="Print the options as a file for --config, and do nothing.",
-                rich_help_panel=COMMON,
-            ),
-        ],
+        bool,
         False,
+        typer.Option("--print-config", help="Print the options as a file for --config, and do nothing."),
     ),
     "config": (
-        Annotated[
-            Path | None,
-            typer.Option(
-                metavar="FILE.toml",
-                callback=load_config,
-                is_eager=True,
-                help="Defaults; flags win.",
-                rich_help_panel=COMMON,
-            ),
-        ],
+        Path | None,
         None,
+        typer.Option(metavar="FILE.toml", callback=load_config, is_eager=True, help="Defaults; flags win."),
     ),
 }
+"""Name → type, default and option."""
 
-
-_SET = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="PATH=VALUE",
-        help="A setting, such as recover.schedule.steps=300 (docs/options.md); reports list all. Repeatable.",
-        rich_help_panel=COMMON,
-    ),
-]
+_SET = typer.Option(
+    "--set",
+    metavar="PATH=VALUE",
+    help="A setting, such as recover.schedule.steps=300 (docs/options.md); reports list all. Repeatable.",
+)
 
 
 class Run:
@@ -298,11 +245,17 @@ def command(
 
     def register(fn: Callable[..., None]) -> Callable[..., None]:
         own = list(inspect.signature(fn, eval_str=True).parameters.values())[1:]
-        shared_options = {**_COMMON, "set": (_SET, None)} if settings else _COMMON
+        shared_options = {**_COMMON, "set": (list[str] | None, None, _SET)} if settings else _COMMON
         common = [
-            inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-            for key, (kind, default) in shared_options.items()
+            inspect.Parameter(
+                key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option]
+            )
+            for key, (kind, default, option) in shared_options.items()
         ]
+        for p in common:
+            into_panels(p.name, p.annotation, COMMON)
+        for p in own if name in GROUPED else ():
+            into_panels(p.name, p.annotation)
 
         def call(ctx: typer.Context, **values: Any) -> None:
             _flags_win(ctx, values, {p.name: p.default for p in own})

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from g2ard.cli.budget_options import Count
-from g2ard.cli.panels import METHOD, OUTPUT, RECOVERY, VIEWS
 from g2ard.config.choices import (
     BLACK,
     Convention,
@@ -45,6 +44,7 @@ __all__ = [
     "ViewsOrMadeOption",
     "can_be_made",
     "is_made",
+    "numbers",
     "picture",
     "recovery_engine",
     "trained_on",
@@ -90,13 +90,12 @@ ViewsOrMadeOption = Annotated[
         metavar="VIEWS|made",
         help="A COLMAP folder, transforms.json, cameras.json, a trainer's run or g2ard's own .json; "
         "what lies beside the scene if not given; made: generated views instead.",
-        rich_help_panel=VIEWS,
     ),
 ]
 LookOption = Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")]
 OutputOption = Annotated[
     Path,
-    typer.Option("-o", "--output", metavar="OUT", help="Where the result goes.", rich_help_panel=OUTPUT),
+    typer.Option("-o", "--output", metavar="OUT", help="Where the result goes."),
 ]
 
 
@@ -124,6 +123,21 @@ def _colour(text: str) -> Triple:
     return Triple((values[0], values[1], values[2]))
 
 
+def numbers(option: str, text: str, count: int) -> list[float]:
+    """`count` finite numbers, parted by commas or blanks.
+
+    >>> numbers("--box", "0, 0,0 1,1,1e1", 6)
+    [0.0, 0.0, 0.0, 1.0, 1.0, 10.0]
+    """
+    try:
+        found = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        found = []
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise typer.BadParameter(f"{option}: expected {count} numbers with commas between, got {text!r}")
+    return found
+
+
 def _direction(text: str) -> Triple:
     try:
         x, y, z = (float(part) for part in text.split(","))
@@ -140,7 +154,6 @@ UpOption = Annotated[
         parser=_direction,
         metavar="X,Y,Z",
         help="Away from the ground, for generated views; estimated unless given.",
-        rich_help_panel=VIEWS,
     ),
 ]
 
@@ -172,7 +185,6 @@ KeepRegionOption = Annotated[
         metavar="X,Y,Z,R|X,Y,Z,X,Y,Z",
         help="More of the budget for a sphere or a box, scene units, as if views stood twice as near "
         "(--set keep_times=4); may be repeated.",
-        rich_help_panel=METHOD,
     ),
 ]
 SplitOption = Annotated[
@@ -184,25 +196,16 @@ ShDegreeOption = Annotated[
 ]
 FormatOption = Annotated[
     FormatName,
-    typer.Option(
-        "--format", case_sensitive=False, help="Of the scene's file in RUN.", rich_help_panel=OUTPUT
-    ),
+    typer.Option("--format", case_sensitive=False, help="Of the scene's file in RUN."),
 ]
-ResumeOption = Annotated[
-    bool, typer.Option("--resume", help="Resume an interrupted run.", rich_help_panel=OUTPUT)
-]
+ResumeOption = Annotated[bool, typer.Option("--resume", help="Resume an interrupted run.")]
 SizeOption = Annotated[
     int | None,
-    typer.Option(min=16, metavar="PIXELS", help="Shrink views to this longer side.", rich_help_panel=VIEWS),
+    typer.Option(min=16, metavar="PIXELS", help="Shrink views to this longer side."),
 ]
 BackgroundOption = Annotated[
     Triple | None,
-    typer.Option(
-        parser=_colour,
-        metavar="COLOUR",
-        help="black (the default), white or R,G,B in [0, 1].",
-        rich_help_panel=VIEWS,
-    ),
+    typer.Option(parser=_colour, metavar="COLOUR", help="black (the default), white or R,G,B in [0, 1]."),
 ]
 SkyOption = Annotated[
     Triple | None,
@@ -246,8 +249,7 @@ PresetOption = Annotated[
     PresetName,
     typer.Option(
         help="Settings by name: regularisers that hold the geometry, measured by auto; or all as in the"
-        " paper, except what other options say.",
-        rich_help_panel=METHOD,
+        " paper, except what other options say."
     ),
 ]
 PaperOption = Annotated[
@@ -257,25 +259,19 @@ PaperOption = Annotated[
         help="paper, or with a row of its regularisers paper-trained, paper-lift, paper-noisy: all as in the"
         " paper, except what other options say.",
         metavar="[paper|paper-…]",
-        rich_help_panel=METHOD,
     ),
 ]
 ScheduleOption = Annotated[
     ScheduleName | None,
     typer.Option(
-        help="Rates and horizon: fast, 300 steps, default, 1,000, or best, 6,000; paper also goes by rounds.",
-        rich_help_panel=RECOVERY,
+        help="Rates and horizon: fast, 300 steps, default, 1,000, or best, 6,000; paper also goes by rounds."
     ),
 ]
 StepsOption = Annotated[
     int | None,
-    typer.Option(
-        min=1, help="Steps of the last recovery, instead of the schedule's.", rich_help_panel=RECOVERY
-    ),
+    typer.Option(min=1, help="Steps of the last recovery, instead of the schedule's."),
 ]
-MethodOption = Annotated[
-    Method | None, typer.Option(help="How to simplify: default unless given.", rich_help_panel=METHOD)
-]
+MethodOption = Annotated[Method | None, typer.Option(help="How to simplify: default unless given.")]
 
 
 def _duration(text: str) -> float:
@@ -292,7 +288,6 @@ RecoveryTimeOption = Annotated[
         parser=_duration,
         metavar="TIME",
         help="Fit recovery, and no other part, into 90s, 2m or 1h.",
-        rich_help_panel=RECOVERY,
     ),
 ]
 

@@ -1,13 +1,40 @@
-"""Titles of the panels that `--help` groups options in."""
+"""Panels that `--help` groups the options of long commands in."""
 
 from __future__ import annotations
 
-__all__ = ["BUDGET", "COMMON", "LARGE", "METHOD", "OUTPUT", "RECOVERY", "VIEWS"]
+from typing import Any, get_args
 
-BUDGET = "Budget"
-VIEWS = "Views"
-METHOD = "Method"
-RECOVERY = "Recovery"
-OUTPUT = "Output"
-LARGE = "Large scenes"
+__all__ = ["COMMON", "GROUPED", "into_panels"]
+
 COMMON = "Common"
+
+GROUPED = ("distill", "simplify", "recover", "adapt", "register", "lod")
+"""Commands with so many options that they are grouped."""
+
+_PANELS = {
+    "Budget": ("count", "ratio", "ratios", "fit", "min_psnr"),
+    "Views": (
+        *("views", "teacher", "photos", "held_out", "split", "size", "background", "up", "no_views"),
+        *("poses", "pool", "intrinsics", "focal"),
+    ),
+    "Method": (
+        *("method", "preset", "keep_region", "clean", "anchors"),
+        *("matcher", "refine", "passes", "accept", "keep", "protocol"),
+    ),
+    "Recovery": (
+        *("recover", "schedule", "steps", "recovery_time", "weighted"),
+        *("tolerance", "prior_views", "sh_degree"),
+    ),
+    "Output": (
+        *("output", "format", "parents", "resume", "dry_run", "report", "truth", "metres_per_unit"),
+        *("errors", "most", "extent", "least"),
+    ),
+    "Large scenes": ("memory", "workers"),
+}
+
+
+def into_panels(name: str, annotation: Any, panel: str | None = None) -> None:
+    """Put the option of a parameter into a panel, or into the one that its name belongs to."""
+    found = panel or next((title for title, names in _PANELS.items() if name in names), None)
+    for option in get_args(annotation)[1:]:
+        option.rich_help_panel = found

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from g2ard.cli.budget_options import Count
-from g2ard.cli.panels import LARGE
 from g2ard.cli.usage import in_flags
 
 if TYPE_CHECKING:
@@ -35,19 +34,11 @@ TileRowsOption = Annotated[
 ]
 MemoryOption = Annotated[
     str | None,
-    typer.Option(
-        metavar="SIZE",
-        help="Memory that all workers together may take, such as 4GB.",
-        rich_help_panel=LARGE,
-    ),
+    typer.Option(metavar="SIZE", help="Memory that all workers together may take, such as 4GB."),
 ]
 WorkersOption = Annotated[
     int | None,
-    typer.Option(
-        min=1,
-        help="Processes that work on tiles; as many as cores and memory allow if not given.",
-        rich_help_panel=LARGE,
-    ),
+    typer.Option(min=1, help="Processes that work on tiles; as many as cores and memory allow if not given."),
 ]
 SchedulerOption = Annotated[
     str | None,

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from g2ard.config.paths import changed, full_paths
 from g2ard.errors import InputError
 
-__all__ = ["PRESETS", "configured", "preset"]
+__all__ = ["GS_CPR", "PRESETS", "configured", "preset"]
 
 Config = TypeVar("Config")
 
@@ -36,6 +36,15 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 """Name → values by path. `auto` measures the scene to choose its regularisers, `paper` likewise among the
 paper's."""
+
+GS_CPR: dict[str, Any] = {
+    "register.matcher": "sift",
+    "register.refine": "none",
+    "register.passes": 1,
+    "register.min_inliers": 6,
+    "register.fallback": False,
+}
+"""The protocol of GS-CPR for `g2ard register`: one pass of matches and no other way to a pose."""
 
 
 def configured(config: Config, preset: str = "auto", settings: Mapping[str, Any] | None = None) -> Config:

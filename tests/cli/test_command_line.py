@@ -96,7 +96,7 @@ def test_config_file_gives_defaults_and_refuses_unknown_names(
 
 
 def test_config_file_takes_plain_toml_values(command_line: CommandLine, tmp_path: Path) -> None:
-    from scenes import checkered_ball
+    from helpers.scenes import checkered_ball
 
     from g2ard.io import read_splats, write_splats
 

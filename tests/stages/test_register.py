@@ -354,5 +354,5 @@ def test_what_keeps_its_start_is_in_the_report(site: Path, command_line: Command
     assert status == 0, err
     result = json.loads(out)
     assert any(row["zncc"] is None for row in result["photos"])
-    assert (result["config"]["passes"], result["config"]["keep"]) == (1, "all")
+    assert (result["settings"]["register.passes"], result["config"]["keep"]) == (1, "all")
     assert "kept where it started" in (tmp_path / "page.html").read_text()

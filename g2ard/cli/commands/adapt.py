@@ -20,7 +20,6 @@ from g2ard.cli.options import (
     TeacherOption,
     trained_on,
 )
-from g2ard.cli.panels import RECOVERY
 from g2ard.config.choices import AdaptSchedule
 from g2ard.progress import plural
 
@@ -32,27 +31,19 @@ def adapt(
     views: LookOption,
     output: OutputOption,
     teacher: TeacherOption = None,
-    steps: Annotated[
-        int | None, typer.Option(min=1, help="Steps at most, 7,000.", rich_help_panel=RECOVERY)
-    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps at most, 7,000.")] = None,
     tolerance: Annotated[
         float | None,
-        typer.Option(
-            min=0,
-            help="Stop when a stretch gains less than this, 0.05 dB; 0 takes all steps.",
-            rich_help_panel=RECOVERY,
-        ),
+        typer.Option(min=0, help="Stop when a stretch gains less than this, 0.05 dB; 0 takes all steps."),
     ] = None,
     schedule: Annotated[
         AdaptSchedule | None,
-        typer.Option(help="Rates and decay.", rich_help_panel=RECOVERY),
+        typer.Option(help="Rates and decay."),
     ] = None,
     prior_views: Annotated[
         float | None,
         typer.Option(
-            min=0,
-            help="Weight of the old appearance, in views, 1; 0 takes the fit as it is, as paper does.",
-            rich_help_panel=RECOVERY,
+            min=0, help="Weight of the old appearance, in views, 1; 0 takes the fit as it is, as paper does."
         ),
     ] = None,
     sh_degree: ShDegreeOption = None,

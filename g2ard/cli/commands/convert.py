@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.lists import numbers
-from g2ard.cli.options import ShDegreeOption
+from g2ard.cli.options import ShDegreeOption, numbers
 
 if TYPE_CHECKING:
     from g2ard.scene.splats import Splats

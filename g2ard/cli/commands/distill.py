@@ -36,7 +36,6 @@ from g2ard.cli.options import (
     recovery_engine,
 )
 from g2ard.cli.outputs import Outputs, budgets_of
-from g2ard.cli.panels import METHOD, OUTPUT, VIEWS
 from g2ard.cli.run_folder import (
     KEPT,
     WORK,
@@ -93,7 +92,6 @@ def distill(
         typer.Option(
             "--photos/--renders",
             help="Targets: photos, or the scene's renders; by default each view's photo if it has one.",
-            rich_help_panel=VIEWS,
         ),
     ] = None,
     held_out: Annotated[
@@ -101,7 +99,6 @@ def distill(
         typer.Option(
             metavar="VIEWS",
             help="Views to score on. --views is then used for training only, without its own test split.",
-            rich_help_panel=VIEWS,
         ),
     ] = None,
     method: MethodOption = None,
@@ -120,16 +117,12 @@ def distill(
     ] = False,
     output: Annotated[
         Path,
-        typer.Option("-o", "--output", metavar="RUN", help="Folder of the run.", rich_help_panel=OUTPUT),
+        typer.Option("-o", "--output", metavar="RUN", help="Folder of the run."),
     ],
     format: FormatOption = "ply",
     clean: Annotated[
         bool,
-        typer.Option(
-            "--clean",
-            help="First remove what no picture needs, as `g2ard clean` does.",
-            rich_help_panel=METHOD,
-        ),
+        typer.Option("--clean", help="First remove what no picture needs, as `g2ard clean` does."),
     ] = False,
     view: Annotated[
         bool,
@@ -142,11 +135,7 @@ def distill(
     up: UpOption = None,
     dry_run: Annotated[
         bool,
-        typer.Option(
-            "--dry-run",
-            help="Only estimate the time and the memory.",
-            rich_help_panel=OUTPUT,
-        ),
+        typer.Option("--dry-run", help="Only estimate the time and the memory."),
     ] = False,
     tile_rows: TileRowsOption = None,
     memory: MemoryOption = None,

@@ -26,7 +26,6 @@ from g2ard.cli.options import (
     trained_on,
     views_or_teacher,
 )
-from g2ard.cli.panels import METHOD, VIEWS
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -48,18 +47,13 @@ def recover(
     teacher: TeacherOption = None,
     photos: Annotated[
         bool,
-        typer.Option(
-            "--photos",
-            help="With --teacher: each view's photo where it has one, else the render.",
-            rich_help_panel=VIEWS,
-        ),
+        typer.Option("--photos", help="With --teacher: each view's photo where it has one, else the render."),
     ] = False,
     anchors: Annotated[
         Path | None,
         typer.Option(
             metavar="SCENE",
             help="The same Gaussians as they were simplified, where the student has been recovered since.",
-            rich_help_panel=METHOD,
         ),
     ] = None,
     preset: PresetOption = "auto",
@@ -71,11 +65,7 @@ def recover(
     split: SplitOption = "train",
     weighted: Annotated[
         bool | None,
-        typer.Option(
-            "--weights/--no-weights",
-            help="Draw views by the weights they carry, if any.",
-            rich_help_panel=VIEWS,
-        ),
+        typer.Option("--weights/--no-weights", help="Draw views by the weights they carry, if any."),
     ] = None,
     size: SizeOption = None,
     background: BackgroundOption = None,

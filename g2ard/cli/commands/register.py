@@ -52,27 +52,28 @@ def register(
         float | None, typer.Option(metavar="PX", min=1, help="Focal length of a folder's photos, pixels.")
     ] = None,
     size: Annotated[
-        int, typer.Option(min=32, metavar="PIXELS", help="Shrink photos to this longer side.")
-    ] = 1000,
+        int | None, typer.Option(min=32, metavar="PIXELS", help="Shrink photos to this longer side, 1000.")
+    ] = None,
     matcher: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="auto|sift|direct|MODULE:FUNCTION",
             help="What matches photo and render: SIFT, nothing (direct alignment), or a function of yours. "
-            "All but direct need the extra `register`; auto takes it where it is there.",
+            "All but direct need the extra `register`; auto, the default, takes it where it is there.",
         ),
-    ] = "auto",
+    ] = None,
     refine: Annotated[
-        Refinement,
+        Refinement | None,
         typer.Option(
             help="A pose from features as it is, aligned, the mean of both by information, or that polished "
-            "by the exact gradient."
+            "by the exact gradient; auto unless given."
         ),
-    ] = "auto",
-    passes: Annotated[int, typer.Option(min=1, help="Renders to match with, at most.")] = 3,
+    ] = None,
+    passes: Annotated[int | None, typer.Option(min=1, help="Renders to match with, at most; 3.")] = None,
     accept: Annotated[
-        float, typer.Option(min=0.01, max=1, help="ZNCC from which a photo counts as registered.")
-    ] = 0.6,
+        float | None,
+        typer.Option(min=0.01, max=1, help="ZNCC from which a photo counts as registered, 0.6."),
+    ] = None,
     keep: Annotated[
         Keep,
         typer.Option(
@@ -104,9 +105,8 @@ def register(
 
     Each photo is registered, uncertain or refused; OUT holds the registered ones as views.
     """
-    from dataclasses import replace
-
     from g2ard.config.paths import changed, listed
+    from g2ard.config.presets import GS_CPR
     from g2ard.errors import InputError
     from g2ard.io import check_views_output, write_views
     from g2ard.io.atomic import check_output
@@ -116,22 +116,21 @@ def register(
     from g2ard.stages.register import register as find
     from g2ard.stages.register.report import summarize
 
-    config = RegisterConfig(size=size, accept=accept, matcher=matcher, refine=refine, passes=passes)
+    names = ("size", "matcher", "refine", "passes", "accept")
+    settings = run.settings(RegisterConfig(), *names)
     if protocol == "gs-cpr":
         given = {
-            "--passes": passes not in (3, 1),
-            "--refine": refine not in ("auto", "none"),
+            "--passes": passes not in (None, 1),
+            "--refine": refine not in (None, "none"),
             "--keep": keep not in ("registered", "all"),
         }
         if contradicted := [name for name, said in given.items() if said] + ["--matcher"] * (
             matcher == "direct"
         ):
             raise typer.BadParameter(f"--protocol gs-cpr decides {contradicted[0]}; leave that out")
-        features = "sift" if matcher == "auto" else matcher
-        config = replace(config, passes=1, refine="none", fallback=False, min_inliers=6, matcher=features)
-        keep = "all"
-        run.config |= {"passes": 1, "refine": "none", "keep": keep, "matcher": features}
-    config = changed(config, run.settings(config))
+        settings, keep = GS_CPR | settings, "all"
+        run.config |= {"keep": keep}
+    config = changed(RegisterConfig(), settings)
     if metres_per_unit is not None and truth is None:
         raise typer.BadParameter("--metres-per-unit goes with --truth")
     if intrinsics is not None and focal is not None:

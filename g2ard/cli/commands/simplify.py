@@ -21,7 +21,6 @@ from g2ard.cli.options import (
     is_made,
 )
 from g2ard.cli.outputs import Outputs, budgets_of
-from g2ard.cli.panels import OUTPUT, VIEWS
 from g2ard.cli.run_result import say_weight, tell_quality
 from g2ard.cli.tile_options import (
     MemoryOption,
@@ -52,9 +51,7 @@ def simplify(
     views: ViewsOrMadeOption = None,
     no_views: Annotated[
         bool,
-        typer.Option(
-            "--no-views", help="Use no cameras at all, neither found nor generated.", rich_help_panel=VIEWS
-        ),
+        typer.Option("--no-views", help="Use no cameras at all, neither found nor generated."),
     ] = False,
     preset: PaperOption = None,
     method: MethodOption = None,
@@ -63,11 +60,7 @@ def simplify(
     output: OutputOption,
     parents: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE.npy",
-            help="Also write the row that each Gaussian went to; -1 is none.",
-            rich_help_panel=OUTPUT,
-        ),
+        typer.Option(metavar="FILE.npy", help="Also write the row that each Gaussian went to; -1 is none."),
     ] = None,
     tile_rows: TileRowsOption = None,
     memory: MemoryOption = None,
