@@ -496,6 +496,6 @@ def test_views_that_see_nothing_of_the_scene_are_refused() -> None:
     behind = replace(TEACHER, means=(TEACHER.means - 99 * ahead.forwards[0]).astype(np.float32))
     with pytest.raises(
         InputError,
-        match="recover: none of 1 view sees the scene; the views and the scene must be of one world",
+        match="none of 1 view sees the scene; the views and the scene must be of one world",
     ):
         recover(behind, TeacherRenders(TEACHER, ahead), RecoverConfig(steps=2))

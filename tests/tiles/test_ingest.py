@@ -403,7 +403,7 @@ def test_the_command(tmp_path: Path, command_line) -> None:
     status, _, said = command_line("ingest", "a.ply", "-o", "deep/tiles", cwd=tmp_path)
     assert status == 1
     assert "another scene" in said
-    assert "give -w (--overwrite) to replace it" in said
+    assert "-w (--overwrite) replaces it" in said
     assert said.count("\n") == 1
     for wrong in (("--tile-rows", "10%"), ("--set", "lift.neighbours=3")):
         assert command_line("ingest", "a.ply", "-o", "x", *wrong, cwd=tmp_path)[0] == 2
