@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 RUST := $(shell find rust -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml) Cargo.toml Cargo.lock
 
-.PHONY: demo test lint docs stress fuzz fuzz-guided miri bench bench-kernels wheel wheel-linux setup clean
+.PHONY: demo test lint docs stress fuzz fuzz-guided miri bench bench-kernels wheel wheel-linux release-check setup clean
 
 setup: $(VENV)/.built
 
@@ -93,6 +93,13 @@ $(VENV)/.zig:
 	test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet "maturin[zig]>=1.12,<2"
 	touch $@
+
+# What is published, as a user installs it: the wheel and the source distribution, each in a clean environment, run
+# README's Use section and must write the same bytes.
+release-check: $(VENV)/.maturin
+	rm -rf dist/check
+	$(BIN)/maturin build --release --locked --sdist --out dist/check
+	$(PYTHON) tests/release/check.py dist/check/*.whl dist/check/*.tar.gz
 
 # Unsafe code of the core under Miri, on the portable lanes, in minutes. Needs a nightly toolchain with miri. Tree Borrows, for
 # rayon's own crates break Stacked Borrows; rayon's threads never end.
