@@ -29,9 +29,12 @@ $(VENV)/.plain: pyproject.toml $(RUST) | $(VENV)/.maturin
 demo: $(VENV)/.plain
 	$(BIN)/python examples/01_distill_a_scene.py
 
+# Python's tests run in TEST_PROCESSES processes (0: in one), each with two threads for the kernels. Tests of determinism set
+# their own number of threads.
+TEST_PROCESSES ?= 2
 test: setup
 	cargo test --quiet --workspace
-	$(BIN)/python -m pytest
+	RAYON_NUM_THREADS=2 $(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist loadfile
 
 # Over 10,000 random gradient cases; a slice of them is in `make test`.
 stress: setup
