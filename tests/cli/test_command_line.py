@@ -96,9 +96,8 @@ def test_config_file_gives_defaults_and_refuses_unknown_names(
 
 
 def test_config_file_takes_plain_toml_values(command_line: CommandLine, tmp_path: Path) -> None:
-    from helpers.scenes import checkered_ball
-
     from g2ard.io import read_splats, write_splats
+    from helpers.scenes import checkered_ball
 
     write_splats(tmp_path / "s.ply", checkered_ball(50))
     (tmp_path / "c.toml").write_text("[simplify]\nratio = 10\nno-views = true\n")
