@@ -56,7 +56,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
             lens = lenses.get(_stem(photo_name))
             guessed += lens is None
             photo = (images or path) / photo_name
-            frames.append(_frame(str(path / name), photo_name, pose, lens or median, photo, split))
+            frames.append(_frame(path / name, photo_name, pose, lens or median, photo, split))
     found = view_set(path, frames)
     if not guessed:
         return found
@@ -64,8 +64,8 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     return replace(found, notes=(*found.notes, Note("guessed_focal", guessed, text)))
 
 
-def _frame(where: str, name: str, pose: list[float], lens: _Lens, photo: Path, split: str) -> Frame:
-    width, height = photo_size(where, photo) if photo.is_file() else _SIZE
+def _frame(where: Path, name: str, pose: list[float], lens: _Lens, photo: Path, split: str) -> Frame:
+    width, height = photo_size(photo, where) if photo.is_file() else _SIZE
     view = np.eye(4)
     view[:3, :3] = rotation(pose[3:])
     view[:3, 3] = -view[:3, :3] @ np.array(pose[:3])

@@ -128,18 +128,18 @@ def frames(path: Path, images: Path | None = None) -> tuple[Path, list[Frame]]:
     with parsing(tables[1]):
         found = (_images_bin if binary else _images_txt)(tables[1])
     if not found:
-        raise InputError(f"{tables[1]}: lists no image")
+        raise InputError("lists no image", path=tables[1])
     photos = images or _photo_folder(path, folder)
     listed = []
     sizes: dict[int, tuple[int, int]] = {}
     for image in sorted(found, key=lambda i: i.name):
         if image.camera not in cameras:
-            raise InputError(f"{tables[1]}: {image.name!r} names camera {image.camera}, which is absent")
+            raise InputError(f"{image.name!r} names camera {image.camera}, which is absent", path=tables[1])
         camera = cameras[image.camera]
         photo = photos / image.name if photos else None
         if images is not None and photo is not None and photo.is_file():
             if image.camera not in sizes:  # one lens, one size
-                sizes[image.camera] = photo_size(str(tables[1]), photo)
+                sizes[image.camera] = photo_size(photo, tables[1])
             camera = camera.at(sizes[image.camera])
         listed.append(
             Frame(image.name, _viewmat(tables[1], image), camera.K, camera.size, photo, camera.distortion)

@@ -86,7 +86,7 @@ def file_format(path: str | Path) -> Format:
         if path.is_symlink():
             raise InputError("a link that leads to no file", path=path)
         raise InputError(f"no such file or folder{_near(path)}", path=path)
-    check_regular(str(path), path)
+    check_regular(path)
     name, suffix = path.name.lower(), path.suffix.lower()
     if name in ("meta.json", "lod-meta.json"):
         return "sog"

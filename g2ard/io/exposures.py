@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import InputError
-from g2ard.io.jsonfile import read_json
+from g2ard.io.jsonfile import fields_of, numbers, read_json
 from g2ard.scene.cameras import Cameras
 
 __all__ = ["find_exposures", "read"]
@@ -22,16 +21,8 @@ def read(path: Path) -> dict[str, NDArray[np.float64]]:
     Raises:
         InputError: anything else.
     """
-    found = {}
-    for name, rows in read_json(path).items():
-        try:
-            matrix = np.array(rows, np.float64)
-        except (TypeError, ValueError, OverflowError):
-            matrix = np.zeros(0)
-        if matrix.shape != (3, 4) or not np.isfinite(matrix).all():
-            raise InputError(f"{name!r} is not a finite 3×4 matrix", path=path)
-        found[name] = matrix
-    return found
+    content = fields_of(path, read_json(path))
+    return {name: np.array(numbers(content, name, 3, 4)) for name in content}
 
 
 def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:

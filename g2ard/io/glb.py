@@ -26,6 +26,7 @@ from g2ard.io.jsonfile import (
     object_of,
     objects,
     parse_json,
+    text,
     whole,
 )
 from g2ard.io.packing import unit_quats, writable
@@ -158,8 +159,7 @@ def read(path: Path) -> Scene:
         InputError: not a .glb, no splat primitive or several, packed, turned or scaled by a node, or broken.
     """
     content, binary = _chunks(path)
-    with fields_of(f"{path}: glTF", content) as document:
-        return _scene(path, document, binary)
+    return _scene(path, fields_of(path, content), binary)
 
 
 def _chunks(path: Path) -> tuple[Any, bytes]:
@@ -177,7 +177,7 @@ def _chunks(path: Path) -> tuple[Any, bytes]:
         at += 8 + size
     if _JSON not in found:
         raise InputError("holds no JSON chunk", path=path)
-    return parse_json(f"{path}: glTF", found[_JSON]), found.get(_BIN, b"")
+    return parse_json(path, found[_JSON]), found.get(_BIN, b"")
 
 
 def _scene(path: Path, document: Fields, binary: bytes) -> Scene:
@@ -231,8 +231,8 @@ def _accessor(
 ) -> NDArray[np.float32]:
     """(count, width) of an accessor; normalised integers become fractions."""
     accessor = _pointed(document, "accessors", names, name)
-    kind = accessor["componentType"]
-    if kind not in _DTYPES or _TYPES.get(accessor["type"]) != width or "sparse" in accessor:
+    kind = whole(accessor, "componentType")
+    if kind not in _DTYPES or _TYPES.get(text(accessor, "type")) != width or "sparse" in accessor:
         raise InputError(f"attribute {name!r} is of a form that is not read", path=path)
     view = _pointed(document, "bufferViews", accessor, "bufferView")
     if view["buffer"] != 0 or "uri" in _pointed(document, "buffers", view, "buffer"):

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from g2ard.io.jsonfile import fields_of, numbers, read_json_list
-from g2ard.io.photos import Frame, find_photo, inverse, pixels, rigid, view_set
+from g2ard.io.jsonfile import fields_of, number, numbers, read_json_list, text, whole
+from g2ard.io.photos import Frame, find_photo, inverse, rigid, view_set
 from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
 
@@ -58,18 +58,17 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
 
 
 def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
-    where = f"{path}: camera {index}"
-    with fields_of(where, entry) as camera:
-        name = str(camera["img_name"])
-        world_from_camera = np.eye(4)
-        world_from_camera[:3, :3] = numbers(camera, "rotation", 3, 3)
-        world_from_camera[:3, 3] = numbers(camera, "position", 3)
-        width, height = pixels(where, camera, "width"), pixels(where, camera, "height")
-        K = [[float(camera["fx"]), 0, width / 2], [0, float(camera["fy"]), height / 2], [0, 0, 1]]
-        return Frame(
-            name=name,
-            viewmat=inverse(rigid(where, world_from_camera)),
-            K=np.array(K),
-            size=(width, height),
-            photo=find_photo(images / Path(name).name) if images else None,
-        )
+    camera = fields_of(path, entry, index, "camera")
+    name = text(camera, "img_name")
+    world_from_camera = np.eye(4)
+    world_from_camera[:3, :3] = numbers(camera, "rotation", 3, 3)
+    world_from_camera[:3, 3] = numbers(camera, "position", 3)
+    width, height = whole(camera, "width"), whole(camera, "height")
+    K = [[number(camera, "fx"), 0, width / 2], [0, number(camera, "fy"), height / 2], [0, 0, 1]]
+    return Frame(
+        name=name,
+        viewmat=inverse(rigid(world_from_camera, camera.place.to("rotation"))),
+        K=np.array(K),
+        size=(width, height),
+        photo=find_photo(images / Path(name).name) if images else None,
+    )

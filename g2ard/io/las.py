@@ -205,4 +205,4 @@ def _check_chunks(path: Path, header: Any) -> None:
             path=path,
             hint=DAMAGED,
         )
-    check_unpacked(str(path), there, header.point_count * size)
+    check_unpacked(path, there, header.point_count * size)

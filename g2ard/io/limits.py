@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
 from g2ard.errors import DAMAGED, InputError
 from g2ard.io.paths import check_regular
@@ -23,11 +23,11 @@ _ALWAYS_UNPACKED = 64 << 20
 """Bytes: what any file may unpack to; past that, `_LARGEST_RATIO` times its own size."""
 
 
-def check_unpacked(where: str, packed: int, unpacked: int) -> None:
+def check_unpacked(path: str | Path, packed: int, unpacked: int) -> None:
     """Refuse what would unpack to more than 64 MiB and to more than 100 times its size.
 
     Args:
-        where: names the file in the error.
+        path: the file, for errors.
         packed: bytes as stored.
         unpacked: bytes it says it holds.
 
@@ -43,47 +43,53 @@ def check_unpacked(where: str, packed: int, unpacked: int) -> None:
     most = max(_ALWAYS_UNPACKED, _LARGEST_RATIO * packed)
     if unpacked > most:
         raise InputError(
-            f"{packed:,} bytes would unpack to {unpacked:,}; at most {most:,} are taken", path=where
+            f"{packed:,} bytes would unpack to {unpacked:,}; at most {most:,} are taken", path=path
         )
 
 
-def check_image(where: str, width: int, height: int) -> None:
+def check_image(width: int, height: int, **fields: Any) -> None:
     """Refuse an image of more than `LARGEST_IMAGE` pixels.
+
+    Args:
+        width, height: of the image.
+        fields: of the error.
 
     Raises:
         InputError: it is larger.
     """
     if width * height > LARGEST_IMAGE:
-        raise InputError(
-            f"an image of {width:,}×{height:,} pixels; at most {LARGEST_IMAGE:,} are taken", path=where
-        )
+        raise InputError(f"has {width:,}×{height:,} pixels; at most {LARGEST_IMAGE:,} are taken", **fields)
 
 
 @contextmanager
-def opened_image(where: str, file: Path | IO[bytes]) -> Iterator[Image]:
-    """A Pillow image, its size checked before its pixels are decoded.
+def opened_image(path: Path, content: IO[bytes] | None = None) -> Iterator[Image]:
+    """Open a Pillow image, with its size checked before its pixels are decoded.
 
-    Whatever goes wrong in the block is told as a broken image.
+    Any exception in the block is reported as a broken image.
+
+    Args:
+        path: the image.
+        content: its bytes, if they are not to be read from `path`.
 
     Raises:
-        InputError: it is no image, not whole, or past `LARGEST_IMAGE`; the message begins with `where`.
+        InputError: it is no image, not whole, or past `LARGEST_IMAGE`.
         FileNotFoundError: there is no such file.
     """
     from PIL import Image, UnidentifiedImageError
 
-    if not hasattr(file, "read"):
-        check_regular(where, Path(file))
+    if content is None:
+        check_regular(path)
     try:
-        with Image.open(file) as image:
-            check_image(where, *image.size)
+        with Image.open(content or path) as image:
+            check_image(*image.size, path=path)
             yield image
     except (InputError, FileNotFoundError):
         raise
     except Image.DecompressionBombError as error:
-        raise InputError(f"an image of more than {LARGEST_IMAGE:,} pixels", path=where) from error
+        raise InputError(f"has more than {LARGEST_IMAGE:,} pixels", path=path) from error
     except UnidentifiedImageError as error:
-        raise InputError("not an image", path=where) from error
+        raise InputError("not an image", path=path) from error
     except Exception as error:  # on damage Pillow's decoders raise whatever they stumble over
         raise InputError(
-            f"not a whole image ({str(error) or type(error).__name__})", path=where, hint=DAMAGED
+            f"not a whole image ({str(error) or type(error).__name__})", path=path, hint=DAMAGED
         ) from error

@@ -74,7 +74,7 @@ def _opened(path: Path) -> int:
     try:
         return os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     except OSError as error:
-        raise OutputError(f"{path.parent}: cannot write there: {error.strerror}") from error
+        raise OutputError(f"cannot write there: {error.strerror}", path=path.parent) from error
 
 
 def _held(path: Path, file: int) -> bool:
@@ -86,7 +86,7 @@ def _held(path: Path, file: int) -> bool:
         holder = os.read(file, 20).decode("ascii", "replace").strip("\0 ")
         os.close(file)
         who = f"process {holder}" if holder.isdecimal() else "another process"
-        raise OutputError(f"{path.parent}: in use by {who}; wait for it, or name another folder") from None
+        raise OutputError(f"in use by {who}; wait for it, or name another folder", path=path.parent) from None
     except OSError:
         return True  # no locks on this file system
     try:

@@ -6,14 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io import colmap, transforms
-from g2ard.io.jsonfile import fields_of, read_json
+from g2ard.io.jsonfile import Fields, fields_of, matrix, number, read_json
 from g2ard.io.photos import Frame, inverse, rigid, view_set
 from g2ard.io.settings import Settings, below, read_settings
 from g2ard.io.types import Note, ViewSet
@@ -46,16 +45,12 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     """
     folder = path if path.is_dir() else path.parent
     file = folder / NAME
-    content = read_json(file)
-    with fields_of(str(file), content) as fields:
-        D = _affine(file, "transform", fields["transform"])
-        scale = float(fields["scale"])
+    fields = fields_of(file, read_json(file))
+    D, scale = _affine(fields, "transform"), _scale(fields, "scale")
     settings = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else None
     frames, A, applied_scale = _data(folder, settings, images)
-    if not (math.isfinite(scale) and scale > 0):
-        raise InputError(f"'scale' is {content['scale']!r}, not a number > 0", path=file)
     scale /= applied_scale
-    trained_from_saved = rigid(f"{file}: 'transform'", D @ np.linalg.inv(A))
+    trained_from_saved = rigid(D @ np.linalg.inv(A), fields.place.to("transform"))
     found = view_set(file, [_moved(frame, trained_from_saved, scale) for frame in frames])
     mode = _optimized(settings)
     if mode is None:
@@ -71,13 +66,13 @@ def _data(
     if settings is None:
         if not (folder / "transforms.json").is_file():
             raise InputError(
-                f"{folder / NAME}: neither a {CONFIG} nor a transforms.json beside it tells its data"
+                f"neither a {CONFIG} nor a transforms.json beside it tells its data", path=folder / NAME
             )
         return _saved(folder / "transforms.json", images, None)
     parser, options, data = _parser(folder / CONFIG, settings)
     place = below(folder / CONFIG, data)
     if place is None:
-        raise InputError(f"{folder / CONFIG}: its data {data.as_posix()} is not there")
+        raise InputError(f"its data {data.as_posix()} is not there", path=folder / CONFIG)
     if parser == "ColmapDataParser":
         model = place / (options.path("colmap_path") or "colmap/sparse/0")
         photos = images or place / (options.path("images_path") or "images")
@@ -91,7 +86,7 @@ def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
     manager = pipeline and pipeline[1].block("datamanager")
     parser = manager and manager[1].block("dataparser")
     if not parser or not manager:
-        raise InputError("lacks 'pipeline.datamanager.dataparser'", path=path)
+        raise InputError("is missing", path=path, property="pipeline.datamanager.dataparser")
     name = parser[0].rsplit(".", 1)[-1].removesuffix("Config")
     if name not in _PARSERS:
         raise InputError(
@@ -100,7 +95,7 @@ def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
         )
     data = settings.path("data") or manager[1].path("data") or parser[1].path("data")
     if data is None:
-        raise InputError("'data' names no folder", path=path)
+        raise InputError("names no folder", path=path, property="data")
     return name, parser[1], data
 
 
@@ -111,26 +106,20 @@ def _saved(
     file = data / "transforms.json" if (data / "transforms.json").is_file() else data
     frames = transforms.frames(file, images)
     if not frames:
-        raise InputError(f"{data}: no transforms.json in the run's data")
-    content = read_json(file) if file.is_file() else {}
+        raise InputError("no transforms.json in the run's data", path=data)
+    content = fields_of(file, read_json(file) if file.is_file() else {})
     given = content.get("applied_transform")
     if given is None and options is not None and (file.parent / "colmap" / "sparse" / "0").is_dir():
-        raise InputError(
-            "lacks 'applied_transform', and versions of nerfstudio differ in what they take for it", path=file
+        raise content.place.to("applied_transform").error(
+            "is missing, and versions of nerfstudio differ in what they take for it"
         )
-    A = _EYE if given is None else _affine(file, "applied_transform", given)
+    A = _EYE if given is None else _affine(content, "applied_transform")
     if options is not None and not any(frame.split for frame in frames):
         try:
             frames = _split(frames, options)
         except (ValueError, OverflowError) as error:
-            raise InputError(f"{data}: the run's split of it is malformed ({error})") from error
-    try:
-        applied_scale = float(content.get("applied_scale", 1.0))
-    except (TypeError, ValueError, OverflowError):
-        applied_scale = math.nan
-    if not (math.isfinite(applied_scale) and applied_scale > 0):
-        raise InputError(f"'applied_scale' is {content['applied_scale']!r}, not a number > 0", path=file)
-    return frames, A, applied_scale
+            raise InputError(f"the run's split of it is malformed ({error})", path=data) from error
+    return frames, A, _scale(content, "applied_scale", 1.0)
 
 
 def _split(frames: Sequence[Frame], options: Settings) -> list[Frame]:
@@ -173,16 +162,17 @@ def _moved(frame: Frame, transform: NDArray[np.float64], scale: float) -> Frame:
     return frame._replace(viewmat=inverse(world_from_camera))
 
 
-def _affine(path: Path, key: str, rows: Any) -> NDArray[np.float64]:
-    """(4, 4) of a 3×4 or 4×4 list."""
-    try:
-        matrix = np.array(rows, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.zeros(0)
-    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
-        raise InputError(f"{key!r} is not a finite 3×4 matrix", path=path)
+def _affine(holder: Fields, key: str) -> NDArray[np.float64]:
+    """Return a 3×4 or 4×4 list as a (4, 4) rotation and translation."""
     out = np.eye(4)
-    out[:3] = matrix[:3]
+    out[:3] = matrix(holder, key)[:3]
     if not 0.99 < abs(np.linalg.det(out[:3, :3])) < 1.01:
-        raise InputError(f"{key!r} is no rotation", path=path)
+        raise holder.place.to(key).error("is no rotation")
     return out
+
+
+def _scale(holder: Fields, key: str, default: float | None = None) -> float:
+    scale = number(holder, key, default)
+    if not scale > 0:
+        raise holder.place.to(key).unexpected(scale, "a number > 0")
+    return scale

@@ -9,7 +9,7 @@ import numpy as np
 
 from g2ard.errors import InputError
 from g2ard.io import colmap, transforms
-from g2ard.io.jsonfile import fields_of, read_any_json, read_json_list
+from g2ard.io.jsonfile import Fields, fields_of, matrix, read_any_json, read_json_list, text
 from g2ard.io.photos import Frame, photo_size, rigid, view_set
 from g2ard.io.settings import below
 from g2ard.io.types import ViewSet
@@ -66,20 +66,19 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
 def _frame(
     path: Path, index: int, entry: Any, images: Path | None, lenses: dict[Path, dict[str, _Lens]]
 ) -> Frame:
-    where = f"{path}: camera {index}"
-    with fields_of(where, entry) as camera:
-        file_path = Path(str(camera["file_path"]))
-        viewmat = transforms.opencv_view(rigid(where, np.array(camera["transform"], np.float64)))
+    camera = fields_of(path, entry, index, "camera")
+    file_path = Path(text(camera, "file_path"))
+    world_from_camera = rigid(matrix(camera, "transform"), camera.place.to("transform"))
     there = below(path, file_path)
     ups = (below(path, up) for up in file_path.parents[:3] if up.parts)
-    lens = _lens(where, file_path, there or next(filter(None, ups), None), lenses)
+    lens = _lens(camera, file_path, there or next(filter(None, ups), None), lenses)
     photo = images / file_path.name if images else there
-    if photo is not None and photo.is_file() and (size := photo_size(where, photo)) != lens.size:
+    if photo is not None and photo.is_file() and (size := photo_size(photo, path)) != lens.size:
         zoom = np.diag([size[0] / lens.size[0], size[1] / lens.size[1], 1.0])
         lens = lens._replace(K=zoom @ lens.K, size=size)
     return Frame(
         name=file_path.name,
-        viewmat=viewmat,
+        viewmat=transforms.opencv_view(world_from_camera),
         K=lens.K,
         size=lens.size,
         photo=photo or file_path,
@@ -88,18 +87,18 @@ def _frame(
     )
 
 
-def _lens(where: str, named: Path, place: Path | None, known: dict[Path, dict[str, _Lens]]) -> _Lens:
+def _lens(camera: Fields, named: Path, place: Path | None, known: dict[Path, dict[str, _Lens]]) -> _Lens:
     """By the photo's file name, out of the data in the nearest folder above it that holds any."""
     for folder in () if place is None else (place, *place.parents[:3]):
         if folder not in known:
             known[folder] = _lenses(folder)
         if named.name in known[folder]:
             return known[folder][named.name]
-    raise InputError(
-        f"ns-export writes no intrinsics, and no transforms.json or COLMAP model above "
-        f"{named.as_posix()} tells them; give the run's folder (with its dataparser_transforms.json) instead",
-        path=where,
+    error = camera.place.error(
+        "has no intrinsics, which ns-export does not write, and no transforms.json or COLMAP model above "
+        f"{named.as_posix()} has them"
     )
+    raise error.at(hint="give the run's folder (with its dataparser_transforms.json) instead")
 
 
 def _lenses(folder: Path) -> dict[str, _Lens]:

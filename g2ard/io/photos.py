@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.io.jsonfile import Place
 from g2ard.io.limits import opened_image
 from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
@@ -23,7 +24,6 @@ __all__ = [
     "inverse",
     "photo_size",
     "pictured",
-    "pixels",
     "rigid",
     "rotation",
     "view_set",
@@ -54,30 +54,21 @@ def find_photo(path: Path) -> Path:
     return next((p for p in tried if p.is_file()), path)
 
 
-def photo_size(where: str, path: Path) -> tuple[int, int]:
-    """Width and height of a photo, from its header.
+def photo_size(path: Path, listed_in: Path | None = None) -> tuple[int, int]:
+    """Return width and height of a photo, from its header.
 
     Args:
-        where: names the file that lists the photo, in errors.
         path: the photo.
+        listed_in: the file that names it, for errors.
 
     Raises:
         InputError: it is not an image, or past `LARGEST_IMAGE`.
     """
-    with opened_image(f"{where}: {path}", path) as image:
-        return image.size
-
-
-def pixels(where: str, values: Mapping[str, Any], key: str) -> int:
-    """A side of an image as a file states it, 80 or 80.0.
-
-    Raises:
-        InputError: it is not a whole number.
-    """
-    value = float(values[key])
-    if not value.is_integer():
-        raise InputError(f"{key!r} is {values[key]!r}, not a whole number of pixels", path=where)
-    return int(value)
+    try:
+        with opened_image(path) as image:
+            return image.size
+    except InputError as error:
+        raise error if listed_in is None else error.at(hint=f"{listed_in} names it") from None
 
 
 def rotation(quat: Sequence[float]) -> NDArray[np.float64]:
@@ -93,18 +84,18 @@ def rotation(quat: Sequence[float]) -> NDArray[np.float64]:
     )
 
 
-def rigid(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rigid transform nearest to a (4, 4) or (3, 4) pose, which may carry rounding or a uniform scale.
+def rigid(matrix: NDArray[np.float64], place: Place) -> NDArray[np.float64]:
+    """Return the rigid transform nearest to a (4, 4) or (3, 4) pose, which may carry rounding or one scale.
 
     Raises:
         InputError: it is not finite, mirrored, or further than 1 % from a rotation.
     """
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
-        raise InputError("its pose is not a finite 4×4 matrix", path=where)
+        raise place.error("is not a finite 4×4 matrix")
     U, s, Vt = np.linalg.svd(matrix[:3, :3])
     R = U @ Vt
     if not s[0] > 0 or s[2] < 0.99 * s[0] or np.linalg.det(R) < 0:
-        raise InputError("its pose is not a rotation and a translation", path=where)
+        raise place.error("is not a rotation and a translation")
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = R, matrix[:3, 3]
     return out
@@ -129,8 +120,10 @@ def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
             [f.distortion for f in frames],
             [_mask(f) for f in frames],
         )
-    except (InputError, OverflowError) as error:
-        raise InputError(f"{error}", path=path) from error
+    except InputError as error:
+        raise error.at(path=path) from error
+    except OverflowError as error:
+        raise InputError("a view is larger than any image", path=path) from error
 
 
 def _mask(frame: Frame) -> Path | None:

@@ -87,9 +87,9 @@ class PointStream(ABC):
         """
         tally = self.tally
         if not tally.rows:
-            raise InputError(f"{self.path}: holds no points")
+            raise InputError("holds no points", path=self.path)
         if tally.dropped == tally.rows:
-            raise InputError(f"{self.path}: none of its {plural(tally.rows, 'point')} is finite")
+            raise InputError(f"none of its {plural(tally.rows, 'point')} is finite", path=self.path)
         if not tally.dropped:
             return self.notes()
         text = f"{plural(tally.dropped, 'non-finite point')} dropped (the first is row {tally.first})"

@@ -6,7 +6,6 @@ detail are alternatives, not parts: only the finest is read.
 
 from __future__ import annotations
 
-import os
 import re
 import struct
 import zipfile
@@ -35,7 +34,7 @@ from g2ard.io.jsonfile import (
 from g2ard.io.limits import check_unpacked
 from g2ard.io.paths import check_regular
 from g2ard.io.sanitize import Raw, cleaned
-from g2ard.io.sog_chunk import Chunk, Decoder, count_of, means_of, meta_errors, rest_of
+from g2ard.io.sog_chunk import Chunk, Decoder, count_of, means_of, rest_of
 from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Note, Scene
 
@@ -69,26 +68,24 @@ def chunks_of(path: Path) -> list[Path]:
 
 def _listed(index: Path) -> list[Path]:
     """The chunks that lod-meta.json's tree uses at level 0, in the order of its list."""
-    with fields_of(str(index), read_json(index)) as content:
-        names = names_of(content, "filenames", len(listed(content, "filenames")))
-        files = [index.parent / Path(name).parent for name in names]
-        used: set[int] = set()
-        nodes = [object_of(content, "tree")]
-        while nodes:
-            node = nodes.pop()
-            nodes.extend(objects(node, "children"))
-            if "lods" in node and "0" in (levels := object_of(node, "lods")):
-                used.add(index_of(object_of(levels, "0"), "file", len(files)))
-        for i in sorted(used):
-            try:
-                there = (files[i] / "meta.json").is_file()
-            except OSError as error:  # a name too long
-                raise InputError(
-                    f"{index}: 'filenames[{i}]' cannot be looked for: {error.strerror}"
-                ) from error
-            if not there:
-                raise InputError(f"{index}: names {names[i]}, which is absent")
-        return [files[i] for i in sorted(used)]
+    content = fields_of(index, read_json(index))
+    names = names_of(content, "filenames", len(listed(content, "filenames")))
+    files = [index.parent / Path(name).parent for name in names]
+    used: set[int] = set()
+    nodes = [object_of(content, "tree")]
+    while nodes:
+        node = nodes.pop()
+        nodes.extend(objects(node, "children"))
+        if "lods" in node and "0" in (levels := object_of(node, "lods")):
+            used.add(index_of(object_of(levels, "0"), "file", len(files)))
+    for i in sorted(used):
+        try:
+            there = (files[i] / "meta.json").is_file()
+        except OSError as error:  # a name too long
+            raise content.place.to("filenames").to(i).error(f"cannot be found ({error.strerror})") from error
+        if not there:
+            raise content.place.to("filenames").to(i).error(f"names {names[i]}, which is absent")
+    return [files[i] for i in sorted(used)]
 
 
 def read(path: Path) -> Scene:
@@ -130,9 +127,8 @@ def _offset(chunks: list[Chunk]) -> NDArray[np.float64]:
     """What g2ard's own writer left under "g2ard"; zeros without it, or where chunks differ."""
     found = set()
     for chunk in chunks:
-        with meta_errors(chunk):
-            own = object_of(chunk.meta, "g2ard") if "g2ard" in chunk.meta else Fields({})
-            found.add(tuple(numbers(own, "offset", 3)) if "offset" in own else (0.0, 0.0, 0.0))
+        own = object_of(chunk.meta, "g2ard") if "g2ard" in chunk.meta else Fields({})
+        found.add(tuple(numbers(own, "offset", 3)) if "offset" in own else (0.0, 0.0, 0.0))
     return np.array(found.pop() if len(found) == 1 else (0, 0, 0), np.float64)
 
 
@@ -199,7 +195,7 @@ class _SogStream(SceneStream):
 def _opened(path: Path) -> Iterator[list[Chunk]]:
     if path.suffix.lower() != ".sog":
         yield [
-            Chunk(f"{f}{os.sep}", Fields(read_json(f / "meta.json")), _folder_loader(f))
+            Chunk(f, fields_of(f / "meta.json", read_json(f / "meta.json")), _folder_loader(f))
             for f in chunks_of(path)
         ]
         return
@@ -210,10 +206,8 @@ def _opened(path: Path) -> Iterator[list[Chunk]]:
                 raise InputError("no meta.json in it", path=path)
             prefix = min(inside, key=len).removesuffix("meta.json")
             load = _bundle_loader(path, bundle, prefix)
-            meta = parse_json(f"{path}: meta.json", load("meta.json"))
-            if not isinstance(meta, dict):
-                raise InputError("meta.json: expected a JSON object", path=path)
-            yield [Chunk(f"{path}: ", Fields(meta), load)]
+            file = path / "meta.json"
+            yield [Chunk(path, fields_of(file, parse_json(file, load("meta.json"))), load)]
     except InputError:
         raise
     except (zipfile.BadZipFile, EOFError, OSError, ValueError, struct.error, OverflowError) as error:
@@ -225,18 +219,18 @@ def _bundle_loader(path: Path, bundle: zipfile.ZipFile, prefix: str) -> Callable
 
     def load(name: str) -> bytes:
         info = bundle.getinfo(prefix + name)
-        check_unpacked(f"{path}: {name}", info.compress_size, info.file_size)
+        check_unpacked(path / name, info.compress_size, info.file_size)
         try:
             return bundle.read(info)
         except (zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError, zlib.error) as error:
-            raise InputError(f"{name}: not whole in the .sog archive ({error})", path=path) from error
+            raise InputError(f"not whole in the archive ({error})", path=path / name) from error
 
     return load
 
 
 def _folder_loader(folder: Path) -> Callable[[str], bytes]:
     def load(name: str) -> bytes:
-        check_regular(str(folder / name), folder / name)
+        check_regular(folder / name)
         return (folder / name).read_bytes()
 
     return load

@@ -5,11 +5,12 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from g2ard.errors import InputError
-from g2ard.io.jsonfile import Fields, fields_of, listed, names_of, numbers, object_of, whole
+from g2ard.io.jsonfile import Fields, listed, names_of, numbers, object_of, whole
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from g2ard.io.sanitize import Raw
 
-__all__ = ["Chunk", "Decoder", "count_of", "means_of", "meta_errors", "rest_of"]
+__all__ = ["Chunk", "Decoder", "count_of", "means_of", "rest_of"]
 
 _COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
 _LARGEST = float.fromhex("0x1.fffffep+127")
@@ -29,42 +30,40 @@ _PALETTE_COLUMNS = 64
 
 
 class Chunk(NamedTuple):
-    """One meta.json, and how to get at the files beside it; `where` and a file's name tell which it is."""
+    """One meta.json, the folder or archive it is in, and how to read the files beside it."""
 
-    where: str
+    place: Path
     meta: Fields
     load: Callable[[str], bytes]
 
 
-def meta_errors(chunk: Chunk) -> AbstractContextManager[Fields]:
-    """Turn what a malformed meta.json causes into one line that names the property."""
-    return fields_of(f"{chunk.where}meta.json", chunk.meta)
-
-
 def count_of(chunk: Chunk) -> int:
-    with meta_errors(chunk):
-        version = chunk.meta.get("version", 1)
-        if version not in (1, 2):
-            raise InputError(f"{chunk.where}meta.json: SOG version {version!r} is not known (1 and 2 are)")
-        means = object_of(chunk.meta, "means")
-        (first,) = names_of(means, "files", 1)
-        count = whole(chunk.meta, "count") if version == 2 else whole(listed(means, "shape"), 0)
+    version = chunk.meta.get("version", 1)
+    if version not in (1, 2):
+        raise chunk.meta.place.to("version").unexpected(version, "1 or 2")
+    means = object_of(chunk.meta, "means")
+    (first,) = names_of(means, "files", 1)
+    count = whole(chunk.meta, "count") if version == 2 else whole(listed(means, "shape"), 0)
     with _opened_image(chunk, first) as image:  # before room is made for them
         if image.width * image.height < count:
             pixels = image.width * image.height
-            raise InputError(f"{chunk.where}{first} has {pixels:,} pixels for {count:,} Gaussians")
+            raise InputError(f"has {pixels:,} pixels for {count:,} Gaussians", path=chunk.place / first)
     return count
 
 
 def rest_of(chunk: Chunk) -> int:
     """How many coefficients past band 0; version 1 tells only by the width of its palette image."""
-    with meta_errors(chunk):
-        if "shN" not in chunk.meta:
-            return 0
-        if "bands" in (part := object_of(chunk.meta, "shN")):
-            return _COEFFICIENTS[whole(part, "bands")]
-        width = _image(chunk, _sh_files(chunk)[0]).shape[1]
-        return {_PALETTE_COLUMNS * k: k for k in (3, 8, 15)}[width]
+    if "shN" not in chunk.meta:
+        return 0
+    if "bands" in (part := object_of(chunk.meta, "shN")):
+        if (bands := whole(part, "bands")) not in _COEFFICIENTS:
+            raise part.place.to("bands").unexpected(bands, "0 to 3")
+        return _COEFFICIENTS[bands]
+    file = _sh_files(chunk)[0]
+    rest, left = divmod(_image(chunk, file).shape[1], _PALETTE_COLUMNS)
+    if left or rest not in _COEFFICIENTS.values():
+        raise InputError("is not as wide as a palette of SH degree 1 to 3", path=chunk.place / file)
+    return rest
 
 
 def _sh_files(chunk: Chunk) -> tuple[str, str]:
@@ -81,14 +80,13 @@ def _opened_image(chunk: Chunk, name: str) -> Iterator[Image]:
 
     from g2ard.io.limits import opened_image
 
-    where = f"{chunk.where}{name}"
     try:
         data = chunk.load(name)
     except (KeyError, FileNotFoundError) as error:
-        raise InputError(f"{where} is missing") from error
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise InputError(f"{where} cannot be read ({error})") from error
-    with opened_image(where, io.BytesIO(data)) as image:
+        raise InputError("no such file", path=chunk.place / name) from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be read ({error})", path=chunk.place / name) from error
+    with opened_image(chunk.place / name, io.BytesIO(data)) as image:
         yield image
 
 
@@ -104,7 +102,7 @@ def _rows(chunk: Chunk, name: str, count: int) -> NDArray[np.uint8]:
     """(count, 4) bytes, one pixel a Gaussian."""
     pixels = _image(chunk, name).reshape(-1, 4)
     if len(pixels) < count:
-        raise InputError(f"{chunk.where}{name} has {len(pixels):,} pixels for {count:,} Gaussians")
+        raise InputError(f"has {len(pixels):,} pixels for {count:,} Gaussians", path=chunk.place / name)
     return pixels[:count]
 
 
@@ -117,19 +115,18 @@ class Decoder:
 
     def __init__(self, chunk: Chunk, count: int) -> None:
         meta, self.chunk = chunk.meta, chunk
-        with meta_errors(chunk):
-            self._low, self._high, self._quats, self._scales, self._base = (
-                _rows(chunk, name, count)
-                for part, files in (("means", 2), ("quats", 1), ("scales", 1), ("sh0", 1))
-                for name in names_of(object_of(meta, part), "files", files)
-            )
-            self._positions = _positions(object_of(meta, "means"))
-            scales, base = object_of(meta, "scales"), object_of(meta, "sh0")
-            self._log_scales, self._colors = _Values(chunk, "scales", scales), _Values(chunk, "sh0", base)
-            self._logits = _logits(base)
-            self._rest = rest_of(chunk)
-            if self._rest:
-                self._palette, self._labels = _palette(chunk, self._rest, count)
+        self._low, self._high, self._quats, self._scales, self._base = (
+            _rows(chunk, name, count)
+            for part, files in (("means", 2), ("quats", 1), ("scales", 1), ("sh0", 1))
+            for name in names_of(object_of(meta, part), "files", files)
+        )
+        self._positions = _positions(object_of(meta, "means"))
+        scales, base = object_of(meta, "scales"), object_of(meta, "sh0")
+        self._log_scales, self._colors = _Values(scales), _Values(base)
+        self._logits = _logits(base)
+        self._rest = rest_of(chunk)
+        if self._rest:
+            self._palette, self._labels = _palette(chunk, self._rest, count)
 
     def fill(self, rows: slice, raw: Raw) -> None:
         """Decode the Gaussians `rows` into `raw`, in blocks that stay in the cache."""
@@ -137,8 +134,7 @@ class Decoder:
 
         for start in range(rows.start, rows.stop, BLOCK):
             stop = min(start + BLOCK, rows.stop)
-            with meta_errors(self.chunk):
-                self._fill(slice(start, stop), raw.take(slice(start - rows.start, stop - rows.start)))
+            self._fill(slice(start, stop), raw.take(slice(start - rows.start, stop - rows.start)))
 
     def _fill(self, rows: slice, raw: Raw) -> None:
         _fill_means(raw.means, self._low[rows], self._high[rows], self._positions)
@@ -157,8 +153,12 @@ class Decoder:
         index = self._labels[rows, 0] + (self._labels[rows, 1].astype(np.intp) << 8)
         if index.max() >= len(self._palette):
             row = int(np.argmax(index >= len(self._palette)))
-            named = f"Gaussian {rows.start + row} names entry {index[row]} of {len(self._palette)}"
-            raise InputError(f"{self.chunk.where}{_sh_files(self.chunk)[1]}: {named}")
+            raise InputError(
+                f"names entry {index[row]} of {len(self._palette)}",
+                path=self.chunk.place / _sh_files(self.chunk)[1],
+                index=rows.start + row,
+                item="Gaussian",
+            )
         np.take(self._palette, index, axis=0, out=out[:, : self._rest], mode="clip")
 
 
@@ -170,12 +170,11 @@ def means_of(chunk: Chunk, count: int) -> NDArray[np.float32]:
     """
     import numpy as np
 
-    with meta_errors(chunk):
-        part = object_of(chunk.meta, "means")
-        low, high = (_rows(chunk, name, count) for name in names_of(part, "files", 2))
-        means = np.empty((count, 3), np.float32)
-        _fill_means(means, low, high, _positions(part))
-        return means
+    part = object_of(chunk.meta, "means")
+    low, high = (_rows(chunk, name, count) for name in names_of(part, "files", 2))
+    means = np.empty((count, 3), np.float32)
+    _fill_means(means, low, high, _positions(part))
+    return means
 
 
 def _fill_means(
@@ -210,10 +209,10 @@ def _logits(part: Fields) -> NDArray[Any]:
 class _Values:
     """What bytes stand for: by codebook (version 2), or between mins and maxs (version 1)."""
 
-    def __init__(self, chunk: Chunk, name: str, part: Fields) -> None:
+    def __init__(self, part: Fields) -> None:
         import numpy as np
 
-        self._where = f"{chunk.where}meta.json: malformed '{name}.codebook'"
+        self._place = part.place.to("codebook")
         self._book: NDArray[Any] | None = None
         if "codebook" in part:
             count = len(listed(part, "codebook"))
@@ -227,7 +226,7 @@ class _Values:
             values: NDArray[Any] = self._low + (self._high - self._low) * (codes / 255)
             return values
         if len(self._book) < 256 and codes.size and (top := int(codes.max())) >= len(self._book):
-            raise InputError(f"{self._where}: expected at least {top + 1} numbers, found {len(self._book)}")
+            raise self._place.error(f"has {len(self._book)} numbers, expected at least {top + 1}")
         return self._book[codes]
 
 
@@ -265,7 +264,9 @@ def _palette(chunk: Chunk, rest: int, count: int) -> tuple[NDArray[np.float32], 
     centroids, labels = _sh_files(chunk)
     image = _image(chunk, centroids)
     if image.shape[1] != _PALETTE_COLUMNS * rest:
-        raise InputError(f"{chunk.where}{centroids} is {image.shape[1]} wide, not {_PALETTE_COLUMNS * rest}")
-    values = _Values(chunk, "shN", object_of(chunk.meta, "shN"))
+        raise InputError(
+            f"is {image.shape[1]} wide, not {_PALETTE_COLUMNS * rest}", path=chunk.place / centroids
+        )
+    values = _Values(object_of(chunk.meta, "shN"))
     palette = values.of(image[:, :, :3].reshape(-1, rest, 3)).astype(np.float32)
     return palette, _rows(chunk, labels, count)

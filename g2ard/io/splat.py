@@ -51,7 +51,7 @@ class _SplatStream(SceneStream):
         for first in range(start, self.count, rows):
             block = np.fromfile(self.path, _ROW, rows, offset=first * _ROW.itemsize)
             if len(block) < min(rows, self.count - first):
-                raise InputError(f"{self.path}: became shorter while it was read")
+                raise InputError("became shorter while it was read", path=self.path)
             yield _raw(block)
 
 

@@ -102,7 +102,7 @@ def _gunzip(path: Path, data: bytes) -> bytes:
         if len(head) < _HEADER:
             return head
         promised = sum(_sizes(path, head))
-        check_unpacked(str(path), len(data), promised)
+        check_unpacked(path, len(data), promised)
         body = stream.decompress(stream.unconsumed_tail, promised) if promised else b""
     except zlib.error as error:
         raise InputError(f"truncated or broken gzip stream ({error})", path=path, hint=DAMAGED) from error
@@ -139,7 +139,7 @@ def _slices(path: Path, data: bytes, sizes: list[int]) -> list[bytes]:
 def _zstd_streams(path: Path, data: bytes, stream_count: int, sizes: list[int]) -> list[bytes]:
     """Version 4: a table of (packed, unpacked) sizes where the header says, then one frame a stream."""
     decompress = _zstd(path)
-    check_unpacked(str(path), len(data), sum(sizes))
+    check_unpacked(path, len(data), sum(sizes))
     try:
         (table,) = struct.unpack_from("<I", data, 16)
         entries = [struct.unpack_from("<QQ", data, table + 16 * i) for i in range(stream_count)]

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.io.jsonfile import fields_of, read_json
-from g2ard.io.photos import Frame, find_photo, inverse, photo_size, pixels, rigid, view_set
+from g2ard.io.jsonfile import Fields, fields_of, matrix, number, optional_text, read_json, text, whole
+from g2ard.io.photos import Frame, find_photo, inverse, photo_size, rigid, view_set
 from g2ard.io.types import ViewSet
 
 __all__ = ["files_of", "frames", "opencv_view", "read"]
@@ -80,7 +80,7 @@ def _stated(path: Path, content: dict[str, Any]) -> dict[str, str]:
     for split in ("train", "val", "test"):
         names = content.get(f"{split}_filenames", ())
         if not isinstance(names, list | tuple):
-            raise InputError(f"'{split}_filenames' is not a list", path=path)
+            raise InputError("is not a list", path=path, property=f"{split}_filenames")
         for listed in names:
             name = Path(str(listed)).as_posix()
             if stated.setdefault(name, split) != split and stated[name] == "train":
@@ -89,37 +89,34 @@ def _stated(path: Path, content: dict[str, Any]) -> dict[str, str]:
 
 
 def _frame(path: Path, index: int, content: dict[str, Any], entry: Any, images: Path | None) -> Frame:
-    where = f"{path}: frame {index}"
-    shared = content if isinstance(entry, dict) else {}
-    with fields_of(where, {**shared, **entry} if shared else entry) as frame:
-        if "rot_mat" in frame:
-            frame.update(_from_matrix_city(path, frame))
-        file_path = str(frame["file_path"])
-        mask = frame.get("mask_path")
-        world_from_camera = np.array(frame["transform_matrix"], np.float64)
-        photo = find_photo(images / Path(file_path).name if images else path.parent / file_path)
-        return Frame(
-            name=file_path.removeprefix("./").removeprefix("images/"),
-            viewmat=opencv_view(rigid(where, world_from_camera)),
-            photo=photo,
-            mask=None if mask is None else _there(where, path.parent / str(mask)),
-            **_intrinsics(where, frame, photo),
-        )
+    frame = fields_of(path, {**content, **entry} if isinstance(entry, dict) else entry, index, "frame")
+    if "rot_mat" in frame:
+        frame.update(_from_matrix_city(path, frame))
+    file_path, mask = text(frame, "file_path"), optional_text(frame, "mask_path")
+    world_from_camera = rigid(matrix(frame, "transform_matrix"), frame.place.to("transform_matrix"))
+    photo = find_photo(images / Path(file_path).name if images else path.parent / file_path)
+    return Frame(
+        name=file_path.removeprefix("./").removeprefix("images/"),
+        viewmat=opencv_view(world_from_camera),
+        photo=photo,
+        mask=None if mask is None else _there(frame, path.parent / mask),
+        **_intrinsics(path, frame, photo),
+    )
 
 
-def _from_matrix_city(path: Path, frame: dict[str, Any]) -> dict[str, Any]:
+def _from_matrix_city(path: Path, frame: Fields) -> dict[str, Any]:
     """A frame of one of its blocks: photos by number, and rotations a hundredth of what they should be.
 
     Positions stay as written, metres; its pose folders (transforms_train.json) count in 100 m instead.
     """
-    name = f"{int(frame['frame_index']):04d}.png"
+    name = f"{whole(frame, 'frame_index'):04d}.png"
     places = [folder for folder in ("", "rgb/", "input/") if (path.parent / folder / name).is_file()]
     return {"file_path": (places or [""])[0] + name, "transform_matrix": frame["rot_mat"]}
 
 
-def _there(where: str, mask: Path) -> Path:
+def _there(frame: Fields, mask: Path) -> Path:
     if not mask.is_file():
-        raise InputError(f"its mask {mask} does not exist", path=where)
+        raise frame.place.to("mask_path").error(f"names {mask}, which does not exist")
     return mask
 
 
@@ -128,42 +125,42 @@ def opencv_view(world_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
     return inverse(world_from_camera @ _FLIP)
 
 
-def _intrinsics(where: str, values: dict[str, Any], photo: Path) -> dict[str, Any]:
-    model = str(values.get("camera_model", "OPENCV"))
+def _intrinsics(path: Path, values: Fields, photo: Path) -> dict[str, Any]:
+    model = text(values, "camera_model", "OPENCV")
     if model not in _MODELS or values.get("is_fisheye"):
         known = ", ".join(_MODELS)
-        raise InputError(
-            f"a {model} lens, or a fisheye, is not supported ({known} are); undistort the photos", path=where
-        )
-    width, height = _size(where, values, photo)
+        error = values.place.error(f"has a {model} lens, or a fisheye, which is not supported ({known} are)")
+        raise error.at(hint="undistort the photos")
+    width, height = _size(path, values, photo)
     fx = _focal(values, "x", width)
     fy = _focal(values, "y", height) or fx
     if fx is None or fy is None:
-        raise InputError("no focal length (fl_x or camera_angle_x)", path=where)
-    cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
+        raise values.place.error("has no focal length (fl_x or camera_angle_x)")
+    cx, cy = number(values, "cx", width / 2), number(values, "cy", height / 2)
     return {
         "K": np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
         "size": (width, height),
-        "distortion": tuple(float(values.get(key, 0)) for key in ("k1", "k2", "p1", "p2", "k3")),
+        "distortion": tuple(number(values, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")),
     }
 
 
-def _focal(values: dict[str, Any], axis: str, pixels: int) -> float | None:
+def _focal(values: Fields, axis: str, pixels: int) -> float | None:
     if f"fl_{axis}" in values:
-        return float(values[f"fl_{axis}"])
+        return number(values, f"fl_{axis}")
     if axis == "y" and "fl_x" in values:
         return None  # square pixels, rather than an angle of another camera
-    angle = values.get(f"camera_angle_{axis}")
-    if angle is None:
+    key = f"camera_angle_{axis}"
+    if values.get(key) is None:
         return None
-    if not _LEAST_ANGLE < float(angle) < math.pi - _LEAST_ANGLE:
-        raise ValueError(f"camera_angle_{axis} is {angle!r}, expected radians between 0 and π")
-    return 0.5 * pixels / math.tan(0.5 * float(angle))
+    angle = number(values, key)
+    if not _LEAST_ANGLE < angle < math.pi - _LEAST_ANGLE:
+        raise values.place.to(key).unexpected(angle, "radians between 0 and π")
+    return 0.5 * pixels / math.tan(0.5 * angle)
 
 
-def _size(where: str, values: dict[str, Any], photo: Path) -> tuple[int, int]:
+def _size(path: Path, values: Fields, photo: Path) -> tuple[int, int]:
     if "w" in values and "h" in values:
-        return pixels(where, values, "w"), pixels(where, values, "h")
+        return whole(values, "w"), whole(values, "h")
     if photo.is_file():
-        return photo_size(where, photo)
-    raise InputError("neither w and h nor its photo is there to tell the size", path=where)
+        return photo_size(photo, path)
+    raise values.place.error("has neither w and h nor a photo that tells its size")

@@ -9,13 +9,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
-from g2ard.io.jsonfile import fields_of, numbers, read_json
+from g2ard.io.jsonfile import (
+    Fields,
+    fields_of,
+    listed,
+    matrix,
+    number,
+    numbers,
+    optional_text,
+    read_json,
+    text,
+    whole,
+)
 from g2ard.io.paths import real_path
-from g2ard.io.photos import Frame, pixels, rigid, view_set
+from g2ard.io.photos import Frame, rigid, view_set
 from g2ard.io.types import ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
@@ -48,37 +59,30 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
 
 
 def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
-    where = f"{path}: view {index}"
-    with fields_of(where, entry) as view:
-        photo = view.get("image")
-        if photo is not None:
-            photo = images / Path(photo).name if images else path.parent / photo
-        mask = view.get("mask")
-        weight = view.get("weight")
-        if weight is not None and not (np.isfinite(weight) and weight >= 0):
-            raise InputError(f"weight {weight!r} is not a number ≥ 0", path=where)
-        split, name = view.get("split"), view["name"]
-        if not isinstance(name, str):
-            raise InputError(f"name {name!r} is not a string", path=where)
-        if split is not None and not isinstance(split, str):
-            raise InputError(f"split {split!r} is not a string", path=where)
-        return Frame(
-            name=name,
-            viewmat=_exact(where, np.array(view["camera_from_world"], np.float64)),
-            K=np.array(numbers(view, "K", 3, 3)),
-            size=(pixels(where, view, "width"), pixels(where, view, "height")),
-            photo=photo,
-            mask=None if mask is None else path.parent / mask,
-            distortion=tuple(map(float, (*view.get("distortion", ()), 0, 0, 0, 0, 0)[:5])),
-            split=split,
-            weight=weight,
-        )
+    view = fields_of(path, entry, index, "view")
+    photo, mask = optional_text(view, "image"), optional_text(view, "mask")
+    weight = None if view.get("weight") is None else number(view, "weight")
+    if weight is not None and weight < 0:
+        raise view.place.to("weight").unexpected(weight, "a number ≥ 0")
+    lens = listed(view, "distortion")
+    return Frame(
+        name=text(view, "name"),
+        viewmat=_exact(view),
+        K=np.array(numbers(view, "K", 3, 3)),
+        size=(whole(view, "width"), whole(view, "height")),
+        photo=None if photo is None else images / Path(photo).name if images else path.parent / photo,
+        mask=None if mask is None else path.parent / mask,
+        distortion=(*(numbers(view, "distortion", len(lens)) if lens else ()), *[0.0] * 5)[:5],
+        split=optional_text(view, "split"),
+        weight=weight,
+    )
 
 
-def _exact(where: str, matrix: Any) -> Any:
-    """The matrix as it stands where it is rigid to rounding, so that writing and reading change no bit."""
-    nearest = rigid(where, matrix)
-    return matrix if matrix.shape == (4, 4) and np.allclose(nearest, matrix, rtol=0, atol=1e-9) else nearest
+def _exact(view: Fields) -> NDArray[np.float64]:
+    """Return the pose as stored if it is rigid to rounding, so that writing and reading change no bit."""
+    stored = matrix(view, "camera_from_world")
+    nearest = rigid(stored, view.place.to("camera_from_world"))
+    return stored if len(stored) == 4 and np.allclose(nearest, stored, rtol=0, atol=1e-9) else nearest
 
 
 def write(

@@ -111,7 +111,7 @@ def _sizes(files: list[Path]) -> list[tuple[int, int]]:
     found: list[tuple[int, int] | None] = []
     for file in files:
         try:
-            found.append(photo_size(str(file), file))
+            found.append(photo_size(file))
         except InputError:
             found.append(None)
     usual = next((size for size in found if size), (0, 0))

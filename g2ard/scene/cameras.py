@@ -148,18 +148,17 @@ class Cameras:
         for i in range(n):
             given = (self.viewmats[i], self.Ks[i], self.distortions[i])
             if not all(np.isfinite(values).all() for values in given):
-                raise InputError(f"view {i} ({self.names[i]}): its pose or intrinsics are not finite")
+                raise self._error(i, "has a pose or intrinsics that are not finite")
             if max(np.abs(values).max() for values in given) > _LARGEST:
-                raise InputError(
-                    f"view {i} ({self.names[i]}): its pose or intrinsics are past {_LARGEST:.0e}"
-                )
+                raise self._error(i, f"has a pose or intrinsics past {_LARGEST:.0e}")
             if self.widths[i] < 1 or self.heights[i] < 1:
-                raise InputError(
-                    f"view {i} ({self.names[i]}): empty image {self.widths[i]}×{self.heights[i]}"
-                )
-            check_image(f"view {i} ({self.names[i]})", int(self.widths[i]), int(self.heights[i]))
+                raise self._error(i, f"has an empty image, {self.widths[i]}×{self.heights[i]}")
+            check_image(int(self.widths[i]), int(self.heights[i]), index=i, item="view")
             if self.Ks[i, 0, 0] <= 0 or self.Ks[i, 1, 1] <= 0:
-                raise InputError(f"view {i} ({self.names[i]}): focal length must be positive")
+                raise self._error(i, "has a focal length that is not positive")
+
+    def _error(self, index: int, message: str) -> InputError:
+        return InputError(f"({self.names[index]}) {message}", index=index, item="view")
 
     def __len__(self) -> int:
         return len(self.viewmats)
@@ -294,8 +293,8 @@ class Cameras:
     ) -> Cameras:
         """Stack per-view lists; `sizes` holds (width, height)."""
         n = len(viewmats)
-        for name, size in zip(names, sizes, strict=True):  # before they must fit an int64
-            check_image(f"view {name}", *map(int, size))
+        for i, (width, height) in enumerate(sizes):  # before they must fit an int64
+            check_image(int(width), int(height), index=i, item="view")
         return cls(
             viewmats=np.asarray(viewmats, np.float64).reshape(n, 4, 4),
             Ks=np.asarray(Ks, np.float64).reshape(n, 3, 3),

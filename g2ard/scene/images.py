@@ -53,17 +53,19 @@ def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
     """
     path, name = cameras.image_paths[index], cameras.names[index]
     if path is None:
-        raise InputError(
-            f"view {index} ({name}) has no photo: its views name no image for it; give views with photos"
-        )
-    listed_in = "" if cameras.source is None else f"{cameras.source}: view {name!r}: "
-    image = _open(f"{listed_in}{path}", path)
+        raise InputError(f"({name}) has no photo", index=index, item="view", hint="give views with photos")
+    named = None if cameras.source is None else f"{cameras.source} names it as view {name!r}"
+    try:
+        image = _open(path)
+    except InputError as error:
+        raise error.at(hint="; ".join(filter(None, (error.hint, named))) or None) from error
     height, width = image.shape[:2]
     target = int(cameras.widths[index]), int(cameras.heights[index])
     if abs(width * target[1] - height * target[0]) > _ASPECT_SLACK * height * target[0]:
         raise InputError(
-            f"{listed_in}{path}: the photo is {width}×{height}, its view {target[0]}×{target[1]}: "
-            "the aspects differ; give the photos as their poses were made from, uncropped"
+            f"the photo is {width}×{height}, its view {target[0]}×{target[1]}: the aspects differ",
+            path=path,
+            hint="give the photos as their poses were made from, uncropped",
         )
     distortion = cameras.distortions[index]
     if distortion.any():
@@ -92,9 +94,9 @@ def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
     return np.ascontiguousarray(image.mean(2) > 0.5)
 
 
-def _open(where: str, path: Path) -> NDArray[np.float32]:
+def _open(path: Path) -> NDArray[np.float32]:
     try:
-        with opened_image(where, path) as image:
+        with opened_image(path) as image:
             if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey, whatever PIL calls it
                 values = np.asarray(image, np.float32)
                 top = 1.0 if image.mode == "F" else 65535.0
@@ -104,7 +106,7 @@ def _open(where: str, path: Path) -> NDArray[np.float32]:
                 return rgba[..., :3] * rgba[..., 3:]
             return np.asarray(image.convert("RGB"), np.float32) / np.float32(255)
     except FileNotFoundError as error:
-        raise InputError("no such photo; it must lie where its views name it", path=where) from error
+        raise InputError("no such photo", path=path) from error
 
 
 def _undistorted(

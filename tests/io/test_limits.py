@@ -23,6 +23,7 @@ from g2ard.scene.images import load_image
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine
+from helpers.faults import Fault, check_fault
 from helpers.glb_files import glb_parts
 from helpers.packed_files import save_spz, truth
 from helpers.sog_files import parts
@@ -229,24 +230,24 @@ def test_a_claim_past_the_limits_is_one_line(what: str, tmp_path: Path) -> None:
 
 
 MESH = {"mesh": 0}
-BROKEN_NODES: dict[str, tuple[list[Any], str]] = {
+BROKEN_NODES: dict[str, tuple[list[Any], Fault]] = {
     "negative child": (
         [MESH, {"children": [-2]}],
-        r"'nodes\[1\]\.children\[0\]': expected an index from 0 to 1",
+        ("nodes[1].children[0]", None),
     ),
-    "absent child": ([MESH, {"children": [0, 2]}], r"'nodes\[1\]\.children\[1\]': expected .*, found 2"),
+    "absent child": ([MESH, {"children": [0, 2]}], ("nodes[1].children[1]", None)),
     "child of lists": (
         [MESH, {"children": [[]]}],
-        r"'nodes\[1\]\.children\[0\]': expected an index .* a list",
+        ("nodes[1].children[0]", None),
     ),
-    "no object": ([MESH, 5], r"malformed 'nodes\[1\]': expected an object, found 5"),
+    "no object": ([MESH, 5], ("nodes[1]", None)),
     "circle": ([MESH | {"children": [1]}, {"children": [0]}], r"node 0 is its own ancestor"),
     "two parents": ([MESH, {"children": [0]}, {"children": [0]}], "a node has 2 parents"),
     "column": (
         [MESH | {"translation": [[1], [2], [3]]}],
-        r"'nodes\[0\]\.translation\[0\]': expected a number",
+        ("nodes[0].translation[0]", None),
     ),
-    "short": ([MESH | {"translation": [1]}], r"lacks 'nodes\[0\]\.translation\[1\]'"),
+    "short": ([MESH | {"translation": [1]}], ("nodes[0].translation[1]", None)),
     "far": (
         [MESH | {"translation": [1e308] * 3}, {"children": [0], "translation": [1e308] * 3}],
         r"its nodes move it by \(inf, inf, inf\)",
@@ -257,9 +258,10 @@ BROKEN_NODES: dict[str, tuple[list[Any], str]] = {
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("what", BROKEN_NODES)
 def test_broken_nodes_of_a_glb_are_named(what: str, tmp_path: Path) -> None:
-    nodes, words = BROKEN_NODES[what]
-    with pytest.raises(InputError, match=rf"a\.glb: .*{words}"):
+    nodes, fault = BROKEN_NODES[what]
+    with pytest.raises(InputError) as caught:
         read_scene(node_tree(tmp_path / "a.glb", nodes))
+    check_fault(caught.value, tmp_path / "a.glb", fault)
 
 
 @pytest.mark.parametrize("table", ["accessors", "bufferViews", "buffers"])
@@ -267,17 +269,19 @@ def test_broken_nodes_of_a_glb_are_named(what: str, tmp_path: Path) -> None:
 def test_an_index_in_a_glb_names_an_entry(table: str, index: Any, tmp_path: Path) -> None:
     write_splats(tmp_path / "a.glb", truth(9, 0))
     document, _ = glb_parts(tmp_path / "a.glb")
+    fault: Fault
     if table == "accessors":
         document["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = index
-        words = r"'meshes\[0\]\.primitives\[0\]\.attributes\.POSITION': expected an index from 0 to"
+        fault = ("meshes[0].primitives[0].attributes.POSITION", None)
     elif table == "bufferViews":
         document["accessors"][0]["bufferView"] = index
-        words = r"'accessors\[0\]\.bufferView': expected an index from 0 to"
+        fault = ("accessors[0].bufferView", None)
     else:
         document["bufferViews"][0]["buffer"] = index
-        words = "lies outside the file"
-    with pytest.raises(InputError, match=rf"a\.glb: .*{words}"):
+        fault = "lies outside the file"
+    with pytest.raises(InputError) as caught:
         read_scene(node_tree(tmp_path / "a.glb", document["nodes"], document))
+    check_fault(caught.value, tmp_path / "a.glb", fault)
 
 
 def test_a_long_chain_of_nodes_is_followed_once(tmp_path: Path) -> None:

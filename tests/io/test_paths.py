@@ -14,6 +14,7 @@ from g2ard.io import read_scene, read_splats, read_views, write_splats, write_vi
 from g2ard.io.paths import output_names, real_path
 from g2ard.scene.splats import Splats
 from helpers.commands import CommandLine
+from helpers.faults import Fault, check_fault
 from helpers.systems import needs_links
 from helpers.view_files import colmap, edit, orbit, views
 
@@ -76,8 +77,9 @@ def test_no_view_is_written_outside_its_folder(
 
 @pytest.mark.parametrize("name", ["", "/", "..", "\0", "x" * 300, "C:"])
 def test_what_cannot_be_a_files_name(name: str) -> None:
-    with pytest.raises(InputError, match=r"^v\.json: view 1: .* cannot be a file's name$"):
+    with pytest.raises(InputError, match="cannot be a file's") as caught:
         output_names("v.json", ["a.png", name])
+    assert (caught.value.path, caught.value.index) == (Path("v.json"), 1)
 
 
 def test_names_of_one_file() -> None:
@@ -104,21 +106,22 @@ def test_an_absurd_number_of_a_coefficient(scene: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "fault"),
     [
-        ({"split": 3}, "view 0: split 3 is not a string"),
-        ({"name": 3}, "view 0: name 3 is not a string"),
-        ({"distortion": [float("nan")] * 5}, "its pose or intrinsics are not finite"),
-        ({"distortion": [1e300]}, "its pose or intrinsics are past"),
-        ({"K": [[1e308, 0, 1], [0, 9, 1], [0, 0, 1]]}, "its pose or intrinsics are past"),
+        ({"split": 3}, ("split", 0)),
+        ({"name": 3}, ("name", 0)),
+        ({"distortion": [float("nan")] * 5}, ("distortion[0]", 0)),
+        ({"distortion": [1e300]}, (None, 0)),
+        ({"K": [[1e308, 0, 1], [0, 9, 1], [0, 0, 1]]}, (None, 0)),
     ],
 )
-def test_views_of_absurd_values(tmp_path: Path, change: dict[str, object], said: str) -> None:
+def test_views_of_absurd_values(tmp_path: Path, change: dict[str, object], fault: Fault) -> None:
     path = tmp_path / "v.json"
     write_views(path, views(1))
     edit(path, lambda content: content["views"][0].update(change))
-    with pytest.raises(InputError, match=rf"v\.json: .*{said}"):
+    with pytest.raises(InputError) as caught:
         read_views(path)
+    check_fault(caught.value, path, fault)
 
 
 def test_quaternions_of_any_length_turn_views_alike(tmp_path: Path) -> None:

@@ -95,8 +95,9 @@ def test_transforms_json_names_masks(tmp_path: Path) -> None:
     assert mask is not None
     assert mask.sum() == 48
     (tmp_path / "m.png").unlink()
-    with pytest.raises(InputError, match=r"frame 0: its mask .*m\.png does not exist"):
+    with pytest.raises(InputError, match="does not exist") as caught:
         io.read_view_set(tmp_path / "transforms.json")
+    assert (caught.value.property, caught.value.index) == ("mask_path", 0)
 
 
 @pytest.mark.parametrize("engine", ["fused", "torch"])
@@ -160,5 +161,6 @@ def test_exposures_are_undone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="exposure of view_001: expected an invertible"):
         Photos(cameras, exposures={"view_001": np.zeros((3, 4))})
     (tmp_path / "exposure.json").write_text('{"view_001": [1, 2]}')
-    with pytest.raises(InputError, match="not a finite 3×4 matrix"):
+    with pytest.raises(InputError, match="list of 4") as caught:
         find_exposures(cameras)
+    assert caught.value.property == "view_001[0]"

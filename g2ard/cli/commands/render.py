@@ -95,7 +95,7 @@ def render(
     )
     cameras = load_views(found, split, size, run.say)
     warn_of_sight(splats, cameras, run.say)
-    places = output_names(str(cameras.source or views), cameras.names) if output is not None else []
+    places = output_names(cameras.source or str(views), cameras.names) if output is not None else []
     shown: list[NDArray[np.float32]] = []
     renderer = Renderer(splats, background=background or BLACK, settings=settings)
     with _folder(output, run.overwrite) as folder:

@@ -1,0 +1,21 @@
+"""Checks of what an `InputError` names."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from g2ard.errors import InputError
+
+Fault = tuple[str | None, int | None] | str
+"""The property and index that an error must name, or words that its message must hold."""
+
+
+def check_fault(error: InputError, path: Path, fault: Fault) -> None:
+    """Check that an error is one line that names a file, and in it a property and an index."""
+    assert error.path == path, error
+    assert "\n" not in str(error)
+    if isinstance(fault, str):
+        assert re.search(fault, str(error)), error
+    else:
+        assert (error.property, error.index) == fault, error
