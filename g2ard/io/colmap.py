@@ -220,16 +220,18 @@ def _images_bin(path: Path) -> list[_Image]:
         start = at + _IMAGE.size
         end = data.find(b"\0", start)
         if end < 0:
-            raise InputError(f"truncated in NAME of image {i:,}", path=path, hint=DAMAGED)
+            raise InputError("is cut off", path=path, property="NAME", index=i, item="image", hint=DAMAGED)
         try:
             name = data[start:end].decode()
         except UnicodeDecodeError:
-            raise InputError(f"malformed image {i:,}: NAME is no UTF-8", path=path) from None
+            raise InputError("is not UTF-8", path=path, property="NAME", index=i, item="image") from None
         (points,) = _POINTS.read(path, "image", i, data, end + 1)
         images.append(_Image(name, camera, tuple(pose[:4]), tuple(pose[4:])))
         at = end + 1 + _POINTS.size + 24 * points
         if at > len(data):
-            raise InputError(f"truncated in POINTS2D of image {i:,}, {name!r}", path=path, hint=DAMAGED)
+            raise InputError(
+                "is cut off", path=path, property="POINTS2D", index=i, item="image", hint=DAMAGED
+            )
     return images
 
 
@@ -246,28 +248,27 @@ def _cameras_txt(path: Path) -> dict[int, _Camera]:
     cameras = {}
     rows = [words for line in text_lines(path) if (words := line.split())]
     for i, words in enumerate(rows):
-        key, width, height = (number(path, f"camera {i}", words, name, at) for name, at in _CAMERA_COLUMNS)
+        key, width, height = (number(path, "camera", i, words, name, at) for name, at in _CAMERA_COLUMNS)
         params = tuple(
-            number(path, f"camera {i}", words, f"PARAMS[{at - 4}]", at, _finite)
-            for at in range(4, len(words))
+            number(path, "camera", i, words, f"PARAMS[{at - 4}]", at, _finite) for at in range(4, len(words))
         )
         cameras[int(key)] = _camera(path, words[1], (int(width), int(height)), params)
     return cameras
 
 
 def number(
-    path: Path, entry: str, words: list[str], name: str, at: int, kind: Callable[[str], float] = int
+    path: Path, item: str, i: int, words: list[str], name: str, at: int, kind: Callable[[str], float] = int
 ) -> float:
-    """A column of a text table."""
+    """Return a column of row `i` of a text table."""
     if at >= len(words):
-        raise InputError(f"malformed {entry}: lacks {name}", path=path)
+        raise InputError("is missing", path=path, property=name, index=i, item=item)
     word = words[at]
     try:
         if "_" in word or not word.isascii():  # which Python's own numbers may have
             raise ValueError(word)
         return kind(word)
     except ValueError:
-        raise InputError(f"malformed {entry}: {name} is {word!r}", path=path) from None
+        raise InputError(f"is {word!r}", path=path, property=name, index=i, item=item) from None
 
 
 def _finite(word: str) -> float:
@@ -284,10 +285,9 @@ def _images_txt(path: Path) -> list[_Image]:
     images = []
     for i, line in enumerate(lines[::2]):  # each second lists the image's points, and may be empty
         if words := line.split(maxsplit=9):
-            where = f"image {i}"
-            pose = tuple(number(path, where, words, name, at, _finite) for name, at in _POSE_COLUMNS)
-            camera = int(number(path, where, words, "CAMERA_ID", 8))
+            pose = tuple(number(path, "image", i, words, name, at, _finite) for name, at in _POSE_COLUMNS)
+            camera = int(number(path, "image", i, words, "CAMERA_ID", 8))
             if len(words) < 10:
-                raise InputError(f"malformed {where}: lacks NAME", path=path)
+                raise InputError("is missing", path=path, property="NAME", index=i, item="image")
             images.append(_Image(words[9].strip(), camera, pose[:4], pose[4:]))
     return images

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from g2ard.errors import DAMAGED, InputError, MissingDependencyError
+from g2ard.errors import DAMAGED, InputError, missing
 from g2ard.io.cloud_ply import finite_cloud
 from g2ard.io.limits import check_unpacked
 from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
@@ -100,7 +100,7 @@ def _opened(path: Path) -> Iterator[Any]:
         import laspy
         import lazrs  # noqa: F401 - what laspy reads .laz with; its absence is told here
     except ImportError as error:
-        raise MissingDependencyError(".las and .laz need `pip install g2ard[las]`", path=path) from error
+        raise missing("a .las or .laz", "g2ard[las]", path=path) from error
     _check_records(path)
     try:
         with laspy.open(path) as reader:

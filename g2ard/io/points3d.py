@@ -49,7 +49,7 @@ def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         positions[i], rgb[i] = (x, y, z), (r, g, b)
         at += _POINT.size + 8 * track
         if at > len(data):
-            raise InputError(f"truncated in TRACK of point {i:,} of {count:,}", path=path, hint=DAMAGED)
+            raise InputError("is cut off", path=path, property="TRACK", index=i, item="point", hint=DAMAGED)
     return positions, rgb
 
 
@@ -60,17 +60,22 @@ def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         if "_" in line or not line.isascii():  # float() takes 1_0, and digits of other scripts
             for name, word in zip(_COLUMNS, rows[i][1:7], strict=False):
                 if "_" in word or not word.isascii():
-                    raise InputError(f"malformed point {i}: {name} is {word!r}", path=path)
+                    raise InputError(f"is {word!r}", path=path, property=name, index=i, item="point")
     try:
         values = np.array([words[1:7] for words in rows], np.float64).reshape(-1, 6)
     except ValueError:
         for i, words in enumerate(rows):
             for at, name in enumerate(_COLUMNS, 1):
-                number(path, f"point {i}", words, name, at, float)
+                number(path, "point", i, words, name, at, float)
         raise
     inside = (values[:, 3:] >= 0) & (values[:, 3:] <= 255)
     if not inside.all():
         i, channel = (int(at) for at in np.argwhere(~inside)[0])
-        found = f"{_COLUMNS[3 + channel]} is {rows[i][4 + channel]!r}"
-        raise InputError(f"malformed point {i}: {found}, expected 0 to 255", path=path)
+        raise InputError(
+            f"is {rows[i][4 + channel]!r}, expected 0 to 255",
+            path=path,
+            property=_COLUMNS[3 + channel],
+            index=i,
+            item="point",
+        )
     return values[:, :3], values[:, 3:].astype(np.uint8)

@@ -41,7 +41,9 @@ class Record:
         except struct.error:
             ends = zip(self._names, self._ends, strict=True)
             name = next(name for name, end in ends if at + end > len(data))
-            raise InputError(f"truncated in {name} of {entry} {i:,}", path=path, hint=DAMAGED) from None
+            raise InputError(
+                "is cut off", path=path, property=name, index=i, item=entry, hint=DAMAGED
+            ) from None
 
     def read_finite(self, path: Path, entry: str, i: int, data: bytes, at: int) -> tuple[Any, ...]:
         """As `read`.
@@ -52,5 +54,5 @@ class Record:
         values = self.read(path, entry, i, data, at)
         for name, value in zip(self._names, values, strict=True):
             if not math.isfinite(value):
-                raise InputError(f"malformed {entry} {i:,}: {name} is {value}", path=path)
+                raise InputError(f"is {value}", path=path, property=name, index=i, item=entry)
         return values

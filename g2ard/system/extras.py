@@ -16,4 +16,4 @@ def require_torch(feature: str) -> None:
         MissingDependencyError: torch is not installed.
     """
     if find_spec("torch") is None:
-        raise MissingDependencyError(f"{feature} needs torch: pip install 'g2ard[torch]'")
+        raise MissingDependencyError(f"{feature} needs torch", hint="pip install 'g2ard[torch]'")

@@ -226,7 +226,7 @@ def test_a_panic_in_lazrs_is_one_line(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_las_needs_laspy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = las(tmp_path / "a.las", np.zeros((3, 3)), np.ones((3, 3), int))
     monkeypatch.setitem(sys.modules, "laspy", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install g2ard\[las\]"):
+    with pytest.raises(MissingDependencyError, match=r"pip install 'g2ard\[las\]'"):
         read_points(path)
 
 

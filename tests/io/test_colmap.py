@@ -11,6 +11,7 @@ import pytest
 
 from g2ard.errors import DAMAGED, InputError
 from g2ard.io import kind, read_points, read_views
+from helpers.faults import Fault, check_fault
 from helpers.realdata import real
 from helpers.view_files import MODELS, colmap, orbit, photo
 
@@ -63,43 +64,45 @@ def test_truncated_colmap(tmp_path: Path, name: str, keep: int) -> None:
     folder = colmap(tmp_path / "project", orbit(3), text=False)
     path = folder / "sparse" / "0" / name
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(InputError, match=rf"{name}: truncated"):
+    with pytest.raises(InputError, match=rf"{name}: .*(truncated|is cut off)"):
         (read_points if "points" in name else read_views)(folder)
 
 
 @pytest.mark.parametrize(
-    ("name", "keep", "column"),
+    ("name", "keep", "fault"),
     [
-        ("cameras.bin", 7, r"COUNT of table 0"),
-        ("cameras.bin", 8 + 11, "WIDTH of camera 0"),
-        ("cameras.bin", 8 + 24 + 3 * 8, r"PARAMS\[3\] of camera 0"),
-        ("images.bin", 8 + 4 + 4 * 8 + 7, r"TX of image 0"),
-        ("images.bin", 8 + 64 + 3, r"NAME of image 0"),
-        ("images.bin", 8 + 64 + 12 + 8 + 47, r"POINTS2D of image 0, 'photo 2\.png'"),
-        ("points3D.bin", 109, "B of point 1"),
+        ("cameras.bin", 7, ("COUNT", 0)),
+        ("cameras.bin", 8 + 11, ("WIDTH", 0)),
+        ("cameras.bin", 8 + 24 + 3 * 8, ("PARAMS[3]", 0)),
+        ("images.bin", 8 + 4 + 4 * 8 + 7, ("TX", 0)),
+        ("images.bin", 8 + 64 + 3, ("NAME", 0)),
+        ("images.bin", 8 + 64 + 12 + 8 + 47, ("POINTS2D", 0)),
+        ("points3D.bin", 109, ("B", 1)),
     ],
 )
-def test_the_column_that_is_cut_is_named(tmp_path: Path, name: str, keep: int, column: str) -> None:
+def test_the_column_that_is_cut_is_named(tmp_path: Path, name: str, keep: int, fault: Fault) -> None:
     folder = colmap(tmp_path / "project", orbit(3), text=False)
     path = folder / "sparse" / "0" / name
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(InputError, match=rf"{name}: .*truncated in ({column});") as caught:
+    with pytest.raises(InputError) as caught:
         (read_points if "points" in name else read_views)(folder)
-    assert (caught.value.path, caught.value.hint) == (path, DAMAGED)
+    check_fault(caught.value, path, fault)
+    assert caught.value.hint == DAMAGED
 
 
 @pytest.mark.parametrize(
-    ("name", "at", "column"),
-    [("cameras.bin", 8 + 24 + 8, r"camera 0: PARAMS\[1\]"), ("images.bin", 8 + 4 + 5 * 8, "image 0: TY")],
+    ("name", "at", "fault"),
+    [("cameras.bin", 8 + 24 + 8, ("PARAMS[1]", 0)), ("images.bin", 8 + 4 + 5 * 8, ("TY", 0))],
 )
-def test_a_binary_value_that_is_not_finite_is_named(tmp_path: Path, name: str, at: int, column: str) -> None:
+def test_a_binary_value_that_is_not_finite_is_named(tmp_path: Path, name: str, at: int, fault: Fault) -> None:
     folder = colmap(tmp_path / "project", orbit(3), text=False)
     path = folder / "sparse" / "0" / name
     data = bytearray(path.read_bytes())
     struct.pack_into("<d", data, at, float("nan"))
     path.write_bytes(data)
-    with pytest.raises(InputError, match=rf"{name}: malformed {column} is nan$"):
+    with pytest.raises(InputError, match=r"is nan$") as caught:
         read_views(folder)
+    check_fault(caught.value, path, fault)
 
 
 def test_fisheye_is_refused(tmp_path: Path) -> None:
@@ -112,55 +115,64 @@ def test_fisheye_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="names camera 7, which is absent"):
         read_views(folder)
     cameras.write_text("7 PINHOLE 8 six 500 500 4 3\n")
-    with pytest.raises(InputError, match=r"cameras\.txt: malformed camera 0: HEIGHT is 'six'$"):
+    with pytest.raises(InputError) as caught:
         read_views(folder)
+    check_fault(caught.value, cameras, ("HEIGHT", 0))
     for word in ("1_0", "٣"):
         cameras.write_text(f"7 PINHOLE 8 {word} 500 500 4 3\n", encoding="utf-8")
-        with pytest.raises(InputError, match=rf"cameras\.txt: malformed camera 0: HEIGHT is '{word}'$"):
+        with pytest.raises(InputError) as caught:
             read_views(folder)
+        check_fault(caught.value, cameras, ("HEIGHT", 0))
     cameras.write_text("7 PINHOLE 8 6 500 x 4 3\n")
-    with pytest.raises(InputError, match=r"cameras\.txt: malformed camera 0: PARAMS\[1\] is 'x'$"):
+    with pytest.raises(InputError) as caught:
         read_views(folder)
+    check_fault(caught.value, cameras, ("PARAMS[1]", 0))
     cameras.write_text("7 PINHOLE 8\n")
-    with pytest.raises(InputError, match=r"cameras\.txt: malformed camera 0: lacks HEIGHT$"):
+    with pytest.raises(InputError) as caught:
         read_views(folder)
+    check_fault(caught.value, cameras, ("HEIGHT", 0))
 
 
 def test_a_bad_row_of_a_text_table_is_named(tmp_path: Path) -> None:
     folder = colmap(tmp_path / "project", orbit(2), text=True)
     images = folder / "sparse" / "0" / "images.txt"
     images.write_text("1 1 0 0 0 0 0 4 7 a.png\n\n2 1 0 0 0 0 deep 4 7 b.png\n\n")
-    with pytest.raises(InputError, match=r"images\.txt: malformed image 1: TY is 'deep'$"):
+    with pytest.raises(InputError) as caught:
         read_views(folder)
+    check_fault(caught.value, images, ("TY", 1))
     images.write_text("1 1 0 0 0 0 0 inf 7 a.png\n\n")
-    with pytest.raises(InputError, match=r"images\.txt: malformed image 0: TZ is 'inf'$"):
+    with pytest.raises(InputError) as caught:
         read_views(folder)
+    check_fault(caught.value, images, ("TZ", 0))
     images.write_text("1 1 0 0 0 0 0 4 7\n\n")
-    with pytest.raises(InputError, match=r"images\.txt: malformed image 0: lacks NAME$"):
+    with pytest.raises(InputError) as caught:
         read_views(folder)
+    check_fault(caught.value, images, ("NAME", 0))
     points = folder / "sparse" / "0" / "points3D.txt"
     points.write_text("1 0 0 0 9 9 9 0.1\n2 0 0 0 9 nine 9 0.1\n")
-    with pytest.raises(InputError, match=r"points3D\.txt: malformed point 1: G is 'nine'$"):
+    with pytest.raises(InputError) as caught:
         read_points(points)
+    check_fault(caught.value, points, ("G", 1))
 
 
 @pytest.mark.parametrize(
-    ("row", "message"),
+    ("row", "column"),
     [
-        ("2 0 0 0 -1 9 9 0.1", "R is '-1', expected 0 to 255"),
-        ("2 0 0 0 9 256 9 0.1", "G is '256', expected 0 to 255"),
-        ("2 0 0 0 9 9 nan 0.1", "B is 'nan', expected 0 to 255"),
-        ("2 0 0 0 9 9 1e308 0.1", "B is '1e308', expected 0 to 255"),
-        ("2 0 0 0 9 9 inf 0.1", "B is 'inf', expected 0 to 255"),
-        ("2 0 1_0 0 9 9 9 0.1", "Y is '1_0'"),
-        ("2 0 0 0 9 \u0663 9 0.1", "G is '\u0663'"),
+        ("2 0 0 0 -1 9 9 0.1", "R"),
+        ("2 0 0 0 9 256 9 0.1", "G"),
+        ("2 0 0 0 9 9 nan 0.1", "B"),
+        ("2 0 0 0 9 9 1e308 0.1", "B"),
+        ("2 0 0 0 9 9 inf 0.1", "B"),
+        ("2 0 1_0 0 9 9 9 0.1", "Y"),
+        ("2 0 0 0 9 \u0663 9 0.1", "G"),
     ],
 )
-def test_numbers_of_points3d_text(tmp_path: Path, row: str, message: str) -> None:
+def test_numbers_of_points3d_text(tmp_path: Path, row: str, column: str) -> None:
     points = tmp_path / "points3D.txt"
     points.write_text(f"1 0 0 0 0 255 9 0.1\n{row}\n", encoding="utf-8")
-    with pytest.raises(InputError, match=rf"points3D\.txt: malformed point 1: {message}$"):
+    with pytest.raises(InputError) as caught:
         read_points(points)
+    check_fault(caught.value, points, (column, 1))
     points.write_text("1 nan 0 0 0 255 9 0.1\n2 0 0 0 0 255 9 0.1\n")
     assert read_points(points).colors.tolist() == [[0, 1, np.float32(9 / 255)]]
 

@@ -21,7 +21,7 @@ def test_features_that_need_torch_name_the_extra(
     ball = checkered_ball(400)
     targets = g2ard.TeacherRenders(ball, around(4, (32, 24)))
     for engine in ("torch", "gsplat"):
-        with pytest.raises(MissingDependencyError, match=rf"'{engine}' needs torch: .*'g2ard\[torch\]'"):
+        with pytest.raises(MissingDependencyError, match=rf"'{engine}' needs torch; .*'g2ard\[torch\]'"):
             g2ard.recover(ball, targets, g2ard.RecoverConfig(steps=1, engine=engine))
     with pytest.raises(MissingDependencyError, match=r"^LPIPS needs torch"):
         load_lpips(folder)
