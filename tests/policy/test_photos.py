@@ -34,7 +34,7 @@ def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_pa
     assert (tmp_path / "ours.ply").read_bytes() == (tmp_path / "run" / "scene.ply").read_bytes()
     status, _, error = command_line(*ask, "-r", 4, "--steps", 5, "-w", cwd=tmp_path)
     assert status == (0 if points else 1)
-    assert points or "give a count, -n COUNT" in error
+    assert points or "give --count COUNT" in error
     status, _, error = command_line("distill", "-n", 500, "-o", "run", cwd=tmp_path)
     assert (status, "give a SCENE, or photos" in error) == (2, True)
 
