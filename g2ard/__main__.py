@@ -5,8 +5,6 @@ import warnings
 
 from g2ard.system import interrupt
 
-__all__ = ["main"]
-
 
 def main() -> None:
     """Entry point."""

@@ -8,16 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
 
-__all__ = [
-    "DAMAGED",
-    "G2ardError",
-    "InputError",
-    "MissingDependencyError",
-    "OutputError",
-    "missing",
-    "require",
-]
-
 DAMAGED = "the file is damaged: copy or export it again"
 """Hint for files that are not as their writer left them."""
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-__all__ = ["Progress", "Say", "counter", "plural", "silent", "unsaid"]
-
 
 class Progress(Protocol):
     """Called with the stage's name, units done, units in all (0 if unknown) and figures worth showing."""

@@ -6,8 +6,6 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["app"]
-
 app = typer.Typer(
     help="Distil a dense 3D Gaussian scene into a compact, standard 3DGS model at an exact budget.",
     no_args_is_help=True,

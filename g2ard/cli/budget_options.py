@@ -12,21 +12,6 @@ import typer
 if TYPE_CHECKING:
     from g2ard.policy.budget import Budget
 
-__all__ = [
-    "Count",
-    "Counts",
-    "CountsOption",
-    "FitOption",
-    "LooksOption",
-    "MinPsnrOption",
-    "MinSsimOption",
-    "RatioOption",
-    "Ratios",
-    "RatiosOption",
-    "one_budget",
-    "parse_ratio",
-]
-
 _COUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmM%]?)")
 _GROUPED = re.compile(r"\d{1,3}(?:,\d{3})+|\d{1,3}(?:_\d{3})+")
 _DOTTED = re.compile(r"[1-9]\d{0,2}(?:\.\d{3})+")

@@ -11,8 +11,6 @@ import typer
 from g2ard.cli.budget_options import Count
 from g2ard.cli.usage import meant
 
-__all__ = ["load_config", "printed"]
-
 _NOT_KEPT = ("config", "print_config", "overwrite", "resume")
 """Options that belong to one call."""
 

@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-__all__ = ["Console", "duration"]
-
 _PLAIN_PERIOD = 10.0
 """Seconds between two progress lines of one stage when stderr is no terminal."""
 

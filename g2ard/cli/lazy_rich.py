@@ -7,8 +7,6 @@ import sys
 from types import ModuleType
 from typing import Any
 
-__all__ = ["defer_rich"]
-
 _UNUSED = {"rich.markdown": "Markdown", "rich.traceback": "Traceback"}
 """Module and the class that typer imports from it: for Markdown in help texts, and for tracebacks."""
 

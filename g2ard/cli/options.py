@@ -27,31 +27,6 @@ if TYPE_CHECKING:
     from g2ard.cli.frame import Run
     from g2ard.scene.splats import Splats
 
-__all__ = [
-    "ConventionOption",
-    "CropOption",
-    "FormatOption",
-    "KeepRegionOption",
-    "LookOption",
-    "OutputOption",
-    "PaperOption",
-    "PolicyOption",
-    "PresetOption",
-    "ProtocolOption",
-    "SceneArgument",
-    "Triple",
-    "ViewsOption",
-    "ViewsOrMadeOption",
-    "can_be_made",
-    "is_made",
-    "numbers",
-    "picture",
-    "recovery_engine",
-    "trained_on",
-    "views_count",
-    "views_or_teacher",
-]
-
 SceneArgument = Annotated[
     Path, typer.Argument(metavar="SCENE", help="A .ply (3DGS), SOG, .spz, .glb, .splat or .compressed.ply.")
 ]

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from g2ard.cli.budget_options import Counts, Ratios
     from g2ard.policy.budget import Budget
 
-__all__ = ["Outputs", "budgets_of"]
-
 
 def budgets_of(
     counts: list[Counts] | None,

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any, get_args
 
-__all__ = ["COMMON", "GROUPED", "into_panels"]
-
 COMMON = "Common"
 
 GROUPED = ("distill", "simplify", "recover", "adapt", "register", "lod")

@@ -6,8 +6,6 @@ import os
 import sys
 from typing import TextIO
 
-__all__ = ["outlive_readers"]
-
 
 def outlive_readers() -> None:
     """From here on a closed pipe (`| head`) ends neither a command nor the files that it is to write."""

@@ -12,8 +12,6 @@ import typer
 from g2ard.cli.frame import Run
 from g2ard.errors import OutputError
 
-__all__ = ["OPTIONS", "check_stopped", "left_at", "rows_kept", "stoppable"]
-
 OPTIONS = "options.json"
 """In a folder of checkpoints: what they belong to. Alone it is nothing to go on from."""
 

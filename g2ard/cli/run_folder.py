@@ -16,22 +16,6 @@ from g2ard.cli.resume import OPTIONS, check_stopped, left_at
 if TYPE_CHECKING:
     from g2ard.policy.budget import Budget
 
-__all__ = [
-    "KEPT",
-    "REPORT",
-    "WORK",
-    "check_place",
-    "check_same_options",
-    "drop_older",
-    "is_done",
-    "note_options",
-    "stopped_run",
-    "tell_anew",
-    "tell_finished",
-    "work_folder",
-    "write_report",
-]
-
 WORK = ".unfinished"
 """In the folder of the run: finished rounds and checkpoints. Nobody else has a folder of this name."""
 KEPT = Path("simplified", "scene.ply")

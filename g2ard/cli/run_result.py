@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from g2ard.policy.fit import Aim
     from g2ard.scene.splats import Splats
 
-__all__ = ["say_views", "say_weight", "tell_quality", "told", "write_table"]
-
 _LOSS, _SSIM_LOSS = 0.05, 0.001
 """dB, and SSIM, under the simplified scene that the command speaks of."""
 

@@ -11,8 +11,6 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
 
-__all__ = ["run_view"]
-
 
 def run_view(
     path: Path, scene: Path, splats: Splats, cameras: Cameras, background: tuple[float, float, float]

@@ -14,15 +14,6 @@ if TYPE_CHECKING:
     from g2ard.cli.frame import Run
     from g2ard.policy.tiling import Tiling
 
-__all__ = [
-    "MemoryOption",
-    "SchedulerOption",
-    "TileRowsOption",
-    "WorkOption",
-    "WorkersOption",
-    "tiling_of",
-]
-
 TileRowsOption = Annotated[
     Count | None,
     typer.Option(

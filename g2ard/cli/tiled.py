@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from g2ard.tiles.merging import TiledScene
     from g2ard.tiles.store import TileStore
 
-__all__ = ["TiledCommand"]
-
 
 class TiledCommand:
     """A command on one scene.

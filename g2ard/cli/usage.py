@@ -11,8 +11,6 @@ import typer
 
 from g2ard.errors import G2ardError
 
-__all__ = ["flags_of", "in_flags", "meant", "typed", "usage_line"]
-
 _FLAGS = {"overwrite=True": "-w (--overwrite)", "engine": "--device cuda", "engine='fused'": "--device cpu"}
 """Parameters, or parameters with a value, whose flag has another name."""
 

@@ -7,34 +7,6 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-__all__ = [
-    "ADAPT_SCHEDULES",
-    "BLACK",
-    "CONVENTIONS",
-    "ENGINES",
-    "LPIPS_INPUTS",
-    "METHODS",
-    "POLICIES",
-    "POOL_KINDS",
-    "REFINEMENTS",
-    "SCHEDULE_NAMES",
-    "UNMEASURED",
-    "AdaptSchedule",
-    "Colour",
-    "Convention",
-    "Engine",
-    "FormatName",
-    "Keep",
-    "LpipsInput",
-    "Method",
-    "PaperPresetName",
-    "Policy",
-    "PoolKind",
-    "PresetName",
-    "Refinement",
-    "ScheduleName",
-]
-
 Colour = tuple[float, float, float]
 """RGB in [0, 1]."""
 BLACK: Colour = (0.0, 0.0, 0.0)

@@ -20,8 +20,6 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from g2ard.errors import InputError
 
-__all__ = ["changed", "full_paths", "listed", "parsed", "values_of"]
-
 Config = TypeVar("Config")
 _UNIONS = (Union, types.UnionType)
 

@@ -8,8 +8,6 @@ from typing import Any, TypeVar
 from g2ard.config.paths import changed, full_paths
 from g2ard.errors import InputError
 
-__all__ = ["GS_CPR", "PRESETS", "configured", "preset"]
-
 Config = TypeVar("Config")
 
 _PAPER: dict[str, Any] = {

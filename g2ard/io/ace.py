@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.photos import rotation
 
-__all__ = ["read"]
-
 
 def read(path: Path) -> dict[str, NDArray[np.float64]]:
     """Read `NAME qw qx qy qz tx ty tz …`: a photo and its camera_from_world, whatever follows.

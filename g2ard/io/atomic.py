@@ -11,8 +11,6 @@ from uuid import uuid4
 
 from g2ard.errors import OutputError
 
-__all__ = ["atomic_folder", "atomic_output", "check_output", "drop_empty", "parents_made"]
-
 
 def check_output(path: str | Path, overwrite: bool = False, *, folder: bool = False) -> Path:
     """Refuse an output that cannot be written, before hours of work rather than after.

@@ -13,8 +13,6 @@ from g2ard.io.colmap import parsing
 from g2ard.io.photos import Frame, photo_size, rotation, view_set
 from g2ard.io.types import Note, ViewSet
 
-__all__ = ["is_cambridge", "read"]
-
 _SIZE = (1920, 1080)
 """Of every photo of the data set, which the focal lengths are pixels of; smaller copies shrink them."""
 

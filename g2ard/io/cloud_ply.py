@@ -16,8 +16,6 @@ from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
 from g2ard.io.types import Cloud, Note, Points
 from g2ard.progress import plural
 
-__all__ = ["finite_cloud", "read", "stream", "write", "write_blocks"]
-
 _POSITION = ["x", "y", "z"]
 _COLOR_NAMES = (["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"])
 

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from g2ard.io.photos import Frame
     from g2ard.io.types import ViewSet
 
-__all__ = ["frames", "model_folder", "number", "parsing", "photos_beside", "read", "text_lines"]
-
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
     *("FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),

@@ -23,8 +23,6 @@ from g2ard.io.types import Scene
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats
 
-__all__ = ["read", "stream", "write"]
-
 _CHUNK = 256
 _SCALE_LIMIT = 20.0
 """Log-scales are held to ±20, as SuperSplat does: one stray would coarsen its whole chunk."""

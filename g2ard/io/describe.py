@@ -16,8 +16,6 @@ from g2ard.io.types import Points, ViewSet
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 
-__all__ = ["bytes_of", "describe"]
-
 _QUANTILES = (0, 1, 25, 50, 75, 99, 100)
 
 

@@ -11,20 +11,6 @@ from typing import Literal
 from g2ard.errors import InputError
 from g2ard.io.paths import check_regular
 
-__all__ = [
-    "JOURNAL",
-    "KINDS",
-    "MANIFEST",
-    "POINTS",
-    "Format",
-    "Kind",
-    "file_format",
-    "is_photo",
-    "kind",
-    "run_scene",
-    "run_views",
-]
-
 Format = Literal[
     "ply",
     "compressed_ply",

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from g2ard.io.jsonfile import fields_of, numbers, read_json
 from g2ard.scene.cameras import Cameras
 
-__all__ = ["find_exposures", "read"]
-
 _NAME = "exposure.json"
 
 

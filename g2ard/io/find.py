@@ -10,8 +10,6 @@ from typing import Any
 
 from g2ard.errors import InputError
 
-__all__ = ["find_views"]
-
 
 def find_views(scene: str | Path) -> Path | None:
     """The cameras a scene was trained with, where its own folder or its trainer's layout tells them.

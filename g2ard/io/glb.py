@@ -34,8 +34,6 @@ from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
 from g2ard.scene.splats import Splats
 
-__all__ = ["EXTENSION", "read", "write"]
-
 EXTENSION = "KHR_gaussian_splatting"
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _FLOAT, _USHORT = 5126, 5123

@@ -11,8 +11,6 @@ from g2ard.io.photos import view_set
 from g2ard.io.settings import below, read_settings
 from g2ard.io.types import Note, ViewSet
 
-__all__ = ["NAME", "is_run", "read"]
-
 NAME = "cfg.yml"
 
 

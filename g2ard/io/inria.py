@@ -14,8 +14,6 @@ from g2ard.io.photos import Frame, find_photo, inverse, rigid, view_set
 from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
 
-__all__ = ["NAME", "is_inria", "read"]
-
 NAME = "cameras.json"
 """How the file is called."""
 

@@ -16,28 +16,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = [
-    "Fields",
-    "Items",
-    "Place",
-    "fields_of",
-    "index_of",
-    "listed",
-    "matrix",
-    "names_of",
-    "number",
-    "numbers",
-    "object_of",
-    "objects",
-    "optional_text",
-    "parse_json",
-    "read_any_json",
-    "read_json",
-    "read_json_list",
-    "text",
-    "whole",
-]
-
 _LARGEST = sys.float_info.max
 _SHOWN = 40
 """Characters of a value that a message tells."""

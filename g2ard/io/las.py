@@ -16,8 +16,6 @@ from g2ard.io.limits import check_unpacked
 from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
 from g2ard.io.types import Cloud, Note
 
-__all__ = ["read", "stream"]
-
 _LARGEST_CHUNK = 1 << 30
 """Bytes of points that lazrs may make room for where a file has fewer points than a chunk holds."""
 

@@ -13,8 +13,6 @@ from g2ard.io.paths import check_regular
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-__all__ = ["LARGEST_IMAGE", "check_image", "check_unpacked", "opened_image"]
-
 LARGEST_IMAGE = 160_000_000
 """Pixels of an image, as a file stores it or as a view asks for it: 12 bytes each once decoded."""
 

@@ -10,8 +10,6 @@ from pathlib import Path
 
 from g2ard.errors import OutputError
 
-__all__ = ["LOCK", "locked"]
-
 LOCK = ".lock"
 """The file in the folder; it names the process, which removes it. One of a killed process is used again."""
 

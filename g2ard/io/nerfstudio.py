@@ -17,8 +17,6 @@ from g2ard.io.photos import Frame, inverse, rigid, view_set
 from g2ard.io.settings import Settings, below, read_settings
 from g2ard.io.types import Note, ViewSet
 
-__all__ = ["CONFIG", "NAME", "read"]
-
 NAME = "dataparser_transforms.json"
 """What a run leaves beside its config.yml: `transform`, 3×4, and `scale`."""
 CONFIG = "config.yml"

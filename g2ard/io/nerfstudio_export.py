@@ -14,8 +14,6 @@ from g2ard.io.photos import Frame, photo_size, rigid, view_set
 from g2ard.io.settings import below
 from g2ard.io.types import ViewSet
 
-__all__ = ["LISTS", "exported", "is_export", "read"]
-
 LISTS = {"transforms_train.json": "train", "transforms_eval.json": "test"}
 """The files, and the split each stands for."""
 

@@ -12,16 +12,6 @@ from g2ard.errors import InputError
 from g2ard.io.sanitize import LOG_SCALE_LIMIT
 from g2ard.scene.splats import Splats
 
-__all__ = [
-    "coded",
-    "log_scales",
-    "morton_order",
-    "smallest_three",
-    "unit_quats",
-    "world_means",
-    "writable",
-]
-
 _MORTON_BITS = 21
 
 

@@ -9,8 +9,6 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from g2ard.errors import InputError
 
-__all__ = ["check_regular", "output_names", "real_path"]
-
 _LONGEST = 200
 """Bytes of a name of a file: systems take 255, of which a suffix and temporary names need some."""
 

@@ -18,17 +18,6 @@ from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 
-__all__ = [
-    "Frame",
-    "find_photo",
-    "inverse",
-    "photo_size",
-    "pictured",
-    "rigid",
-    "rotation",
-    "view_set",
-]
-
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 
 

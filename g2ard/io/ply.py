@@ -20,8 +20,6 @@ from g2ard.io.types import Note, Scene
 from g2ard.progress import plural
 from g2ard.scene.splats import Splats, unit_quats
 
-__all__ = ["read", "stream", "write"]
-
 _MEANS = ["x", "y", "z"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
 _SCALES = ["scale_0", "scale_1", "scale_2"]

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["PlyHeader", "offset_of", "read_element", "read_header", "require", "row_blocks", "spread_rows"]
-
 _OFFSET = re.compile(r"g2ard offset (\S+) (\S+) (\S+)$")
 _HEADER_LIMIT = 1 << 20
 """No sane header is longer; a file without `end_header` by then is not a PLY."""

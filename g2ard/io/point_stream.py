@@ -16,8 +16,6 @@ from g2ard.io.stream import file_identity
 from g2ard.io.types import Cloud, Note
 from g2ard.progress import plural
 
-__all__ = ["JoinedClouds", "PointStream", "PointTally", "RawPoints", "WholeCloud", "cloud_middle"]
-
 RawPoints = tuple[NDArray[np.float64], NDArray[np.float32]]
 """(n, 3) positions, world units, and (n, 3) colours as stored: in [0, 1] once divided by `divisor`."""
 

@@ -13,8 +13,6 @@ from g2ard.io.colmap import model_folder, number, parsing, text_lines
 from g2ard.io.records import Record
 from g2ard.io.types import Cloud
 
-__all__ = ["read"]
-
 _COUNT = Record(["COUNT"], "Q")
 _COLUMNS = ("X", "Y", "Z", "R", "G", "B")
 _POINT = Record(["POINT3D_ID", *"XYZRGB", "ERROR", "TRACK"], "QdddBBBdQ")

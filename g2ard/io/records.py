@@ -10,8 +10,6 @@ from typing import Any
 
 from g2ard.errors import DAMAGED, InputError
 
-__all__ = ["Record"]
-
 
 class Record:
     """Little-endian columns without padding.

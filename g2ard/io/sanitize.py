@@ -14,8 +14,6 @@ from g2ard.io.types import Note, Scene
 from g2ard.progress import plural
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
 
-__all__ = ["BLOCK", "LOGIT_LIMIT", "LOG_SCALE_LIMIT", "Raw", "Tally", "cleaned"]
-
 BLOCK = 8192
 """Rows handled at a time: 60 float32 columns of them are 2 MB and stay in the cache."""
 

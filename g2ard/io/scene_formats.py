@@ -8,8 +8,6 @@ from typing import NamedTuple
 from g2ard.config.choices import FormatName
 from g2ard.errors import OutputError
 
-__all__ = ["FORMATS", "SceneFormat", "check_options", "scene_format"]
-
 
 class SceneFormat(NamedTuple):
     """A format that scenes are written in.

@@ -12,8 +12,6 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from g2ard.errors import InputError
 from g2ard.io.paths import real_path
 
-__all__ = ["Settings", "below", "read_settings"]
-
 _PATH = re.compile(r"(?:&(?P<anchor>\w+)\s+)?!!python/object/apply:pathlib\.(?P<kind>\w*)Path\s*(?:\[\])?$")
 
 

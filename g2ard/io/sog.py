@@ -38,8 +38,6 @@ from g2ard.io.sog_chunk import Chunk, Decoder, count_of, means_of, rest_of
 from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Note, Scene
 
-__all__ = ["chunks_of", "read", "stream"]
-
 _CHUNK_NAME = re.compile(r"(\d+)_(\d+)")
 
 

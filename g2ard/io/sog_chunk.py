@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from g2ard.io.sanitize import Raw
 
-__all__ = ["Chunk", "Decoder", "count_of", "means_of", "rest_of"]
-
 _COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
 _LARGEST = float.fromhex("0x1.fffffep+127")
 """Of float32."""

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     from g2ard.scene.splats import Splats
 
-__all__ = ["palette_size", "sog_bytes", "sog_files", "write", "write_folder"]
-
 _COLUMNS = 64
 """Entries of the palette beside each other in a row of its image."""
 

@@ -17,8 +17,6 @@ from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Scene
 from g2ard.scene.splats import SH_C0, Splats, unit_quats
 
-__all__ = ["read", "stream", "write"]
-
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 

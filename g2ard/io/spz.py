@@ -34,8 +34,6 @@ from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
 from g2ard.scene.splats import Splats
 
-__all__ = ["FLIPS", "fraction_bits", "read", "write"]
-
 _MAGIC = b"NGSP"
 _HEADER = 16
 """Bytes."""

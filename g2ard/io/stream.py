@@ -17,8 +17,6 @@ from g2ard.io.sanitize import BLOCK, Raw, Tally
 from g2ard.io.types import Note
 from g2ard.scene.splats import Splats
 
-__all__ = ["JoinedScenes", "PartsStream", "SceneStream", "file_identity"]
-
 _ENDS = 1 << 16
 """Bytes at each end of a file that tell it from others of its name, size and time."""
 

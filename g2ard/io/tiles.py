@@ -7,8 +7,6 @@ from pathlib import Path
 from g2ard.io.stream import PartsStream
 from g2ard.io.types import Scene
 
-__all__ = ["read", "stream"]
-
 
 def read(path: Path) -> Scene:
     """All tiles as one scene, tile after tile.

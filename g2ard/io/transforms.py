@@ -14,8 +14,6 @@ from g2ard.io.jsonfile import Fields, fields_of, matrix, number, optional_text, 
 from g2ard.io.photos import Frame, find_photo, inverse, photo_size, rigid, view_set
 from g2ard.io.types import ViewSet
 
-__all__ = ["files_of", "frames", "opencv_view", "read"]
-
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 _LEAST_ANGLE = 1e-6

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
 
-__all__ = ["Cloud", "Note", "Points", "Scene", "ViewSet"]
-
 
 @dataclass(frozen=True)
 class Note:

@@ -31,8 +31,6 @@ from g2ard.io.types import ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 
-__all__ = ["read", "write"]
-
 _FORMAT = "g2ard-views"
 _VERSION = 1
 

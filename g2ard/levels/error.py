@@ -15,8 +15,6 @@ from g2ard.scene.splats import Splats
 if TYPE_CHECKING:
     from g2ard.levels.tree import Level
 
-__all__ = ["leaf_errors"]
-
 Float = NDArray[np.float64]
 
 _DISTANCE = 200.0

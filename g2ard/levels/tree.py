@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     Level = Splats | StoredScene
     """A level of detail: a scene in memory, or rows on disk."""
 
-__all__ = ["Cut", "Leaf", "Node", "cut"]
-
 Float = NDArray[np.float64]
 Rows = NDArray[np.int64]
 

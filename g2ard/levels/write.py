@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from g2ard.levels.tree import Level
     from g2ard.scene.splats import Splats
 
-__all__ = ["save_levels"]
-
 _ERRORS = "errors.jsonl"
 """In the folder of what is done: a leaf's errors a line, in one order of leaves."""
 

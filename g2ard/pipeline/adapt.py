@@ -22,8 +22,6 @@ from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.report import Gain
 from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
 
-__all__ = ["AdaptConfig", "AdaptReport", "Adapted", "adapt", "appearance_only"]
-
 _FREE = Regularizers(anchor=0.0, shape=0.0, effective_rank=False)
 """Geometry that cannot move needs nothing to hold it."""
 

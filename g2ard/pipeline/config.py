@@ -13,8 +13,6 @@ from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.select.surfaces import CoverageOptions
 from g2ard.stages.simplify.config import SimplifyConfig
 
-__all__ = ["DistillConfig", "SelectConfig"]
-
 
 @dataclass(frozen=True)
 class SelectConfig(CoverageOptions):

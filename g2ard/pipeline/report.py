@@ -8,8 +8,6 @@ from g2ard.report.base import LEFT_OUT, Report
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.simplify.report import SimplifyReport
 
-__all__ = ["DistillReport", "RoundReport", "StageSeconds", "ViewsReport"]
-
 
 @dataclass(frozen=True)
 class ViewsReport(Report):

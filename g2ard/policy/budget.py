@@ -10,8 +10,6 @@ from numbers import Real
 from g2ard.errors import InputError
 from g2ard.progress import plural
 
-__all__ = ["DEVICES", "Budget"]
-
 DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "web": 2_000_000}
 """Gaussians that run smoothly: what users of Quest 3 report; PlayCanvas' defaults for streamed scenes, on
 phones and in desktop browsers."""

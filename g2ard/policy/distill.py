@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     Scene = Splats | Points | str | Path | None
 
-__all__ = ["distill", "prepare"]
-
 
 def distill(
     scene: Scene,

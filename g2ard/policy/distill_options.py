@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from g2ard.policy.inputs import Views
     from g2ard.stages.recover.anchors import Regularizers
 
-__all__ = ["DistillOptions"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DistillOptions:

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
     from g2ard.scene.targets import Targets
 
-__all__ = ["Estimate", "check_memory", "estimate", "total"]
-
 _TRIED, _STEPS = 4, 8
 """Views that are rendered, and steps that are taken, for the estimate."""
 _MERGING = 4.0

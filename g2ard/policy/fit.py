@@ -25,17 +25,6 @@ from g2ard.scene.splats import Splats
 if TYPE_CHECKING:
     from g2ard.stages.simplify import Simplified
 
-__all__ = [
-    "Aim",
-    "Quality",
-    "aim_of",
-    "as_file",
-    "count_for_bytes",
-    "count_for_quality",
-    "file_bytes",
-    "quality",
-]
-
 _VIEWS, _SIDE = 12, 400
 """Views that a quality is measured in, and their longer side, pixels."""
 _ROWS = 100_000

@@ -23,21 +23,6 @@ if TYPE_CHECKING:
 
     Views = Cameras | ViewSet | str | Path  # read already, or where they lie
 
-__all__ = [
-    "clutter_seen",
-    "drop_held_out",
-    "load_for_training",
-    "load_held_out",
-    "load_scene",
-    "load_split_views",
-    "load_trained",
-    "load_view_sets",
-    "load_views",
-    "make_targets",
-    "say_notes",
-    "say_regions",
-]
-
 _CLUTTER_VIEWS, _CLUTTER_SIDE = 96, 400
 """Generated views that clutter is found by, and their longer side, pixels."""
 _CLUTTER_ROWS = 100_000

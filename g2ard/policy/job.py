@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from g2ard.scene.targets import Targets
     from g2ard.stages.recover.presets import PriorMeasures
 
-__all__ = ["DistillJob"]
-
 
 @dataclass(frozen=True, eq=False)
 class DistillJob:

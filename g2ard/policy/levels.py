@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.targets import Targets
 
-__all__ = ["RATIOS", "LevelReport", "Levels", "check_ratios", "level_size", "lod", "recovery_settings"]
-
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """A level is half of the one before, as viewers' own tools make them."""
 

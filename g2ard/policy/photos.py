@@ -23,8 +23,6 @@ from g2ard.scene.images import load_image
 if TYPE_CHECKING:
     from g2ard.policy.inputs import Views
 
-__all__ = ["points_of_photos", "points_within_sight", "sparse_points"]
-
 _SIDE = 240
 """Pixels of the longer side of the photos that points are looked for in."""
 _DEPTHS = 48

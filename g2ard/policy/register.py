@@ -17,8 +17,6 @@ from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 
-__all__ = ["matched", "photos_of", "pool_of", "poses_for", "read_poses"]
-
 Poses = dict[str, NDArray[np.float64]]
 Found = TypeVar("Found")
 

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
     from g2ard.scene.targets import Targets
 
-__all__ = ["report_of"]
-
 
 def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
     """Both scenes scored in views that recovery did not learn from, beside what the run was and did.

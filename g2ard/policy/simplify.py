@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from g2ard.policy.inputs import Views
     from g2ard.stages.simplify import Simplified, SimplifyConfig, Visibility, VisibilitySource
 
-__all__ = ["Reduction", "simplify"]
-
 
 def simplify(
     scene: Splats | str | Path,

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from g2ard.tiles.sights import Surroundings
     from g2ard.tiles.store import StoredScene, TileStore
 
-__all__ = ["TiledLevels", "distill_in_tiles", "lod_in_tiles", "simplify_in_tiles", "working"]
-
 _OURS = re.compile(r"tiles|steps|(student|merged|level|written)-[0-9a-f]{16}")
 """Names that commands create in the work folder."""
 

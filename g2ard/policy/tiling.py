@@ -17,24 +17,6 @@ if TYPE_CHECKING:
     from g2ard.policy.distill_options import DistillOptions
     from g2ard.tiles.store import TileStore
 
-__all__ = [
-    "LEVELS_TIMES",
-    "RECOVERY_TIMES",
-    "WHOLE_TIMES",
-    "TileMemory",
-    "Tiling",
-    "amount",
-    "bytes_of",
-    "check_memory",
-    "cut_into",
-    "is_tiled",
-    "refuse_whole",
-    "whole_budgets",
-    "whole_method",
-    "whole_options",
-    "workers_for",
-]
-
 _SMALLEST_ROW = 4
 """Least bytes per Gaussian in a file: a smaller file is known to be small without opening it."""
 

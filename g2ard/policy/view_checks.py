@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
 
-__all__ = ["as_pool", "check_sight", "found_views", "opaque_points", "warn_of_photos", "warn_of_sight"]
-
 _SIDE = 800
 """Pixels of the longer side, as a pool has."""
 

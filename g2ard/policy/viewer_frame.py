@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Camera, Cameras
     from g2ard.scene.splats import Splats
 
-__all__ = ["ViewerFrame", "frame_of", "frame_with"]
-
 _POOL = 32
 """Poses of which one is the start, where there are no views."""
 

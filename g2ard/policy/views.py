@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     Up = Sequence[float] | None
 
-__all__ = ["RunViews", "cameras_for_looks", "is_made", "pool_times", "views_of", "views_or_pool"]
-
 _POOL, _GROW, _NEAR = 160, 2.0, 0.25
 """Poses of a pool made for a scene without views, how many times as many there may be where a view holds
 little of it, and the most that step nearer; every 8th is held out for scoring."""

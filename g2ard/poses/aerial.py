@@ -12,8 +12,6 @@ from g2ard.poses.lattice import halton
 from g2ard.poses.sight import Lens, Poses, view_statistics
 from g2ard.poses.site import Site
 
-__all__ = ["plan_aerial"]
-
 Floats = NDArray[np.float64]
 
 _NADIR = 0.4

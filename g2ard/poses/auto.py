@@ -18,8 +18,6 @@ from g2ard.poses.sight import Lens, Poses
 from g2ard.poses.site import Site
 from g2ard.poses.walk import plan_walk
 
-__all__ = ["plan_auto"]
-
 _STREET = 0.25
 """Share of a landscape's poses that stand on its ground, where there is room."""
 

@@ -17,8 +17,6 @@ from g2ard.poses.site import Site
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 
-__all__ = ["Focus", "Glance", "plan_focus"]
-
 Floats = NDArray[np.float64]
 
 _ROWS = 12_000

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from g2ard.poses.sight import Poses
 
-__all__ = ["gather"]
-
 _PATIENCE = 12
 """Candidates judged per pose wanted, at most."""
 

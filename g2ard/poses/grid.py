@@ -12,8 +12,6 @@ from g2ard import _core
 from g2ard.poses.numbers import norms, turned
 from g2ard.poses.volume import OccupiedVolume
 
-__all__ = ["Grid"]
-
 Floats = NDArray[np.float64]
 
 _CELLS = (2_000_000, 6_000_000)

@@ -13,8 +13,6 @@ from g2ard.poses.lattice import fibonacci, halton
 from g2ard.poses.sight import Lens, Poses, view_statistics
 from g2ard.poses.site import Site
 
-__all__ = ["Inside", "find_inside", "plan_inside"]
-
 Floats = NDArray[np.float64]
 
 _TRIES = 4096

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["fibonacci", "halton", "strata"]
-
 Floats = NDArray[np.float64]
 
 _GOLDEN = (np.sqrt(5) - 1) / 2

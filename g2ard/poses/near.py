@@ -12,8 +12,6 @@ from g2ard.poses.numbers import norms
 from g2ard.poses.sight import Lens, Poses, clearance
 from g2ard.poses.site import Site
 
-__all__ = ["Reach", "plan_near", "reach_of"]
-
 Floats = NDArray[np.float64]
 
 _POINTS = 512

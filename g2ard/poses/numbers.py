@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from g2ard.scene.splats import Splats
 
-__all__ = ["along", "canonical_order", "middle", "moments", "norms", "quantile", "turned"]
-
 Floats = NDArray[np.float64]
 
 

@@ -13,8 +13,6 @@ from g2ard.poses.numbers import quantile, turned
 from g2ard.poses.sight import Lens, Poses, view_statistics
 from g2ard.poses.site import Site
 
-__all__ = ["plan_orbit"]
-
 Floats = NDArray[np.float64]
 
 _ELEVATIONS = (-5.0, 50.0)

@@ -27,8 +27,6 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.splits import HOLD_OUT
 
-__all__ = ["Pool", "plan_pool"]
-
 _WORTH = 1.1
 """Times as many poses for which planning begins anew."""
 

@@ -8,8 +8,6 @@ from g2ard.poses.lattice import halton
 from g2ard.poses.site import Site
 from g2ard.poses.walk import enclosed
 
-__all__ = ["shape_of"]
-
 _TRIES = 400
 """Places tried."""
 

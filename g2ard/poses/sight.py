@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from g2ard.poses.site import Site
 from g2ard.scene.cameras import Cameras
 
-__all__ = ["Lens", "Poses", "ViewStatistics", "clearance", "view_statistics"]
-
 Floats = NDArray[np.float64]
 
 _RAYS = (24, 18)

@@ -15,8 +15,6 @@ from g2ard.poses.up import Up, estimate_up, given_up
 from g2ard.poses.volume import OccupiedVolume, Sample
 from g2ard.scene.splats import Splats
 
-__all__ = ["Site"]
-
 Floats = NDArray[np.float64]
 
 _EXTENT = (0.01, 0.99)

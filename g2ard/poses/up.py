@@ -13,8 +13,6 @@ from g2ard.poses.lattice import fibonacci
 from g2ard.poses.numbers import along, moments, quantile
 from g2ard.poses.volume import Sample
 
-__all__ = ["Up", "estimate_up", "given_up"]
-
 Floats = NDArray[np.float64]
 
 _FACING = np.cos(np.radians(20))

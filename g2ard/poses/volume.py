@@ -12,8 +12,6 @@ from g2ard.errors import InputError
 from g2ard.poses.numbers import canonical_order, middle, norms, quantile
 from g2ard.scene.splats import Splats
 
-__all__ = ["OccupiedVolume", "Sample"]
-
 Floats = NDArray[np.float64]
 
 _FAR = 7.0

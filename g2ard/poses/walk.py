@@ -12,8 +12,6 @@ from g2ard.poses.lattice import fibonacci, halton
 from g2ard.poses.sight import Lens, Poses, view_statistics
 from g2ard.poses.site import Site
 
-__all__ = ["enclosed", "plan_walk"]
-
 Floats = NDArray[np.float64]
 
 _PITCHES = (-25.0, 10.0)

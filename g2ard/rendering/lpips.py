@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.system.extras import require_torch
 
-__all__ = ["Lpips", "load_lpips"]
-
 _MEAN, _STD = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """LPIPS's own normalisation of images in [−1, 1]."""
 

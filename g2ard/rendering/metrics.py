@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 
-__all__ = ["psnr", "ssim"]
-
 _Image = NDArray[np.floating[Any]]
 
 

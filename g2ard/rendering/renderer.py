@@ -16,17 +16,6 @@ from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS
 from g2ard.scene.splats import Splats
 
-__all__ = [
-    "RasterSettings",
-    "Rendered",
-    "Renderer",
-    "arrays_of",
-    "centred",
-    "render",
-    "settings_for",
-    "view_of",
-]
-
 _Floats = NDArray[np.float32]
 View = tuple[list[list[float]], list[float], tuple[int, int], float]
 

@@ -17,20 +17,6 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import as_prepared
 from g2ard.scene.splats import Splats
 
-__all__ = [
-    "CONVERGED",
-    "LONGEST",
-    "MOST_LOOKS",
-    "NEAR",
-    "ROUND",
-    "SampledVisibility",
-    "Visibility",
-    "fewest_looks",
-    "spread",
-    "visibility",
-    "visibility_source",
-]
-
 MOST_LOOKS, LONGEST = 96, 300
 """The most views that look at a scene or a tile, and the longer side of their renders, pixels."""
 

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields
 from typing import Any, Self, Union, get_args, get_origin, get_type_hints
 
-__all__ = ["LEFT_OUT", "Report"]
-
 LEFT_OUT = {"left_out": True}
 """Metadata of a field that JSON leaves out where it is None."""
 

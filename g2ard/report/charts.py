@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
 
-__all__ = ["Point", "chart", "pareto", "ticks"]
-
 _WIDTH, _HEIGHT = 560, 340
 _LEFT, _RIGHT, _TOP, _BOTTOM = 54, 14, 12, 44
 _MARKS = ("circle", "square", "diamond", "triangle")

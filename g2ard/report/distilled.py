@@ -20,8 +20,6 @@ from g2ard.scene.images import contact_sheet, to_bytes, write_png
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Targets
 
-__all__ = ["check_crops", "distill_report", "preview", "tiled_report"]
-
 _VIEWS = 6
 _STRETCHES = 25
 """Of the loss: single views differ more than steps do."""

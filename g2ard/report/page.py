@@ -17,8 +17,6 @@ from g2ard.io.atomic import atomic_output
 from g2ard.report.window import Window
 from g2ard.scene.images import to_bytes
 
-__all__ = ["COLORS", "Comparison", "Page", "Shown", "legend", "worst_windows"]
-
 COLORS = ("#2563eb", "#d97706", "#059669", "#db2777", "#7c3aed", "#64748b", "#0891b2", "#b91c1c", "#65a30d")
 _WINDOW, _CROPS = 0.28, 2
 """Side of a crop where a view is worst, as a share of the image's, and how many of them."""

@@ -11,8 +11,6 @@ from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.scene.splats import SH_C0, Splats
 
-__all__ = ["cell_labels", "flag_colors", "label_colors", "painted"]
-
 _FLAGGED = np.array([0.93, 0.33, 0.10])
 _PLAIN = np.array([0.55, 0.60, 0.66])
 _GONE = np.array([0.06, 0.06, 0.06])

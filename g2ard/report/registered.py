@@ -19,8 +19,6 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.images import load_image, to_bytes
 from g2ard.scene.splats import Splats
 
-__all__ = ["registration_report"]
-
 _VIEWS, _SIZE = 12, 640
 """Photos shown, and pixels of the longer side of their pictures."""
 

@@ -6,8 +6,6 @@ from dataclasses import astuple, dataclass
 
 from g2ard.errors import InputError
 
-__all__ = ["Crop", "Window"]
-
 
 @dataclass(frozen=True)
 class Window:

@@ -13,8 +13,6 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.targets import Targets, mask_of
 
-__all__ = ["ColourChange", "blended", "colour_change", "recoloured", "views_seeing"]
-
 _VIEWS = 16
 """Of the targets, evenly spaced, that tell the change of colours."""
 _PIXELS = 20_000

@@ -14,8 +14,6 @@ from g2ard.errors import InputError
 from g2ard.io.limits import check_image
 from g2ard.progress import plural
 
-__all__ = ["Camera", "Cameras", "look_at"]
-
 _LARGEST = 1e12
 """Of a pose or intrinsics: more is damage, and overflows where it is squared."""
 

@@ -17,16 +17,6 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import opened_image
 from g2ard.scene.cameras import Cameras
 
-__all__ = [
-    "as_saved",
-    "contact_sheet",
-    "load_image",
-    "load_mask",
-    "resized",
-    "to_bytes",
-    "write_png",
-]
-
 _ASPECT_SLACK = 0.02
 """Relative difference of aspect ratio that rounding a resized photo may cause; more is another photo."""
 

@@ -13,16 +13,6 @@ from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.scene.splats import Splats
 
-__all__ = [
-    "DRAWN_LOGITS",
-    "DRAWN_LOG_SCALES",
-    "LARGEST_SCALE",
-    "PreparedScene",
-    "as_prepared",
-    "finite_rows_of",
-    "with_some_opacity",
-]
-
 _LIMITS = _core.defaults()["limits"]
 
 DRAWN_LOGITS: tuple[float, float] = _LIMITS["drawn_logits"]

@@ -13,8 +13,6 @@ from g2ard.errors import InputError
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import in_box, in_sphere
 
-__all__ = ["Region", "as_regions", "check_region", "in_any"]
-
 Region = tuple[float, ...]
 """(x, y, z, r), a sphere, or (x, y, z, x, y, z), the lower and the upper corner of a box."""
 

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 
-__all__ = ["DRAWN_LOGIT", "SH_C0", "Splats", "unit_quats"]
-
 SH_C0 = 0.28209479177387814
 """Band-0 spherical harmonic: colour = 0.5 + SH_C0 · sh0."""
 

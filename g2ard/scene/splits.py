@@ -16,16 +16,6 @@ from g2ard.io.paths import real_path
 if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
 
-__all__ = [
-    "HOLD_OUT",
-    "for_scores",
-    "for_training",
-    "not_held_out",
-    "split_mask",
-    "splits_of",
-    "states_splits",
-]
-
 HOLD_OUT = 8
 """Without a split file every 8th name is test, as in Mip-NeRF 360's and INRIA's evaluations."""
 

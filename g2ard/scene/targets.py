@@ -19,20 +19,6 @@ from g2ard.scene.splats import Splats
 if TYPE_CHECKING:
     from g2ard.rendering.renderer import RasterSettings, Renderer
 
-__all__ = [
-    "CACHE_BYTES",
-    "Photos",
-    "PhotosOrRenders",
-    "Subset",
-    "Targets",
-    "TeacherRenders",
-    "against_of",
-    "fingerprint_of",
-    "kinds_of",
-    "kinds_told",
-    "mask_of",
-]
-
 CACHE_BYTES = 2_000_000_000
 """Targets are kept in memory up to this many bytes; beyond it they are made again when they are asked for."""
 

@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.errors import InputError
 from g2ard.scene.splats import Splats
 
-__all__ = ["in_box", "in_sphere", "join", "rotate_harmonics", "similarity", "transform"]
-
 _FAR = 16.0
 """Extents from the origin past which a move goes into `offset`: float32 means keep their precision."""
 

@@ -23,8 +23,6 @@ from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
 
-__all__ = ["KINDS", "Cleaning", "find_clutter", "within_reach"]
-
 KINDS = ("invisible", "giant", "needle", "floater")
 
 _HALF_STEP = 0.5 / 255

@@ -19,8 +19,6 @@ from g2ard.scene.targets import Targets, against_of, mask_of
 if TYPE_CHECKING:
     from g2ard.rendering.renderer import RasterSettings
 
-__all__ = ["Evaluation", "ViewScore", "evaluate"]
-
 
 @dataclass(frozen=True)
 class ViewScore:

@@ -15,8 +15,6 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
 from g2ard.scene.splats import SH_C0, Splats
 
-__all__ = ["LiftConfig", "lift"]
-
 _CORE = _core.defaults()["lift"]
 """The one place of these defaults, which are the paper's."""
 

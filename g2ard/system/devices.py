@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from g2ard import _core
 from g2ard.errors import InputError
 
-__all__ = ["Adapter", "State", "adapters", "is_software", "notes", "state", "use"]
-
 
 @dataclass(frozen=True)
 class Adapter:

@@ -6,8 +6,6 @@ from importlib.util import find_spec
 
 from g2ard.errors import MissingDependencyError
 
-__all__ = ["require_torch"]
-
 
 def require_torch(feature: str) -> None:
     """Check that torch can be imported, without importing it.

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from types import FrameType
     from typing import NoReturn
 
-__all__ = ["STATUSES", "asked_by", "ends_the_program", "leave", "raises", "status", "terminate"]
-
 STATUSES = (130, 143)
 """What the program ends with after Ctrl-C, and after SIGTERM."""
 

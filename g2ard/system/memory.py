@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["forget_workers", "note_worker", "peak_rss", "peak_rss_of_all"]
-
 _WORKERS: dict[int, int] = {}
 """Worker processes → their peaks, in bytes."""
 

@@ -19,8 +19,6 @@ from g2ard.progress import Progress, silent
 from g2ard.system.memory import forget_workers, note_worker, peak_rss
 from g2ard.tiles.tasks import Task, run_task
 
-__all__ = ["DaskExecutor", "Executor", "Workers", "executor"]
-
 _TRIES = 5
 """How often in a row workers may die with no task done between. Dask gives up a task after four deaths."""
 

@@ -21,8 +21,6 @@ from g2ard.tiles.journal import JOURNAL, POINTS, Journal, clear, is_ours
 from g2ard.tiles.pour import PointFeed, SceneFeed, lift_tiles, pour
 from g2ard.tiles.store import MANIFEST, VERSION, TileStore
 
-__all__ = ["MOST_TILES", "TILE_ROWS", "ingest"]
-
 TILE_ROWS = 5_000_000
 """Rows of a tile at the most, unless told otherwise."""
 

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["KdTree", "Sampler", "cut_tree", "margin_of"]
-
 _SIGMAS = 4.0
 """A tile may hold more than a sample foretells; by so many standard deviations at the most, it is taken."""
 

@@ -28,8 +28,6 @@ from g2ard.tiles.tasks import load, scene_of, small_scene
 if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
 
-__all__ = ["TiledScene", "cheapest", "finished", "key_of", "sample_of", "simplify_tiles"]
-
 _POOL, _POOL_ROWS = 96, 4_000_000
 """Poses to look from for so many Gaussians; more of these, more of those."""
 

@@ -23,8 +23,6 @@ from g2ard.tiles.journal import POINTS, Journal, clear
 from g2ard.tiles.kdtree import KdTree, Points, Sampler, cut_tree, margin_of
 from g2ard.tiles.store import TileStore, halo_name, packed, row_width, tile_name
 
-__all__ = ["PointFeed", "SceneFeed", "foretold", "lift_tiles", "pour"]
-
 _SAMPLE = 1 << 20
 """Positions that tiles are cut by: 12 MB."""
 

@@ -41,8 +41,6 @@ from g2ard.tiles.tasks import (
 if TYPE_CHECKING:
     from g2ard.policy.views import RunViews
 
-__all__ = ["TileScore", "TiledScores", "recover_tile", "recover_tiles"]
-
 _MARGIN = 16
 """Pixels around a tile that its images show too: SSIM's windows reach over its edge."""
 

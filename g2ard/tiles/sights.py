@@ -20,8 +20,6 @@ from g2ard.tiles.steps import COARSE, TiledRun
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.tasks import Task, is_whole, load, scene_of
 
-__all__ = ["Sights", "Surroundings", "in_sight", "light_of", "written"]
-
 _IN_SIGHT = 0.01
 """Share of a view's light that comes from a tile that it has in sight."""
 

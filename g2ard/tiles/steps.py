@@ -49,8 +49,6 @@ from g2ard.tiles.tasks import (
     with_surroundings,
 )
 
-__all__ = ["COARSE", "TiledRun", "coarse", "glance", "look", "look_again", "merge", "pair_plan", "run_costs"]
-
 COARSE = (32, 512)
 """How many times fewer Gaussians stand for a tile near the one that is looked at, and for one far."""
 

@@ -25,26 +25,6 @@ from g2ard.scene.transform import join
 from g2ard.stages.simplify.pairs import fit_opacities
 from g2ard.tiles.store import TileStore
 
-__all__ = [
-    "Arguments",
-    "Arrays",
-    "Inputs",
-    "Places",
-    "Task",
-    "arrays_of",
-    "cameras_of",
-    "cropped",
-    "far_around",
-    "is_whole",
-    "load",
-    "run_task",
-    "scene_of",
-    "small_scene",
-    "tile_of",
-    "with_surroundings",
-    "within_halo",
-]
-
 Arrays = dict[str, NDArray[Any]]
 """What a task makes and reads: arrays by name, one .npz file."""
 

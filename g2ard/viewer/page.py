@@ -16,8 +16,6 @@ from g2ard.errors import InputError, OutputError
 if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
-__all__ = ["Start", "Written", "check_page_output", "write_page"]
-
 _HERE = Path(__file__).parent
 _NOTICE = "The viewer on this page is SuperSplat Viewer 1.36.2 with PlayCanvas Engine 2.22.6.\n\n"
 

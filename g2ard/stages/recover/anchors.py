@@ -10,17 +10,6 @@ from numpy.typing import NDArray
 from g2ard.errors import require
 from g2ard.scene.splats import Splats
 
-__all__ = [
-    "NEEDLE_RANK",
-    "PAPER_PRESETS",
-    "PRESETS",
-    "Anchors",
-    "Regularizers",
-    "drift95",
-    "effective_rank",
-    "needle",
-]
-
 NEEDLE_RANK = 1.1
 """A Gaussian whose effective rank is below this is a needle."""
 

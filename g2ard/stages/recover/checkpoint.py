@@ -18,8 +18,6 @@ from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.system import interrupt
 
-__all__ = ["PERIOD", "deferred_interrupt", "load", "save"]
-
 _ANEW = "{overwrite=True} starts again"
 
 PERIOD = 60.0

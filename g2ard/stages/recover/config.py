@@ -9,8 +9,6 @@ from g2ard.errors import InputError
 from g2ard.stages.recover.anchors import PRESETS, Regularizers
 from g2ard.stages.recover.schedule import TUNED, Schedule
 
-__all__ = ["RecoverConfig"]
-
 
 @dataclass(frozen=True)
 class RecoverConfig:

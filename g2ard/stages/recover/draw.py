@@ -7,8 +7,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 
-__all__ = ["checked_weights", "drawn"]
-
 
 def checked_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64] | None:
     """Weights of `count` views, mean 1; None where there are none.

@@ -13,8 +13,6 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, Regularizers
 from g2ard.stages.recover.schedule import Rates
 
-__all__ = ["Engine", "Objective"]
-
 
 @dataclass(frozen=True, eq=False)
 class Objective:

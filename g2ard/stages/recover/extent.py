@@ -9,8 +9,6 @@ from torch.nn.functional import normalize
 
 from g2ard.scene.cameras import Cameras
 
-__all__ = ["extents", "rotations", "share_of_rate"]
-
 
 @torch.no_grad()
 def extents(

@@ -15,8 +15,6 @@ from g2ard.stages.recover.engine import Objective
 from g2ard.stages.recover.schedule import Rates
 from g2ard.stages.recover.sizes import radii
 
-__all__ = ["FusedEngine"]
-
 
 class FusedEngine:
     """Does what `TorchEngine` does, to rounding."""

@@ -12,8 +12,6 @@ from g2ard.stages.recover.engine import Objective
 from g2ard.stages.recover.losses import l1_ssim_anywhere
 from g2ard.stages.recover.torch_engine import TorchEngine
 
-__all__ = ["GsplatEngine", "check_cuda"]
-
 
 def check_cuda() -> None:
     """See to it that gsplat can run.

@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.rendering.renderer import arrays_of
 from g2ard.scene.splats import Splats
 
-__all__ = ["LOOKS", "Guard", "blended"]
-
 LOOKS = (0.1, 0.3, 0.5, 0.75)
 """Shares of the horizon at which the scene is looked at."""
 

@@ -28,8 +28,6 @@ from g2ard.stages.recover.schedule import multiplier_for, reach_for
 from g2ard.stages.recover.sizes import typical_share
 from g2ard.system.extras import require_torch
 
-__all__ = ["Loop", "Watch", "engine_class", "finite"]
-
 _TRIAL_STEPS = 20
 _TRIAL_SHARE, _CALM_SHARE = 0.1, 0.3
 """Under a time limit: steps of a trial, and the share of the limit that all trials may take; the second where

@@ -13,8 +13,6 @@ from g2ard.errors import InputError
 from g2ard.stages.recover.anchors import Anchors, Regularizers
 from g2ard.stages.recover.extent import rotations
 
-__all__ = ["TorchAnchors", "anchor_loss", "l1_ssim", "l1_ssim_anywhere", "regularization", "shape_loss"]
-
 _WINDOW, _SIGMA = 11, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
 

@@ -11,8 +11,6 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS, Regularizers, needle
 
-__all__ = ["PriorMeasures", "measure_prior", "preset_for", "view_consistency"]
-
 _LIFT_THICKNESS = 0.2
 _LIFT_SPREAD = 2.5
 """Discs of one mould: the lift's normal scale is a tenth of the tangential ones, give or take its anisotropy.

@@ -16,8 +16,6 @@ from g2ard.scene.targets import Targets, mask_of
 if TYPE_CHECKING:
     from g2ard.rendering.renderer import Renderer
 
-__all__ = ["MULTIPLIERS", "Probe", "calm", "search_multiplier", "trial_steps"]
-
 MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
 """Of all rates; trained scenes want 1 or less, lifts more."""
 

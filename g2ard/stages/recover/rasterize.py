@@ -15,8 +15,6 @@ from g2ard.errors import InputError
 from g2ard.rendering.renderer import RasterSettings, View, view_of
 from g2ard.scene.cameras import Cameras
 
-__all__ = ["rasterize"]
-
 _NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
 _idle: list[_core.Rasterizer] = []

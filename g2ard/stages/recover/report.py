@@ -7,19 +7,6 @@ from dataclasses import dataclass, field
 
 from g2ard.report.base import LEFT_OUT, Report
 
-__all__ = [
-    "Gain",
-    "Geometry",
-    "Look",
-    "RecoverReport",
-    "Regularized",
-    "Trial",
-    "Validation",
-    "outcome",
-    "unregularized",
-    "unregularized_rounds",
-]
-
 
 @dataclass(frozen=True)
 class Gain(Report):

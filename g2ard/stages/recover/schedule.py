@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
 
-__all__ = ["PAPER", "SCHEDULES", "TUNED", "Rates", "Schedule", "steps_for"]
-
 _REACH = 0.01
 """Gaussians larger than a hundredth of the image hardly move, unless that is the scene's typical size."""
 

@@ -8,8 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["SelectiveAdam"]
-
 _BETAS, _EPS = (0.9, 0.999), 1e-15
 _LARGEST = 1e18
 """Beyond this the square of a gradient leaves float32."""

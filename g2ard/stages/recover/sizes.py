@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 
-__all__ = ["radii", "typical_share"]
-
 _NEEDLE = 1e-2
 """A needle's unit is not less than a tenth of its length."""
 

@@ -21,8 +21,6 @@ from g2ard.stages.recover.schedule import Rates
 from g2ard.stages.recover.selective_adam import SelectiveAdam
 from g2ard.stages.recover.sizes import radii
 
-__all__ = ["TorchEngine"]
-
 _NAMES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 
 

@@ -21,20 +21,6 @@ from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import blurred, gradient
 from g2ard.stages.register.pose import moved
 
-__all__ = [
-    "Aligned",
-    "Level",
-    "Normal",
-    "Shot",
-    "align",
-    "inverse",
-    "level_of",
-    "moves",
-    "normal_equations",
-    "shoot",
-    "shot_of",
-]
-
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 

@@ -18,8 +18,6 @@ from g2ard.stages.register.polish import Prior, polish
 from g2ard.stages.register.pose import motion_between, moved
 from g2ard.stages.register.solve import Solved, solve
 
-__all__ = ["Candidate", "Photo", "Search", "Start", "loaded"]
-
 Float = NDArray[np.float64]
 _FINEST = 2
 """Levels of direct alignment that a pose from features still needs."""

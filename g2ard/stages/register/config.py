@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from g2ard.config.choices import REFINEMENTS, Refinement
 from g2ard.errors import require
 
-__all__ = ["RegisterConfig"]
-
 _POSITIVE = ("max_angle_sigma", "max_position_sigma", "max_edge", "correlated", "max_reprojection", "alike")
 
 

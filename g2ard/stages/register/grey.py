@@ -9,19 +9,6 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 
-__all__ = [
-    "LUMA",
-    "band_passed",
-    "blurred",
-    "blurred_back",
-    "box_mean",
-    "gradient",
-    "grey_of",
-    "local_zncc",
-    "shift_between",
-    "zncc",
-]
-
 Float = NDArray[np.float64]
 
 LUMA = np.array([0.299, 0.587, 0.114])

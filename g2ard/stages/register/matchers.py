@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError, MissingDependencyError
 from g2ard.stages.register.grey import grey_of
 
-__all__ = ["Matcher", "Sift", "checked_pairs", "matcher_named", "mutual"]
-
 Float = NDArray[np.float64]
 Image = NDArray[np.float32]
 Pairs = tuple[Float, Float]

@@ -31,8 +31,6 @@ from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import LUMA, blurred_back
 from g2ard.stages.register.pose import motion_between, moved
 
-__all__ = ["Energy", "Point", "Prior", "polish"]
-
 Float = NDArray[np.float64]
 
 _TUKEY = 4.685

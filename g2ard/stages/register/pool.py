@@ -13,8 +13,6 @@ from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import band_passed, grey_of, shift_between
 from g2ard.stages.register.pose import rotation_of
 
-__all__ = ["PoolRenders", "Turned", "turned"]
-
 Float = NDArray[np.float64]
 
 

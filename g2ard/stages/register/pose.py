@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["motion_between", "moved", "pose_error", "rotation_of"]
-
 Float = NDArray[np.float64]
 
 

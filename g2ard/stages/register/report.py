@@ -14,19 +14,6 @@ from g2ard.errors import require
 from g2ard.report.base import Report
 from g2ard.scene.cameras import Cameras
 
-__all__ = [
-    "KEPT",
-    "RECALLS",
-    "Accuracy",
-    "PhotoReport",
-    "PoseError",
-    "RegisterReport",
-    "Registered",
-    "Status",
-    "Summary",
-    "summarize",
-]
-
 Status = Literal["registered", "uncertain", "refused"]
 KEPT: dict[Keep, tuple[Status, ...]] = {
     "registered": ("registered",),

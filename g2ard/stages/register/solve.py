@@ -18,8 +18,6 @@ from g2ard.scene.cameras import Camera
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.matchers import Matcher
 
-__all__ = ["Solved", "information", "lifted", "solve", "solved"]
-
 Float = NDArray[np.float64]
 
 _LEAST = 6

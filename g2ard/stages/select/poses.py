@@ -13,17 +13,6 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.select.surfaces import Surface, core_scene, core_views
 
-__all__ = [
-    "draw_weights",
-    "facility_location",
-    "farthest",
-    "gains_of",
-    "inside_geometry",
-    "inverse_density",
-    "outlooks",
-    "pose_kernel",
-]
-
 Float = NDArray[np.float64]
 Order = NDArray[np.int64]
 

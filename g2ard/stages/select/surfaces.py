@@ -16,17 +16,6 @@ from g2ard.rendering.renderer import settings_for
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 
-__all__ = [
-    "CoverageOptions",
-    "Surface",
-    "Visible",
-    "core_scene",
-    "core_views",
-    "greedy",
-    "surface",
-    "visible_cells",
-]
-
 Float = NDArray[np.float64]
 Order = NDArray[np.int64]
 

@@ -18,17 +18,6 @@ from g2ard.scene.regions import in_any
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
 from g2ard.stages.simplify.config import SimplifyConfig, round_counts
 
-__all__ = [
-    "Visibility",
-    "VisibilitySource",
-    "emphasised",
-    "fit_opacities",
-    "merge",
-    "merge_and_fit",
-    "rows_of",
-    "splats_of",
-]
-
 _FIT = 1 / 4
 """Exponent of the ratio of what views saw to what they see: ½ fits the views looked from by up to 0.1 dB
 better, and others by up to 0.7 dB worse (decision 0009)."""

@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 
 from g2ard.report.base import LEFT_OUT, Report
 
-__all__ = ["SimplifyReport", "SimplifyRound"]
-
 
 @dataclass(frozen=True)
 class SimplifyRound(Report):
