@@ -50,6 +50,8 @@ def as_regions(given: Sequence[Any]) -> tuple[Region, ...]:
     try:
         alone = len(given) > 0 and not np.ndim(given[0])
         return tuple(check_region(region) for region in ([given] if alone else given))
+    except InputError:
+        raise
     except (TypeError, ValueError):
         raise InputError(
             f"expected (x, y, z, r) or (x, y, z, x, y, z), got {given!r}", parameter="keep_region"

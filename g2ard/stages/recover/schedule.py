@@ -232,6 +232,7 @@ def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
     Returns:
         Between `steps` and 2.25 times that.
 
+    >>> import numpy as np
     >>> from g2ard.scene.cameras import Cameras, look_at
     >>> from g2ard.scene.splats import Splats
     >>> line = Splats.create([[0, 0, 0], [9, 0, 0], [0, 0, 9], [-9, 0, 0]], scales=np.ones((4, 3)))
