@@ -70,13 +70,13 @@ docs: setup $(VENV)/.docs
 	@echo site/docs/index.html
 
 # Needs a scene: SCENE=path, or real data. Every study runs once, small: one scene, two ratios, few steps.
-# What bench/ and bench.csv hold is not measured again; `make clean` removes them.
+# What bench/ holds is not measured again; `make clean` removes it.
+STUDIES := ablations bounded compression geobase k_sweep policies protection protection_given source
 QUICK := --only city,guitar --ratios 10,30 --seeds 0 --size 240 --steps 150 --seconds 8 --adapt-steps 500
 SCENE ?= $(G2ARD_DATA)/playbot/0_0
 bench: setup
-	$(BIN)/python -m benchmarks raster $(SCENE)
-	$(BIN)/python -m benchmarks simplify $(SCENE) --ratios 10,30 --csv bench.csv
-	$(BIN)/python -m benchmarks run benchmarks/definitions/*.toml -o bench $(QUICK)
+	$(BIN)/python -m benchmarks run raster simplify $(SCENE) --ratios 10,30 -o bench/scene
+	$(BIN)/python -m benchmarks run $(STUDIES) -o bench $(QUICK)
 
 # The core's kernels alone, on synthetic scenes: no Python, no data, under a minute once built.
 bench-kernels:
@@ -112,4 +112,4 @@ miri:
 		RAYON_NUM_THREADS=2 cargo +nightly miri test -p g2ard-core --lib -- $(MIRI)
 
 clean:
-	rm -rf $(VENV) target dist demo site bench bench.csv
+	rm -rf $(VENV) target dist demo site bench

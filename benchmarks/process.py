@@ -1,8 +1,10 @@
-"""A command as a process of its own, with what it took."""
+"""Commands as processes of their own with their cost, and the machine they run on."""
 
 from __future__ import annotations
 
 import os
+import platform
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -11,7 +13,15 @@ from pathlib import Path
 
 from g2ard.errors import G2ardError, InputError
 
-__all__ = ["Usage", "check_measurable", "measured"]
+__all__ = [
+    "Usage",
+    "check_measurable",
+    "cpu_name",
+    "machine",
+    "measured",
+    "splat_transform",
+    "version_of",
+]
 
 _LAUNCHER = """
 import os, signal, sys, time
@@ -26,12 +36,12 @@ _, status, usage = os.wait4(pid, 0)
 cpu, wall = usage.ru_utime + usage.ru_stime, time.perf_counter() - began
 print(os.waitstatus_to_exitcode(status), cpu, wall, usage.ru_maxrss)
 """
-"""Between us and the child: Linux counts the memory of whoever starts a process as the process's own peak."""
+"""A small process between ours and the child: Linux counts the memory of the starter in the child's peak."""
 
 
 @dataclass(frozen=True)
 class Usage:
-    """What a process took.
+    """Cost of a process.
 
     Args:
         cpu_s: user + system seconds.
@@ -45,25 +55,25 @@ class Usage:
 
 
 def check_measurable() -> None:
-    """Refuse where the system does not tell what a process took, as Windows does not in POSIX's way.
+    """Check that the system reports the cost of a process.
 
     Raises:
-        G2ardError: it does not.
+        G2ardError: it does not (Windows).
     """
     if not hasattr(os, "posix_spawnp"):
         raise G2ardError("this benchmark measures processes by POSIX's calls, which Windows lacks")
 
 
 def measured(command: Sequence[str], log: Path) -> Usage:
-    """Run a command to its end; it ends with us.
+    """Run a command to its end and return its cost; it is stopped if this process ends.
 
     Args:
         command: program and arguments.
-        log: what it prints goes here.
+        log: file for its output.
 
     Raises:
-        InputError: it failed; the message is its last line.
-        G2ardError: the system does not tell what a process took.
+        InputError: the command failed; the message is its last line.
+        G2ardError: the system does not report the cost of a process.
     """
     check_measurable()
     with log.open("wb") as out:
@@ -85,3 +95,41 @@ def measured(command: Sequence[str], log: Path) -> Usage:
         raise InputError(f"exit status {status:.0f}: {last}")
     unit = 1 if sys.platform == "darwin" else 1024
     return Usage(cpu, wall, peak * unit / 1e6)
+
+
+def splat_transform(*arguments: str, program: str | None = None) -> list[str]:
+    """Return a call of splat-transform: the given program, otherwise the one on PATH.
+
+    Raises:
+        InputError: there is none.
+    """
+    found = shutil.which(program or "splat-transform")
+    if found is None and program is not None:
+        raise InputError(f"{program}: no such program")
+    if found is None:
+        raise InputError("splat-transform: not on PATH (npm i -g @playcanvas/splat-transform)")
+    return [found, "-q", "-w", "-g", "cpu", *arguments]
+
+
+def version_of(program: str) -> str:
+    """Return the first line that a program prints for --version."""
+    told = subprocess.run(
+        [program, "--version"], capture_output=True, encoding="utf-8", errors="replace", check=False
+    )
+    lines = (told.stdout or told.stderr).splitlines()
+    return lines[0].strip() if lines else ""
+
+
+def machine() -> str:
+    """Return processor and cores, as recorded in every row."""
+    return f"{cpu_name()}, {os.cpu_count()} cores"
+
+
+def cpu_name() -> str:
+    """Return the processor's name, as its maker gives it where the system tells."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = (line.split(":", 1)[1].strip() for line in text.splitlines() if line.startswith("model name"))
+    return next(names, platform.machine())

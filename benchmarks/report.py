@@ -1,4 +1,4 @@
-"""A bench's report: error against time and count, then the views that came out worst."""
+"""The report of a run: error against time and count, a table, and the views that came out worst."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from benchmarks.definition import Definition, Matched
-from benchmarks.run import cells_of
-from benchmarks.run_rows import Row
-from benchmarks.simplify import machine
+from benchmarks.process import machine
+from benchmarks.rows import Row, shown
+from benchmarks.study import Study
 from g2ard import __version__
 from g2ard.report.charts import Point, chart, pareto
 from g2ard.report.page import COLORS, Comparison, Page, Shown, legend
@@ -22,253 +21,175 @@ from g2ard.report.page import COLORS, Comparison, Page, Shown, legend
 __all__ = ["write_report"]
 
 _VIEWS = 3
-_MARKS = ("steps", "seconds", "released", "none")
-_COLUMNS = (
-    "method",
-    "matched",
-    "Gaussians",
-    "MB",
-    "PSNR",
-    "SSIM",
-    "LPIPS (VGG)",
-    "LPIPS (Alex)",
-    "drift95",
-    "needle",
-    "luma drift",
-    "reduce CPU s",
-    "recover CPU s",
-    "seconds",
-    "peak MB",
-)
+_METHODS = ("method", "variant", "arm", "format", "matcher", "isa")
+"""Columns that name what a kind of study compares."""
+_MARKS = ("steps", "seconds", "released")
 
 
-def write_report(folder: Path, definitions: Sequence[Definition], rows: Sequence[Row]) -> None:
-    """Write `folder`/report.html: one file, no network.
+def write_report(folder: Path, studies: Sequence[Study], rows: Sequence[Row]) -> None:
+    """Write `folder`/report.html: one file that needs no network.
 
     Args:
-        folder: of the run, with its cells/ and images/.
-        definitions: the studies, in the order of the page.
-        rows: as `bench_run` returns them.
+        folder: of the run, with its images/.
+        studies: in the order of the page.
+        rows: as `benchmarks.runner.run` returns them.
     """
-    page = Page("g2ard bench", f"g2ard {__version__} on {machine()}")
+    page = Page("g2ard benchmarks", f"g2ard {__version__} on {machine()}")
     page.paragraph(
         "PSNR and SSIM on views that no method has used. Step-matched cells took the same number of "
-        "optimiser steps, time-matched ones the same seconds for reduction and recovery together; where "
-        "reduction alone took longer there was no recovery. Figures against photos and against a teacher's "
+        "optimiser steps, time-matched ones the same seconds for reduction and recovery together. If "
+        "reduction alone took longer, there was no recovery. Figures against photos and against a teacher's "
         "renders are never in one chart."
     )
-    for definition in definitions:
-        _study(page, folder, definition, [row for row in rows if row.study == definition.name])
+    for study in studies:
+        _study(page, folder, study, [row for row in rows if row["study"] == study.name])
     page.write(folder / "report.html")
 
 
-def _study(page: Page, folder: Path, definition: Definition, rows: Sequence[Row]) -> None:
-    page.heading(definition.title or definition.name)
-    if definition.differences:
+def _study(page: Page, folder: Path, study: Study, rows: list[Row]) -> None:
+    page.heading(study.title)
+    if study.differs:
         page.paragraph("Differs from the paper:")
-        page.items(definition.differences)
-    names = [method.name for method in definition.methods]
-    kinds = [kind for kind in _MARKS if any(row.matched == kind for row in rows)]
-    page.html(legend(names, [_kind_label(kind) for kind in kinds]))
-    for row in rows:
-        if row.error:
-            matched = Matched(row.matched, row.amount).label
-            page.paragraph(f"Failed: {row.scene} {row.ratio:g}× {row.method} ({matched}): {row.error}")
-    for line in _notes(folder, definition, rows):
+        page.items(study.differs)
+    names = list(dict.fromkeys(map(_name, rows)))
+    page.html(legend(names, [kind for kind in _MARKS if any(row.get("matched") == kind for row in rows)]))
+    for line in dict.fromkeys(line for row in rows for line in _notes(row)):
         page.paragraph(line)
-    whole = [row for row in rows if not row.error]
+    summary = study.summary(rows)
+    if summary is not None:
+        page.paragraph(summary[0])
+        page.table(summary[1], summary[2], set())
 
     def place(row: Row) -> tuple[str, str, str]:
-        return row.scene, row.split, row.against
+        return row["scene"], row.get("split", "") or row.get("views_kind", ""), row.get("against", "")
 
+    whole = [row for row in rows if "error" not in row]
     for (scene, split, against), members in groupby(sorted(whole, key=place), place):
         group = list(members)
-        page.heading(f"{scene}: {group[0].views} {split} views against {_against(against)}", 3)
-        _charts(page, group, names)
-        _table(page, group, names)
-        _views(page, folder, definition, scene, split, group)
+        views = f": {group[0]['views']} {split} views" if "views" in group[0] else ""
+        page.heading(f"{scene}{views}{f' against {against}' if against else ''}", 3)
+        if "psnr" in group[0]:
+            page.charts(_charts(group, names))
+        for line in _over_seeds(group):
+            page.paragraph(line)
+        columns, cells = shown(row for row in group if row.get("final", 1))
+        page.table(columns, cells, _best([row for row in group if row.get("final", 1)], columns))
+        _views(page, folder, group)
 
 
-def _notes(folder: Path, definition: Definition, rows: Sequence[Row]) -> list[str]:
-    """What was left out: training views that are scored on, and renders that came out black."""
+def _name(row: Row) -> str:
+    return next((str(row[name]) for name in _METHODS if name in row), "")
+
+
+def _label(row: Row) -> str:
+    """Return a row's cell in words."""
+    parts = (row["scene"], f"{row['ratio']:g}×" if "ratio" in row else "", _name(row))
+    matched = f"({row['matched']} {row.get('amount', 0):g})" if row.get("amount") else ""
+    return " ".join(part for part in (*parts, matched) if part)
+
+
+def _notes(row: Row) -> list[str]:
+    """Return what a reader must know of a row: errors, views that were not used, black renders."""
     lines = []
-    for scene in definition.scenes:
-        cells = [cell for cell in cells_of([definition]) if cell.scene.name == scene.name]
-        paths = [folder / "cells" / f"{cell.key}.json" for cell in cells]
-        dropped = max(
-            (json.loads(p.read_text(encoding="utf-8")).get("dropped", 0) for p in paths if p.exists()),
-            default=0,
+    if "error" in row:
+        lines.append(f"Failed: {_label(row)}: {row['error']}")
+    if row.get("dropped"):
+        dropped = f"{row['dropped']} views to train on are scored on: they were not trained on."
+        lines.append(f"{row['scene']}: {dropped}")
+    if row.get("black"):
+        count = (
+            f"{row['black']} of {row['black'] + row['views']} {row.get('split', '')} renders are all black"
         )
-        if dropped:
-            lines.append(
-                f"{scene.name}: {dropped} views to train on are scored on: they were not trained on."
-            )
-    lines += [
-        f"{row.scene} {row.ratio:g}× {row.method} ({Matched(row.matched, row.amount).label}): {row.black} of "
-        f"{row.black + (row.views or 0)} {row.split} renders are all black, and left out of its means."
-        for row in rows
-        if row.black
-    ]
+        lines.append(f"{_label(row)}: {count}, and not in its means.")
     return lines
 
 
-def _against(against: str) -> str:
-    named = {"photos": "the photos", "teacher": "the teacher's renders"}
-    return named.get(against, "photos, and the teacher's renders where there is none")
-
-
-def _kind_label(kind: str) -> str:
-    named = {
-        "steps": "step-matched",
-        "seconds": "time-matched",
-        "released": "as released",
-        "none": "as it is",
-    }
-    return named[kind]
-
-
-def _charts(page: Page, rows: Sequence[Row], names: Sequence[str]) -> None:
+def _charts(rows: Sequence[Row], names: Sequence[str]) -> list[tuple[str, str]]:
     charts = []
-    rows = [row for row in rows if row.matched != "none"]
-    for ratio in sorted({row.ratio for row in rows}):
-        points = [_point(row, row.cpu_s or 0.0, names) for row in rows if row.ratio == ratio]
+    rows = [row for row in rows if row.get("matched") != "none"]
+    for ratio in sorted({row.get("ratio", 0.0) for row in rows}):
+        points = [_point(row, row.get("cpu_s", 0.0), names) for row in rows if row.get("ratio", 0.0) == ratio]
         best = {id(point) for point in pareto(points)}
         points = [Point(p.x, p.y, p.series, p.mark, p.text, p.label if id(p) in best else "") for p in points]
-        svg = chart(
-            points, x_label="CPU seconds, reduction and recovery", y_label="PSNR, dB", log=True, front=True
-        )
+        svg = chart(points, x_label="CPU seconds", y_label="PSNR, dB", log=True, front=True)
         charts.append((f"{ratio:g}×: error against time; dashed: the Pareto front", svg))
-    if len({row.ratio for row in rows}) > 1:
-        for matched in dict.fromkeys((row.matched, row.amount) for row in rows):
+    if len({row.get("ratio") for row in rows}) > 1:
+        for matched in dict.fromkeys((row.get("matched", ""), row.get("amount", 0.0)) for row in rows):
             points = [
-                _point(row, row.count or 0, names)
+                _point(row, row["count"], names)
                 for row in rows
-                if (row.matched, row.amount) == matched and row.seed == rows[0].seed
+                if (row.get("matched", ""), row.get("amount", 0.0)) == matched
+                and row.get("seed") == rows[0].get("seed")
             ]
             svg = chart(points, x_label="Gaussians", y_label="PSNR, dB", log=True, joined=True)
-            charts.append((f"Error against count, {Matched(*matched).label}", svg))
-    page.charts(charts)
+            charts.append((f"Error against count {matched[0]} {matched[1] or ''}", svg))
+    return charts
 
 
 def _point(row: Row, x: float, names: Sequence[str]) -> Point:
-    text = (
-        f"{row.method}, {Matched(row.matched, row.amount).label}: {row.psnr:.2f} dB, {row.ssim:.4f}, "
-        f"{row.count:,} Gaussians, {row.cpu_s:.1f} CPU s"
-    )
-    series = names.index(row.method) % len(COLORS) if row.method in names else 0
-    return Point(x, row.psnr or 0.0, series, _MARKS.index(row.matched), text, row.method)
+    text = f"{_label(row)}: {row['psnr']:.2f} dB, {row['ssim']:.4f}, {row['count']:,} Gaussians"
+    series = names.index(_name(row)) % len(COLORS)
+    mark = _MARKS.index(row["matched"]) if row.get("matched") in _MARKS else 0
+    return Point(x, row["psnr"], series, mark, text, _name(row))
 
 
-def _table(page: Page, rows: Sequence[Row], names: Sequence[str]) -> None:
-    """Ratio by ratio and budget by budget, so that what stands together is comparable."""
-
-    def place(row: Row) -> tuple[float, str, float]:
-        return row.ratio, row.matched, row.amount
-
-    teachers = [row for row in rows if row.matched == "none"]
-    others = [row for row in rows if row.matched != "none"]
-    columns = _COLUMNS + (("ΔPSNR",) if teachers else ())
-    if not others:
-        page.table(columns, [_cells(row)[: len(columns)] for row in teachers], set())
-    for (ratio, matched, amount), members in groupby(sorted(others, key=place), place):
-        group = sorted(members, key=lambda row: -(row.psnr or 0))
-        best = {
-            (int(np.argmax([getattr(row, name) or 0.0 for row in group])), column)
-            for column, name in ((4, "psnr"), (5, "ssim"))
-        }
-        page.html(f'<p class="sub">{ratio:g}×, {Matched(matched, amount).label}</p>')
-        for line in _over_seeds(group):
-            page.paragraph(line)
-        cells = [_cells(row)[: len(columns)] for row in [*group, *teachers]]
-        page.table(columns, cells, best)
+def _best(rows: Sequence[Row], columns: Sequence[str]) -> set[tuple[int, int]]:
+    """Return the cells (row, column) of the best figures among comparable rows."""
+    groups: dict[tuple[Any, ...], list[int]] = {}
+    for number, row in enumerate(rows):
+        if row.get("matched") != "none":
+            groups.setdefault(tuple(row.get(n) for n in ("ratio", "matched", "amount")), []).append(number)
+    return {
+        (max(numbers, key=lambda n: rows[n].get(name, -np.inf)), columns.index(name))
+        for numbers in groups.values()
+        for name in ("psnr", "ssim")
+        if name in columns and len(numbers) > 1
+    }
 
 
 def _over_seeds(rows: Sequence[Row]) -> list[str]:
-    """Mean ± standard deviation (n − 1) of PSNR and SSIM of each method that was run with several seeds."""
+    """Return mean ± standard deviation (n − 1) of PSNR and SSIM for all that was run with several seeds."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.get("final", 1) and "psnr" in row:
+            groups.setdefault(_label(row), []).append(row)
     lines = []
-    for method in dict.fromkeys(row.method for row in rows):
-        runs = [row for row in rows if row.method == method and row.psnr is not None and row.ssim is not None]
-        if len(runs) > 1:
-            psnr, ssim = (np.array([getattr(row, name) for row in runs]) for name in ("psnr", "ssim"))
+    for label, runs in groups.items():
+        if len({row.get("seed") for row in runs}) > 1:
+            psnr, ssim = (np.array([row[name] for row in runs]) for name in ("psnr", "ssim"))
             lines.append(
-                f"{method}, {len(runs)} seeds: {psnr.mean():.2f} ± {psnr.std(ddof=1):.2f} dB, "
+                f"{label}, {len(runs)} seeds: {psnr.mean():.2f} ± {psnr.std(ddof=1):.2f} dB, "
                 f"SSIM {ssim.mean():.4f} ± {ssim.std(ddof=1):.4f}"
             )
     return lines
 
 
-def _cells(row: Row) -> list[str]:
-    def figure(value: float | None, form: str) -> str:
-        return "–" if value is None else format(value, form)
-
-    overran = row.matched == "seconds" and not row.steps
-    return [
-        row.method + (f" (seed {row.seed})" if row.seed else "") + ("†" if row.black else ""),
-        Matched(row.matched, row.amount).label,
-        f"{row.count:,}",
-        f"{(row.bytes or 0) / 1e6:.2f}",
-        figure(row.psnr, ".2f"),
-        figure(row.ssim, ".4f"),
-        figure(row.lpips_vgg, ".4f"),
-        figure(row.lpips_alex, ".4f"),
-        figure(row.drift95, ".1f"),
-        figure(row.needle, ".1%"),
-        figure(row.luma_drift, ".4f"),
-        figure(row.reduce_cpu_s, ".1f"),
-        figure(row.recover_cpu_s, ".1f"),
-        figure(row.seconds, ".1f") + (" (reduction alone)" if overran else ""),
-        figure(max(row.reduce_peak_mb or 0.0, row.recover_peak_mb or 0.0), ".0f"),
-        figure(row.delta_psnr, "+.2f"),
-    ]
-
-
-def _views(
-    page: Page, folder: Path, definition: Definition, scene: str, split: str, rows: Sequence[Row]
-) -> None:
-    """The worst pictured views of the first method, at its first budget, for every ratio."""
-    for ratio in sorted({row.ratio for row in rows if row.matched != "none"}):
-        cells = _cell_files(folder, definition, scene, ratio)
-        if not cells:
-            continue
-        _, ours = cells[0]
-        pictured = sorted(int(p.stem) for p in _pictures(folder, cells[0], split).glob("*.jpg"))
-        if not pictured:
-            continue
-        ranked = sorted(pictured, key=lambda view: ours["views"][split][view]["psnr"])
-        count = len(ours["views"][split])
-        among = "" if len(pictured) == count else f" (of {len(pictured)} pictured, of {count})"
-        page.heading(f"{scene} at {ratio:g}×: worst views first{among}", 4)
-        for view in ranked[:_VIEWS]:
-            target = _read(folder / "images" / ours["scene_key"] / split / f"{view}.jpg")
-            shown = [
+def _views(page: Page, folder: Path, rows: Sequence[Row]) -> None:
+    """Show the worst pictured views of the first method, for every ratio."""
+    pictured = [row for row in rows if "pictures" in row and row["matched"] != "none"]
+    for ratio in sorted({row["ratio"] for row in pictured}):
+        first: dict[str, Row] = {}
+        for row in pictured:
+            if row["ratio"] == ratio:
+                first.setdefault(_name(row), row)
+        told = {
+            name: json.loads((folder / row["pictures"] / "views.json").read_text(encoding="utf-8"))
+            for name, row in first.items()
+        }
+        ours = next(iter(told.values()))
+        there = sorted(int(path.stem) for path in (folder / ours["targets"]).glob("*.jpg"))
+        page.heading(f"{pictured[0]['scene']} at {ratio:g}×: worst views first", 4)
+        for view in sorted(there, key=lambda view: ours["views"][view]["psnr"])[:_VIEWS]:
+            images = [
                 Shown(
                     name,
-                    _read(_pictures(folder, (name, cell), split) / f"{view}.jpg"),
-                    f"{cell['views'][split][view]['psnr']:.2f} dB",
+                    _read(folder / first[name]["pictures"] / f"{view}.jpg"),
+                    f"{views['views'][view]['psnr']:.2f} dB",
                 )
-                for name, cell in cells
-                if split in cell["views"]
+                for name, views in told.items()
             ]
-            page.comparison(Comparison(ours["views"][split][view]["name"], target, shown))
-
-
-def _cell_files(
-    folder: Path, definition: Definition, scene: str, ratio: float
-) -> list[tuple[str, dict[str, Any]]]:
-    """Per method, the first of its cells that has pictures."""
-    found: dict[str, dict[str, Any]] = {}
-    for cell in cells_of([definition]):
-        if (cell.scene.name, cell.ratio) != (scene, ratio) or cell.method.name in found:
-            continue
-        path = folder / "cells" / f"{cell.key}.json"
-        content = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"views": {}}
-        if content["views"]:
-            found[cell.method.name] = {**content, "key": cell.key}
-    return list(found.items())
-
-
-def _pictures(folder: Path, cell: tuple[str, dict[str, Any]], split: str) -> Path:
-    return folder / "images" / str(cell[1]["key"]) / split
+            target = _read(folder / ours["targets"] / f"{view}.jpg")
+            page.comparison(Comparison(ours["views"][view]["name"], target, images))
 
 
 def _read(path: Path) -> np.ndarray[Any, Any]:

@@ -1,78 +1,201 @@
-"""Dataclasses as lines of a CSV that grows while a benchmark runs and is taken up again after a stop."""
+"""The one row format of all benchmarks: flat columns, kept in a CSV that a later run continues."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Sequence
-from dataclasses import MISSING, asdict, fields
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, NamedTuple
 
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
+__all__ = ["COLUMNS", "Row", "read_rows", "rounded", "shown", "write_rows"]
 
-    Row = TypeVar("Row", bound=DataclassInstance)
-
-__all__ = ["append", "read", "rewrite"]
-
-_DIGITS = 6
+Row = dict[str, Any]
+"""Column → value; columns that do not apply are missing."""
 
 
-def read(path: Path, kind: type[Row]) -> list[Row]:
-    """The rows of a CSV, none if there is no such file; fields must be int, float, str or optional ones.
+class Column(NamedTuple):
+    """One column: its type, its format in tables ("" as text, None not shown) and its meaning."""
 
-    A file from before the last columns came takes their defaults.
+    type: Callable[[str], Any]
+    form: str | None
+    meaning: str
+
+
+COLUMNS: dict[str, Column] = {
+    "study": Column(str, None, "the study's name"),
+    "scene": Column(str, "", "the scene's name"),
+    "prior": Column(str, None, "given, lift or trained"),
+    "ratio": Column(float, "g", "prior over compact"),
+    "method": Column(str, "", "the method's name"),
+    "matched": Column(str, "", "steps, seconds or released; none: a teacher's row, the prior as it is"),
+    "amount": Column(float, "g", "how many steps or seconds"),
+    "variant": Column(str, "", "what a study of recovery compares"),
+    "pool": Column(str, "", "biased or even"),
+    "arm": Column(str, "", "policy of selection; +weights draws by weight, pool is all candidates"),
+    "percent": Column(float, "g", "chosen views as a share of the pool"),
+    "format": Column(str, "", "file format, or another program's"),
+    "matcher": Column(str, "", "see RegisterConfig"),
+    "start": Column(str, "", "kind of start of a registration"),
+    "isa": Column(str, "", "instruction set"),
+    "threads": Column(int, "d", "number of threads"),
+    "seed": Column(int, "d", "seed of the cell"),
+    "draw": Column(int, None, "which of several random subsets"),
+    "split": Column(str, "", "which views were scored"),
+    "views_kind": Column(str, "", "what was scored on: pool, near or standing"),
+    "against": Column(str, None, "photos, teacher, or either; figures of different ones never compare"),
+    "submethod": Column(str, None, "method and budget in one word"),
+    "input_count": Column(int, None, "Gaussians before"),
+    "budget": Column(int, None, "Gaussians requested"),
+    "count": Column(int, ",", "Gaussians of the result"),
+    "width": Column(int, None, "of the view, pixels"),
+    "height": Column(int, None, "of the view, pixels"),
+    "candidates": Column(int, None, "views in the pool"),
+    "k": Column(int, None, "views chosen"),
+    "step": Column(int, "d", "of the recovery in progress"),
+    "seconds": Column(float, ".1f", "by the clock: recovery so far; with reduction where time is matched"),
+    "bytes": Column(int, ",", "of the file; of float32 arrays where nothing is written"),
+    "psnr": Column(float, ".2f", "mean over the views, dB"),
+    "ssim": Column(float, ".4f", "mean over the views"),
+    "lpips_vgg": Column(float, ".4f", "mean over the views"),
+    "lpips_alex": Column(float, ".4f", "mean over the views"),
+    "luma_drift": Column(float, None, "mean of |mean luma of the render − the target's|"),
+    "lost": Column(float, ".2f", "dB that the format alone takes: PSNR of the .ply less this"),
+    "delta_psnr": Column(float, "+.2f", "PSNR less the teacher's on the same views, dB"),
+    "drift95": Column(float, ".2f", "of the last recovery, in thicknesses of its anchors"),
+    "needle": Column(float, ".2%", "share of needles"),
+    "rank_p1": Column(float, None, "first percentile of effective ranks"),
+    "reg_share": Column(float, None, "share of recovery's time that regularisers took"),
+    "skipped": Column(int, None, "steps of single Gaussians skipped as not finite"),
+    "psnr_in": Column(float, ".2f", "mean over unseen views spread over the pool's extent, dB"),
+    "ssim_in": Column(float, None, "the same"),
+    "psnr_out": Column(float, ".2f", "mean over views outside the pool's distribution, dB"),
+    "ssim_out": Column(float, None, "the same"),
+    "psnr_crowd": Column(float, None, "mean over unseen views where a biased pool is crowded, dB"),
+    "views": Column(int, None, "how many the means are of"),
+    "black": Column(int, None, "how many more came out black, and are not in the means (`tab:geobase`, †)"),
+    "dropped": Column(int, None, "training views that are scored on, and were not trained on"),
+    "steps": Column(int, "d", "optimiser steps taken"),
+    "photos": Column(int, "d", "photos to register"),
+    "registered": Column(int, "d", "of them"),
+    "uncertain": Column(int, "d", "of them"),
+    "start_position": Column(float, ".3g", "median error of the starts: cm, or scene units"),
+    "start_rotation": Column(float, ".3g", "median error of the starts, degrees"),
+    "position": Column(float, ".3g", "median error of the registered"),
+    "rotation": Column(float, ".3g", "median error of the registered"),
+    "worst": Column(float, ".3g", "largest error of position of the registered"),
+    "start_10": Column(float, ".0%", "share of all photos that start within 10 cm, 5°"),
+    "start_5": Column(float, None, "the same, 5 cm, 5°"),
+    "found_10": Column(float, ".0%", "share of all photos registered within 10 cm, 5°"),
+    "found_5": Column(float, ".0%", "the same, 5 cm, 5°"),
+    "reduce_cpu_s": Column(float, None, "user + system seconds of all reductions, whole processes"),
+    "reduce_wall_s": Column(float, None, "by the clock, without start and files; another program's whole"),
+    "reduce_peak_mb": Column(float, None, "of the largest"),
+    "recover_cpu_s": Column(float, None, "of all recoveries, whole processes"),
+    "recover_wall_s": Column(float, None, "of their loops alone, which is what a limit in seconds counts"),
+    "recover_peak_mb": Column(float, None, "of the largest"),
+    "select_cpu_s": Column(float, None, "of the selection of views"),
+    "select_peak_mb": Column(float, None, "of the selection of views"),
+    "adapt_cpu_s": Column(float, None, "of the adaptation"),
+    "adapt_peak_mb": Column(float, None, "of the adaptation"),
+    "cpu_s": Column(float, ".1f", "user + system seconds: the whole command; matched: all but adaptation"),
+    "wall_s": Column(float, ".1f", "by the clock, start and files included"),
+    "peak_mb": Column(float, ".0f", "largest resident size, 10⁶ bytes"),
+    "simplify_s": Column(float, None, "seconds of simplification before a recovery"),
+    "final": Column(int, None, "1 for a result, 0 on the way"),
+    "gaussians": Column(int, None, "recovered"),
+    "pixels": Column(int, None, "longer side of the views"),
+    "pairs": Column(int, None, "(tile, Gaussian) pairs"),
+    "contributing": Column(int, None, "(pixel, Gaussian) pairs with α ≥ 1/255 in front of a stopped pixel"),
+    "forward_ms": Column(float, ".1f", "project, sort, bin and forward, best of the repeats"),
+    "backward_ms": Column(float, ".1f", "to the parameters' gradients"),
+    "loss_ms": Column(float, ".1f", "L1 + SSIM, both ways"),
+    "adam_ms": Column(float, ".1f", "the optimiser's update"),
+    "total_ms": Column(float, ".1f", "the whole step"),
+    "limit_share": Column(float, ".2f", "the machine's limit over forward and backward"),
+    "limit_flops_ms": Column(float, None, "counted flops over the measured FMA rate"),
+    "limit_bytes_ms": Column(float, None, "counted bytes over the measured bandwidth"),
+    "fma_gflops": Column(float, None, "measured beside the row"),
+    "read_gb_s": Column(float, None, "measured beside the row"),
+    "gaussian_bytes": Column(float, None, "memory of a trainer after a step per Gaussian"),
+    "image_bytes": Column(float, None, "memory of a trainer after a step that does not grow with Gaussians"),
+    "pictures": Column(str, None, "folder of the views' pictures, within the run's"),
+    "version": Column(str, None, "of the method's program"),
+    "machine": Column(str, None, "processor and cores"),
+    "error": Column(str, "", "why there are no figures"),
+    "cell": Column(str, None, "fingerprint of all that the figures depend on"),
+}  # fmt: skip
+
+_SURVEY = {
+    "submethod": "Submethod",
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "lpips_vgg": "LPIPS",
+    "bytes": "Size [Bytes]",
+    "count": "#Gaussians",
+}
+"""Names of the 3DGS compression survey, whose plots take a CSV of matched rows as it is."""
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Read the rows of a CSV, also of one that lacks later columns; none if there is no such file.
 
     Raises:
-        InputError: it was not written from `kind`.
+        InputError: the file holds other columns, or a value that does not fit.
     """
     if not path.exists():
         return []
+    names = {survey: name for name, survey in _SURVEY.items()}
     with path.open(newline="", encoding="utf-8") as file:
         lines = csv.DictReader(file)
-        known, held = fields(kind), lines.fieldnames or []
-        if held != [f.name for f in known[: len(held)]] or any(
-            f.default is MISSING for f in known[len(held) :]
-        ):
-            raise InputError(f"{path}: has other columns than this benchmark's")
-        return [_row(path, number, line, kind) for number, line in enumerate(lines, 2)]
+        unknown = [name for name in lines.fieldnames or () if names.get(name, name) not in COLUMNS]
+        if unknown or not lines.fieldnames:
+            raise InputError(f"{path}: has other columns than a benchmark's: {', '.join(unknown)}")
+        try:
+            return [
+                {names.get(k, k): COLUMNS[names.get(k, k)].type(v) for k, v in line.items() if v}
+                for line in lines
+            ]
+        except (TypeError, ValueError):
+            raise InputError(f"{path}: line {lines.line_num}: not a row of a benchmark") from None
 
 
-def _row(path: Path, number: int, line: dict[str, str], kind: type[Row]) -> Row:
-    try:
-        return kind(**{f.name: _value(line[f.name], str(f.type)) for f in fields(kind) if f.name in line})
-    except (TypeError, ValueError):
-        raise InputError(f"{path}: line {number}: not a row of this benchmark") from None
-
-
-def _value(text: str, kind: str) -> Any:
-    if text == "" and "None" in kind:
-        return None
-    if kind.startswith("int"):
-        return int(text)
-    return float(text) if kind.startswith("float") else text
-
-
-def rewrite(path: Path, rows: Iterable[Row], kind: type[Row]) -> None:
-    """Replace the file by these rows, whole or not at all."""
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows, whole or not at all."""
+    present = {name for row in rows for name in row}
+    names = [name for name in COLUMNS if name in present]
+    heads = _SURVEY if "submethod" in present else {}
     with (
         atomic_output(path, overwrite=True) as temporary,
         temporary.open("w", newline="", encoding="utf-8") as file,
     ):
-        writer = csv.DictWriter(file, [f.name for f in fields(kind)], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(_line(row) for row in rows)
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([heads.get(name, name) for name in names])
+        writer.writerows([_text(row.get(name)) for name in names] for row in rows)
 
 
-def append(path: Path, rows: Sequence[Row]) -> None:
-    """Add rows to a file that `rewrite` made."""
-    with path.open("a", newline="", encoding="utf-8") as file:
-        for row in rows:
-            csv.DictWriter(file, [f.name for f in fields(row)], lineterminator="\n").writerow(_line(row))
+def rounded(row: Mapping[str, Any]) -> Row:
+    """Return a row as it will be read again: six digits, nothing empty."""
+    texts = {name: _text(value) for name, value in row.items()}
+    return {name: COLUMNS[name].type(text) for name, text in texts.items() if text}
 
 
-def _line(row: Row) -> dict[str, Any]:
-    return {k: round(v, _DIGITS) if isinstance(v, float) else v for k, v in asdict(row).items()}
+def _text(value: Any) -> str:
+    return "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def shown(rows: Iterable[Row], *, brief: bool = False) -> tuple[list[str], list[list[str]]]:
+    """Return columns and cells of a table: what any of the rows has and `COLUMNS` gives a format.
+
+    Args:
+        rows: what to show.
+        brief: leave out columns that are the same in several rows, except the first.
+    """
+    rows = list(rows)
+    names = [n for n, column in COLUMNS.items() if column.form is not None and any(n in row for row in rows)]
+    if brief and len(rows) > 1:
+        names = [n for i, n in enumerate(names) if i == 0 or len({row.get(n) for row in rows}) > 1]
+    cells = [[format(row[n], COLUMNS[n].form or "") if n in row else "" for n in names] for row in rows]
+    return names, cells

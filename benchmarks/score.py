@@ -1,4 +1,4 @@
-"""What a cell's result is worth: figures of every view, and pictures of some."""
+"""Scores of a result: figures of every view, and pictures of some."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from benchmarks.rows import Row
 from g2ard.rendering.lpips import Lpips
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import RasterSettings, Renderer
@@ -25,8 +26,12 @@ _QUALITY = 88
 
 @dataclass(frozen=True)
 class ViewFigures:
-    """One view's figures; `luma` is the mean luma of the render less the target's, `black` whether all pixels
-    of the render are 0 in 8 bits, though not the target's."""
+    """One view's figures.
+
+    Args:
+        luma: mean luma of the render less the target's.
+        black: whether all pixels of the render are 0 in 8 bits, and not those of the target.
+    """
 
     name: str
     psnr: float
@@ -39,8 +44,7 @@ class ViewFigures:
 
 @dataclass(frozen=True)
 class Scored:
-    """Means over the views, but for those that came out black (`tab:geobase`, †); of nothing but black ones
-    over all.
+    """Means over the views that did not come out black (`tab:geobase`, †), or over all if all did.
 
     Args:
         views: in the cameras' order.
@@ -49,29 +53,25 @@ class Scored:
     views: tuple[ViewFigures, ...]
 
     @property
-    def black(self) -> int:
-        """Views that came out black."""
-        return sum(view.black for view in self.views)
-
-    @property
     def counted(self) -> tuple[ViewFigures, ...]:
-        """The views that the means are of."""
+        """The views in the means."""
         return tuple(view for view in self.views if not view.black) or self.views
 
     def mean(self, name: str) -> float | None:
-        """Of one figure; None where it was not measured."""
+        """Return the mean of one figure, or None if it was not measured."""
         values = [getattr(view, name) for view in self.counted]
         return None if None in values else float(np.mean(values))
 
-    @property
-    def luma_drift(self) -> float:
-        """Mean over views of |mean luma of the render − the target's|, in [0, 1]: exposure that wandered
-        off."""
-        return float(np.mean([abs(view.luma) for view in self.counted]))
+    def figures(self) -> Row:
+        """Return the columns of a row."""
+        means = {name: self.mean(name) for name in ("psnr", "ssim", "lpips_vgg", "lpips_alex")}
+        drift = float(np.mean([abs(view.luma) for view in self.counted]))
+        black = sum(view.black for view in self.views)
+        return {**means, "luma_drift": drift, "views": len(self.counted), "black": black}
 
 
 def luma(image: NDArray[np.float32], mask: NDArray[np.bool_] | None = None) -> float:
-    """Mean Rec. 709 luma of an image in [0, 1], or of the pixels that count.
+    """Return the mean Rec. 709 luma of an image in [0, 1], or of the pixels in a mask.
 
     >>> round(luma(np.full((2, 2, 3), 0.5, np.float32)), 6)
     0.5
@@ -83,7 +83,7 @@ def luma(image: NDArray[np.float32], mask: NDArray[np.bool_] | None = None) -> f
 def score(
     splats: Splats,
     targets: Targets,
-    background: tuple[float, float, float],
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     *,
     lpips: dict[str, Lpips] | None = None,
     settings: RasterSettings | None = None,
@@ -126,7 +126,7 @@ def score(
 
 
 def pictured(count: int) -> list[int]:
-    """The views that are kept as pictures: all, or 32 evenly spaced.
+    """Return the views that are kept as pictures: all, or 32 evenly spaced.
 
     >>> pictured(3), len(pictured(100))
     ([0, 1, 2], 32)

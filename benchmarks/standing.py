@@ -20,14 +20,7 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.splits import for_scores
 from g2ard.scene.targets import TeacherRenders
 
-__all__ = ["PROTOCOLS", "check_protocol", "given_views", "standing_targets", "standing_views"]
-
-PROTOCOLS: dict[str, tuple[str, ...]] = {
-    "pool": ("pool",),
-    "standing": ("near", "standing"),
-    "both": ("pool", "near", "standing"),
-}
-"""By protocol, the kinds of views that are scored."""
+__all__ = ["given_views", "standing_targets", "standing_views"]
 
 _SEED = 7919
 """Added to the seed of a pool: these poses are of another sequence than any that a method looks from."""
@@ -38,17 +31,6 @@ _FOV = 70.0
 
 _BETWEEN = (0.35, 0.8)
 """Share of the way to an object's surface that is left to those who stand between near and far."""
-
-
-def check_protocol(protocol: str) -> tuple[str, ...]:
-    """The kinds of views that a protocol scores.
-
-    Raises:
-        InputError: an unknown protocol.
-    """
-    if protocol not in PROTOCOLS:
-        raise InputError(f"protocol: expected one of {', '.join(PROTOCOLS)}, got {protocol!r}")
-    return PROTOCOLS[protocol]
 
 
 def given_views(scene: Path) -> Cameras | None:

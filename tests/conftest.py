@@ -42,10 +42,8 @@ def command_line() -> Callable[..., Said]:
 
 
 def _program(words: list[str]) -> list[str]:
-    """The module that a command is of, and its words: `bench` and `synth` are the benchmarks'."""
-    if words[:1] == ["bench"]:
-        return ["benchmarks", *words[1:]]
-    return ["benchmarks" if words[:1] == ["synth"] else "g2ard", *words]
+    """Return the module of a command and its words; those of the benchmarks begin with "benchmarks"."""
+    return words if words[:1] == ["benchmarks"] else ["g2ard", *words]
 
 
 def _apart(words: list[str], cwd: Path, env: dict[str, str]) -> Said:

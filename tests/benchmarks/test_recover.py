@@ -1,17 +1,16 @@
-"""The recovery benchmark: its rows, resuming, and what it makes of them."""
+"""The study of recovery: its rows, resuming, and what it makes of them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks import rows
-from benchmarks.recover import Look, RecoverBench, bench_recover
-from benchmarks.speedup import speedups
+from benchmarks.rows import Row, read_rows
+from benchmarks.runner import run
+from benchmarks.study import DEFINITIONS, SceneSpec, read_study
 from g2ard import io
 from g2ard.errors import InputError
 from helpers.commands import CommandLine
@@ -19,106 +18,84 @@ from helpers.scenes import around, checkered_ball
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> RecoverBench:
+def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneSpec:
     folder = tmp_path_factory.mktemp("bench")
     io.write_splats(folder / "ball.ply", checkered_ball(1500))
     io.write_views(folder / "views.json", around(16))
-    return RecoverBench(folder / "ball.ply", folder / "views.json")
+    return SceneSpec("ball", str(folder / "ball.ply"), str(folder / "views.json"))
 
 
-def test_regularizer_rows_are_whole_and_not_measured_twice(bench: RecoverBench, tmp_path: Path) -> None:
-    csv = tmp_path / "f.csv"
-    ask = partial(bench_recover, bench, "regularizers", csv, ratios=[5], seeds=[0, 1], steps=[120])
-    found = ask(variants=["full", "-anchor"])
-    final = [look for look in found if look.final]
+def ask(scene: SceneSpec, out: Path, name: str, **options: str) -> list[Row]:
+    made = read_study(DEFINITIONS / f"recover-{name}.toml").narrowed(options)
+    rows = run([replace(made, scenes=(scene,))], out)
+    assert [row["error"] for row in rows if "error" in row] == []
+    return rows
+
+
+def test_regularizer_rows_are_whole_and_not_measured_twice(scene: SceneSpec, tmp_path: Path) -> None:
+    options = {"methods": "full,-anchor", "ratios": "5", "seeds": "0,1", "steps": "120"}
+    found = ask(scene, tmp_path, "regularizers", **options)
+    final = [row for row in found if row["final"]]
     pairs = [("full", 0), ("full", 1), ("-anchor", 0), ("-anchor", 1)]
-    assert [(look.variant, look.seed) for look in final] == pairs
-    for look in final:
-        assert (look.count, look.budget, look.step, look.skipped) == (300, 300, 120, 0)
-        assert look.drift95 is not None
-        assert look.psnr > 10
-    assert [look.step for look in found if look.key == final[0].key] == [25, 50, 100, 120]
-    assert final[0].psnr != final[1].psnr  # another order of views
-    before = csv.read_text()
-    assert [look.key for look in ask(variants=["full", "-anchor"])] == [look.key for look in found]
-    assert csv.read_text() == before
-
-    stopped = [line for line in before.splitlines() if not (",-anchor," in line and ",120," in line)]
-    csv.write_text("\n".join(stopped) + "\n")
-    ask(variants=["full"])
-    assert "-anchor" not in csv.read_text()  # the looks of runs without an end are gone
+    assert [(row["variant"], row["seed"]) for row in final] == pairs
+    for row in final:
+        assert (row["count"], row["budget"], row["step"], row["skipped"]) == (300, 300, 120, 0)
+        assert row["drift95"] > 0
+        assert row["psnr"] > 10
+    assert [r["step"] for r in found if r["cell"] == final[0]["cell"]] == [25, 50, 100, 120]
+    assert final[0]["psnr"] != final[1]["psnr"]  # another order of views
+    before = (tmp_path / "rows.csv").read_text()
+    assert ask(scene, tmp_path, "regularizers", **options) == found
+    assert (tmp_path / "rows.csv").read_text() == before
 
 
-def test_curves_compare_schedules(bench: RecoverBench, tmp_path: Path) -> None:
-    names = ["default@50", "default@200"]
-    found = bench_recover(bench, "curves", tmp_path / "f.csv", ratios=[2], steps=[50, 200], variants=names)
-    ends = [look for look in found if look.final]
-    assert ends[1].psnr > ends[0].psnr
-    assert ends[1].seconds > ends[0].seconds
-    slow = replace(ends[0], variant="paper/10", seconds=100.0, psnr=ends[0].psnr - 0.01)
-    (faster,) = speedups([*found, slow])
-    assert faster.reached_s is not None
-    assert faster.reached_s <= ends[0].seconds
-    assert faster.share == faster.reached_s / 100
-    (never,) = speedups([*found, replace(slow, psnr=99.0)])
-    assert never.share is None
+def test_curves_compare_schedules(scene: SceneSpec, tmp_path: Path) -> None:
+    found = ask(scene, tmp_path, "curves", methods="default", ratios="2", steps="50,200")
+    ends = [row for row in found if row["final"]]
+    assert [row["variant"] for row in ends] == ["default@50", "default@200"]
+    assert ends[1]["psnr"] > ends[0]["psnr"]
+    assert ends[1]["seconds"] > ends[0]["seconds"]
+    slow = {**ends[0], "variant": "paper/10", "seconds": 100.0, "psnr": ends[0]["psnr"] - 0.01}
+    summary = read_study(DEFINITIONS / "recover-curves.toml").summary
+    faster, never = summary([*found, slow]), summary([*found, {**slow, "psnr": 99.0}])
+    assert faster is not None
+    assert never is not None
+    assert float(faster[2][0][-2]) <= round(ends[0]["seconds"], 1)
+    assert never[2][0][-2:] == ["never", "–"]
 
 
-def test_rounds_take_the_time_they_are_given(bench: RecoverBench, tmp_path: Path) -> None:
-    found = bench_recover(bench, "rounds", tmp_path / "f.csv", ratios=[3], seconds=1.0)
-    ends = [look for look in found if look.final]
-    assert [look.variant for look in ends] == ["one-shot", "rounds", "light-rounds"]
-    assert {look.count for look in ends} == {500}
-    for look in ends:
-        assert 0.9 <= look.seconds < 1.6  # a round that only loses ends at three quarters of its time
-    assert any(look.count > 500 for look in found)  # looks within rounds
+def test_rounds_take_the_time_they_are_given(scene: SceneSpec, tmp_path: Path) -> None:
+    found = ask(scene, tmp_path, "rounds", ratios="3", seconds="2.0")
+    ends = [row for row in found if row["final"]]
+    assert [row["variant"] for row in ends] == ["one-shot", "rounds", "light-rounds"]
+    assert {row["count"] for row in ends} == {500}
+    for row in ends:
+        assert 1.5 <= row["seconds"] < 2.8  # a round that only loses ends at three quarters of its time
+    assert any(row["count"] > 500 for row in found)  # looks within rounds
 
 
-def test_standing_views_are_looked_at_beside_the_pools(bench: RecoverBench, tmp_path: Path) -> None:
-    csv = tmp_path / "f.csv"
-    both = RecoverBench(bench.scene, bench.views, size=48, protocol="both")
-    ask = partial(
-        bench_recover, study="curves", csv_path=csv, ratios=[5], steps=[50], variants=["default@50"]
-    )
-    ask(replace(both, protocol="pool"))
-    found = ask(both)
+def test_standing_views_are_scored_beside_the_pools(scene: SceneSpec, tmp_path: Path) -> None:
+    options = {"methods": "default", "ratios": "5", "steps": "50", "size": "48"}
+    found = ask(scene, tmp_path, "curves", **options, protocol="both")
     kinds = ["pool", "near", "standing"]
-    assert [look.views_kind for look in found if look.final] == kinds
-    on_the_way = [(look.views_kind, look.step) for look in found if not look.final]
+    ends = [row for row in found if row["final"]]
+    assert [row["views_kind"] for row in ends] == kinds
+    assert {row["scene"] for row in found} == {"ball 48px"}
+    on_the_way = [(row["views_kind"], row["step"]) for row in found if not row["final"]]
     assert sorted(on_the_way) == [(kind, step) for kind in sorted(kinds) for step in (25, 50)]
-    assert len({look.psnr for look in found if look.final}) == 3
-    before = csv.read_text()
-    standing = ask(replace(both, protocol="standing"))
-    assert csv.read_text() == before  # nothing was run again
-    assert {look.views_kind for look in standing} == {"near", "standing"}
-    slow = [
-        replace(look, variant="paper/10", seconds=100.0, psnr=look.psnr - 0.01)
-        for look in found
-        if look.final
-    ]
-    assert [s.views_kind for s in speedups([*found, *slow])] == kinds
-    with pytest.raises(InputError, match="protocol"):
-        ask(replace(both, protocol="sitting"))
+    assert len({row["psnr"] for row in ends}) == 3
+    before = (tmp_path / "rows.csv").read_text()
+    ask(scene, tmp_path, "curves", **options, protocol="standing")
+    assert (tmp_path / "rows.csv").read_text() == before  # nothing was run again
     with pytest.raises(InputError, match="trained scene is needed"):
-        ask(replace(both, photos=True))
+        ask(replace(scene, targets="photos"), tmp_path, "curves", protocol="both")
 
 
-def test_bad_wishes_are_named(bench: RecoverBench, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="study"):
-        bench_recover(bench, "speed", tmp_path / "f.csv")
-    with pytest.raises(InputError, match="variants: expected some of full"):
-        bench_recover(bench, "regularizers", tmp_path / "f.csv", variants=["half"])
-    (tmp_path / "f.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(InputError, match="columns"):
-        rows.read(tmp_path / "f.csv", Look)
-
-
-def test_command(bench: RecoverBench, tmp_path: Path, command_line: CommandLine) -> None:
-    asked = ("--study", "multiplier", "--variants", "×1,chosen", "--steps", "30", "--ratios", "5")
-    place = ("bench", "recover", bench.scene, "--views", str(bench.views))
+def test_command(scene: SceneSpec, tmp_path: Path, command_line: CommandLine) -> None:
+    asked = ("--methods", "×1,chosen", "--steps", "30", "--ratios", "5")
+    place = ("benchmarks", "run", "recover-multiplier", scene.prior, "--views", scene.train)
     status, _, told = command_line(*place, *asked, cwd=tmp_path)
     assert status == 0, told
     assert "×1" in told
     assert "chosen" in told
-    looks = rows.read(tmp_path / "bench_recover.csv", Look)
-    assert np.isfinite([look.psnr for look in looks]).all()
+    assert np.isfinite([row["psnr"] for row in read_rows(tmp_path / "figures" / "rows.csv")]).all()

@@ -1,4 +1,4 @@
-"""`bench register` on a small scene: its starts are as far off as they say, its rows hold what it found."""
+"""The study of registration: starts are as far off as they say, rows hold what was found."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import rows
-from benchmarks.register import STARTS, Cell, bench_register, displaced
-from g2ard.errors import InputError
+from benchmarks.kinds.register import STARTS, displaced
 from g2ard.io import write_splats, write_views
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.images import write_png
-from g2ard.stages.register import RegisterConfig, pose_error
+from g2ard.stages.register import pose_error
 from helpers.commands import CommandLine
 from helpers.scenes import around, checkered_ball
 
@@ -39,49 +37,26 @@ def test_starts_are_as_far_off_as_they_say() -> None:
         assert degrees == pytest.approx(15)
 
 
-def test_rows_say_what_was_found_and_from_where(tmp_path: Path) -> None:
-    views = _site(tmp_path).take([0, 4])
-    config = RegisterConfig(size=128)
-    cells = bench_register(
-        [tmp_path / "ball.ply"],
-        views,
-        tmp_path / "rows.csv",
-        ratios=[1, 3],
-        matchers=["direct"],
-        starts=["A"],
-        metres_per_unit=2.0,
-        config=config,
-    )
-    assert [(c.ratio, c.count) for c in cells] == [(1, 1500), (3, 500)]
-    assert rows.read(tmp_path / "rows.csv", Cell)[0].count == 1500
+def test_rows_say_what_was_found_and_from_where(tmp_path: Path, command_line: CommandLine) -> None:
+    write_views(tmp_path / "views.json", _site(tmp_path))
+    call = ("benchmarks", "run", "register", "ball.ply", "--views", "views.json", "--methods", "direct")
+    few = ("--size", "128", "--seeds", "0", "--set", "metres_per_unit=2", "--json", "-")
+    ask = (*call, *few, "--ratios", "1,3", "--set", "starts=A,D")
+    status, out, err = command_line(*ask, cwd=tmp_path)
+    assert status == 0, err
+    cells = json.loads(out)["rows"]
+    assert [(c["ratio"], c["count"], c["start"]) for c in cells] == [
+        (ratio, count, start) for ratio, count in ((1, 1500), (3, 500)) for start in ("A", "D")
+    ]
     dense = cells[0]
     # the ball's surface is about 1.6 units from cameras 2.5 from its middle: 1 % are 3 cm at 2 m a unit
-    assert dense.start_position == pytest.approx(3.3, abs=0.5)
-    assert dense.start_rotation == pytest.approx(STARTS["A"][1] if STARTS["A"] else 0)
-    assert dense.registered == 2
-    assert dense.position is not None
-    assert dense.position < 1
-    assert dense.found_5 == 1
-    assert dense.worst is not None
-    assert dense.worst >= dense.position
-
-
-def test_its_command(command_line: CommandLine, tmp_path: Path) -> None:
-    write_views(tmp_path / "views.json", _site(tmp_path))
-    call = ("bench", "register", "ball.ply", "--photos", "views.json", "--matchers", "direct")
-    options = ("--starts", "A,D", "--ratios", "1", "--seeds", "1", "--size", "128", "--json", "-")
-    status, out, err = command_line(*call, *options, cwd=tmp_path)
-    assert status == 0, err
-    found = json.loads(out)["rows"]
-    assert [(row["start"], row["photos"]) for row in found] == [("A", 2), ("D", 2)]
-    assert found[0]["found_10"] is None
-    status, _, err = command_line(*call, "--starts", "Z", "-w", cwd=tmp_path)
-    assert (status, "expected some of A, B, C, D, got Z" in err) == (1, True)
-
-
-def test_what_cannot_be_is_refused(tmp_path: Path) -> None:
-    views = around(2, (64, 48), 2.5)
-    with pytest.raises(InputError, match="ratios: expected 1 or more"):
-        bench_register([], views, tmp_path / "r.csv", ratios=[0.5])
-    with pytest.raises(InputError, match="D looks for photos in a pool"):
-        bench_register([], views, tmp_path / "r.csv", starts=["D"])
+    assert dense["start_position"] == pytest.approx(3.3, abs=0.5)
+    assert dense["start_rotation"] == pytest.approx(STARTS["A"][1] if STARTS["A"] else 0, rel=1e-4)
+    assert dense["photos"] == dense["registered"] == 2
+    assert dense["position"] < 1
+    assert dense["found_5"] == 1
+    assert dense["worst"] >= dense["position"]
+    status, _, err = command_line(*call, "--set", "starts=Z", cwd=tmp_path)
+    assert (status, "starts: expected one of A, B, C, D, got 'Z'" in err) == (1, True)
+    status, _, err = command_line("benchmarks", "run", "register", "ball.ply", cwd=tmp_path)
+    assert (status, "lacks photos with true poses" in err) == (1, True)

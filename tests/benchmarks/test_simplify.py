@@ -1,23 +1,19 @@
-"""The simplifiers' benchmark: rows, resuming, failures."""
+"""The study of simplifiers, and views of other kinds than any method's."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks import rows as table
-from benchmarks.recover import Look
-from benchmarks.simplify import Cell, bench_simplify, find_splat_transform
+from benchmarks.rows import Row, read_rows
+from benchmarks.runner import run
 from benchmarks.standing import given_views, standing_targets, standing_views
+from benchmarks.study import DEFINITIONS, SceneSpec, read_study
 from g2ard import io
-from g2ard.errors import InputError
 from g2ard.poses import make_pool
-from helpers.commands import CommandLine
-from helpers.project import ROOT
 from helpers.scenes import around, checkered_ball
 from helpers.systems import needs_processes
 from reference import poses as naive
@@ -25,79 +21,52 @@ from reference import poses as naive
 METHODS = ("default", "fast", "paper", "nanogs", "lightgaussian")
 
 
+def ask(scene: SceneSpec, out: Path, methods: str, **options: str) -> list[Row]:
+    made = read_study(DEFINITIONS / "simplify.toml").narrowed({"ratios": "4", "methods": methods, **options})
+    return run([replace(made, scenes=(scene,))], out)
+
+
 @needs_processes
 def test_measures_writes_and_resumes(tmp_path: Path) -> None:
-    scene, views, csv = tmp_path / "ball.ply", tmp_path / "views.json", tmp_path / "figures.csv"
-    io.write_splats(scene, checkered_ball(2000))
-    io.write_views(views, around(16))
-    cells = bench_simplify([scene], csv, ratios=[4], methods=METHODS, views=views)
-    assert table.read(csv, Cell) == [_rounded(c) for c in cells]
-    assert [c.key for c in cells] == [("ball", 4.0, m, "pool") for m in METHODS]
-    for c in cells:
-        assert (c.error, c.input_count, c.budget, c.count, c.views) == ("", 2000, 500, 500, 2)
-        assert 8 < c.psnr < 60
-        assert 0 < c.cpu_s < 60
-        assert 20 < c.peak_mb < 2000
-
-    lines = csv.read_text().splitlines()
-    again = bench_simplify([scene], csv, ratios=[4], methods=[*METHODS, "splat-transform"], views=views)
-    assert csv.read_text().splitlines()[: len(lines)] == lines  # nothing was measured twice
-    assert again[:5] == [_rounded(c) for c in cells]
-    assert again[5].error == "splat-transform: not found"
-    assert again[5].psnr is None
-
+    io.write_splats(tmp_path / "ball.ply", checkered_ball(2000))
+    io.write_views(tmp_path / "views.json", around(16))
+    scene = SceneSpec("ball", str(tmp_path / "ball.ply"), str(tmp_path / "views.json"))
+    rows = ask(scene, tmp_path / "out", ",".join(METHODS))
+    assert [row["method"] for row in rows] == list(METHODS)
+    for row in rows:
+        assert "error" not in row
+        assert (row["input_count"], row["budget"], row["count"], row["views"]) == (2000, 500, 500, 2)
+        assert 8 < row["psnr"] < 60
+        assert 0 < row["cpu_s"] < 60
+        assert 20 < row["peak_mb"] < 2000
+    again = ask(scene, tmp_path / "out", "default,splat-transform", splat_transform=str(tmp_path / "none"))
+    assert again[0] == rows[0]  # nothing was measured twice
+    assert "no such program" in again[1]["error"]
     program = tmp_path / "broken"
     program.write_text("#!/bin/sh\necho it broke 1.2 >&2\nexit 7\n")
     program.chmod(0o755)
-    (failed,) = bench_simplify(
-        [scene], csv, ratios=[4], methods=["splat-transform"], views=views, splat_transform=program
-    )
-    assert failed.error == "exit status 7: it broke 1.2"
-    assert failed.version == "it broke 1.2"
-    assert len(table.read(csv, Cell)) == 6  # in the old failure's place
+    (failed,) = ask(scene, tmp_path / "out", "splat-transform", splat_transform=str(program))
+    assert failed["error"] == "exit status 7: it broke 1.2"
+    assert len(read_rows(tmp_path / "out" / "rows.csv")) == 6  # in the old failure's place
 
 
 @needs_processes
-def test_standing_views_are_no_ones_own(tmp_path: Path, command_line: CommandLine) -> None:
-    scene, csv = tmp_path / "ball.ply", tmp_path / "figures.csv"
-    io.write_splats(scene, checkered_ball(3000))
-    chosen = ["default", "fast"]
-    (pool,) = bench_simplify([scene], csv, ratios=[4], methods=["default"])
-    cells = bench_simplify([scene], csv, ratios=[4], methods=chosen, protocol="both")
+def test_standing_views_are_no_ones_own(tmp_path: Path) -> None:
+    path = tmp_path / "ball.ply"
+    io.write_splats(path, checkered_ball(3000))
+    rows = ask(SceneSpec("ball", str(path)), tmp_path / "out", "default,fast", protocol="both")
     kinds = ["pool", "near", "standing"]
-    assert [c.key for c in cells] == [("ball", 4.0, m, kind) for m in chosen for kind in kinds]
-    assert cells[0] == _rounded(pool)  # not measured again
-    assert {c.error for c in cells} == {""}
-    assert [c.views for c in cells[:3]] == [
-        16,
-        *(len(v) for v in standing_views(io.read_splats(scene), scene).values()),
+    assert [(r["method"], r["views_kind"]) for r in rows] == [
+        (method, kind) for method in ("default", "fast") for kind in kinds
     ]
-    assert cells[0].psnr != cells[2].psnr
-    assert len({c.cpu_s for c in cells[:3]}) == 2  # with the pool's views, and with its own
-    assert len({c.cpu_s for c in cells[3:]}) == 1  # run alike for all, so run once
-    text = csv.read_text()
-    status, out, told = command_line(
-        "bench",
-        "simplify",
-        scene,
-        "--ratios",
-        "4",
-        "--methods",
-        "default",
-        "--protocol",
-        "standing",
-        "--csv",
-        csv,
-        "--json",
-        "-",
-        cwd=tmp_path,
-    )
-    assert status == 0, told
-    assert csv.read_text() == text
-    assert "standing" in told
-    assert [row["views_kind"] for row in json.loads(out)["rows"]] == ["near", "standing"]
-    with pytest.raises(InputError, match="protocol: expected one of pool, standing, both"):
-        bench_simplify([scene], csv, protocol="sitting")
+    standing = standing_views(io.read_splats(path), path).values()
+    assert [r["views"] for r in rows[:3]] == [16, *(len(v) for v in standing)]
+    assert rows[0]["psnr"] != rows[2]["psnr"]
+    assert len({r["cpu_s"] for r in rows[:3]}) == 2  # with the pool's views, and with its own
+    assert len({r["cpu_s"] for r in rows[3:]}) == 1  # run alike for all, so run once
+    text = (tmp_path / "out" / "rows.csv").read_text()
+    ask(SceneSpec("ball", str(path)), tmp_path / "out", "default", protocol="standing")
+    assert (tmp_path / "out" / "rows.csv").read_text() == text
 
 
 def test_a_standing_file_beside_the_scene_is_what_counts(tmp_path: Path) -> None:
@@ -147,43 +116,3 @@ def test_made_standing_views_are_of_another_kind(make) -> None:
         assert standing.positions[:, 2].max() < 9
     again = standing_views(splats, nowhere)
     np.testing.assert_array_equal(again["standing"].viewmats, standing.viewmats)
-
-
-def test_rows_from_before_the_last_column_are_read(tmp_path: Path) -> None:
-    csv = tmp_path / "old.csv"
-    csv.write_text(
-        "scene,ratio,method,input_count,budget,count,cpu_s,wall_s,peak_mb,psnr,ssim,views,version,machine,error\n"
-        "ball,4.0,fast,2000,500,500,1.5,1.5,90.0,30.25,0.9,2,g2ard 1,a machine,\n"
-    )
-    (cell,) = table.read(csv, Cell)
-    assert (cell.key, cell.psnr) == (("ball", 4.0, "fast", "pool"), 30.25)
-    csv.write_text("scene,ratio,method\nball,4.0,fast\n")
-    with pytest.raises(InputError, match="other columns"):
-        table.read(csv, Cell)
-
-
-@pytest.mark.parametrize(("name", "kind"), [("simplify", Cell), ("recover", Look)])
-def test_recorded_rows_are_read(name, kind) -> None:
-    paths = sorted((ROOT / "benchmarks" / "record").rglob(f"{name}-*.csv"))
-    assert paths
-    for path in paths:
-        stated = "views_kind" in path.read_text(encoding="utf-8").splitlines()[0]
-        kinds = {row.views_kind for row in table.read(path, kind)}
-        assert kinds == ({"pool", "near", "standing"} if stated else {"pool"})
-
-
-def _rounded(cell: Cell) -> Cell:
-    return Cell(**{k: round(v, 6) if isinstance(v, float) else v for k, v in vars(cell).items()})
-
-
-@needs_processes
-def test_refuses_a_foreign_file_an_unknown_method_and_an_absent_program(tmp_path: Path) -> None:
-    csv = tmp_path / "mine.csv"
-    csv.write_text("a,b\n1,2\n")
-    with pytest.raises(InputError, match="other columns"):
-        bench_simplify([], csv)
-    assert csv.read_text() == "a,b\n1,2\n"
-    with pytest.raises(InputError, match="magic"):
-        bench_simplify([], csv, methods=["magic"])
-    with pytest.raises(InputError, match="no such program"):
-        find_splat_transform(tmp_path / "nothing")

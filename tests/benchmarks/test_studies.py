@@ -1,346 +1,262 @@
-"""Studies as the paper has them: its weights and recoveries, shared checkpoints, teachers, black renders."""
+"""Studies of any kind: what is read, what is measured once, and what the command and the report show."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from benchmarks.definition import Definition, read_definition
-from benchmarks.methods import METHODS, Matched
+from benchmarks.kinds.methods import METHODS
 from benchmarks.report import write_report
-from benchmarks.run import bench_run
-from benchmarks.run_rows import Row, read_rows, with_deltas
-from benchmarks.score import score
+from benchmarks.rows import read_rows, rounded, shown, write_rows
+from benchmarks.runner import Cell, run
+from benchmarks.study import DEFINITIONS, SceneSpec, Study, read_study
 from g2ard import io
 from g2ard.errors import InputError
-from g2ard.rendering.renderer import RasterSettings
-from g2ard.scene.splats import Splats
-from g2ard.scene.targets import TeacherRenders
-from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS, Anchors, drift95
-from g2ard.stages.simplify import round_counts
 from helpers.commands import CommandLine
 from helpers.project import ROOT
-from helpers.scenes import around, checkered_ball
-from helpers.studies import check_page, pictured, study
+from helpers.scenes import checkered_ball
+from helpers.studies import STUDY, check_page, study
 from helpers.systems import needs_processes
 
-HEAD = 'title = "Balls"\nratios = [4]\nsteps = [12]\n'
-SCENE = '\n[[scene]]\nname = "ball"\nprior = "ball.ply"\ntrain = "views.json"\n'
-CITY = """
-[[scene]]
-name = "city"
-synth = { points = 2000, views = 40, size = [48, 36], blocks = 1 }
-train = "train.json"
-score = { val = "val.json", ood = "ood.json" }
-adapt = "adapt.json"
-targets = "photos"
-train_prior = 4
-"""
+
+@dataclass(frozen=True)
+class Toy(Study):
+    """Cells that count how often they are measured; the method "broken" fails."""
+
+    def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
+        for ratio in self.ratios:
+            for method in self.methods:
+                yield Cell({"ratio": ratio, "method": method}, lambda m=method: self.measured(m))
+
+    def measured(self, method: str) -> list[dict]:
+        CALLS.append(method)
+        if method == "broken":
+            raise InputError("it broke")
+        if method == "interrupted":
+            raise KeyboardInterrupt
+        return [{"psnr": 30.1234567, "ssim": 0.9, "count": 5, "cpu_s": 1.0, "views": 3}]
 
 
-def jobs(out: Path, kind: str) -> list[dict]:
-    found = [json.loads(p.read_text()) for p in out.glob("work/*/stages/*/job.json")]
-    return [job for job in found if job["kind"] == kind]
+CALLS: list[str] = []
 
 
-def run(folder: Path, text: str) -> tuple[Definition, list[Row], Path]:
-    definition = read_definition(study(folder, text))
-    rows = bench_run([definition], folder / "out", keep=True)
-    assert [row.error for row in rows if row.error] == []
-    return definition, rows, folder / "out"
+def toy(folder: Path, *methods: str, **options: object) -> Toy:
+    CALLS.clear()
+    if not (folder / "a.ply").exists():
+        (folder / "a.ply").write_text("something")
+    return Toy("toys", "Toys", (SceneSpec("a", "a.ply"),), methods, folder=folder, **options)
 
 
-@needs_processes
-def test_the_last_round_recovers_twice_and_stays_anchored_where_it_was_built(tmp_path: Path) -> None:
-    text = HEAD.replace("[12]", "[60]") + 'methods = ["g2ard-paper"]\n' + SCENE
-    _, (row,), out = run(tmp_path, text)
-    counts = round_counts(1200, 300)
-    recoveries = {job["output"]: job for job in jobs(out, "recover")}
-    assert len(recoveries) == len(counts) + 1
-    share = 8_000 / (8_000 * len(counts) + 30_000)
-    (final,) = (job for job in recoveries.values() if job["final"])
-    early = [job for job in recoveries.values() if not job["final"]]
-    assert {job["steps"] for job in early} == {int(60 * share)}
-    assert final["steps"] == 60 - len(counts) * int(60 * share)
-    assert row.steps == 60
-    before = recoveries[final["scene"]]  # the last round's own recovery
-    assert final["anchors"] == before["scene"]
-    assert not any("anchors" in job for job in early)
-    anchors = Anchors.of(io.read_splats(final["anchors"]))
-    assert row.drift95 == pytest.approx(drift95(anchors, io.read_splats(final["output"]).means), rel=1e-4)
+def test_cells_are_measured_once_and_failures_again(tmp_path: Path) -> None:
+    rows = run([toy(tmp_path, "good", "broken")], tmp_path / "out")
+    assert [row.get("error") for row in rows] == [None, "it broke"]
+    assert rows == read_rows(tmp_path / "out" / "rows.csv")
+    assert rows[0]["psnr"] == 30.1235
+    assert run([toy(tmp_path, "good", "broken")], tmp_path / "out") == rows
+    assert CALLS == ["broken"]
+    run([toy(tmp_path, "good")], tmp_path / "out", again=True)
+    assert CALLS == ["good"]
+    run([toy(tmp_path, "good", ratios=(2.0,))], tmp_path / "out")
+    assert {row["ratio"] for row in read_rows(tmp_path / "out" / "rows.csv")} == {2.0, 10.0}
 
 
-def test_legs_are_those_of_the_releases() -> None:
-    paper = METHODS["g2ard-paper"].legs(12)
-    assert [leg.final for leg in paper] == [False] * 12 + [True]
-    assert sum(leg.share for leg in paper) == pytest.approx(1)
-    assert paper[0].share == pytest.approx(8 / 126)
-    assert paper[-1].share == pytest.approx(30 / 126)
-    assert [(leg.round, leg.share) for leg in METHODS["pup"].legs(2)] == [(0, 0.5), (1, 0.5)]
-    assert [leg.share for leg in METHODS["g2ard"].legs(1)] == [1]
-    assert [leg.share for leg in replace(METHODS["g2ard-paper"], rounds="one").legs(1)] == [1]
-    shared = replace(METHODS["g2ard-paper"], shared_start=True).legs(3)
-    assert [(leg.round, leg.final) for leg in shared] == [(0, False), (1, False), (2, True)]
-    assert shared[-1].share == 1
+def test_changed_files_and_settings_replace_rows(tmp_path: Path) -> None:
+    (first,) = run([toy(tmp_path, "good")], tmp_path / "out")
+    changed = toy(tmp_path, "good", size=64)
+    assert run([changed], tmp_path / "out")[0]["cell"] != first["cell"]
+    (tmp_path / "a.ply").write_text("something else")
+    run([replace(changed)], tmp_path / "out")
+    assert CALLS == ["good"] * 2
+    assert len(read_rows(tmp_path / "out" / "rows.csv")) == 1
+    other = replace(toy(tmp_path, "good"), name="others")
+    run([other], tmp_path / "out")
+    assert [row["study"] for row in read_rows(tmp_path / "out" / "rows.csv")] == ["toys", "others"]
 
 
-@needs_processes
-def test_the_papers_method_has_the_papers_weights_of_each_prior(tmp_path: Path) -> None:
-    methods = {"a": "trained", "b": "lift"}
-    text = HEAD.replace("12", "6") + 'methods = ["a", "b", "c", "d"]\n'
-    for name, prior in methods.items():
-        text += f'[method.{name}]\nbase = "g2ard-paper"\nrounds = "one"\nprior = "{prior}"\n'
-    text += '[method.c]\nprior = "lift"\npreset = "lift"\n'
-    text += '[method.d]\nbase = "g2ard-paper"\nrounds = "one"\npreset = "noisy"\neffective_rank = false\n'
-    _, rows, out = run(tmp_path, text + CITY)
-    assert {(row.method, row.prior) for row in rows} >= {("a", "trained"), ("b", "lift")}
-    found = [job["regularizers"] for job in jobs(out, "recover") if job["steps"] == 6]
-    as_dicts = [
-        vars(PAPER_PRESETS["trained"]),
-        vars(PAPER_PRESETS["lift"]),
-        vars(PRESETS["lift"]),
-        vars(PAPER_PRESETS["noisy"]) | {"effective_rank": False},
-    ]
-    assert len(found) == 4
-    assert all(weights in found for weights in as_dicts)
+def test_an_interrupted_run_keeps_its_rows_and_others_files(tmp_path: Path) -> None:
+    thesis = tmp_path / "out" / "work" / "thesis.txt"
+    thesis.parent.mkdir(parents=True)
+    thesis.write_text("precious")
+    with pytest.raises(KeyboardInterrupt):
+        run([toy(tmp_path, "good", "interrupted")], tmp_path / "out")
+    assert [row["method"] for row in read_rows(tmp_path / "out" / "rows.csv")] == ["good"]
+    run([toy(tmp_path, "good")], tmp_path / "out")
+    assert CALLS == []
+    assert [path.name for path in thesis.parent.iterdir()] == ["thesis.txt"]
 
 
-@needs_processes
-def test_policies_go_on_from_one_checkpoint(tmp_path: Path) -> None:
-    text = HEAD + 'seeds = [0, 1]\nmethods = ["random", "directional", "own"]\n'
-    for name, base in (("random", "g2ard-paper"), ("directional", "g2ard-paper"), ("own", "g2ard")):
-        policy = "random" if name == "own" else name
-        text += f'[method.{name}]\nbase = "{base}"\npolicy = "{policy}"\nk = 0.5\nshared_start = true\n'
-    _, rows, out = run(tmp_path, text + SCENE)
-    counts = round_counts(1200, 300)
-    assert len(jobs(out, "reduce")) == len(counts) + 1  # once for all rows, and once for g2ard's own
-    recoveries = jobs(out, "recover")
-    early = [job for job in recoveries if not job["final"]]
-    assert len(early) == len(counts) - 1
-    assert {(Path(job["views"]).name, job["seed"]) for job in early} == {("train.json", 0)}
-    final = [job for job in recoveries if job["final"]]
-    assert len(final) == 6
-    assert {job["steps"] for job in final} == {12}
-    assert {Path(job["views"]).name for job in final} == {"views.json"}
-    assert len({job["scene"] for job in final}) == 2
-    assert len({row.psnr for row in rows}) == 6
-
-
-@needs_processes
-def test_a_teacher_has_a_row_and_the_others_their_distance_from_it(tmp_path: Path) -> None:
-    text = HEAD.replace("[4]", "[4, 8]").replace("12", "4") + 'differs = ["small <balls>"]\n'
-    text += 'methods = ["random", "teacher"]\n' + CITY
-    definition, rows, out = run(tmp_path, text)
-    teachers = [row for row in rows if row.method == "teacher"]
-    assert [(row.split, row.matched, row.ratio, row.steps) for row in teachers] == [
-        (split, "none", 1.0, 0) for split in ("val", "ood")
-    ]
-    assert all(row.count == row.input_count and row.delta_psnr is None for row in teachers)
-    of = {row.split: row.psnr for row in teachers}
-    others = [row for row in rows if row.method == "random"]
-    assert len(others) == 4
-    assert all(row.delta_psnr == row.psnr - of[row.split] for row in others)
-    assert read_rows(out / "rows.csv")[-1].delta_psnr == pytest.approx(others[-1].delta_psnr, abs=1e-3)
-    write_report(out, [definition], rows)
-    html = (out / "report.html").read_text()
+def test_the_report_shows_rows_seeds_and_failures(tmp_path: Path) -> None:
+    one = toy(tmp_path, "good", "broken", differs=("small <balls>",))
+    rows = run([one], tmp_path / "out")
+    rows.append(rows[0] | {"seed": 1, "psnr": rows[0]["psnr"] + 2, "black": 11, "views": 484})
+    write_report(tmp_path / "out", [one], rows)
+    html = (tmp_path / "out" / "report.html").read_text()
     check_page(html)
+    assert "Failed: a 10× broken: it broke" in html
     assert "<li>small &lt;balls&gt;</li>" in html
-    assert "ΔPSNR" in html
-    assert html.count("<td>teacher</td>") == 4  # beside the rows of both ratios, in both splits
-    elsewhere = replace(others[0], scene="moon")
-    assert with_deltas([elsewhere, *teachers])[0].delta_psnr is None
-
-
-def test_black_renders_are_counted_and_left_out() -> None:
-    ball = checkered_ball(400)
-    views = around(4)
-    targets = TeacherRenders(ball, views)
-    toward = np.asarray(views.positions[0]) / 3.0
-    hidden = replace(ball, means=(ball.means - 6 * toward).astype(np.float32))  # in the first view alone
-    scored = score(hidden, targets, (0.0, 0.0, 0.0))
-    black = [view.black for view in scored.views]
-    assert 0 < sum(black) < 4
-    assert scored.black == sum(black)
-    assert scored.mean("psnr") == np.mean([v.psnr for v in scored.views if not v.black])
-    nothing = Splats.create([[0, 0, 0]], scales=[[1e-3] * 3], logit_opacities=[-20])
-    everywhere = score(nothing, targets, (0.0, 0.0, 0.0))
-    assert everywhere.black == 4
-    assert everywhere.mean("psnr") == np.mean([v.psnr for v in everywhere.views])
-    assert score(nothing, targets, (0.5, 0.5, 0.5)).black == 0
-
-
-@needs_processes
-def test_black_renders_are_told(tmp_path: Path) -> None:
-    text = HEAD.replace("12", "4") + 'methods = ["random"]\n' + SCENE
-    definition, (row,), out = run(tmp_path, text)
-    assert row.black == 0
-    other = replace(row, seed=1, psnr=(row.psnr or 0) + 2)
-    write_report(out, [definition], [replace(row, black=11, views=484), other])
-    html = (out / "report.html").read_text()
-    assert f"random, 2 seeds: {row.psnr + 1:.2f} ± {2**0.5:.2f} dB" in html
-    assert "11 of 495 test renders are all black" in html
-    assert "random†" in html
-
-
-@needs_processes
-def test_what_is_scored_is_not_trained_on(tmp_path: Path) -> None:
-    views = around(16, size=(48, 36))
-    scored = views.take(range(0, 4))
-    text = HEAD.replace("12", "4") + 'methods = ["random"]\n' + SCENE + 'score = { val = "val.json" }\n'
-    io.write_views(tmp_path / "val.json", scored)
-    definition, (row,), out = run(tmp_path, text)
-    assert row.views == 4
-    (train,) = out.glob("work/*/train.json")
-    assert sorted(io.read_views(train).names) == sorted(views.names[4:])
-    write_report(out, [definition], [row])
-    assert "4 views to train on are scored on" in (out / "report.html").read_text()
-
-
-@needs_processes
-def test_adaptation_takes_all_views_in_the_papers_schedule(tmp_path: Path) -> None:
-    text = HEAD.replace("12", "4") + 'adapt_steps = 7\nadapt_schedule = "paper"\nadapt_on = "all"\n'
-    _, rows, out = run(tmp_path, text + 'methods = ["random"]\n' + CITY)
-    assert [row.split for row in rows] == ["val", "ood"]
-    (job,) = jobs(out, "adapt")
-    assert (job["schedule"], job["steps"]) == ("paper", 7)
-    (city,) = out.glob("work/*/city/adapt.json")
-    assert len(io.read_views(job["views"])) == len(io.read_views(city))
-    (report,) = (
-        p.parent / "report.json"
-        for p in out.glob("work/*/stages/*/job.json")
-        if "adapt" in p.read_text().split('"kind": ')[1][:9]
-    )
-    assert json.loads(report.read_text())["steps"] == 7
-
-
-@needs_processes
-def test_the_last_training_views_may_be_the_new_trajectory(tmp_path: Path) -> None:
-    text = HEAD.replace("12", "4") + 'adapt_steps = 3\nmethods = ["random"]\n'
-    _, (row,), out = run(tmp_path, text + SCENE + "adapt_last = 5\n")
-    (adapt,), (train,) = out.glob("work/*/adapt.json"), out.glob("work/*/train.json")
-    adapted, trained = io.read_views(adapt).names, io.read_views(train).names
-    assert len(adapted) == 5
-    assert min(adapted) > max(trained)
-    assert len(adapted) + len(trained) + row.views == len(io.read_views(tmp_path / "views.json"))
-    none_left = study(tmp_path / "more", text + SCENE + "adapt_last = 14\n")
-    (failed,) = bench_run([read_definition(none_left)], tmp_path / "none")
-    assert "adapt_last: 14 of 14 views leave none to train on" in failed.error
-    for line, message in (
-        ("adapt_last = -1", "expected a number"),
-        ('adapt_last = 2\nadapt = "a"', "without `adapt`"),
-    ):
-        none_left.write_text(text + SCENE + line)
-        with pytest.raises(InputError, match=f"adapt_last.*{message}"):
-            read_definition(none_left)
-
-
-@needs_processes
-def test_a_study_may_score_by_inrias_conventions_in_8_bit(tmp_path: Path) -> None:
-    text = HEAD.replace("12", "4") + 'methods = ["random"]\n' + SCENE
-    _, (plain,), _ = run(tmp_path, text)
-    path = tmp_path / "balls.toml"
-    path.write_text('convention = "inria"\neight_bit = true\n' + text)
-    (row,) = bench_run([read_definition(path)], tmp_path / "out", keep=True)
-    assert row.psnr != plain.psnr
-    (stored,) = (tmp_path / "out").glob("work/*/targets-test-inria")
-    first = np.load(stored / "0.npy")
-    (prior,) = (tmp_path / "out").glob("work/*/prior.ply")
-    cameras = around(16, size=(48, 36)).take([0])
-    again = TeacherRenders(io.read_splats(prior), cameras, settings=RasterSettings(convention="inria"))
-    assert np.array_equal(first, again[0])
-
-
-@needs_processes
-def test_either_target_is_the_photo_or_the_priors_render(tmp_path: Path) -> None:
-    io.write_views(tmp_path / "some.json", pictured(tmp_path), splits=["train", "train", "test", "test"])
-    text = HEAD.replace("12", "4") + 'methods = ["random"]\n' + SCENE.replace("views.json", "some.json")
-    _, (row,), out = run(tmp_path, text + 'targets = "either"\n')
-    assert (row.views, row.against) == (2, "either")
-    kinds = {np.load(path).dtype for path in out.glob("work/*/targets-t*/?.npy")}
-    assert kinds == {np.dtype(np.uint8), np.dtype(np.float32)}
-    assert len(list(out.glob("work/*/targets-train/?.npy"))) == 2
+    assert f"a 10× good, 2 seeds: {rows[0]['psnr'] + 1:.2f} ± {2**0.5:.2f} dB" in html
+    assert "11 of 495  renders are all black" in html
+    columns, cells = shown(rows, brief=True)
+    assert columns[0] == "scene"
+    assert "ratio" not in columns  # the same in all
+    assert cells[1][-1] == "it broke"
 
 
 @pytest.mark.parametrize(
-    ("line", "message"),
+    ("change", "message"),
     [
-        ("keep = [0.1]", "keep and ratios exclude each other"),
-        ('convention = "opengl"', "convention: expected gsplat or inria"),
-        ("eight_bit = 3", "eight_bit: expected true or false"),
-        ('adapt_on = "some"', "adapt_on: expected train or all"),
-        ('lpips_input = "raw"', "lpips_input: expected scaled or unscaled"),
-        ('differs = "size"', "differs: expected a list of lines"),
-        ('[method.x]\nlambdas = "mine"', "lambdas: expected one of own, paper"),
-        ('[method.x]\nshared_start = "yes"', "shared_start: expected true or false"),
+        (("ratios", "rations"), "no key 'rations'"),
+        (('"pup"', '"pop"'), "no 'pop'"),
+        (('base = "g2ard-paper"', 'base = "x"'), "method rounds: base"),
+        (("protection = 0.0", 'rounds = "many"'), "rounds: expected one of one, paper, pup"),
+        (("protection = 0.0", "shared_start = 3"), "method rounds: shared_start: expected true or false"),
+        (('name = "ball"', 'nam = "ball"'), "lacks 'name'"),
+        (('name = "ball"', 'name = "ball"\nadapt_last = -1'), "scene ball: adapt_last: expected a whole"),
+        (('name = "ball"', 'name = "b"\nadapt_last = 2\nadapt = "a"'), "without `adapt`"),
+        (("ratios = [4]", "ratios = [4"), "balls.toml"),
+        (("ratios = [4]", "ratios = []"), "no ratios"),
+        (("ratios = [4]", "ratios = [0]"), "ratios: expected a number, at least 1, got 0"),
+        (("ratios = [4]", "ratios = 10"), "ratios: expected a list"),
+        (("ratios = [4]", "ratios = [4]\nkeep = [0.1]"), "keep and ratios exclude each other"),
+        (("ratios = [4]", "keep = [1.5]"), "keep: expected a list of shares"),
+        (("steps = [9]\nseconds = [3]\n", ""), "no steps"),
+        (("steps = [9]", "steps = [2.5]"), "steps: expected a whole number"),
+        (("seconds = [3]", "seconds = [nan]"), "seconds"),
+        (("steps = [9]", "size = 0"), "size"),
+        (("steps = [9]", 'schedule = "nope"'), "schedule"),
+        (("[[scene]]", '[[scene]]\nname = "ball"\n[[scene]]'), "there are two of that name"),
+        (('title = "Balls"', "title = 3"), "title: expected text"),
+        (('title = "Balls"', 'kind = "cake"'), "kind: expected one of matched"),
     ],
 )
-def test_new_keys_are_checked(tmp_path: Path, line: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_definition(study(tmp_path, HEAD + line + "\n" + SCENE))
+def test_studies_say_what_is_wrong(tmp_path: Path, change: tuple[str, str], message: str) -> None:
+    with pytest.raises(InputError, match=re.escape(message)) as caught:
+        read_study(study(tmp_path, STUDY.replace(*change)))
+    assert "balls.toml" in str(caught.value)
 
 
-def test_keep_is_a_share_of_the_prior(tmp_path: Path) -> None:
-    kept = HEAD.replace("ratios = [4]", "keep = [0.033]") + 'methods = ["random"]\n' + SCENE
-    path = study(tmp_path, kept)
-    assert read_definition(path).ratios == (1 / 0.033,)
-    for bad in ("[0]", "[1.5]", '["x"]', "0.1"):
-        path.write_text(kept.replace("[0.033]", bad))
-        with pytest.raises(InputError, match="keep: expected a list of shares"):
-            read_definition(path)
-
-
-def test_every_study_says_what_differs_from_the_paper() -> None:
-    found = {p.stem: read_definition(p) for p in (ROOT / "benchmarks" / "definitions").rglob("*.toml")}
-    assert all(definition.differs for definition in found.values())
+def test_all_studies_can_be_read_and_name_their_differences(monkeypatch: pytest.MonkeyPatch) -> None:
+    paths = sorted(DEFINITIONS.rglob("*.toml"))
+    for path in paths:
+        for name in re.findall(r"\$(\w+)", path.read_text()):
+            monkeypatch.setenv(name, "/data")
+    found = {path.stem: read_study(path) for path in paths}
+    assert "$" not in repr([asdict(scene) for made in found.values() for scene in made.scenes])
+    assert [m.name for m in found["ablations"].methods][:3] == ["full", "one-shot", "-shape"]
     for name in ("ablations", "k_sweep", "policies", "protection", "compression", "geobase", "source"):
+        assert found[name].differs
         assert any(method.lambdas == "paper" for method in found[name].methods), name
     assert all(method.shared_start for method in found["policies"].methods)
     assert {m.effective_rank for m in found["kings_college_erank"].methods} == {None, False}
     mip = found["mip_nerf_360"]
     assert (mip.convention, mip.eight_bit, mip.lpips_input) == ("inria", True, "unscaled")
-    assert [matched.kind for matched in mip.matched(METHODS["teacher"])] == ["none"]
+    assert [budget.kind for budget in mip.budgets(METHODS["teacher"])] == ["none"]
     geobase = found["matrixcity_geobase"]
     assert (geobase.adapt_schedule, geobase.adapt_on, geobase.adapt_steps) == ("paper", "all", 7000)
     assert round(3_001_333 / found["matrixcity_ablations"].ratios[0]) == 99_044
-    assert round(3_000_000 / found["matrixcity_source"].ratios[0]) == 285_000
-    assert Matched("none").label == "as it is"
+
+
+def test_options_narrow_a_study(tmp_path: Path) -> None:
+    made = read_study(study(tmp_path, STUDY.replace("ratios", 'differs = ["small"]\nratios')))
+    small = made.narrowed({"ratios": "5,10", "methods": "rounds,random", "scene.background": "0,1,0.5"})
+    assert small.ratios == (5.0, 10.0)
+    assert [method.name for method in small.methods] == ["rounds", "random"]
+    assert small.methods[0] == made.methods[2]  # the study's own
+    assert small.scenes[0].background == (0.0, 1.0, 0.5)
+    assert small.differs[0].startswith("run with ratios 5,10, methods rounds,random")
+    for name, message in (("rations", "no key"), ("x.y", "no key"), ("ratios", "expected a number")):
+        with pytest.raises(InputError, match=message):
+            made.narrowed({name: "x"})
+
+
+def test_recorded_rows_are_read(tmp_path: Path) -> None:
+    names = ("run-*.csv", "simplify-*.csv", "recover-*.csv", "select-2*.csv", "ship-*.csv", "register-*.csv")
+    for name in names:
+        paths = sorted((ROOT / "benchmarks" / "record").rglob(name))
+        assert paths
+        for path in paths:
+            rows = read_rows(path)
+            assert rows == [rounded(row) for row in rows] or name != "run-*.csv"
+            assert all("scene" in row and isinstance(row.get("psnr", 1.0), float) for row in rows)
+    write_rows(tmp_path / "rows.csv", read_rows(sorted((ROOT / "benchmarks/record").rglob("run-*.csv"))[0]))
+    head = (tmp_path / "rows.csv").read_text().splitlines()[0].split(",")
+    assert {"Submethod", "PSNR", "SSIM", "Size [Bytes]", "#Gaussians"} <= set(head)  # the survey's
+    (tmp_path / "rows.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match="other columns"):
+        read_rows(tmp_path / "rows.csv")
+    (tmp_path / "rows.csv").write_text("scene,psnr\nball,loud\n")
+    with pytest.raises(InputError, match="line 2"):
+        read_rows(tmp_path / "rows.csv")
 
 
 @needs_processes
-def test_a_study_is_one_command(command_line: CommandLine, tmp_path: Path) -> None:
-    study(tmp_path, HEAD.replace("12", "4") + 'methods = ["random", "teacher"]\n' + SCENE)
-    status, _, err = command_line("bench", "run", "balls.toml", cwd=tmp_path)
+def test_command(command_line: CommandLine, tmp_path: Path) -> None:
+    study(tmp_path)
+    few = ["--methods", "g2ard,random", "--ratios", "5", "--steps", "3"]
+    ask = ("benchmarks", "run", "matched", "ball.ply", "--views", "views.json", *few, "-o", "out")
+    status, out, err = command_line(*ask, "--json", "-", cwd=tmp_path)
     assert status == 0, err
-    assert (tmp_path / "figures" / "report.html").exists()
+    assert [row["method"] for row in json.loads(out)["rows"]] == ["g2ard", "random"]
+    assert "rows.csv" in err
+    check_page((tmp_path / "out" / "report.html").read_text())
+    for wrong, words in (
+        (("balls.toml", "--only", "moon"), "no scene 'moon'"),
+        (("matched",), "no scenes: give some"),
+        (("nothing",), "no study 'nothing'"),
+        (("balls.toml", "--views", "views.json"), "go with scenes"),
+        (("balls.toml", "--set", "ratios"), "expected KEY=VALUE"),
+        (("simplify", "ball.ply", "--set", "protocol=sitting"), "protocol: expected one of pool, standing"),
+    ):
+        status, _, err = command_line("benchmarks", "run", *wrong, "-o", "x", cwd=tmp_path)
+        assert status in (1, 2)
+        assert words in err
+    assert not (tmp_path / "x").exists()
 
 
-def test_rows_from_before_later_columns_can_be_read() -> None:
-    files = sorted((ROOT / "benchmarks" / "record").glob("amd-epyc-2c/run-*.csv"))
-    assert files
-    for path in files:
-        rows = read_rows(path)
-        assert rows
-        assert {(row.black, row.delta_psnr) for row in rows} == {(None, None)}
-
-
-@needs_processes
 def test_a_variable_that_is_not_set_is_told_before_anything_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("G2ARD_NOWHERE", raising=False)
-    text = HEAD + 'methods = ["random"]\n[[scene]]\nname = "block"\nprior = "${G2ARD_NOWHERE}/block.ply"\n'
-    with pytest.raises(InputError, match=r"scene block: \$G2ARD_NOWHERE is not set"):
-        bench_run([read_definition(study(tmp_path, text))], tmp_path / "out")
+    text = STUDY.replace("ball.ply", "${G2ARD_NOWHERE}/ball.ply")
+    with pytest.raises(InputError, match=r"scene ball: \$G2ARD_NOWHERE is not set"):
+        run([read_study(study(tmp_path, text))], tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_a_study_takes_the_row_of_regularisers() -> None:
-    from benchmarks.definition import METHODS, Definition
-    from benchmarks.paper import as_in_the_paper
+@needs_processes
+def test_nothing_is_left_running(tmp_path: Path) -> None:
+    mark = tmp_path / "alive"
+    late = f"import time; time.sleep(1.5); open({str(mark)!r}, 'w')"
+    code = (
+        "from pathlib import Path; import sys; from benchmarks.process import measured;"
+        f"measured([sys.executable, '-c', {late!r}], Path({str(tmp_path / 'log')!r}))"
+    )
+    with subprocess.Popen([sys.executable, "-c", code]) as parent:
+        time.sleep(0.8)
+        parent.kill() if sys.platform == "linux" else parent.send_signal(signal.SIGINT)
+    time.sleep(1.5)
+    assert not mark.exists()
 
-    study = Definition("s", "", (), (METHODS["g2ard"], METHODS["pup"]), steps=(5,))
-    assert [m.preset for m in as_in_the_paper(study, row="lift").methods] == ["lift", "auto"]
+
+def test_what_cannot_be_measured_is_refused_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command_line: CommandLine
+) -> None:
+    """As on Windows, which has no such call."""
+    import os
+
+    io.write_splats(tmp_path / "ball.ply", checkered_ball(100))
+    monkeypatch.delattr(os, "posix_spawnp", raising=False)
+    for kind in ("simplify", "matched"):
+        status, _, error = command_line("benchmarks", "run", kind, "ball.ply", "-o", "out", cwd=tmp_path)
+        assert status == 1
+        assert "measures processes by POSIX's calls, which Windows lacks" in error
+    assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]

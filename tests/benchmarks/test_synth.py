@@ -16,6 +16,7 @@ from g2ard.errors import InputError, OutputError
 from g2ard.io import read_points, read_views
 from reference import synth as naive
 
+SYNTH = ("benchmarks", "synth", "city")
 SMALL = CityConfig(points=12_000, views=12, size=(96, 72), blocks=1, seed=3)
 LARGE = replace(SMALL, points=20_000, size=(480, 360), blocks=2)
 
@@ -156,16 +157,16 @@ def test_a_scan_in_parts_is_as_the_scan_at_once(large, large_scan, monkeypatch):
 
 def test_a_million_is_so_many_points_on_a_city_of_that_size(tmp_path, command_line):
     few = ("--views", "8", "--size", "32x24")
-    status, _, said = command_line("synth", "city", "-o", "a", "--million", "0.012", *few, cwd=tmp_path)
+    status, _, said = command_line(*SYNTH, "-o", "a", "--million", "0.012", *few, cwd=tmp_path)
     assert status == 0, said
-    given = ("synth", "city", "-o", "b", "--points", "12k", "--blocks", "1", *few)
+    given = (*SYNTH, "-o", "b", "--points", "12k", "--blocks", "1", *few)
     assert command_line(*given, cwd=tmp_path)[0] == 0
     assert (tmp_path / "a" / "cloud.ply").read_bytes() == (tmp_path / "b" / "cloud.ply").read_bytes()
     scan = city(points=12_000, blocks=1, views=8).points()
     found = read_points(tmp_path / "a" / "cloud.ply")
     np.testing.assert_array_equal(found.positions, scan.positions)
     assert np.abs(found.colors - scan.colors).max() <= 0.5001 / 255
-    both = command_line("synth", "city", "-o", "c", "--million", "1", "--points", "5", cwd=tmp_path)
+    both = command_line(*SYNTH, "-o", "c", "--million", "1", "--points", "5", cwd=tmp_path)
     assert both[0] == 2
     assert "not both" in both[2]
 
@@ -320,11 +321,11 @@ def test_refuses_bad_rays(town):
 
 
 def test_command_line(tmp_path, command_line):
-    options = ["--points", "2k", "--views", "8", "--size", "40x30", "--blocks", "1", "--sky", "0,0,0"]
+    options = ["--points", "2k", "--views", "8", "--size", "40x30", "--blocks", "1"]
     options += ["--offset", "1e6,2e6,100", "--seed", "5"]
 
     def run(*more):
-        return command_line("synth", "city", "-o", "out", *options, *more, cwd=tmp_path)
+        return command_line(*SYNTH, "-o", "out", *options, *more, cwd=tmp_path)
 
     status, out, err = run("-q", "--json", "-")
     assert (status, err) == (0, "")

@@ -54,10 +54,6 @@ def test_a_bad_value_is_named_with_what_is_allowed(
             ("distill", "a.ply", "-n", 5, "-o", "run", "--steps", 5, "--set", "schedule.steps=9"),
             "--steps and --set recover.schedule.steps exclude each other",
         ),
-        (
-            ("bench", "simplify", "a.ply", "--protocol", "x"),
-            "'--protocol': one of pool, standing, both, not 'x'",
-        ),
         (("simplify", "a.ply", "-n", 5, "-o", "o.ply", "--up", "0,0,0"), "a direction such as 0,0,1"),
     ],
 )

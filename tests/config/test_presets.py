@@ -27,7 +27,6 @@ from g2ard.stages.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, d
 from g2ard.stages.recover.schedule import PAPER, Schedule
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine
-from helpers.project import ROOT
 from helpers.scenes import around, checkered_ball
 
 PRIOR = checkered_ball()
@@ -143,62 +142,6 @@ def test_the_other_commands_know_it(folder: Path, command_line: CommandLine) -> 
     for name in ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN"):
         assert done["settings"][f"adapt.recovery.rates.{name}"] == rates[name]
     assert (done["steps"], done["settings"]["adapt.tolerance"], done["colour_change"]) == (6, 0.0, None)
-
-
-def test_a_study_takes_it_in_g2ard_s_place() -> None:
-    from benchmarks.definition import METHODS, Definition
-    from benchmarks.paper import as_in_the_paper
-
-    study = Definition(
-        "s", "", (), tuple(METHODS[name] for name in ("g2ard", "pup", "g2ard-paper")), steps=(5,)
-    )
-    paper, pup = as_in_the_paper(study).methods
-    assert (paper.name, paper.reduce, paper.rounds, paper.k) == ("g2ard-paper", "paper", "paper", 0.5)
-    assert (paper.schedule, as_in_the_paper(study).sh_degree) == ("paper", 3)
-    assert (pup, as_in_the_paper(study).released) == (METHODS["pup"], True)
-    assert not as_in_the_paper(study, False).released
-
-
-DEFINITIONS = ROOT / "benchmarks" / "definitions"
-
-
-@pytest.mark.parametrize("name", sorted(str(p.relative_to(DEFINITIONS)) for p in DEFINITIONS.rglob("*.toml")))
-def test_it_means_every_row_of_the_paper_s_alike(name: str) -> None:
-    from benchmarks.definition import read_definition
-    from benchmarks.paper import as_in_the_paper
-
-    study = read_definition(DEFINITIONS / name)
-    done = as_in_the_paper(study)
-    papers = [m for m in done.methods if m.reduce == "paper"]
-    assert papers
-    assert not any(m.reduce == "default" for m in done.methods)
-    assert {m.schedule for m in papers} == {"paper"}
-    if all(m.policy is None for m in study.methods):
-        assert {(m.policy, m.k) for m in papers} == {("directional", 0.5)}
-    else:  # which views there are is what is compared
-        before = {m.name: (m.policy, m.k) for m in study.methods}
-        assert all(before[m.name] == (m.policy, m.k) for m in papers)
-    told = "\n".join(done.differences)
-    for untrue in ("g2ard's rates in all rows", "all training views, not a", "not each method's released"):
-        assert untrue not in told
-    assert "rows g2ard" not in told
-    assert "row g2ard is ours" not in told
-    assert "paper's preset" in told
-    matched = "\n".join(as_in_the_paper(study, False).differences)
-    assert "stand beside" not in matched
-
-
-def test_two_priors_take_it_alike() -> None:
-    from benchmarks.definition import read_definition
-    from benchmarks.paper import as_in_the_paper
-
-    study = read_definition(DEFINITIONS / "source.toml")
-    rows = {m.name: m for m in as_in_the_paper(study).methods}
-    assert list(rows)[:3] == ["g2ard-paper", "g2ard-paper (lift)", "lightgaussian"]
-    lift = rows["g2ard-paper (lift)"]
-    assert lift == replace(rows["g2ard-paper"], name=lift.name, prior="lift")
-    alone = study.narrowed(methods=tuple(m for m in study.methods if m.name == "g2ard (lift)"))
-    assert as_in_the_paper(alone).methods == (lift,)
 
 
 def test_in_python() -> None:

@@ -279,7 +279,7 @@ def test_every_stage_writes_the_same_bytes_for_any_threads(command_line: Command
 def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp_path: Path) -> None:
     """As of a city on a map: positions of a million metres, one offset, photos in the same coordinates."""
     laspy = pytest.importorskip("laspy")
-    city = ("synth", "city", "-o", "city", "--points", "2k", "--views", 16, "--size", "32x24")
+    city = ("benchmarks", "synth", "city", "-o", "city", "--points", "2k", "--views", 16, "--size", "32x24")
     assert command_line(*city, "--offset", "443000,4428000,1600", cwd=tmp_path)[0] == 0
     error = refused(command_line, tmp_path, "info", "city", status=1)
     assert "cloud.ply (a cloud), adapt.json, ood.json, train.json, val.json (views)\n" in error

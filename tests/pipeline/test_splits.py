@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.definition import read_definition
-from benchmarks.recover import RecoverBench
-from benchmarks.select_workspaces import Size, pool_of, workspace_of
+from benchmarks.kinds.matched import MatchedWorkspace
+from benchmarks.kinds.select import Universe, pool_of
+from benchmarks.study import DEFINITIONS, SceneSpec, read_study
 from benchmarks.workspace import Workspace
 from g2ard.errors import InputError
 from g2ard.io import Points, read_points, read_view_set, write_points, write_splats, write_views
@@ -187,8 +187,10 @@ def test_views_beside_held_out_ones_train_without_their_own_test_views(
     assert all(
         name.startswith("near_") for part in watch.scored[2:] for name in part
     )  # made, no photo's pose
-    bench = RecoverBench(folder / "ball.ply", folder / "chosen.json", folder / "photos")
-    assert [set(part.names) for part in bench.cameras] == [chosen, TEST]
+    score = {"test": str(folder / "photos")}
+    scene = SceneSpec("ball", str(folder / "ball.ply"), str(folder / "chosen.json"), score)
+    place = Workspace(folder / "work", read_study(DEFINITIONS / "recover-curves.toml"), scene)
+    assert [set(part.names) for part in (place.train_cameras, place.scored["test"])] == [chosen, TEST]
     g2ard(*ask, "--held-out", "photos", "-o", "pool")
     assert [part for part in watch.scored if part == TEST] == [TEST] * 4
     assert set(read_view_set(folder / "pool" / "views.json").splits) == {"train"}
@@ -287,26 +289,28 @@ adapt = "photos"
 
 
 def test_simplifiers_are_given_training_views_alone(folder: Path) -> None:
-    from benchmarks.simplify import _Workspace
-
     names = [f"{i:03d}.png" for i in range(16)]
     (folder / "photos" / "split.json").write_text(
         json.dumps({"train": names[:6], "val": names[6:9], "test": names[9:13]})
     )
-    made = _Workspace(folder, folder / "ball.ply", folder / "photos", None, 0, ["pool"])
-    assert set(made.targets["pool"].cameras.names) == set(names[9:13])
-    written = read_view_set(made.views)
-    assert written.splits == ("train",) * 6 + ("val",) * 3 + ("test",) * 4 + (None,) * 3
-    pool = read_view_set(_Workspace(folder / "photos", folder / "ball.ply", None, None, 0, ["pool"]).views)
-    assert pool.splits == splits_of(None, pool.cameras.names)
+    study, ball = read_study(DEFINITIONS / "simplify.toml"), str(folder / "ball.ply")
+    place = Workspace(folder / "work", study, SceneSpec("ball", ball, str(folder / "photos")))
+    assert set(place.scored["test"].names) == set(names[9:13])
+    written = read_view_set(place.train)
+    assert (written.cameras.names, set(written.splits)) == (tuple(names[:6]), {"train"})
+    place = Workspace(folder / "work", study, SceneSpec("pool", ball))
+    found = read_view_set(place.folder / "pool.json") if place.train else None
+    assert found is not None
+    assert found.splits == splits_of(None, found.cameras.names)
+    assert set(place.train_cameras.names).isdisjoint(place.scored["test"].names)
 
 
 def test_studies_read_the_stated_splits(folder: Path) -> None:
     for score in ("", 'score = { unseen = "photos" }\n'):
         (folder / "study.toml").write_text(STUDY + score)
-        definition = read_definition(folder / "study.toml")
-        made = Workspace(folder / f"work{len(score)}", definition, definition.scenes[0])
-        for path in (made.train, made.adapt):
+        study = read_study(folder / "study.toml")
+        made = MatchedWorkspace(folder / f"work{len(score)}", study, study.scenes[0])
+        for path in (made.train, made.adapted):
             found = read_view_set(path)
             assert (set(found.cameras.names), set(found.splits)) == (TRAIN, {"train"})
         for targets in made.test.values():
@@ -330,12 +334,13 @@ def test_caliterra_s_photos_stay_apart(folder: Path, g2ard: Program, watch: Watc
     assert watch.scored == [split["test"]] * 2
 
 
-def test_the_study_of_policies_never_offers_test_photos() -> None:
+def test_the_study_of_policies_never_offers_test_photos(tmp_path: Path) -> None:
     data = real("caliterra")
     test = set(json.loads((data / "split.json").read_text())["test"])
-    made = workspace_of(data, Size(gaussians=500, pixels=64))
-    names = np.array(made.targets.cameras.names)
-    assert set(names[made.tests]) <= test
+    study = read_study(DEFINITIONS / "select.toml").narrowed({"count": 500, "size": 64})
+    made = Universe(tmp_path, study, SceneSpec("caliterra", str(data), targets="photos"))
+    names = np.array(made.shown.cameras.names)
+    assert set(names[made.held]) <= test
     for kind in ("biased", "even"):
         pool = pool_of(made, kind, 0)
         assert not set(names[np.concatenate([pool.rows, pool.crowd])]) & test

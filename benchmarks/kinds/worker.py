@@ -1,7 +1,7 @@
-"""One stage of a benchmark's cell, as a process of its own: `python -m benchmarks.worker JOB.json`.
+"""One stage of a matched cell as a process of its own: `python -m benchmarks.kinds.worker JOB.json`.
 
-A job says its `kind` (reduce, select, recover or adapt), its inputs by path and where its `output` goes; what
-the stage reports is written beside the output, as report.json.
+A job names its `kind` (reduce, select, recover or adapt), its inputs by path and its `output`. The stage's
+report is written beside the output, as report.json.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Job = dict[str, Any]
 
 
 class StoredTargets:
-    """Targets made once for all cells: one .npy a view, by the view's name; photos as bytes."""
+    """Targets stored once for all cells: one .npy per view, photos as bytes."""
 
     def __init__(self, cameras: Cameras, folder: Path) -> None:
         self.cameras = cameras
@@ -52,13 +52,13 @@ class StoredTargets:
         return image.astype(np.float32) / np.float32(255) if image.dtype == np.uint8 else image
 
     def mask(self, view: int) -> NDArray[np.bool_] | None:
-        """Where the target counts; None where all of it does."""
+        """Return where the target counts, or None if everywhere."""
         path = self._paths[view].with_suffix(".mask.npy")
         return np.load(path) if path.exists() else None
 
 
 def store_targets(targets: Targets, folder: Path) -> None:
-    """Put photos (undistorted, at their views' size) or teacher renders where `StoredTargets` finds them."""
+    """Store photos (undistorted, at their views' size) or renders for `StoredTargets`."""
     folder.mkdir(parents=True, exist_ok=True)
     for view in range(len(targets.cameras)):
         image = targets[view]
@@ -88,7 +88,7 @@ def _reduce(job: Job) -> dict[str, Any]:
     looks = job["method"] in ("default", "fast")
     config = SimplifyConfig()
     if job["method"] == "paper":
-        config = replace(config, retention=1e-9)  # one reduction to the count: the bench goes round by round
+        config = replace(config, retention=1e-9)  # one reduction to the count: rounds are cells' own
     if job["protection"] is not None:
         config = replace(config, protection=job["protection"])
     done = simplify(
@@ -117,7 +117,7 @@ def _select(job: Job) -> dict[str, Any]:
 
 
 def _cameras(path: str) -> Cameras:
-    """All views of a file that the workspace has written, with a photo or without."""
+    """Read all views of a file that the workspace has written, with a photo or without."""
     return io.read_view_set(path, unpictured=True).cameras
 
 
@@ -166,7 +166,7 @@ def _adapt(job: Job) -> dict[str, Any]:
 
 
 def _schedule(name: str, cameras: Cameras) -> Schedule:
-    """3DGS's rates at the end of its training, where fine-tuning goes on, beside those of recovery."""
+    """Return a schedule of recovery, or 3DGS's rates at the end of its training, as fine-tuning uses them."""
     if name != "3dgs":
         return Schedule.named(name)
     positions = cameras.positions

@@ -1,25 +1,31 @@
-"""`python -m benchmarks synth`."""
+"""The command `python -m benchmarks synth city`."""
 
 from __future__ import annotations
 
 import re
+import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from benchmarks.commands.group import bench
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import SkyOption, Triple
+from g2ard.cli.options import Triple
 from g2ard.progress import plural
 
-synth = typer.Typer(help="Make data where none is at hand.", no_args_is_help=True)
-bench.add_typer(synth, name="synth")
+__all__ = ["synth"]
+
+synth = typer.Typer(help="Generate data.", no_args_is_help=True)
+
+
+@synth.callback()
+def _root() -> None:
+    pass
 
 
 class _Size(tuple[int, int]):
-    """Width and height in one argument (see `Triple`)."""
+    """Width and height in one argument."""
 
     def __str__(self) -> str:
         return f"{self[0]}x{self[1]}"
@@ -46,17 +52,12 @@ def city(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for all of it.")],
     points: Annotated[
         Count | None,
-        typer.Option(
-            parser=Count.parse, metavar="COUNT", help="Points of the cloud, such as 1M; 500k if not given."
-        ),
+        typer.Option(parser=Count.parse, metavar="COUNT", help="Points of the cloud; 500k if not given."),
     ] = None,
     million: Annotated[
         float | None,
         typer.Option(
-            min=0.001,
-            max=1000,
-            metavar="N",
-            help="So many million points instead, on a city as large as that.",
+            min=0.001, max=1000, metavar="N", help="Million points instead, on a city as large as that."
         ),
     ] = None,
     views: Annotated[int, typer.Option(min=8, help="Photos in all four splits together.")] = 120,
@@ -65,24 +66,14 @@ def city(
         typer.Option(parser=_size, metavar="WxH", help="Size of a photo; 800x600 if not given."),
     ] = None,
     blocks: Annotated[
-        int | None,
-        typer.Option(
-            min=1, max=40, help="City blocks along each side; 3, or with --million a block for each million."
-        ),
+        int | None, typer.Option(min=1, max=40, help="City blocks along each side; 3, or as --million needs.")
     ] = None,
-    fov: Annotated[float, typer.Option(min=1, max=170, help="Horizontal field of view, degrees.")] = 65.0,
-    noise: Annotated[float, typer.Option(min=0, help="Noise of the laser's range, metres.")] = 0.015,
-    supersample: Annotated[int, typer.Option(min=1, max=8, help="Samples a pixel along each axis.")] = 2,
-    sky: SkyOption = None,
     offset: Annotated[
         Triple | None,
         typer.Option(parser=_offset, metavar="X,Y,Z", help="World coordinates of the middle, as maps have."),
     ] = None,
-    depth: Annotated[bool, typer.Option("--depth", help="Also write exact depth, metres, as .npy.")] = False,
 ) -> None:
-    """A procedural city: coloured LiDAR cloud, photos with exact poses, splits train/val/adapt/ood."""
-    import time
-
+    """Generate a city: coloured LiDAR cloud, photos with exact poses, splits train/val/adapt/ood."""
     from benchmarks.synth import CityConfig, write_city
 
     if points is not None and points.is_share:
@@ -101,18 +92,10 @@ def city(
         size=size or default.size,
         blocks=blocks or default.blocks,
         seed=run.seed,
-        noise=noise,
-        fov=fov,
-        supersample=supersample,
-        sky=sky or default.sky,
         offset=offset or default.offset,
     )
-    manifest = write_city(
-        output, config, depth=depth, overwrite=run.overwrite, threads=run.threads, progress=run.progress
-    )
-    seconds = time.monotonic() - began
+    manifest = write_city(output, config, overwrite=run.overwrite, threads=run.threads, progress=run.progress)
     splits = ", ".join(f"{count} {name}" for name, count in manifest["views"].items())
-    run.say(
-        f"{output}: {plural(config.points, 'point')}, {splits} views of {config.size[0]}×{config.size[1]}"
-    )
-    run.result({**manifest, "output": str(output), "seconds": seconds})
+    pixels = f"{config.size[0]}×{config.size[1]}"
+    run.say(f"{output}: {plural(config.points, 'point')}, {splits} views of {pixels}")
+    run.result({**manifest, "output": str(output), "seconds": time.monotonic() - began})

@@ -1,0 +1,142 @@
+"""The command `python -m benchmarks run`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from g2ard.cli.frame import Run, command
+from g2ard.cli.resume import rows_kept
+from g2ard.errors import InputError
+from g2ard.progress import plural
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    help="Measure speed against the machine's limit, and quality against other methods.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+_BUDGETS = ("steps", "seconds", "adapt_steps")
+_List = Annotated[str | None, typer.Option(help="Comma-separated, instead of the study's.")]
+
+
+@app.callback()
+def _root() -> None:
+    pass
+
+
+@command("run", parent=app, settings=True, example="python -m benchmarks run simplify scene.ply --ratios 10")
+def run_(
+    run: Run,
+    study: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="STUDY... [SCENE...]",
+            help="Studies: .toml files, or names in benchmarks/definitions. Scenes replace theirs.",
+        ),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the run.")] = Path(
+        "figures"
+    ),
+    views: Annotated[Path | None, typer.Option(metavar="VIEWS", help="Of the scenes given.")] = None,
+    held_out: Annotated[
+        Path | None, typer.Option(metavar="VIEWS", help="Score on these; --views is to train on.")
+    ] = None,
+    photos: Annotated[
+        bool, typer.Option("--photos", help="Targets are the photos, not the scenes' renders.")
+    ] = False,
+    only: Annotated[str | None, typer.Option(metavar="NAMES", help="Of the studies' scenes.")] = None,
+    methods: _List = None,
+    ratios: _List = None,
+    seeds: _List = None,
+    steps: _List = None,
+    seconds: _List = None,
+    adapt_steps: _List = None,
+    size: Annotated[str | None, typer.Option(help="Longer side of the views, pixels.")] = None,
+    lpips: Annotated[Path | None, typer.Option(metavar="DIR", help="Weights of LPIPS.")] = None,
+    keep: Annotated[bool, typer.Option("--keep", help="Keep intermediate scenes.")] = False,
+) -> None:
+    """Run studies: DIR/rows.csv holds a row per measurement, DIR/report.html shows them.
+
+    --set KEY=VALUE sets any other key of the studies, --set scene.KEY=VALUE of their scenes. A stopped run
+    continues where it was, -w measures anew. A cell that fails is a row with its error, and is tried again.
+    """
+    from benchmarks.report import write_report
+    from benchmarks.rows import shown
+    from benchmarks.runner import run as run_studies
+    from benchmarks.study import DEFINITIONS, SceneSpec, read_study, scene_label
+    from g2ard.io import kind
+
+    named = [Path(word) if word.endswith(".toml") else DEFINITIONS / f"{word}.toml" for word in study]
+    files = [path for word, path in zip(study, named, strict=True) if word.endswith(".toml") or path.exists()]
+    scenes = [Path(word) for word, path in zip(study, named, strict=True) if path not in files]
+    if not files:
+        raise typer.BadParameter(f"no study {study[0]!r} (there are {', '.join(_names(DEFINITIONS))})")
+    if not scenes and (views or held_out or photos):
+        raise typer.BadParameter("--views, --held-out and --photos go with scenes: a study names its own")
+    flags = {"methods": methods, "ratios": ratios, "seeds": seeds, "steps": steps, "seconds": seconds}
+    flags |= {
+        "size": size,
+        "adapt_steps": adapt_steps,
+        "lpips": None if lpips is None else str(lpips.absolute()),
+    }
+    options: dict[str, Any] = {name: value for name, value in flags.items() if value is not None}
+    if run.seed and seeds is None:
+        options["seeds"] = str(run.seed)
+    forced = dict(_setting(text) for text in run.config.get("set") or [])
+    studies = []
+    for path in files:
+        one = read_study(path)
+        if scenes:
+            specs = tuple(
+                SceneSpec(
+                    scene_label(scene),
+                    str(scene.absolute()),
+                    None if views is None else str(views.absolute()),
+                    {"test": str(held_out.absolute())} if held_out else {},
+                    targets="photos" if photos or kind(scene) != "splats" else "teacher",
+                )
+                for scene in scenes
+            )
+            one = replace(one, scenes=specs)
+        left = {name for name in options if name in _BUDGETS and not getattr(one, name, None)}
+        for name in sorted(left):
+            run.say(f"{path}: has no {name}, and --{name} is ignored there")
+        shared = {name: value for name, value in options.items() if name not in left}
+        shared = {name: value for name, value in shared.items() if name != "lpips" or hasattr(one, "lpips")}
+        one = one.narrowed({**shared, **forced})
+        wanted = one.scenes if only is None else tuple(s for s in one.scenes if s.name in only.split(","))
+        if not wanted:
+            there = f"no scene {only!r} (it has {', '.join(s.name for s in one.scenes)})"
+            raise InputError(f"{path}: {there if one.scenes else 'no scenes: give some'}")
+        studies.append(replace(one, scenes=wanted))
+    with rows_kept(run, output / "rows.csv", goes_on=True):
+        rows = run_studies(studies, output, keep=keep, again=run.overwrite, progress=run.progress)
+    write_report(output, studies, rows)
+    for one in studies:
+        own = [row for row in rows if row["study"] == one.name]
+        run.console.table(one.title, *shown((row for row in own if row.get("final", 1)), brief=True))
+        summary = one.summary(own)
+        if summary is not None:
+            run.console.table(*summary)
+    run.say(f"rows: {output / 'rows.csv'}\nreport: {output / 'report.html'}")
+    run.result({"rows": rows})
+    failed = sum("error" in row for row in rows)
+    if failed:
+        run.unmet(f"{plural(failed, 'row')} failed; the same command tries again")
+
+
+def _names(folder: Path) -> list[str]:
+    return sorted(path.stem for path in folder.glob("*.toml"))
+
+
+def _setting(text: str) -> tuple[str, str]:
+    name, found, value = text.partition("=")
+    if not found:
+        raise typer.BadParameter(f"--set: expected KEY=VALUE, not {text!r}")
+    return name.strip(), value.strip()

@@ -1,0 +1,290 @@
+"""Recovery on unseen views against seconds: schedules, regularisers and rounds side by side."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.rows import Row
+from benchmarks.runner import Cell
+from benchmarks.score import score
+from benchmarks.study import SceneSpec, Study, checked, key
+from benchmarks.workspace import PROTOCOLS, Workspace, budget_of
+from g2ard.errors import InputError
+from g2ard.pipeline import DistillConfig, distill
+from g2ard.rendering.visibility import visibility_source
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import Targets
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, drift95, effective_rank, needle
+from g2ard.stages.recover.presets import preset_for
+from g2ard.stages.recover.report import RecoverReport
+from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
+from g2ard.stages.simplify import simplify
+
+__all__ = ["Recover", "Variant"]
+
+_FIRST_LOOK = 25
+"""Unseen views are scored after this many steps of a recovery, then after twice as many, and so on."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One variant of recovery.
+
+    Args:
+        name: its name in the rows.
+        schedule: "default" or "paper".
+        each: one variant for each of the study's `steps`, NAME@STEPS.
+        horizon: scales the paper's schedule to this many steps; without it the schedule keeps its own.
+        decay: whether the paper's schedule takes the default's decay.
+        multiplier: of the rates; None chooses it.
+        round_share: steps of a round over those of the last recovery; 0 recovers once.
+        anchor: factor of the weight of L_anchor.
+        shape: factor of the weight of L_shape.
+    """
+
+    name: str
+    schedule: str = key("default", choices=("default", "paper"))
+    each: bool = key(False)
+    horizon: int | None = key(None, least=1)
+    decay: bool = key(False)
+    multiplier: float | None = key(None, least=0)
+    round_share: float = key(0.0, least=0)
+    anchor: float = key(1.0, least=0)
+    shape: float = key(1.0, least=0)
+
+    @property
+    def plan(self) -> Schedule:
+        """The schedule."""
+        if self.schedule == "paper":
+            found = PAPER if self.horizon is None else PAPER.scaled(self.horizon)
+            return replace(found, cosine_floor=TUNED.cosine_floor) if self.decay else found
+        rounds = round(self.round_share * TUNED.steps)
+        return replace(TUNED, round_steps=rounds, multiplier=self.multiplier or TUNED.multiplier)
+
+
+@dataclass(frozen=True)
+class Recover(Study):
+    """A study of recovery. Every run starts from the same simplification; looks do not count as time.
+
+    Args:
+        methods: tables of `Variant`.
+        steps: of variants that keep the default's schedule; the last of them unless a variant takes each.
+        seconds: of recovery instead of steps, over all rounds.
+        protocol: "pool", "standing" (near and standing views) or "both".
+    """
+
+    steps: tuple[int, ...] = key((1000,), least=1, axis=True)
+    seconds: float | None = key(None, least=1e-6)
+    protocol: str = key("pool", choices=tuple(PROTOCOLS), axis=True)
+
+    @classmethod
+    def method(cls, name: str, values: Mapping[str, Any]) -> Variant:
+        """Return the variant of a table."""
+        try:
+            return Variant(name, **checked(Variant, values, {"name"}))
+        except InputError as error:
+            raise InputError(f"method {name}: {error}") from None
+
+    def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
+        """Yield a cell for each ratio, variant and seed."""
+        if self.protocol != "pool" and scene.targets == "photos":
+            raise InputError("protocol: no photos show it from elsewhere; a trained scene is needed")
+        place = _Workspace(work, self, scene)
+        label = scene.name + (f" {self.size}px" if self.size else "")  # decibels depend on it
+        for ratio in self.ratios:
+            for variant in self.methods:
+                for steps in self.steps if variant.each else self.steps[-1:]:
+                    name = f"{variant.name}@{steps}" if variant.each else variant.name
+                    horizon = None if variant.schedule == "paper" or self.seconds else steps
+                    for seed in self.seeds:
+                        names = {"scene": label, "ratio": ratio, "variant": name, "seed": seed}
+                        kinds = PROTOCOLS[self.protocol]
+                        run = partial(self._run, place, ratio, variant, horizon, seed, kinds)
+                        yield Cell(names, run, kinds, [repr(variant), horizon])
+
+    @staticmethod
+    def _run(
+        place: _Workspace,
+        ratio: float,
+        variant: Variant,
+        steps: int | None,
+        seed: int,
+        kinds: Sequence[str],
+    ) -> list[Row]:
+        return _Run(place, ratio, variant, steps, seed, kinds).rows()
+
+    def summary(self, rows: list[Row]) -> tuple[str, list[str], list[list[str]]] | None:
+        """Return how much sooner the default reaches what other variants end with."""
+        lines = []
+        for other in rows:
+            if not other.get("final") or other["variant"].startswith("default@"):
+                continue
+            names = ("scene", "ratio", "seed", "views_kind")
+            rivals = [
+                row
+                for row in rows
+                if row.get("variant", "").startswith("default@")
+                and row["count"] == row["budget"]
+                and all(row[name] == other[name] for name in names)
+            ]
+            reached = min((r["seconds"] for r in rivals if r["psnr"] >= other["psnr"]), default=None)
+            share = ["never", "–"]
+            if reached is not None:
+                share = [f"{reached:.1f}", f"{reached / other['seconds']:.3f}"]
+            told = [other["scene"], f"{other['ratio']:g}", other["variant"], other["views_kind"]]
+            if rivals:
+                lines.append([*told, f"{other['psnr']:.2f}", f"{other['seconds']:.1f}", *share])
+        columns = ["scene", "ratio", "against", "views", "PSNR", "seconds", "default's", "share"]
+        return ("The default's seconds to the other's PSNR", columns, lines) if lines else None
+
+
+class _Workspace(Workspace):
+    """A scene with what all its recoveries share."""
+
+    study: Recover
+
+    @property
+    def sh_degree(self) -> int | None:
+        """The SH degree of the results: 3 from a cloud, otherwise the scene's own."""
+        return 3 if self.lifted else None
+
+    @cached_property
+    def train_targets(self) -> Targets:
+        """The training targets, made before any clock starts."""
+        targets = self.targets(self.train_cameras)
+        for view in range(len(targets.cameras)):
+            targets[view]
+        return targets
+
+    @cached_property
+    def starts(self) -> dict[int, tuple[Splats, float]]:
+        """Count → the simplified scene that one-shot runs start from, and the seconds of making it."""
+        return {}
+
+    def start(self, budget: int) -> tuple[Splats, float]:
+        """Return the start of a count, made once."""
+        if budget not in self.starts:
+            began = time.monotonic()
+            small = simplify(self.splats, budget, visibility=visibility_source(self.train_cameras)).splats
+            if self.sh_degree is not None:
+                small = small.with_sh_degree(self.sh_degree)
+            self.starts[budget] = small, time.monotonic() - began
+        return self.starts[budget]
+
+    def weights(self, variant: Variant) -> Regularizers:
+        """Return the regularisers: the paper's for its schedule, with the variant's factors."""
+        views = self.train_cameras if self.scene.targets == "photos" else None
+        preset, why, _ = preset_for("auto", self.splats, views)
+        own = PAPER_PRESETS[why.split()[0]] if variant.schedule == "paper" else preset
+        return replace(own, anchor=own.anchor * variant.anchor, shape=own.shape * variant.shape)
+
+
+class _Run:
+    """One recovery, or a chain of them, scored along the way."""
+
+    def __init__(
+        self,
+        place: _Workspace,
+        ratio: float,
+        variant: Variant,
+        steps: int | None,
+        seed: int,
+        kinds: Sequence[str],
+    ) -> None:
+        self.place, self.plan, self.kinds = place, variant.plan, kinds
+        self.budget = budget_of(len(place.splats), ratio)
+        self.options: dict[str, Any] = {
+            "schedule": self.plan,
+            "steps": steps,
+            "recovery_time": place.study.seconds,
+            "regularizers": place.weights(variant),
+            "background": place.scene.background,
+            "seed": seed,
+        }
+        self.found: list[Row] = []
+        self.simplify_s = 0.0
+        self.before = self.now = 0.0  # seconds of finished recoveries, and of the one in progress
+        self.cpu, self.cpu_began = 0.0, time.process_time()
+
+    def rows(self) -> list[Row]:
+        """Run, and return a row for each look and kind of views.
+
+        Raises:
+            InputError: a loss or a value of the result is not finite.
+        """
+        done, started, reports = (self._chain if self.plan.round_steps else self._once)()
+        self._count_cpu()
+        _check_finite(done, [loss for report in reports for loss in report.loss])
+        spent = sum(report.seconds for report in reports)
+        extra = sum(report.seconds * report.regularizers.share for report in reports)
+        end = {
+            "simplify_s": self.simplify_s,
+            "drift95": drift95(Anchors.of(started), done.means),
+            "reg_share": extra / max(spent, 1e-9),
+            "skipped": sum(report.skipped["non_finite"] for report in reports),
+        }
+        return [*self.found, *({**row, **end} for row in self._looks(done, reports[-1].steps, spent, 1))]
+
+    def _once(self) -> tuple[Splats, Splats, list[RecoverReport]]:
+        targets = self.place.train_targets
+        start, self.simplify_s = self.place.start(self.budget)
+        self.cpu_began = time.process_time()
+        done = recover(start, targets, RecoverConfig(**self.options), watch=self._watch)
+        return done.splats, start, [done.report]
+
+    def _chain(self) -> tuple[Splats, Splats, list[RecoverReport]]:
+        place = self.place
+        config = DistillConfig(recover=RecoverConfig(**self.options, sh_degree=place.sh_degree))
+        done = distill(place.splats, self.budget, place.train_targets, config, watch=self._watch)
+        self.simplify_s = done.report.seconds.simplify
+        reports = [report for entry in done.report.rounds for report in entry.recover]
+        return done.splats, done.simplified, reports
+
+    def _watch(self, step: int, seconds: float, splats: Callable[[], Splats]) -> None:
+        if step == 1:
+            self.before += self.now
+            if self.plan.round_steps:
+                self.cpu_began = time.process_time()  # what came before was mostly simplification
+        self.now = seconds
+        self._count_cpu()
+        if step >= _FIRST_LOOK and (step // _FIRST_LOOK).bit_count() == 1 and step % _FIRST_LOOK == 0:
+            self.found += self._looks(splats(), step, self.before + seconds, 0)
+        self.cpu_began = time.process_time()
+
+    def _count_cpu(self) -> None:
+        now = time.process_time()
+        self.cpu += now - self.cpu_began
+        self.cpu_began = now
+
+    def _looks(self, splats: Splats, step: int, seconds: float, final: int) -> Iterator[Row]:
+        for kind in self.kinds:
+            if kind not in self.place.kinds_of_views:
+                raise InputError(f"no place for {kind} views")
+            scored = score(splats, self.place.kinds_of_views[kind], self.place.scene.background)
+            yield {
+                "views_kind": kind,
+                "budget": self.budget,
+                "count": len(splats),
+                "step": step,
+                "seconds": seconds,
+                "cpu_s": self.cpu,
+                **scored.figures(),
+                "needle": needle(splats.scales),
+                "rank_p1": float(np.percentile(effective_rank(splats.scales), 1)),
+                "final": final,
+            }
+
+
+def _check_finite(splats: Splats, losses: Sequence[float]) -> None:
+    names = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+    bad = [name for name in names if not np.isfinite(getattr(splats, name)).all()]
+    if bad or not np.isfinite(losses).all():
+        raise InputError(f"recovery: not finite: {', '.join(bad) or 'the loss'}")

@@ -1,0 +1,343 @@
+"""Policies of view selection: equal prior, student, K and steps, scored on unseen views."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.rows import Row
+from benchmarks.runner import Cell
+from benchmarks.study import SceneSpec, Study, key
+from benchmarks.synth import City, CityConfig, city
+from benchmarks.workspace import Workspace
+from g2ard.poses import make_pool, plan_pool
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.images import load_image
+from g2ard.scene.splats import Splats
+from g2ard.scene.splits import splits_of, states_splits
+from g2ard.scene.targets import Subset, Targets
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.lift import lift
+from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.anchors import PRESETS
+from g2ard.stages.select import CoverageOptions, Selection, select
+from g2ard.stages.simplify import simplify
+
+__all__ = ["ARMS", "Pool", "Select", "Universe", "pool_of"]
+
+ARMS = ("random", "pose-diverse", "coverage", "directional", "auto", "auto+weights", "pool", "pool+weights")
+_CELLS = 50_000
+"""Surface cells of coverage and directional: as many as a study's small images can tell apart."""
+_CROWD = 24
+"""Views held out where a pool is crowded."""
+
+Rows = NDArray[np.int64]
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Select(Study):
+    """A study of selection policies. Each seed draws a pool; each arm chooses K of its views.
+
+    Scenes are trained ones, which teach themselves, COLMAP folders with photos, and `city`.
+
+    Args:
+        methods: arms: policies, "+weights" where recovery draws by the selection's weights; pool is all
+            candidates.
+        size: longer side of the views.
+        pools: biased (a quarter drawn evenly, the rest from one sector), even.
+        percents: K as shares of the pool.
+        draws: random subsets of each pool.
+        steps: of each recovery.
+        count: Gaussians of the student.
+        candidates: views of a pool, where there are that many; at least 420 in the city.
+        tests: views in each set that is scored.
+    """
+
+    METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in ARMS}
+
+    size: int | None = key(256, least=16)
+    pools: tuple[str, ...] = key(("biased", "even"), choices=("biased", "even"), axis=True)
+    percents: tuple[float, ...] = key((10.0, 25.0, 50.0), least=1e-3, axis=True)
+    draws: int = key(3, least=1, axis=True)
+    steps: tuple[int, ...] = key((250,), least=1, axis=True)
+    count: int = key(10_000, least=1)
+    candidates: int = key(160, least=8)
+    tests: int = key(24, least=1)
+
+    def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
+        """Yield a cell for each pool, arm, K and draw; deterministic policies draw once."""
+        universe = Universe(work, self, scene)
+        orders: dict[tuple[str, int, str], tuple[Selection, float]] = {}
+        for seed in self.seeds:
+            for kind in self.pools:
+                for arm in self.methods:
+                    for percent in (100.0,) if arm.startswith("pool") else self.percents:
+                        for draw in range(self.draws if arm == "random" else 1):
+                            names = {"pool": kind, "arm": arm, "percent": percent, "seed": seed, "draw": draw}
+                            trial = partial(self._trial, universe, orders, kind, arm, percent, seed, draw)
+                            yield Cell(names, trial, more=self.steps)
+
+    def _trial(
+        self,
+        universe: Universe,
+        orders: dict[tuple[str, int, str], tuple[Selection, float]],
+        kind: str,
+        arm: str,
+        percent: float,
+        seed: int,
+        draw: int,
+    ) -> list[Row]:
+        pool = pool_of(universe, kind, seed)
+        k = max(1, math.ceil(percent / 100 * len(pool.rows) - 1e-9))
+        policy, _, weighted = arm.partition("+")
+        rows, weights, select_s = np.arange(len(pool.rows)), None, 0.0
+        if arm != "pool":
+            policy = "auto" if policy == "pool" else policy
+            if weighted or policy == "random":
+                chosen, select_s = _selected(universe, pool, k, policy, 1000 * seed + draw)
+                weights = chosen.weights if weighted else None
+            else:  # one order serves every K
+                if (kind, seed, policy) not in orders:
+                    orders[kind, seed, policy] = _selected(universe, pool, len(pool.rows), policy, seed)
+                chosen, select_s = orders[kind, seed, policy]
+            rows = chosen.order[:k]
+        background = universe.scene.background
+        config = RecoverConfig(
+            steps=self.steps[-1],
+            regularizers=PRESETS["lift" if universe.lifted else "trained"],
+            sh_degree=3 if universe.lifted else None,
+            background=background,
+            seed=seed,
+        )
+        began = time.process_time()
+        result = recover(
+            universe.student, Subset(universe.shown, pool.rows[rows]), config, weights=weights
+        ).splats
+        recover_s = time.process_time() - began
+        inside = evaluate(result, Subset(universe.shown, universe.held), background=background)
+        outside = evaluate(result, universe.outside, background=background)
+        row: Row = {
+            "candidates": len(pool.rows),
+            "k": len(rows),
+            "psnr_in": inside.psnr,
+            "ssim_in": inside.ssim,
+            "psnr_out": outside.psnr,
+            "ssim_out": outside.ssim,
+            "select_cpu_s": select_s,
+            "recover_cpu_s": recover_s,
+            "steps": self.steps[-1],
+            "gaussians": len(result),
+            "pixels": self.size,
+        }
+        if len(pool.crowd):
+            crowd = Subset(universe.shown, pool.crowd)
+            row["psnr_crowd"] = evaluate(result, crowd, background=background).psnr
+        return [row]
+
+    def summary(self, rows: list[Row]) -> tuple[str, list[str], list[list[str]]] | None:
+        """Return gains over mean random on the same pool; those of random itself are absolute.
+
+        Deviations are of single trials over pools and draws.
+        """
+        rows = [row for row in rows if "psnr_in" in row]
+        lines = []
+        groups = dict.fromkeys(
+            (r["scene"], r["pool"], r["percent"]) for r in rows if not r["arm"].startswith("pool")
+        )
+        for scene, pool, percent in groups:
+            here = [r for r in rows if (r["scene"], r["pool"]) == (scene, pool)]
+            here = [r for r in here if r["percent"] in (percent, 100.0)]
+            random = [r for r in here if r["arm"] == "random"]
+            base = {
+                seed: np.mean([_both(r) for r in random if r["seed"] == seed], axis=0)
+                for seed in {r["seed"] for r in random}
+            }
+            for arm in dict.fromkeys(r["arm"] for r in here):
+                own = [r for r in here if r["arm"] == arm and r["seed"] in base]
+                if not own:
+                    continue
+                gains = np.array([_both(r) - base[r["seed"]] for r in own])
+                mean = np.mean(list(base.values()), axis=0) if arm == "random" else gains.mean(0)
+                noise = gains.std(0, ddof=1) if len(gains) > 1 else np.full(2, np.nan)
+                figures = [mean[0], noise[0], mean[1], noise[1]]
+                lines.append([scene, pool, f"{percent:g}", arm, *(f"{figure:.2f}" for figure in figures)])
+        title = "dB over mean random (random: PSNR), ± over pools; in and out of distribution"
+        return (title, ["scene", "pool", "K %", "arm", "in", "±", "out", "±"], lines) if lines else None
+
+
+def _both(row: Row) -> NDArray[np.float64]:
+    return np.array([row["psnr_in"], row["psnr_out"]])
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """Candidates, rows of the universe, and rows held out where the pool is crowded (none if it is even)."""
+
+    rows: Rows
+    crowd: Rows
+
+
+class _Made(Targets):
+    """Images made when first used, and kept in half precision."""
+
+    def __init__(self, cameras: Cameras, make: Callable[[Cameras, int], Image]) -> None:
+        self.cameras, self._make = cameras, make
+        self._kept: dict[int, NDArray[np.float16]] = {}
+
+    def __getitem__(self, view: int) -> Image:
+        if view not in self._kept:
+            self._kept[view] = np.clip(self._make(self.cameras, view), 0, 1).astype(np.float16)
+        return self._kept[view].astype(np.float32)
+
+
+class Universe(Workspace):
+    """A scene with every view that a pool or a test may take, `shown`, and views `outside` of them.
+
+    `held` are the rows of `shown` that are scored. Every 8th view of a planned pool is a fair sample of it.
+    """
+
+    study: Select
+
+    @cached_property
+    def town(self) -> City:
+        """The generated city."""
+        width = self.study.size or 256
+        return city(CityConfig(**{**(self.scene.synth or {}), "size": (width, round(width * 3 / 4))}))
+
+    @cached_property
+    def lifted(self) -> bool:
+        """Whether the prior is a cloud, which is lifted."""
+        return self.scene.synth is not None or super().lifted
+
+    @cached_property
+    def splats(self) -> Splats:
+        """What views are selected from."""
+        if self.scene.synth is None:
+            return super().splats
+        scan = self.town.points()
+        return lift(scan.positions, scan.colors)
+
+    @cached_property
+    def student(self) -> Splats:
+        """What is recovered, simplified without views, so that no pool influences it."""
+        return simplify(self.splats, min(self.study.count, len(self.splats))).splats
+
+    @property
+    def candidates(self) -> int:
+        """How many views a pool has."""
+        return max(420, self.study.candidates) if self.scene.synth else self.study.candidates
+
+    @property
+    def shown(self) -> Targets:
+        """Targets of the universe."""
+        return self._sets[0]
+
+    @property
+    def held(self) -> Rows:
+        """Rows held out evenly over the universe's extent."""
+        return self._sets[1]
+
+    @property
+    def outside(self) -> Targets:
+        """Targets of views out of the universe's distribution."""
+        return self._sets[2]
+
+    @cached_property
+    def _sets(self) -> tuple[Targets, Rows, Targets]:
+        if self.scene.synth:
+            return self._city()
+        return self._photos() if self.lifted else self._trained()
+
+    def _trained(self) -> tuple[Targets, Rows, Targets]:
+        tests, size = self.study.tests, self.study.size
+        planned = plan_pool(self.splats, 7 * self.candidates, seed=1)
+        universe = planned.cameras.resized(size)
+        rows = np.arange(len(universe))
+        if planned.kind == "orbit":
+            outside = _nearer(self.splats, universe.take(_evenly(rows[4::8], tests)))
+        else:
+            outside = make_pool(self.splats, tests, kind="orbit", seed=2).resized(size)
+        renderer = Renderer(self.splats)
+
+        def image(cameras: Cameras, view: int) -> Image:
+            return renderer.image(cameras[view])
+
+        shown = _Made(universe, image)
+        return shown, _evenly(rows[::8], tests), _Made(outside, image)
+
+    def _city(self) -> tuple[Targets, Rows, Targets]:
+        """Return views of the generated city, whose photos are cast from rays when they are used."""
+        town, tests = self.town, self.study.tests
+        universe, outside = town.views["train"], town.views["ood"]
+        shown = _Made(universe, town.photo)
+        far = _Made(outside.take(_evenly(np.arange(len(outside)), tests)), town.photo)
+        return shown, _evenly(np.arange(len(universe)), tests), far
+
+    def _photos(self) -> tuple[Targets, Rows, Targets]:
+        """Return photos: outside is the eighth at one end of the site; the others' stated tests, or every
+        8th, are held out."""
+        folder = self.place / (self.scene.train or self.scene.prior)
+        found = self.read(folder)
+        stated = states_splits(folder, found.splits)
+        words = splits_of(folder, found.cameras.names, found.splits)
+        known = np.array([word in ("train", "test") for word in words])
+        cameras = found.cameras.take(known).resized(self.study.size)
+        tests = np.array(words)[known] == "test"
+        centred = cameras.positions - cameras.positions.mean(0)
+        along = np.argsort(centred @ np.linalg.svd(centred, full_matrices=False)[2][0])
+        far, rest = along[: len(along) // 8], np.sort(along[len(along) // 8 :])
+        held = np.flatnonzero(tests[rest]) if stated else np.arange(0, len(rest), 8)
+        return _Made(cameras.take(rest), load_image), held, _Made(cameras.take(far), load_image)
+
+
+def pool_of(universe: Universe, kind: str, seed: int) -> Pool:
+    """Return candidates out of the universe.
+
+    even: drawn uniformly. biased: a quarter drawn uniformly, the others out of the sixth of the universe
+    (a third of a small one) that is nearest to one of its views, as real trajectories crowd somewhere.
+    """
+    rng = np.random.default_rng([seed, 11])
+    free = np.setdiff1d(np.arange(len(universe.shown.cameras)), universe.held)
+    count = min(universe.candidates, len(free) * 4 // 5)
+    if kind == "even":
+        return Pool(np.sort(rng.choice(free, count, replace=False)), np.zeros(0, np.int64))
+    positions = universe.shown.cameras.positions
+    near = free[np.argsort(np.linalg.norm(positions[free] - positions[rng.choice(free)], axis=1))]
+    crowded = near[: len(near) // 6] if len(near) >= 6 * count else near[: len(near) // 3]
+    crowded = rng.permutation(crowded)
+    crowd, rest = crowded[: min(_CROWD, len(crowded) // 6)], crowded[len(crowded) // 6 :]
+    many = rest[: min(len(rest), 3 * count // 4)]
+    others = np.setdiff1d(free, crowded)
+    few = rng.choice(others, min(len(many) // 3, len(others)), replace=False)
+    return Pool(np.sort(np.concatenate([many, few])), np.sort(crowd))
+
+
+def _selected(universe: Universe, pool: Pool, k: int, policy: str, seed: int) -> tuple[Selection, float]:
+    began = time.process_time()
+    cameras = universe.shown.cameras.take(pool.rows)
+    options = CoverageOptions(cells=_CELLS)
+    chosen = select(universe.splats, cameras, k, policy=policy, seed=seed, options=options)
+    return chosen, time.process_time() - began
+
+
+def _nearer(prior: Splats, cameras: Cameras) -> Cameras:
+    """Move views 40 % of the way to the scene's middle, along their gaze."""
+    middle = np.median(prior.means, axis=0) + prior.offset
+    steps = 0.4 * np.einsum("ci,ci->c", middle - cameras.positions, cameras.forwards)
+    viewmats = cameras.viewmats.copy()
+    viewmats[:, 2, 3] -= steps
+    return replace(cameras, viewmats=viewmats)
+
+
+def _evenly(rows: Rows, count: int) -> Rows:
+    return rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int))]

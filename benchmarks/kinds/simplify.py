@@ -1,0 +1,92 @@
+"""Simplifiers as their users run them: file to file, a process each, scored on unseen views."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+from benchmarks import baselines
+from benchmarks.kinds.methods import REDUCERS
+from benchmarks.process import Usage, measured, splat_transform, version_of
+from benchmarks.rows import Row
+from benchmarks.runner import Cell
+from benchmarks.score import score
+from benchmarks.study import SceneSpec, Study, key
+from benchmarks.workspace import PROTOCOLS, Workspace, budget_of
+from g2ard import io
+from g2ard.scene.splats import Splats
+
+__all__ = ["Simplify"]
+
+
+@dataclass(frozen=True)
+class Simplify(Study):
+    """A study of simplifiers without recovery.
+
+    Scored are every 8th pose of a generated pool, or the test split of the scene's views, which no method
+    uses. "near" and "standing" views are of other kinds than any that a method sees; on them `default` runs
+    with a pool of its own, as its user runs it.
+
+    Args:
+        protocol: "pool", "standing" (near and standing views) or "both".
+        splat_transform: its program; None takes the one on PATH.
+    """
+
+    METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in REDUCERS}
+    PROCESSES: ClassVar[bool] = True
+
+    protocol: str = key("pool", choices=tuple(PROTOCOLS), axis=True)
+    splat_transform: str | None = key(None, axis=True)
+
+    def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
+        """Yield a cell for each ratio and method."""
+        place, kinds = Workspace(work, self, scene), PROTOCOLS[self.protocol]
+        for ratio in self.ratios:
+            for method in self.methods:
+                names = {"ratio": ratio, "method": method}
+                yield Cell(names, partial(self._measured, place, ratio, method, kinds), kinds)
+
+    def _measured(self, place: Workspace, ratio: float, method: str, kinds: tuple[str, ...]) -> Iterator[Row]:
+        budget = budget_of(len(place.splats), ratio)
+        ran: dict[bool, tuple[Usage, Splats]] = {}  # methods that run alike for several kinds run once
+        for kind in kinds:
+            row = {"views_kind": kind, "input_count": len(place.splats), "budget": budget}
+            if method.startswith("splat-transform"):
+                row["version"] = version_of(splat_transform(program=self.splat_transform)[0])
+            if kind not in place.kinds_of_views:
+                yield {**row, "error": f"no place for {kind} views"}
+                continue
+            own = kind != "pool" and method == "default" and place.scene.train is None
+            if own not in ran:
+                ran[own] = self._run(place, method, budget, own)
+            usage, small = ran[own]
+            scored = score(small, place.kinds_of_views[kind], place.scene.background)
+            yield {**row, **asdict(usage), "count": len(small), **scored.figures()}
+
+    def _run(self, place: Workspace, method: str, budget: int, own: bool) -> tuple[Usage, Splats]:
+        with tempfile.TemporaryDirectory(prefix="g2ard-bench-") as folder:
+            output = Path(folder) / "out.ply"
+            usage = measured(self._command(place, method, budget, output, own), Path(folder) / "log")
+            return usage, io.read_splats(output)
+
+    def _command(self, place: Workspace, method: str, budget: int, output: Path, own: bool) -> list[str]:
+        """Return the command as its user types it; `own` means with the views that it makes itself."""
+        source, python = str(place.prior_file), [sys.executable, "-m"]
+        if method.startswith("splat-transform"):
+            mode = "--decimate-adaptive" if method.endswith("adaptive") else "--decimate"
+            return splat_transform(source, mode, str(budget), str(output), program=self.splat_transform)
+        if method in baselines.METHODS:
+            views = ["--views", str(place.train)] if method in baselines.NEED_VIEWS else []
+            return [*python, "benchmarks.baselines", method, source, str(budget), str(output), *views]
+        flags = {
+            "default": [] if own else ["--views", str(place.train)],
+            "no-views": ["--no-views"],
+            "fast": ["--method", "fast"],
+            "paper": ["--method", "paper"],
+        }[method]
+        return [*python, "g2ard", "simplify", source, "-n", str(budget), "-o", str(output), "-q", *flags]
