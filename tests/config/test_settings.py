@@ -66,7 +66,7 @@ def test_a_config_is_set_as_a_whole_by_its_name_and_its_fields_after_it() -> Non
 def test_regions_are_read_as_text() -> None:
     values = parsed(["keep_region=0,0,0,1;0,0,0,1,1,2"], DistillConfig())
     assert values == {"simplify.keep_region": ((0, 0, 0, 1), (0, 0, 0, 1, 1, 2))}
-    with pytest.raises(InputError, match="keep_region"):
+    with pytest.raises(InputError, match="expected X,Y,Z,R"):
         changed(DistillConfig(), {"simplify.keep_region": ((0, 0, 0),)})
 
 
