@@ -8,8 +8,13 @@ from numpy.typing import NDArray
 
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.scene.splats import Splats
+from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.anchors import Regularizers
+from g2ard.stages.recover.engine import Photometric
 from g2ard.stages.recover.schedule import Rates
+from g2ard.stages.select.surfaces import CoverageOptions
+from g2ard.stages.simplify.config import SimplifyConfig
+from g2ard.stages.simplify.pairs import Visibility
 
 __version__: str
 
@@ -21,12 +26,7 @@ def device_state() -> dict[str, Any]: ...
 def device_notes() -> list[str]: ...
 def adapters() -> list[dict[str, Any]] | None: ...
 def lift_points(
-    points: NDArray[np.float64],
-    *,
-    neighbors: int,
-    normal_ratio: float,
-    max_anisotropy: float,
-    progress: Callable[[int, int], None] | None = None,
+    points: NDArray[np.float64], config: LiftConfig, progress: Callable[[int, int], None] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
 def codebook(
     values: NDArray[np.float32], count: int, weights: NDArray[np.float32] | None = None
@@ -48,44 +48,22 @@ def cast_rays(
     directions: NDArray[np.float64],
 ) -> NDArray[np.float64]: ...
 def simplify_flags(
-    scene: Scene,
-    cells: int,
-    *,
-    threshold: float,
-    members: int,
-    progress: Callable[[int, int], None] | None = None,
+    scene: Scene, cells: int, config: SimplifyConfig, progress: Callable[[int, int], None] | None = None
 ) -> NDArray[np.bool_]: ...
 def simplify_paper(
     scene: Scene,
     schedule: list[int],
     cells: int,
-    *,
-    protected: NDArray[np.bool_] | None,
-    min_opacity: float,
-    color_bin: float,
-    max_energy: float,
-    min_coverage: float,
-    support: float,
-    flag_threshold: float,
-    flag_members: int,
-    protection: float,
+    config: SimplifyConfig,
+    protected: NDArray[np.bool_] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]: ...
 def simplify_pairwise(
     scene: Scene,
     schedule: list[int],
-    *,
-    protected: NDArray[np.bool_] | None,
-    weight: NDArray[np.float32] | None,
-    pixel_size: NDArray[np.float32] | None,
-    min_opacity: float,
-    morton_premerge_ratio: float | None,
-    morton_premerge_steps: int | None,
-    neighbors: int,
-    geometric_weight: float,
-    dilation: float,
-    pixel_scale: float,
-    max_growth: float,
+    config: SimplifyConfig,
+    protected: NDArray[np.bool_] | None = None,
+    visibility: Visibility | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]: ...
 
@@ -94,23 +72,13 @@ class TileFrame:
         self, unit: float, pixel_size: float, floor: float, exponent: float, usual: float
     ) -> None: ...
     @staticmethod
-    def of_sample(scene: Scene, pixel_scale: float) -> TileFrame: ...
+    def of_sample(scene: Scene, config: SimplifyConfig) -> TileFrame: ...
     def with_views(self, pixel_size: float, weight: float, mass: float) -> TileFrame: ...
     def values(self) -> tuple[float, float, float, float, float]: ...
 
 class TileMerging:
     def __init__(
-        self,
-        scene: Scene,
-        frame: TileFrame,
-        *,
-        weight: NDArray[np.float32] | None,
-        pixel_size: NDArray[np.float32] | None,
-        min_opacity: float,
-        neighbors: int,
-        geometric_weight: float,
-        dilation: float,
-        max_growth: float,
+        self, scene: Scene, frame: TileFrame, config: SimplifyConfig, visibility: Visibility | None = None
     ) -> None: ...
     def sums(self) -> tuple[float, float]: ...
     def run_costs(self) -> NDArray[np.float32]: ...
@@ -158,8 +126,7 @@ class Rasterizer:
         view: _View,
         options: RasterSettings,
         background: list[float],
-        depth: bool = True,
-        median: bool = False,
+        depths: int = 1,
     ) -> tuple[_F32, _F32, _F32 | None, _F32 | None]: ...
     def backward(
         self, arrays: _Arrays, image: _F32, alpha: _F32 | None = None, depth: _F32 | None = None
@@ -169,24 +136,20 @@ class Rasterizer:
     def passes(self) -> dict[str, float]: ...
 
 class Trainer:
-    def __init__(self, arrays: _Arrays, units: _F32 | None = None, isa: str | None = None) -> None: ...
+    def __init__(
+        self, arrays: _Arrays, objective: Photometric, units: _F32 | None = None, isa: str | None = None
+    ) -> None: ...
     def freeze(self, frozen: NDArray[np.bool_]) -> None: ...
     def anchor(self, means: _F32, frames: _F32, r_parallel: _F32, r_perp: _F32) -> None: ...
     def step(
         self,
         view: _View,
-        options: RasterSettings,
-        background: list[float],
         target: _F32,
-        ssim_weight: float,
         rates: Rates,
         regularizers: Regularizers | None = None,
         mask: NDArray[np.bool_] | None = None,
-        reach: float | None = None,
     ) -> tuple[float, int]: ...
-    def gradients_only(
-        self, view: _View, options: RasterSettings, background: list[float], target: _F32, ssim_weight: float
-    ) -> float: ...
+    def gradients_only(self, view: _View, target: _F32) -> float: ...
     def arrays(self) -> list[_F32]: ...
     def state(self) -> dict[str, NDArray[Any]]: ...
     def load(self, state: dict[str, NDArray[Any]]) -> None: ...
@@ -234,18 +197,10 @@ def select_visible(
 ) -> tuple[NDArray[np.uint64], NDArray[np.uint32]]: ...
 def select_greedy(
     surface: _Surface,
-    starts: NDArray[np.uint64],
-    cells: NDArray[np.uint32],
-    positions: _F64,
+    views: tuple[NDArray[np.uint64], NDArray[np.uint32], _F64],
     k: int,
-    *,
     directional: bool,
-    kappa: float,
-    alpha: float,
-    lambda_: float,
-    anchors: int,
-    epsilon: float,
-    lazy: bool,
+    config: CoverageOptions,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[NDArray[np.uint32], _F64, int]: ...
 

@@ -20,6 +20,7 @@ from g2ard.progress import plural
 from g2ard.rendering.renderer import RasterSettings, arrays_of, view_of
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
+from g2ard.stages.recover.engine import Photometric
 from g2ard.stages.recover.schedule import Rates
 
 __all__ = ["Raster", "built_in_view", "drawn"]
@@ -103,17 +104,18 @@ def _row(splats: Splats, cameras: Cameras, isa: str, repeats: int) -> Row:
     arrays, view = arrays_of(splats), view_of(local, 0, settings)
     width, height = view[2]
     rasterizer = _core.Rasterizer(isa)
-    target, _, _, _ = rasterizer.forward(arrays, view, settings, [0.0, 0.0, 0.0], False)
+    target, _, _, _ = rasterizer.forward(arrays, view, settings, [0.0, 0.0, 0.0], 0)
     counts = rasterizer.counts()
     contributing = int(_core.accumulate(arrays, [view], settings)["hits"].sum())
-    trainer = _core.Trainer(arrays, splats.scales.max(1), isa)
-    step_input = (view, settings, [0.0, 0.0, 0.0], np.ascontiguousarray(target[::-1]), 0.2)
+    objective = Photometric(settings, (0.0, 0.0, 0.0), 0.2)
+    trainer = _core.Trainer(arrays, objective, splats.scales.max(1), isa)
+    upside_down = np.ascontiguousarray(target[::-1])
     limits = _core.machine_limits()
     rehearsals, steps = [], []
     for _ in range(repeats):
-        trainer.gradients_only(*step_input)
+        trainer.gradients_only(view, upside_down)
         rehearsals.append(trainer.passes())
-        trainer.step(*step_input, Rates(*[0.0] * 6))  # rates of 0: every repeat times the same scene
+        trainer.step(view, upside_down, Rates(*[0.0] * 6))  # rates of 0: every repeat times the same scene
         steps.append(trainer.passes())
     memory = trainer.memory()
     again = _core.machine_limits()

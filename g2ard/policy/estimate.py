@@ -187,5 +187,5 @@ def _rounds(job: DistillJob, student: Splats) -> int:
     config = job.config
     if not config.recover.schedule.round_steps:
         return 0
-    kept, fold = config.simplify.retention or 0.75, config.simplify.fold
+    kept, fold = config.simplify.retention_of("paper"), config.simplify.fold
     return len(round_counts(len(job.prior), len(student), kept, fold))

@@ -13,7 +13,7 @@ from g2ard import _core
 from g2ard.config.choices import BLACK, CONVENTIONS, Convention
 from g2ard.errors import InputError
 from g2ard.scene.cameras import Camera, Cameras
-from g2ard.scene.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS
+from g2ard.scene.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS, MAX_OPACITY
 from g2ard.scene.splats import Splats
 
 _Floats = NDArray[np.float32]
@@ -41,7 +41,7 @@ class RasterSettings:
 
     convention: Convention = "gsplat"
     antialiased: bool = False
-    alpha_max: float = 0.99
+    alpha_max: float = MAX_OPACITY
     near: float | Sequence[float] | None = None
 
     def __post_init__(self) -> None:
@@ -189,8 +189,13 @@ class Renderer:
         Raises:
             InputError: a camera that makes no sense, see `Cameras`.
         """
-        image, _, _, _ = self._forward(camera, depth=False, median=False)
+        image, _, _, _ = self._forward(camera, 0)
         return image
+
+    def clipped(self, camera: Camera) -> _Floats:
+        """Return `image` clipped to [0, 1], as photos are."""
+        image = self.image(camera)
+        return np.clip(image, 0, 1, out=image)
 
     def render(self, camera: Camera, *, median: bool = False) -> Rendered:
         """One view: C = Σᵢ cᵢ αᵢ Πⱼ<ᵢ (1 − αⱼ), front to back.
@@ -202,7 +207,7 @@ class Renderer:
         Raises:
             InputError: a camera that makes no sense, see `Cameras`.
         """
-        image, alpha, depth, middle = self._forward(camera, depth=True, median=median)
+        image, alpha, depth, middle = self._forward(camera, 2 if median else 1)
         assert depth is not None
         return Rendered(image, alpha, depth, middle)
 
@@ -219,14 +224,14 @@ class Renderer:
         return np.array(self._rasterizer.pose_gradient(self._arrays, np.ascontiguousarray(gradient)))
 
     def _forward(
-        self, camera: Camera, *, depth: bool, median: bool
+        self, camera: Camera, depths: int
     ) -> tuple[_Floats, _Floats, _Floats | None, _Floats | None]:
         here = Cameras.of([camera]).recentred(self._offset)
         if self._middle is not None:
             here = here.recentred(self._middle)
         settings = self._settings
         view = view_of(here, 0, settings)
-        return self._rasterizer.forward(self._arrays, view, settings, self._background, depth, median)
+        return self._rasterizer.forward(self._arrays, view, settings, self._background, depths)
 
 
 def render(

@@ -15,6 +15,9 @@ from g2ard.scene.splats import Splats
 
 _LIMITS = _core.defaults()["limits"]
 
+MAX_OPACITY: float = _LIMITS["max_opacity"]
+"""Renderers clip α here, so simplification makes no Gaussian more opaque."""
+
 DRAWN_LOGITS: tuple[float, float] = _LIMITS["drawn_logits"]
 """Where float32 can follow the sigmoid."""
 

@@ -82,13 +82,8 @@ def lift(
         xyz, rgb = xyz[finite], rgb[finite]
     middle = _middle(xyz)
     centered = xyz - middle
-    quats, scales = _core.lift_points(
-        centered,
-        neighbors=neighbors,
-        normal_ratio=normal_ratio,
-        max_anisotropy=max_anisotropy,
-        progress=counter(progress, "lift"),
-    )
+    config = LiftConfig(neighbors, normal_ratio, max_anisotropy, opacity)
+    quats, scales = _core.lift_points(centered, config, counter(progress, "lift"))
     n = len(centered)
     near = _fits_float32(xyz, scales)
     return Splats.create(

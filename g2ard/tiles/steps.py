@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.rendering.renderer import RasterSettings, view_of
@@ -31,7 +30,7 @@ from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
-from g2ard.stages.simplify.pairs import emphasised
+from g2ard.stages.simplify.pairs import RowVisibility, emphasised
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.tasks import (
@@ -160,7 +159,7 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     finite = pixel_size[np.isfinite(pixel_size) & (pixel_size > 0)]
     pixel = float(np.partition(finite, len(finite) // 2)[len(finite) // 2]) if len(finite) else math.nan
     frame = _with_pixel_size(arguments["frame"], pixel if finite.size else 1.0)
-    tile = _merging(own, _config(arguments), frame, weight, pixel_size)
+    tile = _merging(own, _config(arguments), frame, RowVisibility(weight, pixel_size))
     return {
         "weight": weight,
         "pixel_size": pixel_size,
@@ -283,23 +282,11 @@ def _merging(
     scene: PreparedScene,
     config: SimplifyConfig,
     frame: _core.TileFrame,
-    weight: NDArray[np.float32] | None,
-    pixel_size: NDArray[np.float32] | None,
+    visibility: RowVisibility | None,
 ) -> _core.TileMerging:
     config = config.resolved("default")
-    if weight is not None and pixel_size is not None:
-        weight, pixel_size = emphasised(scene, weight, pixel_size, config)
-    return _core.TileMerging(
-        scene.core,
-        frame,
-        weight=weight,
-        pixel_size=pixel_size,
-        min_opacity=config.min_opacity_of("default"),
-        neighbors=config.neighbors,
-        geometric_weight=config.geometric_weight,
-        dilation=config.dilation,
-        max_growth=config.max_growth,
-    )
+    seen = None if visibility is None else emphasised(scene, visibility, config)
+    return _core.TileMerging(scene.core, frame, config, seen)
 
 
 def _with_pixel_size(frame: Sequence[float], pixel_size: float) -> _core.TileFrame:
@@ -309,11 +296,8 @@ def _with_pixel_size(frame: Sequence[float], pixel_size: float) -> _core.TileFra
 
 
 def _seen_tile(scene: PreparedScene, arguments: Arguments, inputs: Inputs) -> _core.TileMerging:
-    weight = pixel_size = None
-    if "look" in inputs:
-        weight, pixel_size = load(inputs["look"], "weight", "pixel_size")
-    frame = _core.TileFrame(*arguments["frame"])
-    return _merging(scene, _config(arguments), frame, weight, pixel_size)
+    seen = RowVisibility(*load(inputs["look"], "weight", "pixel_size")) if "look" in inputs else None
+    return _merging(scene, _config(arguments), _core.TileFrame(*arguments["frame"]), seen)
 
 
 def _widened(scene: Splats, times: int) -> Splats:
@@ -373,4 +357,6 @@ class TiledRun:
         sample = join([scene_of(path, "sample").with_sh_degree(0) for path in self.coarse])
         every = -(-len(sample) // _SAMPLED)
         scene, _ = finite_rows_of(sample.take(slice(None, None, every)))
-        return _core.TileFrame.of_sample(scene.core, self.config["pixel_scale"]).values()
+        return _core.TileFrame.of_sample(
+            scene.core, SimplifyConfig(**self.config).resolved("default")
+        ).values()

@@ -53,9 +53,9 @@ def test_views_count_as_if_they_stood_nearer() -> None:
     )
     seen, nearer = (visibility_source(cameras)(scene) for cameras in (far, near))
     config = SimplifyConfig(keep_region=((0, 0, 0, 1),))
-    weight, pixel = emphasised(scene, seen.weight, seen.pixel_size, config)
-    np.testing.assert_allclose(weight, nearer.weight, rtol=0.05)
-    np.testing.assert_allclose(pixel, nearer.pixel_size, rtol=1e-5)
+    found = emphasised(scene, seen, config)
+    np.testing.assert_allclose(found.weight, nearer.weight, rtol=0.05)
+    np.testing.assert_allclose(found.pixel_size, nearer.pixel_size, rtol=1e-5)
 
 
 def test_regions_are_in_world_coordinates() -> None:

@@ -55,7 +55,7 @@ def test_gradient_is_the_twins(variant: str, seed: int, size: float, degree: int
     want = torch.einsum("ij,kij->k", pose.grad, generators() @ pose.detach()).numpy()
     rasterizer = _core.Rasterizer()
     arrays = arrays_of(splats_of(p))
-    rasterizer.forward(arrays, view_of(cameras, 0, settings), settings, BACKGROUND, False)
+    rasterizer.forward(arrays, view_of(cameras, 0, settings), settings, BACKGROUND, 0)
     got = np.array(rasterizer.pose_gradient(arrays, weight.numpy().astype(np.float32)))
     np.testing.assert_allclose(got, want, atol=1e-3 * np.abs(want).max())
 

@@ -214,7 +214,7 @@ def everything(p: Params, cameras: Cameras) -> list[bytes]:
     view = (cameras.viewmats[0].tolist(), [200.0, 200, 100, 75], (200, 150), 0.01)
     r = _core.Rasterizer()
     settings = RasterSettings()
-    image, alpha, depth, median = r.forward(arrays, view, settings, [0.1, 0.2, 0.3], True, True)
+    image, alpha, depth, median = r.forward(arrays, view, settings, [0.1, 0.2, 0.3], 2)
     assert depth is not None
     assert median is not None
     g = np.random.default_rng(0).normal(size=(150, 200, 3)).astype(np.float32)

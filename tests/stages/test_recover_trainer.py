@@ -17,6 +17,7 @@ from g2ard.rendering.renderer import RasterSettings, view_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.engine import Photometric
 from g2ard.stages.recover.extent import extents, share_of_rate
 from g2ard.stages.recover.losses import TorchAnchors, l1_ssim, regularization
 from g2ard.stages.recover.rasterize import rasterize
@@ -24,7 +25,7 @@ from g2ard.stages.recover.schedule import Rates
 from helpers.raster_cases import NAMES, Params, camera, scene, tensors_of
 
 RATES = {"means": 2e-3, "quats": 1e-2, "log_scales": 2e-2, "logit_opacities": 5e-2, "sh0": 2e-2, "shN": 2e-3}
-BACKGROUND = [0.1, 0.2, 0.3]
+BACKGROUND = (0.1, 0.2, 0.3)
 SETTINGS = RasterSettings()
 
 
@@ -33,15 +34,15 @@ def arrays(p: Params) -> tuple[NDArray[np.float32], ...]:
 
 
 def trainer_of(p: Params, units: NDArray[np.float32] | None = None, isa: str | None = None) -> _core.Trainer:
-    return _core.Trainer(arrays(p), units, isa)
+    return _core.Trainer(arrays(p), Photometric(SETTINGS, BACKGROUND, 0.2), units, isa)
 
 
 def step(
     trainer: _core.Trainer, v: Cameras, target: Any, regularizers: Any = None, reach: float | None = None
 ) -> tuple[float, int]:
     view = view_of(v, 0, SETTINGS)
-    rates = Rates(**RATES)
-    return trainer.step(view, SETTINGS, BACKGROUND, target, 0.2, rates, regularizers, None, reach)
+    share = math.inf if reach is None else reach / max(target.shape)
+    return trainer.step(view, target, Rates(**RATES, reach=share), regularizers)
 
 
 def problem(n: int = 200, degree: int = 3, views: int = 3) -> tuple[Params, list[Cameras], list[Any]]:
@@ -312,7 +313,7 @@ def test_bad_input_is_named() -> None:
         step(trainer_of(p), cameras[0], targets[0][:5])
     with pytest.raises(InputError, match="anchors set before"):
         step(trainer_of(p), cameras[0], targets[0], Regularizers(1.0, 1.0, True))
-    with pytest.raises(InputError, match="reach: expected pixels, more than 0"):
+    with pytest.raises(InputError, match="reach: expected more than 0"):
         step(trainer_of(p), cameras[0], targets[0], reach=0.0)
     with pytest.raises(InputError, match="units: expected 10 values"):
         trainer_of(p, np.ones(9, np.float32))

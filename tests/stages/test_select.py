@@ -168,20 +168,10 @@ def random_problem(rng, count=12, cells=60):
     return made, seen, rng.standard_normal((count, 3)) * 4
 
 
-def run_greedy(made, seen, positions, k, lazy, **options):
+def run_greedy(made, seen, positions, k, lazy, directional=True, **options):
     starts = np.concatenate([[0], np.cumsum([len(s) for s in seen])]).astype(np.uint64)
-    merged = {
-        "directional": True,
-        "kappa": 20.0,
-        "alpha": 2.0,
-        "lambda_": 1.0,
-        "anchors": 32,
-        "epsilon": 1e-9,
-        **options,
-    }
-    return _core.select_greedy(
-        made.parts, starts, np.concatenate(seen).astype(np.uint32), positions, k, lazy=lazy, **merged
-    )
+    views = starts, np.concatenate(seen).astype(np.uint32), positions
+    return _core.select_greedy(made.parts, views, k, directional, CoverageOptions(lazy=lazy, **options))
 
 
 @pytest.mark.parametrize("directional", [True, False])

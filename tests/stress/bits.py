@@ -6,6 +6,7 @@ import numpy as np
 
 from g2ard import _core
 from g2ard.rendering.renderer import view_of
+from g2ard.stages.recover.engine import Photometric
 from g2ard.stages.recover.schedule import Rates
 from stress.scenes import NAMES, Problem, random_problem
 
@@ -57,13 +58,14 @@ def _everything(problem: Problem) -> dict[str, bytes]:
     target = rng.random((height, width, 3)).astype(np.float32)
     gradient = rng.normal(size=(height, width, 5)).astype(np.float32)
     rasterizer = _core.Rasterizer()
-    image, alpha, depth, _ = rasterizer.forward(arrays, view, settings, background, True)
+    image, alpha, depth, _ = rasterizer.forward(arrays, view, settings, background)
     assert depth is not None
     planes = [np.ascontiguousarray(gradient[..., part]) for part in (slice(0, 3), 3, 4)]
     found = {"image": image, "alpha": alpha, "depth": depth}
     found |= dict(zip(NAMES, rasterizer.backward(arrays, *planes), strict=True))
-    trainer = _core.Trainer(arrays)
+    r, g, b = background
+    trainer = _core.Trainer(arrays, Photometric(settings, (r, g, b), 0.2))
     for _ in range(2):
-        trainer.step(view, settings, background, target, 0.2, Rates(*[1e-2] * 6))
+        trainer.step(view, target, Rates(*[1e-2] * 6))
     found |= {f"trained {name}": array for name, array in trainer.state().items()}
     return {name: array.tobytes() for name, array in found.items()}

@@ -73,20 +73,10 @@ def test_one_tile_is_the_whole_to_the_bit(seen: bool) -> None:
         pixel_size = np.where(rng.random(len(prepared)) < 0.9, 0.01, np.inf).astype(np.float32)
 
     whole = simplify(prepared, budget, visibility=Seen() if seen else None).splats
-    frame = _core.TileFrame.of_sample(prepared.core, config.pixel_scale)
+    frame = _core.TileFrame.of_sample(prepared.core, config)
 
     def tile(frame: _core.TileFrame) -> _core.TileMerging:
-        return _core.TileMerging(
-            prepared.core,
-            frame,
-            weight=Seen.weight if seen else None,
-            pixel_size=Seen.pixel_size if seen else None,
-            min_opacity=config.min_opacity_of("default"),
-            neighbors=config.neighbors,
-            geometric_weight=config.geometric_weight,
-            dilation=config.dilation,
-            max_growth=config.max_growth,
-        )
+        return _core.TileMerging(prepared.core, frame, config, Seen() if seen else None)
 
     if seen:
         frame = frame.with_views(0.01, 1, 1)

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.rendering.renderer import RasterSettings
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, Regularizers
@@ -15,7 +16,22 @@ from g2ard.stages.recover.schedule import Rates
 
 
 @dataclass(frozen=True, eq=False)
-class Objective:
+class Photometric:
+    """How views are rendered and compared with their targets.
+
+    Args:
+        settings: the renderer's conventions.
+        background: RGB behind the scene.
+        ssim_weight: λ in (1−λ)·L1 + λ·(1−SSIM).
+    """
+
+    settings: RasterSettings
+    background: tuple[float, float, float]
+    ssim_weight: float
+
+
+@dataclass(frozen=True, eq=False)
+class Objective(Photometric):
     """What an engine minimises, from where, in which variables.
 
     Args:
@@ -24,8 +40,6 @@ class Objective:
         anchors: that the regularisers hold it to.
         regularizers: their weights.
         means_in_scales: the means' variables are multiples of each Gaussian's initial radius.
-        ssim_weight: λ in (1−λ)·L1 + λ·(1−SSIM).
-        background: RGB behind the scene.
         frozen: (N,) bool, Gaussians that no step changes; None freezes none.
     """
 
@@ -34,8 +48,6 @@ class Objective:
     anchors: Anchors
     regularizers: Regularizers
     means_in_scales: bool
-    ssim_weight: float
-    background: tuple[float, float, float]
     frozen: NDArray[np.bool_] | None = None
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.rendering.renderer import arrays_of, settings_for, view_of
+from g2ard.rendering.renderer import arrays_of, view_of
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.engine import Objective
 from g2ard.stages.recover.schedule import Rates
@@ -22,8 +21,8 @@ class FusedEngine:
     def __init__(self, objective: Objective) -> None:
         self._objective = objective
         start, anchors = objective.start, objective.anchors
-        self._settings = settings_for(anchors.means)
-        self._trainer = _core.Trainer(arrays_of(start), radii(start) if objective.means_in_scales else None)
+        units = radii(start) if objective.means_in_scales else None
+        self._trainer = _core.Trainer(arrays_of(start), objective, units)
         self._anchors = (
             anchors.means,
             np.ascontiguousarray(anchors.frames),
@@ -46,24 +45,13 @@ class FusedEngine:
         """One optimiser step on one view; returns its photometric loss."""
         objective = self._objective
         loss, _ = self._trainer.step(
-            view_of(objective.cameras, view, self._settings),
-            self._settings,
-            list(objective.background),
+            view_of(objective.cameras, view, objective.settings),
             target,
-            objective.ssim_weight,
             rates,
             objective.regularizers if regularize else None,
             mask,
-            self._reach(view, rates.reach),
         )
         return loss
-
-    def _reach(self, view: int, share: float) -> float | None:
-        """In pixels."""
-        if math.isinf(share):
-            return None
-        cameras = self._objective.cameras
-        return share * float(max(cameras.widths[view], cameras.heights[view]))
 
     def splats(self) -> Splats:
         """The scene as it stands, quaternions normalised."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from g2ard.config.choices import ENGINES
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
+from g2ard.rendering.renderer import settings_for
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Targets, fingerprint_of, mask_of
 from g2ard.stages.recover import checkpoint as checkpoints
@@ -77,7 +78,15 @@ class Loop:
         self.losses: list[float] = []
         self.geometry: list[dict[str, float]] = []
         self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised? → steps, seconds
-        self.key = _fingerprint(student, targets, config, weights, anchors, held, frozen)
+        self._held = held
+        self._epoch: tuple[int, NDArray[np.int64]] | None = None
+
+    @cached_property
+    def key(self) -> str:
+        """What a checkpoint must be of; needed only where one is written or read."""
+        return _fingerprint(
+            self.student, self.targets, self.config, self.weights, self.anchors, self._held, self.frozen
+        )
 
     @cached_property
     def engine(self) -> Engine:
@@ -98,14 +107,15 @@ class Loop:
     def _new_engine(self, start: Splats | None = None) -> Engine:
         config, student = self.config, self.student if start is None else start
         objective = Objective(
-            student,
-            self.targets.cameras.recentred(student.offset),
-            self.anchors,
-            config.regularizers,
-            config.schedule.means_in_scales,
-            config.ssim_weight,
-            config.background,
-            self.frozen,
+            settings=settings_for(self.anchors.means),
+            background=config.background,
+            ssim_weight=config.ssim_weight,
+            start=student,
+            cameras=self.targets.cameras.recentred(student.offset),
+            anchors=self.anchors,
+            regularizers=config.regularizers,
+            means_in_scales=config.schedule.means_in_scales,
+            frozen=self.frozen,
         )
         return engine_class(config.engine)(objective)
 
@@ -261,7 +271,9 @@ class Loop:
         """Views in a fresh random order each epoch; depends on seed, weights and step alone."""
         count = len(self.targets.cameras)
         epoch, position = divmod(step, count)
-        return int(drawn(self.config.seed, epoch, count, self.weights)[position])
+        if self._epoch is None or self._epoch[0] != epoch:
+            self._epoch = epoch, drawn(self.config.seed, epoch, count, self.weights)
+        return int(self._epoch[1][position])
 
     def _save(self, path: Path) -> None:
         meta = {

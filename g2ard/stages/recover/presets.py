@@ -100,7 +100,7 @@ def view_consistency(scene: Splats, cameras: Cameras) -> float | None:
         depths = []
         for view in (view_of(small, int(a), settings), view_of(small, b, settings)):
             rasterizer = _core.Rasterizer()
-            _, _, _, median = rasterizer.forward(arrays, view, settings, [0.0] * 3, False, True)
+            _, _, _, median = rasterizer.forward(arrays, view, settings, [0.0] * 3, 2)
             assert median is not None
             depths.append(median)
         expected, seen = _carried(depths[0], depths[1], small, int(a), b)

@@ -48,7 +48,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.save_for_backward(*params)
         ctx.set_materialize_grads(False)
         arrays = tuple(_numpy(p) for p in params)
-        image, alpha, depth, _ = ctx.lease.rasterizer.forward(arrays, view, settings, background, True, False)
+        image, alpha, depth, _ = ctx.lease.rasterizer.forward(arrays, view, settings, background)
         return torch.from_numpy(image), torch.from_numpy(alpha), torch.from_numpy(depth)
 
     @staticmethod

@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from g2ard.rendering.renderer import settings_for
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.engine import Objective
 from g2ard.stages.recover.extent import extents, share_of_rate
@@ -38,7 +37,7 @@ class TorchEngine:
         self._objective = objective
         splats, anchors = objective.start, objective.anchors
         self._anchors = TorchAnchors(anchors).to(self.device)
-        self._settings = settings_for(anchors.means)
+        self._settings = objective.settings
         self._base = torch.from_numpy(splats.means.astype(np.float32)).to(self.device)
         unit = radii(splats) if objective.means_in_scales else np.ones(len(splats), np.float32)
         self._unit = torch.from_numpy(unit[:, None]).to(self.device)

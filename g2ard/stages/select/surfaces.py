@@ -20,6 +20,9 @@ Float = NDArray[np.float64]
 Order = NDArray[np.int64]
 
 
+_CORE = _core.defaults()["coverage"]
+
+
 @dataclass(frozen=True)
 class CoverageOptions:
     """Of the policies that look at surfaces (the paper, eq. `view_selection`; `tab:s_avs`).
@@ -40,13 +43,13 @@ class CoverageOptions:
     """
 
     cells: int = 300_000
-    kappa: float = 20.0
-    alpha: float = 2.0
-    offset: float = 1.0
-    anchors: int = 32
-    epsilon: float = 1e-9
+    kappa: float = _CORE["kappa"]
+    alpha: float = _CORE["alpha"]
+    offset: float = _CORE["offset"]
+    anchors: int = _CORE["anchors"]
+    epsilon: float = _CORE["epsilon"]
     depth_tolerance: float = 0.01
-    lazy: bool = True
+    lazy: bool = _CORE["lazy"]
 
     def __post_init__(self) -> None:
         require("cells", self.cells, self.cells >= 1, "at least 1")
@@ -191,18 +194,11 @@ def greedy(
     began = time.perf_counter()
     order, gains, evaluations = _core.select_greedy(
         cells.parts,
-        seen.starts,
-        seen.cells,
-        np.ascontiguousarray(cameras.recentred(cells.origin).positions),
+        (seen.starts, seen.cells, np.ascontiguousarray(cameras.recentred(cells.origin).positions)),
         len(cameras),
-        directional=policy == "directional",
-        kappa=options.kappa,
-        alpha=options.alpha,
-        lambda_=options.offset,
-        anchors=options.anchors,
-        epsilon=options.epsilon,
-        lazy=options.lazy,
-        progress=counter(progress, "select"),
+        policy == "directional",
+        options,
+        counter(progress, "select"),
     )
     seconds["greedy"] = time.perf_counter() - began
     keep = usable[order]

@@ -87,13 +87,7 @@ def flag(
     """
     _check_budget(budget, None)
     scene, finite = finite_rows_of(splats)
-    found = _core.simplify_flags(
-        scene.core,
-        budget,
-        threshold=config.flag_threshold,
-        members=config.flag_members,
-        progress=counter(progress, "flag"),
-    )
+    found = _core.simplify_flags(scene.core, budget, config.resolved("paper"), counter(progress, "flag"))
     flags = np.zeros(len(splats), bool)
     flags[finite] = found
     return flags
@@ -207,15 +201,8 @@ def _paper(
         scene.core,
         round_counts(len(scene), budget, config.retention_of("paper"), config.fold),
         cells,
+        config.resolved("paper"),
         protected=flags,
-        min_opacity=config.min_opacity_of("paper"),
-        color_bin=config.color_bin,
-        max_energy=config.max_energy,
-        min_coverage=config.min_coverage,
-        support=config.support,
-        flag_threshold=config.flag_threshold,
-        flag_members=config.flag_members,
-        protection=config.protection,
         progress=counter(progress, "simplify"),
     )
 

@@ -158,7 +158,9 @@ class SimplifyConfig:
         return self.resolved(method).min_opacity or 0.0
 
 
-def round_counts(count: int, budget: int, retention: float = 0.75, fold: float = 0.05) -> list[int]:
+def round_counts(
+    count: int, budget: int, retention: float = _RETENTION["paper"], fold: float = 0.05
+) -> list[int]:
     """Counts after each round: N_r = max(N_S, ⌈retention·N_{r−1}⌉), a last cut by less than `fold` folded in.
 
     >>> round_counts(500_000, 50_000)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.progress import Progress, counter
-from g2ard.scene.prepared import PreparedScene
+from g2ard.scene.prepared import MAX_OPACITY, PreparedScene
 from g2ard.scene.regions import in_any
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
 from g2ard.stages.simplify.config import SimplifyConfig, round_counts
@@ -27,9 +27,6 @@ _RATIO = (0.5, 2.0)
 
 _FLOOR = 0.05
 """Share of the mean that is added to both: what is hardly seen stays as it is."""
-
-MAX_OPACITY = 0.99
-"""α never exceeds it: renderers clip there."""
 
 DRAWN_OPACITY = float(1 / (1 + np.exp(-DRAWN_LOGIT)))
 """Renderers draw nothing fainter."""
@@ -52,38 +49,40 @@ VisibilitySource = Callable[[Splats], Visibility]
 
 
 @dataclass(frozen=True, eq=False)
-class _RowVisibility:
+class RowVisibility:
+    """A visibility of finite rows: float32, contiguous."""
+
     weight: NDArray[np.float32]
     pixel_size: NDArray[np.float32]
 
 
-def rows_of(visibility: Visibility, count: int, finite: NDArray[np.bool_] | slice) -> _RowVisibility:
+def rows_of(visibility: Visibility, count: int, finite: NDArray[np.bool_] | slice) -> RowVisibility:
     """The finite rows of a visibility, contiguous."""
     for name in ("weight", "pixel_size"):
         shape = getattr(visibility, name).shape
         if shape != (count,):
             raise InputError(f"visibility.{name}: expected shape ({count},), got {shape}")
     weight, pixel = (np.asarray(a, np.float32)[finite] for a in (visibility.weight, visibility.pixel_size))
-    return _RowVisibility(np.ascontiguousarray(weight), np.ascontiguousarray(pixel))
+    return RowVisibility(np.ascontiguousarray(weight), np.ascontiguousarray(pixel))
 
 
-def emphasised(
-    scene: Splats, weight: NDArray[np.float32], pixel_size: NDArray[np.float32], config: SimplifyConfig
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What views would see that stood √t times as near to what lies in the regions to keep, t = keep_times: a
-    Gaussian covers t times as many pixels, which are 1/√t as wide there.
+def emphasised(scene: Splats, visibility: Visibility, config: SimplifyConfig) -> Visibility:
+    """Return a visibility as if views stood √t times as near to the regions to keep, t = keep_times.
+
+    A Gaussian there covers t times as many pixels, which are 1/√t as wide.
 
     Args:
         scene: N Gaussians.
-        weight: (N,) Σ αT of them.
-        pixel_size: (N,) the size of a pixel there.
+        visibility: of its N rows.
         config: `keep_region` and `keep_times` are read.
     """
     if not config.keep_region:
-        return weight, pixel_size
+        return visibility
     inside = in_any(scene, config.keep_region)
     times = np.where(inside, np.float32(config.keep_times), np.float32(1))
-    return weight * times, (pixel_size / np.sqrt(times)).astype(np.float32)
+    return RowVisibility(
+        visibility.weight * times, (visibility.pixel_size / np.sqrt(times)).astype(np.float32)
+    )
 
 
 def merge(
@@ -97,23 +96,12 @@ def merge(
 ) -> dict[str, Any]:
     """`default` or `fast`; `visibility` has a row for each of the scene's."""
     config = config.resolved(method)
-    weight = pixel_size = None
-    if visibility is not None:
-        weight, pixel_size = emphasised(scene, visibility.weight, visibility.pixel_size, config)
     return _core.simplify_pairwise(
         scene.core,
         round_counts(len(scene), budget, config.retention_of(method), config.fold),
+        config,
         protected=flags,
-        weight=weight,
-        pixel_size=pixel_size,
-        min_opacity=config.min_opacity_of(method),
-        morton_premerge_ratio=config.morton_premerge_ratio,
-        morton_premerge_steps=config.morton_premerge_steps,
-        neighbors=config.neighbors,
-        geometric_weight=config.geometric_weight,
-        dilation=config.dilation,
-        pixel_scale=config.pixel_scale,
-        max_growth=config.max_growth,
+        visibility=None if visibility is None else emphasised(scene, visibility, config),
         progress=tell,
     )
 

@@ -62,7 +62,7 @@ mod spatial {
 mod simplify {
     use super::*;
     use g2ard_core::scene::Ordered;
-    use g2ard_core::simplify::{Pairwise, Paper, flags};
+    use g2ard_core::simplify::{Pairwise, Paper, PaperPlan, flags};
 
     /// Counts after each round, `retention` of the one before kept.
     fn schedule(mut count: usize, retention: f64) -> Vec<usize> {
@@ -98,21 +98,24 @@ mod simplify {
 
     #[divan::bench(args = COUNTS)]
     fn paper_flags(bencher: Bencher, count: usize) {
-        let (splats, texture) = (Scene::of(count).splats(), Paper::default().texture);
-        let run = || flags(&splats, count / RATIO, texture, &Cpu, &Control::default());
+        let (splats, paper) = (Scene::of(count).splats(), Paper::default());
+        let run = || flags(&splats, count / RATIO, &paper, &Cpu, &Control::default());
         bencher.bench(|| run().expect("never cancelled"));
     }
 
     /// Its flags included.
     #[divan::bench(args = COUNTS)]
     fn paper_policy(bencher: Bencher, count: usize) {
-        let (scene, counts) = (Scene::of(count), schedule(count, 0.75));
-        let (paper, cells) = (Paper::default(), count / RATIO);
+        let (scene, paper, counts) = (Scene::of(count), Paper::default(), schedule(count, 0.75));
+        let plan = PaperPlan {
+            schedule: &counts,
+            cells: count / RATIO,
+        };
         bencher.bench(|| {
             let (scene, control) = (scene.scene(), Control::default());
             let ordered = Ordered::new(&scene).expect("a valid scene");
             paper
-                .run(&scene, &ordered, None, cells, &counts, &Cpu, &control)
+                .run(&scene, &ordered, None, plan, &Cpu, &control)
                 .expect("a valid scene")
         });
     }
@@ -259,16 +262,10 @@ mod select {
             surface: &surface,
             visible: &seen_cells(&scene, &surface, &views),
             positions: &positions,
-        };
-        let coverage = Coverage {
             directional: true,
-            kappa: 20.0,
-            alpha: 2.0,
-            lambda: 1.0,
-            anchors: 32,
-            epsilon: 1e-9,
         };
-        let run = || problem.greedy(CHOSEN, &coverage, true, &Control::default());
+        let coverage = Coverage::default();
+        let run = || problem.greedy(CHOSEN, &coverage, &Control::default());
         bencher.bench(|| run().expect("a valid problem"));
     }
 }

@@ -5,6 +5,7 @@
 //! Results never depend on the number of threads: every reduction has a fixed order.
 
 pub mod backend;
+pub mod constants;
 pub mod control;
 mod cpu;
 pub mod error;

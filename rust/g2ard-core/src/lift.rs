@@ -2,31 +2,20 @@
 
 use rayon::prelude::*;
 
+use crate::constants::constants;
 use crate::linalg::{Sym3, outer, quat_from_rotation, sub, symmetric_eigen};
 use crate::spatial::{Neighbor, Tree};
 use crate::{Control, Error, Result};
 
-/// Defaults are the paper's.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LiftConfig {
-    /// Nearest others that PCA takes in.
-    pub neighbors: usize,
-    /// Normal scale over the geometric mean of the tangential ones.
-    pub normal_ratio: f64,
-    /// Largest ratio of the two tangential scales.
-    pub max_anisotropy: f64,
-    /// Tangential scale over the neighbourhood's standard deviation along that axis.
-    pub spread: f64,
-}
-
-impl Default for LiftConfig {
-    fn default() -> Self {
-        Self {
-            neighbors: 10,
-            normal_ratio: 0.1,
-            max_anisotropy: 4.0,
-            spread: 0.94,
-        }
+constants! {
+    /// Defaults are the paper's.
+    pub struct LiftConfig {
+        /// Nearest others that PCA takes in.
+        pub neighbors: usize = 10,
+        /// Normal scale over the geometric mean of the tangential ones.
+        pub normal_ratio: f64 = 0.1,
+        /// Largest ratio of the two tangential scales.
+        pub max_anisotropy: f64 = 4.0,
     }
 }
 
@@ -38,7 +27,6 @@ impl LiftConfig {
         for (name, value, least) in [
             ("normal_ratio", self.normal_ratio, 0.0),
             ("max_anisotropy", self.max_anisotropy, 1.0),
-            ("spread", self.spread, 0.0),
         ] {
             if !(value.is_finite() && value >= least && value > 0.0) {
                 return Err(Error::invalid(
@@ -67,6 +55,9 @@ struct Patch {
     tangential: [f64; 2],
     quat: [f64; 4],
 }
+
+/// Tangential scale over the neighbourhood's standard deviation along that axis.
+const SPREAD: f64 = 0.94;
 
 /// Rows between two checks of the control.
 const CHUNK: usize = 4096;
@@ -108,8 +99,8 @@ fn patch(points: &[[f64; 3]], row: u32, near: &[Neighbor<f64>], config: &LiftCon
     }
     let e = symmetric_eigen(&cov);
     let [t1, t2, n] = e.vectors;
-    let wide = config.spread * e.values[0].max(0.0).sqrt();
-    let narrow = config.spread * e.values[1].max(0.0).sqrt();
+    let wide = SPREAD * e.values[0].max(0.0).sqrt();
+    let narrow = SPREAD * e.values[1].max(0.0).sqrt();
     Patch {
         tangential: [wide, narrow.max(wide / config.max_anisotropy)],
         quat: quat_from_rotation(&[0, 1, 2].map(|r| [t1[r], t2[r], n[r]])),

@@ -3,7 +3,7 @@
 use pyo3::prelude::*;
 
 mod arrays;
-mod defaults;
+mod constants;
 mod device;
 mod error;
 mod lift;
@@ -25,7 +25,7 @@ mod work;
 fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("__version__", env!("CARGO_PKG_VERSION"))?;
     work::register(m)?;
-    defaults::register(m)?;
+    constants::register(m)?;
     device::register(m)?;
     scene::register(m)?;
     visibility::register(m)?;

@@ -117,8 +117,8 @@ impl PyRasterizer {
         })
     }
 
-    /// (image (H, W, 3), alpha (H, W), depth (H, W) or None, median depth (H, W) or None).
-    #[pyo3(signature = (arrays, view, options, background, depth = true, median = false))]
+    /// (image (H, W, 3), alpha (H, W), depth (H, W) or None, median depth (H, W) or None): the first `depths` of the two.
+    #[pyo3(signature = (arrays, view, options, background, depths = 1))]
     #[allow(clippy::type_complexity)]
     fn forward<'py>(
         &mut self,
@@ -127,8 +127,7 @@ impl PyRasterizer {
         view: View,
         options: RasterOptions,
         background: [f32; 3],
-        depth: bool,
-        median: bool,
+        depths: usize,
     ) -> PyResult<(
         Array<'py, numpy::Ix3>,
         Array<'py, numpy::Ix2>,
@@ -140,25 +139,25 @@ impl PyRasterizer {
         camera.validate().map_err(to_py)?;
         let (height, width) = (camera.height, camera.width);
         let inner = &mut self.inner;
-        let (rgb, alpha, depths, medians) = work::quick(py, || {
+        let (rgb, alpha, depth, median) = work::quick(py, || {
             let zeros = || vec![0f32; height * width];
             let (mut rgb, mut alpha) = (vec![0f32; 3 * height * width], zeros());
-            let (mut depths, mut medians) = (depth.then(zeros), median.then(zeros));
+            let (mut depth, mut median) = ((depths > 0).then(zeros), (depths > 1).then(zeros));
             let mut image = Image {
                 rgb: &mut rgb,
                 alpha: &mut alpha,
-                depth: depths.as_deref_mut(),
-                median: medians.as_deref_mut(),
+                depth: depth.as_deref_mut(),
+                median: median.as_deref_mut(),
             };
             inner.forward(&params, &camera, &settings, background, &mut image)?;
-            Ok((rgb, alpha, depths, medians))
+            Ok((rgb, alpha, depth, median))
         })?;
         self.shape = [height, width];
         Ok((
             PyArray1::from_vec(py, rgb).reshape([height, width, 3])?,
             PyArray1::from_vec(py, alpha).reshape([height, width])?,
-            plane(py, depths, self.shape)?,
-            plane(py, medians, self.shape)?,
+            plane(py, depth, self.shape)?,
+            plane(py, median, self.shape)?,
         ))
     }
 

@@ -7,6 +7,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::arrays;
+use crate::constants::Config;
 use crate::device::{backend, kernels};
 use crate::error::to_py;
 use crate::views::View;
@@ -147,57 +148,41 @@ fn select_visible<'py>(
 
 type Choice<'py> = (Bound<'py, PyArray1<u32>>, Bound<'py, PyArray1<f64>>, u64);
 
+/// Each view's cells as `select_visible` returns them, and (V, 3) camera centres.
+type Views<'py> = (
+    PyReadonlyArray1<'py, u64>,
+    PyReadonlyArray1<'py, u32>,
+    PyReadonlyArray2<'py, f64>,
+);
+
 /// (views, gains, evaluations) of greedy maximisation.
 #[pyfunction]
-#[pyo3(signature = (surface, starts, cells, positions, k, *, directional, kappa, alpha, lambda_, anchors, epsilon, lazy, progress=None))]
+#[pyo3(signature = (surface, views, k, directional, config, progress=None))]
 fn select_greedy<'py>(
     py: Python<'py>,
     surface: Surfaces<'py>,
-    starts: PyReadonlyArray1<'py, u64>,
-    cells: PyReadonlyArray1<'py, u32>,
-    positions: PyReadonlyArray2<'py, f64>,
+    views: Views<'py>,
     k: usize,
     directional: bool,
-    kappa: f64,
-    alpha: f64,
-    lambda_: f64,
-    anchors: usize,
-    epsilon: f64,
-    lazy: bool,
+    config: Config<Coverage>,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Choice<'py>> {
     let surface = surface_of(&surface)?;
-    let (starts, cells) = (
-        arrays::flat("starts", &starts)?,
-        arrays::flat("cells", &cells)?,
-    );
-    let positions = arrays::rows("positions", &positions)?;
+    let starts = arrays::flat("starts", &views.0)?;
+    let cells = arrays::flat("cells", &views.1)?;
     let visible = starts
         .windows(2)
         .map(|w| cells.get(w[0] as usize..w[1] as usize).map(<[u32]>::to_vec))
-        .collect::<Option<Vec<_>>>()
-        .ok_or_else(|| {
-            to_py(g2ard_core::Error::invalid(
-                "starts",
-                "ascending offsets into cells",
-                "others",
-            ))
-        })?;
-    let coverage = Coverage {
-        directional,
-        kappa,
-        alpha,
-        lambda: lambda_,
-        anchors,
-        epsilon,
-    };
+        .collect::<Option<Vec<_>>>();
+    let offsets = || g2ard_core::Error::invalid("starts", "ascending offsets into cells", "others");
     let problem = Problem {
         surface: &surface,
-        visible: &visible,
-        positions,
+        visible: &visible.ok_or_else(offsets).map_err(to_py)?,
+        positions: arrays::rows("positions", &views.2)?,
+        directional,
     };
     let chosen = long(py, progress, |control| {
-        problem.greedy(k, &coverage, lazy, control)
+        problem.greedy(k, &config.0, control)
     })?;
     Ok((
         PyArray1::from_vec(py, chosen.views),

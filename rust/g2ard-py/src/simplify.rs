@@ -1,36 +1,51 @@
 //! `g2ard.stages.simplify`.
 
 use g2ard_core::simplify::{
-    Outcome, Pairwise, PairwiseRound, Paper, PaperRound, Texture, Visibility, flags,
+    Outcome, Pairwise, PairwiseRound, Paper, PaperPlan, PaperRound, Visibility, flags,
 };
 use numpy::{PyArray1, PyArrayMethods, PyReadonlyArray1};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::arrays;
+use crate::constants::Config;
 use crate::device::{backend, kernels};
 use crate::scene::PyScene;
 use crate::work::long;
 
-/// `protected` (N,) bool of the raw prior over about `cells` cells.
+/// What views see of each row, such as a `g2ard.rendering.visibility.SampledVisibility`.
+#[derive(FromPyObject)]
+pub struct PyVisibility<'py> {
+    weight: PyReadonlyArray1<'py, f32>,
+    pixel_size: PyReadonlyArray1<'py, f32>,
+}
+
+impl PyVisibility<'_> {
+    pub fn borrow(&self) -> PyResult<Visibility<'_>> {
+        Ok(Visibility {
+            weight: arrays::flat("weight", &self.weight)?,
+            pixel_size: arrays::flat("pixel_size", &self.pixel_size)?,
+        })
+    }
+}
+
+/// Return `protected` (N,) bool of the raw prior over about `cells` cells.
 #[pyfunction]
-#[pyo3(signature = (scene, cells, *, threshold, members, progress=None))]
+#[pyo3(signature = (scene, cells, config, progress=None))]
 fn simplify_flags<'py>(
     py: Python<'py>,
     scene: &PyScene,
     cells: usize,
-    threshold: f64,
-    members: usize,
+    config: Config<Paper>,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyArray1<bool>>> {
     let (splats, ordered) = (scene.splats(py)?, &scene.ordered);
     let scene = splats.borrow()?;
-    let texture = Texture { threshold, members };
     let kernels = kernels();
     let found = long(py, progress, |control| {
         let splats = ordered.splats(&scene);
         let run = backend(&kernels).group_kernels();
-        let found = flags(&splats, cells, texture, &*run, control)?;
+        let found = flags(&splats, cells, &config.0, &*run, control)?;
         let mut by_row = vec![false; found.len()];
         for (&row, &flag) in ordered.rows.iter().zip(&found) {
             by_row[row as usize] = flag;
@@ -40,117 +55,58 @@ fn simplify_flags<'py>(
     Ok(PyArray1::from_vec(py, found))
 }
 
-/// The paper's rounds, down to each count of `schedule`, over about `cells` cells each.
+/// Run the paper's rounds, down to each count of `schedule`, over about `cells` cells each.
 #[pyfunction]
-#[pyo3(signature = (
-    scene, schedule, cells, *, protected, min_opacity, color_bin, max_energy, min_coverage, support,
-    flag_threshold, flag_members, protection, progress=None
-))]
+#[pyo3(signature = (scene, schedule, cells, config, protected=None, progress=None))]
 fn simplify_paper<'py>(
     py: Python<'py>,
     scene: &PyScene,
     schedule: Vec<usize>,
     cells: usize,
+    config: Config<Paper>,
     protected: Option<PyReadonlyArray1<'py, bool>>,
-    min_opacity: f64,
-    color_bin: f64,
-    max_energy: f64,
-    min_coverage: f64,
-    support: f64,
-    flag_threshold: f64,
-    flag_members: usize,
-    protection: f64,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let (splats, ordered) = (scene.splats(py)?, &scene.ordered);
     let scene = splats.borrow()?;
-    let protected = protected
-        .as_ref()
-        .map(|p| arrays::flat("protected", p))
-        .transpose()?;
-    let policy = Paper {
-        min_opacity,
-        color_bin,
-        max_energy,
-        min_coverage,
-        support,
-        texture: Texture {
-            threshold: flag_threshold,
-            members: flag_members,
-        },
-        protection,
-    };
+    let protected = protected.as_ref().map(|p| arrays::flat("protected", p));
+    let (policy, protected) = (config.0, protected.transpose()?);
     let kernels = kernels();
     let outcome = long(py, progress, |control| {
         let run = backend(&kernels).group_kernels();
-        policy.run(&scene, ordered, protected, cells, &schedule, &*run, control)
+        let plan = PaperPlan {
+            schedule: &schedule,
+            cells,
+        };
+        policy.run(&scene, ordered, protected, plan, &*run, control)
     })?;
-    let rounds = outcome
-        .rounds
-        .iter()
-        .map(|r| round_dict(py, r))
-        .collect::<PyResult<Vec<_>>>()?;
+    let rounds = outcome.rounds.iter().map(|r| round_dict(py, r));
+    let rounds = rounds.collect::<PyResult<Vec<_>>>()?;
     outcome_dict(py, outcome, rounds)
 }
 
-/// The methods `default` and `fast`: runs of Morton order, then pairs of neighbours, cheapest first.
+/// Run the methods `default` and `fast`: runs of Morton order, then pairs of neighbours, cheapest first.
 #[pyfunction]
-#[pyo3(signature = (
-    scene, schedule, *, protected, weight, pixel_size, min_opacity, morton_premerge_ratio, morton_premerge_steps, neighbors, geometric_weight,
-    dilation, pixel_scale, max_growth, progress=None
-))]
+#[pyo3(signature = (scene, schedule, config, protected=None, visibility=None, progress=None))]
 fn simplify_pairwise<'py>(
     py: Python<'py>,
     scene: &PyScene,
     schedule: Vec<usize>,
+    config: Config<Pairwise>,
     protected: Option<PyReadonlyArray1<'py, bool>>,
-    weight: Option<PyReadonlyArray1<'py, f32>>,
-    pixel_size: Option<PyReadonlyArray1<'py, f32>>,
-    min_opacity: f64,
-    morton_premerge_ratio: f64,
-    morton_premerge_steps: usize,
-    neighbors: usize,
-    geometric_weight: f64,
-    dilation: f64,
-    pixel_scale: f64,
-    max_growth: f64,
+    visibility: Option<PyVisibility<'py>>,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let (splats, ordered) = (scene.splats(py)?, &scene.ordered);
     let scene = splats.borrow()?;
-    let protected = protected
-        .as_ref()
-        .map(|p| arrays::flat("protected", p))
-        .transpose()?;
-    let weight = weight
-        .as_ref()
-        .map(|a| arrays::flat("weight", a))
-        .transpose()?;
-    let pixel_size = pixel_size
-        .as_ref()
-        .map(|a| arrays::flat("pixel_size", a))
-        .transpose()?;
-    let visibility = weight
-        .zip(pixel_size)
-        .map(|(weight, pixel_size)| Visibility { weight, pixel_size });
-    let policy = Pairwise {
-        min_opacity,
-        morton_premerge_ratio,
-        morton_premerge_steps,
-        neighbors,
-        geometric_weight,
-        dilation,
-        pixel_scale,
-        max_growth,
-    };
+    let protected = protected.as_ref().map(|p| arrays::flat("protected", p));
+    let visibility = visibility.as_ref().map(PyVisibility::borrow);
+    let (protected, visibility) = (protected.transpose()?, visibility.transpose()?);
     let outcome = long(py, progress, |control| {
-        policy.run(&scene, ordered, visibility, protected, &schedule, control)
+        (config.0).run(&scene, ordered, visibility, protected, &schedule, control)
     })?;
-    let rounds = outcome
-        .rounds
-        .iter()
-        .map(|r| pairwise_dict(py, r))
-        .collect::<PyResult<Vec<_>>>()?;
+    let rounds = outcome.rounds.iter().map(|r| pairwise_dict(py, r));
+    let rounds = rounds.collect::<PyResult<Vec<_>>>()?;
     outcome_dict(py, outcome, rounds)
 }
 

@@ -1,13 +1,14 @@
 //! `_core.TileMerging`: simplification of one tile, in the steps that tiles agree between.
 
-use g2ard_core::simplify::{Frame, Importance, Pairwise, Tile, Visibility};
+use g2ard_core::simplify::{Frame, Importance, Pairwise, Tile};
 use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::arrays;
+use crate::constants::Config;
 use crate::scene::PyScene;
-use crate::simplify::outcome_dict;
+use crate::simplify::{PyVisibility, outcome_dict};
 use crate::work::long;
 
 type Floats<'py> = Bound<'py, PyArray1<f32>>;
@@ -32,13 +33,13 @@ impl PyFrame {
 
     /// That of a fair sample of a scene, without views.
     #[staticmethod]
-    fn of_sample(py: Python<'_>, scene: &PyScene, pixel_scale: f64) -> PyResult<Self> {
+    fn of_sample(py: Python<'_>, scene: &PyScene, config: Config<Pairwise>) -> PyResult<Self> {
         let (splats, ordered) = (scene.splats(py)?, &scene.ordered);
-        let policy = Pairwise {
-            pixel_scale,
-            ..Pairwise::default()
-        };
-        Ok(Self(Frame::of_sample(&policy, &splats.borrow()?, ordered)))
+        Ok(Self(Frame::of_sample(
+            &config.0,
+            &splats.borrow()?,
+            ordered,
+        )))
     }
 
     /// The same with views: the usual size of a pixel, and `sums` added up over all tiles.
@@ -62,7 +63,7 @@ impl PyFrame {
 #[pyclass(name = "TileMerging", module = "g2ard._core", frozen)]
 struct PyTileMerging {
     scene: Py<PyScene>,
-    seen: Option<[Py<PyArray1<f32>>; 2]>,
+    visibility: Option<Py<PyAny>>,
     policy: Pairwise,
     frame: Frame,
 }
@@ -72,17 +73,9 @@ impl PyTileMerging {
         let scene = self.scene.get();
         let splats = scene.splats(py)?;
         let rows = splats.borrow()?;
-        let seen: Option<[PyReadonlyArray1<'_, f32>; 2]> = match &self.seen {
-            Some([weight, pixel]) => Some([weight.bind(py).extract()?, pixel.bind(py).extract()?]),
-            None => None,
-        };
-        let visibility = match &seen {
-            Some([weight, pixel]) => Some(Visibility {
-                weight: arrays::flat("weight", weight)?,
-                pixel_size: arrays::flat("pixel_size", pixel)?,
-            }),
-            None => None,
-        };
+        let seen = self.visibility.as_ref().map(|seen| seen.extract(py));
+        let seen: Option<PyVisibility<'_>> = seen.transpose()?;
+        let visibility = seen.as_ref().map(PyVisibility::borrow).transpose()?;
         work(&Tile {
             policy: self.policy,
             scene: &rows,
@@ -96,32 +89,17 @@ impl PyTileMerging {
 #[pymethods]
 impl PyTileMerging {
     #[new]
-    #[pyo3(signature = (
-        scene, frame, *, weight, pixel_size, min_opacity, neighbors, geometric_weight, dilation, max_growth
-    ))]
+    #[pyo3(signature = (scene, frame, config, visibility=None))]
     fn new(
         scene: Py<PyScene>,
         frame: PyFrame,
-        weight: Option<Py<PyArray1<f32>>>,
-        pixel_size: Option<Py<PyArray1<f32>>>,
-        min_opacity: f64,
-        neighbors: usize,
-        geometric_weight: f64,
-        dilation: f64,
-        max_growth: f64,
+        config: Config<Pairwise>,
+        visibility: Option<Py<PyAny>>,
     ) -> Self {
-        let policy = Pairwise {
-            min_opacity,
-            neighbors,
-            geometric_weight,
-            dilation,
-            max_growth,
-            ..Pairwise::default()
-        };
         Self {
             scene,
-            seen: weight.zip(pixel_size).map(|(w, p)| [w, p]),
-            policy,
+            visibility,
+            policy: config.0,
             frame: frame.0,
         }
     }

@@ -1,6 +1,6 @@
 //! `_core.Trainer`: whole recovery steps in Rust.
 
-use g2ard_core::raster::Isa;
+use g2ard_core::raster::{Camera, Isa, Settings};
 use g2ard_core::train::{Exported, Rates, Regularizers, StepInput, Trainer};
 use numpy::{
     IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
@@ -9,11 +9,13 @@ use numpy::{
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
+use crate::arrays::flat;
+use crate::constants::Config;
 use crate::raster::{Arrays, Floats, isa_named, slice};
 use crate::views::{RasterOptions, View};
 use crate::work;
 
-/// The attributes of a `g2ard.stages.recover.schedule.Rates` that are learning rates.
+/// A `g2ard.stages.recover.schedule.Rates`.
 #[derive(FromPyObject)]
 struct PyRates {
     means: f32,
@@ -23,6 +25,16 @@ struct PyRates {
     sh0: f32,
     #[pyo3(attribute("shN"))]
     sh_n: f32,
+    /// A share of the longer side of a view.
+    reach: f64,
+}
+
+impl PyRates {
+    /// The reach in pixels of a view.
+    fn reach_in(&self, camera: &Camera) -> Option<f32> {
+        let pixels = self.reach * camera.width.max(camera.height) as f64;
+        (self.reach != f64::INFINITY).then_some(pixels as f32)
+    }
 }
 
 impl From<PyRates> for Rates {
@@ -38,46 +50,60 @@ impl From<PyRates> for Rates {
     }
 }
 
-/// The attributes of a `g2ard.stages.recover.anchors.Regularizers` that are weights.
+/// The attributes of a `g2ard.stages.recover.engine.Objective` that are alike in all steps.
 #[derive(FromPyObject)]
-struct PyRegularizers {
-    anchor: f32,
-    shape: f32,
-    effective_rank: bool,
-    thickness: f32,
-    rank_offset: f32,
-}
-
-impl From<PyRegularizers> for Regularizers {
-    fn from(weights: PyRegularizers) -> Self {
-        Self {
-            anchor: weights.anchor,
-            shape: weights.shape,
-            effective_rank: weights.effective_rank,
-            thickness: weights.thickness,
-            rank_offset: weights.rank_offset,
-        }
-    }
+struct PyObjective {
+    settings: RasterOptions,
+    background: [f32; 3],
+    ssim_weight: f32,
 }
 
 #[pyclass(name = "Trainer", module = "g2ard._core")]
 struct PyTrainer {
     inner: Trainer,
+    settings: Settings,
+    background: [f32; 3],
+    ssim_weight: f32,
     isa: Isa,
     seconds_loss: f64,
     skipped: usize,
 }
 
+impl PyTrainer {
+    /// A step without rates.
+    fn input<'a>(&self, camera: &'a Camera, target: &'a [f32]) -> StepInput<'a> {
+        StepInput {
+            camera,
+            settings: self.settings,
+            background: self.background,
+            target,
+            mask: None,
+            ssim_weight: self.ssim_weight,
+            rates: Rates::default(),
+            reach: None,
+            regularizers: None,
+        }
+    }
+}
+
 #[pymethods]
 impl PyTrainer {
     #[new]
-    #[pyo3(signature = (arrays, units = None, isa = None))]
-    fn new(arrays: Arrays<'_>, units: Option<Floats<'_>>, isa: Option<&str>) -> PyResult<Self> {
+    #[pyo3(signature = (arrays, objective, units = None, isa = None))]
+    fn new(
+        arrays: Arrays<'_>,
+        objective: PyObjective,
+        units: Option<Floats<'_>>,
+        isa: Option<&str>,
+    ) -> PyResult<Self> {
         let isa = isa_named(isa)?;
         let units = units.as_ref().map(|u| slice("units", u)).transpose()?;
         let inner = Trainer::new(&arrays.params()?, units, isa).map_err(crate::error::to_py)?;
         Ok(Self {
             inner,
+            settings: objective.settings.settings()?,
+            background: objective.background,
+            ssim_weight: objective.ssim_weight,
             isa,
             seconds_loss: 0.0,
             skipped: 0,
@@ -108,33 +134,25 @@ impl PyTrainer {
         self.inner.freeze(frozen).map_err(crate::error::to_py)
     }
 
-    /// One step: (photometric loss before it, Gaussians moved). `mask`: where the loss counts. `reach`: pixels beyond
-    /// which geometry stands still.
-    #[pyo3(signature = (view, options, background, target, ssim_weight, rates, regularizers = None, mask = None, reach = None))]
-    #[allow(clippy::too_many_arguments)] // all of them by name from one place in Python
+    /// Take one step; return (photometric loss before it, Gaussians moved). `mask`: where the loss counts.
+    #[pyo3(signature = (view, target, rates, regularizers = None, mask = None))]
     fn step(
         &mut self,
         py: Python<'_>,
         view: View,
-        options: RasterOptions,
-        background: [f32; 3],
         target: PyReadonlyArray3<'_, f32>,
-        ssim_weight: f32,
         rates: PyRates,
-        regularizers: Option<PyRegularizers>,
+        regularizers: Option<Config<Regularizers>>,
         mask: Option<PyReadonlyArray2<'_, bool>>,
-        reach: Option<f32>,
     ) -> PyResult<(f64, usize)> {
+        let camera = view.camera();
+        let target = flat("target", &target)?;
         let input = StepInput {
-            camera: &view.camera(),
-            settings: &options.settings()?,
-            background,
-            target: values(&target)?,
-            mask: mask.as_ref().map(covered).transpose()?,
-            ssim_weight,
+            mask: mask.as_ref().map(|m| flat("mask", m)).transpose()?,
+            reach: rates.reach_in(&camera),
             rates: rates.into(),
-            reach,
-            regularizers: regularizers.map(Into::into),
+            regularizers: regularizers.map(|r| r.0),
+            ..self.input(&camera, target)
         };
         let inner = &mut self.inner;
         let report = work::quick(py, || inner.step(&input))?;
@@ -143,27 +161,15 @@ impl PyTrainer {
         Ok((report.loss, report.updated))
     }
 
-    /// A step up to the gradients, which are thrown away: for timing. Returns the photometric loss.
+    /// Take a step up to the gradients, which are discarded: for timing. Return the photometric loss.
     fn gradients_only(
         &mut self,
         py: Python<'_>,
         view: View,
-        options: RasterOptions,
-        background: [f32; 3],
         target: PyReadonlyArray3<'_, f32>,
-        ssim_weight: f32,
     ) -> PyResult<f64> {
-        let input = StepInput {
-            camera: &view.camera(),
-            settings: &options.settings()?,
-            background,
-            target: values(&target)?,
-            mask: None,
-            ssim_weight,
-            rates: Rates::default(),
-            reach: None,
-            regularizers: None,
-        };
+        let (camera, target) = (view.camera(), flat("target", &target)?);
+        let input = self.input(&camera, target);
         let inner = &mut self.inner;
         let report = work::quick(py, || inner.gradients_only(&input))?;
         self.seconds_loss = report.seconds_loss;
@@ -246,19 +252,6 @@ impl PyTrainer {
         dict.set_item("loss", self.seconds_loss)?;
         Ok(dict)
     }
-}
-
-fn values<'a>(target: &'a PyReadonlyArray3<'_, f32>) -> PyResult<&'a [f32]> {
-    let layout = |_| g2ard_core::Error::invalid("target", "a C-contiguous array", "another layout");
-    target
-        .as_slice()
-        .map_err(layout)
-        .map_err(crate::error::to_py)
-}
-
-fn covered<'a>(mask: &'a PyReadonlyArray2<'_, bool>) -> PyResult<&'a [bool]> {
-    let layout = |_| g2ard_core::Error::invalid("mask", "a C-contiguous array", "another layout");
-    mask.as_slice().map_err(layout).map_err(crate::error::to_py)
 }
 
 fn vector<T: numpy::Element + Clone>(

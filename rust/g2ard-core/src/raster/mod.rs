@@ -42,6 +42,7 @@ pub use rasterizer::{Counts, Image, ImageGradients, Memory, Passes, Rasterizer};
 pub use sensitivity::TRIANGLE as SENSITIVITY_TRIANGLE;
 pub use simd::Isa;
 
+use crate::scene::limits::MAX_OPACITY;
 use crate::{Error, Result};
 
 /// Pixels on a tile's side.
@@ -162,7 +163,7 @@ impl Default for Settings {
         Self {
             convention: Convention::Gsplat,
             antialiased: false,
-            alpha_max: 0.99,
+            alpha_max: MAX_OPACITY as f32,
             transmittance_min: 1e-4,
         }
     }

@@ -5,6 +5,9 @@
 /// it too.
 pub const LOGIT_OF_OPAQUE: f32 = 16.0;
 
+/// Renderers clip α here, so no Gaussian weighs more, and none is merged into more.
+pub const MAX_OPACITY: f64 = 0.99;
+
 /// The logits between which f32 can follow the sigmoid.
 pub const DRAWN_LOGITS: (f32, f32) = (-80.0, 80.0);
 

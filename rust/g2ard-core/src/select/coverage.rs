@@ -6,6 +6,7 @@ use std::collections::BinaryHeap;
 use rayon::prelude::*;
 
 use super::Surface;
+use crate::constants::constants;
 use crate::linalg::{dot, sub};
 use crate::{Control, Error, Result};
 
@@ -14,21 +15,22 @@ const MAX_ANCHORS: usize = 64;
 /// Cells summed together: the order of the sum does not depend on the number of threads.
 const CHUNK: usize = 4096;
 
-/// What the objective rewards.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Coverage {
-    /// Cells seen from the directions their normals ask for; else seen at all, from anywhere.
-    pub directional: bool,
-    /// Sharpness of the observation kernel and of the targets.
-    pub kappa: f64,
-    /// Exponent of the fair utility u(x) = x^(1−α)/(1−α); 1 is the logarithm.
-    pub alpha: f64,
-    /// g(x) = u(λ + x).
-    pub lambda: f64,
-    /// Directions on the sphere that targets and observations are laid out on.
-    pub anchors: usize,
-    /// ε of C_jk / (P_jk + ε): keeps the ratio finite where a target is next to nothing.
-    pub epsilon: f64,
+constants! {
+    /// What the objective rewards.
+    pub struct Coverage {
+        /// Sharpness of the observation kernel and of the targets.
+        pub kappa: f64 = 20.0,
+        /// Exponent of the fair utility u(x) = x^(1−α)/(1−α); 1 is the logarithm.
+        pub alpha: f64 = 2.0,
+        /// λ of g(x) = u(λ + x).
+        pub offset: f64 = 1.0,
+        /// Directions on the sphere that targets and observations are laid out on.
+        pub anchors: usize = 32,
+        /// ε of C_jk / (P_jk + ε): keeps the ratio finite where a target is next to nothing.
+        pub epsilon: f64 = 1e-9,
+        /// Evaluate again only the view that leads by its bound (CELF), not all of them each time.
+        pub lazy: bool = true,
+    }
 }
 
 impl Coverage {
@@ -36,7 +38,7 @@ impl Coverage {
         for (name, value, ok) in [
             ("kappa", self.kappa, self.kappa > 0.0),
             ("alpha", self.alpha, self.alpha >= 0.0),
-            ("lambda", self.lambda, self.lambda > 0.0),
+            ("offset", self.offset, self.offset > 0.0),
             ("epsilon", self.epsilon, self.epsilon > 0.0),
         ] {
             if !(ok && value.is_finite()) {
@@ -51,7 +53,7 @@ impl Coverage {
     }
 
     fn g(&self, x: f64) -> f64 {
-        let x = self.lambda + x;
+        let x = self.offset + x;
         if self.alpha == 2.0 {
             -1.0 / x
         } else if self.alpha == 1.0 {
@@ -70,6 +72,8 @@ pub struct Problem<'a> {
     pub visible: &'a [Vec<u32>],
     /// Each view's camera centre.
     pub positions: &'a [[f64; 3]],
+    /// Whether cells count as seen from the directions that their normals ask for, or from anywhere.
+    pub directional: bool,
 }
 
 /// Views in the order they were chosen.
@@ -85,15 +89,9 @@ pub struct Chosen {
 impl Problem<'_> {
     /// The `k` views that greedy maximisation of F picks.
     ///
-    /// F is monotone and submodular, so a gain once computed bounds all later ones: lazily, only the view
-    /// that leads by its bound is evaluated again (CELF). `lazy: false` evaluates all of them, each time.
-    pub fn greedy(
-        &self,
-        k: usize,
-        coverage: &Coverage,
-        lazy: bool,
-        control: &Control,
-    ) -> Result<Chosen> {
+    /// F is monotone and submodular, so a gain once computed bounds all later ones: a lazy search
+    /// evaluates only the view that leads by its bound.
+    pub fn greedy(&self, k: usize, coverage: &Coverage, control: &Control) -> Result<Chosen> {
         coverage.validate()?;
         let n = self.visible.len();
         if self.positions.len() != n {
@@ -114,7 +112,7 @@ impl Problem<'_> {
         let state = State::new(*self, *coverage);
         let k = k.min(n);
         control.begin(k as u64);
-        if lazy {
+        if coverage.lazy {
             state.lazy(k, control)
         } else {
             state.plain(k, control)
@@ -158,7 +156,7 @@ impl PartialOrd for Bound {
 
 impl<'a> State<'a> {
     fn new(problem: Problem<'a>, coverage: Coverage) -> Self {
-        let anchors = if coverage.directional {
+        let anchors = if problem.directional {
             sphere(coverage.anchors)
         } else {
             vec![[0.0, 0.0, 1.0]]
@@ -183,7 +181,7 @@ impl<'a> State<'a> {
     /// Calls `f(index of (cell, anchor), ν·η·φ)` for all that `view` adds to a cell.
     fn observe(&self, view: usize, cell: u32, mut f: impl FnMut(usize, f64)) {
         let (j, count) = (cell as usize, self.anchors.len());
-        if !self.coverage.directional {
+        if !self.problem.directional {
             return f(j, 1.0);
         }
         let surface = self.problem.surface;

@@ -4,9 +4,10 @@
 use super::occluders::Occluders;
 use super::pinhole::{ALPHA_MIN, Pinhole, Splat};
 use crate::raster::Camera;
+use crate::scene::limits::MAX_OPACITY;
 
 /// As gsplat: opacity ends at 0.99.
-const ALPHA_MAX: f32 = 0.99;
+const ALPHA_MAX: f32 = MAX_OPACITY as f32;
 
 /// What one thread needs for a view; kept from view to view.
 #[derive(Default)]

@@ -2,8 +2,9 @@
 
 use rayon::prelude::*;
 
-use super::moments::{MAX_OPACITY, pool, rendered_area, sigmoid};
+use super::moments::{pool, rendered_area, sigmoid};
 use super::{GONE, Step};
+use crate::scene::limits::MAX_OPACITY;
 use crate::scene::{Gaussian, Ordered, SceneRef};
 use crate::{Control, Result, Splats};
 

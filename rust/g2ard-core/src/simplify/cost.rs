@@ -8,6 +8,7 @@
 use std::f32::consts::PI;
 
 use crate::raster::simd::{Real, exp_negative};
+use crate::scene::limits::MAX_OPACITY;
 
 /// Six axes in eight places, which fill a register; the last two repeat and weigh nothing.
 const PLACES: usize = 8;
@@ -45,7 +46,7 @@ pub struct Node<T = f32> {
 }
 
 /// α never exceeds it: renderers clip there.
-pub const MAX_ALPHA: f32 = 0.99;
+pub const MAX_ALPHA: f32 = MAX_OPACITY as f32;
 
 /// Renderers draw nothing fainter.
 const MIN_ALPHA: f32 = 1.0 / 255.0;

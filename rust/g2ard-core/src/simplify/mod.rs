@@ -24,11 +24,11 @@ pub use clusters::Pair;
 pub use guards::{coverage, disc};
 pub use importance::Importance;
 pub use kernels::{Group, GroupKernels, means_of};
-pub use moments::{MAX_OPACITY, Merged, merge, optical_mass, pool, weights};
+pub use moments::{Merged, merge, optical_mass, pool, weights};
 pub use outcome::Outcome;
 pub use pairwise::{Pairwise, PairwiseRound, Visibility};
-pub use paper::{Paper, PaperRound};
-pub use residual::{Texture, color, flags};
+pub use paper::{Paper, PaperPlan, PaperRound};
+pub use residual::{color, flags};
 pub use tile::{Frame, Tile, TilePlan};
 
 use crate::Splats;

@@ -3,9 +3,7 @@
 use crate::Splats;
 use crate::linalg::{Sym3, outer, sub};
 use crate::scene::Gaussian;
-
-/// Renderers clip α here, so no Gaussian weighs more, and none is merged into more.
-pub const MAX_OPACITY: f64 = 0.99;
+use crate::scene::limits::MAX_OPACITY;
 
 /// −log(1 − σ(x)) without cancellation: 1 − σ(x) loses every digit from x = 17 on.
 pub fn softplus(x: f64) -> f64 {

@@ -15,43 +15,30 @@ use super::morton_tree::{cut, merge_costs};
 use super::rows::{Rows, Shuffled};
 use super::trim::best;
 use super::{GONE, Outcome};
+use crate::constants::constants;
 use crate::scene::{Ordered, SceneRef};
 use crate::{Control, Error, Result};
 
-/// The constants, named as in Python, which takes its defaults from here. They are what measured best
-/// (docs/decisions.md).
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Pairwise {
-    /// Below this α a Gaussian is dropped: no renderer draws it.
-    pub min_opacity: f64,
-    /// Down to this many times the budget, rows merge along Morton order alone; infinite for never.
-    pub morton_premerge_ratio: f64,
-    /// In so many steps, each on a shifted lattice; every step but the first halves the count.
-    pub morton_premerge_steps: usize,
-    /// Nearest clusters that one may merge with.
-    pub neighbors: usize,
-    /// Weight of the geometric error beside that of colour; without views [`Self::BLIND`] of it.
-    pub geometric_weight: f64,
-    /// Standard deviation of the blur that renderers add, in pixels.
-    pub dilation: f64,
-    /// Without views: size of a pixel over the median largest scale.
-    pub pixel_scale: f64,
-    /// How much larger than its moments say a cluster may be, in area, where α alone cannot hold its mass.
-    pub max_growth: f64,
-}
-
-impl Default for Pairwise {
-    fn default() -> Self {
-        Self {
-            min_opacity: 0.004,
-            morton_premerge_ratio: 3.0,
-            morton_premerge_steps: 1,
-            neighbors: 6,
-            geometric_weight: 0.03,
-            dilation: 0.4,
-            pixel_scale: 0.2,
-            max_growth: 1.25,
-        }
+constants! {
+    /// The constants, named as in Python, which takes its defaults from here. They are what measured best
+    /// (docs/decisions.md).
+    pub struct Pairwise {
+        /// Below this α a Gaussian is dropped: no renderer draws it.
+        pub min_opacity: f64 = 0.004,
+        /// Down to this many times the budget, rows merge along Morton order alone; infinite for never.
+        pub morton_premerge_ratio: f64 = 3.0,
+        /// In so many steps, each on a shifted lattice; every step but the first halves the count.
+        pub morton_premerge_steps: usize = 1,
+        /// Nearest clusters that one may merge with.
+        pub neighbors: usize = 6,
+        /// Weight of the geometric error beside that of colour; without views [`Self::BLIND`] of it.
+        pub geometric_weight: f64 = 0.03,
+        /// Standard deviation of the blur that renderers add, in pixels.
+        pub dilation: f64 = 0.4,
+        /// Without views: size of a pixel over the median largest scale.
+        pub pixel_scale: f64 = 0.2,
+        /// How much larger than its moments say a cluster may be, in area, where α alone cannot hold its mass.
+        pub max_growth: f64 = 1.25,
     }
 }
 
@@ -118,20 +105,12 @@ impl Pairwise {
         let geometric = self.geometric(visibility);
         let mut rounds = Vec::new();
         let mut nodes = self.premerge(leaves, geometric, &mut partition, budget, &mut rounds);
-        // The loop of `Tile::plan` too: change both.
-        for &target in schedule {
-            while nodes.len() > target {
-                let before = nodes.len();
-                let lists = candidates(&nodes, self.neighbors, geometric, control)?;
-                let pairs = matched(&lists, self.neighbors, before - target);
-                drop(lists);
-                let map = merge(&mut nodes, &pairs);
-                let of = partition.of.par_iter_mut().filter(|c| **c != GONE);
-                of.for_each(|c| *c = map[*c as usize]);
-                rounds.push(PairwiseRound::merging(before, nodes.len()));
-                control.advance(pairs.len() as u64);
-            }
-        }
+        self.merge_rounds(&mut nodes, geometric, schedule, control, |pairs, map| {
+            let of = partition.of.par_iter_mut().filter(|c| **c != GONE);
+            of.for_each(|c| *c = map[*c as usize]);
+            let before = map.len();
+            rounds.push(PairwiseRound::merging(before, before - pairs.len()));
+        })?;
         if rounds.is_empty() && dropped > 0 {
             rounds.push(PairwiseRound::merging(nodes.len(), nodes.len()));
         }
@@ -152,6 +131,29 @@ impl Pairwise {
         let mut outcome = step.finish(scene, ordered, rounds);
         outcome.clamped_opacities = clamped;
         Ok(outcome)
+    }
+
+    /// Merge the cheapest pairs of neighbours in rounds, down to each count of `schedule`. After a round `on_pairs`
+    /// gets its pairs and the new index of every node that there was; two nodes that merged share one.
+    pub(super) fn merge_rounds(
+        &self,
+        nodes: &mut Nodes,
+        geometric: f32,
+        schedule: &[usize],
+        control: &Control,
+        mut on_pairs: impl FnMut(&[Pair], &[u32]),
+    ) -> Result<()> {
+        for &target in schedule {
+            while nodes.len() > target {
+                let lists = candidates(nodes, self.neighbors, geometric, control)?;
+                let pairs = matched(&lists, self.neighbors, nodes.len() - target);
+                drop(lists);
+                let map = merge(nodes, &pairs);
+                on_pairs(&pairs, &map);
+                control.advance(pairs.len() as u64);
+            }
+        }
+        Ok(())
     }
 
     /// Merges runs of Morton order down to `morton_premerge_ratio` times the budget. Each time the lattice lies
@@ -313,8 +315,8 @@ impl RunMerging<'_> {
     }
 }
 
-/// Merges the pairs and puts the nodes that are left in Morton order. Returns where each node went.
-pub(super) fn merge(nodes: &mut Nodes, pairs: &[Pair]) -> Vec<u32> {
+/// Merge the pairs and put the remaining nodes in Morton order. Return the new index of every node.
+fn merge(nodes: &mut Nodes, pairs: &[Pair]) -> Vec<u32> {
     let width = nodes.width;
     let mut into = vec![GONE; nodes.len()];
     for &Pair { a, b, .. } in pairs {

@@ -3,42 +3,42 @@
 use rayon::prelude::*;
 
 use super::moments::{Merged, optical_mass, sigmoid};
-use super::residual::{Texture, color};
+use super::residual::color;
 use super::trim::best;
 use super::{GONE, GroupKernels, Outcome, Step};
+use crate::constants::constants;
 use crate::scene::{Ordered, SceneRef};
 use crate::{Control, Error, Result, Splats};
 
-/// Defaults are the paper's (`tab:s_config`) but `support` and `texture.members`, which it does not state.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Paper {
-    /// Below this α a Gaussian is dropped.
-    pub min_opacity: f64,
-    /// Edge of the colour bins, which part [0, 1].
-    pub color_bin: f64,
-    /// Largest affine energy of a merged group, in-sample as E_j of eq. `frequency`.
-    pub max_energy: f64,
-    /// Least share of the members' footprint that the merged one covers.
-    pub min_coverage: f64,
-    /// Where a footprint ends, in standard deviations: see [`super::coverage`].
-    pub support: f64,
-    pub texture: Texture,
-    /// λ_h of π.
-    pub protection: f64,
+constants! {
+    /// Defaults are the paper's (`tab:s_config`) but `support` and `flag_members`, which it does not state.
+    pub struct Paper {
+        /// Below this α a Gaussian is dropped.
+        pub min_opacity: f64 = 0.01,
+        /// Edge of the colour bins, which part [0, 1].
+        pub color_bin: f64 = 0.25,
+        /// Largest affine energy of a merged group, in-sample as E_j of eq. `frequency`.
+        pub max_energy: f64 = 0.01,
+        /// Least share of the members' footprint that the merged one covers.
+        pub min_coverage: f64 = 0.6,
+        /// Where a footprint ends, in standard deviations: see [`super::coverage`].
+        pub support: f64 = 3.0,
+        /// ε_h: a cell of higher affine residual is protected.
+        pub flag_threshold: f64 = 0.01,
+        /// A cell with fewer members borrows those of its face neighbours for the fit; two for each of the four affine
+        /// coefficients.
+        pub flag_members: usize = 8,
+        /// λ_h of π.
+        pub protection: f64 = 10.0,
+    }
 }
 
-impl Default for Paper {
-    fn default() -> Self {
-        Self {
-            min_opacity: 0.01,
-            color_bin: 0.25,
-            max_energy: 0.01,
-            min_coverage: 0.6,
-            support: 3.0,
-            texture: Texture::default(),
-            protection: 10.0,
-        }
-    }
+/// Counts to reach, and about how many cells each round divides the scene into: one for every Gaussian of the final
+/// budget.
+#[derive(Debug, Clone, Copy)]
+pub struct PaperPlan<'a> {
+    pub schedule: &'a [usize],
+    pub cells: usize,
 }
 
 /// What one round did, in rows unless said otherwise.
@@ -77,15 +77,13 @@ struct Candidate {
 }
 
 impl Paper {
-    /// Rounds down to each count of `schedule`, over about `cells` cells each: one for every Gaussian of the
-    /// final budget. Without `flags` they are computed first, on the raw scene over such cells.
+    /// Run the rounds of a plan. Without `flags` they are computed first, on the raw scene over its cells.
     pub fn run(
         &self,
         scene: &SceneRef,
         ordered: &Ordered,
         flags: Option<&[bool]>,
-        cells: usize,
-        schedule: &[usize],
+        plan: PaperPlan,
         kernels: &dyn GroupKernels,
         control: &Control,
     ) -> Result<Outcome<PaperRound>> {
@@ -99,15 +97,15 @@ impl Paper {
                     flags.len(),
                 ));
             }
-            None => super::flags(&step.splats, cells, self.texture, kernels, control)?,
+            None => super::flags(&step.splats, plan.cells, self, kernels, control)?,
         };
         let mut rounds = Vec::new();
         let shed = |budget: usize| ordered.rows.len().saturating_sub(budget) as u64;
-        control.begin(shed(schedule.last().copied().unwrap_or(usize::MAX)));
-        for &budget in schedule {
+        control.begin(shed(plan.schedule.last().copied().unwrap_or(usize::MAX)));
+        for &budget in plan.schedule {
             let target = Target {
                 budget,
-                cells,
+                cells: plan.cells,
                 grid: ordered.grid,
             };
             let (next, report) = self.round(&step.splats, &step.flags, target, kernels, control)?;

@@ -1,6 +1,6 @@
 //! Protection flags: where an affine function of position cannot predict colour.
 
-use super::GroupKernels;
+use super::{GroupKernels, Paper};
 use crate::{Control, Result, Splats};
 
 /// Band-0 spherical harmonic: colour = 0.5 + SH_C0·sh0.
@@ -11,30 +11,11 @@ pub fn color(splats: &Splats, i: usize) -> [f64; 3] {
     splats.sh_of(i)[0].map(|v| (0.5 + SH_C0 * f64::from(v)).clamp(0.0, 1.0))
 }
 
-/// Which cells are textured.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Texture {
-    /// ε_h: a cell of higher affine residual is protected.
-    pub threshold: f64,
-    /// A cell with fewer members borrows those of its face neighbours for the fit.
-    pub members: usize,
-}
-
-impl Default for Texture {
-    /// ε_h is the paper's; two members for each of the four affine coefficients.
-    fn default() -> Self {
-        Self {
-            threshold: 0.01,
-            members: 8,
-        }
-    }
-}
-
 /// p_i = 1[E_c(i) > ε_h] (eq. `frequency`), over about `cells` cells.
 pub fn flags(
     splats: &Splats,
     cells: usize,
-    texture: Texture,
+    constants: &Paper,
     kernels: &dyn GroupKernels,
     control: &Control,
 ) -> Result<Vec<bool>> {
@@ -43,14 +24,14 @@ pub fn flags(
     let group = |cell: usize, rows: &mut Vec<u32>| {
         let own = grid.members_of(cell);
         rows.extend_from_slice(own);
-        if own.len() < texture.members {
+        if own.len() < constants.flag_members {
             rows.extend(grid.face_neighbors(cell).flat_map(|c| grid.members_of(c)));
         }
         own.len()
     };
     let energies = kernels.energies(splats, grid.len(), &group, control)?;
     let mut out = vec![false; all.len()];
-    for cell in (0..grid.len()).filter(|&c| energies[c] > texture.threshold) {
+    for cell in (0..grid.len()).filter(|&c| energies[c] > constants.flag_threshold) {
         grid.members_of(cell)
             .iter()
             .for_each(|&i| out[i as usize] = true);

@@ -9,9 +9,8 @@
 use super::clusters::{Pair, Partition};
 use super::importance::Importance;
 use super::leaves::{Leaves, floor, typical_size};
-use super::matching::{candidates, matched};
 use super::morton_tree::{cut, merge_costs};
-use super::pairwise::{PairwiseRound, merge};
+use super::pairwise::PairwiseRound;
 use super::rows::{Rows, Shuffled};
 use super::{GONE, Outcome, Pairwise, Visibility};
 use crate::scene::{Ordered, SceneRef};
@@ -131,30 +130,27 @@ impl Tile<'_> {
         for (&row, &run) in kept.iter().zip(&at) {
             run_of[row as usize] = run;
         }
-        // The loop of `Pairwise::run`, which keeps a partition where this keeps names and merges: change both.
+        // The run that each node began with; a merged node keeps that of the node it was merged into.
         let mut names: Vec<u32> = (0..runs as u32).collect();
         let mut merges = Vec::new();
-        for &target in schedule {
-            while nodes.len() > target {
-                let before = nodes.len();
-                let lists = candidates(&nodes, self.policy.neighbors, self.geometric(), control)?;
-                let pairs = matched(&lists, self.policy.neighbors, before - target);
-                drop(lists);
-                merges.extend(pairs.iter().map(|p| Pair {
-                    a: names[p.a as usize],
-                    b: names[p.b as usize],
-                    cost: p.cost,
-                }));
-                let survives = left(before, &pairs);
-                let map = merge(&mut nodes, &pairs);
-                let mut next = vec![0; nodes.len()];
-                for i in (0..before).filter(|&i| survives[i]) {
-                    next[map[i] as usize] = names[i];
+        let geometric = self.geometric();
+        self.policy
+            .merge_rounds(&mut nodes, geometric, schedule, control, |pairs, map| {
+                let mut next = vec![0; map.len() - pairs.len()];
+                for &Pair { a, b, cost } in pairs {
+                    let (a, b) = (a as usize, b as usize);
+                    merges.push(Pair {
+                        a: names[a],
+                        b: names[b],
+                        cost,
+                    });
+                    names[b] = names[a];
+                }
+                for (&name, &to) in names.iter().zip(map) {
+                    next[to as usize] = name;
                 }
                 names = next;
-                control.advance(pairs.len() as u64);
-            }
-        }
+            })?;
         Ok(TilePlan {
             run_of,
             runs,
@@ -218,11 +214,4 @@ impl Tile<'_> {
     fn geometric(&self) -> f32 {
         self.policy.geometric(self.visibility)
     }
-}
-
-/// The nodes that no pair takes away.
-fn left(count: usize, pairs: &[Pair]) -> Vec<bool> {
-    let mut left = vec![true; count];
-    pairs.iter().for_each(|p| left[p.b as usize] = false);
-    left
 }

@@ -8,6 +8,6 @@ mod voxels;
 
 pub use bounds::RobustBounds;
 pub use knn::{Neighbor, Tree};
-pub use morton::{BITS, code, codes, order, unit};
+pub use morton::{BITS, code, codes, codes_in_box, order, unit};
 pub use rays::Steps;
 pub use voxels::{Cells, OCTAVES, first_apart, octave_counts, search_size};

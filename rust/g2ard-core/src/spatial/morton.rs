@@ -62,6 +62,27 @@ pub fn codes(points: &[[f64; 3]], bounds: &RobustBounds) -> Vec<u64> {
     points.par_iter().map(|&p| code(p, bounds)).collect()
 }
 
+/// The code of every point on a lattice of 2¹⁶ cells a side between the 1st and 99th percentile of each axis, which
+/// fits a flat scene closer than the cube of [`codes`]; points that are not finite set no bounds.
+pub fn codes_in_box(points: &[[f32; 3]]) -> Vec<u64> {
+    const LAST: f32 = 65_535.0;
+    let ranges = [0, 1, 2].map(|axis| {
+        let finite = points.iter().map(|p| p[axis]).filter(|v| v.is_finite());
+        let mut values: Vec<f32> = finite.collect();
+        if values.is_empty() {
+            return (0.0, 1.0);
+        }
+        values.sort_unstable_by(f32::total_cmp);
+        let low = values[values.len() / 100];
+        let high = values[values.len() - 1 - values.len() / 100];
+        (low, LAST / (high - low).max(f32::MIN_POSITIVE))
+    });
+    let cell = |p: &[f32; 3]| {
+        [0, 1, 2].map(|axis| ((p[axis] - ranges[axis].0) * ranges[axis].1).clamp(0.0, LAST) as u64)
+    };
+    points.par_iter().map(|p| encode(cell(p))).collect()
+}
+
 /// The rows in the order of their codes, ties by row.
 pub fn order(codes: &[u64]) -> Vec<u32> {
     let mut keyed: Vec<(u64, u32)> = codes

@@ -1,24 +1,26 @@
 //! L_anchor and L_shape (`eq:anchor`, `eq:shape`) and their gradients, sixteen Gaussians at a time.
 
 use super::store::ParameterView;
+use crate::constants::constants;
 use crate::raster::params::Source;
 use crate::raster::project::{RowGradients, quaternion_gradient, rotation, unit_quaternion};
 use crate::raster::simd::{LANES, LN_2, Lanes, Lanes16, Mask};
 use crate::{Error, Result};
 
-/// Weights of the two terms.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Regularizers {
-    /// λ_a of (1/N) Σ log(1 + [D² − 1]₊).
-    pub anchor: f32,
-    /// λ_s of (1/N) Σ max(0, −log(r_eff − 1 + ε)) + β[log s⊥ − log s̄⊥]₊.
-    pub shape: f32,
-    /// Whether L_shape has its first term.
-    pub effective_rank: bool,
-    /// β.
-    pub thickness: f32,
-    /// ε.
-    pub rank_offset: f32,
+constants! {
+    /// Weights of the two terms.
+    pub struct Regularizers {
+        /// λ_a of (1/N) Σ log(1 + [D² − 1]₊).
+        pub anchor: f32 = 0.0,
+        /// λ_s of (1/N) Σ max(0, −log(r_eff − 1 + ε)) + β[log s⊥ − log s̄⊥]₊.
+        pub shape: f32 = 0.0,
+        /// Whether L_shape has its first term.
+        pub effective_rank: bool = false,
+        /// β.
+        pub thickness: f32 = 1.0,
+        /// ε.
+        pub rank_offset: f32 = 1e-6,
+    }
 }
 
 /// Rows of a block: 3 of the mean, 9 of the frame, 1/r∥², 1/r⊥².

@@ -45,7 +45,7 @@ pub struct Rates {
 #[derive(Debug, Clone, Copy)]
 pub struct StepInput<'a> {
     pub camera: &'a Camera,
-    pub settings: &'a Settings,
+    pub settings: Settings,
     pub background: [f32; 3],
     /// height × width × 3.
     pub target: &'a [f32],
@@ -245,7 +245,7 @@ impl Trainer {
         self.rasterizer.forward_from(
             parameters,
             camera,
-            input.settings,
+            &input.settings,
             input.background,
             &mut image,
         );

@@ -5,6 +5,7 @@ use crate::raster::disjoint::DisjointSlice;
 use crate::raster::memory::bytes;
 use crate::raster::params::Source;
 use crate::raster::simd::{LANES, Lanes, Lanes16};
+use crate::spatial::{codes_in_box, order};
 use crate::{Error, Result};
 
 /// Attributes before the SH: 3 means, 4 quats, 3 log-scales, 1 logit.
@@ -68,7 +69,7 @@ impl Store {
             units: vec![Lanes16([1.0; LANES]); blocks],
             steps: vec![0; blocks * LANES],
             most_steps: 0,
-            order: morton_order(params.means),
+            order: order(&codes_in_box(params.means.as_chunks().0)),
         };
         for row in 0..rows {
             let from = store.order[row] as usize;
@@ -352,40 +353,4 @@ impl Source for ParameterView<'_> {
     fn sh<F: Lanes>(&self, group: usize, k: usize, c: usize) -> F {
         self.get(group, SH + 3 * k + c)
     }
-}
-
-/// Rows by the interleaved bits of their means, 16 a side, over the 1st to 99th percentile of each axis (one stray
-/// floater must not put all the rest into one cell); ties by row.
-fn morton_order(means: &[f32]) -> Vec<u32> {
-    let rows = means.len() / 3;
-    let ranges = [0, 1, 2].map(|axis| {
-        let mut values: Vec<f32> = means
-            .iter()
-            .skip(axis)
-            .step_by(3)
-            .copied()
-            .filter(|v| v.is_finite())
-            .collect();
-        if values.is_empty() {
-            return (0.0, 1.0);
-        }
-        values.sort_unstable_by(f32::total_cmp);
-        let low = values[values.len() / 100];
-        let high = values[values.len() - 1 - values.len() / 100];
-        (low, 65_535.0 / (high - low).max(f32::MIN_POSITIVE))
-    });
-    let code = |row: u32| {
-        let mut code = 0u64;
-        for axis in 0..3 {
-            let (low, scale) = ranges[axis];
-            let cell = ((means[3 * row as usize + axis] - low) * scale).clamp(0.0, 65_535.0) as u64;
-            for bit in 0..16 {
-                code |= (cell >> bit & 1) << (3 * bit + axis);
-            }
-        }
-        code
-    };
-    let mut order: Vec<u32> = (0..rows as u32).collect();
-    order.sort_by_cached_key(|row| (code(*row), *row));
-    order
 }

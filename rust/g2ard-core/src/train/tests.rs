@@ -9,7 +9,7 @@ fn steps_give_the_same_bits_on_any_number_of_threads_and_learn() {
         let mut trainer = Trainer::new(&scene.params(), None, Isa::detect()).unwrap();
         let input = StepInput {
             camera: &camera,
-            settings: &Settings::default(),
+            settings: Settings::default(),
             background: [0.0; 3],
             target: &target,
             mask: None,
