@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,7 +88,7 @@ def distill(
 
     config = config or DistillConfig()
     many = config.recover.schedule.round_steps > 0
-    kept, fold = config.simplify.retention or 0.75, config.simplify.fold
+    kept, fold = config.simplify.retention_of("paper"), config.simplify.fold
     counts = round_counts(len(prior), budget, kept, fold) if many else [budget]
     rounds = _Rounds(prior, budget, targets, config, len(counts), weights, validation, work, progress, watch)
     for number, count in enumerate(counts, start=1):
@@ -194,8 +195,12 @@ class _Rounds:
         self.log: list[dict[str, Any]] = []
         self.seconds: dict[str, float] = {"select": 0.0, "simplify": 0.0, "recover": 0.0}
         self.weights = checked_weights(weights, len(targets.cameras))
-        self.key = _fingerprint(prior, budget, targets, config, self.weights, validation)
         self._select(prior)
+
+    @cached_property
+    def key(self) -> str:
+        """What saved stages must be of; needed only where there is a work folder."""
+        return _fingerprint(self.prior, self.budget, self.targets, self.config, self.weights, self.validation)
 
     def advance(self, number: int, count: int, *, final: bool) -> None:
         """One round: simplify to `count`, recover; the final one recovers for the final horizon as well."""

@@ -139,7 +139,7 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
 
 def _images(splats: Splats, cameras: Cameras) -> list[NDArray[Any]]:
     renderer = Renderer(splats)
-    return [np.clip(renderer.image(camera), 0, 1) for camera in cameras]
+    return [renderer.clipped(camera) for camera in cameras]
 
 
 def quality(renders: list[Any], splats: Splats, cameras: Cameras) -> Quality:

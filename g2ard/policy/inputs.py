@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from g2ard.io import Note, ViewSet
-    from g2ard.rendering.renderer import RasterSettings
+    from g2ard.rendering.renderer import RasterSettings, Renderer
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
     from g2ard.scene.targets import Targets
@@ -202,6 +202,7 @@ def make_targets(
     lazy: bool = False,
     photos: bool = False,
     settings: RasterSettings | None = None,
+    renderer: Renderer | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Targets:
@@ -212,7 +213,13 @@ def make_targets(
 
     if teacher is not None and not photos:
         return TeacherRenders(
-            teacher, cameras, background=background, settings=settings, lazy=lazy, progress=progress
+            teacher,
+            cameras,
+            background=background,
+            settings=settings,
+            lazy=lazy,
+            renderer=renderer,
+            progress=progress,
         )
     exposures = find_exposures(cameras)
     if exposures:
@@ -226,6 +233,7 @@ def make_targets(
         exposures=exposures,
         settings=settings,
         lazy=lazy,
+        renderer=renderer,
         progress=progress,
     )
 

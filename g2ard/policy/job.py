@@ -16,6 +16,7 @@ from g2ard.scene.targets import kinds_of
 if TYPE_CHECKING:
     from g2ard.pipeline import DistillConfig, Distilled
     from g2ard.policy.fit import Aim
+    from g2ard.rendering.renderer import Renderer
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.targets import Targets
     from g2ard.stages.recover.presets import PriorMeasures
@@ -91,6 +92,15 @@ class DistillJob:
     def render_targets(self) -> None:
         """Have all targets that are rendered beforehand; `run` does so where it has not been done."""
         _ = self.targets, self.held_out, self.apart
+        vars(self).pop("_renderer", None)  # its buffers are larger than the scene
+
+    @cached_property
+    def _renderer(self) -> Renderer | None:
+        """The teacher's, shared by all targets."""
+        from g2ard.rendering.renderer import Renderer
+
+        background = self.config.recover.background
+        return None if self.teacher is None else Renderer(self.teacher, background=background)
 
     def tried(self, cameras: Cameras) -> Targets:
         """Targets of a few views, none of them kept."""
@@ -103,6 +113,7 @@ class DistillJob:
             self.config.recover.background,
             lazy=lazy,
             photos=self.photos_over_renders,
+            renderer=self._renderer,
             progress=self.progress,
             say=self.say,
         )

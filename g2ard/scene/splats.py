@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -135,7 +136,14 @@ class Splats:
         return 4 * len(self) * (14 + 3 * self.shN.shape[1])
 
     def fingerprint(self) -> str:
-        """A hash of every array: the same scene, the same text."""
+        """A hash of every array: the same scene, the same text.
+
+        It is computed once; arrays that are changed in place later do not change it.
+        """
+        return self._digest
+
+    @cached_property
+    def _digest(self) -> str:
         digest = hashlib.sha256()
         for name in ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset"):
             digest.update(np.ascontiguousarray(getattr(self, name)).tobytes())

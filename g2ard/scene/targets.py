@@ -80,7 +80,11 @@ class Subset:
     def __init__(self, targets: Targets, rows: ArrayLike) -> None:
         self._targets, self._rows = targets, np.asarray(rows, np.int64)
         self.cameras = targets.cameras.take(self._rows)
-        self.source = getattr(targets, "source", type(targets).__name__)
+
+    @property
+    def source(self) -> str:
+        """As that of all of them."""
+        return str(getattr(self._targets, "source", type(self._targets).__name__))
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         return self._targets[int(self._rows[view])]
@@ -215,6 +219,7 @@ class TeacherRenders(_Cached):
         settings: the renderer's conventions; None means gsplat's.
         limit: bytes of renders kept in memory; what is over it is rendered again when asked for.
         lazy: render a view when it is first asked for, not all at once.
+        renderer: of the same teacher, background and settings, shared by several targets; None makes one.
         progress: told of views rendered.
 
     Raises:
@@ -230,25 +235,29 @@ class TeacherRenders(_Cached):
         settings: RasterSettings | None = None,
         limit: int = CACHE_BYTES,
         lazy: bool = False,
+        renderer: Renderer | None = None,
         progress: Progress = silent,
     ) -> None:
         super().__init__(cameras, limit)
         self._teacher = teacher
         self._background, self._settings = background, settings
-        self.source = f"teacher {teacher.fingerprint()} {background}"
-        if settings is not None:
-            self.source += f" {settings}"
-        self._renderer: Renderer | None = None
+        self._renderer = renderer
         if not lazy:
             self.fill(progress, "teacher")
             self._renderer = None  # its buffers are larger than the scene
+
+    @property
+    def source(self) -> str:
+        """What the renders are made of; it takes a hash of the teacher."""
+        conventions = "" if self._settings is None else f" {self._settings}"
+        return f"teacher {self._teacher.fingerprint()} {self._background}{conventions}"
 
     def _make(self, view: int) -> NDArray[np.float32]:
         if self._renderer is None:
             from g2ard.rendering.renderer import Renderer
 
             self._renderer = Renderer(self._teacher, background=self._background, settings=self._settings)
-        return np.clip(self._renderer.image(self.cameras[view]), 0, 1)
+        return self._renderer.clipped(self.cameras[view])
 
     def against(self, view: int) -> str:
         """See `against_of`."""
@@ -270,6 +279,7 @@ class PhotosOrRenders:
         settings: the renderer's conventions; None means gsplat's.
         limit: bytes kept in memory, of each kind.
         lazy: render when first asked for.
+        renderer: see `TeacherRenders`.
         progress: told of every render.
 
     Raises:
@@ -286,6 +296,7 @@ class PhotosOrRenders:
         settings: RasterSettings | None = None,
         limit: int = CACHE_BYTES,
         lazy: bool = False,
+        renderer: Renderer | None = None,
         progress: Progress = silent,
     ) -> None:
         self.cameras = cameras
@@ -298,13 +309,19 @@ class PhotosOrRenders:
             settings=settings,
             limit=limit,
             lazy=lazy,
+            renderer=renderer,
             progress=progress,
         )
         rows = np.where(pictured, np.cumsum(pictured), np.cumsum(~pictured)) - 1
         self._places: list[tuple[Photos | TeacherRenders, int]] = [
             (photos if photo else renders, int(row)) for photo, row in zip(pictured, rows, strict=True)
         ]
-        self.source = f"{photos.source} | {renders.source}"
+        self._parts = photos, renders
+
+    @property
+    def source(self) -> str:
+        """What photos and renders are made of."""
+        return " | ".join(part.source for part in self._parts)
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         targets, row = self._places[view]

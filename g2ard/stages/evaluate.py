@@ -117,7 +117,7 @@ def evaluate(
     renderer = Renderer(splats, background=background, settings=settings)
     scores = []
     for view, name in enumerate(cameras.names):
-        image, target = np.clip(renderer.image(cameras[view]), 0, 1), targets[view]
+        image, target = renderer.clipped(cameras[view]), targets[view]
         if eight_bit:
             image, target = as_saved(image), as_saved(target)
         perceived = {net: model(image, target) for net, model in (lpips or {}).items()}

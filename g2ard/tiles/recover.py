@@ -185,7 +185,7 @@ def _errors(
     total, count, renderer = 0.0, 0, Renderer(scene, background=background)
     for view, camera in enumerate(targets.cameras):
         mask = targets.mask(view)
-        lost = np.clip(renderer.image(camera), 0, 1)[mask] - targets[view][mask]
+        lost = renderer.clipped(camera)[mask] - targets[view][mask]
         total += float(np.sum(np.square(lost, dtype=np.float64)))
         count += lost.size
     return total, count

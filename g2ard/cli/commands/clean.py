@@ -94,7 +94,7 @@ def _paint(path: Path, splats: Splats, found: Cleaning, cameras: Cameras, overwr
     scenes = [splats, painted(splats, colors), splats.take(found.keep)]
     chosen = np.unique(np.linspace(0, len(cameras) - 1, min(3, len(cameras))).astype(int))
     renderers = [Renderer(scene) for scene in scenes]
-    rows = [[np.clip(r.image(cameras[int(view)]), 0, 1) for r in renderers] for view in chosen]
+    rows = [[r.clipped(cameras[int(view)]) for r in renderers] for view in chosen]
     legend = ", ".join(f"{name} {word}" for name, word in zip(KINDS, _WORDS, strict=True))
     labels = [f"{plural(len(splats), 'Gaussian')}", legend, f"{len(scenes[2]):,} stay"]
     write_png(path, contact_sheet(rows, labels), overwrite=overwrite)

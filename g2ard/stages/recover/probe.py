@@ -131,5 +131,5 @@ class Probe:
         return self._latest
 
     def _score(self, renderer: Renderer, view: int) -> float:
-        image = renderer.image(self._targets.cameras[view])
-        return psnr(np.clip(image, 0, 1), self._targets[view], mask_of(self._targets, view))
+        image = renderer.clipped(self._targets.cameras[view])
+        return psnr(image, self._targets[view], mask_of(self._targets, view))

@@ -81,7 +81,11 @@ impl Rasterizer {
                                 values[3 * i + c] = channel[i] + light[i] * background[c];
                             }
                         }
-                        rgb[3 * x..3 * (x + count)].copy_from_slice(&values[..3 * count]);
+                        let place = &mut rgb[3 * x..];
+                        match place.first_chunk_mut() {
+                            Some(four) if count == 4 => *four = values, // no call of memcpy
+                            _ => place[..3 * count].copy_from_slice(&values[..3 * count]),
+                        }
                     });
                     for (plane, rows) in [(depth, &pixels.depth), (median, &pixels.median)] {
                         let Some(plane) = plane else { continue };
