@@ -2,7 +2,7 @@
 
 use g2ard_core::random::Lcg;
 use g2ard_core::scene::{Means, Ordered, SceneRef};
-use g2ard_core::simplify::{Outcome, Paper, PaperRound};
+use g2ard_core::simplify::{Outcome, Paper, PaperPlan, PaperRound};
 use g2ard_core::{Backend, Control, Cpu};
 use g2ard_gpu::runtime::{Error, Gpu, Options, list};
 use g2ard_gpu::{Choice, Device};
@@ -55,14 +55,16 @@ fn simplify(scene: &Scene, backend: &dyn Backend) -> Outcome<PaperRound> {
         sh_rest: &[],
         rest: 0,
     };
-    let schedule = [3 * count / 4, count / 2, count / 5];
+    let plan = PaperPlan {
+        schedule: &[3 * count / 4, count / 2, count / 5],
+        cells: count / 5,
+    };
     Paper::default()
         .run(
             &borrowed,
             &Ordered::new(&borrowed).unwrap(),
             None,
-            count / 5,
-            &schedule,
+            plan,
             &*backend.group_kernels(),
             &Control::default(),
         )
