@@ -1,1 +1,1 @@
-"""Configuration: constants by name, names to choose from, presets of published methods."""
+"""Configuration: settings by dotted path, allowed names, presets of published methods."""

@@ -1,11 +1,11 @@
-"""Fields of nested config dataclasses by dotted path, as `--set`, files, presets and reports name them.
+"""Fields of nested config dataclasses by dotted path, as used by `--set`, config files, presets and reports.
 
-A config is a frozen dataclass whose fields are values or other configs. A stage's config gives its paths
-their root, `RecoverConfig` → `recover`; a config that only joins others, such as `DistillConfig`, adds none.
-A new field has its path at once: `recover.schedule.rates.means`. Any tail of a path names it where no other
-path ends alike, `rates.means`; of several the one nearest the root counts: `steps` is `recover.steps`.
+A config is a frozen dataclass whose fields are values or other configs. A stage's config roots its paths:
+`RecoverConfig` → `recover`. A config that only joins others, such as `DistillConfig`, adds no prefix.
+Any unambiguous tail names a path: `rates.means` is `recover.schedule.rates.means`. If several paths end
+alike, the one nearest the root wins: `steps` is `recover.steps`.
 
-A config with a classmethod `named` can be set as a whole by a name, `recover.schedule=fast`. Fields marked
+A config with a classmethod `named` can be set as a whole by name: `recover.schedule=fast`. Fields marked
 `setting=False` are computed and cannot be set.
 """
 
@@ -25,10 +25,10 @@ _UNIONS = (Union, types.UnionType)
 
 
 def parsed(texts: Iterable[str], config: Any) -> dict[str, Any]:
-    """Read `PATH=VALUE` for a config; of a path given twice the last counts.
+    """Parse `PATH=VALUE` texts for a config; the last value of a repeated path wins.
 
-    Values are checked against the field's type: numbers (`1e-3`, `inf`), `true` or `false`, words, `0.36,0.1`
-    for tuples, `1,2;3,4` for tuples of tuples, and `none` where the field may be None.
+    Values are checked against the field's type: numbers (`1e-3`, `inf`), `true` or `false`, names, `0.36,0.1`
+    for tuples, `1,2;3,4` for tuples of tuples, and `none` if the field may be None.
 
     Returns:
         Full path → value, for `changed`.
@@ -45,14 +45,14 @@ def parsed(texts: Iterable[str], config: Any) -> dict[str, Any]:
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals:
-            raise InputError(f"expected PATH=VALUE, not {text!r}")
+            raise InputError(f"expected PATH=VALUE, got {text!r}")
         path = _full(name.strip(), known)
         values[path] = _read(path, value.strip(), known[path].kind)
     return values
 
 
 def full_paths(values: Mapping[str, Any], config: Any) -> dict[str, Any]:
-    """Return values by full path.
+    """Expand the keys of `values` to full paths.
 
     Raises:
         InputError: an unknown or ambiguous path.
@@ -66,9 +66,9 @@ def full_paths(values: Mapping[str, Any], config: Any) -> dict[str, Any]:
 
 
 def changed(config: Config, values: Mapping[str, Any]) -> Config:
-    """Return the config with values replaced, those of configs within it included.
+    """Return the config with values replaced, including those of nested configs.
 
-    A config that is set as a whole, by name or by itself, is replaced first and its fields after it.
+    A nested config given as a whole (by name or as an object) is replaced before its fields.
 
     Args:
         config: a dataclass.
@@ -86,7 +86,7 @@ def changed(config: Config, values: Mapping[str, Any]) -> Config:
 
 
 def listed(config: Any) -> dict[str, Any]:
-    """Return every value of a config by full path, as JSON can hold it: infinite numbers are "inf".
+    """Return every value of a config by full path in JSON form, with infinity as "inf".
 
     >>> from g2ard.stages.recover.config import RecoverConfig
     >>> listed(RecoverConfig())["recover.regularizers.period"]
@@ -99,7 +99,7 @@ def listed(config: Any) -> dict[str, Any]:
 
 
 def values_of(config: Any) -> dict[str, Any]:
-    """Return every value of a config by full path; `changed` gives another config of its class the same.
+    """Return every value of a config by full path, as `changed` accepts it.
 
     >>> from g2ard.stages.recover.config import RecoverConfig
     >>> config = RecoverConfig(steps=9)
@@ -162,7 +162,7 @@ def _changed(config: Any, root: str, values: Mapping[str, Any]) -> Any:
 
 
 def _whole(held: Any, value: Any, path: str) -> Any:
-    """Return the config that a value stands for: one by its name, or itself."""
+    """Return the config that `value` names, or `value` itself if it is a config."""
     if not isinstance(value, str):
         return value
     try:
@@ -172,7 +172,7 @@ def _whole(held: Any, value: Any, path: str) -> Any:
 
 
 def _full(name: str, known: Mapping[str, Any]) -> str:
-    """Return the full path of a path or of its tail."""
+    """Expand a path or an unambiguous tail of one."""
     if name in known:
         return name
     same = [path for path in known if path.endswith(f".{name}")]
@@ -181,14 +181,14 @@ def _full(name: str, known: Mapping[str, Any]) -> str:
     if len(same) == 1:
         return same[0]
     if same:
-        raise InputError(f"{name!r} could be {' or '.join(same)}")
+        raise InputError(f"ambiguous setting {name!r}; use {' or '.join(same)}")
     prefix, _, last = name.rpartition(".")
     close = get_close_matches(last, sorted({path.rpartition(".")[2] for path in known}), 3, 0.6)
     near = [path for word in close for path in known if path.endswith(f".{word}")]
     if near:
         raise InputError(f"unknown setting {name!r}; did you mean {' or '.join(near)}?")
     within = [path for path in known if path.startswith(f"{prefix}.")]
-    raise InputError(f"unknown setting {name!r}; there are {', '.join(within or known)}")
+    raise InputError(f"unknown setting {name!r}; expected one of {', '.join(within or known)}")
 
 
 def _read(path: str, text: str, kind: Any) -> Any:
@@ -197,11 +197,11 @@ def _read(path: str, text: str, kind: Any) -> Any:
             return _as(option, text)
         except ValueError:
             continue
-    raise InputError(f"expected {_described(kind)}, not {text!r}", parameter=path)
+    raise InputError(f"expected {_described(kind)}, got {text!r}", parameter=path)
 
 
 def _as(kind: Any, text: str) -> Any:
-    """Return `text` as one type; raise ValueError if it is not of it."""
+    """Parse `text` as one type, or raise ValueError."""
     if get_origin(kind) is Literal and text in get_args(kind):
         return text
     if get_origin(kind) is tuple:
@@ -228,10 +228,6 @@ def _described(kind: Any) -> str:
         return f"one of {', '.join(map(str, get_args(kind)))}"
     if get_origin(kind) is tuple:
         kinds = get_args(kind)
-        return (
-            "numbers with commas between"
-            if kinds[-1] is Ellipsis
-            else f"{len(kinds)} numbers with commas between"
-        )
+        return "comma-separated numbers" if kinds[-1] is Ellipsis else f"{len(kinds)} comma-separated numbers"
     words = {bool: "true or false", int: "a whole number", float: "a number", type(None): "none"}
     return words.get(kind, "text")

@@ -1,4 +1,4 @@
-"""Presets: settings by path that together make a method, and configurations made from them."""
+"""Presets: settings by path that make up a method."""
 
 from __future__ import annotations
 
@@ -32,8 +32,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         for kind in ("paper", "paper-trained", "paper-lift", "paper-noisy")
     },
 }
-"""Name → values by path. `auto` measures the scene to choose its regularisers, `paper` likewise among the
-paper's."""
+"""Preset name → values by path. `auto` and `paper` choose their regularisers by measuring the scene."""
 
 GS_CPR: dict[str, Any] = {
     "register.matcher": "sift",
@@ -42,18 +41,18 @@ GS_CPR: dict[str, Any] = {
     "register.min_inliers": 6,
     "register.fallback": False,
 }
-"""The protocol of GS-CPR for `g2ard register`: one pass of matches and no other way to a pose."""
+"""The protocol of GS-CPR for `g2ard register`: one pass of feature matching, without a fallback."""
 
 
 def configured(config: Config, preset: str = "auto", settings: Mapping[str, Any] | None = None) -> Config:
-    """Return a config with a preset's values, and over them with settings.
+    """Apply a preset to a config, then individual settings.
 
-    A schedule that is set by name is scaled to `recover.steps`. The paper's schedule means SH of degree 3.
+    A schedule given by name is scaled to `recover.steps`. The paper's schedule implies SH degree 3.
 
     Args:
-        config: of a stage, or of several.
-        preset: see `PRESETS`; values that are not of the config are ignored.
-        settings: by path, or by the tail of one.
+        config: config of one stage or of several.
+        preset: a key of `PRESETS`; its values for other configs are ignored.
+        settings: values by path or unambiguous tail.
 
     Raises:
         InputError: an unknown preset or setting, or a value out of its range.
@@ -78,17 +77,18 @@ def configured(config: Config, preset: str = "auto", settings: Mapping[str, Any]
 
 
 def preset(name: str = "paper", config: Any = None) -> Any:
-    """Return a configuration as a preset has it; `dataclasses.replace` changes it further.
+    """Return the configuration of a preset; change it further with `dataclasses.replace`.
 
-    `paper` is the paper (`tab:s_config`, `tab:s_avs`, `tab:s_recovery`): simplification in rounds of 75 %;
-    half of the views, by directional selection, once, from the raw prior; an even draw of them; 8,000 steps
-    after every round and 30,000 at the end, all of them kept; anchors of each round's construction; SH of
-    degree 3; 7,000 steps of adaptation. Where it is silent `docs/decisions.md` says what we read.
+    `paper` follows the paper (`tab:s_config`, `tab:s_avs`, `tab:s_recovery`): simplification in rounds that
+    keep 75 %; half of the views, selected directionally once from the raw prior and drawn uniformly; 8,000
+    steps after every round and 30,000 at the end, without going back; anchors from each round's construction;
+    SH degree 3; 7,000 steps of adaptation. `docs/decisions.md` lists our reading of what the paper leaves
+    open.
 
     Args:
         name: auto, trained, lift, noisy, paper, paper-trained, paper-lift or paper-noisy. `auto` and `paper`
-            have the weights of a trained scene here; `g2ard.distill` measures which the scene needs.
-        config: the config to change, such as `AdaptConfig()`; `DistillConfig()` if None.
+            use the weights of a trained scene here; `g2ard.distill` measures the scene to choose.
+        config: the config to apply it to, such as `AdaptConfig()`; None means `DistillConfig()`.
 
     Raises:
         InputError: an unknown name.

@@ -1,4 +1,4 @@
-"""Levels of detail: one kd-tree over all of them, and what each loses in each of its leaves."""
+"""Levels of detail: one kd-tree over all levels, and the error of each level in each leaf."""
 
 from g2ard.levels.error import leaf_errors
 from g2ard.levels.tree import Cut, Leaf, Node, cut

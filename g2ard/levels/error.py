@@ -1,4 +1,4 @@
-"""What a leaf's coarser levels lose against its finest, by our own rasteriser."""
+"""Error of a leaf's coarser levels against its finest, measured with g2ard's rasteriser."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 _DISTANCE = 200.0
-"""Of the camera, in radii of the leaf's ball: directions differ by a third of a degree over the image."""
+"""Distance of the camera in radii of the leaf: ray directions differ by ⅓° across the image."""
 _MARGIN = 1.05
 _SMALLEST, _LARGEST = 64, 512
-"""Pixels across an image: as many as show the finest level's footprints, four across each, within these."""
+"""Limits of the image size in pixels; within them it shows the finest footprints at four pixels each."""
 _FOOTPRINT = 0.1
-"""Quantile of the longest scales that counts as the finest level's footprint."""
+"""Quantile of the longest scales taken as the finest level's footprint."""
 _TURN = np.radians((40.0, 25.0, 10.0))
-"""Axes are turned by these angles about x, y and z: along bare axes half of the harmonics are zero."""
+"""Rotation of the view axes about x, y and z; along the scene's axes half of the harmonics vanish."""
 
 
 def leaf_errors(leaf: Leaf, levels: Sequence[Level]) -> list[float]:
-    """Of each level Σ‖RGBA − RGBA_f‖² / Σ‖RGBA_f‖² over six views of the leaf's Gaussians alone.
+    """Return Σ‖RGBA − RGBA_f‖² / Σ‖RGBA_f‖² per level over six views of the leaf's Gaussians alone.
 
-    f is the finest level that has any there. Errors never fall from a level to the next coarser, for a viewer
-    ranks what it loads by how much error goes; a level that has none there, and f, have 0.
+    f is the finest level with Gaussians in the leaf. Errors never decrease from a level to the next coarser
+    one, because viewers rank loads by the error removed. f and levels without Gaussians here have error 0.
 
     Args:
-        leaf: of the tree.
-        levels: what it was cut from.
+        leaf: a leaf of the tree.
+        levels: the levels that the tree was cut from.
 
     Returns:
-        As many errors as levels.
+        One error per level.
     """
     there = [level for level, rows in enumerate(leaf.rows) if len(rows)]
     errors = [0.0] * len(levels)
@@ -58,7 +58,7 @@ def leaf_errors(leaf: Leaf, levels: Sequence[Level]) -> list[float]:
 
 
 def _cameras(leaf: Leaf, finest: Splats) -> list[Camera]:
-    """From both ends of three turned axes, the ball about the leaf's box within each image."""
+    """Place cameras at both ends of three rotated axes with the bounding ball in each image."""
     middle = (leaf.low + leaf.high) / 2 + finest.offset
     radius = max(float(np.linalg.norm(leaf.high - leaf.low)) / 2, 1e-3)
     footprint = max(float(np.quantile(finest.scales.max(axis=1), _FOOTPRINT)), 1e-6)
@@ -80,7 +80,7 @@ def _cameras(leaf: Leaf, finest: Splats) -> list[Camera]:
 
 
 def _axes() -> Float:
-    """(3, 3) orthonormal rows, none along an axis of the scene."""
+    """Return (3, 3) orthonormal rows, none along an axis of the scene."""
     turn = np.eye(3)
     for axis, angle in enumerate(_TURN):
         a, b = (axis + 1) % 3, (axis + 2) % 3
@@ -92,7 +92,7 @@ def _axes() -> Float:
 
 
 def _images(splats: Splats, cameras: Sequence[Camera]) -> NDArray[np.float32]:
-    """(6, S, S, 4) colours over black, and alpha."""
+    """Render (6, S, S, 4) colours over black with alpha."""
     from g2ard.rendering.renderer import Renderer
 
     renderer = Renderer(splats)

@@ -1,4 +1,4 @@
-"""One binary kd-tree over all levels of a scene: a viewer loads its leaves, each at a level of its own."""
+"""One binary kd-tree over all levels of a scene; a viewer loads each leaf at a level of its choice."""
 
 from __future__ import annotations
 
@@ -26,18 +26,19 @@ Float = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 _BLOCK = 1 << 20
-"""Rows that are looked at together."""
+"""Rows processed together."""
 
 
 @dataclass(frozen=True)
 class Cut:
-    """When a node is split: it holds more than `most` Gaussians of all levels, or it is wider than `extent`
+    """Rule for splitting a node: it holds more than `most` Gaussians of all levels, or is wider than `extent`
     and holds more than `least`. The defaults are those of PlayCanvas' writer.
 
     Args:
-        most: Gaussians of a leaf; also about what one file holds.
+        most: most Gaussians of a leaf, and roughly of a file.
         extent: longest side of the box of a leaf's means, scene units.
-        least: Gaussians below which a wide node stays whole: sky and floaters would be thousands of leaves.
+        least: a wide node with at most this many Gaussians stays whole; otherwise sky and floaters would
+            become thousands of leaves.
 
     Raises:
         InputError: a value out of range.
@@ -55,11 +56,11 @@ class Cut:
 
 @dataclass(frozen=True, eq=False)
 class Leaf:
-    """A part of space.
+    """A leaf of the tree: a box in space and the rows in it.
 
     Args:
-        low, high: (3,) float64 box about all its Gaussians to one standard deviation, relative to the offset.
-        rows: of each level the rows that lie here, maybe none.
+        low, high: (3,) float64 box around its Gaussians' 1σ ellipsoids, relative to the offset.
+        rows: per level, the rows in this leaf; may be empty.
     """
 
     low: Float
@@ -69,14 +70,14 @@ class Leaf:
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """Two parts of space, and the box of both."""
+    """An inner node: its box and two children."""
 
     low: Float
     high: Float
     children: tuple[Node | Leaf, Node | Leaf]
 
     def leaves(self) -> Iterator[Leaf]:
-        """All below, in the order of the tree."""
+        """Yield all leaves below, in tree order."""
         for child in self.children:
             if isinstance(child, Leaf):
                 yield child
@@ -85,19 +86,19 @@ class Node:
 
 
 def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None = None) -> Node | Leaf:
-    """Cut space at medians of the means of all levels, along the longer side of their box.
+    """Cut space at medians of the means of all levels, along the longest side of their box.
 
     Args:
-        levels: the same scene, the finest first, all of one offset.
+        levels: the same scene at several levels, finest first, with equal offsets.
         rule: when to split; None means `Cut()`.
-        scratch: a folder on whose disk positions and row numbers lie, in files without a name, so that memory
-            holds 4 bytes a row beside the rows of a leaf; None keeps all in memory.
+        scratch: folder for unnamed temporary files of positions and row numbers. Memory then holds 4 bytes
+            per row plus the rows of one leaf. None keeps everything in memory.
 
     Returns:
-        The tree; a leaf alone where nothing is split.
+        The root of the tree, a leaf if nothing is split.
 
     Raises:
-        InputError: no level, an empty one, offsets that differ, or a mean that is not finite.
+        InputError: no levels, an empty level, different offsets, or a mean that is not finite.
 
     >>> fine = Splats.create([[0, 0, 0], [9, 0, 0]], scales=[[1, 1, 2]] * 2)
     >>> tree = cut([fine, fine.take([0])], Cut(most=2))
@@ -105,9 +106,9 @@ def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None =
     ([[1, 0], [1, 1]], [-1.0, -1.0, -2.0], [10.0, 1.0, 2.0])
     """
     if not levels or not all(len(level) for level in levels):
-        raise InputError("expected at least one, and none of them empty", parameter="levels")
+        raise InputError("expected at least one level, none of them empty", parameter="levels")
     if any((level.offset != levels[0].offset).any() for level in levels):
-        raise InputError("their offsets differ", parameter="levels")
+        raise InputError("the levels have different offsets", parameter="levels")
     tree = _Tree(levels, rule or Cut(), scratch)
     rows = tree.room(len(tree.means))
     for at in _blocks(len(rows)):
@@ -120,14 +121,14 @@ def _blocks(count: int) -> Iterator[slice]:
 
 
 def _reach(splats: Splats) -> Float:
-    """(N, 3) half sides of the box about each Gaussian's own: |R|·s."""
+    """Return the (N, 3) half extents of each Gaussian's 1σ box, |R|·s."""
     frames = rotation_matrices(splats.quats)
     return np.einsum("nij,nj->ni", np.abs(frames), splats.scales.astype(np.float64))
 
 
 @dataclass(eq=False)
 class _Tree:
-    """All levels' rows, numbered one level after the other; those of a node are in ascending order."""
+    """Rows of all levels, numbered consecutively; the rows of a node are in ascending order."""
 
     levels: Sequence[Level]
     rule: Cut
@@ -151,14 +152,14 @@ class _Tree:
                 at += len(block)
 
     def room(self, shape: int | tuple[int, int], dtype: type[Any] = np.int64) -> NDArray[Any]:
-        """An array in memory, or of a file that goes with it."""
+        """Allocate an array in memory, or in a temporary file that is removed with it."""
         if self.scratch is None or np.prod(shape) < _BLOCK:
             return np.empty(shape, dtype)
         with TemporaryFile(dir=self.scratch) as file:
             return np.memmap(file, dtype, "w+", shape=shape)
 
     def of(self, rows: Rows, axes: tuple[int, ...]) -> Node | Leaf:
-        """The node of these rows, its parents cut along `axes`, the last one last."""
+        """Build the node of these rows; `axes` are the axes of its ancestors' cuts, outermost first."""
         low, high = self._box(rows)
         sides = high - low
         wide = sides.max() > self.rule.extent and len(rows) > self.rule.least
@@ -178,7 +179,7 @@ class _Tree:
         return low.min(axis=0), high.max(axis=0)
 
     def _halves(self, rows: Rows, axis: int, axes: tuple[int, ...]) -> tuple[Rows, Rows]:
-        """The lower half along `axis`, ties by the last cut's axis, then by those before it, then by row."""
+        """Split rows at the median of `axis`; ties go by earlier cuts' axes, last first, then by row."""
         middle = len(rows) // 2
         values = np.empty(len(rows), self.means.dtype)
         for at in _blocks(len(rows)):

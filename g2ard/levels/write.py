@@ -1,7 +1,7 @@
-"""Writing streamed SOG (PlayCanvas): levels of detail as SOG files that hold the leaves of one tree in a row.
+"""Writer for streamed SOG (PlayCanvas): levels of detail as SOG files of consecutive leaves.
 
-`lod-meta.json`, version 1: a node has a `bound` and two `children`, or, a leaf, `lods`: of each level that
-has Gaussians there the file, the offset of the first of its rows and their count; and `errors` of all levels.
+`lod-meta.json`, version 1: a node has a `bound` and two `children`. A leaf has `lods` instead: for each level
+with Gaussians there, the file, the offset of its first row and the count; and `errors` of all levels.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
 _ERRORS = "errors.jsonl"
-"""In the folder of what is done: a leaf's errors a line, in one order of leaves."""
+"""File in the work folder: one line of errors per leaf, in a fixed order of leaves."""
 
 _BESIDE = "beside.txt"
-"""There too: the hidden folder that becomes the output, for a killed call leaves it."""
+"""File in the work folder that names the hidden folder of an unfinished output."""
 
 _PART, _IMAGE = re.compile(r"\d+_\d+/meta\.json"), re.compile(r"\w+\.webp")
-"""What a file of a level is called, and what the images that it names are."""
+"""Names of a level's files, and of the images in them."""
 
 
 def save_levels(
@@ -49,26 +49,25 @@ def save_levels(
     work: Path | None = None,
     progress: Progress = silent,
 ) -> int:
-    """Write levels of detail as a folder of streamed SOG, `lod-meta.json` and `LEVEL_N/meta.json`.
+    """Write levels of detail as a streamed SOG folder: `lod-meta.json` and `LEVEL_N/meta.json`.
 
     Args:
-        path: the folder.
-        levels: the same scene, the finest first, of one offset; scenes, or each a `StoredScene`, whose rows
-            are read a leaf or a file at a time.
-        cut: how the tree is cut; None means `Cut()`.
-        errors: measure what each leaf's levels lose (`g2ard.levels.leaf_errors`), which tells viewers what to
-            load; without them they go by counts.
-        overwrite: whether files in the folder may be replaced; those that its `lod-meta.json` names and the
-            new one does not go.
-        work: a folder for what is done so far, which the same call on the same levels goes on from, and for
-            what memory need not hold.
-        progress: told of leaves measured and files written.
+        path: the output folder.
+        levels: the same scene at several levels, finest first, with equal offsets. A `StoredScene` is read
+            one leaf or file at a time.
+        cut: splitting rule of the tree; None means `Cut()`.
+        errors: measure the error of each leaf's levels (`g2ard.levels.leaf_errors`), from which viewers
+            decide what to load; without errors they use counts.
+        overwrite: replace files in the folder, and remove files of its previous `lod-meta.json`.
+        work: folder for intermediate results; the same call on the same levels resumes from it and uses less
+            memory.
+        progress: called for leaves measured and files written.
 
     Returns:
         Bytes written.
 
     Raises:
-        InputError: no level, one that is empty or not finite, or offsets that differ.
+        InputError: no levels, a level that is empty or not finite, or different offsets.
         OutputError: see `atomic_folder`.
     """
     from g2ard import __version__
@@ -105,7 +104,7 @@ def save_levels(
             files.write(folder, Path(path), progress)
         else:
             (work / _BESIDE).write_text(str(folder), encoding="utf-8", newline="\n")
-            for name in files.parts:  # not moved: after an interruption all are whole here still
+            for name in files.parts:  # linked, not moved: an interrupted call resumes from them
                 shutil.copytree((work / name).parent, (folder / name).parent, copy_function=_linked)
         (folder / "lod-meta.json").write_text(
             json.dumps(meta, separators=(",", ":")), encoding="utf-8", newline="\n"
@@ -122,7 +121,7 @@ def save_levels(
 
 
 def _sweep(work: Path) -> None:
-    """Remove what a call that was killed had begun: folders of files here, and the one beside its output."""
+    """Remove the leftovers of a killed call: partial folders in `work` and the hidden output folder."""
     begun = [path for path in work.iterdir() if path.is_dir() and path.name.startswith(".")]
     if (note := work / _BESIDE).is_file():
         beside = Path(note.read_text(encoding="utf-8"))
@@ -132,7 +131,7 @@ def _sweep(work: Path) -> None:
 
 
 def _linked(source: str, target: str) -> None:
-    """The same file under another name, or a copy where the disk is another."""
+    """Hard-link a file, or copy it across file systems."""
     try:
         os.link(source, target)
     except OSError:
@@ -141,7 +140,7 @@ def _linked(source: str, target: str) -> None:
 
 @dataclass
 class _Files:
-    """What goes where: a level's leaves fill a file until it holds more than `most`."""
+    """Assignment of leaves to files: a level's leaves fill a file until it holds more than `most` rows."""
 
     levels: Sequence[Level]
     most: int
@@ -150,7 +149,7 @@ class _Files:
     last: dict[int, tuple[str, int]] = field(default_factory=dict)
 
     def place(self, level: int, rows: NDArray[np.int64]) -> dict[str, int]:
-        """The file, offset and count of a leaf's rows."""
+        """Append a leaf's rows and return their file, offset and count."""
         name, filled = self.last.get(level, ("", self.most + 1))
         if filled > self.most:
             name, filled = f"{level}_{sum(of == level for of in self.level_of.values())}/meta.json", 0
@@ -160,7 +159,7 @@ class _Files:
         return {"file": list(self.parts).index(name), "offset": filled, "count": len(rows)}
 
     def write(self, folder: Path, path: Path, progress: Progress) -> None:
-        """All files that are not there yet, one whole after the other; `path` names them in messages."""
+        """Write all missing files, each atomically; `path` names them in messages."""
         from g2ard.io.atomic import atomic_folder
         from g2ard.io.sog_write import sog_files
 
@@ -172,7 +171,7 @@ class _Files:
             progress("write", number, len(self.parts))
 
     def _rows(self, name: str) -> Splats:
-        """The rows of a file's leaves, those of each in Morton order."""
+        """Return the rows of a file, each leaf's in Morton order."""
         import numpy as np
 
         from g2ard.io.packing import morton_order
@@ -195,7 +194,7 @@ def _node(tree: Node | Leaf, files: _Files) -> dict[str, Any]:
 def _measure(
     tree: Node | Leaf, root: dict[str, Any], levels: Sequence[Level], work: Path | None, progress: Progress
 ) -> None:
-    """Put `errors` into the leaves of the tree as it is written."""
+    """Add `errors` to the leaves of the JSON tree."""
     pairs = [(tree, root)]
     leaves: list[tuple[Leaf, dict[str, Any]]] = []
     while pairs:
@@ -218,7 +217,7 @@ def _measure(
 
 
 def _lines(table: Path) -> list[list[float]]:
-    """The lines up to the first that is not whole, which is cut off with all after it."""
+    """Read all complete lines and truncate the file after them."""
     text, whole, found = table.read_bytes(), 0, []
     for line in text.splitlines(keepends=True):
         try:
@@ -235,12 +234,12 @@ def _lines(table: Path) -> list[list[float]]:
 
 
 def _rounded(values: Sequence[float] | NDArray[np.float64]) -> list[float]:
-    """Seven digits, those of a float32."""
+    """Round to seven digits, the precision of float32."""
     return [float(f"{float(value):.7g}") for value in values]
 
 
 def _named_in(path: Path) -> set[Path]:
-    """The files of all levels, relative to the folder; none where there is no folder of ours."""
+    """Return the relative paths of all level files that the folder's `lod-meta.json` names."""
     named: set[Path] = set()
     for part in map(Path, _names(_json(path / "lod-meta.json"), "filenames", _PART)):
         entries = [entry for entry in _json(path / part).values() if isinstance(entry, dict)]
@@ -250,7 +249,7 @@ def _named_in(path: Path) -> set[Path]:
 
 
 def _remove(path: Path, files: Collection[Path]) -> None:
-    """Remove files of the folder, and the folders in it that they leave empty."""
+    """Remove files and the folders that become empty."""
     for file in files:
         (path / file).unlink(missing_ok=True)
     for folder in {(path / file).parent for file in files}:

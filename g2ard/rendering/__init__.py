@@ -1,1 +1,1 @@
-"""Images of a scene: the renderer, metrics, LPIPS and what each Gaussian adds to views."""
+"""Images of a scene: the renderer, metrics, LPIPS and each Gaussian's visibility."""

@@ -1,4 +1,4 @@
-"""LPIPS (Zhang et al. 2018), version 0.1, from weights that the user gives; nothing is ever downloaded."""
+"""LPIPS (Zhang et al. 2018), version 0.1, with weights supplied by the user; nothing is downloaded."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from g2ard.errors import InputError
 from g2ard.system.extras import require_torch
 
 _MEAN, _STD = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""LPIPS's own normalisation of images in [−1, 1]."""
+"""LPIPS's normalisation of images in [−1, 1]."""
 
 _CONV = {
     "alex": {0: (4, 2), 3: (1, 2), 6: (1, 1), 8: (1, 1), 10: (1, 1)},
     "vgg": dict.fromkeys((0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28), (1, 1)),
 }
-"""Convolutions of torchvision's `features`, by index; each with a ReLU behind it. (stride, padding) is read
-below."""
+"""Convolutions of torchvision's `features` by index, each followed by a ReLU → (stride, padding)."""
 
 _POOL = {"alex": {2: 3, 5: 3}, "vgg": {4: 2, 9: 2, 16: 2, 23: 2}}
 _TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
@@ -27,18 +26,18 @@ _FILES = {"alex": ("alexnet*.pth", "alex.pth"), "vgg": ("vgg16*.pth", "vgg.pth")
 
 
 class Lpips:
-    """The distance of one network: 0 for equal images, about 1 at worst.
+    """LPIPS distance by one network: 0 for equal images, about 1 at worst.
 
     Args:
         net: "alex" or "vgg".
-        backbone: torchvision's state dict of the network: features.N.weight, features.N.bias.
-        linear: LPIPS's own: linN.model.1.weight (1, C, 1, 1).
-        scaled: bring images from [0, 1] to the [−1, 1] that the networks were fitted for; False feeds them as
-            they are, as 3DGS's own evaluation does (graphdeco-inria/gaussian-splatting#1239). The figures
-            of the two do not compare.
+        backbone: torchvision's state dict of the network (features.N.weight, features.N.bias).
+        linear: LPIPS's linear layers (linN.model.1.weight, shape (1, C, 1, 1)).
+        scaled: map images from [0, 1] to [−1, 1], the range the networks were fitted for. False passes them
+            unscaled, as 3DGS's evaluation does (graphdeco-inria/gaussian-splatting#1239). Scores of the two
+            are not comparable.
 
     Raises:
-        InputError: weights that are missing.
+        InputError: missing weights.
     """
 
     def __init__(
@@ -54,7 +53,7 @@ class Lpips:
             raise InputError(f"LPIPS {net}: the weights lack {error}") from None
 
     def __call__(self, image: NDArray[np.float32], target: NDArray[np.float32]) -> float:
-        """Distance of two (H, W, 3) images in [0, 1]."""
+        """Return the distance of two (H, W, 3) images in [0, 1]."""
         import torch
 
         with torch.inference_mode():
@@ -88,16 +87,16 @@ class Lpips:
 
 
 def load_lpips(folder: Path, *, scaled: bool = True) -> dict[str, Lpips]:
-    """The networks whose weights lie in a folder: alexnet*.pth with alex.pth, vgg16*.pth with vgg.pth.
+    """Load the networks whose weights are in a folder: alexnet*.pth with alex.pth, vgg16*.pth with vgg.pth.
 
-    The former are torchvision's ImageNet weights, the latter LPIPS's linear layers (v0.1), both as published.
+    The first of each pair holds torchvision's ImageNet weights, the second LPIPS's linear layers (v0.1).
 
     Args:
-        folder: where they lie.
+        folder: folder with the weights.
         scaled: see `Lpips`.
 
     Raises:
-        InputError: the folder holds neither pair, or a file that is no state dict.
+        InputError: neither pair is in the folder, or a file is not a state dict.
         MissingDependencyError: torch is not installed.
     """
     require_torch("LPIPS")
@@ -112,8 +111,8 @@ def load_lpips(folder: Path, *, scaled: bool = True) -> dict[str, Lpips]:
         for path in (found[0], folder / linear):
             try:
                 files.append(torch.load(path, map_location="cpu", weights_only=True))
-            except Exception as error:  # torch raises whatever the pickle met
-                raise InputError(f"{path}: no weights of torch's ({type(error).__name__})") from None
+            except Exception as error:  # torch raises any exception from unpickling
+                raise InputError(f"{path}: not a torch state dict ({type(error).__name__})") from None
         out[net] = Lpips(net, files[0], files[1], scaled=scaled)
     if not out:
         raise InputError(f"{folder}: no LPIPS weights (alexnet*.pth and alex.pth, or vgg16*.pth and vgg.pth)")
@@ -125,5 +124,5 @@ def _linear(weights: dict[str, Any], i: int) -> Any:
 
 
 def _unit(x: Any) -> Any:
-    """Each pixel's features divided by their length."""
+    """Normalise each pixel's feature vector to unit length."""
     return x / (x.pow(2).sum(1, keepdim=True).sqrt() + 1e-10)

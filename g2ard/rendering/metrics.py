@@ -13,12 +13,12 @@ _Image = NDArray[np.floating[Any]]
 
 
 def psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
-    """−10·log10 of the mean squared difference, peak 1; at most 100 dB, which identical images reach.
+    """Return the PSNR, −10·log₁₀ MSE for a peak of 1, at most 100 dB (identical images).
 
     Args:
         image: (H, W, C) in [0, 1].
         target: of the same shape.
-        mask: (H, W), where to look; None means everywhere.
+        mask: (H, W), True for pixels that count; None means all.
 
     Returns:
         dB.
@@ -35,13 +35,14 @@ def psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -
 
 
 def ssim(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
-    """Mean structural similarity: 11×11 Gaussian window, σ 1.5, zero-padded, range 0–1 (INRIA's).
+    """Return the mean structural similarity: 11×11 Gaussian window, σ 1.5, zero-padded, values in 0–1, as
+    INRIA's.
 
     Args:
         image: (H, W, C) in [0, 1].
         target: of the same shape.
-        mask: (H, W), where to look: elsewhere both are taken to be equal, and the shortfall from 1 is
-            averaged over these pixels only; None means everywhere.
+        mask: (H, W), True for pixels that count. The images are made equal elsewhere, and 1 − SSIM is
+            averaged over the masked pixels only. None means all.
 
     Returns:
         Mean over pixels and channels, at most 1.

@@ -1,4 +1,4 @@
-"""Rendering with the CPU rasteriser: numpy in, numpy out."""
+"""CPU renderer: numpy in, numpy out."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ View = tuple[list[list[float]], list[float], tuple[int, int], float]
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """What the rasteriser's conventions leave open.
+    """Conventions of the rasteriser.
 
     Args:
-        convention: "gsplat" (the default: what trainers of today use) or "inria" (also cuts every splat to
-            the tiles its 3σ square touches).
-        antialiased: opacity × √(det Σ₂ / det(Σ₂ + 0.3 I)), Mip-Splatting's factor; for scenes trained so.
-        alpha_max: α is clipped here. 0.99 as in 3DGS; some trainers use 0.999.
-        near: Gaussians nearer than this are left out, scene units; None means the convention's 0.01 or 0.2,
-            and less in a small scene (`settings_for`). A sequence holds one distance per camera.
+        convention: "gsplat" (default, used by current trainers) or "inria" (also limits each splat to the
+            tiles that its 3σ square touches).
+        antialiased: opacity × √(det Σ₂ / det(Σ₂ + 0.3 I)), Mip-Splatting's factor; for scenes trained with
+            it.
+        alpha_max: upper limit of α: 0.99 as in 3DGS; some trainers use 0.999.
+        near: near plane, scene units; None means the convention's 0.01 (gsplat) or 0.2 (inria), and less in a
+            small scene (`settings_for`). A sequence holds one distance per camera.
 
     Raises:
         InputError: a value out of range.
@@ -53,7 +54,7 @@ class RasterSettings:
             raise InputError(f"expected a value in [1/255, 1), got {self.alpha_max}", parameter="alpha_max")
 
     def near_of(self, index: int) -> float:
-        """The near plane of camera `index`."""
+        """Return the near plane of camera `index`."""
         if self.near is None:
             return 0.01 if self.convention == "gsplat" else 0.2
         if isinstance(self.near, (int, float)):
@@ -62,14 +63,14 @@ class RasterSettings:
 
 
 def settings_for(means: NDArray[Any], settings: RasterSettings | None = None) -> RasterSettings:
-    """`settings` whose near plane does not depend on how small a unit the scene is in.
+    """Scale the default near plane down for scenes in a small unit.
 
-    The conventions' near planes are lengths, made for scenes of some units. Where half of the Gaussians lie
-    within r < ½ of their middle, the near plane is 2 r times the convention's.
+    The conventions' near planes suit scenes a few units across. If half of the Gaussians lie within r < ½ of
+    the median, the near plane is 2r times the convention's.
 
     Args:
         means: (N, 3) scene units.
-        settings: None means gsplat's convention. A near plane that is given stays.
+        settings: None means gsplat's convention. A given near plane is kept.
 
     >>> import numpy as np
     >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
@@ -85,7 +86,7 @@ def settings_for(means: NDArray[Any], settings: RasterSettings | None = None) ->
 
 
 def view_of(cameras: Cameras, index: int, settings: RasterSettings) -> View:
-    """One camera as `_core` takes it."""
+    """Convert one camera to the form that `_core` takes."""
     K = cameras.Ks[index]
     return (
         cameras.viewmats[index].tolist(),
@@ -96,9 +97,9 @@ def view_of(cameras: Cameras, index: int, settings: RasterSettings) -> View:
 
 
 def arrays_of(splats: Splats) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats, _Floats]:
-    """The six stored-form float32 arrays `_core` takes.
+    """Return the six float32 arrays that `_core` takes, in stored form.
 
-    Logits and logarithms are clamped to where float32 can follow them: opacity 255 of a byte decodes to +∞.
+    Logits and log-scales are clamped to what float32 can represent: a byte opacity of 255 decodes to +∞.
     """
     with np.errstate(divide="ignore"):
         log_scales = np.clip(splats.log_scales, *DRAWN_LOG_SCALES)
@@ -109,15 +110,17 @@ def arrays_of(splats: Splats) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floa
 
 
 def middle_of(splats: Splats) -> NDArray[np.float64] | None:
-    """(3,) a point that float32 means can be taken from: float64 means may be map coordinates; None where the
-    means are float32 already."""
+    """Return the (3,) median of float64 means, or None if they are float32.
+
+    Float64 means may be map coordinates; relative to the median they fit float32.
+    """
     if splats.means.dtype == np.float32 or not len(splats):
         return None
     return np.median(splats.means, axis=0)
 
 
 def centred(splats: Splats, cameras: Cameras) -> tuple[Splats, Cameras]:
-    """Both about `middle_of` the scene."""
+    """Recentre the scene and cameras on `middle_of` the scene."""
     cameras = cameras.recentred(splats.offset)
     middle = middle_of(splats)
     if middle is None:
@@ -127,15 +130,15 @@ def centred(splats: Splats, cameras: Cameras) -> tuple[Splats, Cameras]:
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """One view.
+    """Images of one rendered view.
 
     Args:
         image: (H, W, 3) float32, linear in the SH colours, ≥ 0, not clipped at 1.
-        alpha: (H, W) float32 in [0, 1], how much of the background is hidden.
-        depth: (H, W) float32, scene units, Σ αT·z: the expected depth times alpha; divide by alpha for a
-            distance.
-        median: (H, W) float32, scene units, depth of the splat behind which less than half the light is
-            left, 0 if there is none; None unless asked for.
+        alpha: (H, W) float32 in [0, 1], the share of the background that is hidden.
+        depth: (H, W) float32, scene units, Σ αT·z: alpha times the expected depth; divide by alpha for the
+            depth.
+        median: (H, W) float32, scene units, depth of the splat behind which less than half the light remains,
+            0 if there is none; None unless requested.
     """
 
     image: _Floats
@@ -145,7 +148,7 @@ class Rendered:
 
 
 class Renderer:
-    """One scene, rendered into any number of views; the scene is prepared once and buffers are kept.
+    """Renderer for many views of one scene; prepares the scene once and reuses buffers.
 
     Args:
         splats: the scene, SH degree 0–3.
@@ -153,7 +156,7 @@ class Renderer:
         settings: conventions; None means gsplat's.
 
     Raises:
-        InputError: a background that is not three numbers, or near planes of several cameras.
+        InputError: the background is not three numbers, or `settings.near` is a sequence.
 
     >>> from g2ard.scene.cameras import Camera
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
@@ -174,7 +177,7 @@ class Renderer:
         if len(self._background) != 3:
             raise InputError(f"expected 3 numbers, got {len(self._background)}", parameter="background")
         if settings is not None and not isinstance(settings.near, int | float | None):
-            raise InputError("expected one distance, for all views of a renderer", parameter="near")
+            raise InputError("expected one distance for all views", parameter="near")
         self._offset, middle = splats.offset, middle_of(splats)
         if middle is not None:
             splats = splats.recentred(splats.offset + middle)
@@ -184,10 +187,10 @@ class Renderer:
         self._rasterizer = _core.Rasterizer()
 
     def image(self, camera: Camera) -> _Floats:
-        """The view's (H, W, 3) image alone, see `Rendered.image`; without depths it takes less time.
+        """Render the (H, W, 3) image only, see `Rendered.image`; faster than `render`.
 
         Raises:
-            InputError: a camera that makes no sense, see `Cameras`.
+            InputError: an invalid camera, see `Cameras`.
         """
         image, _, _, _ = self._forward(camera, 0)
         return image
@@ -198,25 +201,26 @@ class Renderer:
         return np.clip(image, 0, 1, out=image)
 
     def render(self, camera: Camera, *, median: bool = False) -> Rendered:
-        """One view: C = Σᵢ cᵢ αᵢ Πⱼ<ᵢ (1 − αⱼ), front to back.
+        """Render one view: C = Σᵢ cᵢ αᵢ Πⱼ<ᵢ (1 − αⱼ), front to back.
 
         Args:
-            camera: the view, in world coordinates; its K and size decide the image.
+            camera: the view, in world coordinates; its width and height are the image's.
             median: also return the median depth.
 
         Raises:
-            InputError: a camera that makes no sense, see `Cameras`.
+            InputError: an invalid camera, see `Cameras`.
         """
         image, alpha, depth, middle = self._forward(camera, 2 if median else 1)
         assert depth is not None
         return Rendered(image, alpha, depth, middle)
 
     def pose_gradient(self, gradient: _Floats) -> NDArray[np.float64]:
-        """(6,) dL/d(v, ω) of the last render's pose T, T ← exp(v, ω)·T in the camera's axes.
+        """Return the (6,) gradient dL/d(v, ω) of the last render's pose T, where T ← exp(v, ω)·T in the
+        camera's axes.
 
-        g_v = Σ W·dL/dμ and g_ω = Σ X × dL/dX + Σᵢ W·(dL/djwᵢ × jwᵢ), with X = Wμ + t, dL/dX without the
-        colour's direction and jw the rows of the projection's J·W. Where a Gaussian enters or leaves at
-        α = 1/255 there is no gradient.
+        g_v = Σ W·dL/dμ and g_ω = Σ X × dL/dX + Σᵢ W·(dL/djwᵢ × jwᵢ), with X = Wμ + t, dL/dX without the view
+        dependence of colours, and jwᵢ the rows of the projection's J·W. Gaussians crossing α = 1/255
+        contribute no gradient.
 
         Args:
             gradient: (H, W, 3) float32 dL/d(image).
@@ -252,13 +256,13 @@ def render(
         camera: the view, world coordinates.
         background: RGB in [0, 1] behind the scene.
         settings: conventions; None means gsplat's.
-        median: whether the median depth is wanted too.
+        median: also return the median depth.
 
     Returns:
         A `Rendered`: image (H, W, 3), alpha (H, W) and depth (H, W), all float32; depth in scene units.
 
     Raises:
-        InputError: a camera whose values are out of range, a background that is not three numbers.
+        InputError: an invalid camera, or a background that is not three numbers.
 
     >>> from g2ard.scene.cameras import Camera
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
@@ -270,4 +274,4 @@ def render(
 
 
 _NEAR_SAMPLE = 65_536
-"""Gaussians, at most, that tell how large a scene is."""
+"""Largest sample of Gaussians used to measure the size of a scene."""

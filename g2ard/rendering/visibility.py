@@ -1,4 +1,4 @@
-"""What every Gaussian contributes to views: over all pixels, or sampled from a few small renders."""
+"""Contribution of each Gaussian to views: over all pixels, or sampled from a few small renders."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from g2ard.scene.prepared import as_prepared
 from g2ard.scene.splats import Splats
 
 MOST_LOOKS, LONGEST = 96, 300
-"""The most views that look at a scene or a tile, and the longer side of their renders, pixels."""
+"""Largest number of views per scene or tile, and the longer side of their renders in pixels."""
 
 ROUND = 16
-"""Views at a time."""
+"""Views per round."""
 
 _CHEAP = 6_000_000
-"""Gaussians times views up to which another round costs next to nothing."""
+"""Gaussians × views up to which another round costs almost nothing."""
 
 NEAR = 1e-3
-"""Nearest depth that counts, over the median distance of the cameras from the scene's middle."""
+"""Near plane as a fraction of the cameras' median distance from the scene's centre."""
 
 CONVERGED = 0.01
-"""A round that finds a smaller share of the Gaussians for the first time is the last."""
+"""Sampling stops after a round whose share of newly seen Gaussians is below this."""
 
 _Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """What every Gaussian contributes to a set of views, summed over their pixels.
+    """Contribution of each Gaussian to a set of views, summed over their pixels.
 
     Args:
-        weight: (N,) float64, Σ αT: the light it sends to the cameras.
+        weight: (N,) float64, Σ αT: the light that it sends to the cameras.
         transmittance: (N,) float64, Σ T over the pixels it touches.
-        hits: (N,) uint64, pixels it touches (α ≥ 1/255, light left).
+        hits: (N,) uint64, pixels it touches (α ≥ 1/255, before the light is used up).
         dominant: (N,) uint64, pixels where no other Gaussian has a larger αT.
         peak: (N,) float32, its largest αT.
         pixel_size: (N,) float32, the smallest depth / focal length over the views whose image contains its
-            mean: the size of a pixel there, scene units; ∞ where no view contains it.
+            mean: the size of a pixel there, scene units; ∞ if no view contains it.
     """
 
     weight: NDArray[np.float64]
@@ -64,9 +64,9 @@ def visibility(
     *,
     settings: RasterSettings | None = None,
 ) -> Visibility:
-    """Sum every Gaussian's contributions αT over all pixels of all views.
+    """Sum each Gaussian's contributions αT over all pixels of all views.
 
-    The sums have a fixed order: the result does not depend on the number of threads.
+    Summation has a fixed order, so the result does not depend on the number of threads.
 
     >>> import numpy as np
     >>> from g2ard.scene.cameras import Cameras, look_at
@@ -88,11 +88,11 @@ def visibility(
 
 @dataclass(frozen=True, eq=False)
 class SampledVisibility:
-    """The parts of a visibility that simplification weighs by, sampled from a few small renders.
+    """Visibility sampled from a few small renders, for the weights of simplification.
 
     Args:
         weight: (N,) float32, Σ αT.
-        pixel_size: (N,) float32, that of the full image, scene units; ∞ where no view contains it.
+        pixel_size: (N,) float32, as in `Visibility`, for the full-size image.
     """
 
     weight: _Floats
@@ -102,22 +102,21 @@ class SampledVisibility:
 def visibility_source(
     cameras: Cameras, *, views: int = MOST_LOOKS, longest: int = LONGEST, progress: Progress = silent
 ) -> Callable[[Splats], SampledVisibility]:
-    """A function that finds what a few small renders see of a scene, as `simplify` takes it.
+    """Return a function that samples a scene's visibility from a few small renders, for `simplify`.
 
-    It renders sixteen views at a time until the next sixteen find under 1 % more of the Gaussians: an object
-    of half a million takes 32 views, a small one 80, a room all (decision 0007). The first scene
-    decides how many; for the later ones the views stay the same, so that the sums compare. The result
-    depends on the scene's content alone, not on the order of its rows.
+    Views are rendered in rounds of sixteen until a round finds under 1 % more of the Gaussians: 32 views for
+    an object of half a million, 80 for a small one, all for a room (decision 0007). The first scene fixes the
+    views for later ones, so that sums are comparable. Results do not depend on the order of the scene's rows.
 
     Args:
-        cameras: at most `views` of them are used, evenly spaced.
-        views: the most.
-        longest: longer side of the renders, pixels; `pixel_size` stays that of the full image.
-        progress: told after each view.
+        cameras: the views; at most `views` of them are used, evenly spaced.
+        views: upper limit of the number of views.
+        longest: longer side of the renders, pixels; `pixel_size` refers to the full image.
+        progress: called after each view.
 
     Returns:
-        scene → `SampledVisibility`; the scene's arrays are C-contiguous and float32, but for its means. A
-        `g2ard.scene.prepared.PreparedScene` is not put in order again.
+        scene → `SampledVisibility`. The scene's arrays are C-contiguous and float32, except its means. A
+        `g2ard.scene.prepared.PreparedScene` is not sorted again.
     """
     sample = np.unique(np.linspace(0, len(cameras) - 1, min(views, len(cameras))).round().astype(int))
     full = cameras.take(sample)
@@ -132,7 +131,7 @@ def visibility_source(
         core = as_prepared(scene).core
         sums = _core.VisibilityAccumulator(core)
         here = small.recentred(scene.offset)
-        if not enough:  # a near plane in the scene's own unit
+        if not enough:  # near plane in the scene's unit
             distance = np.median(np.linalg.norm(here.positions - core.origin, axis=1))
             settings = RasterSettings(near=NEAR * float(distance) or None)
         seen = 0
@@ -151,7 +150,7 @@ def visibility_source(
 
 
 def fewest_looks(gaussians: int) -> int:
-    """Looks that `visibility_source` takes of a scene of so many Gaussians where it has the views, at least.
+    """Return the least number of views that `visibility_source` renders, if it has enough.
 
     >>> fewest_looks(90_854), fewest_looks(500_000)
     (80, 32)
@@ -161,7 +160,7 @@ def fewest_looks(gaussians: int) -> int:
 
 
 def spread(count: int) -> list[int]:
-    """0 … count − 1, each far from those before.
+    """Order 0 … count − 1 so that neighbours in the order are far apart.
 
     >>> spread(6)
     [0, 3, 1, 4, 2, 5]

@@ -1,11 +1,11 @@
-"""What a trained scene holds that no picture of it needs: found by kind, from its own views and neighbours.
+"""Detection of clutter: Gaussians of a trained scene that no image of it needs, by kind.
 
-| kind | what it is |
+| kind | definition |
 |---|---|
-| invisible | within reach of a view, no pixel changes by half an 8-bit step without it, nor their mean |
-| giant | larger than the scene, which lies within its 3σ: fog over everything |
+| invisible | no pixel changes by half an 8-bit step without it, nor the mean without all of them |
+| giant | larger than the scene, with the scene's centre within 3σ: fog over everything |
 | needle | ten times as long as wide, with both ends beyond the 3σ of every neighbour |
-| floater | with all it touches less than a thousandth of the scene, in number and in light |
+| floater | in a connected group below a thousandth of the scene, by number and by light |
 """
 
 from __future__ import annotations
@@ -27,51 +27,47 @@ KINDS = ("invisible", "giant", "needle", "floater")
 
 _HALF_STEP = 0.5 / 255
 _REACH = 3.0
-"""Standard deviations at which renderers end a footprint."""
+"""Standard deviations at which renderers cut off a footprint."""
 _LONG = 10.0
 _SMALL = 1e-3
-"""Share of the scene's Gaussians, and of its light, below which a group of its own is a floater."""
+"""Share of the scene's Gaussians and of its light below which a separate group is a floater."""
 _NEIGHBORS = 16
 _BEHIND = 0.01
-"""Share of the depth that a Gaussian may lie behind what a view sees and count as looked at."""
+"""Share of the depth by which a Gaussian may lie behind the visible surface and still be within reach."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cleaning:
-    """What each Gaussian was found to be.
+    """Kind of clutter per Gaussian.
 
     Args:
-        kind: (N,) int8, −1 for what stays, else an index into `KINDS`.
+        kind: (N,) int8, −1 to keep, otherwise an index into `KINDS`.
     """
 
     kind: NDArray[np.int8]
 
     @property
     def keep(self) -> NDArray[np.bool_]:
-        """(N,) what stays."""
+        """(N,) mask of the Gaussians to keep."""
         return self.kind < 0
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many of each kind."""
+        """Number of Gaussians per kind."""
         return {name: int(np.count_nonzero(self.kind == i)) for i, name in enumerate(KINDS)}
 
 
 def find_clutter(
     splats: Splats, seen: Any, looked: NDArray[np.bool_], pixels: int, kinds: tuple[str, ...] = KINDS
 ) -> Cleaning:
-    """Find what can go. A Gaussian of several kinds counts as the first of them in the order of `KINDS`.
+    """Find Gaussians to remove; one of several kinds gets the first in the order of `KINDS`.
 
     Args:
         splats: N Gaussians, finite.
-        seen: what views see of them (`g2ard.rendering.visibility.visibility`): `weight` and `peak` are read.
-        looked: (N,) those that the views could see (`within_reach`): no other is called invisible, unless
-            its α is below 1/255.
-        pixels: of all those views together.
-        kinds: the kinds looked for.
-
-    Returns:
-        A kind for each.
+        seen: their visibility (`g2ard.rendering.visibility.visibility`); uses `weight` and `peak`.
+        looked: (N,) mask from `within_reach`: only these can be invisible, apart from α below 1/255.
+        pixels: number of pixels of all views together.
+        kinds: kinds to find.
 
     Raises:
         InputError: an unknown kind, or `seen` or `looked` of another length.
@@ -91,15 +87,17 @@ def find_clutter(
     }
     for number, name in enumerate(KINDS):
         if name in kinds:
-            rest = (kind < 0) & ~hidden  # what hides nothing supports nothing either
+            rest = (kind < 0) & ~hidden  # invisible Gaussians support nothing either
             found = finders[name](rest)
             kind[found & (kind < 0)] = number
     return Cleaning(kind)
 
 
 def _invisible(splats: Splats, seen: Any, looked: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
-    """What no renderer draws; and, least light first, what changes no pixel by half a step, until all
-    together would change the mean pixel by as much."""
+    """Mark Gaussians that no renderer draws, and the weakest ones that change no pixel by half an 8-bit step.
+
+    The latter are taken in order of light until together they would change the mean pixel by half a step.
+    """
     faint = splats.logit_opacities < DRAWN_LOGIT
     small = np.flatnonzero(looked & ~faint & (seen.peak < _HALF_STEP))
     order = small[np.argsort(seen.weight[small], kind="stable")]
@@ -110,15 +108,11 @@ def _invisible(splats: Splats, seen: Any, looked: NDArray[np.bool_], pixels: int
 
 
 def within_reach(splats: Splats, cameras: Cameras, progress: Progress = silent) -> NDArray[np.bool_]:
-    """(N,) whose mean lies in the image of some view, before its matter or 1 % of the depth behind.
+    """Return an (N,) mask of means in front of the visible surface of some view, or up to 1 % of its depth
+    behind it.
 
-    Matter is where half of a pixel's light is hidden. What lies deeper in all views, behind a wall or in a
-    corner that none of them looks into, may show from elsewhere.
-
-    Args:
-        splats: the scene.
-        cameras: in world coordinates.
-        progress: told after each view.
+    The surface is where half of a pixel's light is blocked. Gaussians deeper in all views, behind a wall or
+    in an unseen corner, may be visible from elsewhere.
     """
     renderer = Renderer(splats)
     means = splats.means.astype(np.float64) + splats.offset
@@ -139,7 +133,7 @@ def within_reach(splats: Splats, cameras: Cameras, progress: Progress = silent) 
 
 
 def _giants(splats: Splats) -> NDArray[np.bool_]:
-    """Larger than the radius that holds 99 % of the means, whose middle is within 3σ."""
+    """Mark Gaussians larger than the radius of 99 % of the means, with the median mean within 3σ."""
     means = splats.means.astype(np.float64)
     middle = np.median(means, axis=0)
     radius = float(np.percentile(np.linalg.norm(means - middle, axis=1), 99))
@@ -151,16 +145,18 @@ def _giants(splats: Splats) -> NDArray[np.bool_]:
 
 
 def _away(splats: Splats, rows: NDArray[np.intp], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n,) standard deviations of each of some rows from a point to its mean: √((p − μ)ᵀ Σ⁻¹ (p − μ))."""
+    """Return the (n,) Mahalanobis distances √((p − μ)ᵀ Σ⁻¹ (p − μ)) of the given rows."""
     local = np.einsum("nji,nj->ni", _axes(splats.quats[rows]), points - splats.means[rows].astype(np.float64))
     local /= np.maximum(splats.scales[rows].astype(np.float64), 1e-30)
     return np.sqrt((local * local).sum(axis=1))
 
 
 def _needles(splats: Splats, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Long and thin ones of `rest` whose both ends (2σ) lie beyond 3σ of their nearest neighbours,
-    taken as spheres of their largest scale: by their true shape eight times as many were needles on a clean
-    scene, many of them its fine lines."""
+    """Mark long, thin Gaussians of `rest` with both ends (2σ) beyond 3σ of their nearest neighbours.
+
+    Neighbours count as spheres of their largest scale: by their true shape eight times as many were needles
+    on a clean scene, many of them its fine lines.
+    """
     out = np.zeros(len(splats), bool)
     rows = np.flatnonzero(rest)
     order = np.sort(splats.scales[rows], axis=1).astype(np.float64)
@@ -186,8 +182,7 @@ def _needles(splats: Splats, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _floaters(
     splats: Splats, rest: NDArray[np.bool_], weight: NDArray[Any], looked: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Groups of `rest` that touch (spheres of 3σ of the largest scale meet), small in number and light, some
-    of them within reach of a view."""
+    """Mark small groups of touching Gaussians of `rest` (3σ spheres meet), partly within reach of a view."""
     out = np.zeros(len(splats), bool)
     rows = np.flatnonzero(rest)
     if len(rows) <= _NEIGHBORS:
@@ -207,7 +202,7 @@ def _floaters(
 
 
 def _groups(count: int, a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.int64]:
-    """(count,) the least row that each is connected to by the edges a–b.
+    """Return the (count,) smallest row connected to each row by the edges a–b.
 
     >>> _groups(5, np.array([3, 1]), np.array([4, 3])).tolist()
     [0, 1, 2, 1, 1]
@@ -224,7 +219,7 @@ def _groups(count: int, a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def _axes(quats: NDArray[Any]) -> NDArray[np.float64]:
-    """(N, 3, 3) rotation matrices; columns are the axes of the scales."""
+    """Return (N, 3, 3) rotation matrices whose columns are the axes of the scales."""
     from g2ard.io.packing import unit_quats
 
     w, x, y, z = unit_quats(quats).T

@@ -1,4 +1,4 @@
-"""How close a scene's renders come to the targets, and what the scene weighs."""
+"""Scores of a scene's renders against the targets, and the scene's size."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One view's figures: PSNR in dB, SSIM in [−1, 1], LPIPS by network, empty without weights; `against` is
-    "photo" or "teacher" where the targets say so."""
+    """Scores of one view: PSNR in dB, SSIM in [−1, 1], LPIPS by network (empty without weights).
+
+    `against` is "photo" or "teacher" if the targets say so.
+    """
 
     name: str
     psnr: float
@@ -34,12 +36,12 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A scene's figures over some views.
+    """Scores of a scene over a set of views.
 
     Args:
-        count: Gaussians.
-        bytes: of the scene as float32 arrays, the form a .ply holds.
-        views: one score a view, in the cameras' order.
+        count: number of Gaussians.
+        bytes: size as float32 arrays, as in a .ply.
+        views: one score per view, in camera order.
     """
 
     count: int
@@ -62,7 +64,7 @@ class Evaluation:
         return {net: float(np.mean([v.lpips[net] for v in self.views])) for net in self.views[0].lpips}
 
     def as_dict(self) -> dict[str, Any]:
-        """The keys of `g2ard evaluate --json`."""
+        """Return the content of `g2ard evaluate --json`."""
         return {
             "count": self.count,
             "bytes": self.bytes,
@@ -92,21 +94,21 @@ def evaluate(
 
     PSNR = −10·log₁₀ of the mean squared difference over pixels and channels, in dB, at most 100; SSIM (Wang
     et al. 2004) has an 11×11 Gaussian window, σ 1.5, zero-padded, values in 0–1. Renders are clamped to
-    [0, 1] without 8-bit rounding, unless asked for. Where a photo has a mask, only its pixels count.
+    [0, 1] without 8-bit rounding, unless `eight_bit` is set. If a photo has a mask, only masked pixels count.
 
     Args:
-        splats: the scene; its offset counts, cameras are in world coordinates.
-        targets: photos or teacher renders; photo-relative and teacher-relative figures never mix.
+        splats: the scene; cameras are in world coordinates, including its offset.
+        targets: photos or teacher renders; scores against the two are not comparable.
         background: RGB in [0, 1] behind the scene.
-        lpips: networks to score with as well, as `g2ard.rendering.lpips.load_lpips` finds them.
-        settings: the renderer's conventions; None means gsplat's. A teacher's renders have their own, see
+        lpips: networks to score with, from `g2ard.rendering.lpips.load_lpips`.
+        settings: the renderer's conventions; None means gsplat's. Teacher renders have their own, see
             `g2ard.scene.targets.TeacherRenders`.
-        eight_bit: round renders and targets to multiples of 1/255, as evaluations from saved PNGs do.
-        progress: told after each view.
-        stage: the name progress is reported under.
+        eight_bit: round renders and targets to multiples of 1/255, as in evaluations from saved PNGs.
+        progress: called after each view.
+        stage: stage name for progress.
 
     Returns:
-        An `Evaluation`: one `ViewScore` a view, and their means.
+        One `ViewScore` per view, and their means.
 
     Raises:
         InputError: a photo cannot be read.

@@ -1,6 +1,6 @@
-"""Coloured points → a geometric prior of surface-aligned discs, without training.
+"""Lift coloured points to a geometric prior of surface-aligned discs, without training.
 
-A prior to distil *from*, with photos as targets; rendered as it is, it is flat (10 dB in the paper).
+Distil *from* this prior, with photos as targets; rendered as it is, it looks flat (10 dB in the paper).
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from g2ard.progress import Progress, counter, silent
 from g2ard.scene.splats import SH_C0, Splats
 
 _CORE = _core.defaults()["lift"]
-"""The one place of these defaults, which are the paper's."""
+"""Defaults of the Rust core, which are the paper's."""
 
 
 @dataclass(frozen=True)
 class LiftConfig:
-    """The constants of `lift`, for those who keep them together: `lift(points, colors, **vars(config))`."""
+    """Constants of `lift`, for callers that keep them together: `lift(points, colors, **vars(config))`."""
 
     neighbors: int = _CORE["neighbors"]
     normal_ratio: float = _CORE["normal_ratio"]
@@ -39,28 +39,29 @@ def lift(
     opacity: float = LiftConfig.opacity,
     progress: Progress = silent,
 ) -> Splats:
-    """One flat disc for each coloured point (supplement, "Dense Prior Construction").
+    """Turn each coloured point into a flat disc (supplement, "Dense Prior Construction").
 
-    The frame is a PCA of the point and its nearest others: two tangents, then the normal. With the
+    A PCA of the point and its nearest neighbours gives two tangents and the normal. With the
     neighbourhood's variances λ₁ ≥ λ₂ along the tangents, s₁ = 0.94·√λ₁, s₂ = max(0.94·√λ₂, s₁/max_anisotropy)
-    and the normal scale s₃ = normal_ratio·√(s₁s₂), in the points' unit. A point whose
-    neighbours all coincide takes the median size around it.
+    and the normal scale s₃ = normal_ratio·√(s₁s₂), in the points' unit. If all neighbours coincide, the disc
+    gets the median size around it.
 
     Args:
-        points: (N, 3), any unit and origin; float64 keeps map coordinates exact.
+        points: (N, 3), any unit and origin; pass float64 to keep map coordinates exact.
         colors: (N, 3) in [0, 1].
-        neighbors: nearest others that PCA looks at (10 in the paper).
+        neighbors: number of neighbours for the PCA (10 in the paper).
         normal_ratio: normal over tangential scale (0.1 in the paper).
-        max_anisotropy: largest ratio of the tangential scales (4 in the paper: no needles).
-        opacity: of every disc, in (0, 1) (0.5 in the paper).
-        progress: told of points done.
+        max_anisotropy: largest ratio of the tangential scales (4 in the paper, to avoid needles).
+        opacity: opacity of every disc, in (0, 1) (0.5 in the paper).
+        progress: called with the number of points done.
 
     Returns:
-        N discs of SH degree 0 in the order of the points; rows that are not finite are left out. Means are
-        float32; far coordinates, which float32 cannot hold, are relative to `offset`, the median point.
+        N discs of SH degree 0 in the order of the points; points that are not finite are skipped. Means are
+        float32, relative to `offset`, which is the median point if float32 cannot hold the coordinates and 0
+        otherwise.
 
     Raises:
-        InputError: shapes that do not fit, no finite point, or a parameter out of its range.
+        InputError: mismatched shapes, no finite point, or a parameter out of range.
 
     >>> grid = np.stack(np.meshgrid(range(8), range(8), [0]), -1).reshape(-1, 3)
     >>> discs = lift(grid + [5.4e6, 0, 0], np.full((64, 3), 0.5))
@@ -77,7 +78,7 @@ def lift(
         raise InputError(f"expected a number between 0 and 1, got {opacity}", parameter="opacity")
     finite = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
     if not finite.any():
-        raise InputError(f"none of {len(xyz)} is finite", parameter="points")
+        raise InputError(f"none of the {len(xyz)} points is finite", parameter="points")
     if not finite.all():
         xyz, rgb = xyz[finite], rgb[finite]
     middle = _middle(xyz)
@@ -97,12 +98,12 @@ def lift(
 
 
 def _fits_float32(points: NDArray[np.float64], scales: NDArray[np.float32]) -> bool:
-    """Whether float32 holds the coordinates as they are, to 1 % of a disc: other programs know no offset."""
+    """Return whether float32 holds the coordinates to 1 % of a disc; other programs ignore offsets."""
     step = np.spacing(np.float32(np.abs(points).max()))
     return bool(step <= 0.01 * np.median(scales[:, 0]))
 
 
 def _middle(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The per-axis lower median: a value of the data, so moving the cloud moves it exactly."""
+    """Return the lower median per axis: it is an input value, so shifting the points shifts it exactly."""
     rank = (len(points) - 1) // 2
     return np.partition(points, rank, axis=0)[rank]

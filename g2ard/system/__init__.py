@@ -1,1 +1,1 @@
-"""What g2ard uses of the machine: devices, memory, signals."""
+"""Access to the machine: devices, memory, signals, optional packages."""

@@ -1,4 +1,4 @@
-"""Which device the kernels run on. It changes how long they take, and nothing else."""
+"""The device that kernels run on. It affects the running time, never the results."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Adapter:
         backend: vulkan, metal or dx12.
         driver: its name and version.
         max_buffer: bytes of its largest buffer.
-        max_binding: bytes that one kernel sees of a buffer; larger scenes go in pieces.
-        max_workgroup_memory: bytes that the threads of a workgroup share.
-        timestamps: whether it keeps time.
+        max_binding: bytes of a buffer that one kernel can address; larger scenes are processed in pieces.
+        max_workgroup_memory: bytes shared by the threads of a workgroup.
+        timestamps: whether it can time kernels.
     """
 
     name: str
@@ -36,13 +36,13 @@ class Adapter:
 
 @dataclass(frozen=True)
 class State:
-    """What became of the choice.
+    """The current device and its usage.
 
     Args:
-        adapter: the name of the adapter in use; None on the CPU, and before a kernel asks for one.
-        served: how many kernels it has run.
-        uploaded_bytes: what it was sent for them; 0 again once it is left.
-        seconds: on the device by kernel, where `use` was told to keep time.
+        adapter: name of the adapter in use; None on the CPU and before the first kernel runs.
+        served: number of kernels it has run.
+        uploaded_bytes: bytes sent to it; 0 after a fallback to the CPU.
+        seconds: time on the device by kernel, if `use` was called with `timed`.
     """
 
     adapter: str | None
@@ -52,26 +52,25 @@ class State:
 
 
 def adapters() -> list[Adapter] | None:
-    """Every adapter, the one to use first; None where this build has no GPU kernels."""
+    """Return all adapters, best first, or None if this build has no GPU kernels."""
     _hush()
     found = _core.adapters()
     return None if found is None else [Adapter(**row) for row in found]
 
 
 def use(device: str, *, timed: bool = False) -> None:
-    """Choose where kernels run from now on, in all threads of this process.
+    """Select the device for all kernels of this process.
 
-    Twins of the kernels exist for `simplify` by the paper's method and for what `select` looks at; all others
-    run on the CPU whatever is chosen. A device that fails is left for good, with a line in `notes()`.
+    Only `simplify` with the paper's method and the visibility pass of `select` have GPU kernels; the rest
+    always runs on the CPU. If the device fails, the CPU takes over for good and `notes()` says so.
 
     Args:
-        device: "cpu", which is what a process starts with; "gpu", the best adapter there is, even in
-            software; "auto", a real GPU if the scene is large and a quick probe shows it to be right
-            and faster.
-        timed: keep time of every kernel, where the adapter can.
+        device: "cpu" (the initial device); "gpu", the best adapter, even a software one; or "auto", a
+            hardware GPU if the scene is large and a quick probe shows that it is correct and faster.
+        timed: time every kernel, if the adapter can.
 
     Raises:
-        InputError: another name.
+        InputError: unknown device name.
 
     >>> use("cpu")
     >>> state().adapter is None
@@ -84,22 +83,22 @@ def use(device: str, *, timed: bool = False) -> None:
 
 
 def _hush() -> None:
-    """Where there is no desktop, a layer of Mesa that asks it for the preferred GPU complains on stderr."""
+    """Silence a Mesa layer that complains on stderr when there is no desktop session."""
     if "XDG_RUNTIME_DIR" not in os.environ:
         os.environ.setdefault("NODEVICE_SELECT", "1")
 
 
 def state() -> State:
-    """Where kernels run, and what there is to tell."""
+    """Return the current device and its usage."""
     return State(**_core.device_state())
 
 
 def is_software() -> bool:
-    """Whether the adapter in use is a driver that computes on the CPU."""
+    """Return whether the adapter in use is a software renderer."""
     name = state().adapter
     return any(found.name == name and found.kind == "cpu" for found in adapters() or ())
 
 
 def notes() -> list[str]:
-    """Lines for the user since last asked, such as why the CPU took over."""
+    """Return and clear pending messages, such as the reason for a fallback to the CPU."""
     return _core.device_notes()

@@ -1,7 +1,7 @@
-"""Ctrl-C and SIGTERM: both end the program with one line, during a command after it has kept what it can.
+"""Handling of Ctrl-C and SIGTERM: both end the program with one line.
 
-Outside a command nothing is to be cleaned up yet, or any more, so they just end it: libraries that load, and
-typer as it builds its commands, would answer with pages of traceback.
+A running command first saves what it can. Outside a command there is nothing to clean up, so the process ends
+at once; otherwise libraries that are still loading would print long tracebacks.
 """
 
 from __future__ import annotations
@@ -9,25 +9,25 @@ from __future__ import annotations
 import os
 import signal
 
-TYPE_CHECKING = False  # the program's first import: typing's own takes long enough to press Ctrl-C in
+TYPE_CHECKING = False  # this is the program's first import, and importing typing is slow enough to interrupt
 if TYPE_CHECKING:
     from types import FrameType
     from typing import NoReturn
 
 STATUSES = (130, 143)
-"""What the program ends with after Ctrl-C, and after SIGTERM."""
+"""Exit statuses after Ctrl-C and after SIGTERM."""
 
 _last = signal.SIGINT
 
 
 def asked_by(number: int) -> None:
-    """Remember which signal it was that asked for the end, for `status`."""
+    """Remember the signal that requested the exit, for `status`."""
     global _last
     _last = signal.Signals(number)
 
 
 def status() -> int:
-    """What the program ends with after the signal that asked for it."""
+    """Return the exit status for the last signal."""
     return 128 + _last
 
 
@@ -37,13 +37,13 @@ def _end(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def terminate(number: int, frame: FrameType | None) -> NoReturn:
-    """SIGTERM's handler during a command: as Ctrl-C."""
+    """Handle SIGTERM during a command like Ctrl-C."""
     asked_by(number)
     raise KeyboardInterrupt
 
 
 def ends_the_program() -> None:
-    """From here on both end the program with a line, unless something else handles them."""
+    """Make both signals end the process with one line, unless another handler is installed."""
     for number, ours in (
         (signal.SIGINT, (signal.default_int_handler,)),
         (signal.SIGTERM, (signal.SIG_DFL, terminate)),
@@ -53,7 +53,8 @@ def ends_the_program() -> None:
 
 
 def raises() -> bool:
-    """From here on they raise KeyboardInterrupt; False where `ends_the_program` had not changed Ctrl-C."""
+    """Make both signals raise KeyboardInterrupt; return False if `ends_the_program` had not replaced Ctrl-C's
+    handler."""
     if signal.getsignal(signal.SIGTERM) is _end:
         signal.signal(signal.SIGTERM, terminate)
     if signal.getsignal(signal.SIGINT) is not _end:
@@ -63,15 +64,15 @@ def raises() -> bool:
 
 
 def leave() -> NoReturn:
-    """End at once with `status`.
+    """Exit immediately with `status`.
 
-    If the signal came while source was executed from a string, as making a dataclass does, Python remembers
-    that as an interrupt nobody handled, and would end a program that has handled it by the signal.
+    Python records a signal that arrives during `exec` (as in creating a dataclass) as unhandled, and would
+    end even a program that has handled it by the signal; `os._exit` avoids that.
     """
     import sys
 
     if (shared := sys.modules.get("multiprocessing.util")) is not None:
-        shared._run_finalizers(0)  # semaphores: without it a helper process tells later that they were left
+        shared._run_finalizers(0)  # release semaphores, or the resource tracker reports them as leaked
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(status())

@@ -1,13 +1,13 @@
-"""Memory of this process, and of its workers."""
+"""Peak memory of this process and its workers."""
 
 from __future__ import annotations
 
 _WORKERS: dict[int, int] = {}
-"""Worker processes → their peaks, in bytes."""
+"""Worker process ID → peak bytes."""
 
 
 def peak_rss() -> int | None:
-    """The most bytes of memory that were resident so far; None where the system does not tell (Windows).
+    """Return the peak resident memory in bytes, or None if the system does not report it (Windows).
 
     >>> peak_rss() is None or peak_rss() > 1_000_000
     True
@@ -23,17 +23,16 @@ def peak_rss() -> int | None:
 
 
 def note_worker(process: int, peak: int | None) -> None:
-    """Note what `peak_rss` says in a worker."""
+    """Record a worker's `peak_rss`."""
     if peak is not None:
         _WORKERS[process] = max(peak, _WORKERS.get(process, 0))
 
 
 def forget_workers() -> None:
-    """Those of another run."""
     _WORKERS.clear()
 
 
 def peak_rss_of_all() -> int | None:
-    """The peaks of this process and of each worker here, summed: no less than they held at once."""
+    """Return the sum of the peaks of this process and its workers: an upper bound of their joint peak."""
     own = peak_rss()
     return None if own is None else own + sum(_WORKERS.values())

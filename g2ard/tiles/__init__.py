@@ -1,1 +1,1 @@
-"""Scenes larger than memory, as tiles in a folder."""
+"""Scenes larger than memory, stored as tiles in a folder."""

@@ -20,30 +20,30 @@ from g2ard.system.memory import forget_workers, note_worker, peak_rss
 from g2ard.tiles.tasks import Task, run_task
 
 _TRIES = 5
-"""How often in a row workers may die with no task done between. Dask gives up a task after four deaths."""
+"""Worker deaths in a row, without a finished task, before giving up. Dask gives up a task after four."""
 
 _MANAGER = 5.0
-"""Seconds for the pool's own thread to end once its workers are dead. It removes semaphores, of which Python
-warns where the program ends meanwhile."""
+"""Seconds to wait for the pool's manager thread after its workers are dead.
+
+The thread releases semaphores; otherwise Python warns about them at exit.
+"""
 
 
 class Executor(Protocol):
-    """Runs tasks that do not read each other's files."""
+    """Runner for tasks that do not read each other's files."""
 
     def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
-        """The tasks' files, in the tasks' order; those that are there are not made again."""
+        """Run the tasks that are not done; return the files of all, in order."""
 
 
 @dataclass(frozen=True)
 class Workers:
-    """An executor, the folder for its tasks' files, and a callback for progress."""
-
     executor: Executor
     folder: Path
     progress: Progress = silent
 
     def run(self, tasks: Sequence[Task], stage: str) -> list[Path]:
-        """Run tasks; return their files, in the tasks' order."""
+        """Run tasks; return their files in order."""
         return self.executor.run(tasks, stage, self.progress)
 
 
@@ -51,16 +51,16 @@ class Workers:
 def executor(
     workers: int = 1, threads: int | None = None, scheduler: str | None = None
 ) -> Iterator[Executor]:
-    """Where tasks run.
+    """Yield an executor.
 
     Args:
-        workers: processes at once; 1 runs tasks in this process.
-        threads: of each worker; None shares the cores out.
+        workers: number of processes; 1 runs tasks in this process.
+        threads: threads per worker; None divides the cores among workers.
         scheduler: `tcp://HOST:PORT` of a Dask scheduler whose workers see the same files, or `local` for a
-            Dask cluster of `workers` processes here.
+            Dask cluster of `workers` processes on this machine.
 
     Raises:
-        InputError: Dask is not installed, or does not answer.
+        InputError: Dask is not installed, or the scheduler does not answer.
     """
     forget_workers()
     threads = threads or max(1, (os.cpu_count() or 1) // workers)
@@ -88,7 +88,7 @@ class _Here:
 
 
 class _Processes:
-    """A pool of processes; where one is killed the pool is made anew, and what was not done is done again."""
+    """A pool of processes; if one is killed, the pool is recreated and unfinished tasks run again."""
 
     def __init__(self, workers: int, threads: int):
         self._workers, self._threads = workers, threads
@@ -114,8 +114,8 @@ class _Processes:
                 failures = failures + 1 if left == before else 0
                 if failures == _TRIES:
                     raise InputError(
-                        f"{stage}: workers die before they finish anything; with less --memory or fewer "
-                        "--workers they take less each"
+                        f"{stage}: workers were killed before finishing a task; lower --memory or "
+                        "--workers so that they need less memory"
                     ) from None
         progress(stage, total, total)
         return [task.output for task in tasks]
@@ -153,20 +153,20 @@ class _Processes:
 
 
 def _sweep(tasks: Sequence[Task]) -> None:
-    """Remove what workers that were killed had begun to write."""
+    """Remove partial files of killed workers."""
     for task in tasks:
         for begun in task.folder.glob(f".{task.output.stem}.*"):
             begun.unlink(missing_ok=True)
 
 
 def _run_noted(task: Task) -> tuple[int, int | None]:
-    """Run a task in a worker: the worker, and the most memory that it has come to."""
+    """Run a task in a worker; return the worker's process ID and its peak memory."""
     run_task(task)
     return os.getpid(), peak_rss()
 
 
 def _begin(threads: int) -> None:
-    """A worker's start: Ctrl-C is its parent's to act on, and without its parent it ends."""
+    """Initialise a worker: leave Ctrl-C to the parent, and exit when the parent dies."""
     from g2ard import _core
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -175,7 +175,7 @@ def _begin(threads: int) -> None:
 
 
 def _end_with_parent() -> None:
-    """A parent that was killed tells its workers nothing: they would wait for it for ever."""
+    """Exit when the parent is gone; a killed parent cannot tell its workers, which would wait forever."""
     parent = parent_process()
     if parent is not None:
         parent.join()
@@ -183,9 +183,9 @@ def _end_with_parent() -> None:
 
 
 class DaskExecutor:
-    """Runs tasks on the workers of a scheduler, which must see the same files under the same paths.
+    """Executor on the workers of a Dask scheduler, which must see the same files under the same paths.
 
-    Results are paths: what workers hold in memory is Rust's, which Dask's spilling does not know of.
+    Results are paths, because Dask cannot spill what workers hold in Rust's memory.
 
     Raises:
         InputError: Dask is not installed, or the scheduler does not answer.
@@ -196,7 +196,7 @@ class DaskExecutor:
             from distributed import Client, LocalCluster
         except ImportError:
             raise InputError(
-                '--scheduler: Dask is not installed; pip install "g2ard[distributed]" brings it'
+                '--scheduler: Dask is not installed; run pip install "g2ard[distributed]"'
             ) from None
         self._threads = threads
         self._cluster: Any = None
@@ -215,8 +215,8 @@ class DaskExecutor:
             )
         except (OSError, TimeoutError, ValueError) as error:
             raise InputError(
-                f"--scheduler {scheduler}: does not answer ({error}); `dask scheduler` starts one and prints "
-                "its address"
+                f"--scheduler {scheduler}: no answer ({error}); start one with `dask scheduler`, which "
+                "prints its address"
             ) from None
 
     def __enter__(self) -> DaskExecutor:
@@ -228,7 +228,7 @@ class DaskExecutor:
             self._cluster.close()
 
     def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
-        """As `Executor.run`; a worker's death costs a retry."""
+        """Run tasks like `Executor.run`, retrying after a worker's death."""
         from distributed import KilledWorker
 
         deaths = 0
@@ -241,12 +241,12 @@ class DaskExecutor:
                 deaths = deaths + 1 if left == before else 0
                 if deaths == _TRIES:
                     raise InputError(
-                        f"{stage}: workers die before they finish anything; give them memory"
+                        f"{stage}: workers were killed before finishing a task; give them more memory"
                     ) from None
                 continue
             if missing := [task.output for task in tasks if not task.done]:
                 raise InputError(
-                    f"{missing[0]}: a worker made it, but it is not here; share that folder with all workers"
+                    f"{missing[0]}: written by a worker but missing here; share the folder with all workers"
                 )
         return [task.output for task in tasks]
 

@@ -1,4 +1,4 @@
-"""Streaming a scene, or a coloured cloud, of any size into tiles, in memory that does not grow with it."""
+"""Ingestion: streaming a scene or coloured point cloud of any size into tiles, in bounded memory."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from g2ard.tiles.pour import PointFeed, SceneFeed, lift_tiles, pour
 from g2ard.tiles.store import MANIFEST, VERSION, TileStore
 
 TILE_ROWS = 5_000_000
-"""Rows of a tile at the most, unless told otherwise."""
+"""Default largest number of rows per tile."""
 
 MOST_TILES = 10_000
-"""Tiles of a scene, about: each is two files, and every step goes over all of them."""
+"""Approximate largest number of tiles; each is two files, and every step visits all of them."""
 
 _BLOCK_BYTES = 1 << 24
-"""Bytes of rows in memory at a time; some five copies of them are made on the way."""
+"""Bytes of rows in memory at a time; processing makes about five copies of them."""
 
 
 def ingest(
@@ -45,27 +45,28 @@ def ingest(
 ) -> TileStore:
     """Write a scene as tiles of at most `tile_rows` Gaussians, each with a halo of its neighbours.
 
-    A kd tree cuts at medians of a sample of positions, along the longest side. A halo holds the Gaussians of
-    other tiles that lie in the tile's box once its sides are moved outwards by 3 % of the median over tiles
-    of √(ab), a and b a tile's two longer sides. Which tile a Gaussian comes to depends neither on the order
-    of the rows nor on `block_rows`; within a tile the rows keep their order.
+    A kd-tree cuts at medians of a sample of positions, along the longest side. The halo of a tile holds the
+    Gaussians of other tiles within a margin around its box. The margin is 3 % of the median over tiles of
+    √(ab), where a and b are a tile's two longer sides. The assignment to tiles depends neither on the order
+    of the rows nor on `block_rows`; rows keep their order within a tile.
 
-    The points of a cloud come to tiles in the same way, and are lifted tile by tile, each with its halo
-    around, so that a point at a border has its neighbours.
+    Points of a point cloud are assigned in the same way and lifted tile by tile, together with the halo, so
+    that points at a border have all their neighbours.
 
-    Where it was interrupted the same call goes on from the last block, and where all is done it returns.
+    After an interruption the same call resumes from the last block. If the tiles are complete, it returns at
+    once.
 
     Args:
-        source: a scene, or several as one, as `g2ard.io.open_stream` takes them; or coloured clouds,
-            as `g2ard.io.open_point_stream` does; or a stream of a scene.
-        folder: where the tiles go; absent, empty, or holding these tiles in part or whole.
-        tile_rows: Gaussians of a tile at the most; only Gaussians of one position are never parted.
-        block_rows: rows in memory at a time; None takes 16 MiB of them.
-        lift: how points are lifted; None is `LiftConfig()`.
-        like: tiles whose tree and margin are taken, however many rows they come to hold.
-        overwrite: whether tiles of another scene, or of other settings, may be replaced.
-        progress: told of rows done.
-        say: told what was noticed.
+        source: one or more scenes as accepted by `g2ard.io.open_stream`, one or more coloured point clouds as
+            accepted by `g2ard.io.open_point_stream`, or a scene stream.
+        folder: output folder: absent, empty, or with these tiles, complete or partial.
+        tile_rows: most Gaussians per tile; exceeded only if more of them share one position.
+        block_rows: rows in memory at a time; None means 16 MiB of rows.
+        lift: constants for lifting points; None means `LiftConfig()`.
+        like: reuse the tree and margin of these tiles, ignoring `tile_rows`.
+        overwrite: replace tiles of another scene or of other settings.
+        progress: called with the number of rows done.
+        say: called with messages.
 
     Raises:
         InputError: the source cannot be read, or `tile_rows` is less than 1 or a 10,000th of its rows.
@@ -90,8 +91,8 @@ def ingest(
     fewest = -(-feed.stream.count // MOST_TILES)
     if like is None and tile_rows < fewest:
         raise InputError(
-            f"{feed.stream.path} is {feed.stream.count:,} rows, too many for tiles of {tile_rows:,}; "
-            f"at least {fewest:,} each are needed",
+            f"{feed.stream.path}: {feed.stream.count:,} rows are too many for tiles of {tile_rows:,}; "
+            f"use at least {fewest:,} rows per tile",
             parameter="tile_rows",
         )
     settings: dict[str, Any] = {"tile_rows": tile_rows} if like is None else {"like": like.key}
@@ -100,12 +101,12 @@ def ingest(
     feed.settings, key = settings, _key(feed.stream.identity(), settings)
     done = _done(folder, key, overwrite)
     if done is not None:
-        say(f"{folder}: holds these {plural(done.count, 'Gaussian')} already; skipped")
+        say(f"{folder}: already holds these {plural(done.count, 'Gaussian')}; skipped")
         return done
     _check_foreign(folder)
     with locked(folder):
         if (done := _done(folder, key, overwrite)) is not None:
-            return done  # by another process in the meantime
+            return done  # finished by another process in the meantime
         _check_tiles(folder, key, settings, overwrite, say)
         rows = block_rows or max(1, _BLOCK_BYTES // feed.row_bytes)
         try:
@@ -131,7 +132,7 @@ def ingest(
 def _feed(
     source: str | Path | Sequence[str | Path] | SceneStream, config: LiftConfig
 ) -> tuple[SceneFeed | PointFeed, list[str]]:
-    """What is poured, and the names of where it comes from."""
+    """Return the feed of a source and the names of its files."""
     if isinstance(source, SceneStream):
         return SceneFeed(source), [str(source.path)]
     sources: list[str | Path] = [source] if isinstance(source, str | Path) else list(source)
@@ -147,8 +148,10 @@ def _key(identity: list[Any], settings: dict[str, Any]) -> str:
 
 
 def _done(folder: Path, key: str, overwrite: bool) -> TileStore | None:
-    """The store, if it is this very one and whole; what is broken may be replaced if it was this one, or
-    under `overwrite`."""
+    """Return the store if it is complete and has this key, otherwise None.
+
+    A broken manifest raises, unless it has this key or `overwrite` is set.
+    """
     if not (folder / MANIFEST).is_file():
         return None
     try:
@@ -161,49 +164,51 @@ def _done(folder: Path, key: str, overwrite: bool) -> TileStore | None:
 
 
 def _check_foreign(folder: Path) -> None:
-    """Make the folder; refuse one that holds anything but tiles."""
+    """Create the folder; reject one that holds anything but tiles."""
     if folder.is_file():
-        raise OutputError(f"{folder}: is a file; a folder is to be written there")
+        raise OutputError(f"{folder}: is a file; expected a folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         names = {path.name for path in folder.iterdir()}
     except OSError as error:
-        raise OutputError(f"{folder}: cannot write there: {error.strerror}") from error
+        raise OutputError(f"{folder}: cannot write: {error.strerror}") from error
     foreign = sorted(name for name in names if not (is_ours(name) or name == LOCK))
     if foreign:
-        raise OutputError(f"{folder}: holds {foreign[0]}, which is no part of tiles; name another folder")
+        raise OutputError(
+            f"{folder}: holds {foreign[0]}, which does not belong to tiles; choose another folder"
+        )
 
 
 def _check_tiles(folder: Path, key: str, settings: dict[str, Any], overwrite: bool, say: Say) -> None:
-    """Refuse all but the beginnings of these very tiles, and clear away what is no use to go on from."""
+    """Reject tiles of another scene or other settings, and clear tiles that cannot be resumed."""
     found = (folder / MANIFEST, folder / JOURNAL, folder / POINTS / JOURNAL)
     manifest, *begun = [_key_in(path) for path in found]
     known = {each for each in (manifest, *begun) if each is not None}
     if known - {key} and not overwrite:
         raise OutputError(
-            f"holds tiles of another scene or of other settings{_differing(found, settings)}",
+            f"holds tiles of another scene or with other settings{_differing(found, settings)}",
             path=folder,
             hint="{overwrite=True} replaces it",
         )
     if manifest == key:
-        say(f"{folder}: its tiles are damaged; written anew")
+        say(f"{folder}: its tiles are damaged; writing them again")
     if manifest is not None or known != {key}:
         clear(folder)
 
 
 def _differing(found: Sequence[Path], settings: dict[str, Any]) -> str:
-    """Which settings of a manifest or journal are other ones, in brackets; nothing where none is."""
+    """Return the settings that differ from a manifest's or journal's, in brackets, or ""."""
     for path in found:
         with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
             theirs = dict(json.loads(path.read_text(encoding="utf-8"))["settings"])
             names = [name for name in {**theirs, **settings} if theirs.get(name) != settings.get(name)]
-            told = [f"{name} {theirs.get(name)}, not {settings.get(name)}" for name in names]
+            told = [f"{name} {theirs.get(name)} instead of {settings.get(name)}" for name in names]
             return f" ({'; '.join(told)})" if told else ""
     return ""
 
 
 def _key_in(path: Path) -> str | None:
-    """The key in a manifest or journal; "" where it cannot be read, None where there is none."""
+    """Return the key in a manifest or journal: "" if unreadable, None if there is no file."""
     if not path.is_file():
         return None
     try:

@@ -1,4 +1,4 @@
-"""How far the writing of tiles has come, kept beside them, so that any interruption costs one block."""
+"""Journal of partially written tiles; an interruption costs at most one block."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _OURS = re.compile(r"(tile|halo)-\d{5,}\.f32|\.?(tiles|journal)\.json(\.new)?|\.
 
 
 def is_ours(name: str) -> bool:
-    """Whether a file or folder of this name belongs to tiles, whole or begun."""
+    """Return whether a file or folder of this name belongs to tiles, complete or partial."""
     return _OURS.fullmatch(name) is not None
 
 
 def clear(folder: Path) -> None:
-    """Remove all that belongs to tiles, the manifest first, and nothing else."""
+    """Remove all files that belong to tiles, the manifest first."""
     for path in sorted(folder.iterdir(), key=lambda path: path.name != MANIFEST):
         if path.is_dir() and path.name == POINTS:
             shutil.rmtree(path)
@@ -40,7 +40,7 @@ def clear(folder: Path) -> None:
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write beside and rename: the file is the old one or the new one."""
+    """Write JSON atomically."""
     temporary = path.with_name(f".{path.name}.new")
     temporary.write_text(json.dumps(content) + "\n", encoding="utf-8", newline="\n")
     os.replace(temporary, path)
@@ -48,7 +48,7 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 
 @dataclass
 class _Files:
-    """What has been written of the files of one kind."""
+    """Row counts and checksums of the written files of one kind."""
 
     rows: list[int]
     checks: list[int]
@@ -58,18 +58,18 @@ class _Files:
 class Journal:
     """The tiles of a scene while they are written.
 
-    `save` follows the rows, so that what it names has been written; whatever else the files hold is cut off
-    when it is opened again.
+    `save` runs after the rows are written, so the journal never names more than the files hold. `cut` removes
+    the excess after an interruption.
 
     Args:
-        folder: where the tiles are.
-        key: of their content.
-        tree: the kd tree.
-        margin: of halos.
-        row_bytes: bytes of a row.
-        tally: a dataclass of what the source counts while it is read.
-        settings: that decide the content beside the source, for those who ask for others.
-        next_row: the first row of the source that is not in its tile yet.
+        folder: folder of the tiles.
+        key: hash of everything that determines their content.
+        tree: the kd-tree.
+        margin: reach of halos, scene units.
+        row_bytes: bytes per row.
+        tally: a dataclass of counts gathered while reading the source.
+        settings: settings behind `key`, for error messages.
+        next_row: first row of the source that is not in its tile yet.
     """
 
     folder: Path
@@ -91,10 +91,10 @@ class Journal:
 
     @classmethod
     def open(cls, folder: Path, row_bytes: int, tally: type) -> Journal | None:
-        """The journal in a folder, its files cut to what it names; None if there is none.
+        """Read the journal of a folder, or return None if there is none.
 
         Raises:
-            InputError: it is malformed, or a file is shorter than it says.
+            InputError: it is malformed.
         """
         path = folder / JOURNAL
         if not path.is_file():
@@ -117,12 +117,12 @@ class Journal:
         return journal
 
     def cut(self) -> None:
-        """Cut the files to what the journal names, and make those that are absent and ought to be empty."""
+        """Truncate files to the journal's row counts, and create missing empty ones."""
         for name, rows in self._named():
             path = self.folder / name
             with path.open("ab") as file:
                 if file.tell() < rows * self.row_bytes:
-                    raise InputError(f"{path}: {file.tell():,} bytes, the journal says more")
+                    raise InputError(f"{path}: {file.tell():,} bytes, fewer than the journal says")
                 file.truncate(rows * self.row_bytes)
 
     def _named(self) -> list[tuple[str, int]]:
@@ -135,16 +135,16 @@ class Journal:
         return self.row_bytes * (sum(self.tiles.rows) + sum(self.halos.rows))
 
     def positions(self, name: str, count: int) -> Points:
-        """(count, 3) float32: the first three numbers of each row of a file."""
+        """Return the (count, 3) float32 positions in a file, the first three numbers of each row."""
         rows = np.memmap(self.folder / name, "u1", "r", shape=(count, self.row_bytes))
         return np.ascontiguousarray(rows[:, :12]).view("<f4")
 
     def add(self, rows: NDArray[Any], means: Points) -> None:
-        """Append each row to its tile, and to the halos of all tiles that it is near to.
+        """Append rows to their tiles and to the halos of tiles nearby.
 
         Args:
             rows: (N, …) rows of `row_bytes`, contiguous.
-            means: (N, 3) where they are.
+            means: (N, 3) their positions.
         """
         if not len(rows):
             return
@@ -169,7 +169,7 @@ class Journal:
         files.checks[index] = zlib.crc32(data, files.checks[index])
 
     def save(self) -> None:
-        """Tell the disk how far the rows have come."""
+        """Write the journal to disk."""
         content = {
             "key": self.key,
             "settings": self.settings,
@@ -185,7 +185,7 @@ class Journal:
         _write_json(self.folder / JOURNAL, content)
 
     def finish(self, manifest: dict[str, Any]) -> None:
-        """Write the manifest, which makes the folder a store, and forget the journal."""
+        """Write the manifest, which makes the folder a store, and remove the journal."""
         low, high = np.array(self.low), np.array(self.high)
         tiles = [
             {

@@ -1,4 +1,4 @@
-"""The kd tree whose leaves are tiles: cut at medians of points, and what lies in and around each leaf."""
+"""kd-tree of tiles: median cuts, and the rows in and around each leaf."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 _SIGMAS = 4.0
-"""A tile may hold more than a sample foretells; by so many standard deviations at the most, it is taken."""
+"""Standard deviations by which a tile may exceed the count estimated from a sample."""
 
 _HALO = 0.03
-"""The margin of a halo, in sides of a tile."""
+"""Margin of a halo as a fraction of a tile's side."""
 
 _TAILS = 1, 99
-"""Percentiles between which a box's sides are measured, so that stray floaters decide nothing."""
+"""Percentiles that bound a box when its sides are measured, to ignore floaters."""
 
 Points = NDArray[np.float32]
 Rows = NDArray[np.intp]
@@ -24,7 +24,7 @@ Rows = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class KdTree:
-    """A node: points with `x[axis] < at` are `below`'s. A leaf has neither."""
+    """A node: points with `x[axis] < at` are in `below`. A leaf has no children."""
 
     axis: int = -1
     at: float = 0.0
@@ -33,11 +33,11 @@ class KdTree:
 
     @property
     def leaves(self) -> int:
-        """How many tiles there are."""
+        """Number of leaves."""
         return self.below.leaves + self.above.leaves if self.below and self.above else 1
 
     def boxes(self) -> NDArray[np.float64]:
-        """(leaves, 2, 3) low and high corners, infinite where nothing was cut."""
+        """Return the (leaves, 2, 3) low and high corners, infinite where nothing was cut."""
         boxes = [np.array([[-np.inf] * 3, [np.inf] * 3])]
         if self.below and self.above:
             below, above = self.below.boxes(), self.above.boxes()
@@ -47,13 +47,13 @@ class KdTree:
         return np.stack(boxes)
 
     def route(self, points: Points, margin: float = 0.0) -> Iterator[tuple[Rows, Rows]]:
-        """For each leaf in order: the rows in its box, and those of other boxes within `margin`.
+        """Yield per leaf, in order, the rows in its box and the rows of other boxes within `margin`.
 
-        A point is within the margin where it lies in the box after all of its sides moved outwards by it.
+        A point is within the margin if it lies in the box after all sides move outwards by `margin`.
 
         Args:
             points: (N, 3) float32, finite.
-            margin: as far as a halo reaches; 0 makes none.
+            margin: reach of the halo; 0 makes no halo.
         """
         core, halo = np.arange(len(points)), np.empty(0, np.intp)
         columns = tuple(np.ascontiguousarray(points.T))
@@ -78,7 +78,7 @@ class KdTree:
         yield from self.above._route(columns, right, halo_right, margin)
 
     def refined(self, parts: dict[int, KdTree]) -> KdTree:
-        """The same tree with some leaves, by number, replaced by trees."""
+        """Return the tree with some leaves, by number, replaced by trees."""
         numbers = iter(range(self.leaves))
 
         def build(node: KdTree) -> KdTree:
@@ -89,17 +89,17 @@ class KdTree:
         return build(self)
 
     def to_json(self) -> Any:
-        """Nested lists [axis, at, below, above]; null for a leaf."""
+        """Return nested lists [axis, at, below, above], with null for a leaf."""
         if self.below and self.above:
             return [self.axis, self.at, self.below.to_json(), self.above.to_json()]
         return None
 
     @classmethod
     def from_json(cls, content: Any) -> KdTree:
-        """What `to_json` gave.
+        """Parse the output of `to_json`.
 
         Raises:
-            ValueError, TypeError: it is something else.
+            ValueError, TypeError: malformed content.
         """
         if content is None:
             return cls()
@@ -112,13 +112,13 @@ class KdTree:
 def cut_tree(points: Points, rows_each: float, most: int) -> KdTree:
     """Cut until no leaf is expected to hold more than `most` rows.
 
-    Along the longest side, at the quantile that leaves both parts with whole tiles. The order of the points
-    decides nothing.
+    Each cut is along the longest side, at the quantile that gives both parts whole numbers of tiles. The
+    order of the points does not matter.
 
     Args:
-        points: (N, 3) float32, finite: all rows or a sample of them.
-        rows_each: how many rows a point stands for; 1 where they are all.
-        most: rows of a leaf.
+        points: (N, 3) float32, finite: all rows or a sample.
+        rows_each: rows per point; 1 for all rows.
+        most: most rows of a leaf.
 
     Returns:
         A tree; a leaf whose points all coincide may hold more.
@@ -139,7 +139,7 @@ def cut_tree(points: Points, rows_each: float, most: int) -> KdTree:
 
 
 def _parts(points: int, rows_each: float, most: int) -> int:
-    """The least number of equal parts none of which will hold more than `most` rows."""
+    """Return the smallest number of equal parts that are expected to hold at most `most` rows each."""
     parts = max(1, int(np.ceil(points * rows_each / most)))
     sigmas = _SIGMAS if rows_each > 1 else 0.0
     while parts < points and (points / parts + sigmas * np.sqrt(points / parts)) * rows_each > most:
@@ -148,7 +148,7 @@ def _parts(points: int, rows_each: float, most: int) -> int:
 
 
 def _between(values: Points, rank: float) -> np.float32 | None:
-    """The value with something below it whose number of lesser values is nearest to `rank`."""
+    """Return the value, other than the minimum, whose rank is nearest to `rank`."""
     middle = values[min(int(rank), len(values) - 1)]
     first = int(np.searchsorted(values, middle, "left"))
     after = int(np.searchsorted(values, middle, "right"))
@@ -160,12 +160,7 @@ def _between(values: Points, rank: float) -> np.float32 | None:
 
 
 def margin_of(tree: KdTree, points: Points) -> float:
-    """How far halos reach: 3 % of the median over tiles of √(ab), a and b a tile's two longer sides.
-
-    Args:
-        tree: the tiles.
-        points: (N, 3) float32, all rows or a sample of them.
-    """
+    """Return the margin of halos: 3 % of the tiles' median √(ab), where a and b are the longer sides."""
     if tree.leaves == 1:
         return 0.0
     sizes = []
@@ -178,8 +173,10 @@ def margin_of(tree: KdTree, points: Points) -> float:
 
 
 class Sampler:
-    """A sample of points that neither their order nor how they come in blocks decides: those whose hash is
-    below a limit, which is halved when they are too many."""
+    """Sample of points that depends neither on their order nor on the blocks they arrive in.
+
+    It keeps points whose hash is below a limit, and halves the limit when there are too many.
+    """
 
     def __init__(self, count: int, size: int) -> None:
         self._limit = min(1 << 32, max(1, (size << 32) // max(1, count)))
@@ -188,7 +185,7 @@ class Sampler:
         self._hashes: list[NDArray[np.uint32]] = []
 
     def add(self, points: Points) -> None:
-        """Draw from (N, 3) float32 points; those that are not finite are left out."""
+        """Sample from (N, 3) float32 points, skipping points that are not finite."""
         hashes = _hashes(points)
         chosen = np.isfinite(points).all(1)
         if self._limit < 1 << 32:
@@ -204,13 +201,13 @@ class Sampler:
             self._held = len(self._points[0])
 
     def result(self) -> tuple[Points, float]:
-        """(n, 3) points, and how many rows each stands for."""
+        """Return (n, 3) points, and the number of rows per point."""
         points = np.concatenate(self._points) if self._points else np.empty((0, 3), np.float32)
         return points, (1 << 32) / self._limit
 
 
 def _hashes(points: Points) -> NDArray[np.uint32]:
-    """(N,) of each row's bits: multiplied and mixed as MurmurHash3 ends."""
+    """Hash each row's bits to (N,) uint32, finished like MurmurHash3."""
     bits = np.ascontiguousarray(points).view(np.uint32)
     h = bits[:, 0] * np.uint32(0x9E3779B1)
     for axis, factor in ((1, 0x85EBCA77), (2, 0xC2B2AE3D)):

@@ -1,4 +1,4 @@
-"""Simplification of a scene in tiles, at one exact budget."""
+"""Simplification of a tiled scene to one exact budget."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
 
 _POOL, _POOL_ROWS = 96, 4_000_000
-"""Poses to look from for so many Gaussians; more of these, more of those."""
+"""Number of poses for each so many Gaussians; larger scenes get proportionally more."""
 
 _PLANNED_ON = 100_000
-"""Gaussians of a fair sample that so many poses are planned on."""
+"""Sampled Gaussians on which each `_POOL` poses are planned."""
 
 _HALF = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
 class TiledScene:
-    """A simplified scene, in tiles.
+    """A simplified scene in tiles.
 
     Args:
-        counts: Gaussians of each tile.
-        tiles: reads the Gaussians of a tile, opacities fitted.
-        sh_degree: of all.
+        counts: Gaussians per tile.
+        tiles: reads the Gaussians of a tile, with fitted opacities.
+        sh_degree: SH degree of all tiles.
         offset: (3,) float64.
-        key: tells it from others: a hash of the names of its files.
-        views: that the tiles were looked at from; 0 without views.
+        key: hash of the names of its files.
+        views: number of views used; 0 without views.
         unseen: Gaussians of the dense scene that no view sees; None without views.
-        surroundings: what recovery needs beside; None without views.
+        surroundings: placement of the dense tiles, for recovery; None without views.
     """
 
     counts: tuple[int, ...]
@@ -68,12 +68,12 @@ class TiledScene:
         return (self.tiles(tile) for tile in range(len(self.counts)))
 
     def stream(self) -> PartsStream:
-        """The scene to be read tile by tile, as `g2ard.tiles.ingest.ingest` takes it."""
+        """Return a stream over the tiles, as `g2ard.tiles.ingest.ingest` takes it."""
         name = Path(f"simplified-{self.key}")
         return PartsStream(name, self.counts, self.tiles, self.sh_degree, self.offset, [self.key])
 
     def whole(self) -> Splats:
-        """All tiles as one scene in memory."""
+        """Return all tiles as one scene in memory."""
         return join(list(self))
 
 
@@ -90,41 +90,41 @@ def simplify_tiles(
     seed: int = 0,
     say: Say = unsaid,
 ) -> TiledScene:
-    """Reduce a scene in tiles to exactly `budget` Gaussians with the method `default`; all there are stay as
-    they are.
+    """Reduce a tiled scene to exactly `budget` Gaussians with method `default`.
 
-    1. Each tile is merged to a few coarse Gaussians, which stand for it where others are looked at.
-    2. Poses are planned on those; each tile is looked at, by the views that have it in sight, where it stands
-       in the whole scene: its own Gaussians, its halo's, coarse ones of all else.
-    3. What merging along Morton order costs is found in every tile; of all gaps the cheapest close, down to
-       three times the budget. Then each tile plans merges of pairs, farther than it will need; of all plans
-       the cheapest merges are done, down to the budget.
+    If `budget` is the scene's count, the scene is returned unchanged. Otherwise:
+
+    1. Each tile is merged to a few coarse Gaussians that represent it in views of other tiles.
+    2. Poses are planned on these. Each tile is rendered from the views that see it, amid its halo and the
+    coarse
+       Gaussians of all other tiles.
+    3. Each tile computes the costs of merging along Morton order. The cheapest merges of all tiles are done,
+    down to
+       three times the budget. Then each tile plans more merges of pairs than needed, and the cheapest of all
+       plans are done, down to the budget.
     4. Opacities are fitted to what the same views see of the result.
 
-    Every step is a task whose file stays in the folder of `workers`, so that the same call resumes. The
-    result depends on the scene, the tiles and the seed alone, not on where, in which order or how often
-    tasks ran.
+    Every step is a task with a file in the folder of `workers`, so the same call resumes. The result depends
+    only on the scene, the tiles and the seed, not on where, in which order or how often tasks ran.
 
     Args:
         store: the scene.
         budget: Gaussians to keep.
-        workers: run the tasks, one stage after another.
-        config: constants; None means the method's own.
-        views: cameras to look from; None takes those that `beside` finds for a fair sample of the scene, else
-            plans a pool.
-        beside: finds the cameras that lie beside the scene, given a fair sample of it; None where there are
-            none.
+        workers: runs the tasks, stage by stage.
+        config: constants; None means the method's defaults.
+        views: cameras to render from; None uses `beside`, or as a fallback a generated pool.
+        beside: returns cameras found beside the scene for a sample of it, or None.
         blind: use no cameras at all.
-        up: (3,) away from the ground, for poses that are made; None to estimate it.
-        seed: of poses that are made.
-        say: told in lines what was decided.
+        up: (3,) direction away from the ground for generated views; None estimates it.
+        seed: seed of the generated views.
+        say: called with messages.
 
     Raises:
-        InputError: a budget below 1 or above what a renderer draws of the scene.
+        InputError: a budget below 1 or above the number of visible Gaussians.
     """
     if not 1 <= budget <= store.count:
         raise InputError(
-            f"expected 1 to the {store.count:,} Gaussians there are, got {budget:,}", parameter="budget"
+            f"expected 1 to {store.count:,} (the scene's Gaussians), got {budget:,}", parameter="budget"
         )
     run = TiledRun(store, workers, config or SimplifyConfig())
     coarse = run.begin()
@@ -174,7 +174,7 @@ def simplify_tiles(
 
 
 def sample_of(store: TileStore, workers: Workers) -> Splats:
-    """A fair sample of a scene in tiles; its task is one of `simplify_tiles`, which does not do it again."""
+    """Return a representative sample of a tiled scene; `simplify_tiles` reuses its task."""
     run = TiledRun(store, workers, SimplifyConfig())
     return join([scene_of(path, "sample") for path in run.begin()])
 
@@ -182,7 +182,7 @@ def sample_of(store: TileStore, workers: Workers) -> Splats:
 def _scene(
     store: TileStore, counts: tuple[int, ...], files: list[dict[str, Path]], mean: float | None
 ) -> TiledScene:
-    """The scene of what all tiles were merged to."""
+    """Return the scene made of all tiles' merge results."""
 
     def tile(i: int) -> Splats:
         return finished(small_scene(files[i], mean), store.sh_degree)
@@ -203,26 +203,26 @@ def _as_it_is(store: TileStore, sights: Sights | None) -> TiledScene:
 
 
 def key_of(files: Any) -> str:
-    """16 hexadecimal digits of the names of files, which hold the hashes of what decides their content."""
+    """Return 16 hexadecimal digits of a hash of file names, which contain the hashes of their content."""
     names = json.dumps(files, default=lambda path: path.name)
     return hashlib.sha256(names.encode()).hexdigest()[:16]
 
 
 def finished(small: Splats, sh_degree: int) -> Splats:
-    """A tile's Gaussians as they are written."""
+    """Return a tile's Gaussians as they are written to files."""
     return replace(small.with_sh_degree(sh_degree), quats=unit_quats(small.quats))
 
 
 def _check_regions(sample: Splats, regions: Sequence[Region]) -> None:
     if regions and not in_any(sample, regions).any():
         raise InputError(
-            f"none of {len(sample):,} Gaussians, a fair sample of the scene, lies there",
+            f"contains none of {len(sample):,} sampled Gaussians",
             parameter="keep_region",
         )
 
 
 def _planned(run: TiledRun, sample: Splats, up: Any, seed: int, say: Say) -> Cameras | None:
-    """A pool that grows with the scene."""
+    """Plan a view pool that grows with the scene."""
     from g2ard.poses import plan_pool
 
     times = max(1.0, run.store.count / _POOL_ROWS)
@@ -239,18 +239,18 @@ def _planned(run: TiledRun, sample: Splats, up: Any, seed: int, say: Say) -> Cam
             progress=run.workers.progress,
         )
     except InputError as e:
-        say(f"goes on without views: {e}")
+        say(f"continuing without views: {e}")
         return None
     say(f"poses: {len(pool.cameras)}, {pool.kind}")
     return pool.cameras
 
 
 def _runs(run: TiledRun, costs: list[Path], budget: int) -> list[int]:
-    """How many runs of Morton order each tile keeps."""
+    """Return the number of Morton runs that each tile keeps."""
     kept = [_length(path) + 1 for path in costs]
     if sum(kept) < budget:
         raise InputError(
-            f"expected at most the {sum(kept):,} Gaussians that a renderer draws, got {budget:,}",
+            f"expected at most {sum(kept):,} (the visible Gaussians), got {budget:,}",
             parameter="budget",
         )
     target = min(sum(kept), int(run.config["morton_premerge_ratio"] * budget))
@@ -268,23 +268,23 @@ def _costs_of(path: Path) -> Callable[[], NDArray[np.float32]]:
 
 def _check_reached(count: int, budget: int, tiles: int) -> None:
     if count != budget:
-        each = "one a tile" if count == tiles else "each keeps one or more"
+        each = "one per tile" if count == tiles else "at least one per tile"
         raise InputError(
-            f"{count:,} Gaussians is the fewest that the {tiles:,} tiles come to ({each}), not "
-            f"{budget:,}; greater --tile-rows make fewer tiles",
+            f"the {tiles:,} tiles keep at least {count:,} Gaussians ({each}), got "
+            f"{budget:,}; raise --tile-rows to get fewer tiles",
             parameter="budget",
         )
 
 
 def cheapest(costs: Sequence[Callable[[], NDArray[np.float32]]], count: int) -> list[int]:
-    """How many of the `count` smallest of all costs lie in each array; of equals the earlier ones count.
+    """Return how many of the `count` smallest costs lie in each array; ties go to earlier ones.
 
-    Non-negative floats sort as their bits do: two histograms, of the upper and of the lower 16 bits, find the
-    count-th without more than one array in memory.
+    Non-negative floats sort like their bits. Two histograms, of the upper and lower 16 bits, find the
+    count-th value with one array in memory at a time.
 
     Args:
-        costs: functions that give arrays of float32 ≥ 0, asked three times each.
-        count: at most as many as there are.
+        costs: functions that return arrays of float32 ≥ 0, called three times each.
+        count: at most the total number of costs.
 
     >>> few = [np.array([3, 1, 1], np.float32), np.array([1, 0, 2], np.float32)]
     >>> cheapest([lambda a=a: a for a in few], 3)
@@ -318,7 +318,7 @@ def _histogram(values: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def _rank(histogram: NDArray[np.int64], count: int) -> tuple[int, int]:
-    """The bin that holds the count-th value, and how many lie before that bin."""
+    """Return the bin of the count-th value, and the number of values in earlier bins."""
     sums = np.cumsum(histogram)
     at = min(int(np.searchsorted(sums, count)), len(sums) - 1)
     return at, int(sums[at - 1]) if at else 0

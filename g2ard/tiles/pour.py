@@ -1,4 +1,4 @@
-"""Writing rows of scenes and clouds into the files of tiles, cut by a sample of their positions."""
+"""Writing rows of scenes and point clouds to tile files."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from g2ard.tiles.kdtree import KdTree, Points, Sampler, cut_tree, margin_of
 from g2ard.tiles.store import TileStore, halo_name, packed, row_width, tile_name
 
 _SAMPLE = 1 << 20
-"""Positions that tiles are cut by: 12 MB."""
+"""Size of the sample of positions that determines the tiles (12 MB)."""
 
 _SIGMAS = 4.0
-"""A tile with its halo may hold more than the sample foretells, by so many standard deviations."""
+"""Standard deviations by which a tile and its halo may exceed the count estimated from the sample."""
 
 _POINT = np.dtype([("near", "<f4", 3), ("rgb", "<f4", 3), ("far", "<f8", 3)])
-"""A point: relative to the offset in float32, which decides its tile; colour as stored; world position."""
+"""A point: float32 position relative to the offset (determines the tile), stored colour, world position."""
 
 _AT_ONCE = 1 << 16
-"""Rows of a lifted tile that are written at a time."""
+"""Rows of a lifted tile written at a time."""
 
 
 class Feed(ABC):
-    """Rows of bytes to pour into tiles, each with a position.
+    """Source of rows for tiles, as bytes, each with a position.
 
     Attributes:
         stream: the source.
-        row_bytes: bytes of a row, which begins with its float32 position.
-        room: bytes on disk that a row finally takes, with all copies.
-        settings: what it is poured with, beside the arguments of `pour`.
+        row_bytes: bytes per row; a row begins with its float32 position.
+        room: bytes on disk per row in the end, including all copies.
+        settings: settings stored in the journal.
     """
 
     stream: SceneStream | PointStream
@@ -64,7 +64,7 @@ class Feed(ABC):
 
 
 class SceneFeed(Feed):
-    """A scene's Gaussians as rows of its tiles."""
+    """Feed of a scene's Gaussians."""
 
     def __init__(self, stream: SceneStream) -> None:
         super().__init__()
@@ -80,7 +80,7 @@ class SceneFeed(Feed):
 
 
 class PointFeed(Feed):
-    """A cloud's points as rows of tiles that are still to be lifted."""
+    """Feed of a point cloud's points, for tiles to be lifted."""
 
     row_bytes = _POINT.itemsize
     room = _POINT.itemsize + 4 * row_width(0)
@@ -114,20 +114,20 @@ def pour(
     say: Say,
     like: TileStore | None = None,
 ) -> Journal:
-    """Write all tiles and halos of a feed, going on where an earlier call was interrupted.
+    """Write all tiles and halos of a feed, resuming an interrupted call.
 
     Args:
-        folder: there already; empty or with the journal of this very key.
-        key: of the content.
+        folder: an existing folder: empty, or with a journal of the same key.
+        key: hash of everything that determines the content.
         feed: the rows.
-        tile_rows: rows of a tile at the most.
+        tile_rows: most rows per tile.
         rows: rows in memory at a time.
-        progress: told of rows read.
-        say: told what was decided.
-        like: tiles whose tree and margin are taken, however many rows they come to hold.
+        progress: called with the number of rows read.
+        say: called with messages.
+        like: reuse the tree and margin of these tiles, ignoring `tile_rows`.
 
     Raises:
-        InputError: the source is broken, or has no row to be kept.
+        InputError: the source is broken, or has no row to keep.
         OutputError: the disk has too little room.
     """
     stream: Any = feed.stream
@@ -136,7 +136,7 @@ def pour(
         journal = _started(folder, key, feed, tile_rows, rows, progress, like)
     else:
         journal.cut()
-        say(f"{folder}: goes on after row {journal.next_row:,}")
+        say(f"{folder}: resuming after row {journal.next_row:,}")
     while True:
         stream.tally = journal.tally
         for block, positions in feed.rows(rows, journal.next_row):
@@ -148,7 +148,7 @@ def pour(
         parts = {} if like else _overfull(journal, tile_rows)
         if not parts:
             return journal
-        say(f"{plural(len(parts), 'tile')} hold more than {tile_rows:,} rows; cut once more")
+        say(f"{plural(len(parts), 'tile')} hold more than {tile_rows:,} rows; cutting again")
         tree = journal.tree.refined(parts)
         points, _ = _sampled(feed, rows, progress)
         clear(folder)
@@ -166,7 +166,7 @@ def _started(
     progress: Progress,
     like: TileStore | None,
 ) -> Journal:
-    """Cut the tiles, and see to it that there is room for them."""
+    """Plan the tiles, check that the disk has room, and start a journal."""
     tree, points, each = like.tree if like else KdTree(), np.empty((0, 3), np.float32), 1.0
     if like or feed.stream.count > tile_rows:
         points, each = _sampled(feed, rows, progress)
@@ -199,7 +199,7 @@ def _sampled(feed: Feed, rows: int, progress: Progress) -> tuple[Points, float]:
 
 
 def _overfull(journal: Journal, tile_rows: int) -> dict[int, KdTree]:
-    """How tiles are to be cut that came to hold more rows than the sample foretold."""
+    """Plan cuts of the tiles that exceed `tile_rows`."""
     parts = {}
     for index, count in enumerate(journal.tiles.rows):
         if count > tile_rows:
@@ -212,19 +212,12 @@ def _overfull(journal: Journal, tile_rows: int) -> dict[int, KdTree]:
 def lift_tiles(
     folder: Path, key: str, feed: PointFeed, tile_rows: int, rows: int, progress: Progress, say: Say
 ) -> Journal:
-    """Pour points into a subfolder, then lift each tile among the points around it and pour the result.
+    """Write points to tiles in a subfolder, then lift each tile with its halo and write the result.
 
-    Args:
-        folder: there already; empty or with the journals of this very key.
-        key: of the content.
-        feed: the points.
-        tile_rows: points of a tile at the most.
-        rows: points in memory at a time while they are read.
-        progress: told of points read, then of points lifted.
-        say: told what was decided.
+    Arguments are those of `pour`.
 
     Raises:
-        InputError: the source is broken, or has no point to be kept.
+        InputError: the source is broken, or has no point to keep.
         OutputError: the disk has too little room.
     """
     within, row_bytes = folder / POINTS, 4 * row_width(0)
@@ -236,7 +229,7 @@ def lift_tiles(
         journal = Journal(folder, key, points.tree, points.margin, row_bytes, points.tally, feed.settings)
         journal.save()
     else:
-        say(f"{folder}: goes on after tile {journal.next_row:,}")
+        say(f"{folder}: resuming after tile {journal.next_row:,}")
     journal.cut()
     total = sum(points.tiles.rows)
     for index in range(journal.next_row, points.tree.leaves):
@@ -252,7 +245,7 @@ def lift_tiles(
 
 
 def _lifted(points: Journal, index: int, feed: PointFeed) -> Splats:
-    """A tile's own points, lifted among those of its halo."""
+    """Lift a tile's points with those of its halo as neighbours."""
     core = _read(points.folder / tile_name(index), points.tiles.rows[index])
     if not len(core):
         return Splats.create(np.empty((0, 3)), scales=np.empty((0, 3)))
@@ -268,11 +261,11 @@ def _read(path: Path, count: int) -> NDArray[Any]:
 
 
 def foretold(positions: Iterable[Points], count: int) -> Callable[[int], int]:
-    """About how many rows the largest tile will hold, halo included, as a function of `tile_rows`.
+    """Return a function `tile_rows` → estimated rows of the largest tile, including its halo.
 
     Args:
-        positions: all of them, in blocks.
-        count: how many there are.
+        positions: all positions, in blocks.
+        count: number of positions.
 
     >>> line = np.stack([np.arange(100.0, dtype=np.float32)] * 3, 1)
     >>> rows = foretold([line], 100)

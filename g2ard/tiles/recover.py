@@ -1,4 +1,4 @@
-"""Recovery of a scene in tiles: each tile learns where it stands, its surroundings frozen."""
+"""Recovery of a tiled scene: each tile is trained amid its frozen surroundings."""
 
 from __future__ import annotations
 
@@ -42,23 +42,23 @@ if TYPE_CHECKING:
     from g2ard.policy.views import RunViews
 
 _MARGIN = 16
-"""Pixels around a tile that its images show too: SSIM's windows reach over its edge."""
+"""Margin in pixels around a tile in its images, because SSIM's windows reach over its edge."""
 
 _OWN = 0.5
-"""Share of a pixel's alpha that is a tile's where the pixel counts for it; an empty one counts for all."""
+"""Share of a pixel's alpha from which a tile owns the pixel; empty pixels belong to all tiles."""
 
 _FEWEST = 256
-"""Pixels that count in a view, at least: fewer teach nothing."""
+"""Fewest owned pixels for a view to be used."""
 
 
 @dataclass(frozen=True)
 class TileScore:
-    """A tile's part of `TiledScores`.
+    """Score of one tile.
 
     Args:
         tile: its number.
         count: its Gaussians.
-        simplified, recovered, pixels, steps: as there; PSNR means nothing without pixels.
+        simplified, recovered, pixels, steps: as in `TiledScores`; PSNR is meaningless without pixels.
     """
 
     tile: int
@@ -71,14 +71,14 @@ class TileScore:
 
 @dataclass(frozen=True)
 class TiledScores:
-    """Held-out views, over all pixels that tiles own in them.
+    """Scores on held-out views, over all pixels owned by tiles.
 
     Args:
-        simplified: PSNR, dB, before recovery.
-        recovered: and after it.
-        pixels: that it is taken over.
-        steps: of all tiles together.
-        tiles: each one's part.
+        simplified: PSNR before recovery, dB.
+        recovered: PSNR after recovery, dB.
+        pixels: number of pixels scored.
+        steps: steps of all tiles together.
+        tiles: scores per tile.
     """
 
     simplified: float
@@ -89,7 +89,7 @@ class TiledScores:
 
 
 class TileTargets(TeacherRenders):
-    """The dense scene's renders, of which the pixels count that no other tile gives most of."""
+    """Renders of the dense scene, masked to the pixels that one tile owns."""
 
     def __init__(
         self, teacher: Splats, own: int, cameras: Cameras, background: tuple[float, float, float]
@@ -100,12 +100,12 @@ class TileTargets(TeacherRenders):
         super().__init__(teacher, cameras.take(shown), background=background, lazy=True)
 
     def mask(self, view: int) -> NDArray[np.bool_]:
-        """(H, W), where a pixel counts."""
+        """Return the (H, W) mask of owned pixels."""
         return self._masks[view]
 
 
 def _masks(scene: Splats, own: int, cameras: Cameras) -> list[NDArray[np.bool_]]:
-    """(H, W) of each view, where the first `own` Gaussians give most of the alpha."""
+    """Return the (H, W) mask per view where the first `own` Gaussians give at least half of the alpha."""
     white = np.full((len(scene), 1, 3), -0.5 / SH_C0, np.float32)
     white[:own] = 0.5 / SH_C0
     renderer = Renderer(replace(scene, sh0=white, shN=np.zeros((len(scene), 0, 3), np.float32)))
@@ -114,26 +114,24 @@ def _masks(scene: Splats, own: int, cameras: Cameras) -> list[NDArray[np.bool_]]
 
 
 def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
-    """A tile's Gaussians after recovery, and what held-out views say of it.
+    """Recover a tile and score it on held-out views.
 
     Args:
-        arguments: `tile`; `levels`, see `g2ard.tiles.steps`; `steps` to take, 0 to be scored alone; `config`,
-            recovery's constants by full name; `train`, `test` and `apart`: which views of these inputs have
-            the tile in sight.
-        inputs: `coarse`, what `coarse` made of each tile, `own`, of this one; `train`, `test` and `apart`,
-            cameras in world coordinates.
-        places: `store`, the folder of the dense scene in tiles; `student`, of the scene to recover in the
-            same boxes.
+        arguments: `tile`; `levels`, see `g2ard.tiles.steps`; `steps`, 0 to only score; `config`, recovery's
+            constants by path; `train`, `test` and `apart`, the views of these inputs that see the tile.
+        inputs: `coarse`, the output of `coarse` for each tile; `own`, for this tile; `train`, `test` and
+            `apart`, cameras in world coordinates.
+        places: `store`, the folder of the dense tiles; `student`, of the tiles to recover, in the same boxes.
 
     Returns:
-        `scene` (`scene_of`), the tile's Gaussians; `errors`, (2, 2) before and after: the squared error in
-        the held-out views and the number of values it sums; `steps` that were taken.
+        `scene` (`scene_of`), the tile's Gaussians; `errors`, (2, 2) before and after: squared error in the
+        held-out views and number of values summed; `steps` taken.
     """
     from g2ard.stages.recover import recover
 
     store = TileStore.open(places["store"])
     core, far = tile_of(arguments, inputs, places), far_around(store, arguments, inputs)
-    # The tile's own Gaussians first, in teacher and student: masks and `frozen` count on it.
+    # The tile's own Gaussians come first in teacher and student: masks and `frozen` rely on it.
     teacher = join([part for part in (core, store.read_halo(arguments["tile"]), *far) if len(part)])
     smaller = TileStore.open(places["student"])
     small, beside = smaller.read(arguments["tile"]), smaller.read_halo(arguments["tile"])
@@ -170,16 +168,16 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
 
 
 def _cropped(cameras: Cameras, core: PreparedScene, offset: NDArray[np.float64]) -> Cameras:
-    """The parts of the images that show a tile."""
+    """Crop the cameras' images to a tile."""
     settings = settings_for(core.means, RasterSettings())
-    # Means lie in the store's coordinates, about `offset`; the cameras of targets in the world's.
+    # Means are relative to the store's `offset`, target cameras are in world coordinates.
     return cropped(cameras.recentred(offset), core, settings, _MARGIN).recentred(-offset)
 
 
 def _errors(
     scene: Splats, targets: TileTargets | None, background: tuple[float, float, float]
 ) -> tuple[float, int]:
-    """Squared error summed over the pixels that count and their channels, and how many values those are."""
+    """Return the squared error summed over masked pixels and channels, and the number of values."""
     if targets is None:
         return 0.0, 0
     total, count, renderer = 0.0, 0, Renderer(scene, background=background)
@@ -200,21 +198,20 @@ def recover_tiles(
     steps: int,
     workers: Workers,
 ) -> tuple[TiledScene, TiledScores]:
-    """Recover each tile against the dense scene's renders, as if it were part of one recovery of all.
+    """Recover each tile against renders of the dense scene, as if all were recovered together.
 
-    A tile's Gaussians learn; those of others within its margin, and coarse ones of all else, stand frozen
-    around them, so that what hides what is right. Only the pixels count that no other tile gives most of
-    in the dense scene; images are cropped to the tile. A tile takes the share of `steps` that views
-    which have it in sight are of all.
+    A tile's Gaussians are trained. Those of other tiles within the margin, and coarse Gaussians of all other
+    tiles, are frozen around it, so that occlusion is right. Images are cropped to the tile and masked to the
+    pixels it owns in the dense scene. A tile's share of `steps` is the share of views that see it.
 
     Args:
         store: the dense scene.
-        student: what is to be recovered, in the same boxes (`ingest(…, like=store)`).
-        around: where the dense scene's tiles stand, as `simplify_tiles` with views tells.
-        views: to learn from, to score on, and of another kind to judge by.
-        config: of recovery; its steps are not read.
-        steps: of a recovery of all; 0 only scores.
-        workers: run the tasks.
+        student: the scene to recover, in the same boxes (`ingest(…, like=store)`).
+        around: placement of the dense tiles, from `simplify_tiles` with views.
+        views: views for training, for scoring, and of another kind for validation.
+        config: constants of recovery; its steps are ignored.
+        steps: steps of a recovery of the whole scene; 0 only scores.
+        workers: runs the tasks.
     """
     sight = {
         name: (written(workers.folder, cameras), _seen(store, around, cameras, workers))
@@ -259,13 +256,13 @@ def recover_tiles(
 
 
 def _psnr(errors: NDArray[np.float64]) -> tuple[float, float]:
-    """Before and after, of the (2, 2) `errors` of `recover_tile`."""
+    """Return PSNR before and after from the (2, 2) `errors` of `recover_tile`."""
     before, after = (float(-10 * math.log10(max(e, 1e-12) / max(n, 1))) for e, n in errors)
     return before, after
 
 
 def _seen(store: TileStore, around: Surroundings, cameras: Cameras, workers: Workers) -> list[list[int]]:
-    """For each tile the views that have it in sight."""
+    """Return the views that see each tile."""
     if not len(cameras):
         return [[] for _ in store.tiles]
     light = light_of(store, around.coarse, cameras, workers)

@@ -1,4 +1,4 @@
-"""Which views have which tile in sight, and what they see of it."""
+"""Visibility of tiles: the views that see each tile, and each Gaussian's contribution to them."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from g2ard.tiles.store import TileStore
 from g2ard.tiles.tasks import Task, is_whole, load, scene_of
 
 _IN_SIGHT = 0.01
-"""Share of a view's light that comes from a tile that it has in sight."""
+"""Share of a view's light from which it sees a tile."""
 
 _GLANCED = 200_000
-"""Coarse Gaussians of a scene up to which the nearer level tells which views have which tile in sight."""
+"""Most coarse Gaussians for which the `near` level decides which views see a tile."""
 
 _CHUNK = 64
-"""Views a task that tells so."""
+"""Views per `glance` task."""
 
 _TAILS = 1, 99
-"""Percentiles of its Gaussians that count as a tile's box: floaters decide nothing."""
+"""Percentiles of its Gaussians that bound a tile's box, to ignore floaters."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Where tiles stand.
+    """Placement of tiles.
 
     Args:
-        coarse: each tile's file of coarse Gaussians.
-        levels: for each tile, by which of them every other stands beside it; None is itself.
+        coarse: coarse Gaussians of each tile (file).
+        levels: per tile, the coarse level of every other tile around it; None for itself.
     """
 
     coarse: list[Path]
@@ -47,8 +47,6 @@ class Surroundings:
 
 
 class Sights:
-    """Which views have which tile in sight, and what they see of it."""
-
     def __init__(self, run: TiledRun, coarse: list[Path], cameras: Cameras, frame: tuple[float, ...]):
         self.run, self.coarse, self.cameras = run, coarse, cameras.resized(LONGEST)
         self.shrunk = float((self.cameras.widths / cameras.widths).mean())
@@ -74,11 +72,11 @@ class Sights:
 
     @property
     def surroundings(self) -> Surroundings:
-        """Where the tiles stand."""
+        """Placement of the tiles."""
         return Surroundings(self.coarse, [given["levels"] for given in self.arguments])
 
     def again(self, merged: list[Path]) -> list[Path]:
-        """What the same views see of the merged tiles."""
+        """Measure what the same views see of the merged tiles."""
         inputs = [
             {**given, "merged": path, "look": look}
             for given, path, look in zip(self._inputs(), merged, self.looks, strict=True)
@@ -90,7 +88,7 @@ class Sights:
         return [{"coarse": self.coarse, "views": self.views} for _ in self.coarse]
 
     def _chosen(self, light: NDArray[np.float64], tile: int) -> dict[str, Any]:
-        """The views that look at a tile: evenly spaced among those that have it in sight."""
+        """Choose the views of a tile, evenly spaced among those that see it."""
         sight = in_sight(light, tile)
         some = sight[
             np.unique(np.linspace(0, len(sight) - 1, min(MOST_LOOKS, len(sight))).round().astype(int))
@@ -102,7 +100,7 @@ class Sights:
         }
 
     def _levels(self, tile: int) -> list[str | None]:
-        """By which coarse level each tile stands beside `tile`, which has none itself."""
+        """Return the coarse level of every tile in views of `tile`, None for itself."""
         low, high = self.boxes[:, 0], self.boxes[:, 1]
         gaps = np.maximum(0.0, np.maximum(low - high[tile], low[tile] - high))
         near = np.linalg.norm(gaps, axis=1) <= np.linalg.norm(high[tile] - low[tile])
@@ -112,16 +110,16 @@ class Sights:
 
 
 def boxes_of(coarse: Sequence[Path]) -> NDArray[np.float64]:
-    """(T, 2, 3) low and high corners of tiles."""
+    """Return the (T, 2, 3) low and high corners of tiles."""
     return np.array([np.percentile(scene_of(path, "near").means, _TAILS, axis=0) for path in coarse])
 
 
 def in_sight(light: NDArray[np.float64], tile: int) -> NDArray[np.intp]:
-    """The views that have a tile in sight; where those are few, also the best of the others.
+    """Return the views that see a tile; if they are few, include the best of the others.
 
     Args:
-        light: (V, T) of `light_of`.
-        tile: which.
+        light: (V, T) from `light_of`.
+        tile: tile number.
     """
     own = light[:, tile]
     sight = np.flatnonzero(own > _IN_SIGHT * light.sum(axis=1))
@@ -132,7 +130,7 @@ def in_sight(light: NDArray[np.float64], tile: int) -> NDArray[np.intp]:
 
 
 def written(work: Path, cameras: Cameras) -> Path:
-    """Cameras as a task's input, named by their content."""
+    """Write cameras to a file named by their content, as input of tasks."""
     arrays = {name: getattr(cameras, name) for name in ("viewmats", "Ks", "widths", "heights")}
     content = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays.values())
     path = work / f"views-{hashlib.sha256(content).hexdigest()[:16]}.npz"
@@ -143,7 +141,7 @@ def written(work: Path, cameras: Cameras) -> Path:
 
 
 def light_of(store: TileStore, coarse: list[Path], cameras: Cameras, workers: Workers) -> NDArray[np.float64]:
-    """(V, T) Σ αT that each view gets from each tile, of the tiles' coarse Gaussians, in small renders."""
+    """Return (V, T) Σ αT of each tile's coarse Gaussians in small renders of each view."""
     level = "near" if store.count // COARSE[0] <= _GLANCED else "far"
     small = cameras.resized(LONGEST)
     views = written(workers.folder, small)

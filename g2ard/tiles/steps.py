@@ -1,16 +1,18 @@
-"""Simplification of one tile, step by step: each function reads files and makes arrays (`g2ard.tiles.tasks`).
+"""Simplification of one tile, step by step: each function reads files and returns arrays
+(`g2ard.tiles.tasks`).
 
-Between the steps tiles agree on a frame that costs are measured in, and on what each of them keeps
-(`g2ard.tiles.merging`). What several steps take:
+Between steps the tiles agree on a common frame for costs and on how many Gaussians each keeps
+(`g2ard.tiles.merging`). Common parameters:
 
-- arguments: `tile`, its number; `config`, the fields of a `SimplifyConfig`; `frame`, the values of the
-  `_core.TileFrame` of all tiles; `levels`, for each tile by which of its coarse scenes ("near", "far") it
-  stands beside this one, None for this one itself.
-- inputs: `own`, what `coarse` made of this tile, for all steps but that one; `coarse`, the same of each tile;
-  `views`, cameras in world coordinates; `look`, what `look` made of this tile, not there without views.
-- places: `store`, the folder of the scene in tiles.
+- arguments: `tile`, its number; `config`, the fields of a `SimplifyConfig`; `frame`, the values of the common
+  `_core.TileFrame`; `levels`, per tile the coarse scene ("near", "far") that represents it around this tile,
+  None for this tile.
+- inputs: `own`, the output of `coarse` for this tile (not for `coarse` itself); `coarse`, the same for every
+tile;
+  `views`, cameras in world coordinates; `look`, the output of `look` for this tile, absent without views.
+- places: `store`, the folder of the tiled scene.
 
-N rows are those of the tile with finite values, ordered rows the same in Morton order.
+N counts the tile's rows with finite values; "ordered rows" are these in Morton order.
 """
 
 from __future__ import annotations
@@ -49,23 +51,23 @@ from g2ard.tiles.tasks import (
 )
 
 COARSE = (32, 512)
-"""How many times fewer Gaussians stand for a tile near the one that is looked at, and for one far."""
+"""Reduction of a tile's coarse Gaussians for use near the rendered tile, and far from it."""
 
 _DEEPER = 0.6
-"""Share of the Gaussians that a tile is expected to keep down to which its merges are planned."""
+"""Plans of merges go down to this share of the Gaussians that a tile is expected to keep."""
 
 _THINNED = 8
-"""Of so many rows in Morton order one is merged to coarse Gaussians, widened to stand for all."""
+"""Every n-th row in Morton order becomes a coarse Gaussian, widened to represent the rest."""
 
 GONE = np.uint32(0xFFFFFFFF)
-"""The cluster of a row that is dropped."""
+"""Cluster number of a dropped row."""
 
 _SAMPLED = 1_000_000
-"""Gaussians of a scene by which its frame is found, at most."""
+"""Largest sample of Gaussians that determines a scene's frame."""
 
 
 def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
-    """A tile merged to a few Gaussians, near and far, and a fair sample of its rows.
+    """Merge a tile to a few Gaussians, near and far, and sample its rows.
 
     Args:
         arguments: `tile`, `config`.
@@ -74,10 +76,10 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
     Returns:
         Three scenes (`scene_of`): `near`, `far`, `sample`; `order`, (N,) the tile's rows in Morton order, and
-        `bounds` that it is found in.
+        the `bounds` of that order.
     """
     scene = tile_of(arguments, inputs, places)
-    config = replace(_config(arguments), keep_region=())  # for what other tiles see of this one
+    config = replace(_config(arguments), keep_region=())  # regions do not matter for other tiles' views
     some = _widened(scene.take(scene.core.order[::_THINNED]), _THINNED)
     near = simplify(some, max(1, len(scene) // COARSE[0]), method="fast", config=config).splats
     far = simplify(near, max(1, len(scene) // COARSE[1]), method="fast", config=config).splats
@@ -92,11 +94,11 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
 
 def glance(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
-    """What light some views get from each tile, of the tiles' coarse Gaussians.
+    """Measure the light that views get from each tile, from coarse Gaussians.
 
     Args:
-        arguments: `views`, numbers of V of the cameras; `level`, which of the coarse scenes, for all tiles;
-            `near`, the near plane, None for the renderer's own.
+        arguments: `views`, numbers of V cameras; `level`, the coarse scene used for all tiles; `near`, the
+            near plane, None for the renderer's default.
         inputs: `coarse`, `views`.
         places: none.
 
@@ -117,24 +119,24 @@ def glance(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
 
 def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
-    """What the views see of a tile's Gaussians, where it stands in the whole scene.
+    """Measure what the views see of a tile's Gaussians amid the whole scene.
 
-    The views that have it in sight look sixteen at a time until the next sixteen find few Gaussians that were
-    not seen before; their sums are raised to stand for all views.
+    Views are rendered in rounds of sixteen until a round finds few new Gaussians; the sums are scaled up to
+    represent all views.
 
     Args:
-        arguments: `tile`, `config`, `frame`, `levels`; `views`, numbers of the V that have the tile in sight;
-            `light`, (V,) Σ αT that each of them gets from it, in the same order (`glance`); `all_light`, the
-            sum of that over all views; `shrunk`, the width of these images over that of the full ones.
+        arguments: `tile`, `config`, `frame`, `levels`; `views`, numbers of the V views that see the tile;
+            `light`, (V,) Σ αT that each gets from it (`glance`); `all_light`, its sum over all views;
+            `shrunk`, the ratio of these images' width to the full width.
         inputs: `coarse`, `views`.
         places: `store`.
 
     Returns:
-        `weight`, (N,) float32 Σ αT over all views; `pixel_size`, (N,) float32 of a full image there, scene
-        units, infinite where no view shows the row; `pixel`, the median of those that are known, NaN where
-        none is; `sums`, (2,) `emphasised` weight and mass of what is kept, for the frame's floor; `used`,
-        numbers of the views that looked; `share`, the part of `all_light` that they have, which `weight` was
-        divided by; `near`, their near plane.
+        `weight`, (N,) float32 Σ αT over all views; `pixel_size`, (N,) float32 size of a full-image pixel,
+        scene units, infinite if no view shows the row; `pixel`, the median of the finite ones, NaN if there
+        are none; `sums`, (2,) `emphasised` weight and mass of the kept rows, for the frame's floor; `used`,
+        numbers of the rendered views; `share`, their part of `all_light`, by which `weight` was divided;
+        `near`, their near plane.
     """
     own = tile_of(arguments, inputs, places, sh=False)
     cameras = cameras_of(inputs["views"]).recentred(own.offset)
@@ -155,7 +157,7 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     share = light[used].sum() / arguments["all_light"] if used else 1.0
     weight, pixel_size = (values[: len(own)] for values in sums.by_row())
     weight = weight / np.float32(share or 1.0)
-    pixel_size = pixel_size * np.float32(arguments["shrunk"])  # of a full image
+    pixel_size = pixel_size * np.float32(arguments["shrunk"])  # in pixels of the full image
     finite = pixel_size[np.isfinite(pixel_size) & (pixel_size > 0)]
     pixel = float(np.partition(finite, len(finite) // 2)[len(finite) // 2]) if len(finite) else math.nan
     frame = _with_pixel_size(arguments["frame"], pixel if finite.size else 1.0)
@@ -172,7 +174,7 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
 
 def run_costs(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
-    """What merging along Morton order costs.
+    """Compute the costs of merging along Morton order.
 
     Args:
         arguments: `tile`, `config`, `frame`.
@@ -180,25 +182,25 @@ def run_costs(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         places: `store`.
 
     Returns:
-        `costs`, (R − 1,) float32, one for each gap between the R ordered rows that a renderer draws.
+        `costs`, (R − 1,) float32, one per gap between the R ordered rows that a renderer draws.
     """
     scene = tile_of(arguments, inputs, places, sh=False)
     return {"costs": _seen_tile(scene, arguments, inputs).run_costs()}
 
 
 def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
-    """Merges down to runs of Morton order, then pairs of neighbours, farther than the budget asks for.
+    """Plan merges to runs of Morton order, then of neighbouring pairs, beyond what the budget needs.
 
     Args:
-        arguments: `tile`, `config`, `frame`; `runs`, down to how many; `expected`, how many Gaussians
-            of it the budget is expected to leave.
-        inputs: `look`; `costs`, what `run_costs` made.
+        arguments: `tile`, `config`, `frame`; `runs`, the number of runs; `expected`, the Gaussians that the
+            budget is expected to leave in this tile.
+        inputs: `look`; `costs`, the output of `run_costs`.
         places: `store`.
 
     Returns:
-        `of`, (N,) uint32 the run of each ordered row, or `GONE`; `a`, `b`, (M,) merges in their order: run b
-        joins run a; `costs`, (M,) float32 of each, or of the dearest before it if that is more: no merge may
-        be done without those before it.
+        `of`, (N,) uint32 the run of each ordered row, or `GONE`; `a`, `b`, (M,) merges in order: run b joins
+        run a; `costs`, (M,) float32, each at least that of the merge before, because merges must be done in
+        order.
     """
     scene = tile_of(arguments, inputs, places)
     config = _config(arguments).resolved("default")
@@ -211,17 +213,17 @@ def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
 
 def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
-    """The tile's Gaussians after the first merges of its plan, and what the views saw of their members.
+    """Apply the first merges of a tile's plan.
 
     Args:
-        arguments: `tile`, `config`, `frame`; `runs`, as for `pair_plan`; `merges`, how many of the plan's.
-        inputs: `plan`, what `pair_plan` made; `look`.
+        arguments: `tile`, `config`, `frame`; `runs`, as for `pair_plan`; `merges`, the number to apply.
+        inputs: `plan`, the output of `pair_plan`; `look`.
         places: `store`.
 
     Returns:
-        `scene`, n = runs − merges Gaussians (`scene_of`), opacities not fitted yet; `members`, (n,) rows that
-        each stands for; with views `wanted`, (n,) Σ αT of those, and `unseen`, how many rows no view sees;
-        `clamped`, how many opacities were.
+        `scene`, n = runs − merges Gaussians (`scene_of`) with unfitted opacities; `members`, (n,) rows merged
+        into each; `clamped`, the number of clamped opacities; with views also `wanted`, (n,) Σ αT of the
+        members, and `unseen`, the number of rows that no view sees.
     """
     scene = tile_of(arguments, inputs, places)
     runs, merges = arguments["runs"], arguments["merges"]
@@ -254,15 +256,15 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
 
 def look_again(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
-    """What the same views see of a tile's merged Gaussians.
+    """Measure what the same views see of a tile's merged Gaussians.
 
     Args:
         arguments: `tile`, `levels`.
-        inputs: `coarse`, `views`, `look`; `merged`, what `merge` made.
+        inputs: `coarse`, `views`, `look`; `merged`, the output of `merge`.
         places: `store`.
 
     Returns:
-        `weight`, (n,) float32 Σ αT, raised as those of `look` were.
+        `weight`, (n,) float32 Σ αT, scaled like those of `look`.
     """
     core = as_prepared(scene_of(inputs["merged"], "scene").with_sh_degree(0))
     used, share, near = load(inputs["look"], "used", "share", "near")
@@ -290,7 +292,7 @@ def _merging(
 
 
 def _with_pixel_size(frame: Sequence[float], pixel_size: float) -> _core.TileFrame:
-    """A frame with a tile's own size of a pixel where no view tells it."""
+    """Return the frame with the tile's own pixel size."""
     unit, _, floor, exponent, usual = frame
     return _core.TileFrame(unit, pixel_size, floor, exponent, usual)
 
@@ -301,14 +303,14 @@ def _seen_tile(scene: PreparedScene, arguments: Arguments, inputs: Inputs) -> _c
 
 
 def _widened(scene: Splats, times: int) -> Splats:
-    """Rows that each stand for so many: their two longer axes cover as much."""
+    """Widen the two longer axes of rows so that each covers the area of `times` rows."""
     longer = np.arange(3) != np.argmin(scene.scales, axis=1)[:, None]
     factor = np.where(longer, np.float32(math.sqrt(times)), np.float32(1))
     return replace(scene, scales=scene.scales * factor)
 
 
 class TiledRun:
-    """What all steps of a simplification in tiles share."""
+    """Shared state of the steps of a tiled simplification."""
 
     def __init__(self, store: TileStore, workers: Workers, config: SimplifyConfig):
         self.store, self.workers = store, workers
@@ -326,7 +328,7 @@ class TiledRun:
         per_tile: list[dict[str, Any]] | None = None,
         inputs: list[dict[str, Any]] | None = None,
     ) -> list[Path]:
-        """One task a tile, which reads what the first step made of it."""
+        """Run one task per tile; each reads the tile's `coarse` output if there is one."""
         tasks = []
         for tile, rows in enumerate(self.sizes):
             own = {"own": self.coarse[tile]} if self.coarse else {}
@@ -348,12 +350,12 @@ class TiledRun:
         return self.workers.run(tasks, stage)
 
     def begin(self) -> list[Path]:
-        """The first step: what `g2ard.tiles.steps.coarse` makes of each tile."""
+        """Run the first step, `coarse`."""
         self.coarse = self.each("coarse", "coarse")
         return self.coarse
 
     def sampled_frame(self) -> tuple[float, ...]:
-        """The frame of a fair sample of the scene, without views."""
+        """Return the frame of a representative sample of the scene, without views."""
         sample = join([scene_of(path, "sample").with_sh_degree(0) for path in self.coarse])
         every = -(-len(sample) // _SAMPLED)
         scene, _ = finite_rows_of(sample.take(slice(None, None, every)))

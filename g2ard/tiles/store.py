@@ -1,9 +1,8 @@
-"""A folder of tiles: fixed rows of float32, and a manifest that says what they are.
+"""A folder of tiles: fixed-size rows of float32, and a manifest.
 
-`tiles.json` tells what the tiles hold together; `tile-00007.f32` has the rows of a tile, `halo-00007.f32`
-rows of its neighbours that lie around it. A row is little-endian float32: mean (3, relative to the offset),
-quaternion wxyz (4), scales (3, linear), logit of opacity (1), sh0 (3), shN (K × 3, a coefficient's channels
-beside each other).
+`tiles.json` describes the tiles; `tile-00007.f32` has the rows of a tile, `halo-00007.f32` rows of its
+neighbours around it. A row is little-endian float32: mean (3, relative to the offset), quaternion wxyz (4),
+scales (3, linear), logit of opacity (1), sh0 (3), shN (K × 3, the channels of a coefficient adjacent).
 """
 
 from __future__ import annotations
@@ -38,26 +37,24 @@ __all__ = [
 FORMAT, VERSION = "g2ard tiles", 1
 
 _AT_ONCE = 1 << 16
-"""Rows read at a time into a tile's arrays."""
+"""Rows read at a time."""
 
 
 def tile_name(index: int) -> str:
-    """The file of a tile's own rows."""
     return f"tile-{index:05}.f32"
 
 
 def halo_name(index: int) -> str:
-    """The file of the rows around a tile."""
     return f"halo-{index:05}.f32"
 
 
 def row_width(sh_degree: int) -> int:
-    """Numbers in a row: 14 + 3K."""
+    """Return the numbers per row: 14 + 3K for K higher SH coefficients."""
     return 14 + 3 * ((sh_degree + 1) ** 2 - 1)
 
 
 def packed(splats: Splats) -> NDArray[np.float32]:
-    """(N, 14 + 3K) rows as tiles hold them."""
+    """Return (N, 14 + 3K) rows as stored in tiles."""
     rows = np.empty((len(splats), row_width(splats.sh_degree)), "<f4")
     rows[:, 0:3] = splats.means
     rows[:, 3:7] = splats.quats
@@ -69,7 +66,7 @@ def packed(splats: Splats) -> NDArray[np.float32]:
 
 
 def _unpacked(rows: NDArray[np.float32], offset: NDArray[np.float64]) -> Splats:
-    """The scene of which `packed` gives these rows."""
+    """Return the scene of packed rows."""
     rest = (rows.shape[1] - 14) // 3
     return Splats(
         means=np.ascontiguousarray(rows[:, :3]),
@@ -84,14 +81,13 @@ def _unpacked(rows: NDArray[np.float32], offset: NDArray[np.float64]) -> Splats:
 
 @dataclass(frozen=True)
 class Tile:
-    """What the manifest says of a tile.
+    """Manifest entry of a tile.
 
     Args:
-        index: its place, along the kd tree.
-        rows: Gaussians whose mean lies in its box.
-        halo: Gaussians of other tiles within the margin around the box.
-        low: corner of the box, cut to the bounds of the whole scene's means, relative to the offset.
-        high: the other corner.
+        index: position in the order of the kd-tree.
+        rows: number of Gaussians whose mean lies in its box.
+        halo: number of Gaussians of other tiles within the margin around the box.
+        low, high: corners of the box, clipped to the bounds of the scene's means, relative to the offset.
         checks: CRC-32 of both files.
     """
 
@@ -108,16 +104,16 @@ class TileStore:
     """A scene as tiles in a folder; `open` reads the manifest, `read` a tile.
 
     Args:
-        folder: where it lies.
-        tiles: in the order of the kd tree.
-        count: Gaussians in all, halos not counted.
+        folder: folder of the tiles.
+        tiles: tiles in the order of the kd-tree.
+        count: number of Gaussians, excluding halos.
         sh_degree: 0–3.
         offset: (3,) float64, world = means + offset.
-        margin: how far halos reach beyond a box's sides, scene units.
-        tree: the kd tree.
-        notes: what was noticed while ingesting.
-        key: SHA-256 of all that decides the content: which source, which settings.
-        settings: those settings.
+        margin: reach of halos beyond a box's sides, scene units.
+        tree: the kd-tree.
+        notes: notes from ingestion.
+        key: SHA-256 of everything that determines the content: source and settings.
+        settings: the settings of ingestion.
     """
 
     folder: Path
@@ -133,21 +129,21 @@ class TileStore:
 
     @classmethod
     def open(cls, folder: str | Path) -> TileStore:
-        """The store in a folder; every file must have its size, contents are checked as they are read.
+        """Open the store in a folder; check the size of every file (contents are checked when read).
 
         Raises:
-            InputError: no manifest, one that is broken or of another version, or a file that is absent or
-                has another size.
+            InputError: the manifest is missing, malformed or of another version, or a file is missing or has
+                another size.
         """
         folder = Path(folder)
         path = folder / MANIFEST
         if not path.is_file():
-            raise InputError(f"{folder}: holds no finished tiles (no {MANIFEST})")
+            raise InputError(f"{folder}: no finished tiles ({MANIFEST} is missing)")
         content = read_json(path)
         if content.get("format") != FORMAT:
             raise InputError(f"{path}: not a manifest of tiles")
         if content.get("version") != VERSION:
-            raise InputError(f"{path}: version {content.get('version')!r} is not known ({VERSION} is)")
+            raise InputError(f"{path}: unsupported version {content.get('version')!r}; expected {VERSION}")
         try:
             store = cls._parsed(folder, content)
         except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
@@ -183,7 +179,7 @@ class TileStore:
         fits = offset.shape == (3,) and store.sh_degree in range(4) and tree.leaves == len(tiles)
         finite = np.isfinite([*offset.ravel(), store.margin, *(x for t in tiles for x in (*t.low, *t.high))])
         if not fits or not finite.all() or sum(tile.rows for tile in tiles) != store.count:
-            raise ValueError("its numbers contradict each other")
+            raise ValueError("inconsistent counts or values that are not finite")
         return store
 
     def _check_size(self, name: str, rows: int) -> None:
@@ -194,11 +190,11 @@ class TileStore:
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}") from error
         if size != expected:
-            raise InputError(f"{path}: {size:,} bytes, the manifest says {expected:,}")
+            raise InputError(f"{path}: {size:,} bytes, but the manifest says {expected:,}")
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of a row."""
+        """Bytes per row."""
         return 4 * row_width(self.sh_degree)
 
     @property
@@ -207,20 +203,20 @@ class TileStore:
         return self.row_bytes * sum(tile.rows + tile.halo for tile in self.tiles)
 
     def read(self, index: int, *, sh: bool = True) -> Splats:
-        """A tile's own rows, in the order of the source.
+        """Read a tile's own rows, in the order of the source.
 
         Args:
-            index: which tile.
-            sh: the higher bands too; else the result has SH degree 0.
+            index: tile number.
+            sh: read the higher SH bands too; otherwise the result has SH degree 0.
 
         Raises:
-            InputError: the file is absent, has another size, or its contents changed.
+            InputError: the file is missing, has another size, or its contents changed.
         """
         tile = self.tiles[index]
         return self._read(tile_name(index), tile.rows, tile.checks[0], sh)
 
     def read_halo(self, index: int, *, sh: bool = True) -> Splats:
-        """The rows around a tile, in the order of the source; `sh` as for `read`.
+        """Read the rows of a tile's halo, in the order of the source; `sh` as for `read`.
 
         Raises:
             InputError: as for `read`.
@@ -229,10 +225,10 @@ class TileStore:
         return self._read(halo_name(index), tile.halo, tile.checks[1], sh)
 
     def rows(self, index: int) -> NDArray[np.float32]:
-        """(rows, 14 + 3K) a view of the mapped file of a tile's own rows; `check` checks its contents.
+        """Return a (rows, 14 + 3K) memory map of a tile's own rows; `check` verifies its contents.
 
         Raises:
-            InputError: the file is absent or has another size.
+            InputError: the file is missing or has another size.
         """
         tile = self.tiles[index]
         shape = (tile.rows, row_width(self.sh_degree))
@@ -242,7 +238,7 @@ class TileStore:
         return np.memmap(self.folder / tile_name(index), "<f4", "r", shape=shape)
 
     def check(self, index: int) -> None:
-        """Hold the contents of the file of a tile's own rows to their checksum.
+        """Verify the checksum of a tile's own rows.
 
         Raises:
             InputError: as for `read`.
@@ -255,8 +251,8 @@ class TileStore:
     def _check_contents(self, name: str, crc: int, expected: int) -> None:
         if crc != expected:
             raise InputError(
-                f"{self.folder / name}: its contents are not those that were written; once it is removed, "
-                "the command that wrote the tiles writes them again"
+                f"{self.folder / name}: its contents changed after writing; remove it and run "
+                "the command that wrote the tiles again"
             )
 
     def _read(self, name: str, count: int, check: int, sh: bool) -> Splats:
@@ -280,11 +276,7 @@ class TileStore:
 
 
 class StoredScene:
-    """All tiles' own rows, tile after tile, of which `take` reads some; `positions` checks the contents.
-
-    Args:
-        store: the scene in tiles.
-    """
+    """Random access to all tiles' own rows, numbered tile after tile."""
 
     def __init__(self, store: TileStore) -> None:
         self.store, self.offset = store, store.offset
@@ -294,7 +286,7 @@ class StoredScene:
         return self.store.count
 
     def positions(self) -> Iterator[NDArray[np.float32]]:
-        """(n, 3) means of each tile in order, views of its file.
+        """Yield the (n, 3) means of each tile in order, memory-mapped, after verifying its contents.
 
         Raises:
             InputError: a file's contents changed.
@@ -304,7 +296,7 @@ class StoredScene:
             yield self.store.rows(tile.index)[:, :3]
 
     def take(self, index: NDArray[np.integer]) -> Splats:
-        """The rows of these numbers, in their order."""
+        """Return the rows with these numbers, in order."""
         index = np.asarray(index)
         tiles = np.searchsorted(self._starts, index, "right") - 1
         rows = np.empty((len(index), self.store.row_bytes // 4), "<f4")

@@ -1,4 +1,4 @@
-"""Tasks, pure functions from files to one file, and the scenes and cameras in those files."""
+"""Tasks (pure functions from files to one file), and the scenes and cameras in those files."""
 
 from __future__ import annotations
 
@@ -26,40 +26,40 @@ from g2ard.stages.simplify.pairs import fit_opacities
 from g2ard.tiles.store import TileStore
 
 Arrays = dict[str, NDArray[Any]]
-"""What a task makes and reads: arrays by name, one .npz file."""
+"""Output of a task: arrays by name, stored as one .npz file."""
 
 Arguments = Mapping[str, Any]
 Inputs = Mapping[str, Any]
 Places = Mapping[str, Path]
-"""What a task's function is given: see `Task`."""
+"""Parameters of a task's function, see `Task`."""
 
 _FIELDS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset")
 
 _OUTLINE, _BESIDE = 20_000, 8
-"""Gaussians of a tile by whose means its images are cropped, and pixels left around them."""
+"""Number of means that outline a tile for cropping, and the pixels kept around them."""
 
 _VERSION = 3
-"""Of what the functions make: raised when a change of theirs makes files of before useless."""
+"""Version of the functions' output; raise it when a change makes earlier files unusable."""
 
 _DAMAGED = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, LookupError, RuntimeError)
-"""What readers of arrays raise where a file's bytes are not those that were written."""
+"""Exceptions that numpy and zipfile raise for corrupt files."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A call of a function whose result is kept in a file.
+    """A function call whose result is kept in a file.
 
-    The file's name holds a hash of the function, its arguments and the names of the files that it reads,
-    which hold the hashes of theirs. So a file that is there need not be made again, whoever made it.
+    The file's name contains a hash of the function, its arguments and the names of its input files, which
+    contain hashes in turn. An existing file is therefore always up to date.
 
     Args:
         function: "module:name" of a function (arguments, inputs, places) → arrays.
-        label: begins the file's name.
-        folder: where the file goes.
-        arguments: what JSON holds.
-        inputs: files of other tasks that it reads, by name.
-        places: files and folders that `arguments` decide the content of, and that may be moved.
-        cost: how much work it is, in any one unit, for progress.
+        label: prefix of the file's name.
+        folder: folder of the file.
+        arguments: JSON values.
+        inputs: output files of other tasks, by name.
+        places: files and folders whose content `arguments` determine; they may be moved.
+        cost: amount of work in any common unit, for progress.
     """
 
     function: str
@@ -72,7 +72,7 @@ class Task:
 
     @property
     def key(self) -> str:
-        """16 hexadecimal digits that name what the task makes."""
+        """16 hexadecimal digits that identify the task's output."""
         names = {
             name: [path.name for path in (paths if isinstance(paths, list) else [paths])]
             for name, paths in self.inputs.items()
@@ -83,21 +83,21 @@ class Task:
 
     @property
     def output(self) -> Path:
-        """The file."""
+        """Path of the output file."""
         return self.folder / f"{self.label}-{self.key}.npz"
 
     @property
     def done(self) -> bool:
-        """Whether the file is there, and whole as far as its table of contents tells."""
+        """Return whether the output file exists and has its table of contents."""
         return is_whole(self.output)
 
 
 def run_task(task: Task) -> Path:
-    """Run a task unless it is done; the file appears whole or not at all.
+    """Run a task unless it is done; the file is written atomically.
 
     Raises:
-        InputError: of the function.
-        OutputError: the disk refuses.
+        InputError: raised by the function.
+        OutputError: the file cannot be written.
     """
     from g2ard.io.atomic import atomic_output
 
@@ -108,12 +108,12 @@ def run_task(task: Task) -> Path:
     with atomic_output(task.output, overwrite=True) as temporary, temporary.open("wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
     del arrays
-    gc.collect()  # scenes and their cores hold each other
+    gc.collect()  # break reference cycles between scenes and their cores
     return task.output
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a file of arrays is there with its end, which holds the table of contents."""
+    """Return whether an .npz file exists and is complete: its table of contents is at the end."""
     try:
         with zipfile.ZipFile(path):
             return True
@@ -122,27 +122,26 @@ def is_whole(path: Path) -> bool:
 
 
 def load(path: Path, *names: str) -> list[NDArray[Any]]:
-    """Some arrays of a task's file.
+    """Read arrays of a task's file.
 
     Raises:
-        InputError: its contents are not those that were written.
+        InputError: the file is corrupt.
     """
     try:
         with np.load(path, allow_pickle=False) as arrays:
             return [arrays[name] for name in names]
     except _DAMAGED as error:
         raise InputError(
-            f"{path}: its contents are not those that were written; once it is removed, the same command "
-            "makes it again"
+            f"{path}: its contents changed after writing; remove it and run the same command again"
         ) from error
 
 
 def small_scene(files: Mapping[str, Path], mean: float | None) -> Splats:
-    """A tile's Gaussians from what `merge` made, with opacities fitted to what views see where they looked.
+    """Return a tile's merged Gaussians with opacities fitted to what the views see.
 
     Args:
-        files: "merged", and with views "again" of `look_again`.
-        mean: of what the views saw, over all tiles; None without views.
+        files: "merged", and with views "again" from `look_again`.
+        mean: mean weight in the views over all tiles; None without views.
     """
     small = scene_of(files["merged"], "scene")
     if mean is None:
@@ -152,18 +151,18 @@ def small_scene(files: Mapping[str, Path], mean: float | None) -> Splats:
 
 
 def scene_of(path: Path, name: str) -> Splats:
-    """A scene that a task made."""
+    """Read a scene from a task's file."""
     return Splats(*load(path, *(f"{name}_{field}" for field in _FIELDS)))
 
 
 def cameras_of(path: Path) -> Cameras:
-    """Cameras that `g2ard.tiles.simplify` wrote."""
+    """Read cameras written by `g2ard.tiles.sights.written`."""
     viewmats, Ks, widths, heights = load(path, "viewmats", "Ks", "widths", "heights")
     return Cameras(viewmats, Ks, widths, heights, tuple(str(i) for i in range(len(viewmats))))
 
 
 def tile_of(arguments: Arguments, inputs: Inputs, places: Places, *, sh: bool = True) -> PreparedScene:
-    """A tile's Gaussians, with all bands or band 0; the first step finds the order that all others take."""
+    """Read a tile's Gaussians with all SH bands or band 0, in the order that the first step stored."""
     known = inputs.get("own")
     scene = TileStore.open(places["store"]).read(arguments["tile"], sh=sh)
     prepared = finite_rows_of(scene)[0]
@@ -173,7 +172,7 @@ def tile_of(arguments: Arguments, inputs: Inputs, places: Places, *, sh: bool = 
 
 
 def with_surroundings(core: Splats, arguments: Arguments, inputs: Inputs, places: Places) -> PreparedScene:
-    """A tile's Gaussians first, then its halo, then coarse ones of all other tiles outside of that."""
+    """Join a tile's Gaussians with its halo and the coarse Gaussians of all other tiles beyond the halo."""
     store = TileStore.open(places["store"])
     halo = store.read_halo(arguments["tile"], sh=False)
     parts = [core, halo, *far_around(store, arguments, inputs)]
@@ -181,7 +180,7 @@ def with_surroundings(core: Splats, arguments: Arguments, inputs: Inputs, places
 
 
 def far_around(store: TileStore, arguments: Arguments, inputs: Inputs) -> list[Splats]:
-    """Coarse Gaussians of all other tiles outside of the reach of a tile's halo."""
+    """Return coarse Gaussians of all other tiles beyond the reach of a tile's halo."""
     parts = []
     for path, level in zip(inputs["coarse"], arguments["levels"], strict=True):
         if level:
@@ -191,7 +190,7 @@ def far_around(store: TileStore, arguments: Arguments, inputs: Inputs) -> list[S
 
 
 def within_halo(store: TileStore, tile: int, means: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(N,) whether positions lie in a tile's box or within the margin around it."""
+    """Return the (N,) mask of positions in a tile's box or within the margin around it."""
     low = np.array(store.tiles[tile].low) - store.margin
     high = np.array(store.tiles[tile].high) + store.margin
     return np.asarray(((means >= low) & (means <= high)).all(axis=1))
@@ -200,7 +199,7 @@ def within_halo(store: TileStore, tile: int, means: NDArray[np.float32]) -> NDAr
 def cropped(
     cameras: Cameras, core: PreparedScene, settings: RasterSettings, beside: int = _BESIDE
 ) -> Cameras:
-    """The parts of the images that show a tile, and some pixels `beside`: the others need not be drawn."""
+    """Crop the cameras' images to a tile, with `beside` pixels around it."""
     points = core.means[core.core.order[:: max(1, len(core) // _OUTLINE)]].astype(np.float64)
     boxes = []
     for view, (viewmat, K) in enumerate(zip(cameras.viewmats, cameras.Ks, strict=True)):

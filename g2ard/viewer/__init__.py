@@ -1,7 +1,6 @@
-"""Pages that show scenes in a browser, from disk and without a network: SuperSplat's viewer and what it is to
-show, in one file.
+"""Self-contained viewer pages: SuperSplat's viewer and the scenes in one HTML file that needs no network.
 
-`supersplat/` holds the viewer as its makers publish it; its README.md says which version, and how to renew.
+`supersplat/` holds the published viewer; its README.md tells the version and how to update it.
 """
 
 from g2ard.viewer.page import Start, check_page_output, write_page

@@ -1,4 +1,4 @@
-"""The page: viewer, scenes and start in one HTML file."""
+"""Writer for viewer pages: viewer, scenes and start camera in one HTML file."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _HERE = Path(__file__).parent
 _NOTICE = "The viewer on this page is SuperSplat Viewer 1.36.2 with PlayCanvas Engine 2.22.6.\n\n"
 
 _LARGEST = 380_000_000
-"""Bytes of a scene as SOG: browsers hold no text over 2²⁹ characters, and base64 takes 4 for 3 bytes."""
+"""Largest SOG in bytes: browsers limit text to 2²⁹ characters, and base64 needs 4 characters per 3 bytes."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """The camera that a page opens with, in the viewer's axes: x right, y up, z towards us.
+    """Initial camera of a page, in the viewer's axes: x right, y up, z towards the viewer.
 
     Args:
         position: scene units.
-        target: what it turns about, scene units.
+        target: centre of rotation, scene units.
         fov: degrees, along the window's longer side.
     """
 
@@ -40,11 +40,11 @@ class Start:
 
 @dataclass(frozen=True)
 class Written:
-    """What a page came to.
+    """Sizes of a written page.
 
     Args:
-        bytes: of the file.
-        scenes: of each scene as SOG.
+        bytes: size of the file.
+        scenes: SOG bytes per scene.
     """
 
     bytes: int
@@ -52,15 +52,11 @@ class Written:
 
 
 def check_page_output(path: str | Path, overwrite: bool = False) -> Path:
-    """As `g2ard.io.check_output`, for a page.
-
-    Raises:
-        OutputError: as `write_page` would, before the work rather than after it.
-    """
+    """Check that a page can be written here, like `g2ard.io.check_output`."""
     from g2ard.io.atomic import check_output
 
     if Path(path).suffix.lower() not in (".html", ".htm"):
-        raise OutputError(f"{path}: pages are written as .html")
+        raise OutputError(f"{path}: expected a file name that ends in .html")
     return check_output(path, overwrite)
 
 
@@ -72,24 +68,23 @@ def write_page(
     background: Sequence[float] = BLACK,
     overwrite: bool = False,
 ) -> Written:
-    """Write a page of one scene, or of two under one camera with a divider between.
+    """Write a page that shows one scene, or two with a divider under a shared camera.
 
-    Each scene goes in as a .sog of it, so what is seen is quantised as that is. An `offset` is left out.
-    Equal scenes give equal bytes.
+    Scenes are embedded, and quantised, as .sog; their `offset` is dropped. Equal scenes give equal bytes.
 
     Args:
-        path: the .html to write.
-        scenes: (label, scene), one or two, left to right, in one frame: x right, y down, z ahead.
-        start: where the camera stands; None lets the viewer hold the whole scene.
+        path: the .html file.
+        scenes: (label, scene), one or two, left to right, in the same frame: x right, y down, z ahead.
+        start: initial camera; None lets the viewer frame the whole scene.
         background: RGB in [0, 1].
         overwrite: whether an existing file may be replaced.
 
     Returns:
-        What it came to.
+        The sizes of the page and its scenes.
 
     Raises:
-        OutputError: the file exists, cannot be written, or is no .html.
-        InputError: a scene is empty, has a value that is not finite, or is more than browsers take in a page.
+        OutputError: the file exists, cannot be written, or is not .html.
+        InputError: a scene is empty, not finite, or too large for a page.
     """
     from g2ard.io.atomic import atomic_output
 
@@ -117,7 +112,7 @@ def _sog(path: Path, label: str, splats: Splats) -> bytes:
     packed = sog_bytes(path, replace(splats, offset=np.zeros(3)))
     if len(packed) > _LARGEST:
         raise InputError(
-            f"{path}: not written: {label} has {len(packed) / 1e6:.0f} MB as SOG, and browsers take at most"
+            f"{path}: {label} has {len(packed) / 1e6:.0f} MB as SOG, but browsers accept at most"
             f" {_LARGEST / 1e6:.0f} in a page; simplify it first"
         )
     return packed

@@ -50,7 +50,7 @@ def test_a_field_of_any_dataclass_is_a_setting_at_once() -> None:
 def test_the_path_nearest_the_root_is_meant() -> None:
     assert parsed(["brand_new=2"], Outer()) == {"outer.brand_new": 2.0}
     assert parsed(["steps=3"], DistillConfig()) == {"recover.steps": 3}
-    with pytest.raises(InputError, match=r"could be simplify\.neighbors or lift\.neighbors"):
+    with pytest.raises(InputError, match=r"use simplify\.neighbors or lift\.neighbors"):
         parsed(["neighbors=3"], DistillConfig())
 
 
@@ -74,16 +74,16 @@ def test_regions_are_read_as_text() -> None:
     ("text", "words"),
     [
         ("outer.cells", "PATH=VALUE"),
-        ("outer.cells=7.5", "outer.cells: expected a whole number or none, not '7.5'"),
+        ("outer.cells=7.5", "outer.cells: expected a whole number or none, got '7.5'"),
         ("outer.exact=1", "true or false"),
-        ("edges=1", "2 numbers"),
+        ("edges=1", "2 comma-separated numbers"),
         ("inner.brand_new=nan", "a number"),
         ("outer.mode=loud", "one of soft, hard"),
         ("inner.brandnew=2", "did you mean outer.inner.brand_new"),
         ("egdes=1,2", "did you mean outer.inner.edges"),
         ("inner.worked_out=1", "unknown setting 'inner.worked_out'"),
-        ("qqqqqq=1", "there are outer.cells, outer.mode"),
-        ("outer.inner.qqqqqq=1", "there are outer.inner.brand_new, outer.inner.edges"),
+        ("qqqqqq=1", "expected one of outer.cells, outer.mode"),
+        ("outer.inner.qqqqqq=1", "expected one of outer.inner.brand_new, outer.inner.edges"),
     ],
 )
 def test_what_is_refused_of_a_setting(text: str, words: str) -> None:

@@ -116,14 +116,14 @@ def test_the_fewest_that_tiles_come_to_are_one_each(
     words = ("simplify", folder / "town.ply", "-n", "2", "-o", "x.ply", "--no-views", "--workers", "1")
     told = refused(command_line, tmp_path, 1, *words, "--tile-rows", "500")
     assert re.search(
-        r"budget: (\d+) Gaussians is the fewest that the \1 tiles come to \(one a tile\), not 2; greater "
-        r"--tile-rows make fewer tiles",
+        r"budget: the (\d+) tiles keep at least \1 Gaussians \(one per tile\), got 2; raise "
+        r"--tile-rows to get fewer tiles",
         told,
     )
 
 
 def test_ingest_goes_on_with_resume_too(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
     words = ("ingest", folder / "town.ply", "-o", "tiles", "--resume")
-    for said in ("nothing to go on from (tiles): starts anew", "holds these 3,000 Gaussians already"):
+    for said in ("nothing to go on from (tiles): starts anew", "already holds these 3,000 Gaussians"):
         status, _, told = command_line(*words, cwd=tmp_path)
         assert (status, said in told) == (0, True), told

@@ -119,7 +119,7 @@ def test_outputs_are_checked_and_nothing_half_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ball = checkered_ball(20)
-    with pytest.raises(OutputError, match=r"a\.txt: pages are written as \.html"):
+    with pytest.raises(OutputError, match=r"a\.txt: expected a file name that ends in \.html"):
         check_page_output(tmp_path / "a.txt")
     write_page(tmp_path / "made" / "too" / "a.HTML", [("a", ball)])
     with pytest.raises(OutputError, match="exists"):
@@ -127,7 +127,7 @@ def test_outputs_are_checked_and_nothing_half_is_left(
     with pytest.raises(InputError, match=r"b\.html"):
         write_page(tmp_path / "b.html", [("a", ball.take(slice(0)))])
     monkeypatch.setattr(page, "_LARGEST", 100)
-    with pytest.raises(InputError, match="browsers take at most"):
+    with pytest.raises(InputError, match="browsers accept at most"):
         write_page(tmp_path / "b.html", [("a", ball)])
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
 
@@ -254,7 +254,7 @@ def test_a_run_has_a_page_unless_its_scene_is_too_large(
     [
         (["none.ply", "-o", "a.html"], "none.ply"),
         (["dense.ply", "none.ply", "-o", "a.html"], "none.ply"),
-        (["dense.ply", "-o", "a.png"], "a.png: pages are written as .html"),
+        (["dense.ply", "-o", "a.png"], "a.png: expected a file name that ends in .html"),
         (["dense.ply", "-o", "a.html", "--views", "none.json"], "none.json"),
         (["dense.ply", "-o", "a.html", "--views", "v.json", "--start", "nope"], "nope"),
         (["empty", "-o", "a.html"], "empty"),
