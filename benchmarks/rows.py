@@ -44,7 +44,7 @@ COLUMNS: dict[str, Column] = {
     "seed": Column(int, "d", "seed of the cell"),
     "draw": Column(int, None, "which of several random subsets"),
     "split": Column(str, "", "which views were scored"),
-    "views_kind": Column(str, "", "what was scored on: pool, near or standing"),
+    "views_kind": Column(str, "", "what was scored on: pool, near, standing or anywhere"),
     "against": Column(str, None, "photos, teacher, or either; figures of different ones never compare"),
     "submethod": Column(str, None, "method and budget in one word"),
     "input_count": Column(int, None, "Gaussians before"),

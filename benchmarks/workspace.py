@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from benchmarks.runner import folder_of, scene_key
 from benchmarks.standing import standing_targets
 from benchmarks.study import SceneSpec, Study
+from benchmarks.views import anywhere_views
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.poses import make_pool
@@ -34,6 +35,7 @@ PROTOCOLS: dict[str, tuple[str, ...]] = {
     "pool": ("pool",),
     "standing": ("near", "standing"),
     "both": ("pool", "near", "standing"),
+    "anywhere": ("anywhere",),
 }
 """By protocol, the kinds of views that are scored."""
 
@@ -221,4 +223,7 @@ class Workspace:
             return found
         source, seed = self.place / self.scene.prior, self.study.pool_seed
         size, background = self.study.size, self.scene.background
+        if getattr(self.study, "protocol", "pool") == "anywhere":
+            cameras = anywhere_views(self.splats, seed=seed).resized(size)
+            return {**found, "anywhere": TeacherRenders(self.splats, cameras, background=background)}
         return {**found, **standing_targets(self.splats, source, seed, size=size, background=background)}

@@ -78,7 +78,7 @@ class Recover(Study):
         methods: tables of `Variant`.
         steps: of variants that keep the default's schedule; the last of them unless a variant takes each.
         seconds: of recovery instead of steps, over all rounds.
-        protocol: "pool", "standing" (near and standing views) or "both".
+        protocol: "pool", "standing" (near and standing views), "both" or "anywhere".
     """
 
     steps: tuple[int, ...] = key((1000,), least=1, axis=True)

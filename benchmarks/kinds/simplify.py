@@ -33,7 +33,7 @@ class Simplify(Study):
     with a pool of its own, as its user runs it.
 
     Args:
-        protocol: "pool", "standing" (near and standing views) or "both".
+        protocol: "pool", "standing" (near and standing views), "both" or "anywhere".
         splat_transform: its program; None takes the one on PATH.
     """
 

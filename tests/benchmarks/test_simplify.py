@@ -12,6 +12,7 @@ from benchmarks.rows import Row, read_rows
 from benchmarks.runner import run
 from benchmarks.standing import given_views, standing_targets, standing_views
 from benchmarks.study import DEFINITIONS, SceneSpec, read_study
+from benchmarks.views import anywhere_views
 from g2ard import io
 from g2ard.poses import make_pool
 from helpers.scenes import around, checkered_ball
@@ -116,3 +117,15 @@ def test_made_standing_views_are_of_another_kind(make) -> None:
         assert standing.positions[:, 2].max() < 9
     again = standing_views(splats, nowhere)
     np.testing.assert_array_equal(again["standing"].viewmats, standing.viewmats)
+
+
+def test_views_from_anywhere_are_near_free_and_repeatable() -> None:
+    splats = naive.statue()
+    views = anywhere_views(splats, 6)
+    assert len(views) == 6
+    assert not (np.linalg.norm(views.positions - (0, 0, 1.3), axis=1) < 1.0).any()  # within its hollow body
+    gaps = np.linalg.norm(splats.means[:, None] - views.positions, axis=2).min(axis=0)
+    diagonal = np.linalg.norm(np.ptp(splats.means, axis=0))
+    assert (gaps < 0.4 * diagonal).all()
+    np.testing.assert_array_equal(anywhere_views(splats, 6).viewmats, views.viewmats)
+    assert np.abs(anywhere_views(splats, 6, seed=1).viewmats - views.viewmats).max() > 0.1
