@@ -103,7 +103,7 @@ def test_errors_speak_of_parameters(folder: Path) -> None:
     for wrong, words in (
         ({}, "expected exactly one kind of budget"),
         ({"count": 5, "ratio": 2}, "expected exactly one kind of budget"),
-        ({"count": 1501}, "1,501 is above its 1,500"),
+        ({"count": 1501}, "at most its 1,500 Gaussians, got 1,501"),
         ({"ratio": 0.5}, "ratio: expected at least 1"),
         ({"ratio": 2, "method": "magic"}, "method: expected one of default, fast, paper"),
     ):

@@ -1,5 +1,5 @@
-"""What a whole command decides: which views a run looks at, what their targets are, which regularisers hold.
+"""Decisions of whole commands: views, their targets, budgets and regularisers.
 
-`simplify` and `distill` are `g2ard.simplify` and `g2ard.distill`; the commands of those names call them too,
-so that a shell and a program get the same bits. Stages know nothing of it.
+`simplify` and `distill` are `g2ard.simplify` and `g2ard.distill`. The commands of the same names call them,
+so the shell and Python give the same bits. Stages do not depend on this package.
 """

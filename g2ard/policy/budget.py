@@ -1,4 +1,4 @@
-"""An exact budget out of a count, a share, a ratio, a device, bytes of a file or a quality."""
+"""Budgets: an exact count from a count, share, ratio, device, file size or quality."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from g2ard.errors import InputError
 from g2ard.progress import plural
 
 DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "web": 2_000_000}
-"""Gaussians that run smoothly: what users of Quest 3 report; PlayCanvas' defaults for streamed scenes, on
-phones and in desktop browsers."""
+"""Gaussians that render smoothly: reports of Quest 3 users; PlayCanvas' defaults for streamed scenes on
+phones and in desktop browsers.
+"""
 
 _BYTES = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmMgG])[bB]")
 _UNITS = {"k": 1e3, "m": 1e6, "g": 1e9}
@@ -20,19 +21,19 @@ _UNITS = {"k": 1e3, "m": 1e6, "g": 1e9}
 
 @dataclass(frozen=True)
 class Budget:
-    """How many Gaussians are to be left, said in one of several ways.
+    """Number of Gaussians to keep, given in one of several ways.
 
     Args:
-        count: exactly so many.
-        ratio: how many times fewer, at least 1; N/ratio is rounded to the nearest, and at least 1.
-        share: of those there are, in (0, 1]; rounded up.
-        fit: about the most whose file has these bytes, such as 5MB or 800kB; or as many as run smoothly on
-            a device of `DEVICES`.
-        min_psnr: about the fewest that keep this PSNR, dB, against the scene's own renders.
-        min_ssim: about the fewest that keep this SSIM; beside `min_psnr` both hold.
+        count: exact number.
+        ratio: reduction factor, at least 1; keeps round(N/ratio), at least 1.
+        share: share to keep, in (0, 1]; rounded up.
+        fit: as many as fit into a file of this size, such as 5MB or 800kB, or render smoothly on a device of
+            `DEVICES`.
+        min_psnr: approximately the fewest that keep this PSNR (dB) against renders of the scene.
+        min_ssim: approximately the fewest that keep this SSIM; with `min_psnr` both hold.
 
     Raises:
-        InputError: not exactly one kind of them, several of a kind, or one out of its range.
+        InputError: no budget or several, or a value out of range.
 
     >>> Budget(ratio=3).of(1000), Budget(count=10).of(1000), Budget(share=0.25).of(10)
     (333, 10, 3)
@@ -50,9 +51,7 @@ class Budget:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if isinstance(value, list | tuple):
-                raise InputError(
-                    f"one a call, got {value!r}; several take a call each, in a loop", parameter=name
-                )
+                raise InputError(f"expected one value, got {value!r}; call once per value", parameter=name)
             if name != "fit" and value is not None and not isinstance(value, Real):
                 raise InputError(f"expected a number, got {value!r}", parameter=name)
         quality = self.min_psnr if self.min_ssim is None else self.min_ssim
@@ -76,28 +75,28 @@ class Budget:
 
     @property
     def kind(self) -> str:
-        """The first of the names above that is given."""
+        """Name of the given field; min_psnr for both qualities."""
         return next(name for name, value in vars(self).items() if value is not None)
 
     @property
     def bytes(self) -> int | None:
-        """What `fit` allows the file; None where it names a device, or something else is asked."""
+        """File size of `fit` in bytes; None if `fit` names a device or is not given."""
         match = _BYTES.fullmatch((self.fit or "").strip())
         return None if match is None else round(float(match[1]) * _UNITS[match[2].lower()])
 
     @property
     def is_measured(self) -> bool:
-        """Whether it takes the scene itself, not just its count, to tell (`g2ard.policy.fit`)."""
+        """Return whether the count depends on the scene, not only on its size (`g2ard.policy.fit`)."""
         return self.bytes is not None or self.min_psnr is not None or self.min_ssim is not None
 
     def of(self, total: int, name: str = "scene") -> int:
-        """The exact budget out of `total` Gaussians of the scene that errors call `name`.
+        """Return the exact count for a scene of `total` Gaussians, called `name` in errors.
 
         Raises:
-            InputError: it is above `total`, or cannot be told without the scene.
+            InputError: it is above `total`, or depends on the scene.
         """
         if self.is_measured:
-            raise InputError("fit, min_psnr, min_ssim: only the scene itself tells how many Gaussians")
+            raise InputError("fit, min_psnr, min_ssim: the count depends on the scene")
         if self.ratio is not None:
             return max(1, math.floor(total / self.ratio + 0.5))
         if self.share is not None:
@@ -107,7 +106,7 @@ class Budget:
         assert self.count is not None
         if self.count > total:
             raise InputError(
-                f"a budget of {self.count:,} is above its {plural(total, 'Gaussian')}; {total:,} at most",
+                f"expected a budget of at most its {plural(total, 'Gaussian')}, got {self.count:,}",
                 path=name,
             )
         return self.count

@@ -1,4 +1,4 @@
-"""`g2ard.distill`: what a scene, its views and a few options come to, and the pipeline on it."""
+"""`g2ard.distill`: reading inputs, deciding options, and running the pipeline."""
 
 from __future__ import annotations
 
@@ -50,39 +50,37 @@ def distill(
     say: Say = unsaid,
     **fields: Any,
 ) -> Distilled:
-    """Distil a dense scene, or a coloured cloud with photos, as `g2ard distill` does, to the bit.
+    """Distil a dense scene, or a coloured point cloud with photos, exactly like the command `g2ard distill`.
 
-    Views are chosen or made, the scene is simplified, its geometry frozen as anchors, and the rest is
-    recovered against the views' photos or the dense scene's own renders. `g2ard.pipeline.distill` is the same
-    for a caller who has targets and a `DistillConfig` of their own.
+    The scene is simplified and then recovered against photos or renders of the dense scene, in given, found
+    or generated views; the simplified geometry serves as anchors. `g2ard.pipeline.distill` is the lower-level
+    version for given targets and a `DistillConfig`.
 
     Args:
-        scene: the dense scene, a coloured cloud, or the path of either; None where `views` hold photos and
-            there is nothing else: the start is then COLMAP's sparse points, else points within the cameras'
-            sight (`g2ard.policy.photos`).
-        count: Gaussians of the result, at most as many as there are.
-        ratio: how many times fewer there are to be, at least 1.
-        fit: instead, about the most whose file has these bytes at most, such as "5MB"; or a device: quest3,
-            mobile or web.
-        min_psnr: instead, about the fewest that simplification alone keeps this PSNR with, dB, against the
-            scene in views of its own.
-        min_ssim: the same of SSIM; with `min_psnr` both hold. `say` tells what the result has.
+        scene: the dense scene, a coloured point cloud, or the path of either. None starts from photos alone:
+            from COLMAP's sparse points, or as a fallback from points along camera rays
+            (`g2ard.policy.photos`).
+        count: Gaussians of the result, at most those of the scene.
+        ratio: reduction factor, at least 1.
+        fit: largest file, such as "5MB", or a device: quest3, mobile or web.
+        min_psnr: PSNR (dB) that simplification alone must keep against the scene, in generated views.
+        min_ssim: SSIM to keep likewise; with `min_psnr` both hold. `say` receives the result's quality.
         views, photos, held_out, beside, up, size, clean, format, preset: see `g2ard.DistillOptions`.
         settings: values of `g2ard.DistillConfig` by path, such as {"recover.schedule.rates.means": 1e-3};
-            they win over the preset's.
-        work: a folder for finished rounds and checkpoints; the same call resumes there after a Ctrl-C.
-        progress: told of all stages.
-        say: told in lines what was noticed and decided.
-        fields: settings by the name of their field, as flags have them: `steps=100`, `background=(1, 1, 1)`,
+            they override the preset.
+        work: folder for finished rounds and checkpoints; the same call resumes from it after Ctrl-C.
+        progress: called by all stages.
+        say: called with log messages.
+        fields: settings by field name, like the command's flags: `steps=100`, `background=(1, 1, 1)`,
             `method="fast"`. None keeps the preset's value.
 
     Returns:
-        The compact scene, the same before recovery, a report, and the targets that were held out.
+        The compact scene, its unrecovered version, a report, and the held-out targets.
 
     Raises:
-        InputError: not exactly one kind of budget, one that does not fit, a cloud without views,
-            files that cannot be read, an unknown setting, or a value out of its range.
-        KeyboardInterrupt: after Ctrl-C; what is in `work` can be resumed.
+        InputError: no budget or several, a budget that does not fit, a point cloud without views, an
+            unreadable file, an unknown setting, or a value out of range.
+        KeyboardInterrupt: after Ctrl-C; the same call resumes from `work`.
 
     >>> import numpy as np
     >>> ball = np.random.default_rng(0).normal(size=(900, 3))
@@ -121,13 +119,10 @@ def prepare(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> DistillJob:
-    """Read and decide all that a distillation needs, at one budget or several; else as `distill`.
+    """Read inputs and decide everything that a distillation needs, for one or more budgets.
 
-    `counted` is told how many Gaussians there are to reduce, before budgets and views are worked out; what it
-    raises ends the preparation.
-
-    Raises:
-        InputError: as `distill`.
+    `counted` is called with the number of Gaussians to reduce, before budgets and views are computed; its
+    exceptions propagate. Other arguments and errors are those of `distill`.
     """
     from g2ard.policy.inputs import clutter_seen
     from g2ard.stages.recover.presets import preset_for
@@ -185,7 +180,7 @@ def prepare(
     return DistillJob(
         prior=prior,
         aims=aims,
-        views=replace(views, apart=None) if use_photos else views,  # photos are only where they were taken
+        views=replace(views, apart=None) if use_photos else views,  # photos exist only for given poses
         teacher=prior if needs_teacher else None,
         photos_over_renders=use_photos and needs_teacher,
         config=config,
@@ -201,7 +196,7 @@ def prepare(
 
 
 def _task(prior: Splats, aims: Sequence[Aim], photos: int, renders: int) -> str:
-    """What is to be made of what, in words."""
+    """Describe the task in one line."""
     from g2ard.scene.targets import kinds_told
 
     counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
@@ -218,7 +213,7 @@ def _aims(
     progress: Progress,
     say: Say,
 ) -> tuple[Aim, ...]:
-    """What the budgets come to; bytes are of the scene at the degree that the result is written in."""
+    """Resolve the budgets; bytes are measured at the result's SH degree."""
     from g2ard.policy.fit import aim_of
     from g2ard.policy.simplify import Reduction
 
@@ -241,7 +236,7 @@ def _aims(
 
 
 def _all_pictured(pictured: Sequence[bool], names: Sequence[str], lifted: bool) -> None:
-    """Refuse a view without a photo where only photos can be targets."""
+    """Reject views without a photo if targets must be photos."""
     if not all(pictured):
         scene = "a trained scene" if lifted else "leave out {photos} to render the scene there"
         raise InputError(
@@ -251,9 +246,9 @@ def _all_pictured(pictured: Sequence[bool], names: Sequence[str], lifted: bool) 
 
 
 def _points(budgets: Sequence[Budget], options: DistillOptions, progress: Progress, say: Say) -> Points:
-    """A start from photos alone."""
+    """Create starting points from photos alone."""
     if options.views is None or is_made(options.views):
-        raise InputError("without one, photos with poses are needed as views", parameter="scene")
+        raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
     from g2ard.policy.photos import points_of_photos
 
     wanted = max((budget.count for budget in budgets if budget.count is not None), default=None)
@@ -275,7 +270,7 @@ def _prior(
     progress: Progress,
     say: Say,
 ) -> tuple[Splats, bool, str | Path | None, str]:
-    """The dense scene, whether it is a lift, where cameras may lie beside it, and what errors call it."""
+    """Return the dense scene, whether it was lifted, where to look for cameras, and its name in errors."""
     from g2ard.io import kind, read_cloud
     from g2ard.stages.lift import lift
 

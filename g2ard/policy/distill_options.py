@@ -1,4 +1,4 @@
-"""Inputs and settings of a distillation beside its scene and budget."""
+"""Inputs and settings of a distillation, besides the scene and budget."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DistillOptions:
-    """Inputs of a distillation, and the settings of its configuration.
+    """Inputs and settings of a distillation.
 
     Args:
-        views: cameras in world coordinates, or where they lie; None takes those beside the scene, or makes
-            a pool of poses if there are none; "made" always makes one. Their test split is held out.
-        photos: True for the views' photos as targets, and no view without one; False for the scene's renders;
-            None for the photo of each view that has one, and the scene's render of the others (sec. 3.1). A
-            cloud has no renders to learn from: its lift is no picture of the place.
-        held_out: views to score on instead.
-        beside: where to look for cameras, if the scene is no path.
-        up: (3,) away from the ground, for poses that are made; None to estimate it.
-        size: pixels that the longer side of views is shrunk to.
-        clean: first take out what no picture of the scene needs (`g2ard.stages.clean`).
-        format: of the file that a budget in bytes speaks of: ply, compressed.ply, sog, spz, glb or splat.
+        views: cameras in world coordinates, or their path. None uses cameras found beside the scene, or
+            generates a view pool; "made" always generates one. The test split is held out.
+        photos: targets: True for photos, skipping views without one; False for renders of the scene; None for
+            each view's photo, or a render if it has none (sec. 3.1). A point cloud needs photos, because its
+            lift cannot render training images.
+        held_out: views to score on instead of the test split.
+        beside: where to look for cameras, if the scene is not a path.
+        up: (3,) direction away from the ground for generated views; None estimates it.
+        size: longer side of the views in pixels, if they are larger.
+        clean: remove clutter first (`g2ard.stages.clean`).
+        format: file format for a budget in bytes: ply, compressed.ply, sog, spz, glb or splat.
         preset: settings by name, see `g2ard.config.presets`.
-        settings: values of `DistillConfig` by path, which win over the preset's.
+        settings: values of `DistillConfig` by path, which override the preset.
     """
 
     views: Views | None = None
@@ -47,17 +47,17 @@ class DistillOptions:
 
     @cached_property
     def config(self) -> DistillConfig:
-        """The configuration before the scene is measured: with a trained scene's regularisers unless named.
+        """Configuration before the scene is measured; its regularisers are a trained scene's unless named.
 
         Raises:
-            InputError: an unknown preset or setting, or a value out of its range.
+            InputError: an unknown preset or setting, or a value out of range.
         """
         return self.configured()
 
     def configured(
         self, regularizers: Regularizers | None = None, sh_degree: int | None = None
     ) -> DistillConfig:
-        """Return the configuration for measured regularisers, and a degree of SH if no setting says one."""
+        """Return the configuration with measured regularisers and a default SH degree."""
         from g2ard.config.presets import configured
         from g2ard.pipeline import DistillConfig
 
@@ -69,7 +69,7 @@ class DistillOptions:
         return configured(DistillConfig(), self.preset, settings)
 
     def named(self, path: str) -> Any:
-        """Return the value of a path in the settings or else in the preset; None if neither has one."""
+        """Return the value of a path in the settings or the preset, or None."""
         from g2ard.config.presets import PRESETS
 
         return self._full.get(path, PRESETS.get(self.preset, {}).get(path))

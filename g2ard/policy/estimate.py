@@ -1,4 +1,4 @@
-"""A coarse estimate of a distillation's time and memory, from a few renders and steps on this machine."""
+"""Rough estimates of a distillation's time and memory, from a few renders and steps on this machine."""
 
 from __future__ import annotations
 
@@ -24,35 +24,36 @@ if TYPE_CHECKING:
     from g2ard.scene.targets import Targets
 
 _TRIED, _STEPS = 4, 8
-"""Views that are rendered, and steps that are taken, for the estimate."""
+"""Number of views rendered and of steps taken for the estimate."""
 _MERGING = 4.0
-"""Seconds of merging by `default` or `paper` over those of `fast`: 2 to 6.5 measured."""
+"""Time of merging by `default` or `paper` relative to `fast`: 2 to 6.5 measured."""
 _WATCHING = 1.3
-"""Seconds of a recovery over those of its steps alone: trials of rates, and checks that it does not lose."""
+"""Time of a recovery relative to its steps alone; the rest is trials of rates and validation."""
 _ONCE = "prepare", "targets"
 """Stages that several budgets share."""
 _PAGE_BYTES, _PAGE_FULL = 170, 130_000
-"""Bytes of packing the page, per coefficient above SH degree 0 and Gaussian, and the Gaussians beyond which
-it grows no further: playbot 113 MB of 25,000, 511 of 125,000, 538 of 250,000."""
+"""Memory of packing the viewer page: bytes per Gaussian and SH coefficient above degree 0, and the count from
+which it stops growing. Measured on playbot: 113 MB for 25,000 Gaussians, 511 for 125,000, 538 for 250,000.
+"""
 _TRAINER_BYTES = 983
-"""Of a Gaussian in recovery: parameters, Adam's moments, buffers (`docs/benchmarks.md`)."""
+"""Bytes per Gaussian in recovery: parameters, Adam's moments, buffers (`docs/benchmarks.md`)."""
 _RASTER_BYTES = 192
-"""Of a Gaussian of the dense scene while it is rendered, at most; 123 where most lie outside the views."""
+"""Bytes per Gaussian of the dense scene while it is rendered, at most; 123 if most lie outside the views."""
 _PROGRAM_BYTES = 150_000_000
-"""Of the interpreter and what it loads."""
+"""Bytes of the interpreter and loaded libraries."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Of one budget.
+    """Estimate for one budget.
 
     Args:
-        views: that need a target, those for scoring included.
-        pixels: of one view.
-        steps: of recovery, all rounds together.
+        views: number of views that need a target, including those for scoring.
+        pixels: pixels per view.
+        steps: recovery steps of all rounds together.
         seconds: by stage: prepare (measured), targets, simplify, recover, score.
-        bytes: of memory at the peak: what this process has taken at most, the trial included, and what comes
-            on top of it, the targets above all.
+        bytes: peak memory: the peak of this process so far, including the trial, plus what the run adds,
+            mainly the targets.
     """
 
     views: int
@@ -68,12 +69,12 @@ class Estimate:
 
 
 def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
-    """Estimate a job at a budget from a few renders and steps, and one merge by the fast method.
+    """Estimate a job at one budget from a few renders and steps and one fast merge.
 
     Args:
-        job: as `g2ard.policy.distill.prepare` returns it.
+        job: a job from `g2ard.policy.distill.prepare`.
         budget: Gaussians of the result.
-        page: whether a page for the browser is written too.
+        page: whether a viewer page is written too.
     """
     train, test, apart = job.views.train.cameras, job.views.test, job.views.apart
     near = 0 if apart is None or job.teacher is None else len(apart)
@@ -94,22 +95,21 @@ def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
         seconds={
             "prepare": job.seconds,
             "targets": per_view * views,
-            "simplify": merging + per_view * len(train),  # each view is looked through once
+            "simplify": merging + per_view * len(train),  # each view is rendered once for visibility
             "recover": _WATCHING * steps * _step_seconds(job, merged, targets) if limit is None else limit,
             "score": per_view * (2 * len(test) + near),
         },
         bytes=max(_trial_bytes(job, budget), _page_bytes(job, merged) if page else 0)
-        + 2 * merged.nbytes  # the recovered scene, and its rows on their way to the file
+        + 2 * merged.nbytes  # the recovered scene, and its rows during writing
         + min(CACHE_BYTES, views * pixels * (12 if job.teacher is not None else 3)),
     )
 
 
 def check_memory(job: DistillJob, most: int | None, *, page: bool = True) -> None:
-    """Refuse a job that takes more memory than `most` bytes by `estimate`, at any of its budgets; None is no
-    limit.
+    """Reject a job whose estimated memory exceeds `most` bytes at any budget; None means no limit.
 
     Raises:
-        InputError: it does.
+        InputError: the estimate exceeds `most`.
     """
     if most is None:
         return
@@ -118,14 +118,14 @@ def check_memory(job: DistillJob, most: int | None, *, page: bool = True) -> Non
         count = len(job.prior)
         told = f"--memory: {plural(count, 'Gaussian')} in one piece take about {amount(need, up=True)}, "
         told += f"more than {amount(most)}; smaller views, --size, take less"
-        if job.teacher is not None and not job.lifted:  # what tiles can work on
+        if job.teacher is not None and not job.lifted:  # tiles support this job
             tiles = TileMemory(count, 4 * row_width(job.prior.sh_degree), RECOVERY_TIMES)
             told += f"; in tiles {tiles.advice(most, max(1, count // 2), foretold([job.prior.means], count))}"
         raise InputError(told)
 
 
 def total(estimates: Sequence[Estimate]) -> tuple[float, int]:
-    """Seconds and bytes of one run at several budgets: preparation and targets once, the rest one by one."""
+    """Return seconds and bytes of one run at several budgets, which share preparation and targets."""
     once = sum(estimates[0].seconds[stage] for stage in _ONCE)
     apart = sum(found.total - sum(found.seconds[stage] for stage in _ONCE) for found in estimates)
     return once + apart, max(found.bytes for found in estimates)
@@ -137,7 +137,7 @@ def _evenly(cameras: Cameras, count: int) -> Cameras:
 
 
 def _trial_bytes(job: DistillJob, budget: int) -> int:
-    """What this process took at most, the trial included; where the system does not tell, what it should."""
+    """Return this process's peak memory, or its expected peak if the system does not report it."""
     if (peak := peak_rss()) is not None:
         return peak
     rendering = _RASTER_BYTES * len(job.prior) if job.teacher is not None else 0
@@ -145,13 +145,13 @@ def _trial_bytes(job: DistillJob, budget: int) -> int:
 
 
 def _page_bytes(job: DistillJob, merged: Splats) -> int:
-    """What is taken while the page is written, the scene and the program included."""
+    """Return the memory while the page is written, including the scene and the program."""
     packing = _PAGE_BYTES * 3 * ((merged.sh_degree + 1) ** 2 - 1) * min(len(merged), _PAGE_FULL)
     return min(_PROGRAM_BYTES, peak_rss() or _PROGRAM_BYTES) + 2 * job.prior.nbytes + packing
 
 
 def _merged(job: DistillJob, budget: int) -> tuple[Splats, float]:
-    """Return the scene merged by `fast`, and about how long the requested method takes."""
+    """Merge the scene by `fast`; return it and the expected time of the requested method."""
     from g2ard.stages.simplify import simplify
 
     began = time.monotonic()
@@ -181,7 +181,7 @@ def _steps(job: DistillJob, student: Splats) -> int:
 
 
 def _rounds(job: DistillJob, student: Splats) -> int:
-    """How many recoveries there are before the last; 0 where the schedule has no rounds."""
+    """Return the number of recoveries before the last; 0 if the schedule has no rounds."""
     from g2ard.stages.simplify import round_counts
 
     config = job.config

@@ -1,4 +1,4 @@
-"""What a budget comes to for a scene: how many Gaussians fit bytes of a file, or keep a quality."""
+"""Resolution of budgets for a scene: the count that fits a file size or keeps a quality."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ if TYPE_CHECKING:
     from g2ard.stages.simplify import Simplified
 
 _VIEWS, _SIDE = 12, 400
-"""Views that a quality is measured in, and their longer side, pixels."""
+"""Number of views in which quality is measured, and their longer side in pixels."""
 _ROWS = 100_000
-"""Gaussians that those are planned on."""
+"""Gaussians that those views are planned on."""
 _SAMPLE = 4096
-"""Gaussians of the first probe, a file of which tells about what each takes."""
+"""Gaussians of the first probe file, which estimates the bytes per Gaussian."""
 _PROBES, _FULL, _AIM = 6, 0.98, 0.99
-"""The most files written to find a count of bytes; shares of the bytes that are enough, and aimed at."""
+"""Most files written to find a count for bytes; shares of the bytes that are accepted and aimed at."""
 _MARGIN = 0.985
-"""Of the bytes asked for, where the result is not what the files were written of: recovery is to come."""
+"""Safety factor on the bytes if recovery will change the scene after the search."""
 _TRIALS = 8
-"""Most counts at which the quality is measured."""
+"""Most counts at which quality is measured."""
 _CLOSE_ENOUGH = 0.25
-"""Decibels above what is wanted that are close enough to stop."""
+"""Excess in dB at which the search stops."""
 _SLOPE = 4.0
-"""Decibels for twice the Gaussians, until two counts tell."""
+"""Expected gain in dB for twice the Gaussians, until two counts are measured."""
 _FEWEST = 64
-"""Gaussians that a search for bytes or a quality stops at."""
+"""Smallest count that a search tries."""
 
 
 @dataclass(frozen=True)
@@ -53,18 +53,18 @@ class Quality:
     ssim: float
 
     def meets(self, wanted: Quality) -> bool:
-        """Whether both are reached."""
+        """Return whether both values are reached."""
         return self.psnr >= wanted.psnr and self.ssim >= wanted.ssim
 
     def over(self, wanted: Quality) -> float:
-        """Decibels above what is wanted, the less of PSNR's and −10 log₁₀(1 − SSIM)'s; ∞ where nothing is."""
+        """Return the smaller excess, dB, of PSNR and −10 log₁₀(1 − SSIM); ∞ if nothing is wanted."""
         ssims = (max(1 - value, 1e-9) for value in (wanted.ssim, self.ssim))
         of_ssim = 10 * math.log10(next(ssims) / next(ssims)) if wanted.ssim > 0 else math.inf
         return min(self.psnr - wanted.psnr if wanted.psnr > 0 else math.inf, of_ssim)
 
 
 def file_bytes(splats: Splats, name: str, **options: Any) -> int:
-    """Bytes of the scene as `write_splats` writes it under `name`."""
+    """Return the bytes of the scene as `write_splats` writes it under `name`."""
     with _written(splats, name, **options) as path:
         folder = path.parent if path.name == "meta.json" else path
         files = folder.iterdir() if folder.is_dir() else [folder]
@@ -72,7 +72,7 @@ def file_bytes(splats: Splats, name: str, **options: Any) -> int:
 
 
 def as_file(splats: Splats, name: str) -> Splats:
-    """The scene as it is read again from the format of `name`: quantised, without what that does not hold."""
+    """Return the scene as read back from the format of `name`: quantised and without unsupported fields."""
     from g2ard.io import read_splats
     from g2ard.io.scene_formats import scene_format
 
@@ -84,7 +84,7 @@ def as_file(splats: Splats, name: str) -> Splats:
 
 @contextmanager
 def _written(splats: Splats, name: str, **options: Any) -> Iterator[Path]:
-    """A file of the scene in the format of `name`, while it lasts."""
+    """Yield a temporary file of the scene in the format of `name`."""
     from g2ard.io import write_splats
     from g2ard.io.scene_formats import scene_format
 
@@ -97,24 +97,24 @@ def _written(splats: Splats, name: str, **options: Any) -> Iterator[Path]:
 
 
 def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[int], Splats]) -> int:
-    """About the most Gaussians whose file has at most `wanted` bytes.
+    """Return approximately the most Gaussians whose file has at most `wanted` bytes.
 
-    A sample's bytes per Gaussian give a first count, files of the scene reduced to it and to further counts
-    better ones, between the last that fits and the last that does not, until one fills 98 %.
+    A sample's bytes per Gaussian give the first count. Files of the scene reduced to trial counts then
+    bracket the result, until one fills 98 % of the bytes.
 
     Args:
         splats: the dense scene.
         wanted: bytes.
-        name: of the file; its suffix is the format.
+        name: a file name; its suffix is the format.
         reduce: count → scene.
 
     Raises:
-        InputError: not even a few Gaussians fit.
+        InputError: too few bytes for any useful scene.
     """
     fewest, most = min(_FEWEST, len(splats)), len(splats)
     sample = splats.take(np.unique(np.linspace(0, most - 1, min(most, _SAMPLE)).astype(int)))
     count = int(len(sample) * wanted / file_bytes(sample, name))
-    fits, over = (0, 0), (most + 1, 0)  # (count, bytes); 0 bytes until there is such a file
+    fits, over = (0, 0), (most + 1, 0)  # (count, bytes); 0 bytes means no such file yet
     for _ in range(_PROBES):
         count = min(max(count, fits[0] + 1, fewest), over[0] - 1, most)
         size = file_bytes(reduce(count) if count < most else splats, name)
@@ -125,7 +125,7 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
         full = size <= wanted and (size >= _FULL * wanted or count == most)
         if full or (count == fewest and size > wanted) or over[0] - fits[0] <= 1:
             break
-        if fits[0] and over[1]:  # files grow in steps, so that not all of the way is trusted
+        if fits[0] and over[1]:  # file sizes grow in steps, so interpolate with limits
             share = (_AIM * wanted - fits[1]) / (over[1] - fits[1])
             count = round(fits[0] + min(max(share, 0.1), 0.9) * (over[0] - fits[0]))
         else:
@@ -133,7 +133,7 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
     if fits[0]:
         return fits[0]
     if over[0] <= fewest:
-        raise InputError(f"{wanted:,} bytes hold hardly a Gaussian; {over[1]:,} hold {over[0]:,}", path=name)
+        raise InputError(f"{wanted:,} bytes are too few; {over[0]:,} Gaussians take {over[1]:,}", path=name)
     return max(fewest, int(over[0] * _AIM * wanted / over[1]))
 
 
@@ -143,7 +143,7 @@ def _images(splats: Splats, cameras: Cameras) -> list[NDArray[Any]]:
 
 
 def quality(renders: list[Any], splats: Splats, cameras: Cameras) -> Quality:
-    """Of a scene against images in [0, 1], one for each camera."""
+    """Return the quality of a scene against images in [0, 1], one per camera."""
     pairs = list(zip(_images(splats, cameras), renders, strict=True))
     return Quality(
         float(np.mean([psnr(image, target) for image, target in pairs])),
@@ -154,20 +154,20 @@ def quality(renders: list[Any], splats: Splats, cameras: Cameras) -> Quality:
 def count_for_quality(
     splats: Splats, wanted: Quality, cameras: Cameras, reduce: Callable[[int], Splats]
 ) -> tuple[int, Quality]:
-    """About the fewest Gaussians that keep a quality in these views, and the quality there.
+    """Return approximately the fewest Gaussians that keep a quality in these views, and their quality.
 
-    The excess of a quality over what is wanted, dB, is nearly linear in the logarithm of the count: from a
-    quarter of the scene the counts looked at follow its slope, then the line between the last that keeps the
-    quality and the last that does not, until one keeps it by at most 0.25 dB.
+    The excess in dB over the wanted quality is nearly linear in the logarithm of the count. The search starts
+    at a quarter of the scene, follows the slope, then interpolates between counts on both sides, until the
+    excess is at most 0.25 dB.
 
     Args:
         splats: the dense scene, N Gaussians.
-        wanted: mean PSNR and SSIM; 0 asks for nothing.
-        cameras: where they are measured.
-        reduce: the method that the result will be made with: count → scene.
+        wanted: mean PSNR and SSIM; 0 means no requirement.
+        cameras: views to measure in.
+        reduce: count → scene, by the method that makes the result.
 
     Returns:
-        The count, N where nothing less that was looked at keeps the quality.
+        The count and its quality; N if no smaller count tried keeps it.
     """
     renders = _images(splats, cameras)
     met, good, missed = len(splats), Quality(float("inf"), 1.0), 0
@@ -187,7 +187,7 @@ def count_for_quality(
 
 
 def _next_count(excesses: Mapping[int, float], met: int, missed: int, most: int) -> int:
-    """Where the excess is expected to be half of what is close enough."""
+    """Predict the count whose excess is half the tolerance."""
     aim = _CLOSE_ENOUGH / 2
     if missed and met < most:
         share = (aim - excesses[missed]) / max(excesses[met] - excesses[missed], 1e-12)
@@ -196,22 +196,22 @@ def _next_count(excesses: Mapping[int, float], met: int, missed: int, most: int)
     (a, at_a), (b, at_b) = min(excesses.items()), max(excesses.items())
     slope = (at_b - at_a) / math.log2(b / a) if b > a else _SLOPE
     steps = (aim - excesses[near]) / max(slope, _SLOPE / 4)
-    # Beyond what was looked at the line is a guess, and towards N the excess grows faster than it.
+    # Extrapolation is unreliable, and towards N the excess grows faster than linearly.
     highest = math.sqrt(near * most) if met == most else most
     return max(_FEWEST, round(min(near * 2 ** min(max(steps, -3.0), 3.0), highest)))
 
 
 @dataclass(frozen=True, eq=False)
 class Aim:
-    """What a budget came to for a scene.
+    """Budget resolved for a scene.
 
     Args:
         count: Gaussians to reduce it to.
-        bytes: that the result's file may have at most; None if that is not asked.
-        file: a name whose suffix is the file's format.
-        wanted: quality that is to be kept; None if that is not asked.
-        dense: the scene that it is kept of.
-        cameras: where it is measured.
+        bytes: largest size of the result's file; None for no limit.
+        file: a file name; its suffix is the format.
+        wanted: quality to keep; None for no requirement.
+        dense: the scene to compare with.
+        cameras: views to measure quality in.
     """
 
     count: int
@@ -222,10 +222,10 @@ class Aim:
     cameras: Cameras | None = None
 
     def shrink(self, splats: Splats, say: Say = unsaid) -> tuple[Splats, NDArray[np.int64]]:
-        """The scene, merged on as far as its file would be too large.
+        """Merge the scene further while its file is too large.
 
         Returns:
-            The scene, and (N,) the row that each row went to; −1 if it was dropped.
+            The scene, and (N,) the new row of each row, −1 if dropped.
         """
         from g2ard.stages.simplify import simplify
 
@@ -234,14 +234,14 @@ class Aim:
             fewer = max(1, int(len(splats) * self.bytes / size * 0.99))
             if fewer == len(splats):
                 break
-            say(f"{size:,} bytes: merged on from {len(splats):,} to {plural(fewer, 'Gaussian')}")
+            say(f"{size:,} bytes are too many: merging {len(splats):,} to {plural(fewer, 'Gaussian')}")
             made = simplify(splats, fewer, method="fast")
             rows = _onward(rows, made.parents)
             splats = made.splats
         return splats, rows
 
     def shrink_simplified(self, small: Simplified, say: Say = unsaid) -> Simplified:
-        """The same with what is known of its rows."""
+        """Shrink a simplification like `shrink`, and update its rows and report."""
         splats, rows = self.shrink(small.splats, say)
         if splats is small.splats:
             return small
@@ -258,7 +258,7 @@ class Aim:
         return replace(small, splats=splats, parents=parents, protected=protected, report=report)
 
     def judge(self, splats: Splats) -> tuple[bool, str] | None:
-        """Whether a result keeps the quality, and a line of it; None where no quality is asked."""
+        """Return whether a result keeps the quality, with a message; None if no quality is required."""
         if self.wanted is None:
             return None
         from g2ard.io.scene_formats import scene_format
@@ -270,10 +270,10 @@ class Aim:
         line = f"{count}: {got.psnr:.2f} dB, SSIM {got.ssim:.4f} in {views}"
         if got.meets(self.wanted):
             return True, line
-        more = f"ask for a count above {len(splats):,}"
+        more = f"request a count above {len(splats):,}"
         if len(splats) >= len(self.dense):
-            more = f"{scene_format(self.file).suffix} keeps no more"
-        return False, f"{line}, which is less than was asked; {more}"
+            more = f"{scene_format(self.file).suffix} cannot store more quality"
+        return False, f"{line}, less than requested; {more}"
 
 
 def aim_of(
@@ -288,22 +288,22 @@ def aim_of(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Aim:
-    """What a budget means for a scene.
+    """Resolve a budget for a scene.
 
     Args:
-        budget: of any kind.
+        budget: a budget of any kind.
         splats: the scene.
-        name: what errors call the scene.
-        file: a name whose suffix is the format of the file that `Budget.fit` speaks of.
-        reduce: count → scene, the reduction that the result will be made with.
+        name: name of the scene in errors.
+        file: a file name; its suffix is the format for `Budget.fit`.
+        reduce: count → scene, by the method that makes the result.
         recovered: whether recovery follows. Bytes are then searched with the method `fast` and a margin.
-        seed: of the views that quality is measured in.
-        progress: told of planning.
-        say: told what was found.
+        seed: seed of the views for measuring quality.
+        progress: called during planning.
+        say: called with the count found.
 
     Raises:
         InputError: the budget is above the scene's count, or no file of its format has so few bytes.
-        OutputError: `file` names no format of scenes.
+        OutputError: `file` has no known scene format.
     """
     if budget.min_psnr is not None or budget.min_ssim is not None:
         wanted = Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0)
@@ -340,7 +340,7 @@ def _by_quality(
 
     found, near = count_for_quality(splats, wanted, cameras, written)
     if found == len(splats):
-        say(f"nothing less than all {found:,} Gaussians was found to keep what was asked")
+        say(f"no smaller count was found that keeps the quality; keeping all {found:,} Gaussians")
     else:
         say(f"{plural(found, 'Gaussian')} should keep {near.psnr:.2f} dB, SSIM {near.ssim:.4f}")
     return Aim(found, file=file, wanted=wanted, dense=splats, cameras=cameras)
@@ -353,7 +353,7 @@ def _fast(splats: Splats, count: int) -> Splats:
 
 
 def _onward(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where rows went in two reductions, one after the other.
+    """Compose the row maps of two consecutive reductions.
 
     >>> _onward(np.array([1, -1, 0, 2]), np.array([0, 1, -1])).tolist()
     [1, -1, 0, -1]

@@ -1,4 +1,4 @@
-"""Reading what a run is given: scenes, views and their splits, with a line for all that was noticed."""
+"""Reading the inputs of a run: scenes, views and splits, with a message for every note."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from g2ard.stages.clean import Cleaning
     from g2ard.stages.simplify import SimplifyConfig
 
-    Views = Cameras | ViewSet | str | Path  # read already, or where they lie
+    Views = Cameras | ViewSet | str | Path  # cameras, or the path of views
 
 _CLUTTER_VIEWS, _CLUTTER_SIDE = 96, 400
-"""Generated views that clutter is found by, and their longer side, pixels."""
+"""Number of generated views for finding clutter, and their longer side in pixels."""
 _CLUTTER_ROWS = 100_000
 """Gaussians that those views are planned on."""
 _CLUTTER_NEAR = 0.25
@@ -32,7 +32,7 @@ _CLUTTER_NEAR = 0.25
 
 
 def load_scene(path: str | Path, say: Say = unsaid) -> Splats:
-    """Read a scene and say what was noticed."""
+    """Read a scene and report its notes."""
     from g2ard.io import read_scene
 
     scene = read_scene(path)
@@ -41,8 +41,10 @@ def load_scene(path: str | Path, say: Say = unsaid) -> Splats:
 
 
 def say_notes(path: str | Path, notes: Sequence[Note], say: Say) -> None:
-    """Say what was noticed, but for what changes nothing that is drawn: a logit past ±16 is α = 0 or 1 either
-    way, to 1e-7 (`g2ard info` tells of those too)."""
+    """Report notes, except those that do not affect rendering.
+
+    A logit beyond ±16 is α = 0 or 1 to within 1e-7; only `g2ard info` reports these.
+    """
     for note in notes:
         if note.code not in _HARMLESS:
             say(f"{path}: {note}")
@@ -52,7 +54,7 @@ def say_regions(splats: Splats, config: SimplifyConfig, name: str, say: Say) -> 
     """Say how many Gaussians lie in the regions to keep.
 
     Raises:
-        InputError: none.
+        InputError: no Gaussian lies there.
     """
     from g2ard.errors import InputError
     from g2ard.scene.regions import in_any
@@ -61,8 +63,8 @@ def say_regions(splats: Splats, config: SimplifyConfig, name: str, say: Say) -> 
         inside = int(in_any(splats, config.keep_region).sum())
         if not inside:
             raise InputError(
-                f"none of the {len(splats):,} Gaussians of {name} lies there; "
-                "`g2ard info` tells where they are",
+                f"contains none of the {len(splats):,} Gaussians of {name}; "
+                "see their extent with `g2ard info`",
                 parameter="keep_region",
             )
         share = inside / len(splats)
@@ -76,7 +78,7 @@ _HARMLESS = ("clamped_logits",)
 def load_views(
     views: Views, split: str, size: int | None, say: Say = unsaid, *, unpictured: bool = False
 ) -> Cameras:
-    """Read views, pick a split, shrink them; `unpictured` keeps views without a photo beside others.
+    """Read the views of a split, shrunk to `size`; `unpictured` keeps views without a photo among others.
 
     Raises:
         InputError: the file has no views, or the split is empty.
@@ -87,7 +89,7 @@ def load_views(
 def load_view_sets(
     views: Views, splits: list[str], size: int | None, say: Say = unsaid, *, unpictured: bool = False
 ) -> list[ViewSet]:
-    """Read views once and give each of several splits, shrunk, with the weights that they state.
+    """Read views once and return several splits, shrunk to `size`, with their weights.
 
     Raises:
         InputError: as `load_views`.
@@ -102,8 +104,8 @@ def load_view_sets(
 def load_for_training(
     views: Views, size: int | None, say: Say = unsaid, *, unpictured: bool = False
 ) -> ViewSet:
-    """The views to train on of a set beside which another is given to score on: its train split where it
-    states splits, else all; `unpictured` as for `load_views`.
+    """Read training views when views for scoring are given separately: the train split if splits are stated,
+    otherwise all.
 
     Raises:
         InputError: as `load_views`, and as `g2ard.scene.splits.for_training`.
@@ -115,7 +117,7 @@ def load_for_training(
 
 
 def load_held_out(views: Views, size: int | None, say: Say = unsaid, *, unpictured: bool = False) -> ViewSet:
-    """The views of a set given to score on; `unpictured` as for `load_views`.
+    """Read views that were given for scoring.
 
     Raises:
         InputError: as `load_views`, and as `g2ard.scene.splits.for_scores`.
@@ -127,10 +129,10 @@ def load_held_out(views: Views, size: int | None, say: Say = unsaid, *, unpictur
 
 
 def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewSet:
-    """The views to train on that are none of those to score on; says how many were.
+    """Remove held-out views from training views, and report how many were removed.
 
     Raises:
-        InputError: all of them are.
+        InputError: no views are left.
     """
     from g2ard.errors import InputError
     from g2ard.scene.splits import not_held_out
@@ -138,19 +140,18 @@ def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewS
     keep = not_held_out(train.cameras, held_out)
     if not keep.any():
         raise InputError(
-            f"held-out views: all {plural(len(keep), 'view')} to train on are among them; hold out fewer, or "
+            f"held-out views: they include all {plural(len(keep), 'view')} for training; hold out fewer, or "
             "train on others"
         )
     if not keep.all():
-        say(f"held out, so not trained on: {len(keep) - int(keep.sum())} of {plural(len(keep), 'view')}")
+        say(f"held out from training: {len(keep) - int(keep.sum())} of {plural(len(keep), 'view')}")
     return train.take(keep)
 
 
 def load_trained(
     views: Views, split: str, size: int | None, say: Say = unsaid, *, unpictured: bool = False
 ) -> ViewSet:
-    """The views of a split to train on, shrunk; says so if that makes training views of held-out ones;
-    `unpictured` as for `load_views`.
+    """Read the training views of a split, shrunk to `size`; report test views among them.
 
     Raises:
         InputError: as `load_views`.
@@ -166,8 +167,7 @@ def load_trained(
 def load_split_views(
     views: Views, split: str, say: Say = unsaid, *, unpictured: bool = False
 ) -> tuple[ViewSet, NDArray[np.bool_]]:
-    """All views, each with the split it belongs to, stated or by the rule; and which of them `split` means;
-    `unpictured` as for `load_views`.
+    """Read all views with their splits, stated or by the rule, and the mask of the views in `split`.
 
     Raises:
         InputError: as `load_views`.
@@ -181,7 +181,7 @@ def load_split_views(
 
 
 def _read(views: Views, say: Say, *, unpictured: bool = False) -> tuple[ViewSet, Path | None]:
-    """The views, and where they lie, if they had to be read."""
+    """Return the views, and their path if they were read."""
     from g2ard.io import ViewSet, read_view_set
 
     if isinstance(views, ViewSet):
@@ -206,8 +206,11 @@ def make_targets(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Targets:
-    """The teacher's renders (`lazy`: when first asked for), or the photos where no teacher is given; with
-    `photos` the photo of each view that has one, and the teacher's render of the others."""
+    """Return targets: renders of the teacher, or photos if there is no teacher.
+
+    With `photos` and a teacher, each view's photo is used, or a render if it has none. `lazy` renders on
+    first access.
+    """
     from g2ard.io.exposures import find_exposures
     from g2ard.scene.targets import Photos, PhotosOrRenders, TeacherRenders
 
@@ -223,7 +226,7 @@ def make_targets(
         )
     exposures = find_exposures(cameras)
     if exposures:
-        say(f"exposure.json: {plural(len(exposures), 'photo')} brought to the scene's own colours")
+        say(f"exposure.json: corrected the exposure of {plural(len(exposures), 'photo')}")
     if teacher is None:
         return Photos(cameras, exposures=exposures)
     return PhotosOrRenders(
@@ -281,5 +284,5 @@ def clutter_seen(
     found = find_clutter(splats, seen, within_reach(splats, cameras, progress), pixels, kinds)
     parts = [f"{count:,} {name}" for name, count in found.counts.items() if name in kinds]
     gone = len(splats) - int(found.keep.sum())
-    say(f"{gone:,} of {plural(len(splats), 'Gaussian')} can go: {', '.join(parts)}")
+    say(f"{gone:,} of {plural(len(splats), 'Gaussian')} are clutter: {', '.join(parts)}")
     return found, cameras

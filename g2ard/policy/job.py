@@ -1,4 +1,4 @@
-"""A distillation with all decided: what `prepare` gives, and the pipeline on it."""
+"""A fully prepared distillation and its run."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class DistillJob:
-    """A distillation, ready to run: all is decided, nothing rendered yet.
+    """A prepared distillation: everything is decided, nothing rendered yet.
 
     Args:
-        prior: the dense scene, or the lift of a cloud.
-        aims: what one or more budgets came to; what they share is made once.
-        views: what is looked at.
-        teacher: whose renders the targets are; None where all of them are photos.
-        photos_over_renders: of a view that has a photo the target is the photo, the teacher's render of the
-            others; always False without a teacher.
-        config: of the pipeline.
-        weights: (C,) how often each view is drawn, where the views say so.
-        lifted: whether `prior` is the lift of a cloud.
-        preset: which regularisers, and why.
-        measured: what decided it.
-        seconds: that preparing it took, reading included.
-        cleaned: how many Gaussians of each kind were taken out first; None where nothing was looked for.
-        progress: told of all stages.
-        say: told in lines what was noticed.
+        prior: the dense scene, or a lifted point cloud.
+        aims: one or more resolved budgets; shared work is done once.
+        views: views for training and scoring.
+        teacher: the scene rendered for targets; None if all targets are photos.
+        photos_over_renders: use photos where views have them and renders for the rest; always False without a
+            teacher.
+        config: configuration of the pipeline.
+        weights: (C,) sampling weight per view, if the views state them.
+        lifted: whether `prior` is a lifted point cloud.
+        preset: the regularisers chosen, and why.
+        measured: the measures that decided it.
+        seconds: time of preparation, including reading.
+        cleaned: number of Gaussians removed by kind of clutter; None without cleaning.
+        progress: called by all stages.
+        say: called with log messages.
     """
 
     prior: Splats
@@ -66,23 +66,25 @@ class DistillJob:
 
     @property
     def against(self) -> str:
-        """What the views are scored against, in words."""
+        """Kind of the scoring targets, in words."""
         return kinds_of(self.held_out)
 
     @cached_property
     def targets(self) -> Targets:
-        """What recovery learns from."""
+        """Training targets."""
         return self._targets(self.views.train.cameras, lazy=self.config.select.views_count is not None)
 
     @cached_property
     def held_out(self) -> Targets:
-        """Views of their kind to score on, never learned from."""
+        """Held-out targets of the same kind, for scoring only."""
         return self._targets(self.views.test)
 
     @cached_property
     def apart(self) -> tuple[Targets | None, Targets | None]:
-        """Views of another kind: every second one decides how much of recovery stays, the others are to score
-        on; None where there are none, or no teacher to render them."""
+        """Views of another kind: one half for validation during recovery, the other for scoring.
+
+        Both are None if there are no such views or no teacher to render them.
+        """
         cameras = self.views.apart
         if cameras is None or self.teacher is None or len(cameras) < 2:
             return None, None
@@ -90,7 +92,7 @@ class DistillJob:
         return first, second
 
     def render_targets(self) -> None:
-        """Have all targets that are rendered beforehand; `run` does so where it has not been done."""
+        """Render all targets that are not lazy; `run` calls this too."""
         _ = self.targets, self.held_out, self.apart
         vars(self).pop("_renderer", None)  # its buffers are larger than the scene
 
@@ -103,7 +105,7 @@ class DistillJob:
         return None if self.teacher is None else Renderer(self.teacher, background=background)
 
     def tried(self, cameras: Cameras) -> Targets:
-        """Targets of a few views, none of them kept."""
+        """Return lazy targets for a few views."""
         return self._targets(cameras, lazy=True)
 
     def _targets(self, cameras: Cameras, *, lazy: bool = False) -> Targets:
@@ -119,14 +121,14 @@ class DistillJob:
         )
 
     def run(self, budget: int | None = None, *, work: Path | None = None) -> Distilled:
-        """Distil to one of the budgets, the first if none is named.
+        """Distil to one of the budgets, by default the first.
 
         Args:
             budget: one of `budgets`.
-            work: a folder for what a stopped run leaves, see `g2ard.pipeline.distill`.
+            work: folder for resuming, see `g2ard.pipeline.distill`.
 
         Returns:
-            As `g2ard.distill`.
+            The result of `g2ard.distill`.
         """
         from g2ard.pipeline import distill as pipeline
 

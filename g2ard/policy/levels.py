@@ -1,4 +1,4 @@
-"""`g2ard.lod`: levels of detail, each merged from the one before and recovered at the size it is seen at."""
+"""`g2ard.lod`: levels of detail, each merged from the previous one and recovered at its viewing size."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
     from g2ard.scene.targets import Targets
 
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
-"""A level is half of the one before, as viewers' own tools make them."""
+"""Reduction factors; each level has half the Gaussians of the previous one, as in viewers' own tools."""
 
 _SMALLEST = 200
-"""Pixels that the longer side of a level's views keeps: beneath, the error of a render is its edge's."""
+"""Smallest longer side of a level's views in pixels; below it, edges dominate the error."""
 
 
 @dataclass(frozen=True)
 class LevelReport(Report):
-    """A level in numbers.
+    """Figures of one level.
 
     Args:
-        count: Gaussians.
-        ratio: how many times fewer than the scene.
-        size: pixels of the longer side of the views that it is recovered and scored in.
-        seconds: of the whole level.
+        count: number of Gaussians.
+        ratio: reduction factor relative to the scene.
+        size: longer side in pixels of the views for recovery and scoring.
+        seconds: time for the whole level.
         simplified, recovered: PSNR, dB, in held-out views of that size; None for the scene itself.
     """
 
@@ -52,7 +52,7 @@ class LevelReport(Report):
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """A scene's levels of detail, the finest first, and a report on each."""
+    """Levels of detail of a scene, finest first, with a report on each."""
 
     splats: tuple[Splats, ...]
     reports: tuple[LevelReport, ...]
@@ -75,35 +75,34 @@ def lod(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Levels:
-    """Levels of detail of a trained scene, as `g2ard lod` makes them, to the bit.
+    """Make levels of detail of a trained scene, exactly like the command `g2ard lod`.
 
-    A level is merged from the one before, so that its Gaussians are unions of that one's. From √r times as
-    far N/r Gaussians fill as many pixels each, but a viewer that has not loaded more shows them near, too:
-    level r is recovered against views shrunk by √√r, midway between.
+    Each level is merged from the previous one, so its Gaussians are unions of finer ones. At √r times the
+    distance, N/r Gaussians cover as many pixels each. Viewers also show coarse levels close up while loading,
+    so level r is recovered in views shrunk by √√r, a compromise.
 
     Args:
         scene: the dense scene, or its path.
-        ratios: how many times fewer Gaussians each level has, rising; 1 is the scene as it is.
-        recover: optimise each level; else they are merged alone.
+        ratios: reduction factor of each level, rising; 1 is the unchanged scene.
+        recover: recover each level; otherwise only merge.
         views: as for `g2ard.distill`.
-        photos: True for the views' photos as targets, None for photos if every view has one; the default are
-            the scene's own renders.
-        steps: of each recovery; None for as many as `g2ard.distill` would take.
-        size: pixels that the longer side of the finest level's views is shrunk to.
+        photos: as for `g2ard.distill`; by default targets are renders of the scene.
+        steps: steps of each recovery; None chooses like `g2ard.distill`.
+        size: longer side in pixels of the finest level's views, if they are larger.
         background: RGB in [0, 1] behind the scene.
-        beside: where to look for cameras, if `scene` is no path.
-        up: (3,) away from the ground, for poses that are made; None to estimate it.
-        seed: of all that is random.
-        work: a folder for finished levels and checkpoints; the same call goes on there after a Ctrl-C.
-        progress: told of all stages.
-        say: told in lines what was noticed and decided.
+        beside: where to look for cameras, if `scene` is not a path.
+        up: (3,) direction away from the ground for generated views; None estimates it.
+        seed: random seed.
+        work: folder for finished levels and checkpoints; the same call resumes from it after Ctrl-C.
+        progress: called by all stages.
+        say: called with log messages.
 
     Returns:
-        The levels, of exactly round(N/r) Gaussians each.
+        The levels, with exactly round(N/r) Gaussians each.
 
     Raises:
-        InputError: ratios that do not rise, a scene or views that cannot be read.
-        KeyboardInterrupt: after Ctrl-C; what is in `work` can be gone on from.
+        InputError: ratios that do not rise, or an unreadable scene or views.
+        KeyboardInterrupt: after Ctrl-C; the same call resumes from `work`.
 
     >>> import numpy as np
     >>> ball = np.random.default_rng(0).normal(size=(800, 3))
@@ -153,11 +152,7 @@ def recovery_settings(steps: int | None, background: Colour, seed: int) -> dict[
 
 
 def check_ratios(ratios: Sequence[float]) -> None:
-    """Refuse ratios that do not rise from 1 or more.
-
-    Raises:
-        InputError: naming them.
-    """
+    """Reject ratios that do not rise from 1 or more."""
     from g2ard.errors import InputError
 
     rising = all(a < b for a, b in pairwise(ratios))
@@ -169,7 +164,7 @@ def check_ratios(ratios: Sequence[float]) -> None:
 def _level(
     job: DistillJob, finer: Splats, count: int, ratio: float, recover: bool, work: Path | None
 ) -> tuple[Splats, Splats, LevelReport]:
-    """The level, the same before recovery, and its report."""
+    """Return the level, its unrecovered version, and its report."""
     from g2ard.pipeline import distill as pipeline
     from g2ard.stages.evaluate import evaluate
 
@@ -206,7 +201,7 @@ def _level(
 
 
 def _merged(job: DistillJob, finer: Splats, count: int) -> Splats:
-    """One step of the chain, weighed by the views that recovery would learn from."""
+    """Merge to the next level, weighted by visibility in the training views."""
     from g2ard.rendering.visibility import visibility_source
     from g2ard.stages.simplify import simplify
 
@@ -225,6 +220,6 @@ def _targets(job: DistillJob, cameras: Cameras, longest: int) -> Targets:
 
 
 def level_size(cameras: Cameras, ratio: float) -> int:
-    """Pixels of the longer side of a level's views, given the finest level's."""
+    """Return the longer side of a level's views in pixels."""
     longest = int(max(cameras.widths.max(), cameras.heights.max()))
     return longest if ratio == 1 else max(_SMALLEST, round(longest / ratio**0.25))

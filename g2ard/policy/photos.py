@@ -1,7 +1,8 @@
-"""A start where there are only photos and their poses: COLMAP's sparse points, else points within sight.
+"""Starting points from photos with poses: COLMAP's sparse points, and as a fallback points along camera rays.
 
-A point within sight lies on the ray of a random pixel, at the depth where the photos of nearby views agree
-best about its colour (a plane sweep, one ray at a time): a start to distil from, not a reconstruction.
+A point along a camera ray lies on the ray of a random pixel, at the depth where photos of nearby views agree
+best on its colour (a plane sweep, one ray at a time). The points are a start for distillation, not a
+reconstruction.
 """
 
 from __future__ import annotations
@@ -24,18 +25,18 @@ if TYPE_CHECKING:
     from g2ard.policy.inputs import Views
 
 _SIDE = 240
-"""Pixels of the longer side of the photos that points are looked for in."""
+"""Longer side in pixels of the photos used to place points."""
 _DEPTHS = 48
 _NEAREST, _FARTHEST = 0.3, 4.0
-"""Depths that are tried, evenly in 1/z, as multiples of the view's distance from what all look at."""
+"""Range of trial depths, evenly spaced in 1/z, as multiples of the view's distance from the common centre."""
 _NOTHING = 2 / 255
-"""A pixel this near to the background's colour shows nothing."""
+"""A pixel this close to the background colour is empty."""
 _ALIKE = 1e-4
-"""Variance of colour, summed over channels, within which depths are as good as each other."""
+"""Variance of colour, summed over channels, within which depths count as equal."""
 _OTHERS = 6
-"""Nearby views that are asked; at least two must hold a point."""
+"""Number of nearby views compared; at least two must contain a point."""
 _RAYS = 2048
-"""At a time."""
+"""Rays at a time."""
 
 Float = NDArray[np.float64]
 
@@ -51,18 +52,17 @@ def points_of_photos(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Points:
-    """A coloured cloud to start from: the sparse points that lie with the views, and as many more within
-    their sight as are wanting to `count`.
+    """Return starting points: sparse points stored with the views, topped up to `count` along camera rays.
 
     Args:
-        views: cameras with photos, or where they lie; only those for training are looked at.
-        held_out: views to score on, if they are given apart: all of `views` are then for training.
-        count: points, at least; None where the sparse points decide.
-        asked: the kind of budget, where it is no count: ratio, share, fit, min_psnr or min_ssim.
-        background: RGB of pixels that show nothing.
-        seed: of the rays.
-        progress: told of rays.
-        say: told what was started from.
+        views: cameras with photos, or their path; only training views are used.
+        held_out: separate views for scoring; all of `views` are then for training.
+        count: least number of points; None means only the sparse points.
+        asked: the kind of budget if it is not a count: ratio, share, fit, min_psnr or min_ssim.
+        background: RGB of empty pixels.
+        seed: seed of the rays.
+        progress: called with the number of points.
+        say: called with a summary.
 
     Raises:
         InputError: a view without a photo, or no sparse points and no `count`.
@@ -71,7 +71,7 @@ def points_of_photos(
     found = len(sparse) if sparse is not None else 0
     if count is None and sparse is None:
         raise InputError(
-            "has no sparse points to measure that on",
+            "needs sparse points, and there are none",
             parameter=asked,
             path=str(views),
             hint="give {count=COUNT}",
@@ -91,18 +91,18 @@ def points_of_photos(
         words
         for count, words in (
             (found, plural(found, "sparse point")),
-            (wanting, f"{plural(wanting, 'point')} within the cameras' sight"),
+            (wanting, f"{plural(wanting, 'point')} along camera rays"),
         )
         if count
     ]
-    say(f"starts from {' and '.join(starts)}")
+    say(f"starting from {' and '.join(starts)}")
     return Points(
         np.concatenate([part.positions for part in parts]), np.concatenate([part.colors for part in parts])
     )
 
 
 def sparse_points(views: Path) -> Points | None:
-    """The points of a COLMAP model, or a transforms.json's `ply_file_path`; None where there are none."""
+    """Return the points of a COLMAP model or of a transforms.json's `ply_file_path`, or None."""
     from g2ard.io import read_points
     from g2ard.io.detect import file_format
     from g2ard.io.jsonfile import read_json
@@ -128,33 +128,29 @@ def points_within_sight(
     seed: int = 0,
     progress: Progress = silent,
 ) -> Points:
-    """Points on the rays of random pixels, each where nearby photos agree best about its colour.
+    """Place points on the rays of random pixels, where nearby photos agree best on the colour.
 
-    z* = argmin_z Var_v[c_v(x(z))] over the views v among the nearest that hold x(z), two at least beside the
-    ray's own.
+    z* = argmin_z Var_v[c_v(x(z))] over the nearest views v that contain x(z), at least two besides the ray's
+    own.
 
     Args:
         cameras: C ≥ 3 views with photos, in world coordinates.
-        count: points.
-        background: RGB of pixels that show nothing.
-        seed: of the rays.
-        progress: told of rays.
+        count: number of points.
+        background: RGB of empty pixels.
+        seed: seed of the rays.
+        progress: called with the number of points.
 
     Returns:
-        `count` points in the world, coloured as the pixel of their ray.
+        `count` points in world coordinates, with the colour of their ray's pixel.
 
     Raises:
-        InputError: fewer than three views, one without a photo, or views that share no sight.
+        InputError: fewer than three views, a view without a photo, or no point seen by three views.
     """
     if len(cameras) < 3:
-        raise InputError(
-            f"photos: expected at least 3 views, got {len(cameras)}; give more, or a scene beside them"
-        )
+        raise InputError(f"photos: expected at least 3 views, got {len(cameras)}; pass more, or a scene")
     bare = [name for name, path in zip(cameras.names, cameras.image_paths, strict=True) if path is None]
     if bare:
-        raise InputError(
-            f"photos: view {bare[0]} has none to start from; give views with photos, or a scene beside them"
-        )
+        raise InputError(f"photos: view {bare[0]} has no photo; pass views with photos, or a scene")
     photos = [load_image(cameras, i) for i in range(len(cameras))]
     rng = np.random.default_rng([seed, 11])
     middle = _looked_at(cameras)
@@ -163,9 +159,7 @@ def points_within_sight(
     positions, colors, tried = np.zeros((0, 3)), np.zeros((0, 3), np.float32), 0
     while len(positions) < count:
         if tried > 64 * max(count, _RAYS):
-            raise InputError(
-                "photos: the views share no sight: no point is seen by three of them; give a cloud"
-            )
+            raise InputError("photos: no point was found that three views see; pass a point cloud")
         view = int(rng.integers(len(cameras)))
         rays = min(_RAYS, max(64, -(-count // len(cameras))))
         xyz, rgb = _swept(cameras, photos, view, near[view], float(reach[view]), rays, background, rng)
@@ -176,7 +170,8 @@ def points_within_sight(
 
 
 def _looked_at(cameras: Cameras) -> Float:
-    """(3,) the point nearest to all optical axes; before the median camera where they hardly cross."""
+    """Return the (3,) point nearest to all optical axes, or a point ahead of the mean camera if they hardly
+    cross."""
     across = np.eye(3) - cameras.forwards[:, :, None] * cameras.forwards[:, None, :]
     pull = across.sum(0)
     away = cameras.extent or 1.0
@@ -189,7 +184,7 @@ def _looked_at(cameras: Cameras) -> Float:
 
 
 def _neighbours(cameras: Cameras, view: int) -> NDArray[np.int64]:
-    """The views nearest to one, in place and direction."""
+    """Return the views nearest to one in position and direction."""
     away = np.linalg.norm(cameras.positions - cameras.positions[view], axis=1) / (cameras.extent or 1.0)
     turn = 1 - cameras.forwards @ cameras.forwards[view]
     order = np.argsort(away + turn, kind="stable")
@@ -206,7 +201,7 @@ def _swept(
     background: tuple[float, float, float],
     rng: np.random.Generator,
 ) -> tuple[Float, NDArray[np.float32]]:
-    """Points on random rays of one view that two others hold, and their colours."""
+    """Return points and colours on random rays of one view that at least two others contain."""
     photo, K, pose = photos[view], cameras.Ks[view], cameras.viewmats[view]
     columns, rows = rng.integers(photo.shape[1], size=rays), rng.integers(photo.shape[0], size=rays)
     own = photo[rows, columns]
@@ -225,7 +220,7 @@ def _swept(
     spread = (squares / seen[..., None] - (total / seen[..., None]) ** 2).sum(-1)
     spread[seen < 3] = np.inf
     alike = spread <= spread.min(1, keepdims=True) + _ALIKE
-    best = _DEPTHS - 1 - alike[:, ::-1].argmax(1)  # of equals the farthest: it hides nothing
+    best = _DEPTHS - 1 - alike[:, ::-1].argmax(1)  # among equals the farthest, because it occludes nothing
     kept = np.isfinite(spread.min(1)) & (np.abs(own - background).max(1) > _NOTHING)
     return world[np.arange(rays), best][kept], own[kept].astype(np.float32)
 
@@ -233,8 +228,7 @@ def _swept(
 def _sampled(
     cameras: Cameras, photos: list[NDArray[np.float32]], view: int, world: Float
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """The nearest pixel's colour of points in the world, black where the view does not hold them; and whether
-    it does."""
+    """Return the colours of world points in a photo, black outside of it, and whether they are inside."""
     photo, pose, K = photos[view], cameras.viewmats[view], cameras.Ks[view]
     local = world @ pose[:3, :3].T + pose[:3, 3]
     ahead = local[..., 2] > 0

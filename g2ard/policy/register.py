@@ -1,4 +1,4 @@
-"""What registration is given: photos and their lenses, poses to start from, and the true ones."""
+"""Inputs of registration: photos with intrinsics, starting poses, and reference poses."""
 
 from __future__ import annotations
 
@@ -32,21 +32,22 @@ def photos_of(
     focal: float | None = None,
     say: Say = unsaid,
 ) -> Cameras:
-    """Photos with their lenses.
+    """Read photos with their intrinsics.
 
     Args:
         path: views with photos, or a folder of photos.
-        split: of views, see `g2ard.scene.splits`; a folder has none but "all".
-        intrinsics: for a folder: views that hold the lens of each photo by name, or one lens for all.
-        focal: for a folder: pixels of the photo as stored, principal point in the middle, no distortion.
-        say: told what readers noticed.
+        split: split of the views, see `g2ard.scene.splits`; "all" for a folder.
+        intrinsics: for a folder: views with the intrinsics of each photo by name, or the same for all.
+        focal: for a folder: focal length in pixels of the stored photo; centred principal point, no
+            distortion.
+        say: called with notes.
 
     Returns:
-        C cameras; those of a folder have no pose (the identity).
+        C cameras; photos from a folder have the identity as pose.
 
     Raises:
-        InputError: no photos, no lens or two, several lenses of which none is named, or all photos of
-            another aspect than their lens.
+        InputError: no photos, no intrinsics or both kinds, ambiguous intrinsics, or no photo with the
+            intrinsics' aspect ratio.
     """
     files = _photos_in(path)
     if not files:
@@ -55,18 +56,12 @@ def photos_of(
             say(f"{path}: {note}")
         missing = next((v.name for v in found.cameras if v.image_path is None), None)
         if missing is not None:
-            raise InputError(
-                f"{path}: view {missing} has no photo to register; give the folder of the photos"
-            )
+            raise InputError(f"{path}: view {missing} has no photo to register; pass the folder of photos")
         if intrinsics is not None or focal is not None:
-            raise InputError(
-                f"{path}: these views state their intrinsics; others would contradict them: leave those out"
-            )
+            raise InputError(f"{path}: these views state their intrinsics; drop the option that gives others")
         return found.cameras
     if split != "all":
-        raise InputError(
-            f"{path}: a folder of photos has no split {split!r}: all of it is meant, or views are to be given"
-        )
+        raise InputError(f"{path}: a folder of photos has no split {split!r}; pass views, or drop the split")
     if (intrinsics is None) == (focal is None):
         raise InputError(
             "photos without views need their intrinsics",
@@ -88,7 +83,7 @@ def photos_of(
 
 
 def _photos_in(path: Path) -> list[Path]:
-    """The photos of a folder that holds no views; [] for anything else."""
+    """Return the photos of a folder without views, or [] for anything else."""
     from g2ard.io.detect import file_format, is_photo
 
     if not path.is_dir():
@@ -104,8 +99,10 @@ def _photos_in(path: Path) -> list[Path]:
 
 
 def _sizes(files: list[Path]) -> list[tuple[int, int]]:
-    """Width and height of each; a broken photo, which registration will refuse, takes another's, or (0, 0)
-    where all are broken."""
+    """Return the width and height of each photo.
+
+    A broken photo, which registration rejects later, gets the size of another, or (0, 0) if all are broken.
+    """
     found: list[tuple[int, int] | None] = []
     for file in files:
         try:
@@ -123,7 +120,7 @@ def _centred(focal: float, size: tuple[int, int]) -> Camera:
 
 
 def _lenses(path: Path, names: list[str]) -> list[Camera]:
-    """The view of each name, else the one lens that all views share."""
+    """Return the view of each name, or the intrinsics that all views share."""
     views = read_view_set(path, unpictured=True).cameras
     by_name = matched({view.name: view for view in views}, names)
     one = views[0]
@@ -131,8 +128,8 @@ def _lenses(path: Path, names: list[str]) -> list[Camera]:
     missing = next((name for name in names if name not in by_name), None)
     if missing is not None and not shared:
         raise InputError(
-            f"{path}: no intrinsics for {missing}, and its views are of several lenses; name it there, or "
-            "give one lens"
+            f"{path}: no intrinsics for {missing}, and its views have different ones; add that name, or "
+            "use the same intrinsics for all"
         )
     return [by_name.get(name, one) for name in names]
 
@@ -143,20 +140,20 @@ def _same_lens(a: Camera, b: Camera) -> bool:
 
 
 def _check_aspects(files: list[Path], sizes: list[tuple[int, int]], views: list[Camera]) -> None:
-    """Single photos of another aspect are refused later; where none fits, the intrinsics are another's."""
+    """Reject intrinsics that fit none of the photos; single misfits are rejected later."""
     off = [
         abs(w * v.height - h * v.width) > 0.02 * h * v.width for (w, h), v in zip(sizes, views, strict=True)
     ]
     if all(off) and any(sizes[0]):
         (w, h), view = sizes[0], views[0]
         raise InputError(
-            f"{files[0]}: the photo is {w}×{h}, its intrinsics are for {view.width}×{view.height}: "
-            "the aspects differ; give the intrinsics of these photos"
+            f"{files[0]}: the photo is {w}×{h}, but its intrinsics are for {view.width}×{view.height}; "
+            "pass intrinsics with the aspect ratio of these photos"
         )
 
 
 def read_poses(path: Path) -> Poses:
-    """Name → (4, 4) camera_from_world: of views in any format, or of ACE's text (`g2ard.io.ace`).
+    """Read name → (4, 4) camera_from_world from views in any format, or from ACE's text (`g2ard.io.ace`).
 
     Raises:
         InputError: it cannot be read, or names a view twice.
@@ -170,21 +167,19 @@ def read_poses(path: Path) -> Poses:
 
 
 def poses_for(path: Path, names: Sequence[str]) -> Poses:
-    """The poses of `read_poses` that belong to some photos, by the photos' names; see `matched`.
+    """Read the poses of the named photos, see `read_poses` and `matched`.
 
     Raises:
-        InputError: as `read_poses`, or none of them belongs to any.
+        InputError: as `read_poses`, or no pose belongs to a photo.
     """
     found = matched(read_poses(path), names)
     if not found:
-        raise InputError(
-            f"{path}: names none of the photos, of which the first is {names[0]}; poses are found by name"
-        )
+        raise InputError(f"{path}: no pose has the name of a photo (the first photo is {names[0]})")
     return found
 
 
 def matched(found: Mapping[str, Found], names: Sequence[str]) -> dict[str, Found]:
-    """What belongs to each of `names`: by the whole name, else by a stem that is unique on both sides.
+    """Look up each of `names` by full name, or by a stem that is unique on both sides.
 
     >>> matched({"seq/a.png": 1, "b": 2}, ["a.jpg", "c.jpg"])
     {'a.jpg': 1}
@@ -202,12 +197,10 @@ def matched(found: Mapping[str, Found], names: Sequence[str]) -> dict[str, Found
 
 
 def pool_of(scene: Splats, pool: str, seed: int, progress: Progress = silent, say: Say = unsaid) -> Cameras:
-    """Poses to look for photos in: of a file of views, or as many as a number says, planned for the scene.
-
-    `say` is told what kind of poses was planned.
+    """Return poses from a file of views, or plan as many as a number says; `say` receives their kind.
 
     Raises:
-        InputError: neither, or a scene with no room for poses.
+        InputError: an unreadable file, or a scene with no room for poses.
     """
     if not pool.strip().isdigit():
         return read_view_set(Path(pool), unpictured=True).cameras
@@ -215,7 +208,7 @@ def pool_of(scene: Splats, pool: str, seed: int, progress: Progress = silent, sa
 
     planned = plan_pool(scene, int(pool), seed=seed, rows=_ROWS, progress=progress)
     say(
-        f"pool: {len(planned.cameras)} poses, {planned.kind} ({planned.why}); for photos taken otherwise "
-        "make poses like theirs by `g2ard poses --kind` and give --pool that file"
+        f"pool: {len(planned.cameras)} poses, {planned.kind} ({planned.why}); if the photos were taken "
+        "differently, generate similar poses with `g2ard poses --kind` and pass the file to --pool"
     )
     return planned.cameras

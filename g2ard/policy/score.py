@@ -1,4 +1,4 @@
-"""What a distillation came to, in figures: the report that `g2ard distill` writes as report.json."""
+"""Scores of a distillation, as `g2ard distill` writes them to report.json."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
 
 def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
-    """Both scenes scored in views that recovery did not learn from, beside what the run was and did.
+    """Score the simplified and the recovered scene in held-out views, and describe the run.
 
     Args:
-        job: what was to be done.
-        done: what came of it.
+        job: the job.
+        done: its result.
 
     Returns:
-        Counts, bytes, scores in each kind of views (None where there are none of a kind), rounds, seconds by
-        stage, and every setting by its path.
+        Counts, bytes, scores in each kind of views (or None), rounds, seconds by stage, and every setting by
+        path.
     """
     from g2ard.config.paths import listed
 
@@ -50,7 +50,7 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
 def _scores(
     job: DistillJob, done: Distilled, targets: Targets | None, progress: Progress
 ) -> dict[str, Any] | None:
-    """Both scenes' figures in one kind of views."""
+    """Score both scenes in one kind of views."""
     from g2ard.stages.evaluate import evaluate
 
     if targets is None:
@@ -69,8 +69,10 @@ def _scores(
 
 
 def _unseen(job: DistillJob, done: Distilled) -> float | None:
-    """Share of the scene that no view sees: of its matter where a pool was made, else of the Gaussians that
-    simplification looked at; None for the paper's, which does not look."""
+    """Return the share of the scene that no view sees, or None for the paper's method.
+
+    For a generated pool it is the share of the matter, otherwise of the Gaussians in simplification's views.
+    """
     if job.views.unseen is not None:
         return job.views.unseen
     unseen = done.report.rounds[0].simplify.unseen

@@ -1,4 +1,4 @@
-"""`g2ard.simplify`: the views that the stage weighs errors by, then the stage."""
+"""`g2ard.simplify`: choosing views for visibility weights, then running the stage."""
 
 from __future__ import annotations
 
@@ -39,40 +39,40 @@ def simplify(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Simplified:
-    """Reduce a scene to an exact number of Gaussians, as `g2ard simplify` does, to the bit; no images needed.
+    """Reduce a scene to an exact number of Gaussians, exactly like the command `g2ard simplify`.
 
-    The default method weighs errors by what is seen: from `views`, else from the cameras that lie beside the
-    scene, else from a pool of poses of its own. `fast` looks only from given views, `paper` from none.
+    No images are needed. The default method weights errors by visibility in `views`, in cameras found beside
+    the scene, or in generated views. `fast` uses only given views, `paper` none.
 
     Args:
         scene: the dense scene, or its path.
-        count: Gaussians to keep, at most as many as there are.
-        ratio: how many times fewer to keep, at least 1; the result has N/ratio, rounded to the nearest.
-        fit: instead, about the most whose file has these bytes at most, such as "5MB"; or a device: quest3,
-            mobile or web.
-        min_psnr: instead, about the fewest that keep this PSNR, dB, against the scene in views of its own.
-        min_ssim: the same of SSIM; with `min_psnr` both hold. `say` tells what the result has.
-        format: of the file that `fit` speaks of: ply, compressed.ply, sog, spz, glb or splat.
-        views: cameras in world coordinates, or where they lie, of which the training split is used;
-            "made" makes a pool even if cameras lie beside the scene.
+        count: Gaussians to keep, at most those of the scene.
+        ratio: reduction factor, at least 1; the result has round(N/ratio).
+        fit: largest file, such as "5MB", or a device: quest3, mobile or web.
+        min_psnr: PSNR (dB) to keep against the scene, in generated views.
+        min_ssim: SSIM to keep; with `min_psnr` both hold. `say` receives the result's quality.
+        format: file format for `fit`: ply, compressed.ply, sog, spz, glb or splat.
+        views: cameras in world coordinates, or their path; the training split is used. "made" always
+            generates views.
         blind: use no cameras at all.
-        method: default, fast or paper; `g2ard.stages.simplify.simplify` says what they do.
-        keep_region: spheres (x, y, z, r) and boxes (x, y, z, x, y, z), world coordinates, which get more of
-            the budget, as if views stood √keep_times times as near.
-        config: None means the method's own; `method` and `keep_region`, if given, win over it.
-        settings: values of `config` by path, such as {"simplify.max_energy": 0.02}; they win over all.
-        beside: where to look for cameras, if `scene` is no path; its folder and its trainer's are looked in.
-        up: (3,) away from the ground, for poses that are made; None to estimate it.
-        seed: of poses that are made.
-        progress: told of planning, visibility and Gaussians shed.
-        say: told in lines what was noticed and which views are used.
+        method: default, fast or paper; see `g2ard.stages.simplify.simplify`.
+        keep_region: spheres (x, y, z, r) and boxes (x, y, z, x, y, z) in world coordinates that get more of
+            the budget, as if views were √keep_times times closer.
+        config: constants; None means the method's defaults. `method` and `keep_region` override it.
+        settings: values of `config` by path, such as {"simplify.max_energy": 0.02}; they override everything
+            else.
+        beside: where to look for cameras, if `scene` is not a path: in its folder and its trainer's.
+        up: (3,) direction away from the ground for generated views; None estimates it.
+        seed: seed of generated views.
+        progress: called during planning, visibility and merging.
+        say: called with log messages.
 
     Returns:
-        The scene, where each row went, protection flags and a report.
+        The scene, the new row of each row, protection flags and a report.
 
     Raises:
-        InputError: not exactly one kind of budget, one that does not fit, an unknown method, views
-            that cannot be read, no such constant, or both `views` and `blind`.
+        InputError: no budget or several, a budget that does not fit, an unknown method or setting, unreadable
+            views, or both `views` and `blind`.
 
     >>> import numpy as np
     >>> ball = np.random.default_rng(0).normal(size=(900, 3))
@@ -110,19 +110,10 @@ def simplify(
 
 
 class Reduction:
-    """A scene's reductions to any budget, each as `simplify` gives it: count → `Simplified`.
+    """Reductions of one scene to any budget: count → `Simplified`, as `simplify` returns it.
 
-    Poses and what they see of the scene are found once, and the last two results stay.
-
-    Args:
-        splats: the dense scene.
-        progress: told of planning, visibility and Gaussians shed.
-        say: told in lines what was noticed and which views are used.
-
-    The others are as for `simplify`.
-
-    Raises:
-        InputError: as `simplify`.
+    Poses and visibility are computed once, and the last two results are cached. Arguments and errors are
+    those of `simplify`.
     """
 
     def __init__(
@@ -142,7 +133,7 @@ class Reduction:
         from g2ard.stages.simplify import SimplifyConfig
 
         if views is not None and blind:
-            raise InputError("views, blind: blind uses no views")
+            raise InputError("views and blind exclude each other")
         self.splats, self.blind = splats, blind
         self.config, self.progress = config or SimplifyConfig(), progress
         say_regions(splats, self.config, "the scene", say)
@@ -160,7 +151,7 @@ class Reduction:
         self._made: dict[int, Simplified] = {}
 
     def __call__(self, count: int) -> Simplified:
-        """The scene at a budget."""
+        """Return the scene at a budget."""
         from g2ard.stages.simplify import simplify as reduce
 
         if count not in self._made:
@@ -185,14 +176,14 @@ class Reduction:
 def _scene(
     scene: Splats | str | Path, beside: str | Path | None, say: Say
 ) -> tuple[Splats, str | Path | None, str]:
-    """The scene, where cameras may lie beside it, and what errors call it."""
+    """Return the scene, where to look for cameras, and its name in errors."""
     if isinstance(scene, Splats):
         return scene, beside, "scene"
     return load_scene(scene, say), beside or scene, str(scene)
 
 
 def _remembering(look: VisibilitySource) -> VisibilitySource:
-    """What views see of the first scene is found once: reductions to other budgets begin with it too."""
+    """Cache the visibility of the first scene, which every reduction starts with."""
     first: list[tuple[Splats, Visibility]] = []
 
     def remembered(scene: Splats) -> Visibility:
@@ -207,6 +198,5 @@ def _remembering(look: VisibilitySource) -> VisibilitySource:
 
 
 def _same(a: Splats, b: Splats) -> bool:
-    """Whether two scenes hold the very arrays of one: each reduction clamps scales anew, and colours are not
-    looked at."""
+    """Return whether two scenes share their geometry arrays; scales are clamped anew by each reduction."""
     return all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "logit_opacities"))

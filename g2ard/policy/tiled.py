@@ -69,7 +69,7 @@ def working(tiling: Tiling, *views: Views | None) -> Iterator[None]:
                 if made and not _worth_keeping(folder, error):
                     shutil.rmtree(folder, ignore_errors=True)
                 elif not tiling.keep:
-                    raise type(error)(f"{error}; {folder} keeps what is done") from error
+                    raise type(error)(f"{error}; finished work is kept in {folder}") from error
                 raise
             if not tiling.keep:
                 shutil.rmtree(folder, ignore_errors=True)
@@ -91,12 +91,12 @@ def _check_folder(folder: Path) -> None:
     try:
         names = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
     except OSError as error:
-        raise OutputError(f"{folder}: cannot work there: {error.strerror}; name another folder") from error
+        raise OutputError(f"{folder}: cannot write: {error.strerror}; choose another folder") from error
     of_tiles = [name for name in names if is_ours(name)]
     others = [name for name in names if not name.startswith(".")]
     if of_tiles or (others and not any(map(_OURS.fullmatch, names))):
         raise OutputError(
-            f"{folder}: holds {(of_tiles or others)[0]} and is no folder of such work; name another one"
+            f"{folder}: holds {(of_tiles or others)[0]} and is not a work folder; choose another folder"
         )
 
 

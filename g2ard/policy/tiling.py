@@ -85,7 +85,7 @@ class Tiling:
     def memory_limit(self) -> str:
         """`usable_memory` in words, with its origin."""
         size = amount(self.usable_memory)
-        return f"--memory {size}" if self.memory else f"the {size} that are taken of the machine's memory"
+        return f"--memory {size}" if self.memory else f"the {size} used of the machine's memory"
 
 
 def _physical_memory() -> int:
@@ -302,10 +302,10 @@ def refuse_whole(scene: Path, options: Sequence[str]) -> None:
     from g2ard.io import open_stream
 
     one = cut_into(_folder_of_tiles(scene), open_stream(scene).count)
-    takes = "takes" if len(options) == 1 else "take"
+    takes = "needs" if len(options) == 1 else "need"
     raise InputError(
-        f"{scene}: {' and '.join(options)} {takes} the scene in one piece, and it is worked on in tiles; "
-        f"{one} gives one piece"
+        f"{scene}: {' and '.join(options)} {takes} the whole scene in memory, but it is processed in tiles; "
+        f"use {one} for one piece"
     )
 
 
@@ -329,7 +329,7 @@ def whole_budgets(budgets: Sequence[Budget]) -> list[str]:
 
 
 def whole_method(method: str | None, preset: str | None) -> list[str]:
-    """Return the option for a method other than `default`, or for the preset that brings it."""
+    """Return the option for a method other than `default`, or the preset that sets it."""
     if preset is not None and preset.startswith("paper"):
         return [f"--preset {preset}"]
     return [f"--method {method}"] if method not in (None, "default") else []

@@ -1,4 +1,4 @@
-"""Checks whether views show a scene: those found beside it, and those that were given."""
+"""Checks whether given or found views show a scene."""
 
 from __future__ import annotations
 
@@ -16,31 +16,32 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
 _SIDE = 800
-"""Pixels of the longer side, as a pool has."""
+"""Longer side in pixels, as in a generated pool."""
 
 _SAMPLE = 4096
 _SEEING = 0.5
-"""Share of the cameras that must see something of the scene, or they are another's."""
+"""Share of cameras that must see the scene for found views to be used."""
 _LOOKED_AT, _SMALL = 5, 160
-"""Photos that the scene is compared with, and their longer side, pixels."""
+"""Number of photos compared with the scene, and their longer side in pixels."""
 _ALIKE = 0.2
-"""Correlation of a photo and a render under which they show different things. Median of five: fox and
-caliterra with scenes of their own, 2,000 Gaussians after 20 steps, 0.86 and 0.50; others -0.26 to 0.06."""
+"""Correlation below which a photo and a render are considered unrelated. Medians of five: fox and caliterra
+with their own scenes (2,000 Gaussians, 20 steps) 0.86 and 0.50; with others −0.26 to 0.06.
+"""
 _BLIND = 0.1
-"""Share of views given for a scene that may see nothing of it untold."""
+"""Share of given views that may see nothing of the scene without a warning."""
 
 
 def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: Say = unsaid) -> Path | None:
-    """The views that lie beside a scene (`g2ard.io.find_views`), if they see it; says what came of it.
+    """Find views beside a scene (`g2ard.io.find_views`) that see it.
 
     Args:
         scene: the scene's path.
         splats: the scene.
-        splits: what the run needs of them; none may be empty.
-        say: told in one line which cameras are used, or why those that are there are not.
+        splits: splits that must not be empty.
+        say: called with the views used, or why those found are not used.
 
     Returns:
-        A path for `load_views` and its kin; None if there are none, or none that fit.
+        A path for `load_views`, or None.
     """
     from g2ard.errors import InputError
     from g2ard.io import find_views, read_view_set
@@ -67,20 +68,20 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
 
 
 def warn_of_sight(splats: Splats, cameras: Cameras, say: Say) -> None:
-    """Say in one line that more than a tenth of the views given for a scene have nothing of it in sight."""
+    """Warn if more than a tenth of the given views see nothing of the scene."""
     blind = int((~cameras.facing(opaque_points(splats))).sum())
     if blind > _BLIND * len(cameras):
         say(
-            f"warning: {blind} of {plural(len(cameras), 'view')} have nothing of the scene in sight: are "
-            "both of one world? (`g2ard info` shows the extent of each)"
+            f"warning: {blind} of {plural(len(cameras), 'view')} see nothing of the scene; check that "
+            "both use the same coordinates (`g2ard info` shows the extent of each)"
         )
 
 
 def check_sight(splats: Splats, cameras: Cameras, say: Say = unsaid) -> None:
-    """Refuse views of which none holds the middle of any Gaussian; else as `warn_of_sight`.
+    """Reject views that contain no Gaussian's centre; otherwise warn like `warn_of_sight`.
 
     Raises:
-        InputError: with what to look at.
+        InputError: no view sees the scene.
     """
     from g2ard.errors import InputError
     from g2ard.scene.cameras import unseeing
@@ -93,8 +94,10 @@ def check_sight(splats: Splats, cameras: Cameras, say: Say = unsaid) -> None:
 def warn_of_photos(
     splats: Splats, cameras: Cameras, background: tuple[float, float, float], say: Say
 ) -> None:
-    """Say in one line that the scene's renders have nothing in common with its photos: the correlation of the
-    brightness of their pixels, in the median of a few small photos, is next to none."""
+    """Warn if the scene's renders look unlike its photos.
+
+    The measure is the correlation of pixel brightness, as the median over a few small photos.
+    """
     import numpy as np
 
     from g2ard.rendering.renderer import Renderer
@@ -114,14 +117,16 @@ def warn_of_photos(
         alike.append(float(centred[0] @ centred[1] / scale) if scale > 0 else 0.0)
     if alike and np.median(alike) < _ALIKE:
         say(
-            f"warning: the scene looks like none of the photos (correlation {np.median(alike):.2f}): are "
-            "both of one world? (`g2ard render --views` shows what views see; --renders leaves photos out)"
+            f"warning: the scene does not look like the photos (correlation {np.median(alike):.2f}); check "
+            "the views with `g2ard render --views`, or ignore the photos with --renders"
         )
 
 
 def as_pool(cameras: Cameras) -> Cameras:
-    """Found cameras at a pool's size where they have no photos to be compared with: INRIA's file states the
-    size of the full photos, which its trainer had shrunk."""
+    """Resize found cameras without photos to a generated pool's size.
+
+    INRIA's file states the size of the full photos, which its trainer had shrunk.
+    """
     return cameras if any(cameras.image_paths) else cameras.resized(_SIDE)
 
 

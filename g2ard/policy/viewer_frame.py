@@ -1,4 +1,4 @@
-"""Frame of the browser viewer around scenes, and the camera that it opens with."""
+"""Coordinate frame and initial camera for the viewer."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
 _POOL = 32
-"""Poses of which one is the start, where there are no views."""
+"""Number of generated poses from which the initial camera is chosen."""
 
 _ROWS = 100_000
-"""Gaussians that up is estimated on."""
+"""Gaussians used to estimate the up direction."""
 
 _ROLL = 0.1
-"""Views tell which way is up where their x axes spread this many times less along it than across it."""
+"""Ratio of the spread of the views' x axes along and across a direction, below which it is up."""
 
 _FOV = (10.0, 120.0)
-"""Degrees that the viewer takes."""
+"""Field of view that the viewer accepts, in degrees."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewerFrame:
-    """A frame for the viewer, x right, y down, z ahead: here = rotation · (world − origin).
+    """Frame for the viewer, x right, y down, z ahead: p = rotation · (world − origin).
 
     Args:
-        rotation: (3, 3), turns up to −y.
-        origin: (3,) world, the middle of the opaque Gaussians.
-        start: None where no pose has a view.
-        name: of the view that is the start.
+        rotation: (3, 3), rotates up to −y.
+        origin: (3,) world, the median of the opaque Gaussians.
+        start: initial camera; None if there is no suitable pose.
+        name: name of the view used as initial camera.
     """
 
     rotation: NDArray[np.float64]
@@ -53,11 +53,11 @@ class ViewerFrame:
 
     @property
     def up(self) -> NDArray[np.float64]:
-        """(3,) unit vector in the world."""
+        """Up direction, (3,) unit vector in world coordinates."""
         return -self.rotation[1]
 
     def of(self, splats: Splats) -> Splats:
-        """A scene in this frame, without an offset."""
+        """Transform a scene to this frame, without offset."""
         from g2ard.scene.transform import transform
 
         turn = np.eye(4)
@@ -76,20 +76,20 @@ def frame_of(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> ViewerFrame:
-    """A frame and a start for a scene: from views given, else from those beside the scene, else from a pool.
+    """Choose a frame and an initial camera from given views, found views, or a generated pool.
 
     Args:
         scene: the scene, or the left one of two.
-        views: cameras, or where they lie; "made" is a pool.
-        start: the view to open with; None takes the one that holds most of the scene.
-        beside: where the scene lies, if cameras are to be looked for there.
-        up: (3,) away from the ground; None to take it from the views, or to estimate it.
-        seed: of poses that are made.
-        progress: told of planning.
-        say: told what is looked at.
+        views: cameras, or their path; "made" generates a pool.
+        start: name of the initial view; None takes the one that contains most of the scene.
+        beside: path beside which to look for cameras.
+        up: (3,) direction away from the ground; None takes it from the views, or estimates it.
+        seed: seed of generated views.
+        progress: called during planning.
+        say: called with log messages.
 
     Raises:
-        InputError: a file without views, no view of that name, or an `up` that is no direction.
+        InputError: a file without views, no view of that name, or an invalid `up`.
     """
     try:
         found = views_or_pool(
@@ -107,10 +107,10 @@ def frame_of(
 def frame_with(
     scene: Splats, cameras: Cameras, *, start: str | None = None, up: Sequence[float] | None = None
 ) -> ViewerFrame:
-    """As `frame_of`, with cameras that are there already.
+    """Choose a frame and an initial camera from given cameras, like `frame_of`.
 
     Raises:
-        InputError: no view of that name, or an `up` that is no direction.
+        InputError: no view of that name, or an invalid `up`.
     """
     axis = _level(cameras) if up is None else None
     stand = ViewerFrame(_turn(_estimated(scene, up) if axis is None else axis), _middle(scene))
@@ -120,7 +120,7 @@ def frame_with(
 
 
 def _level(cameras: Cameras) -> NDArray[np.float64] | None:
-    """The direction that all views' horizons are level with; None where they roll, or face one way alone."""
+    """Return the up direction shared by all views, or None if they roll or all face one way."""
     across = cameras.viewmats[:, 0, :3]
     values, vectors = np.linalg.eigh(across.T @ across / len(cameras))
     if values[0] > _ROLL * values[1]:
@@ -131,7 +131,7 @@ def _level(cameras: Cameras) -> NDArray[np.float64] | None:
 
 
 def _estimated(scene: Splats, up: Sequence[float] | None) -> NDArray[np.float64]:
-    """Up as given, else as the scene tells, else −y."""
+    """Return `up` if given, otherwise estimate it from the scene, with −y as a fallback."""
     from g2ard.poses.site import Site
 
     if up is not None:
@@ -141,13 +141,15 @@ def _estimated(scene: Splats, up: Sequence[float] | None) -> NDArray[np.float64]
         return axis / np.linalg.norm(axis)
     try:
         return Site.of(scene, None, _ROWS).up.axis
-    except InputError:  # nothing to see
+    except InputError:  # nothing visible
         return np.array([0.0, -1.0, 0.0])
 
 
 def _turn(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) the smallest rotation that turns `up` to −y: I + K + K²/(1 + c), K the cross product's matrix of
-    axis × sine, c the cosine."""
+    """Return the smallest rotation (3, 3) from `up` to −y: I + K + K²/(1 + c).
+
+    K is the cross product matrix of up × −y, c the cosine.
+    """
     down = np.array([0.0, -1.0, 0.0])
     (x, y, z), c = np.cross(up, down), float(up @ down)
     if c < -1 + 1e-12:
@@ -161,7 +163,7 @@ def _middle(scene: Splats) -> NDArray[np.float64]:
 
 
 def _chosen(cameras: Cameras, points: NDArray[np.float64], name: str | None) -> int:
-    """The view of that name, else the first of those that hold most of the points."""
+    """Return the index of the named view, or of the first that contains most points."""
     if name is None:
         return int(np.argmax([view.holds(points).mean() for view in cameras]))
     if name not in cameras.names:
@@ -170,13 +172,13 @@ def _chosen(cameras: Cameras, points: NDArray[np.float64], name: str | None) -> 
 
 
 def _start(stand: ViewerFrame, view: Camera, points: NDArray[np.float64]) -> Start:
-    """A view as the viewer takes it, its roll left out; it turns about the median depth of what it holds."""
+    """Convert a view for the viewer, without roll; it orbits the median depth of the points in view."""
     held = points[view.holds(points)]
     if not len(held):
         held = stand.origin[None]
     ahead = view.viewmat[2, :3]
     depth = float(np.median(np.abs((held - view.position) @ ahead)))
-    to_viewer = np.diag([-1.0, -1.0, 1.0]) @ stand.rotation  # it turns scenes by 180° about z
+    to_viewer = np.diag([-1.0, -1.0, 1.0]) @ stand.rotation  # the viewer rotates scenes by 180° about z
 
     def there(point: NDArray[np.float64]) -> tuple[float, float, float]:
         x, y, z = (float(v) for v in to_viewer @ (point - stand.origin))

@@ -1,4 +1,4 @@
-"""Views of a run: given, found beside the scene, or made; and those of another kind."""
+"""Views of a run: given, found beside the scene, or generated; and views of another kind."""
 
 from __future__ import annotations
 
@@ -21,30 +21,32 @@ if TYPE_CHECKING:
     Up = Sequence[float] | None
 
 _POOL, _GROW, _NEAR = 160, 2.0, 0.25
-"""Poses of a pool made for a scene without views, how many times as many there may be where a view holds
-little of it, and the most that step nearer; every 8th is held out for scoring."""
+"""Generated pool: number of poses, growth factor if views show little of the scene, and share of nearer
+poses. Every 8th pose is held out for scoring.
+"""
 _APART = 24
-"""Views of another kind: half of them validate recovery, half are scored."""
+"""Number of views of another kind: one half validates recovery, the other is scored."""
 _POOL_GAUSSIANS = 4_000_000
-"""Gaussians in tiles for which such a pool is made; for more of these, more of those."""
+"""Size of a tiled scene from which the pool grows in proportion."""
 _ROWS = 200_000
 """Gaussians that poses are planned on."""
 
 _LOOKS, _LOOK_ROWS = 96, 100_000
-"""Poses of a pool that simplification looks from, as many of them are used as the scene needs, and Gaussians
-that those are planned on."""
+"""Size of the pool for simplification, of which as many are used as the scene needs, and the Gaussians that
+it is planned on.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class RunViews:
-    """What a run looks at.
+    """Views of a run.
 
     Args:
-        train: to recover from.
-        test: of their kind, for scoring.
-        apart: of another kind, nearer; None where none can be made.
-        pool: all of a pool made for the scene, to be written beside the result.
-        unseen: share of a sample of the scene's matter that no view of that pool sees.
+        train: views for training.
+        test: views of the same kind, for scoring.
+        apart: views of another kind, nearer to the scene; None if there are none.
+        pool: the whole generated pool, written beside the result.
+        unseen: share of the sampled matter that no view of the pool sees.
     """
 
     train: ViewSet
@@ -54,13 +56,13 @@ class RunViews:
     unseen: float | None = None
 
     def resized(self, longest: int) -> RunViews:
-        """Return the same views for training and scoring, shrunk."""
+        """Shrink all views for training and scoring."""
         apart = self.apart and self.apart.resized(longest)
         return replace(self, train=self.train.resized(longest), test=self.test.resized(longest), apart=apart)
 
 
 def is_made(views: object) -> bool:
-    """Whether views are asked to be made, rather than given."""
+    """Return whether views are to be generated rather than given."""
     return isinstance(views, str) and views == "made"
 
 
@@ -78,27 +80,26 @@ def views_of(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> RunViews:
-    """Views for recovery and for scoring.
+    """Choose views for recovery and for scoring.
 
     Args:
         prior: the dense scene.
-        views: cameras, or where they lie; None takes those that lie beside the scene, else a pool of its own;
-            "made" is that pool.
-        held_out: views to score on; None holds out the test split of `views`, of a pool every 8th.
-        beside: where the scene lies, if cameras are to be looked for there.
-        size: pixels that the longer side of a view is shrunk to; None leaves it.
-        up: (3,) away from the ground, for poses that are made; None to estimate it.
-        seed: of poses that are made.
-        teach: the scene can be rendered: into views without a photo beside others, which are left out else,
-            and into other views than those given.
-        represents: of a fair sample of a scene: how many Gaussians each of its rows stands for. The pool of a
-            scene too large for memory grows with it.
-        progress: told of planning.
-        say: told what is looked at, and why.
+        views: cameras, or their path. None uses cameras found beside the scene, or generates a pool; "made"
+            always generates one.
+        held_out: views to score on; None holds out the test split, or every 8th view of a pool.
+        beside: path beside which to look for cameras.
+        size: longer side in pixels, if views are larger.
+        up: (3,) direction away from the ground for generated views; None estimates it.
+        seed: seed of generated views.
+        teach: whether the scene can render targets; otherwise views without a photo are skipped and no views
+            are generated.
+        represents: Gaussians per row if `prior` is a sample of a larger scene; the pool grows with it.
+        progress: called during planning.
+        say: called with log messages.
 
     Raises:
-        InputError: a file without views, an empty split, views that see nothing of the scene, a scene with
-            no room for poses, or a pool where the targets are photos.
+        InputError: a file without views, an empty split, views that see nothing of the scene, a scene with no
+            room for poses, or a generated pool when targets must be photos.
     """
     from g2ard.errors import InputError
     from g2ard.io import ViewSet
@@ -151,14 +152,13 @@ def views_or_pool(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Views:
-    """Views to render, score or learn from: those given, else those beside the scene, else a pool as
-    `distill` makes it, every 8th of it held out.
+    """Return given views, views found beside the scene, or a generated pool with every 8th view held out.
 
     Args:
         scene: the dense scene.
-        count: poses of a generated pool; None for as many as `distill` makes.
+        count: size of a generated pool; None chooses like `distill`.
 
-    The others are as for `views_of`.
+    Other arguments are those of `views_of`.
 
     Raises:
         InputError: a scene with no room for poses.
@@ -180,8 +180,8 @@ def views_or_pool(
 
 
 def _of(pool: Pool) -> str:
-    """A pool in a few words; `g2ard poses` tells why it is of that kind."""
-    guess = "; which way is up is a guess" if "guess" in pool.why else ""
+    """Describe a pool briefly."""
+    guess = "; the up direction is a guess" if "guess" in pool.why else ""
     return f"{len(pool.cameras)}, {pool.kind}{guess}"
 
 
@@ -196,15 +196,17 @@ def cameras_for_looks(
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Cameras | None:
-    """The views that simplification looks from: those given, else those beside the scene, else a few of its
-    own where it leaves room for them.
+    """Choose views for simplification's visibility: given, found beside the scene, or generated.
 
     Args:
         scene: the dense scene.
-        views: as for `views_of`; of a split, those for training.
-        method: `fast` uses only views that are given or requested, `paper` none.
+        views: as for `views_of`; the training split is used.
+        method: `fast` uses only given or requested views, `paper` none.
 
-    The others are as for `views_of`.
+    Other arguments are those of `views_of`.
+
+    Returns:
+        The cameras, or None for no views.
 
     Raises:
         InputError: a file without views, or an empty split.
@@ -232,7 +234,7 @@ def cameras_for_looks(
             scene, _LOOKS, up=up, seed=seed, rows=_LOOK_ROWS, near=_NEAR, looks=True, progress=progress
         )
     except InputError as e:
-        say(f"goes on without views: {e}")
+        say(f"continuing without views: {e}")
         return None
     return pool.cameras
 
@@ -246,7 +248,7 @@ def _planned(
     grow: float = 1.0,
     represents: float = 1.0,
 ) -> Pool:
-    """A pool of `count` views or up to `grow` times as many, and views of another kind."""
+    """Plan a pool of `count` to `grow` × `count` views, and views of another kind."""
     from g2ard.poses import plan_pool
 
     times = pool_times(len(prior) * represents) if represents > 1 else 1.0
@@ -265,14 +267,14 @@ def _planned(
 
 
 def pool_times(count: float) -> float:
-    """How many times the usual views are made for a scene of `count` Gaussians in tiles."""
+    """Return the growth factor of the pool for a tiled scene of `count` Gaussians."""
     return max(1.0, count / _POOL_GAUSSIANS)
 
 
 def _near(
     prior: Splats, size: int | None, up: Up, seed: int, progress: Progress, represents: float
 ) -> Cameras | None:
-    """Views of another kind beside those that were given; None where the scene has no place for any."""
+    """Plan views of another kind beside given ones, or return None if the scene has no room."""
     from g2ard.errors import InputError
 
     try:

@@ -43,7 +43,7 @@ def test_the_wrong_kind_of_input_is_told_what_takes_it(command_line: CommandLine
         (
             ("distill", "--views", "views.json", "--min-psnr", 30, "-o", "run"),
             1,
-            "--min-psnr: views.json: has no sparse points to measure that on; give --count COUNT",
+            "--min-psnr: views.json: needs sparse points, and there are none; give --count COUNT",
         ),
         (
             ("render", "ball.ply", "-n", 4, "--views", "views.json", "--sheet", "a.png"),
@@ -120,7 +120,7 @@ def test_views_without_photos_say_what_stands_in(command_line: CommandLine, fold
     for ask, words in (
         (("distill", "ball.ply", *to, "--photos"), "leave out --photos to render the scene there"),
         (("distill", "cloud.ply", *to), "give views with photos, or a trained scene"),
-        (("distill", *to[2:], "-n", 50), "give views with photos, or a scene beside them"),
+        (("distill", *to[2:], "-n", 50), "pass views with photos, or a scene"),
         (("recover", "ball.ply", "-o", "x.ply", *to[4:]), "render them from --teacher SCENE"),
     ):
         status, _, error = command_line(*ask, cwd=folder)

@@ -42,7 +42,7 @@ SHORT = ("distill", "ball.ply", "--steps", 5, "--size", 48)
 def test_a_short_run_has_no_needless_notes(command_line: CommandLine, folder: Path) -> None:
     status, _, error = command_line(*SHORT, "-r", 10, "-o", "run", cwd=folder)
     assert status == 0, error
-    assert "poses: 160, orbit; which way is up is a guess\n" in error
+    assert "poses: 160, orbit; the up direction is a guess\n" in error
     for needless in ("never acted", "of its box", "times as high"):
         assert needless not in error
     assert "never acted" in command_line(*SHORT, "-r", 10, "-o", "run", "-wv", cwd=folder)[2]
@@ -72,7 +72,7 @@ def test_views_of_another_world_are_told(command_line: CommandLine, folder: Path
     for ask in (("distill", "-n", 9, "-o", "run", "--dry-run"), ("evaluate", "--teacher", "ball.ply")):
         split = ("--split", "all") if ask[0] == "evaluate" else ()
         for name, status, words in (
-            ("some.json", 0, "views have nothing of the scene in sight"),
+            ("some.json", 0, "views see nothing of the scene"),
             ("none.json", int(not split), "16 of 16 views" if split else "the scene must be of one world"),
             ("views.json", 0, ""),
         ):
@@ -101,7 +101,7 @@ def test_every_command_tells_of_views_of_another_world(
     for views, warned in (("some.json", True), ("views.json", False)):
         status, _, error = command_line(*ask, "--views", views, "-w", cwd=folder)
         assert status == 0, error
-        assert ("views have nothing of the scene in sight: are both of one world?" in error) == warned, error
+        assert ("views see nothing of the scene; check" in error) == warned, error
 
 
 def test_photos_of_another_world_are_told(command_line: CommandLine, folder: Path) -> None:
@@ -114,7 +114,7 @@ def test_photos_of_another_world_are_told(command_line: CommandLine, folder: Pat
     for scene, warned in (("other.ply", True), ("own.ply", False)):
         status, _, error = command_line("distill", scene, *ask, "-o", "run", cwd=folder)
         assert status == 0, error
-        assert ("warning: the scene looks like none of the photos (correlation" in error) == warned, error
+        assert ("warning: the scene does not look like the photos (correlation" in error) == warned, error
 
 
 def test_the_table_has_a_start_where_there_are_photos_alone() -> None:

@@ -126,7 +126,7 @@ def test_the_commands(command_line: CommandLine, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("args", "code", "said"),
     [
-        (("--keep-region", "0,0,90,1"), 1, "none of the 500 Gaussians of the scene lies there"),
+        (("--keep-region", "0,0,90,1"), 1, "contains none of the 500 Gaussians of the scene"),
         (
             ("--keep-region", "0,0,90,1", "--tile-rows", "200", "--workers", "1"),
             1,

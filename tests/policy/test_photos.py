@@ -23,11 +23,7 @@ def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_pa
     found = json.loads(out)
     assert (found["output_count"], found["against"]) == (500, "photos")
     assert found["scores"]["recovered"]["psnr"] > max(17, found["scores"]["simplified"]["psnr"] + 1)
-    said = (
-        "starts from 1,200 sparse points\n"
-        if points
-        else "starts from 500 points within the cameras' sight\n"
-    )
+    said = "starting from 1,200 sparse points\n" if points else "starting from 500 points along camera rays\n"
     assert said in error
     ours = g2ard.distill(None, views=tmp_path / "photos", count=500, steps=150).splats
     g2ard.save(tmp_path / "ours.ply", ours)

@@ -212,9 +212,9 @@ def test_the_command_writes_views_and_says_how_good_they_are(
     [
         ("--photos photos --poses coarse.txt", 1, "need their intrinsics"),
         ("--photos photos --focal 128", 1, "no pose to start from; give --poses or --pool"),
-        ("--photos photos --focal 128 --poses other.txt", 1, "names none of the photos"),
-        ("--photos photos --intrinsics wide.json --poses coarse.txt", 1, "the aspects differ"),
-        ("--photos views.json --truth other.txt", 1, "other.txt: names none of the photos"),
+        ("--photos photos --focal 128 --poses other.txt", 1, "no pose has the name of a photo"),
+        ("--photos photos --intrinsics wide.json --poses coarse.txt", 1, "pass intrinsics with"),
+        ("--photos views.json --truth other.txt", 1, "other.txt: no pose has the name of a photo"),
         ("--photos views.json --focal 100", 1, "these views state their intrinsics"),
         ("--photos views.json --metres-per-unit 2", 2, "goes with --truth"),
         ("--photos views.json --keep some", 2, "keep"),

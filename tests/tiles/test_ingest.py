@@ -255,8 +255,8 @@ def test_damage_is_named(tmp_path: Path) -> None:
     content = json.loads(text)
     for change, message in (
         ({"format": "other"}, "not a manifest of tiles"),
-        ({"version": 99}, "version 99 is not known"),
-        ({"count": 3}, "contradict"),
+        ({"version": 99}, "unsupported version 99"),
+        ({"count": 3}, "inconsistent"),
         ({"sh_degree": 7}, "malformed"),
         ({"tiles": 5}, "malformed"),
         ({"cells": [4, 0, None, None]}, "malformed"),

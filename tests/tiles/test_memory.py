@@ -83,7 +83,7 @@ def test_memory_that_nobody_gave_is_the_machine_s(
 ) -> None:
     store, tiling = tiles(scene, tmp_path, 6000)
     monkeypatch.setattr(policy, "_physical_memory", lambda: 4_000_000_000)
-    told = r"--workers 1000 take about 20\d[\d.]* GB, more than the 3\.2 GB that are taken of the machine's"
+    told = r"--workers 1000 take about 20\d[\d.]* GB, more than the 3\.2 GB used of the machine's"
     with pytest.raises(InputError, match=told + r" memory; --workers 1\d fit$"):
         workers_for(store, Tiling(folder=tiling.folder, workers=1000))
 

@@ -62,8 +62,8 @@ def test_what_takes_the_scene_in_one_piece_is_named_as_it_is_typed(
 ) -> None:
     words = (*command, "town.ply", *given.split(), "--tile-rows", "1500")
     told = refused(command_line, folder, 1, *words)
-    end = "and it is worked on in tiles; --tile-rows 3,000 gives one piece"
-    assert told == f"g2ard: town.ply: {named} takes the scene in one piece, {end}"
+    end = "but it is processed in tiles; use --tile-rows 3,000 for one piece"
+    assert told == f"g2ard: town.ply: {named} needs the whole scene in memory, {end}"
     assert not (folder / "x").exists()
 
 
@@ -71,8 +71,8 @@ def test_several_are_named_together_and_renders_are_what_tiles_learn_from(
     command_line: CommandLine, folder: Path
 ) -> None:
     told = refused(command_line, folder, 1, *_DISTILL, "tiles", "--clean", "--photos")
-    assert "tiles: --clean and --photos take the scene in one piece" in told
-    assert "`g2ard ingest tiles -o DIR --tile-rows 3,000` gives one piece" in told
+    assert "tiles: --clean and --photos need the whole scene in memory" in told
+    assert "use `g2ard ingest tiles -o DIR --tile-rows 3,000` for one piece" in told
     assert whole_options(DistillOptions(photos=False)) == []
     assert whole_options(DistillOptions(settings={"engine": "gsplat"})) == ["--device cuda"]
 
