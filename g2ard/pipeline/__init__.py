@@ -32,14 +32,14 @@ _ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 
 @dataclass(frozen=True, eq=False)
 class Distilled:
-    """A compact scene and how it came about.
+    """A compact scene and a report.
 
     Args:
         splats: exactly `budget` Gaussians.
-        simplified: the same Gaussians before any recovery at their count: the anchors of all that followed,
-            and what Drift95 is measured from.
-        report: what was done, in numbers.
-        held_out: targets that nothing was learned from, to score on; None where the caller has their own.
+        simplified: the scene before recovery at its final count: the anchors of the final recovery, and the
+            reference of Drift95.
+        report: views, rounds and times.
+        held_out: held-out targets for scoring; None if the caller has their own.
     """
 
     splats: Splats
@@ -62,27 +62,28 @@ def distill(
 ) -> Distilled:
     """Distil a dense prior into exactly `budget` Gaussians.
 
-    N_r = max(N_S, ⌈0.75·N_{r−1}⌉) with recovery after each round where the schedule asks for it, else one
-    shot.
+    The scene is simplified in one step, or, if the schedule has `round_steps`, in rounds of N_r = max(N_S,
+    ⌈0.75·N_{r−1}⌉) with recovery after each.
 
     Args:
-        prior: a trained model, or a lift; its offset counts, cameras are in world coordinates.
+        prior: a trained scene or a lifted point cloud; cameras are in world coordinates, including its
+            offset.
         budget: N_S, at most the prior's count.
         targets: photos, or the prior's own renders.
         config: see `DistillConfig`.
-        weights: (C,) how often to draw each view, where that is known already; None weighs them here.
-        validation: a few views of another kind, never learned from, which decide how much of recovery's
-            changes stays where they lose, see `g2ard.stages.recover.recover`.
-        work: a folder for finished rounds and checkpoints; a second call with the same inputs goes on there.
-        progress: told of all stages.
+        weights: (C,) sampling weight of each view; None computes them.
+        validation: views of another kind, not trained on, that limit recovery's changes if they lose quality,
+            see `g2ard.stages.recover.recover`.
+        work: folder for finished rounds and checkpoints; the same call resumes from it.
+        progress: called by all stages.
         watch: called after every step of every recovery, see `g2ard.stages.recover.recover`.
 
     Returns:
-        A `Distilled`.
+        The compact scene with its unrecovered version and report.
 
     Raises:
         InputError: the budget does not fit, no view sees the prior, or `work` belongs to another run.
-        KeyboardInterrupt: after Ctrl-C, with `work` ready for a resume.
+        KeyboardInterrupt: after Ctrl-C; the same call resumes from `work`.
     """
     from g2ard.stages.simplify import round_counts
 
@@ -100,13 +101,13 @@ def distill(
 
 
 def final_steps(config: DistillConfig, scene: Splats, cameras: Cameras, *, photos: bool) -> int:
-    """Steps of the last recovery: as asked for, the schedule's, or by need where a teacher renders targets.
+    """Return the steps of the last recovery: as set, the schedule's, or by need if targets are renders.
 
     Args:
-        config: of the pipeline.
-        scene: what is to be recovered.
-        cameras: the views it learns from.
-        photos: whether those are photos.
+        config: configuration of the pipeline.
+        scene: the scene to recover.
+        cameras: training views.
+        photos: whether targets are photos.
     """
     from g2ard.stages.recover.schedule import steps_for
 
@@ -120,7 +121,7 @@ def final_steps(config: DistillConfig, scene: Splats, cameras: Cameras, *, photo
 
 @dataclass(frozen=True, eq=False)
 class _Supervision:
-    """What recovery looks at, how often, and why."""
+    """Training targets with sampling weights, and a report of their selection."""
 
     targets: Targets
     weights: Any
@@ -130,7 +131,7 @@ class _Supervision:
     def of(
         cls, scene: Splats, targets: Targets, config: DistillConfig, weights: Any, progress: Progress
     ) -> _Supervision:
-        """The views worth having of `scene`; `weights` that are given stand, over what selection says."""
+        """Select the views that see `scene`; given `weights` override those of the selection."""
         from g2ard.stages.select import select
 
         cameras = targets.cameras
@@ -164,7 +165,7 @@ class _Supervision:
         return cls(subset, weights, report)
 
     def fill(self, progress: Progress) -> None:
-        """Have every target at hand, so that later steps take equal time."""
+        """Load every target, so that later steps take equal time."""
         count = len(self.targets.cameras)
         for view in range(count):
             self.targets[view]
@@ -172,7 +173,7 @@ class _Supervision:
 
 
 class _Rounds:
-    """The scene as it shrinks, its protection flags, and the log; each stage is saved if `work` is given."""
+    """State of the rounds: scene, protection flags and log; each stage is saved if `work` is given."""
 
     def __init__(
         self,
@@ -203,7 +204,7 @@ class _Rounds:
         return _fingerprint(self.prior, self.budget, self.targets, self.config, self.weights, self.validation)
 
     def advance(self, number: int, count: int, *, final: bool) -> None:
-        """One round: simplify to `count`, recover; the final one recovers for the final horizon as well."""
+        """Run one round: simplify to `count` and recover; the final round adds the final recovery."""
         entry: dict[str, Any] = {"count": count}
         if self.config.select.reselect and number > 1:
             self._select(self.state)
@@ -284,12 +285,11 @@ class _Rounds:
         self.seconds["recover"] += entry["recover"][-1]["seconds"]
 
     def _steps(self) -> int:
-        """The final horizon."""
         photos = isinstance(self.targets, Photos | PhotosOrRenders)
         return final_steps(self.config, self.state, self.supervision.targets.cameras, photos=photos)
 
     def _seconds(self, final: bool) -> float | None:
-        """This recovery's part of the time limit."""
+        """Return this recovery's share of the time limit."""
         config, schedule = self.config.recover, self.config.recover.schedule
         if config.recovery_time is None:
             return None
@@ -308,7 +308,7 @@ class _Rounds:
         checkpoints.save(self.work / f"{name}.npz", self.key, {"entry": entry}, arrays)
 
     def _restore(self, name: str, entry: dict[str, Any]) -> bool:
-        """Take up a finished stage of an earlier run; False where there is none."""
+        """Restore a finished stage of an earlier run; return False if there is none."""
         path = self.work / f"{name}.npz" if self.work else None
         if path is None or not path.exists():
             return False

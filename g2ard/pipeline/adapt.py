@@ -1,4 +1,4 @@
-"""New appearance on frozen geometry: what a compact map is reused for (`tab:geobase`)."""
+"""Adaptation: fitting new appearance to frozen geometry (`tab:geobase`)."""
 
 from __future__ import annotations
 
@@ -23,31 +23,32 @@ from g2ard.stages.recover.report import Gain
 from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
 
 _FREE = Regularizers(anchor=0.0, shape=0.0, effective_rank=False)
-"""Geometry that cannot move needs nothing to hold it."""
+"""No regularisers, because geometry is frozen."""
 
 
 @dataclass(frozen=True)
 class AdaptConfig:
-    """How appearance is refitted.
+    """Options of adaptation.
 
     Args:
-        steps: at most; 7,000 as in the paper.
-        tolerance: dB; a stretch of steps that gains less on the training views is the last; 0 takes all.
-        schedule: "default" takes stretches of 500, 1,000, 2,000 … steps, each under a cosine; "paper" takes
-            all steps at its rates, which decay to a tenth, from the scene as it is, and blends nothing.
-        prior_views: what the appearance before the fit weighs, in views. A Gaussian that v views have seen
-            ends v/(v + this) of the way from there to its fit: few images say little of what they hardly
-            see. 0 takes the fit as it is.
-        sh_degree: of the result; None keeps the scene's. A scene without higher bands has no place for shine.
+        steps: most steps; 7,000 as in the paper.
+        tolerance: fitting stops after a stretch that gains less than this on the training views, dB; 0 takes
+            all steps.
+        schedule: "default" takes stretches of 500, 1,000, 2,000 … steps with cosine decay; "paper" takes all
+            steps at once, with rates that decay to a tenth, without colour change or blending.
+        prior_views: weight of the appearance before the fit, in views. A Gaussian seen by v views moves v/(v
+            + prior_views) of the way to its fit. 0 keeps the fit.
+        sh_degree: SH degree of the result; None keeps the scene's. Highlights need higher bands.
         background: RGB behind the scene.
-        seed: of the order of views.
+        seed: seed of the order of views.
         first_stretch: steps of the first stretch.
-        colour_worth: dB that a change of all colours at once must bring on the images.
+        colour_worth: least gain (dB) on the images for changing all colours at once.
         ssim_weight: λ of the photometric loss, see `RecoverConfig`.
-        recovery: rates and decay of a stretch, see `appearance_only`; None means those of `schedule`.
+        recovery: rates and decay of a stretch with frozen geometry, see `appearance_only`; None means those
+            of `schedule`.
 
     Raises:
-        InputError: a value out of its range.
+        InputError: a value out of range.
     """
 
     steps: int = 7000
@@ -65,7 +66,8 @@ class AdaptConfig:
     def __post_init__(self) -> None:
         if self.steps < 1 or not self.tolerance >= 0:
             raise InputError(
-                f"{self.steps} steps, tolerance {self.tolerance}: expected ≥ 1 and ≥ 0", parameter="steps"
+                f"expected steps ≥ 1 and tolerance ≥ 0, got {self.steps} and {self.tolerance}",
+                parameter="steps",
             )
         if not 0 <= self.prior_views < float("inf"):
             raise InputError(
@@ -78,12 +80,13 @@ class AdaptConfig:
         require("first_stretch", self.first_stretch, self.first_stretch >= 1, "at least 1")
         if self.recovery is not None and self.recovery != appearance_only(self.recovery):
             raise InputError(
-                "geometry stays: the rates of means, log_scales and quats are 0", parameter="recovery"
+                "expected rates of 0 for means, log_scales and quats, because geometry is frozen",
+                parameter="recovery",
             )
 
     @classmethod
     def scheduled(cls, schedule: AdaptSchedule) -> AdaptConfig:
-        """Return the config of a schedule, its rates and decay included.
+        """Return the config of a schedule, including rates and decay.
 
         >>> AdaptConfig.scheduled("paper").prior_views
         0.0
@@ -92,7 +95,7 @@ class AdaptConfig:
         return cls(schedule=schedule, prior_views=0.0 if schedule == "paper" else 1.0, recovery=rates)
 
     def stretches(self) -> list[int]:
-        """Steps of each stretch, doubling; what would be left over for a shorter one joins the last.
+        """Return the steps of each stretch, doubling; the remainder joins the last one.
 
         >>> AdaptConfig().stretches(), AdaptConfig(steps=600).stretches()
         ([500, 1000, 2000, 3500], [600])
@@ -109,7 +112,7 @@ class AdaptConfig:
 
 @dataclass(frozen=True)
 class Stretch(Report):
-    """Steps under one cosine, and the training views' PSNR after them, dB."""
+    """Number of steps, and the PSNR (dB) of the training views after them."""
 
     steps: int
     psnr: float
@@ -117,16 +120,16 @@ class Stretch(Report):
 
 @dataclass(frozen=True)
 class AdaptReport(Report):
-    """An adaptation in numbers.
+    """Figures of an adaptation.
 
     Args:
-        steps: taken.
-        seconds: for them.
+        steps: steps taken.
+        seconds: time for these steps.
         converged: whether the last stretch gained less than the tolerance.
-        psnr: over a sample of the training views.
-        stretches: one after another.
-        colour_change: gain (dB), matrix and shift of the change of all colours; None where none is worth it.
-        prior_share: the mean share of the appearance before the fit.
+        psnr: PSNR before and after, on a sample of the training views.
+        stretches: figures of each stretch.
+        colour_change: gain (dB), matrix and shift of the change of all colours; None if it was not applied.
+        prior_share: mean share of the previous appearance in the result.
     """
 
     steps: int
@@ -143,8 +146,8 @@ class Adapted:
     """A scene with new appearance.
 
     Args:
-        splats: means, rotations and scales of the scene given, bit for bit; new SH and opacities.
-        report: what was done, in numbers.
+        splats: the given means, rotations and scales, bit for bit, with new SH and opacities.
+        report: figures of the adaptation.
     """
 
     splats: Splats
@@ -153,7 +156,7 @@ class Adapted:
 
 @dataclass
 class _State:
-    """What a resume must bring back between two stretches."""
+    """State between two stretches, for resuming."""
 
     splats: Splats
     seconds: float = 0.0
@@ -184,26 +187,26 @@ def adapt(
 ) -> Adapted:
     """Refit spherical harmonics and opacities to targets; means, rotations and scales stay.
 
-    First one affine map c ↦ M·(c, 1) of all colours, M (3, 4) by least squares
-    (`g2ard.scene.appearance.colour_change`), where it gains enough on the images: a change of light is then
-    right in unseen places too. Then each Gaussian's own appearance, under L = (1−λ)·L1 + λ·(1−SSIM) as in
-    recovery, without regularisers. Last a blend: a Gaussian seen by v images goes v/(v + prior_views) of the
-    way to its fit. PSNR on other trajectories then measures the geometry (`tab:geobase`).
+    First, one affine map c ↦ M·(c, 1) is applied to all colours if it gains enough (M (3, 4) by least
+    squares, `g2ard.scene.appearance.colour_change`), so that a change of light is right in unseen places too.
+    Second, each Gaussian's appearance is fitted with L = (1−λ)·L1 + λ·(1−SSIM) as in recovery, without
+    regularisers. Last, a Gaussian seen by v images moves v/(v + prior_views) of the way to its fit. PSNR on
+    other trajectories then measures the geometry (`tab:geobase`).
 
     Args:
-        compact: the scene; its offset counts, cameras are in world coordinates.
+        compact: the scene; cameras are in world coordinates, including its offset.
         targets: photos, or renders of a scene with the wanted appearance.
         config: see `AdaptConfig`.
-        work: a folder that exists, for checkpoints: after every stretch, every minute and at Ctrl-C. Where it
-            holds some, adaptation goes on from them, and ends as if it had never stopped.
-        progress: told of every step.
+        work: existing folder for checkpoints, written after every stretch, every minute and at Ctrl-C. The
+            same call resumes from them, with the same result.
+        progress: called after every step.
 
     Returns:
-        An `Adapted` with as many Gaussians, in their order.
+        The scene with new appearance, its Gaussians in the same order.
 
     Raises:
         InputError: no Gaussians, no views, or checkpoints of another run.
-        KeyboardInterrupt: after Ctrl-C, once the checkpoint is written.
+        KeyboardInterrupt: after Ctrl-C, when the checkpoint is written.
     """
     config = config or AdaptConfig()
     given = compact if config.sh_degree is None else compact.with_sh_degree(config.sh_degree)
@@ -255,7 +258,7 @@ def _stretch(
     within: Path | None,
     progress: Progress,
 ) -> None:
-    """Steps under one cosine."""
+    """Fit one stretch of steps."""
     recovery = config.recovery or appearance_only(PAPER if config.schedule == "paper" else TUNED)
     how = RecoverConfig(
         schedule=recovery,
@@ -274,5 +277,5 @@ def _stretch(
 
 
 def appearance_only(schedule: Schedule) -> Schedule:
-    """A schedule under which geometry stays: its rates are 0."""
+    """Return the schedule with the rates of geometry set to 0."""
     return replace(schedule, rates=replace(schedule.rates, means=0.0, log_scales=0.0, quats=0.0))

@@ -1,4 +1,4 @@
-"""Configuration of a distillation: every stage's, nested."""
+"""Configuration of a distillation: the nested configs of all stages."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from g2ard.stages.simplify.config import SimplifyConfig
 
 @dataclass(frozen=True)
 class SelectConfig(CoverageOptions):
-    """Which views recovery learns from, and how often it draws each; and `CoverageOptions`.
+    """Options for selecting and weighting training views, in addition to `CoverageOptions`.
 
     Args:
-        views_count: how many of the views, best first: a count, a share in (0, 1] rounded up, "auto" for as
-            many as the curve of gains asks for, or None for all that see the scene.
-        policy: how views are chosen, see `g2ard.stages.select`.
-        weighted: draw views by weights, their own or the selection's, so that crowded poses do not rule: on a
-            crowded pool all views drawn so beat an even draw, and every choice of a tenth of them.
-        reselect: choose again from every round's scene instead of once from the raw prior.
+        views_count: number of views, best first: a count, a share in (0, 1] rounded up, "auto" to stop where
+            the curve of gains flattens, or None for all that see the scene.
+        policy: selection policy, see `g2ard.stages.select.select`.
+        weighted: draw views by weight, so that crowded poses do not dominate. On a crowded pool this beats
+            uniform draws, and any selection of a tenth of the views.
+        reselect: select again from every round's scene instead of once from the prior.
     """
 
     views_count: int | float | Literal["auto"] | None = None
@@ -38,12 +38,12 @@ class SelectConfig(CoverageOptions):
         require("views_count", self.views_count, share, "a count, auto, none, or a share in (0, 1]")
         if self.views_count == "auto" and self.policy in UNMEASURED:
             raise InputError(
-                f"policy {self.policy} does not measure what views add; give a count, not auto",
+                f"policy {self.policy} does not measure gains; pass a count instead of auto",
                 parameter="views_count",
             )
 
     def count_of(self, candidates: int) -> int | Literal["auto"]:
-        """Return how many of the candidates to take, or "auto".
+        """Return the number of candidates to take, or "auto".
 
         >>> SelectConfig(views_count=0.25).count_of(10), SelectConfig().count_of(10)
         (3, 10)
@@ -54,16 +54,16 @@ class SelectConfig(CoverageOptions):
 
 @dataclass(frozen=True)
 class DistillConfig:
-    """How a scene is distilled; the paper's way is `g2ard.preset("paper")`.
+    """Configuration of a distillation; the paper's is `g2ard.preset("paper")`.
 
     Args:
-        select: which views are learned from.
-        simplify: how the scene is reduced; its retention also sets the counts of rounds, 0.75 if None.
-        recover: how it is recovered. A schedule with `round_steps` recovers after every round of 75 % (the
-            paper); without them the reduction is one shot and all recovery happens at the target count.
-            `steps` None means the schedule's, more where a view holds little of the scene
-            (`g2ard.stages.recover.schedule`); rounds share `recovery_time` in proportion to their steps.
-        lift: how a cloud becomes a scene.
+        select: selection of training views.
+        simplify: simplification; its `retention` also sets the counts of rounds (0.75 if None).
+        recover: recovery. A schedule with `round_steps` recovers after every round, as the paper does;
+            otherwise there is one reduction and one recovery. If `steps` is None, the schedule's are taken,
+            and more if a view shows little of the scene (`g2ard.stages.recover.schedule`). Rounds share
+            `recovery_time` in proportion to their steps.
+        lift: lifting of point clouds.
     """
 
     select: SelectConfig = field(default_factory=SelectConfig)

@@ -1,4 +1,4 @@
-"""What the pipeline tells of its work: views, rounds, seconds."""
+"""Reports of the pipeline: views, rounds, seconds."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ from g2ard.stages.simplify.report import SimplifyReport
 
 @dataclass(frozen=True)
 class ViewsReport(Report):
-    """What was made of the candidate views.
+    """Report of the view selection.
 
     Args:
-        policy: how they were chosen.
-        candidates: how many there were.
-        chosen: names, best first.
-        weighted: whether they were drawn by weight.
-        refused: names of those that see nothing of the scene, or stand within it.
-        left_out: what the views not chosen would have added to the policy's objective, as a share of the
-            whole pool's.
+        policy: selection policy.
+        candidates: number of candidates.
+        chosen: names of the chosen views, best first.
+        weighted: whether views are drawn by weight.
+        refused: names of views that see nothing of the scene or lie inside geometry.
+        left_out: share of the whole pool's objective that the remaining views would add.
     """
 
     policy: str
@@ -33,7 +32,7 @@ class ViewsReport(Report):
 
 @dataclass(frozen=True)
 class RoundReport(Report):
-    """A round, recovered once where the schedule asks for it, and once more if it is the last."""
+    """Report of a round: simplification, and its recoveries if there are any."""
 
     count: int
     simplify: SimplifyReport
@@ -45,10 +44,10 @@ class StageSeconds(Report):
     """Wall seconds of each stage.
 
     Args:
-        select: of choosing or weighing views.
-        simplify: of all rounds.
-        recover: of all rounds.
-        resumed: of these, what calls before this one had taken; None where none had.
+        select: selecting or weighting views.
+        simplify: simplification in all rounds.
+        recover: recovery in all rounds.
+        resumed: part of these spent by earlier, interrupted calls; None if there were none.
     """
 
     select: float
@@ -59,7 +58,7 @@ class StageSeconds(Report):
 
 @dataclass(frozen=True)
 class DistillReport(Report):
-    """A distillation in numbers; `views` is None where nothing was selected."""
+    """Report of a distillation; `views` is None if nothing was selected."""
 
     rounds: tuple[RoundReport, ...]
     seconds: StageSeconds

@@ -1,1 +1,1 @@
-"""Self-contained HTML: charts as SVG, images inline, one page that needs no network."""
+"""Self-contained HTML reports: SVG charts and inline images on one page that needs no network."""

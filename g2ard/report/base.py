@@ -1,4 +1,4 @@
-"""Reports as dataclasses that JSON can hold: what stages tell of their work, in files and in Python alike."""
+"""Base class of reports: dataclasses that convert to and from JSON."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import MISSING, dataclass, fields
 from typing import Any, Self, Union, get_args, get_origin, get_type_hints
 
 LEFT_OUT = {"left_out": True}
-"""Metadata of a field that JSON leaves out where it is None."""
+"""Metadata of a field that JSON omits if it is None."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """A dataclass of numbers, words, lists of them, and further reports.
+    """A dataclass of numbers, strings, lists of these, and nested reports.
 
     >>> from dataclasses import field
     >>> @dataclass(frozen=True)
@@ -26,13 +26,13 @@ class Report:
     """
 
     def as_dict(self) -> dict[str, Any]:
-        """The report as JSON has it: fields by name, reports within as dicts."""
+        """Return the report as JSON values: fields by name, nested reports as dicts."""
         found = ((f, getattr(self, f.name)) for f in fields(self))
         return {f.name: _plain(value) for f, value in found if value is not None or not _left_out(f)}
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:
-        """The report that `as_dict` gave `data`."""
+        """Restore a report from `as_dict`."""
         kinds = get_type_hints(cls)
         names = [f.name for f in fields(cls) if f.name in data or f.default is MISSING]
         return cls(**{name: _read(kinds[name], data[name]) for name in names})
@@ -49,7 +49,7 @@ def _plain(value: Any) -> Any:
 
 
 def _read(kind: Any, value: Any) -> Any:
-    """A value as its field's type has it."""
+    """Convert a JSON value to the type of its field."""
     if value is None:
         return None
     if get_origin(kind) in (Union, types.UnionType):

@@ -1,4 +1,4 @@
-"""Scatter and line charts as SVG text that follows the page's light or dark colours."""
+"""Scatter and line charts as SVG that follows the page's light or dark colours."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class Point:
     """A dot of a chart.
 
     Args:
-        x: along the axis; positive on a logarithmic one.
-        y: up.
-        series: which colour, a number from 0.
-        mark: which shape, a number from 0.
-        text: what hovering shows.
-        label: written beside it where there is room; "" for none.
+        x: horizontal value; positive on a logarithmic axis.
+        y: vertical value.
+        series: index of the colour, from 0.
+        mark: index of the shape, from 0.
+        text: tooltip.
+        label: text beside the dot, if there is room; "" for none.
     """
 
     x: float
@@ -35,7 +35,7 @@ class Point:
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:
-    """Those that no other point beats: none is both at most as far right and at least as high; left to right.
+    """Return the Pareto front, sorted by x.
 
     >>> [p.x for p in pareto([Point(1, 5, 0), Point(2, 4, 0), Point(3, 9, 0)])]
     [1, 3]
@@ -48,7 +48,7 @@ def pareto(points: Sequence[Point]) -> list[Point]:
 
 
 def ticks(low: float, high: float, *, log: bool = False) -> list[float]:
-    """Round values between two ends, about six.
+    """Return about six round values between two limits.
 
     >>> ticks(0, 10), ticks(0.9, 120, log=True)
     ([0, 2, 4, 6, 8, 10], [1, 2, 5, 10, 20, 50, 100])
@@ -70,7 +70,7 @@ def _neat(value: float) -> float:
 
 
 class _Axis:
-    """Values to pixels."""
+    """Map from values to pixels."""
 
     def __init__(self, values: Sequence[float], start: float, end: float, *, log: bool) -> None:
         self.log, self._start, self._end = log, start, end
@@ -98,18 +98,18 @@ def chart(
     joined: bool = False,
     front: bool = False,
 ) -> str:
-    """One chart.
+    """Draw a chart.
 
     Args:
         points: the dots.
-        x_label: under the axis.
-        y_label: beside it.
-        log: whether x is logarithmic.
-        joined: whether dots of one series and mark are joined by a line.
-        front: whether the Pareto front (left and up is better) is drawn.
+        x_label: label of the x axis.
+        y_label: label of the y axis.
+        log: use a logarithmic x axis.
+        joined: connect dots of one series and mark.
+        front: draw the Pareto front (left and up is better).
 
     Returns:
-        An <svg> element; "" where there is no point to draw.
+        An <svg> element; "" if there is no point to draw.
     """
     points = [p for p in points if math.isfinite(p.y) and math.isfinite(p.x) and (p.x > 0 or not log)]
     if not points:
@@ -146,7 +146,7 @@ def _grid(x: _Axis, y: _Axis) -> list[str]:
 
 
 def _short(value: float) -> str:
-    """1500000 → 1.5M: counts and seconds alike."""
+    """Abbreviate a count or duration: 1500000 → 1.5M."""
     for size, unit in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
             return f"{value / size:g}{unit}"
@@ -164,7 +164,7 @@ def _caption(x_label: str, y_label: str) -> str:
 
 
 def _front(points: Sequence[Point], x: _Axis, y: _Axis) -> str:
-    """A staircase: between two points of the front, the left one is still the best."""
+    """Draw the front as a staircase: between two points the left one is still the best."""
     corners = [f"{x(points[0].x):.1f},{y(points[0].y):.1f}"]
     for before, after in pairwise(points):
         corners.append(f"{x(after.x):.1f},{y(before.y):.1f}")
@@ -200,7 +200,7 @@ def _dot(point: Point, x: float, y: float) -> str:
 
 
 def _names(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
-    """Labels beside their dots, best first; one that would cover another is left to hovering."""
+    """Place labels beside their dots, best first; skip labels that would overlap another."""
     out: list[str] = []
     taken: list[tuple[float, float, float]] = []
     for point in sorted((p for p in points if p.label), key=lambda p: -p.y):

@@ -1,4 +1,4 @@
-"""Reports of a distillation: the page, the page of a run in tiles, and the before/after picture."""
+"""Pages and the preview picture of a distillation, also of one in tiles."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from g2ard.scene.targets import Targets
 
 _VIEWS = 6
 _STRETCHES = 25
-"""Of the loss: single views differ more than steps do."""
+"""Segments of the loss curve, averaged because views differ more than steps."""
 
 _PREVIEWED = 3
-"""Rows of the before/after picture."""
+"""Rows of the preview picture."""
 
 _STAGES = ("simplified", "recovered")
 
@@ -41,26 +41,26 @@ def distill_report(
     told: Sequence[str] = (),
     crops: Sequence[Crop] = (),
 ) -> None:
-    """Write an HTML page about one run: error against seconds and count, the loss, worst views first.
+    """Write the HTML page of one run: error against time and count, the loss, and views in order of error.
 
-    Views that crops name come before those.
+    Views with crops come first.
 
     Args:
-        path: the file.
-        title: of the page.
+        path: output file.
+        title: title of the page.
         scenes: (name, scene) of `simplified` and `recovered`, as `report["scores"]` names them.
         targets: held-out photos or teacher renders.
         report: what `g2ard distill` writes as report.json.
         background: RGB behind the scenes.
-        told: what the command says of the run: what was kept, where it lost, what no view saw.
-        crops: what to magnify; where a view has none, where it is worst.
+        told: summary lines that the command prints.
+        crops: regions to magnify; by default the worst regions of each view.
 
     Raises:
-        InputError: a crop of a view that is not among the targets'.
+        InputError: a crop names a view that is not among the targets.
     """
     check_crops(crops, targets.cameras.names)
     against = report["against"]
-    page = Page(title, f"{plural(len(targets.cameras), 'unseen view')} against {against}")
+    page = Page(title, f"{plural(len(targets.cameras), 'held-out view')} against {against}")
     scores, seconds = report["scores"], report["seconds"]
     names = [name for name, _ in scenes]
     took = [seconds["simplify"], seconds["simplify"] + seconds["recover"]]
@@ -91,7 +91,7 @@ def distill_report(
     if apart:
         count = len(apart[names[-1]]["views"])
         page.paragraph(
-            f"Near: {plural(count, 'view')} of another kind, nearer, that recovery did not learn from."
+            f"Near: {plural(count, 'view')} of another kind, nearer to the scene, not used for training."
         )
     for line in told:
         page.paragraph(line)
@@ -113,16 +113,16 @@ def distill_report(
 
 
 def check_crops(crops: Sequence[Crop], names: Sequence[str]) -> None:
-    """Refuse a crop of a view that will not be scored, before anything else is done.
+    """Reject crops of views that are not scored.
 
     Raises:
-        InputError: there is one.
+        InputError: a crop names another view.
     """
     for crop in crops:
         if crop.view is not None and crop.view not in names:
             few = ", ".join(names[:4]) + (", …" if len(names) > 4 else "")
             raise InputError(
-                f"{crop.view} is not among the {plural(len(names), 'view')} that are scored ({few})",
+                f"expected one of the {plural(len(names), 'scored view')} ({few}), got {crop.view}",
                 parameter="crop",
             )
 
@@ -146,7 +146,7 @@ def _error_charts(
 
 
 def _loss_charts(rounds: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
-    """The last recovery's."""
+    """Draw the loss of the last recovery."""
     runs = [run for entry in rounds for run in entry.get("recover", [])]
     if not runs or not runs[-1]["loss"]:
         return []
@@ -160,15 +160,15 @@ def _loss_charts(rounds: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
 
 
 def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:
-    """Write an HTML page about one run in tiles.
+    """Write the HTML page of a run in tiles.
 
     Args:
-        path: the file.
-        title: of the page.
-        report: what `g2ard distill` writes of a run in tiles as report.json.
+        path: output file.
+        title: title of the page.
+        report: content of report.json from `g2ard distill` in tiles.
     """
     scores, views = report["scores"], report["views"]
-    unseen, tiles = plural(views["test"], "unseen view"), plural(len(scores["tiles"]), "tile")
+    unseen, tiles = plural(views["test"], "held-out view"), plural(len(scores["tiles"]), "tile")
     page = Page(title, f"{unseen} against teacher renders, in {tiles}")
     page.table(
         ["scene", "Gaussians", "PSNR"],
@@ -177,13 +177,14 @@ def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:
     )
     page.paragraph(
         f"From {plural(report['input_count'], 'Gaussian')}, in {report['seconds']['total']:,.0f} s and "
-        f"{scores['steps']:,} steps of recovery, those of all tiles summed; {plural(views['train'], 'view')} "
-        f"to learn from. PSNR is over the {scores['pixels']:,} pixels that tiles own."
+        f"{scores['steps']:,} recovery steps of all tiles together; "
+        f"{plural(views['train'], 'training view')}. "
+        f"PSNR is over the {scores['pixels']:,} pixels owned by tiles."
     )
     shown = [tile for tile in scores["tiles"] if tile["pixels"]]
     page.html(legend(_STAGES))
     page.charts([("Error of each tile against its Gaussians", _tile_chart(shown))])
-    page.heading("Tiles, the worst first")
+    page.heading("Tiles, worst first")
     page.table(
         ["tile", "Gaussians", "simplified, dB", "recovered, dB", "steps", "pixels"],
         [
@@ -199,7 +200,7 @@ def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:
         set(),
     )
     if others := len(scores["tiles"]) - len(shown):
-        page.paragraph(f"No held-out view has a pixel that is owned by the {plural(others, 'other tile')}.")
+        page.paragraph(f"The {plural(others, 'other tile')} own no pixel in a held-out view.")
     page.write(path)
 
 
@@ -221,7 +222,7 @@ def preview(
     """Write a PNG with a row for each of three evenly spaced views: target, then each scene with its PSNR.
 
     Args:
-        path: where the PNG goes.
+        path: output file.
         targets: photos or teacher renders with their cameras.
         scenes: (label, scene), left to right after the target.
         background: RGB behind the scenes.

@@ -1,4 +1,4 @@
-"""The page: its style, its script, and images that are stored once however often they are shown."""
+"""HTML page with style and script; each image is stored once and can be shown several times."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from g2ard.scene.images import to_bytes
 
 COLORS = ("#2563eb", "#d97706", "#059669", "#db2777", "#7c3aed", "#64748b", "#0891b2", "#b91c1c", "#65a30d")
 _WINDOW, _CROPS = 0.28, 2
-"""Side of a crop where a view is worst, as a share of the image's, and how many of them."""
+"""Side of an automatic crop as a share of the image's, and number of crops."""
 
 _LONGEST = 640
 _QUALITY = 86
@@ -27,7 +27,7 @@ _QUALITY = 86
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """One rendering of a view: what made it, its picture and its figure."""
+    """One rendering of a view: its method, image and caption."""
 
     name: str
     image: NDArray[np.uint8]
@@ -36,8 +36,10 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A view as it should be and as several methods show it; the first of them is the one looked at. Without
-    `crops` those are magnified where it is worst."""
+    """A view's target and its renderings by several methods, the first of which is shown initially.
+
+    Without `crops`, the worst regions of the first rendering are magnified.
+    """
 
     title: str
     target: NDArray[np.uint8]
@@ -46,7 +48,7 @@ class Comparison:
 
 
 def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> list[Window]:
-    """The windows that differ most, worst first, none of which overlap.
+    """Return the windows with the largest error, worst first, without overlaps.
 
     Args:
         image: (H, W, 3).
@@ -75,7 +77,7 @@ def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> list[W
 
 
 class Page:
-    """An HTML page that grows section by section and is written whole."""
+    """An HTML page built section by section and written atomically."""
 
     def __init__(self, title: str, subtitle: str = "") -> None:
         self._title = title
@@ -83,19 +85,16 @@ class Page:
         self._images: list[str] = []
 
     def html(self, text: str) -> None:
-        """Add markup as it is."""
+        """Add markup unescaped."""
         self._parts.append(text)
 
     def heading(self, text: str, level: int = 2) -> None:
-        """Add a heading."""
         self._parts.append(f"<h{level}>{escape(text)}</h{level}>")
 
     def paragraph(self, text: str) -> None:
-        """Add a paragraph."""
         self._parts.append(f"<p>{escape(text)}</p>")
 
     def items(self, lines: Sequence[str]) -> None:
-        """Add a list."""
         self._parts.append(f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>")
 
     def table(
@@ -125,7 +124,7 @@ class Page:
         self._parts.append(f'<div class="row">{"".join(figures)}</div>')
 
     def figure(self, image: NDArray[np.uint8], caption: str) -> None:
-        """Add a picture, up to twice as wide as others: it is of two."""
+        """Add a wide picture, up to twice the usual width."""
         number, text = self._image(image, 2 * _LONGEST), escape(caption)
         self._parts.append(
             f'<figure class="wide"><img data-i="{number}" alt="{text}">'
@@ -133,9 +132,9 @@ class Page:
         )
 
     def comparison(self, view: Comparison) -> None:
-        """Add a view: a slider between target and any rendering, and the same crops of each, magnified.
+        """Add a view: a slider between the target and any rendering, and magnified crops of each.
 
-        The crops are cut from the images as they are given; the rest is shrunk.
+        Crops keep the resolution of the given images; whole images are shrunk.
         """
         target = self._image(view.target)
         numbers = [self._image(shown.image) for shown in view.shown]
@@ -185,10 +184,10 @@ class Page:
         return len(self._images) - 1
 
     def text(self) -> str:
-        """The whole page."""
+        """Return the HTML of the page."""
         colors = "".join(
             f".s{i}{{--c:{color}}}" for i, color in enumerate(COLORS)
-        )  # one class a series, in charts and legends
+        )  # one class per series, for charts and legends
         images = json.dumps(self._images)
         return (
             '<!doctype html><html lang="en"><head><meta charset="utf-8">'
@@ -200,13 +199,13 @@ class Page:
         )
 
     def write(self, path: Path) -> None:
-        """Write the page, whole or not at all, over what is there."""
+        """Write the page atomically, replacing an existing file."""
         with atomic_output(path, overwrite=True) as temporary:
             temporary.write_text(self.text(), encoding="utf-8", newline="\n")
 
 
 def legend(series: Sequence[str], marks: Sequence[str] = ()) -> str:
-    """Which colour is which method, and which shape which budget."""
+    """Return the legend of colours (methods) and shapes (budgets)."""
     shapes = ("●", "■", "◆", "▲")
     items = [
         f'<span><i class="s{i % len(COLORS)}"></i>{escape(name)}</span>' for i, name in enumerate(series)

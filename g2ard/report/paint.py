@@ -1,4 +1,4 @@
-"""What simplification sees, painted on the scene: protection flags, locality cells, and where rows went."""
+"""Scenes painted by what simplification computes: protection flags, locality cells and parents."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from g2ard.scene.splats import SH_C0, Splats
 _FLAGGED = np.array([0.93, 0.33, 0.10])
 _PLAIN = np.array([0.55, 0.60, 0.66])
 _GONE = np.array([0.06, 0.06, 0.06])
-"""Of rows that went nowhere: dropped, or trimmed."""
+"""Colour of rows that were dropped or trimmed."""
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 _SHADE = 0.45
-"""How much of a paint's brightness is the scene's own, so that its shape stays legible."""
+"""Share of the brightness taken from the scene, so that its shape stays visible."""
 
 _GOLDEN = 0.6180339887498949
 
 
 def painted(splats: Splats, colors: ArrayLike) -> Splats:
-    """The scene in other colours, alike from every side, shaded by the luma of its own.
+    """Recolour a scene, view-independently, shaded by the luma of its own colours.
 
     Args:
         splats: N Gaussians.
@@ -50,14 +50,14 @@ def painted(splats: Splats, colors: ArrayLike) -> Splats:
 
 
 def flag_colors(flags: ArrayLike) -> NDArray[np.float64]:
-    """(N, 3) colours of (N,) protection flags: orange where p_i = 1 (eq. `frequency`), else grey."""
+    """Return (N, 3) colours of (N,) protection flags: orange if p_i = 1 (eq. `frequency`), otherwise grey."""
     return np.where(np.asarray(flags, bool)[:, None], _FLAGGED, _PLAIN)
 
 
 def label_colors(labels: ArrayLike) -> NDArray[np.float64]:
-    """(N, 3) colours of (N,) labels: each its own hue, nearly black below 0.
+    """Return (N, 3) colours of (N,) labels: one hue per label, nearly black for negative labels.
 
-    Hues go round by the golden ratio, so that labels in sequence differ; labels far apart may look alike.
+    Hues advance by the golden ratio, so consecutive labels differ; distant labels may look alike.
 
     >>> np.unique(label_colors([0, 1, 1, -1]), axis=0).shape
     (3, 3)
@@ -71,24 +71,25 @@ def label_colors(labels: ArrayLike) -> NDArray[np.float64]:
 
 
 def cell_labels(splats: Splats, count: int) -> NDArray[np.int64]:
-    """The locality cell of every Gaussian: adaptive voxels, about `count` of them occupied (`tab:s_config`).
+    """Return the locality cell of each Gaussian: adaptive voxels, about `count` of them occupied
+    (`tab:s_config`).
 
-    They are the cells of `simplify.flag` for a budget of `count`. A Gaussian beyond the lattice is a
-    cell of its own.
+    They are the cells of `simplify.flag` for a budget of `count`. A Gaussian outside the lattice gets a cell
+    of its own.
 
     Args:
         splats: N Gaussians, all of them finite.
-        count: of cells, N_S in the paper.
+        count: number of cells, N_S in the paper.
 
     Returns:
-        (N,) cells numbered from 0, in no order that means anything.
+        (N,) cell numbers from 0, in arbitrary order.
 
     Raises:
         InputError: no Gaussian, or a count below 1.
     """
     if count < 1 or not len(splats):
         raise InputError(
-            f"{count} of {len(splats)} Gaussians: expected at least one of each", parameter="cells"
+            f"expected at least one cell and one Gaussian, got {count} and {len(splats)}", parameter="cells"
         )
     means = splats.means.astype(np.float64)
     origin, radius = _frame(means)
@@ -102,7 +103,7 @@ def cell_labels(splats: Splats, count: int) -> NDArray[np.int64]:
 
 
 def _frame(means: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Middle and half-width of the lattice's cube, as the core's `Frame`: order statistics of each axis."""
+    """Return the centre and half-width of the lattice's cube, as in the core's `Frame`."""
     last = len(means) - 1
     ranks = np.sort(means, axis=0)
     low, middle, high = (ranks[rank] for rank in (last // 100, last // 2, last - last // 100))

@@ -1,4 +1,4 @@
-"""A registration's report: every photo in a table, and renders laid on the photos they were aligned with."""
+"""Report of a registration: a table of all photos, and renders compared with the photos."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from g2ard.scene.images import load_image, to_bytes
 from g2ard.scene.splats import Splats
 
 _VIEWS, _SIZE = 12, 640
-"""Photos shown, and pixels of the longer side of their pictures."""
+"""Number of photos shown, and the longer side of their images in pixels."""
 
 _LINES = 80
 """Matches drawn per photo."""
@@ -39,18 +39,18 @@ def registration_report(
     told: Sequence[str] = (),
     background: Colour = BLACK,
 ) -> None:
-    """Write an HTML page about one registration, the least alike photos first.
+    """Write the HTML page of a registration, least similar photos first.
 
     Args:
-        path: the file.
-        title: of the page.
-        scene: that the photos were registered against.
+        path: output file.
+        title: title of the page.
+        scene: the scene that the photos were registered against.
         photos: C views with photos.
         rows: C `PhotoReport`s, in the same order.
-        starts: name → (4, 4) camera_from_world, shown beside what was found.
+        starts: name → (4, 4) camera_from_world, shown beside the result.
         matches: name → (M, 4) of `Registered`, drawn between photo and render.
-        side: pixels of the longer side that they count.
-        told: what the command says of the run.
+        side: longer side in pixels of the images that `matches` refer to.
+        told: summary lines that the command prints.
         background: RGB behind the scene.
     """
     page = Page(title, f"{plural(len(photos), 'photo')} against {plural(len(scene), 'Gaussian')}")
@@ -69,9 +69,9 @@ def registration_report(
         try:
             photo = to_bytes(load_image(one, 0))
         except InputError:
-            continue  # gone since it was registered
+            continue  # deleted since it was registered
         found = renderer.image(replace(one[0], viewmat=np.array(row.camera_from_world)))
-        alike = "kept where it started" if row.zncc is None else f"ZNCC {row.zncc:.2f}"
+        alike = "kept at its start" if row.zncc is None else f"ZNCC {row.zncc:.2f}"
         shown = [Shown("found", to_bytes(found), alike)]
         if row.name in starts:
             shown.append(Shown("start", to_bytes(renderer.image(replace(one[0], viewmat=starts[row.name])))))
@@ -80,19 +80,19 @@ def registration_report(
             scale = photo.shape[1] / photos.take([i]).resized(side)[0].width
             drawn = matches_drawn(photo, to_bytes(found), matches[row.name] * scale)
             told_of = plural(len(matches[row.name]), "match", "matches")
-            page.figure(drawn, f"{told_of} that the pose explains; lines of at most {_LINES}")
+            page.figure(drawn, f"{told_of} explained by the pose; at most {_LINES} are drawn")
     page.write(path)
 
 
 def matches_drawn(
     photo: NDArray[np.uint8], render: NDArray[np.uint8], matches: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """Photo and render side by side, (H, 2 W, 3), and a line from each pixel to the one it matches.
+    """Draw photo and render side by side, (H, 2 W, 3), with a line for each match.
 
     Args:
         photo: (H, W, 3).
         render: likewise.
-        matches: (M, 4) pixels of both.
+        matches: (M, 4) matching pixels (u, v) of photo and render.
     """
     from PIL import Image, ImageDraw
 
@@ -100,7 +100,7 @@ def matches_drawn(
     pen, width = ImageDraw.Draw(pair), photo.shape[1]
     every = max(1, -(-len(matches) // _LINES))
     for k, (u, v, u_seen, v_seen) in enumerate(matches[::every].tolist()):
-        colour = f"hsl({137 * k % 360}, 90%, 55%)"  # turned by the golden angle: neighbours differ
+        colour = f"hsl({137 * k % 360}, 90%, 55%)"  # steps of the golden angle, so neighbours differ
         pen.line((u, v, width + u_seen, v_seen), fill=colour)
         for x, y in ((u, v), (width + u_seen, v_seen)):
             pen.ellipse((x - 2, y - 2, x + 2, y + 2), outline=colour)

@@ -9,10 +9,10 @@ from g2ard.errors import InputError
 
 @dataclass(frozen=True)
 class Window:
-    """A rectangle of an image, in shares of its width and height.
+    """A rectangle of an image, as fractions of its width and height.
 
     Raises:
-        InputError: it is empty, or reaches beyond the image.
+        InputError: it is empty or extends beyond the image.
 
     >>> Window(0.25, 0.5, 0.25, 0.25).pixels(100, 200)
     (slice(50, 75, None), slice(50, 100, None))
@@ -32,18 +32,18 @@ class Window:
             )
 
     def pixels(self, height: int, width: int) -> tuple[slice, slice]:
-        """Rows and columns of an image of that size; at least one of each."""
+        """Return the rows and columns in an image of that size, at least one of each."""
         rows = _span(self.top, self.height, height)
         return rows, _span(self.left, self.width, width)
 
 
 @dataclass(frozen=True)
 class Crop:
-    """A window that was asked for.
+    """A requested window.
 
     Args:
-        window: where.
-        view: in which view; None means in all that are shown.
+        window: the window.
+        view: name of the view; None means every view shown.
     """
 
     window: Window
@@ -51,10 +51,10 @@ class Crop:
 
     @classmethod
     def parse(cls, text: str) -> Crop:
-        """Read [VIEW:]LEFT,TOP,WIDTH,HEIGHT.
+        """Parse [VIEW:]LEFT,TOP,WIDTH,HEIGHT.
 
         Raises:
-            InputError: it is not four numbers that make a window.
+            InputError: not four numbers that form a window.
 
         >>> Crop.parse("a:b.jpg:0,0,.5,.5")
         Crop(window=Window(left=0.0, top=0.0, width=0.5, height=0.5), view='a:b.jpg')

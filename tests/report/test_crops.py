@@ -90,7 +90,7 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
     assert {image.shape[:2] for image in images_of(html)} == {(36, 48), (18, 24), (9, 24)}
     status, _, err = command_line(*common, "--crop", "moon:0,0,1,1", "-o", "none", cwd=tmp_path)
     assert (status, "Traceback" in err) == (1, False)
-    assert "--crop: moon is not among the 2 views that are scored (view_000, view_008)" in err
+    assert "--crop: expected one of the 2 scored views (view_000, view_008), got moon" in err
     assert not (tmp_path / "none").exists()
     assert command_line(*common, "--crop", "9,9,9,9", "-o", "none", cwd=tmp_path)[0] == 2
 

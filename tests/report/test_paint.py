@@ -33,7 +33,7 @@ def test_cells_are_the_cores() -> None:
         assert np.median(apart) < 0.3 * cells.size  # their centres are weighed by mass
     lone = cell_labels(both, 300)[-2:]
     assert lone[0] != lone[1]  # beyond the lattice each is a cell of its own
-    with pytest.raises(InputError, match="cells: 0 of 4000"):
+    with pytest.raises(InputError, match="got 0 and 4000"):
         cell_labels(ball, 0)
 
 
@@ -115,7 +115,7 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
         (["--color", "parents", "--parents", "nowhere.npy"], 1, "nowhere.npy"),
         (["--color", "parents", "--parents", "views.json"], 1, "not an array"),
         (["--color", "parents", "--parents", "few.npy"], 1, "expected 90 whole numbers"),
-        (["--color", "flags", "-n", "91"], 1, "above its 90"),
+        (["--color", "flags", "-n", "91"], 1, "at most its 90 Gaussians, got 91"),
     ],
 )
 def test_bad_input_is_one_line(

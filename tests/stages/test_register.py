@@ -355,4 +355,4 @@ def test_what_keeps_its_start_is_in_the_report(site: Path, command_line: Command
     result = json.loads(out)
     assert any(row["zncc"] is None for row in result["photos"])
     assert (result["settings"]["register.passes"], result["config"]["keep"]) == (1, "all")
-    assert "kept where it started" in (tmp_path / "page.html").read_text()
+    assert "kept at its start" in (tmp_path / "page.html").read_text()

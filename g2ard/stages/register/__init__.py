@@ -1,4 +1,4 @@
-"""Photos registered against a scene: where was each of them taken?"""
+"""Registration of photos: estimating camera poses against a scene."""
 
 from __future__ import annotations
 
@@ -42,8 +42,10 @@ __all__ = [
 
 Float = NDArray[np.float64]
 _FEATURES_COUNT = 0.05
-"""By how much less alike a pose that features bear out may be than one that they do not: likeness tells poses
-that are wrong by metres, features those that are wrong by decimetres."""
+"""Bonus in likeness for a pose confirmed by features.
+
+Likeness detects poses that are wrong by metres, features those that are wrong by decimetres.
+"""
 
 
 def register(
@@ -58,53 +60,54 @@ def register(
     background: Sequence[float] = BLACK,
     progress: Progress = silent,
 ) -> Registered:
-    """Find the poses of photos by features and direct alignment with renders of the scene.
+    """Estimate the poses of photos by features and by direct alignment with renders of the scene.
 
-    A photo starts from its own pose in `starts`: matches with a render there, lifted by its depth, give a
-    pose by PnP, repeated and refined (`g2ard.stages.register.solve`). Where there are too few, it is aligned
-    directly, coarse to fine (`g2ard.stages.register.align`), and where that ends in doubt once more, turned
-    to where a small render lies best on the photo. Without a pose it starts from the `candidates` poses of
-    `pool` whose renders at `pool_size` pixels, turned alike, are most like it: from the one with the most
-    inliers, or by alignment from each. The result with the highest median local ZNCC is kept, and that
-    decides what it is worth.
-    A photo that cannot be read is refused like any other: the rest goes on.
+    A photo starts from its pose in `starts`. Matches with a render at that pose, lifted by the render's
+    depth, give a new pose by PnP; this is repeated and refined (`g2ard.stages.register.solve`). If there are
+    too few matches, the photo is aligned directly, coarse to fine (`g2ard.stages.register.align`). If the
+    result is doubtful, alignment is tried again from the start rotated so that a small render fits best.
+
+    A photo without a pose starts from the `candidates` poses of `pool` whose renders at `pool_size` pixels,
+    rotated likewise, are most similar: by features from the pose with the most inliers, or by alignment from
+    each. The result with the highest median local ZNCC is kept, and the ZNCC decides its status.
+    An unreadable photo gets status "refused"; the others are still registered.
 
     Args:
-        scene: the Gaussians; its offset counts, poses are in world coordinates.
-        photos: C views with photos, K, size and distortion; their poses do not count.
+        scene: the scene; poses are in world coordinates, including its offset.
+        photos: C views with photos, K, size and distortion; their poses are ignored.
         starts: name → (4, 4) camera_from_world.
-        pool: poses to start from where `starts` has none.
-        truth: name → (4, 4) camera_from_world, to score with; it decides nothing.
+        pool: starting poses for photos that are not in `starts`.
+        truth: name → (4, 4) camera_from_world, used only for scoring.
         config: see `RegisterConfig`.
-        keep: "registered", "uncertain" to keep those as well, or "all", where a photo without a pose found
-            keeps its starting pose.
+        keep: which poses to keep: "registered", "uncertain" (both), or "all", which falls back to the
+            starting pose.
         background: RGB behind the scene.
-        progress: told of every photo.
+        progress: called after every photo.
 
     Returns:
-        A `Registered`: the kept cameras, and a report on all photos.
+        The kept cameras, and a report on all photos.
 
     Raises:
-        InputError: no photos, another `keep`, no pose to start any photo from, a pose that is none, or a
-            matcher that is none.
-        MissingDependencyError: a matcher is asked for without the extra `register`.
+        InputError: no photos, an unknown `keep`, no starting pose or pool, an invalid pose, or an unknown
+            matcher.
+        MissingDependencyError: a matcher is requested but the extra `register` is not installed.
 
     >>> from g2ard.scene.cameras import Camera
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
     >>> view = Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0], name="a.png")])
     >>> report = register(dot, view, starts={"a.png": view.viewmats[0]}).report
     >>> report.photos[0].status, report.photos[0].reason
-    ('refused', 'view 0 (a.png) has no photo: its views name no image for it; give views with photos')
+    ('refused', 'view 0 (a.png) has no photo; give views with photos')
     """
     config = config or RegisterConfig()
     if not len(photos):
-        raise InputError("photos: there are none")
+        raise InputError("no photos to register")
     if keep not in KEPT:
         raise InputError(f"expected {', '.join(KEPT)}, got {keep!r}", parameter="keep")
     given = _poses("starts", starts, photos)
     true = _poses("truth", truth, photos)
     if not given and pool is None:
-        raise InputError("no photo has a pose, and there is no pool to look for one in", parameter="starts")
+        raise InputError("no photo has a starting pose; pass starting poses or a pool", parameter="starts")
     renderer = Renderer(scene, background=background)
     renders = None if pool is None else PoolRenders(renderer, pool, config)
     search = Search(renderer, config, matcher_named(config.matcher, config.ratio, config.features))
@@ -133,7 +136,7 @@ def _rows(matrix: Float) -> tuple[tuple[float, ...], ...]:
 
 
 def _poses(what: str, poses: Mapping[str, ArrayLike] | None, photos: Cameras) -> dict[str, Float]:
-    """The poses of those photos that have one."""
+    """Return the poses of the photos that have one."""
     out = {}
     for name in photos.names:
         if poses and name in poses:
@@ -153,7 +156,7 @@ def _one(
     pool: PoolRenders | None,
     true: Float | None,
 ) -> tuple[PhotoReport, Candidate | None]:
-    """One photo from whatever it can start from."""
+    """Register one photo from its pose or the pool."""
     name = photos.names[index]
     start_error = None if given is None or true is None else PoseError(*pose_error(given.pose, true))
     refused = PhotoReport(name, "refused", start=given.name if given else None, start_error=start_error)
@@ -171,9 +174,9 @@ def _one(
         candidates = _from_pool(search, pool, photo)
     renders = search.renders
     if not candidates:
-        why = "the scene is out of the starting pose's sight"
+        why = "the starting pose does not see the scene"
         if not search.config.fallback:
-            why = f"fewer than {search.config.min_inliers} matches bear a pose out"
+            why = f"fewer than {search.config.min_inliers} matches confirm a pose"
         return replace(refused, reason=why, renders=renders), None
     best = max(candidates, key=lambda c: c.zncc + (_FEATURES_COUNT if c.solved else 0))
     row = _reported(name, best, search.config, renders)
@@ -185,7 +188,7 @@ def _one(
 
 
 def _from_pose(search: Search, given: Start, photo: Photo) -> list[Candidate]:
-    """Features from the pose; in doubt alignment; in doubt alignment turned; then features from its end."""
+    """Try features, then alignment, then alignment from a rotated start, then features from the result."""
     config = search.config
 
     def accepted(found: list[Candidate]) -> bool:
@@ -207,7 +210,7 @@ def _from_pose(search: Search, given: Start, photo: Photo) -> list[Candidate]:
 
 
 def _from_pool(search: Search, pool: PoolRenders, photo: Photo) -> list[Candidate]:
-    """The likest poses: features from the one they bear out best, else alignment from each."""
+    """Try features from the pose with the most inliers, otherwise alignment from each similar pose."""
     order, renders = pool.ranked(*photo.small)
     search.renders += renders
     starts = [
@@ -226,7 +229,7 @@ def _from_pool(search: Search, pool: PoolRenders, photo: Photo) -> list[Candidat
 
 
 def _featured(search: Search, aligned: list[Candidate], photo: Photo) -> list[Candidate]:
-    """Features from the likest of what alignment found, unless that is nothing."""
+    """Try features from the most similar aligned pose, unless its status would be refused."""
     best = max(aligned, key=lambda c: c.zncc, default=None)
     if best is None or best.zncc < min(search.config.doubt, search.config.accept):
         return []
@@ -269,7 +272,7 @@ _HALVES = (slice(0, 3), slice(3, 6))
 def _status(
     zncc: float, sigma: PoseError | None, depth: float, config: RegisterConfig
 ) -> tuple[Status, str | None]:
-    """What a result is worth, and why it is worth no more."""
+    """Return the status of a result and the reason."""
     if sigma is None:
         return "refused", "the photo does not determine the pose"
     if zncc < min(config.doubt, config.accept):
@@ -277,7 +280,7 @@ def _status(
     if zncc < config.accept:
         return "uncertain", f"render and photo differ: ZNCC {zncc:.2f}"
     if sigma.rotation > config.max_angle_sigma:
-        return "uncertain", f"the rotation is known to {sigma.rotation:.2g}° only"
+        return "uncertain", f"the rotation is only known to {sigma.rotation:.2g}°"
     if sigma.position > config.max_position_sigma * depth:
-        return "uncertain", f"the position is known to {sigma.position / depth:.2g} of the depth only"
+        return "uncertain", f"the position is only known to {sigma.position / depth:.2g} of the depth"
     return "registered", None

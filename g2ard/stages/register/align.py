@@ -1,10 +1,13 @@
-"""Direct alignment: the pose at which a render explains a photo, up to a gain and a bias.
+"""Direct alignment: the pose at which a render explains a photo, up to gain and bias.
 
-The photo P and the render R at camera_from_world T obey P(x) = g·R(x) + b. Moving the camera to exp(ξ)T moves
-the image of the point X (in the camera's axes) by ∂π/∂X · (v + ω × X), so to first order
-P − g·R − b = −∇I · ∂π/∂X · [I | −[X]ₓ] · ξ, with ∇I the mean of g·∇R and ∇P (efficient second-order
-minimisation: Malis 2004; Benhimane and Malis 2004). ξ, the change of g and that of b are solved together,
-under Tukey's weights; the scene is then rendered anew.
+The photo P and the render R at camera_from_world T satisfy P(x) = g·R(x) + b. Moving the camera to exp(ξ)T
+moves the image of the point X (in the camera's axes) by ∂π/∂X · (v + ω × X), so to first order
+
+P − g·R − b = −∇I · ∂π/∂X · [I | −[X]ₓ] · ξ,
+
+where ∇I is the mean of g·∇R and ∇P (efficient second-order minimisation: Malis 2004; Benhimane and Malis
+2004). ξ and the changes of g and b are solved together with Tukey's weights, then the scene is rendered
+again.
 """
 
 from __future__ import annotations
@@ -25,15 +28,15 @@ Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _DAMPING = 1e-6
-"""Added to the normal equations' diagonal, relatively."""
+"""Relative damping added to the diagonal of the normal equations."""
 _HALVINGS = 3
 _COARSER = 10
-"""`still` of every level but the finest: the next one looks more closely."""
+"""Factor on `still` for all levels but the finest."""
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """A photo at one size: (H, W) float64 grey, blurred; its gradients; its pixels that count."""
+    """A photo at one size: (H, W) float64 blurred grey, its gradients, and the mask of valid pixels."""
 
     grey: Float
     right: Float
@@ -43,12 +46,12 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A render as alignment needs it, at one pose.
+    """A render prepared for alignment.
 
     Args:
-        grey: (H, W) float64, blurred as the photo is.
-        depth: (H, W) float64 scene units, the expected depth; 1 where nothing counts.
-        mask: (H, W) opaque enough, and not beside an edge of depth.
+        grey: (H, W) float64, blurred like the photo.
+        depth: (H, W) float64 scene units, the expected depth; 1 outside the mask.
+        mask: (H, W) True where it is opaque enough and not next to a depth edge.
     """
 
     grey: Float
@@ -63,8 +66,8 @@ class Normal:
     Args:
         matrix: (8, 8).
         right: (8,).
-        scale: σ of the residuals, by their median absolute deviation.
-        cost: mean of Tukey's ρ(r/σ) over the pixels that count, in [0, 1].
+        scale: σ of the residuals, from their median absolute deviation.
+        cost: mean of Tukey's ρ(r/σ) over valid pixels, in [0, 1].
         weights: Σ w.
     """
 
@@ -77,17 +80,17 @@ class Normal:
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """What alignment found.
+    """Result of alignment.
 
     Args:
         viewmat: (4, 4) camera_from_world.
-        gain: of the render's grey.
-        bias: added to it.
-        covariance: (6, 6) of ξ = (v, ω) about the result, in the camera's axes: (JᵀWJ)⁻¹·σ²·`correlated`,
-            gain and bias marginalised; None where the photo does not determine the pose.
-        overlap: share of the pixels that count.
-        steps: renders at all levels.
-        depth: median depth of what counts, scene units.
+        gain: factor on the render's grey.
+        bias: offset added to it.
+        covariance: (6, 6) of ξ = (v, ω) around the result, in the camera's axes: (JᵀWJ)⁻¹·σ²·`correlated`
+            with gain and bias marginalised; None if the photo does not determine the pose.
+        overlap: share of valid pixels.
+        steps: number of renders at all levels.
+        depth: median depth of valid pixels, scene units.
     """
 
     viewmat: Float
@@ -100,35 +103,26 @@ class Aligned:
 
 
 def level_of(grey: Float, mask: Mask | None = None) -> Level:
-    """A grey photo as a level; `mask` (H, W) is true where it counts, None everywhere."""
+    """Prepare a grey photo as a level; `mask` (H, W) marks valid pixels, None means all."""
     soft = blurred(grey)
     return Level(soft, *gradient(soft), np.ones(grey.shape, bool) if mask is None else mask)
 
 
 def shoot(renderer: Renderer, camera: Camera, config: RegisterConfig) -> Shot:
-    """Render one view for alignment; see `Shot`."""
     return shot_of(renderer.render(camera), config)
 
 
 def shot_of(out: Rendered, config: RegisterConfig) -> Shot:
-    """A render for alignment; see `Shot`."""
+    """Convert a render to a `Shot`."""
     return Shot(*_core.shot(out.image, out.alpha, out.depth, config.min_alpha, config.max_edge))
 
 
 def normal_equations(
     photo: Level, shot: Shot, K: Float, gain: float, bias: float, scale: float | None = None
 ) -> Normal:
-    """Weighted normal equations of one step, and the cost before it.
+    """Compute the weighted normal equations of one step, and the cost before it.
 
-    Args:
-        photo: at a size.
-        shot: the render at that size.
-        K: (3, 3) pixels.
-        gain: of the render.
-        bias: added to it.
-        scale: σ of the residuals; None finds it.
-
-    Sums run over pixels in an order of their own: they do not depend on the number of threads.
+    `scale` is σ of the residuals; None estimates it. Results do not depend on the number of threads.
     """
     of_photo = photo.grey, photo.right, photo.down, photo.mask
     matrix, target, *rest = _core.normal_equations(of_photo, _parts(shot), _lens(K), (gain, bias), scale)
@@ -136,7 +130,7 @@ def normal_equations(
 
 
 def moves(shot: Shot, K: Float, xi: Float) -> float:
-    """Root of the mean square, in pixels, of how far ξ moves the pixels that count."""
+    """Return the root mean square motion, in pixels, of the valid pixels under ξ."""
     return _core.flow(_parts(shot), _lens(K), xi.tolist())
 
 
@@ -159,12 +153,11 @@ def align(
     Args:
         renderer: of the scene.
         start: (4, 4) camera_from_world.
-        pyramid: the photo at each level: a camera with that size and K (its pose does not count), and the
-            level.
+        pyramid: the photo at each level: a camera with that size and K (its pose is ignored), and the level.
         config: see `RegisterConfig`.
 
     Returns:
-        An `Aligned`; None where too few pixels count at the start.
+        The aligned pose; None if too few pixels are valid at the start.
     """
     state = Aligned(np.asarray(start, np.float64), 1.0, 0.0, None, 0.0, 0, 0.0)
     for number, (camera, photo) in enumerate(pyramid):
@@ -187,8 +180,11 @@ def _level(
     *,
     fresh: bool,
 ) -> Aligned | None:
-    """Gauss–Newton at one size; a step that costs more is halved; the level ends where that fails, or where a
-    step moves the image by fewer pixels than `enough`."""
+    """Run Gauss–Newton at one size.
+
+    A step that raises the cost is halved. The level ends when that fails, or when a step moves the image by
+    fewer pixels than `enough`.
+    """
 
     def shot_at(viewmat: Float) -> Shot:
         return shoot(renderer, replace(camera, viewmat=viewmat), config)
@@ -240,7 +236,7 @@ def _level(
 
 
 def _light(photo: Level, shot: Shot) -> tuple[float, float]:
-    """Gain and bias that give the render the photo's mean and spread: images need not be aligned for it."""
+    """Return the gain and bias that match the render's mean and spread to the photo's, without alignment."""
     mask = photo.mask & shot.mask
     a, b = shot.grey[mask], photo.grey[mask]
     spread = float(a.std())
@@ -249,7 +245,7 @@ def _light(photo: Level, shot: Shot) -> tuple[float, float]:
 
 
 def _solved(normal: Normal) -> Float | None:
-    """δ of the normal equations, each unknown scaled to a unit diagonal; None where one says nothing."""
+    """Solve the normal equations with unit diagonal scaling; return None if an unknown is undetermined."""
     diagonal = np.diag(normal.matrix)
     if not (np.isfinite(normal.matrix).all() and (diagonal > 0).all()):
         return None
@@ -264,7 +260,7 @@ def _covariance(normal: Normal, correlated: float) -> Float | None:
 
 
 def inverse(matrix: Float) -> Float | None:
-    """Of a symmetric matrix, its unknowns scaled to a unit diagonal; None where it has none."""
+    """Invert a symmetric matrix with unit diagonal scaling; return None if it is singular."""
     diagonal = np.diag(matrix)
     if not (np.isfinite(matrix).all() and (diagonal > 0).all()):
         return None

@@ -1,4 +1,4 @@
-"""What is tried on one photo: poses from features, from direct alignment, and from both."""
+"""Attempts on one photo: poses from features, from direct alignment, and from both."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from g2ard.stages.register.solve import Solved, solve
 
 Float = NDArray[np.float64]
 _FINEST = 2
-"""Levels of direct alignment that a pose from features still needs."""
+"""Finest levels of direct alignment that refine a pose from features."""
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A photo at the sizes that registration looks at.
+    """A photo at the sizes that registration needs.
 
     Args:
-        camera: at `size`; its pose does not count.
-        image: (H, W, 3) there.
-        mask: (H, W) its pixels that count.
+        camera: camera at `size`; its pose is ignored.
+        image: (H, W, 3) at `size`.
+        mask: (H, W) valid pixels.
         pyramid: levels of direct alignment, coarse to fine.
-        small: at the size of the pool's renders.
-        whole: grey at the finest level, without a blur.
+        small: camera and grey image at the size of the pool's renders.
+        whole: unblurred grey at the finest level.
     """
 
     camera: Camera
@@ -46,7 +46,7 @@ class Photo:
 
 @dataclass(frozen=True)
 class Start:
-    """A pose to start from; `turned`, where it is not None, is what is begun with."""
+    """A starting pose; `turned` replaces it as the initial estimate if it is not None."""
 
     pose: Float
     name: str
@@ -55,19 +55,19 @@ class Start:
 
     @property
     def begins(self) -> Float:
-        """(4, 4) camera_from_world."""
+        """The initial estimate, (4, 4) camera_from_world."""
         return self.pose if self.turned is None else self.turned
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A pose found for a photo.
+    """A candidate pose of a photo.
 
     Args:
-        start: what it was found from.
-        found: the pose, its light and covariance.
-        zncc: median local ZNCC of render and photo there.
-        solved: what matches said, None where direct alignment found it alone.
+        start: its starting pose.
+        found: the pose with gain, bias and covariance.
+        zncc: median local ZNCC of render and photo.
+        solved: result of feature matching; None for direct alignment alone.
     """
 
     start: Start
@@ -77,7 +77,7 @@ class Candidate:
 
 
 def loaded(photos: Cameras, index: int, config: RegisterConfig) -> Photo:
-    """Read a photo, once, and shrink it to each size.
+    """Read a photo and shrink it to each size.
 
     Raises:
         InputError: it cannot be read.
@@ -88,7 +88,7 @@ def loaded(photos: Cameras, index: int, config: RegisterConfig) -> Photo:
     everywhere = np.ones(image.shape[:2], bool) if mask is None else mask
     planes = np.stack([grey_of(image), everywhere], 2).astype(np.float32)
     levels: list[_Planes] = []
-    for side in reversed(sizes):  # each from the one before: that is the quickest
+    for side in reversed(sizes):  # each level from the previous one, which is fastest
         levels.insert(0, _shrunk(one, levels[0].planes if levels else planes, side))
     pyramid = [(level.camera, level_of(level.grey, level.mask)) for level in levels]
     small = _shrunk(one, levels[-1].planes, config.pool_size)
@@ -97,7 +97,7 @@ def loaded(photos: Cameras, index: int, config: RegisterConfig) -> Photo:
 
 @dataclass(frozen=True, eq=False)
 class _Planes:
-    """A photo shrunk: (H, W, 2) float32, its grey and the share of each pixel that counts."""
+    """A shrunk photo: (H, W, 2) float32, grey and the valid share of each pixel."""
 
     camera: Camera
     planes: NDArray[np.float32]
@@ -117,12 +117,12 @@ def _shrunk(one: Cameras, planes: NDArray[np.float32], side: int) -> _Planes:
 
 
 class Search:
-    """Attempts at photos of one scene, and how many renders they took.
+    """Attempts on photos of one scene, with a count of renders.
 
     Args:
         renderer: of the scene.
         config: see `RegisterConfig`.
-        match: None is direct alignment alone.
+        match: a matcher; None means direct alignment only.
     """
 
     def __init__(self, renderer: Renderer, config: RegisterConfig, match: Matcher | None) -> None:
@@ -130,19 +130,19 @@ class Search:
         self.renders = 0
 
     def by_alignment(self, start: Start, photo: Photo) -> Candidate | None:
-        """Direct alignment, coarse to fine; None where the scene is out of the start's sight."""
+        """Align directly, coarse to fine; return None if the start does not see the scene."""
         found = self._aligned(start.begins, photo, photo.pyramid)
         if found is not None and self.config.refine == "exact":
             found = self._polished(found, photo, None)
         return None if found is None else Candidate(start, found, self._likeness(found.viewmat, photo))
 
     def by_features(self, start: Start, photo: Photo) -> Candidate | None:
-        """Matches and PnP, then what `refine` says; None where there is no matcher, or too few inliers."""
+        """Match, solve PnP and refine; return None without a matcher or with too few inliers."""
         solved = self.solved(start.begins, photo, self.config.passes)
         return None if solved is None else self._refined(start, solved, photo)
 
     def solved(self, pose: Float, photo: Photo, passes: int) -> Solved | None:
-        """Matches and PnP alone; None likewise."""
+        """Match and solve PnP only; return None like `by_features`."""
         if self.match is None:
             return None
         found = solve(
@@ -152,9 +152,12 @@ class Search:
         return found if found is not None and found.inliers >= self.config.min_inliers else None
 
     def _refined(self, start: Start, solved: Solved, photo: Photo) -> Candidate:
-        """Without refinement, the features' pose; with the photometric one, what alignment makes of it; and
-        with both, the mean of the two weighted by their information: ξ = (Λ_f + Λ_p)⁻¹ Λ_p ξ_p, ξ_p from the
-        first to the second; the exact one polishes that."""
+        """Refine a pose from features as `refine` says.
+
+        "none" keeps it. "photometric" aligns from it. "auto" takes the mean of both weighted by their
+        information: ξ = (Λ_f + Λ_p)⁻¹ Λ_p ξ_p, with ξ_p the motion from the first to the second. "exact"
+        polishes that mean.
+        """
         refine = self.config.refine
         near = self._aligned(solved.viewmat, photo, photo.pyramid[-_FINEST:])
         plain = Aligned(solved.viewmat, 1.0, 0.0, inverse(solved.information), 0.0, 0, solved.depth)
@@ -174,7 +177,7 @@ class Search:
         return Candidate(start, found, self._likeness(found.viewmat, photo), solved)
 
     def _polished(self, start: Aligned, photo: Photo, prior: Prior | None) -> Aligned:
-        """By the exact gradient, at the finest level; the start where that fails."""
+        """Polish by the exact gradient at the finest level; return the start if that fails."""
         found = polish(self.renderer, start, *photo.pyramid[-1], prior, self.config)
         self.renders += 1 if found is None else found.steps
         return start if found is None else found
@@ -185,7 +188,7 @@ class Search:
         return found
 
     def _likeness(self, viewmat: Float, photo: Photo) -> float:
-        """Median local ZNCC at the finest level, without a blur."""
+        """Return the median local ZNCC at the finest level, unblurred."""
         camera, level = photo.pyramid[-1]
         out = self.renderer.render(replace(camera, viewmat=viewmat))
         self.renders += 1

@@ -12,43 +12,42 @@ _POSITIVE = ("max_angle_sigma", "max_position_sigma", "max_edge", "correlated", 
 
 @dataclass(frozen=True)
 class RegisterConfig:
-    """How photos are registered.
+    """Options of registration.
 
     Args:
-        size: pixels of the longer side that features are matched at; photos are shrunk to it.
-        align_size: pixels of the longer side that alignment ends at, and that likeness is judged at, or
-            `size` where that is less.
-        matcher: "auto" (SIFT where the extra `register` is installed, else direct), "sift", "direct", or
+        size: longer side in pixels for matching features; photos are shrunk to it.
+        align_size: longer side in pixels of the finest alignment level, also for likeness; at most `size`.
+        matcher: "auto" (SIFT if the extra `register` is installed, otherwise direct), "sift", "direct", or
             "MODULE:FUNCTION".
-        refine: what follows features: "auto" joins their pose and that of direct alignment, "photometric"
-            takes the second, "none" the first; "exact" goes on from "auto", or from alignment where there
-            are no features, by the exact gradient of renders (`g2ard.stages.register.polish`).
-        passes: of rendering, matching and solving, at most.
-        coarsest: pixels of the longer side that alignment begins at; it doubles from level to level.
-        iterations: at most, at each level.
-        still: the finest level ends when a step moves the image by fewer pixels (root of the mean square), a
-            coarser one at ten times as many.
-        accept: median local ZNCC from which a photo counts as registered.
-        doubt: the same, from which it counts as uncertain; below, it is refused.
-        max_angle_sigma: degrees; a registered photo's rotation is known better than this.
-        max_position_sigma: as a share of the median depth; likewise its position.
-        min_alpha: pixels of the render that hide less of the background than this do not count.
-        max_edge: pixels next to which depth jumps by more than this share of it do not count.
-        min_overlap: share of the pixels that must count, or nothing can be said.
-        window: pixels of the side of ZNCC's windows.
-        candidates: the best poses of a pool, by renders of `pool_size` pixels, that are aligned.
-        pool_size: pixels of the longer side of those renders.
-        correlated: what variances are multiplied by, for neighbouring residuals err alike: set so that
-            errors at 500 pixels are about as large as their σ says, on photos of caliterra and of the city.
-        features: of an image, at most, for SIFT.
-        ratio: SIFT's nearest feature is nearer than this share of the distance to the second nearest.
-        max_reprojection: pixels within which PnP explains a match.
-        min_inliers: matches that PnP must explain for a pose from features to count.
-        fallback: whether alignment is tried where features fail.
-        alike: what the variances of features' poses are multiplied by, as `correlated`.
+        refine: refinement after features: "none" keeps their pose, "photometric" aligns from it, "auto"
+            combines both, "exact" polishes the result (or alignment's) by the exact gradient of renders
+            (`g2ard.stages.register.polish`).
+        passes: most passes of rendering, matching and solving.
+        coarsest: approximate longer side in pixels of the coarsest alignment level; each level doubles it.
+        iterations: most iterations per level.
+        still: the finest level ends when a step moves the image by fewer pixels (root mean square), coarser
+            ones at ten times this.
+        accept: least median local ZNCC for status "registered".
+        doubt: least median local ZNCC for status "uncertain"; below, a photo is "refused".
+        max_angle_sigma: largest σ of the rotation for "registered", degrees.
+        max_position_sigma: largest σ of the position for "registered", as a share of the median depth.
+        min_alpha: render pixels with less alpha are ignored.
+        max_edge: pixels next to a relative depth jump above this are ignored.
+        min_overlap: least share of valid pixels.
+        window: side of ZNCC's windows in pixels.
+        candidates: number of pool poses tried, ranked by renders of `pool_size` pixels.
+        pool_size: longer side of those renders in pixels.
+        correlated: factor on variances, because neighbouring residuals are correlated; calibrated at 500
+            pixels on photos of caliterra and of the city.
+        features: most SIFT features per image.
+        ratio: SIFT's ratio test: largest ratio of the nearest to the second nearest distance.
+        max_reprojection: largest reprojection error of an inlier, pixels.
+        min_inliers: least inliers of a pose from features.
+        fallback: try alignment if features fail.
+        alike: factor on the variances of poses from features, like `correlated`.
 
     Raises:
-        InputError: a value out of its range.
+        InputError: a value out of range.
     """
 
     size: int = 1000
@@ -99,7 +98,7 @@ class RegisterConfig:
         require("pool_size", self.pool_size, self.pool_size >= 16, "at least 16 pixels")
 
     def levels(self) -> list[int]:
-        """Longer sides in pixels, coarse to fine: halves of `align_size` down to `coarsest`.
+        """Return longer sides in pixels, coarse to fine, halving `align_size` down to about `coarsest`.
 
         >>> RegisterConfig().levels(), RegisterConfig(size=40).levels()
         ([31, 62, 125, 250, 500], [40])

@@ -1,4 +1,4 @@
-"""Grey images, their gradients, and how alike two of them are."""
+"""Grey images, their gradients and similarity measures."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ Float = NDArray[np.float64]
 LUMA = np.array([0.299, 0.587, 0.114])
 
 _BAND = 9
-"""Side of the window whose mean `band_passed` removes, pixels."""
+"""Side in pixels of the window whose mean `band_passed` subtracts."""
 
 
 def grey_of(image: NDArray[Any]) -> Float:
-    """(H, W) float64 luma of an (H, W, 3) image, .299 R + .587 G + .114 B."""
+    """Return the (H, W) float64 luma of an (H, W, 3) image, .299 R + .587 G + .114 B."""
     rgb = np.asarray(image, np.float64)
     return rgb[..., 0] * LUMA[0] + rgb[..., 1] * LUMA[1] + rgb[..., 2] * LUMA[2]
 
 
 def blurred(image: Float) -> Float:
-    """Both axes by the binomial (1, 4, 6, 4, 1)/16, σ = 1 pixel; edges are repeated."""
+    """Blur by the binomial (1, 4, 6, 4, 1)/16 along both axes (σ = 1 pixel), repeating edges."""
     for axis in (0, 1):
         pad = np.pad(image, [(2, 2) if i == axis else (0, 0) for i in (0, 1)], mode="edge")
         n = image.shape[axis]
@@ -34,7 +34,7 @@ def blurred(image: Float) -> Float:
 
 
 def blurred_back(slope: Float) -> Float:
-    """dL/d(image) from dL/d(`blurred`), each (H, W): the blur's transpose."""
+    """Return dL/d(image) from dL/d(`blurred`), each (H, W): the transpose of the blur."""
     for axis in (0, 1):
         slope = np.moveaxis(slope, axis, 0)
         n = len(slope)
@@ -48,25 +48,27 @@ def blurred_back(slope: Float) -> Float:
 
 
 def gradient(image: Float) -> tuple[Float, Float]:
-    """∂/∂u (right) and ∂/∂v (down) by central differences, one-sided at the edges; each (H, W)."""
+    """Return ∂/∂u (right) and ∂/∂v (down), (H, W) each: central differences, one-sided at edges."""
     return np.asarray(np.gradient(image, axis=1)), np.asarray(np.gradient(image, axis=0))
 
 
 def box_mean(image: Float, side: int) -> Float:
-    """Mean over the `side`×`side` windows that lie within an (H, W) image, as (H−side+1, W−side+1)."""
+    """Return means over the `side`×`side` windows inside an (H, W) image, as (H−side+1, W−side+1)."""
     sums = np.pad(np.cumsum(np.cumsum(image, 0), 1), ((1, 0), (1, 0)))
     whole = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
     return whole / (side * side)
 
 
 def band_passed(image: Float) -> Float:
-    """Blurred a little less its mean over a window: what neither light nor noise decides; (H, W)."""
+    """Return the (H, W) blurred image minus its local mean, which suppresses lighting and noise."""
     return blurred(image) - box_mean(np.pad(image, _BAND // 2, mode="edge"), _BAND)
 
 
 def zncc(a: Float, b: Float, mask: NDArray[np.bool_]) -> float:
-    """Zero-mean normalised cross-correlation of two (H, W) images over a mask, in [−1, 1]; 0 where either
-    is flat or the mask is empty."""
+    """Return the zero-mean normalised cross-correlation of two (H, W) images over a mask, in [−1, 1].
+
+    It is 0 if either image is flat or the mask is empty.
+    """
     if not mask.any():
         return 0.0
     x, y = a[mask], b[mask]
@@ -76,13 +78,13 @@ def zncc(a: Float, b: Float, mask: NDArray[np.bool_]) -> float:
 
 
 def shift_between(a: Float, b: Float) -> tuple[int, int, float]:
-    """By how many pixels `a` is best moved, right and down, to lie on `b`; and how alike they are then.
+    """Return the shift in pixels (right, down) that best moves `a` onto `b`, and their likeness.
 
-    The likeness is Σ a(x − s)·b(x) / √(Σa²·Σb²): what is moved out of sight counts 0. Moves are at most half
-    an image; of equals the first in order of rows wins.
+    The likeness is Σ a(x − s)·b(x) / √(Σa²·Σb²): pixels shifted out count as 0. Shifts are at most half an
+    image; ties go to the first in row order.
 
     Args:
-        a: (H, W), of mean 0 about, 0 where it does not count.
+        a: (H, W), with mean near 0, and 0 where invalid.
         b: (H, W), likewise.
 
     >>> a = np.zeros((8, 8)); a[2, 3] = 1
@@ -102,19 +104,18 @@ def shift_between(a: Float, b: Float) -> tuple[int, int, float]:
 
 
 def local_zncc(a: Float, b: Float, mask: NDArray[np.bool_], side: int) -> float:
-    """Median ZNCC over windows all of whose pixels count and in which `b` has contrast.
+    """Return the median ZNCC over fully valid windows in which `b` has contrast.
 
-    Local, for light that differs across an image is no error of a pose; where `a` is flat and `b` is not, a
-    window counts 0.
+    Local windows tolerate uneven lighting. A window counts as 0 if `a` is flat and `b` is not.
 
     Args:
         a: (H, W) render, grey.
         b: (H, W) photo, grey.
-        mask: (H, W) pixels that count.
-        side: of a window, pixels, odd.
+        mask: (H, W) valid pixels.
+        side: side of a window in pixels, odd.
 
     Returns:
-        In [−1, 1]; 0 where no window tells.
+        A value in [−1, 1]; 0 without a usable window.
     """
     if min(a.shape) < side:
         return zncc(a, b, mask)

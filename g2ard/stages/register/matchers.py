@@ -1,8 +1,8 @@
-"""Matchers: pixels of a photo and of a render that show the same.
+"""Matchers: corresponding pixels of a photo and a render.
 
 A matcher is a function of two (H, W, 3) float images in [0, 1], the photo and the render, that returns two
-(M, 2) arrays of pixel coordinates (u, v), of which row i shows the same thing. They count from the image's
-corner: the middle of the first pixel is (½, ½), as in COLMAP and in K.
+(M, 2) arrays of pixel coordinates (u, v) whose rows correspond. The origin is the image's corner: the centre
+of the first pixel is (½, ½), as in COLMAP and in K.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ Pairs = tuple[Float, Float]
 Matcher = Callable[[Image, Image], Pairs]
 
 _DOUBLED = 500
-"""Pixels of the longer side up to which SIFT doubles an image: small ones have few features otherwise."""
+"""Longer side in pixels up to which SIFT upsamples an image, because small images have few features."""
 
 _WHEELS = (("linux", "x86_64"), ("darwin", "arm64"), ("win32", "AMD64"))
-"""Where pycolmap has wheels; it has no source distribution, so the extra leaves it out elsewhere."""
+"""Platforms with pycolmap wheels; there is no source distribution, so the extra omits it elsewhere."""
 
 
 def matcher_named(name: str, ratio: float, most: int) -> Matcher | None:
-    """The matcher of a name; None is direct alignment alone.
+    """Return the named matcher; None means direct alignment only.
 
     Args:
-        name: "auto" (SIFT where the extra `register` is installed), "sift", "direct" or "MODULE:FUNCTION".
-        ratio: of `mutual`, for SIFT.
-        most: features of an image, for SIFT.
+        name: "auto" (SIFT if the extra `register` is installed), "sift", "direct" or "MODULE:FUNCTION".
+        ratio: SIFT's ratio test, see `mutual`.
+        most: most SIFT features per image.
 
     Raises:
-        InputError: another name, no such module or function.
-        MissingDependencyError: a matcher is asked for, and pycolmap, which solves for poses, is absent.
+        InputError: an unknown name, module or function.
+        MissingDependencyError: a matcher is requested but pycolmap, which solves for poses, is unavailable.
 
     >>> matcher_named("direct", 0.85, 4096) is None
     True
@@ -64,7 +64,7 @@ def matcher_named(name: str, ratio: float, most: int) -> Matcher | None:
 
 
 def _unusable() -> str:
-    """Why pycolmap cannot be had; nothing where it can."""
+    """Return why pycolmap is unavailable, or ""."""
     if sys.modules.get("pycolmap", ...) is None or find_spec("pycolmap") is None:
         where = (sys.platform, platform.machine())
         no_wheel = "" if where in _WHEELS else f", and has no wheel for {' '.join(where)}"
@@ -72,12 +72,12 @@ def _unusable() -> str:
     try:
         importlib.import_module("pycolmap")
     except Exception as error:
-        return f"pycolmap is installed and cannot be imported: {_told(error)}"
+        return f"pycolmap is installed but cannot be imported: {_told(error)}"
     return ""
 
 
 def _plugged(name: str) -> Matcher:
-    """A user's function; modules are also looked for in the working directory."""
+    """Load a user's function, also from modules in the working directory."""
     module, _, function = name.partition(":")
     path = list(sys.path)
     sys.path.insert(0, os.getcwd())
@@ -105,11 +105,12 @@ def _told(error: BaseException) -> str:
 
 
 def checked_pairs(what: str, pairs: Any, *shapes: tuple[int, ...]) -> Pairs:
-    """Two (M, 2) float64 arrays of what a matcher returned; pairs out of their images are left out, and what
-    follows the two arrays: many matchers also say how sure they are.
+    """Validate a matcher's result and return two (M, 2) float64 arrays.
+
+    Pairs outside the images are dropped, and so are further elements such as confidences.
 
     Raises:
-        InputError: it is something else, or not finite, or all pairs are out of their images.
+        InputError: another type or shape, values that are not finite, or no pair inside the images.
 
     >>> checked_pairs("m", ([[1, 2], [9, 1]], [[3, 1], [0, 0]]), (4, 4, 3), (4, 4, 3))[1].tolist()
     [[3.0, 1.0]]
@@ -125,33 +126,33 @@ def checked_pairs(what: str, pairs: Any, *shapes: tuple[int, ...]) -> Pairs:
     if a.ndim != 2 or a.shape[1:] != (2,) or a.shape != b.shape:
         raise InputError(f"{expected}, got shapes {a.shape} and {b.shape}")
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        raise InputError(f"{expected}, got some that are not finite")
+        raise InputError(f"{expected}, got values that are not finite")
     within = np.ones(len(a), bool)
     for points, (height, width, *_) in zip((a, b), shapes, strict=True):
         within &= ((points >= 0) & (points <= [width, height])).all(1)
     if len(a) and not within.any():
         sizes = " and ".join(f"{width}×{height}" for height, width, *_ in shapes)
-        raise InputError(f"{expected}, got {len(a)} pairs of which none is within the images, {sizes}")
+        raise InputError(f"{expected}, got {len(a)} pairs, none of them within the images ({sizes})")
     return a[within], b[within]
 
 
 class Sift:
-    """RootSIFT by pycolmap on the CPU, matched by `mutual`; a photo's features are kept while it is the same.
+    """RootSIFT by pycolmap on the CPU, matched by `mutual`; features of the current photo are cached.
 
-    Images of over `_DOUBLED` pixels are not doubled first: poses were as good, at 3.2 times the speed.
+    Images larger than `_DOUBLED` pixels are not upsampled: poses are as good, 3.2 times faster.
 
-    Descriptors are bytes of length 512: products of two are whole numbers below 2²⁴, whose sums float32 holds
-    exactly, in whatever order threads add them.
+    Descriptors are bytes of norm 512, so dot products are integers below 2²⁴, exact in float32 in any
+    summation order.
 
     Args:
         ratio: see `mutual`.
-        most: features of an image, the strongest.
+        most: most features per image; the strongest are kept.
     """
 
     def __init__(self, ratio: float, most: int) -> None:
         import pycolmap
 
-        pycolmap.logging.minloglevel = 2  # it tells every extractor that is made
+        pycolmap.logging.minloglevel = 2  # silence the log line per extractor
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu, options.num_threads = False, 1
         options.sift.max_num_features = most
@@ -169,7 +170,7 @@ class Sift:
         return a[i], b[j]
 
     def _features(self, image: Image) -> tuple[Float, NDArray[np.float32]]:
-        """(M, 2) places and (M, 128) whole-numbered descriptors."""
+        """Return (M, 2) positions and (M, 128) integer-valued descriptors."""
         grey = np.clip(grey_of(image) * 255 + 0.5, 0, 255).astype(np.uint8)
         doubled, whole = self._extractors
         extractor = doubled if max(grey.shape) <= _DOUBLED else whole
@@ -181,12 +182,12 @@ class Sift:
 def mutual(
     a: NDArray[np.float32], b: NDArray[np.float32], ratio: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of `a` and `b` that are each other's nearest, and nearer than `ratio` times a's second nearest.
+    """Return mutual nearest rows of `a` and `b` that are nearer than `ratio` times a's second nearest.
 
     Args:
-        a: (M, D) whole numbers, below 2²⁴ in every sum of products.
+        a: (M, D) integers whose dot products are below 2²⁴.
         b: (N, D), likewise.
-        ratio: of distances.
+        ratio: largest ratio of distances.
 
     >>> a = np.array([[9, 0], [0, 9]], np.float32)
     >>> [i.tolist() for i in mutual(a, np.array([[0, 8], [9, 1], [4, 4]], np.float32), 0.8)]

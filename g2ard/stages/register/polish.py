@@ -1,11 +1,11 @@
-"""Polishing: the pose that photo and features together bear out, by the exact gradient of renders.
+"""Polishing: refinement of a pose by the exact gradient of renders, with features as a prior.
 
     E(T, g, b) = Σ ρ((P − g·R(T) − b)/σ)/κ + ½ ξᵀ Λ ξ,   T = exp(ξ) T_f
 
-ρ is Tukey's, P and R the blurred grey of photo and render, κ the `correlated` of `RegisterConfig`, and Λ the
-information of the features' pose T_f (none without features). Direct alignment follows a gradient in which a
-pixel shows one surface; this one goes through the rasteriser (`Renderer.pose_gradient`). Steps are
-Levenberg–Marquardt's with alignment's matrix as the Hessian.
+ρ is Tukey's function, P and R the blurred grey of photo and render, κ the `correlated` of `RegisterConfig`,
+and Λ the information of the features' pose T_f (0 without features). Direct alignment assumes one surface per
+pixel; this gradient goes through the rasteriser (`Renderer.pose_gradient`). Steps are Levenberg–Marquardt
+with alignment's matrix as the Hessian.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ from g2ard.stages.register.pose import motion_between, moved
 Float = NDArray[np.float64]
 
 _TUKEY = 4.685
-"""As the normal equations' weights."""
+"""Tukey's constant, as in the normal equations' weights."""
 _DAMPING = 1e-3, 10.0
-"""At first, and what it is multiplied by after a step that costs more; divided by after one that does not."""
+"""Initial damping, and its factor: multiplied after a step that raises the cost, divided otherwise."""
 _LEAST_DAMPING = 1e-6
 _MOST_DAMPING = 1e3
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What features say: (4, 4) camera_from_world, and the (6, 6) inverse covariance about it."""
+    """Pose from features: (4, 4) camera_from_world, and its (6, 6) inverse covariance."""
 
     viewmat: Float
     information: Float
 
     def at(self, viewmat: Float) -> tuple[float, Float]:
-        """½ ξᵀ Λ ξ and Λ ξ, for small ξ."""
+        """Return ½ ξᵀ Λ ξ and Λ ξ, for small ξ."""
         xi = motion_between(self.viewmat, viewmat)
         slope = self.information @ xi
         return float(xi @ slope) / 2, slope
@@ -57,7 +57,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """E at one pose and light, its gradient and its Hessian over (v, ω, g, b)."""
+    """E at one pose and light, with gradient and Hessian over (v, ω, g, b)."""
 
     viewmat: Float
     gain: float
@@ -71,7 +71,7 @@ class Point:
 
 
 class Energy:
-    """E of one photo; σ and the number of pixels are those of the first pose asked for."""
+    """E of one photo; σ and the pixel count are fixed at the first evaluation."""
 
     def __init__(
         self, renderer: Renderer, camera: Camera, photo: Level, prior: Prior | None, config: RegisterConfig
@@ -83,7 +83,7 @@ class Energy:
         self.renders = 0
 
     def at(self, viewmat: Float, gain: float, bias: float) -> Point | None:
-        """None where too few pixels count."""
+        """Evaluate E; return None if too few pixels are valid."""
         camera, photo, config = replace(self._camera, viewmat=viewmat), self._photo, self._config
         out = self._renderer.render(camera)
         self.renders += 1
@@ -109,7 +109,7 @@ class Energy:
         return Point(viewmat, gain, bias, energy, slope, hessian, shot, float(counted.mean()), depth)
 
     def _pull(self, residual: Float, counted: NDArray[np.bool_]) -> Float:
-        """(H, W) dE/dr."""
+        """Return (H, W) dE/dr."""
         assert self._scale is not None
         share = residual / self._scale
         weight = np.maximum(0.0, 1 - (share / _TUKEY) ** 2) ** 2
@@ -131,14 +131,14 @@ def polish(
 
     Args:
         renderer: of the scene.
-        start: of alignment or of what was joined.
-        camera: the photo's size and K; its pose does not count.
-        photo: at that size.
-        prior: of features; None without.
-        config: see `RegisterConfig`; `iterations` and `still` end it.
+        start: pose and light from alignment or features.
+        camera: the photo's size and K; its pose is ignored.
+        photo: the photo at that size.
+        prior: pose from features; None without.
+        config: see `RegisterConfig`; `iterations` and `still` end the search.
 
     Returns:
-        An `Aligned`, `steps` its renders; None where too few pixels count or nothing determines the pose.
+        The pose, with its renders as `steps`; None if too few pixels are valid.
     """
     energy = Energy(renderer, camera, photo, prior, config)
     here = energy.at(start.viewmat, start.gain, start.bias)

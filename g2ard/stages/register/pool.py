@@ -1,4 +1,4 @@
-"""Starts for photos without a pose: the poses of a pool whose small renders look most like the photo."""
+"""Starting poses for photos without one: pool poses whose small renders are most similar to the photo."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Turned:
-    """A pose turned so that its render lies on a photo, as far as moving the image tells.
+    """A pose rotated so that its render fits a photo, estimated from an image shift.
 
     Args:
-        viewmat: (4, 4) camera_from_world; the centre has stayed.
-        likeness: of the moved render and the photo, see `shift_between`.
-        pixels: by how many pixels it was moved.
+        viewmat: (4, 4) camera_from_world; the camera centre is unchanged.
+        likeness: similarity of the shifted render and the photo, see `shift_between`.
+        pixels: length of the shift in pixels.
     """
 
     viewmat: Float
@@ -32,20 +32,20 @@ class Turned:
 
 
 def small_render(renderer: Renderer, camera: Camera, config: RegisterConfig) -> Float:
-    """(H, W) band-passed grey, 0 where too little is opaque."""
+    """Render (H, W) band-passed grey, 0 where alpha is too low."""
     out = renderer.render(camera)
     grey = band_passed(grey_of(np.clip(out.image, 0, 1)))
     return np.where(out.alpha >= config.min_alpha, grey, 0.0)
 
 
 def turned(viewmat: Float, render: Float, photo: Float, K: Float) -> Turned:
-    """Turn a pose by what moves its render onto the photo: ω = (−s_v/f_y, s_u/f_x, 0).
+    """Rotate a pose by the shift s of its render onto the photo: ω = (−s_v/f_y, s_u/f_x, 0).
 
     Args:
-        viewmat: (4, 4) of the render.
-        render: (H, W) of `small_render`.
+        viewmat: (4, 4) pose of the render.
+        render: (H, W) from `small_render`.
         photo: (H, W) band-passed grey.
-        K: (3, 3) of both.
+        K: (3, 3) intrinsics of both.
     """
     right, down, likeness = shift_between(render, photo)
     turn = np.eye(4)
@@ -54,11 +54,11 @@ def turned(viewmat: Float, render: Float, photo: Float, K: Float) -> Turned:
 
 
 class PoolRenders:
-    """Renders of a pool's poses through the lens of a photo, kept for photos of the same lens.
+    """Renders of a pool's poses with a photo's intrinsics, cached per intrinsics.
 
     Args:
         renderer: of the scene.
-        pool: C poses; their own K and size do not count.
+        pool: C poses; their K and size are ignored.
         config: `min_alpha` of `RegisterConfig`.
     """
 
@@ -67,11 +67,11 @@ class PoolRenders:
         self._kept: dict[bytes, list[Float]] = {}
 
     def ranked(self, camera: Camera, grey: Float) -> tuple[list[tuple[int, Turned]], int]:
-        """Poses from the likest on, each turned onto the photo; and how many renders that took.
+        """Return poses by decreasing similarity, each rotated onto the photo, and the number of renders.
 
         Args:
-            camera: the photo's, at `pool_size`.
-            grey: (H, W) of the photo at that size.
+            camera: the photo's camera at `pool_size`.
+            grey: (H, W) grey photo at that size.
 
         Ties go by index.
         """

@@ -1,4 +1,4 @@
-"""Rigid motions: their exponential, and how far two poses are from each other."""
+"""Rigid motions: the exponential map, and pose errors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Float = NDArray[np.float64]
 
 
 def rotation_of(omega: ArrayLike) -> Float:
-    """(3, 3) rotation by |ω| radians about ω (Rodrigues): I + sin θ/θ [ω]ₓ + (1 − cos θ)/θ² [ω]ₓ².
+    """Return the (3, 3) rotation by |ω| radians about ω (Rodrigues): I + sin θ/θ [ω]ₓ + (1 − cos θ)/θ² [ω]ₓ².
 
     >>> np.round(rotation_of([0, 0, np.pi / 2]) @ [1, 0, 0], 12).tolist()
     [0.0, 1.0, 0.0]
@@ -19,10 +19,10 @@ def rotation_of(omega: ArrayLike) -> Float:
 
 
 def moved(viewmat: Float, xi: ArrayLike) -> Float:
-    """exp(ξ)·T of a (4, 4) camera_from_world T and ξ = (v, ω), (6,), in the camera's axes.
+    """Return exp(ξ)·T for a (4, 4) camera_from_world T and ξ = (v, ω), (6,), in the camera's axes.
 
     The translation of exp(ξ) is V·v with V = I + (1 − cos θ)/θ² [ω]ₓ + (θ − sin θ)/θ³ [ω]ₓ². The rotation is
-    made orthogonal again, so that many small motions do not add up their rounding.
+    re-orthogonalised, so that rounding does not accumulate.
     """
     v, omega = np.asarray(xi, np.float64)[:3], np.asarray(xi, np.float64)[3:]
     cross, sine, cosine = _parts(omega)
@@ -38,7 +38,7 @@ def moved(viewmat: Float, xi: ArrayLike) -> Float:
 
 
 def motion_between(first: Float, second: Float) -> Float:
-    """ξ = (v, ω), (6,), with exp(ξ)·first = second, for rotations below half a turn.
+    """Return ξ = (v, ω), (6,), with exp(ξ)·first = second, for rotations below 180°.
 
     >>> np.round(motion_between(np.eye(4), moved(np.eye(4), [1, 2, 3, 0.1, 0.2, 0.3])), 12).tolist()
     [1.0, 2.0, 3.0, 0.1, 0.2, 0.3]
@@ -54,13 +54,13 @@ def motion_between(first: Float, second: Float) -> Float:
 
 
 def pose_error(found: Float, true: Float) -> tuple[float, float]:
-    """Distance of the camera centres, scene units, and angle between the rotations, degrees.
+    """Return the distance of the camera centres, scene units, and the angle between rotations, degrees.
 
-    The angle is atan2(|axis|, trace − 1): the arc cosine of the trace alone loses small angles to rounding.
+    The angle is atan2(|axis|, trace − 1): the arc cosine of the trace loses small angles to rounding.
 
     Args:
         found: (4, 4) camera_from_world.
-        true: the same of the same photo.
+        true: (4, 4) reference pose.
 
     >>> T = np.eye(4)
     >>> [round(e, 9) for e in pose_error(moved(T, [0, 0.3, 0, 0, 0, 0]), T)]
@@ -74,7 +74,7 @@ def pose_error(found: Float, true: Float) -> tuple[float, float]:
 
 
 def _parts(omega: ArrayLike) -> tuple[Float, float, float]:
-    """[ω]ₓ, sin θ/θ and (1 − cos θ)/θ², by their series where θ is small."""
+    """Return [ω]ₓ, sin θ/θ and (1 − cos θ)/θ², by series for small θ."""
     x, y, z = np.asarray(omega, np.float64)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle2 = x * x + y * y + z * z

@@ -1,4 +1,4 @@
-"""Report of a registration: each photo, and all of them against true poses."""
+"""Reports of a registration: each photo, and accuracy against reference poses."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ KEPT: dict[Keep, tuple[Status, ...]] = {
     "uncertain": ("registered", "uncertain"),
     "all": ("registered", "uncertain", "refused"),
 }
-"""The photos whose poses are kept; with "all" one that has none keeps the pose it started from."""
+"""Statuses whose poses are kept; with "all" a photo without a result keeps its starting pose."""
 
 RECALLS = ((0.05, 5.0), (0.10, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
-"""Metres and degrees within which visual localisation counts a pose as found."""
+"""Limits in metres and degrees used in visual localisation."""
 
 
 @dataclass(frozen=True)
 class PoseError(Report):
-    """Distance of the camera's centre from the true one, scene units, and of the rotation, degrees."""
+    """Errors of a pose: distance of the camera centre, scene units, and rotation, degrees."""
 
     position: float
     rotation: float
@@ -36,30 +36,30 @@ class PoseError(Report):
 
 @dataclass(frozen=True)
 class PhotoReport(Report):
-    """One photo.
+    """Report of one photo.
 
     Args:
-        name: of the photo.
+        name: name of the photo.
         status: "registered", "uncertain" or "refused".
-        reason: why it is no better than that; None where it is registered.
-        start: the name of the pose that was started from; None where there was none.
-        rank: of that pose in the pool, from 1; None where a pose was given.
-        matches: of photo and render, whose depth is known; 0 where direct alignment found the pose alone.
-        inliers: of them, that the pose explains.
-        spread: share of the photo's 4 × 4 cells that hold an inlier; None without features.
-        reprojection: median distance of the inliers, pixels at `size`; None likewise.
-        passes: of rendering, matching and solving.
+        reason: why it is not registered; None if it is.
+        start: name of the starting pose; None if there was none.
+        rank: its rank in the pool, from 1; None for a given pose.
+        matches: matches of photo and render with known depth; 0 for direct alignment alone.
+        inliers: matches that the pose explains.
+        spread: share of the photo's 4 × 4 cells with an inlier; None without features.
+        reprojection: median reprojection error of the inliers, pixels at `size`; None without features.
+        passes: passes of rendering, matching and solving.
         zncc: median local ZNCC of render and photo at the result, in [−1, 1].
         gain: photo's grey = gain·render + bias.
         bias: see `gain`.
-        overlap: share of the pixels that are compared.
-        covariance: (6, 6) of (v, ω) in the camera's axes: scene units, radians.
-        sigma: root of the trace of the covariance of position, scene units, and of rotation, degrees.
-        renders: of the scene, for this photo.
-        seconds: for this photo.
-        camera_from_world: (4, 4) found; None where nothing was.
-        start_error: of the pose started from; None without a truth, or where there was no pose.
-        error: of the pose found; None likewise.
+        overlap: share of the pixels compared.
+        covariance: (6, 6) covariance of (v, ω) in the camera's axes: scene units, radians.
+        sigma: root of the covariance's trace for position, scene units, and rotation, degrees.
+        renders: number of renders for this photo.
+        seconds: time for this photo.
+        camera_from_world: (4, 4) result; None if there is none.
+        start_error: error of the starting pose; None without a reference or a starting pose.
+        error: error of the result; None without a reference or a result.
     """
 
     name: str
@@ -87,24 +87,24 @@ class PhotoReport(Report):
 
 @dataclass(frozen=True)
 class RegisterReport(Report):
-    """All photos, in their order."""
+    """Report of all photos, in order."""
 
     photos: tuple[PhotoReport, ...]
 
     def count(self, status: Status) -> int:
-        """Photos of a status."""
+        """Return the number of photos with a status."""
         return sum(photo.status == status for photo in self.photos)
 
 
 @dataclass(frozen=True, eq=False)
 class Registered:
-    """The outcome of `register`.
+    """Result of `register`.
 
     Args:
-        cameras: the photos that are kept, with the poses found.
-        report: about every photo, kept or not.
-        matches: name → (M, 4) pixels (u, v) of the photo and of its last render that features matched and the
-            pose explains, at `size`.
+        cameras: the kept photos with their estimated poses.
+        report: report of every photo, kept or not.
+        matches: name → (M, 4) pixels (u, v) of the photo and (u, v) of its last render for the inliers, at
+            `size`.
     """
 
     cameras: Cameras
@@ -114,7 +114,7 @@ class Registered:
 
 @dataclass(frozen=True)
 class Recall(Report):
-    """The share of all photos whose pose is within so many metres and degrees."""
+    """Share of photos whose error is within these limits."""
 
     metres: float
     degrees: float
@@ -123,14 +123,14 @@ class Recall(Report):
 
 @dataclass(frozen=True)
 class Accuracy(Report):
-    """Poses against the true ones.
+    """Accuracy against reference poses.
 
     Args:
-        photos: that have a pose and a true one.
-        median: of the errors of those, scene units and degrees, each by itself.
-        worst: likewise.
-        recalls: over *all* photos with a true pose: a photo without a pose counts as missed. Empty where the
-            scene's unit is not known in metres.
+        photos: number of photos with an estimated and a reference pose.
+        median: median position and rotation errors, scene units and degrees.
+        worst: largest position and rotation errors.
+        recalls: shares of *all* photos with a reference pose; a photo without an estimate counts as missed.
+            Empty if the scene's unit in metres is unknown.
     """
 
     photos: int
@@ -141,15 +141,15 @@ class Accuracy(Report):
 
 @dataclass(frozen=True)
 class Summary(Report):
-    """A registration in numbers.
+    """Summary of a registration.
 
     Args:
-        photos: all.
-        registered, uncertain, refused: of them.
-        true: photos with a true pose.
-        metres_per_unit: of the scene, if known.
-        start: accuracy of the poses started from; None without a truth.
-        found: accuracy of the poses that are kept; None likewise.
+        photos: number of photos.
+        registered, uncertain, refused: number of photos per status.
+        true: number of photos with a reference pose.
+        metres_per_unit: scale of the scene, if known.
+        start: accuracy of the starting poses; None without references.
+        found: accuracy of the kept poses; None without references.
     """
 
     photos: int
@@ -169,13 +169,13 @@ def summarize(
     true: int = 0,
     metres_per_unit: float | None = None,
 ) -> Summary:
-    """Count photos and, given the truth, score starts and results alike.
+    """Count photos by status and, with reference poses, score starting poses and results.
 
     Args:
-        photos: of a `RegisterReport`.
+        photos: the photos of a `RegisterReport`.
         keep: see `KEPT`.
-        true: how many photos have a true pose.
-        metres_per_unit: of the scene; None where it is not known.
+        true: number of photos with a reference pose.
+        metres_per_unit: scale of the scene; None if unknown.
 
     Raises:
         InputError: a scale that is not positive.

@@ -1,9 +1,9 @@
-"""Poses from matches: a render's pixels lifted by its depth, then PnP.
+"""Poses from matches: render pixels lifted by depth, then PnP.
 
-A match (u, v) ↔ (u', v') of photo and render gives the photo's pixel the point that the render shows at
-(u', v'): its median depth there, taken back through the render's pose. The pose follows by LO-RANSAC over P3P
-and is refined by min Σ ρ(|π(T X) − u|²) with Cauchy's ρ; both by pycolmap. Rendered again at that pose, the
-scene looks more like the photo: the same is repeated until the pose stands still.
+A match (u, v) ↔ (u', v') of photo and render assigns to the photo's pixel the 3D point that the render shows
+at (u', v'), from its median depth. LO-RANSAC over P3P gives a pose, refined by min Σ ρ(|π(T X) − u|²) with
+Cauchy's ρ; both by pycolmap. A render at the new pose is more similar to the photo, so this is repeated until
+the pose converges.
 """
 
 from __future__ import annotations
@@ -21,14 +21,13 @@ from g2ard.stages.register.matchers import Matcher
 Float = NDArray[np.float64]
 
 _LEAST = 6
-"""Matches, and inliers, below which there is no pose: three decide it, and some must bear them out."""
+"""Least matches and inliers for a pose; three determine it, the rest confirm it."""
 _SIGMAS = 1.4826
-"""Standard deviations of a normal distribution in its median absolute deviation."""
+"""Standard deviation of a normal distribution over its median absolute deviation."""
 _LEAST_SIGMA = 0.1
-"""Pixels that a match is known to at best."""
+"""Least σ of a match, pixels."""
 _STILL = 0.3
-"""Pixels (root of the mean square over the inliers): what moves the image by less, about the error of a
-keypoint's place, was the last pass."""
+"""Root mean square motion in pixels below which passes stop; about a keypoint's error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +36,14 @@ class Solved:
 
     Args:
         viewmat: (4, 4) camera_from_world.
-        matches: that have a depth.
-        inliers: of them.
-        spread: share of the image's 4 × 4 cells that hold an inlier.
-        reprojection: median distance of the inliers, pixels.
+        matches: number of matches with known depth.
+        inliers: number of inliers.
+        spread: share of the image's 4 × 4 cells with an inlier.
+        reprojection: median reprojection error of the inliers, pixels.
         information: (6, 6) inverse covariance of ξ = (v, ω), camera axes; see `information`.
-        depth: median of the inliers, scene units.
-        passes: renders.
-        pixels, points: (inliers, 2) of the photo and (inliers, 3), world.
+        depth: median depth of the inliers, scene units.
+        passes: number of renders.
+        pixels, points: (inliers, 2) of the photo and (inliers, 3) in world coordinates.
         seen: (inliers, 2) pixels of the last render.
     """
 
@@ -71,20 +70,20 @@ def solve(
     config: RegisterConfig,
     passes: int,
 ) -> Solved | None:
-    """Match, lift and solve from a starting pose, again and again from what was found.
+    """Match, lift and solve from a starting pose, then repeat from the result.
 
     Args:
         renderer: of the scene.
         start: (4, 4) camera_from_world.
-        camera: the photo's size and K; its pose does not count.
+        camera: the photo's size and K; its pose is ignored.
         photo: (H, W, 3) in [0, 1].
-        mask: (H, W) pixels of it that count.
+        mask: (H, W) valid pixels.
         match: see `g2ard.stages.register.matchers`.
         config: see `RegisterConfig`.
-        passes: renders, at most.
+        passes: most renders.
 
     Returns:
-        The last pass that led to a pose; None where the first did not.
+        The last pass that gave a pose; None if the first did not.
     """
     found = None
     for number in range(passes):
@@ -115,11 +114,11 @@ def _at(image: NDArray[np.bool_], uv: Float) -> NDArray[np.bool_]:
 def lifted(
     out: Rendered, camera: Camera, uv: Float, config: RegisterConfig
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Points that a render shows at pixels, and where they are known.
+    """Lift render pixels to 3D points.
 
-    Depth is the median depth, between the four pixels around (u, v): where all four have one, opaque enough
-    (`min_alpha`), and no two differ by more than `max_edge`. The expected depth would lie between a
-    foreground and what is behind it.
+    The median depth is interpolated between the four pixels around (u, v). It is known if all four have a
+    depth, enough alpha (`min_alpha`), and differ by at most `max_edge`. The expected depth would lie between
+    foreground and background.
 
     Args:
         out: a render with its median depth.
@@ -128,7 +127,7 @@ def lifted(
         config: see `RegisterConfig`.
 
     Returns:
-        (M, 3) world coordinates, and (M,) whether they are known.
+        (M, 3) world coordinates, and the (M,) mask of known ones.
     """
     assert out.median is not None
     height, width = out.alpha.shape
@@ -152,12 +151,12 @@ def lifted(
 def solved(
     camera: Camera, uv: Float, points: Float, config: RegisterConfig
 ) -> tuple[Float, NDArray[np.bool_]] | None:
-    """A pose of PnP and which matches it explains, within `max_reprojection`; None where it explains too few.
+    """Solve PnP; return the pose and the inlier mask, or None with too few inliers.
 
     Args:
         camera: size and K.
         uv: (M, 2) pixels.
-        points: (M, 3) world; taken about their middle, for map coordinates.
+        points: (M, 3) world coordinates.
         config: see `RegisterConfig`.
     """
     import pycolmap
@@ -216,9 +215,9 @@ def _solved_of(
 
 
 def information(T: Float, K: Float, uv: Float, points: Float) -> Float:
-    """(6, 6) JᵀWJ/σ² of the reprojections π(exp(ξ) T X) − u, with J = ∂π/∂X·[I | −[X]ₓ].
+    """Return the (6, 6) JᵀWJ/σ² of the reprojections π(exp(ξ) T X) − u, with J = ∂π/∂X·[I | −[X]ₓ].
 
-    W is Cauchy's weight 1/(1 + r²/σ²), σ the residuals' by their median absolute deviation.
+    W is Cauchy's weight 1/(1 + r²/σ²), with σ from the median absolute deviation of the residuals.
 
     Args:
         T: (4, 4) camera_from_world.
@@ -240,6 +239,6 @@ def information(T: Float, K: Float, uv: Float, points: Float) -> Float:
 
 
 def _projected(T: Float, K: Float, points: Float) -> Float:
-    """(M, 2) pixels of (M, 3) world points."""
+    """Project (M, 3) world points to (M, 2) pixels."""
     X = points @ T[:3, :3].T + T[:3, 3]
     return X[:, :2] / X[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]

@@ -1,4 +1,4 @@
-"""Which views are worth having."""
+"""View selection."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which views are worth having: an order of the candidates, what each adds, and how often to draw it."""
+"""View selection: an order of the candidates, their gains and sampling weights."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ Float = NDArray[np.float64]
 Order = NDArray[np.int64]
 
 _BEND = 0.02
-"""A curve that nowhere rises this far above its chord is straight: no K is better than another."""
+"""Height above its chord below which a curve counts as straight, so that no K stands out."""
 _LARGEST = 32_768
-"""Pixels a side; what a raster takes."""
+"""Largest side of a view in pixels that the rasteriser accepts."""
 _COARSE = 20_000
-"""Cells that stand for the scene where only distances to it matter."""
+"""Number of surface cells when only depths matter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,18 +35,16 @@ class Selection:
     """The chosen views, best first.
 
     Args:
-        policy: how they were chosen.
+        policy: selection policy.
         order: (K,) indices into the candidates.
-        gains: (K,) what each added to the policy's objective when it was chosen, as a share of what the whole
-            pool reaches.
-        weights: (K,) how often to draw each, mean 1: the share of the pool that it stands for, with crowded
-            poses counted less.
-        left_out: what the candidates not chosen would have added, as a share of the whole.
-        curve: (n,) what the first 1, 2, … n views of the order reach together, over all usable candidates, as
-            a share of the whole: K can be read off it.
-        refused: indices of candidates that see nothing of the scene, or that stand within it.
-        evaluations: how often a view's gain was computed; 0 where a policy computes none.
-        seconds: by stage.
+        gains: (K,) gain of each in the policy's objective when it was chosen, as a share of the pool's total.
+        weights: (K,) sampling weights, mean 1: the share of the pool that each represents, with crowded poses
+            counted less.
+        left_out: share of the total that the remaining candidates would add.
+        curve: (n,) share of the total reached by the first 1, 2, … n views, for all usable candidates.
+        refused: indices of candidates that see nothing of the scene or lie inside geometry.
+        evaluations: number of gains computed; 0 for policies that compute none.
+        seconds: time by stage.
     """
 
     policy: str
@@ -73,24 +71,23 @@ def select(
     """Choose `k` of the candidate views.
 
     Args:
-        splats: the raw prior; what the views see of it counts, not what they show.
+        splats: the dense scene; only its geometry matters, not the views' images.
         cameras: C candidates, in world coordinates.
-        k: how many; C or more takes them all, in order of worth. "auto" stops where the curve of gains
-            flattens, at the K farthest above the straight line from none to all; all, if it never bends.
-        policy: one of `POLICIES`. auto works on poses: first the farthest next, until all are within reach,
-            then those that best represent all candidates, crowded ones counted less, by facility location
-            Σ_u w_u max_{v∈S} exp(−(d_uv/0.35)²). directional is the paper's; coverage counts cells seen at
-            all; pose-diverse takes the farthest pose next; random and uniform (evenly along the candidates'
-            order) look at nothing.
-        seed: of random.
-        options: of directional and coverage.
-        progress: told of the views rasterised.
+        k: number of views; C or more takes all, best first. "auto" stops where the curve of gains flattens,
+            at the K farthest above its chord; all, if the curve is straight.
+        policy: one of `POLICIES`. "auto" uses poses only: farthest pose first until all are within reach,
+            then facility location Σ_u w_u max_{v∈S} exp(−(d_uv/0.35)²) with crowded poses weighted less.
+            "directional" is the paper's. "coverage" counts visible cells. "pose-diverse" takes the farthest
+            pose next. "random" and "uniform" (evenly along the candidates' order) measure nothing.
+        seed: seed of "random".
+        options: options of "directional" and "coverage".
+        progress: called with the number of views rasterised.
 
     Returns:
-        A `Selection`.
+        The chosen views with gains and weights.
 
     Raises:
-        InputError: `k` is not positive, an unknown policy, no candidates, or none that sees the scene.
+        InputError: an invalid `k`, an unknown policy, no candidates, or none that sees the scene.
 
     >>> from g2ard.scene.cameras import look_at
     >>> ball = Splats.create(np.random.default_rng(0).normal(size=(500, 3)), scales=np.full((500, 3), 0.1))
@@ -103,14 +100,14 @@ def select(
     if policy not in POLICIES:
         raise InputError(f"expected {', '.join(POLICIES)}, got {policy!r}", parameter="policy")
     if k == "auto" and policy in UNMEASURED:
-        raise InputError(f"'auto' needs a policy that measures what views add, not {policy!r}", parameter="k")
+        raise InputError(f"'auto' needs a policy that measures gains, got {policy!r}", parameter="k")
     if k != "auto" and not isinstance(k, int | np.integer):
         raise InputError(f"expected 'auto' or a whole number of views, got {k!r}", parameter="k")
     large = np.maximum(cameras.widths, cameras.heights) > _LARGEST
     if large.any():
         i = int(np.argmax(large))
         size = f"{cameras.widths[i]}×{cameras.heights[i]}"
-        raise InputError(f"view {cameras.names[i]}: {size} pixels; at most {_LARGEST} a side")
+        raise InputError(f"view {cameras.names[i]}: expected at most {_LARGEST} pixels per side, got {size}")
     if k != "auto" and k < 1:
         raise InputError(f"expected at least 1 view, got {k}", parameter="k")
     if not len(cameras):
@@ -130,7 +127,7 @@ def select(
         rows = np.flatnonzero(usable)
         order, gains, evaluations = greedy(splats, cameras.take(rows), policy, options, progress, seconds)
         order = rows[order]
-        refused = ~np.isin(np.arange(len(cameras)), order)  # also what sees no cell: greedy leaves it out
+        refused = ~np.isin(np.arange(len(cameras)), order)  # also views that see no cell, which greedy drops
     elif policy == "pose-diverse":
         order, gains = poses.farthest(alike, usable)
     elif policy == "auto":
@@ -165,7 +162,7 @@ def _blind(policy: str, rows: Order, k: int | Literal["auto"], seed: int) -> Ord
 
 
 def _knee(gains: Float) -> int:
-    """The count at which the curve of summed gains lies farthest above its chord; all if it never bends.
+    """Return the count where cumulative gains lie farthest above their chord; all if straight.
 
     >>> _knee(np.array([5.0, 4.0, 3.0, 0.1, 0.1, 0.1, 0.1])), _knee(np.array([1.0, 1.0, 1.0]))
     (3, 3)

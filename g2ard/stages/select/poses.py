@@ -1,4 +1,4 @@
-"""Views as poses: a kernel between them, which of them represent the others, and how often to draw each."""
+"""View selection by poses: a kernel between poses, representatives, and sampling weights."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ Float = NDArray[np.float64]
 Order = NDArray[np.int64]
 
 _BANDWIDTH = 0.35
-"""Of the kernel exp(−(d/0.35)²) between poses: neighbours 20° apart on an orbit are half alike."""
+"""Bandwidth of the kernel exp(−(d/0.35)²): neighbours 20° apart on an orbit have similarity ½."""
 _REACH = 2.0
-"""Bandwidths within which a chosen view represents a pose: beyond, the kernel is below 2 %."""
+"""Distance in bandwidths within which a chosen view represents a pose; beyond, the kernel is below 2 %."""
 _WORTH = 0.25
-"""Power of its share of the scene by which a view's gain is weighed."""
+"""Exponent of a view's share of the scene in the weight of its gain."""
 _GRID = 48, 36
 _BEHIND = 1.15
-"""Times the nearest depth of its place in the grid: what lies farther is hidden."""
+"""A point farther than this multiple of the nearest depth in its grid cell is hidden."""
 _ROWS = 200_000
-"""Gaussians by which a pose inside geometry is found: of more, a fair sample, each as much larger."""
+"""Largest sample of Gaussians for detecting poses inside geometry; sampled ones are enlarged."""
 _SIDE = 48
-"""Pixels along the longer side of the images that decide it."""
+"""Longer side in pixels of the renders for that."""
 _INSIDE = 0.02
-"""A pose whose image is mostly nearer than this share of the median pose's depth is inside geometry."""
+"""A pose is inside geometry if most of its image is nearer than this share of the median depth."""
 
 
 def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
-    """What each view sees of a coarse surface.
+    """Measure what each view sees of a coarse surface.
 
     Returns:
-        (C,) its median depth of the cells within its image, 0 where there is none, and (C,) the share of all
-        cells that lie in front there: not much behind the nearest of theirs in a grid of 48 × 36.
+        (C,) the median depth of the cells in its image, 0 if there are none; and (C,) the share of all cells
+        that are visible there, by occlusion in a grid of 48 × 36.
     """
     local = cameras.recentred(cells.origin)
     depths, shares = np.zeros(len(local)), np.zeros(len(local))
@@ -65,15 +65,9 @@ def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
 
 
 def inside_geometry(splats: Splats, cameras: Cameras, depths: Float, progress: Progress) -> NDArray[np.bool_]:
-    """(C,) whether a pose stands inside geometry: what fills its image is next to its lens.
+    """Return a (C,) mask of poses inside geometry; poses of photos are never marked.
 
-    A photo's pose is never refused: there was a camera.
-
-    Args:
-        splats: the scene.
-        cameras: C views.
-        depths: (C,) see `outlooks`.
-        progress: told of the views done.
+    `depths` comes from `outlooks`.
     """
     made = np.array([path is None for path in cameras.image_paths])
     if not (made.any() and (depths > 0).any()):
@@ -90,17 +84,18 @@ def inside_geometry(splats: Splats, cameras: Cameras, depths: Float, progress: P
 
 
 def pose_kernel(cameras: Cameras, depths: Float) -> Float:
-    """(C, C) exp(−(d/0.35)²): d² = |Δposition|²/(depth·depth) + |Δdirection|²: parallax and turn."""
+    """Return (C, C) exp(−(d/0.35)²) with d² = |Δposition|²/(depth·depth) + |Δdirection|²: parallax and
+    rotation."""
     seen = depths[depths > 0]
     scale = np.where(depths > 0, depths, np.median(seen) if len(seen) else 1.0)
-    positions = cameras.positions - np.median(cameras.positions, axis=0)  # whatever one of them is
-    with np.errstate(over="ignore", invalid="ignore"):  # 1e300 away is as far as can be
+    positions = cameras.positions - np.median(cameras.positions, axis=0)  # robust to a single far pose
+    with np.errstate(over="ignore", invalid="ignore"):  # squares of 1e300 overflow to infinity
         away = np.nan_to_num(_squares(positions), nan=np.inf) / (scale[:, None] * scale)
     return np.exp(-(away + _squares(cameras.forwards)) / _BANDWIDTH**2)
 
 
 def _squares(rows: Float) -> Float:
-    """(n, n) squared distances; exactly 0 between equal rows."""
+    """Return (n, n) squared distances, exactly 0 between equal rows."""
     out = np.zeros((len(rows), len(rows)))
     for column in rows.T:
         out += (column[:, None] - column) ** 2
@@ -108,7 +103,7 @@ def _squares(rows: Float) -> Float:
 
 
 def inverse_density(alike: Float) -> Float:
-    """(C,) weights of the poses, one over the kernel density there; they sum to 1."""
+    """Return (C,) weights inverse to the kernel density, with sum 1."""
     weights = 1 / alike.sum(1)
     return weights / weights.sum()
 
@@ -116,20 +111,20 @@ def inverse_density(alike: Float) -> Float:
 def facility_location(
     alike: Float, pose_weights: Float, usable: NDArray[np.bool_], shares: Float
 ) -> tuple[Order, Float]:
-    """Views that represent all candidates: first within reach of every pose, then by facility location.
+    """Order views by how well they represent all candidates: reach first, then facility location.
 
-    From the weighted medoid of the poses on, the farthest comes next while any is more than two bandwidths
-    from all chosen: there the kernel is flat. Then greedy facility location. Each view counts times the
-    fourth root of its share of the scene, so that of like views the one that sees more is taken.
+    From the weighted medoid, the farthest pose comes next while any pose is more than two bandwidths from all
+    chosen ones, where the kernel is flat. Greedy facility location follows. A view's gain is multiplied by
+    the fourth root of its share of the scene, to prefer the one that sees more among similar views.
 
     Args:
-        alike: (C, C) see `pose_kernel`.
-        pose_weights: (C,) see `inverse_density`.
-        usable: (C,) which may be chosen; the others weigh nothing.
-        shares: (C,) see `outlooks`.
+        alike: (C, C) from `pose_kernel`.
+        pose_weights: (C,) from `inverse_density`.
+        usable: (C,) mask of views that may be chosen; the others have no weight.
+        shares: (C,) from `outlooks`.
 
     Returns:
-        The usable views in order, and what each adds to Σ_u w_u max_{v∈S} alike_uv.
+        The usable views in order, and the gain of each in Σ_u w_u max_{v∈S} alike_uv.
     """
     pose_weights, away, worth = np.where(usable, pose_weights, 0.0), _bandwidths_apart(alike), shares**_WORTH
     best, left = np.zeros(len(alike)), usable.copy()
@@ -153,12 +148,12 @@ def facility_location(
 
 
 def _bandwidths_apart(alike: Float) -> Float:
-    """(C, C) distances in bandwidths of the kernel."""
+    """Return (C, C) distances in bandwidths of the kernel."""
     return np.asarray(np.sqrt(-np.log(np.maximum(alike, np.finfo(np.float64).tiny))))
 
 
 def gains_of(order: Order, alike: Float, pose_weights: Float) -> Float:
-    """What each view of a given order adds to the facility location."""
+    """Return the gain in facility location of each view of a given order."""
     best, gains = np.zeros(len(alike)), []
     for view in order:
         gains.append(float(pose_weights @ np.maximum(alike[:, view] - best, 0.0)))
@@ -167,7 +162,7 @@ def gains_of(order: Order, alike: Float, pose_weights: Float) -> Float:
 
 
 def farthest(alike: Float, usable: NDArray[np.bool_]) -> tuple[Order, Float]:
-    """Farthest pose next, from the one most like all others; gains are distances to the nearest chosen."""
+    """Order by farthest pose, starting at the most central; gains are distances to the nearest chosen one."""
     if not usable.any():
         return np.zeros(0, np.int64), np.zeros(0)
     away = _bandwidths_apart(alike)
@@ -185,8 +180,8 @@ def farthest(alike: Float, usable: NDArray[np.bool_]) -> tuple[Order, Float]:
 
 
 def draw_weights(order: Order, alike: Float, pose_weights: Float) -> Float:
-    """(K,) the summed weights of the poses that each chosen view is nearest to, mean 1."""
+    """Return (K,) summed weights of the poses nearest to each chosen view, with mean 1."""
     nearest = order[np.argmax(alike[:, order], axis=1)]
-    nearest[order] = order  # each is nearest to itself, equals included
+    nearest[order] = order  # each is its own nearest, even among equal poses
     weights = np.bincount(nearest, pose_weights, len(alike))[order]
     return weights / weights.mean()

@@ -1,4 +1,4 @@
-"""The scene as cells of surface, what each view sees of them, and the greedy order of views by that."""
+"""View selection by surfaces: cells of the scene, their visibility in views, and the greedy order."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ _CORE = _core.defaults()["coverage"]
 
 @dataclass(frozen=True)
 class CoverageOptions:
-    """Of the policies that look at surfaces (the paper, eq. `view_selection`; `tab:s_avs`).
+    """Options of the surface-based policies (the paper, eq. `view_selection`; `tab:s_avs`).
 
     Args:
-        cells: surface cells M; adaptive voxels.
+        cells: number M of surface cells (adaptive voxels).
         kappa: sharpness of the observation kernel and of the targets.
         alpha: exponent of the fair utility u(x) = x^(1−α)/(1−α).
         offset: g(x) = u(offset + x); the paper's λ.
-        anchors: directions on the sphere, at most 64, that targets and observations are laid out on.
+        anchors: directions on the sphere, at most 64, at which targets and observations are evaluated.
         epsilon: ε of the coverage ratio C_jk / (P_jk + ε).
-        depth_tolerance: a cell is seen within this share of its depth of the depth in its pixel, or within
-            a cell's size if that is more.
-        lazy: look again only at the view that leads (CELF): the same views, fewer evaluations.
+        depth_tolerance: a cell is visible if its depth differs from the pixel's by at most this share, or by
+            a cell's size.
+        lazy: lazy evaluation (CELF): the same views with fewer evaluations.
 
     Raises:
         InputError: a value out of range.
@@ -65,7 +65,7 @@ class CoverageOptions:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """M cells of surface, in coordinates about `origin`.
+    """M surface cells, in coordinates relative to `origin`.
 
     Args:
         centers: (M, 3) float64.
@@ -85,13 +85,13 @@ class Surface:
 
     @property
     def parts(self) -> tuple[Float, Float, Float, Float, float]:
-        """As `_core` takes them."""
+        """Arrays in the form that `_core` takes."""
         return self.centers, self.normals, self.confidence, self.weights, self.size
 
 
 @dataclass(frozen=True, eq=False)
 class Visible:
-    """Which cells each of C views sees: view v's are cells[starts[v]:starts[v + 1]], ascending."""
+    """Visible cells of C views: view v sees cells[starts[v]:starts[v + 1]], ascending."""
 
     starts: NDArray[np.uint64]
     cells: NDArray[np.uint32]
@@ -101,7 +101,7 @@ class Visible:
 
 
 def surface(splats: Splats, cells: int = 300_000) -> Surface:
-    """Partition a prior into about `cells` cells of surface.
+    """Partition a scene into about `cells` surface cells.
 
     Raises:
         InputError: the scene is empty or not finite.
@@ -123,20 +123,20 @@ def visible_cells(
     depth_tolerance: float = CoverageOptions.depth_tolerance,
     progress: Progress = silent,
 ) -> Visible:
-    """Rasterise the prior's median depth into every view and compare: ν_jv.
+    """Compute the visibility ν_jv of cells in views from the scene's median depth.
 
-    A cell is visible where its centre falls on the image within max(cell size, depth_tolerance · depth) of
-    the median depth (by gsplat's conventions) in that pixel. Pixels without a cell are not worked out.
+    A cell is visible if its centre projects into the image and lies within max(cell size, depth_tolerance ·
+    depth) of the pixel's median depth (gsplat's convention).
 
     Args:
-        splats: the prior that `cells` came from.
+        splats: the scene that `cells` came from.
         cells: see `surface`.
         cameras: C views in world coordinates.
         depth_tolerance: see `CoverageOptions`.
-        progress: told of the views done.
+        progress: called with the number of views done.
 
     Returns:
-        A `Visible`.
+        The visible cells of each view.
     """
     scene, origin = core_scene(splats)
     starts, seen = _core.select_visible(
@@ -150,7 +150,7 @@ def visible_cells(
 
 
 def core_scene(splats: Splats) -> tuple[tuple[Any, ...], Float]:
-    """What `_core` takes, and the world point it is centred about."""
+    """Return the arrays that `_core` takes, and the world point they are relative to."""
     if not len(splats):
         raise InputError("the scene is empty")
     means = splats.means.astype(np.float64)
@@ -160,7 +160,7 @@ def core_scene(splats: Splats) -> tuple[tuple[Any, ...], Float]:
 
 
 def core_views(cameras: Cameras, origin: Float, scene: tuple[Any, ...]) -> list[tuple[Any, ...]]:
-    """The cameras as `_core` takes them, about the origin of a `core_scene`."""
+    """Convert cameras to the form that `_core` takes, relative to the origin of `core_scene`."""
     near = settings_for(scene[0]).near_of(0)
     local = cameras.recentred(origin)
     return [
@@ -182,7 +182,7 @@ def greedy(
     progress: Progress,
     seconds: dict[str, float],
 ) -> tuple[Order, Float, int]:
-    """The pool in the greedy's order without views that see no cell, what each adds, and evaluations."""
+    """Return the views that see a cell in greedy order, their gains, and the number of evaluations."""
     options = options or CoverageOptions()
     began = time.perf_counter()
     cells = surface(splats, options.cells)
