@@ -200,7 +200,7 @@ class _Rounds:
 
     @cached_property
     def key(self) -> str:
-        """What saved stages must be of; needed only where there is a work folder."""
+        """Fingerprint that saved stages must have; computed only with a work folder."""
         return _fingerprint(self.prior, self.budget, self.targets, self.config, self.weights, self.validation)
 
     def advance(self, number: int, count: int, *, final: bool) -> None:

@@ -98,7 +98,7 @@ class DistillJob:
 
     @cached_property
     def _renderer(self) -> Renderer | None:
-        """The teacher's, shared by all targets."""
+        """Renderer of the teacher, shared by all targets."""
         from g2ard.rendering.renderer import Renderer
 
         background = self.config.recover.background

@@ -1,1 +1,1 @@
-"""Scenes and what stages pass on: splats, cameras, targets, images, splits, regions."""
+"""Data types shared by stages: splats, cameras, targets, images, splits, regions."""

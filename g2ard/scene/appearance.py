@@ -1,4 +1,4 @@
-"""What new images say of a scene's appearance: of all its colours at once, and of each Gaussian's own."""
+"""Appearance from new images: a change of all colours, and blending per Gaussian."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.targets import Targets, mask_of
 
 _VIEWS = 16
-"""Of the targets, evenly spaced, that tell the change of colours."""
+"""Number of evenly spaced targets used to fit the change of colours."""
 _PIXELS = 20_000
-"""Of each, at most."""
+"""Most pixels used per target."""
 _RIDGE = 1e-5
-"""Weight of no change, as a share of the pixels: colours that a scene lacks say nothing of theirs."""
+"""Weight of no change, as a share of the pixels, for colours that the scene lacks."""
 _LOOK = 300
-"""Pixels along the longer side where a Gaussian's visibility is measured."""
+"""Longer side in pixels of the renders that measure visibility."""
 _SEEN = 10.0
-"""Σ αT over such pixels at which a view has half seen a Gaussian."""
+"""Σ αT over these renders at which a view counts as half."""
 
 
 @dataclass(frozen=True, eq=False)
 class ColourChange:
-    """c → matrix·c + shift, for every colour of a scene.
+    """Affine change of all colours of a scene: c → matrix·c + shift.
 
     Args:
         matrix: (3, 3) float64.
         shift: (3,) float64.
-        gain: dB that it brings over the pixels it was fitted to.
+        gain: gain in dB on the pixels it was fitted to.
     """
 
     matrix: NDArray[np.float64]
@@ -41,15 +41,15 @@ class ColourChange:
 
 
 def colour_change(splats: Splats, targets: Targets, background: tuple[float, float, float]) -> ColourChange:
-    """The affine map of colours under which a scene's renders best fit images: exposure, white balance.
+    """Fit the affine colour map (exposure, white balance) from a scene's renders to images.
 
-    A pixel is C + (1 − A)·background, C = Σ αT·c and A = Σ αT, so under the map it is matrix·C + A·shift +
-    (1 − A)·background: linear least squares in twelve numbers, with a little weight on no change.
+    A pixel is C + (1 − A)·background, C = Σ αT·c and A = Σ αT, and matrix·C + A·shift + (1 − A)·background
+    after the map: linear least squares with twelve unknowns and a small weight on no change.
 
     Args:
         splats: the scene.
-        targets: images; masked pixels do not count.
-        background: RGB behind the scene, which stays as it is.
+        targets: images; masked pixels are ignored.
+        background: RGB behind the scene, which stays unchanged.
     """
     cameras = targets.cameras
     behind = np.asarray(background)
@@ -79,7 +79,7 @@ def colour_change(splats: Splats, targets: Targets, background: tuple[float, flo
 
 
 def recoloured(splats: Splats, change: ColourChange) -> Splats:
-    """A scene whose colours are changed: in every band by the matrix, in the base by the shift too."""
+    """Change the colours of a scene: all bands by the matrix, the base also by the shift."""
     matrix = change.matrix.astype(np.float32)
     rest = (change.matrix.sum(1) * 0.5 + change.shift - 0.5) / SH_C0
     base = splats.sh0 @ matrix.T + rest.astype(np.float32)
@@ -87,7 +87,8 @@ def recoloured(splats: Splats, change: ColourChange) -> Splats:
 
 
 def views_seeing(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:
-    """(N,) how many views have seen each Gaussian: each counts w/(w + 10), w = Σ αT over a small render."""
+    """Return (N,) the number of views that see each Gaussian; each counts w/(w + 10), w = Σ αT in a small
+    render."""
     small = cameras.resized(_LOOK)
     out = np.zeros(len(splats))
     for view in range(len(small)):
@@ -97,7 +98,7 @@ def views_seeing(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:
 
 
 def blended(start: Splats, fitted: Splats, share: NDArray[np.float64]) -> Splats:
-    """Colours and opacity logits between those of a start and of a fit, (N,) `share` of the way."""
+    """Interpolate colours and opacity logits from `start` to `fitted` by the (N,) `share`."""
     s = share.astype(np.float32)
 
     def between(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Pinhole cameras, OpenCV axes (x right, y down, z forward), and what evaluation needs to name them."""
+"""Pinhole cameras with OpenCV axes (x right, y down, z forward), and their photos."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from g2ard.io.limits import check_image
 from g2ard.progress import plural
 
 _LARGEST = 1e12
-"""Of a pose or intrinsics: more is damage, and overflows where it is squared."""
+"""Largest value of poses and intrinsics; larger ones are damaged data and overflow when squared."""
 
 _MEDIAN_OF = 16
-"""Views that stand for all of them."""
+"""Views used for medians over all views."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +30,12 @@ class Camera:
         K: (3, 3) float64 pinhole intrinsics in pixels; pixel centres at +0.5.
         width: pixels.
         height: pixels.
-        name: of the photo, or of the pose.
-        image_path: the photo; None where there is none.
-        mask_path: which of its pixels count; None where all do.
+        name: name of the photo or pose.
+        image_path: the photo, or None.
+        mask_path: mask of its valid pixels; None if all are.
         distortion: (5,) float64, OpenCV k1 k2 p1 p2 k3 of the photo.
 
-    Shapes and values are checked where views come together, by `Cameras`.
+    Shapes and values are checked by `Cameras`.
 
     >>> camera = Camera.facing([0, -2, 0], [0, 0, 0], width=32, height=24, fov=50)
     >>> camera.position.tolist(), camera.holds([[0, 0, 0], [0, -3, 0]]).tolist()
@@ -63,10 +63,11 @@ class Camera:
         up: ArrayLike = (0.0, 0.0, 1.0),
         name: str = "view",
     ) -> Camera:
-        """A view from `position` to `target`, image top towards `up`; `fov` is horizontal, in degrees.
+        """Create a view from `position` to `target` with the image's top towards `up`; `fov` is horizontal,
+        degrees.
 
         Raises:
-            InputError: position and target coincide, or a field of view that is not between 0 and 180°.
+            InputError: position and target coincide, or the field of view is not between 0 and 180°.
         """
         if not 0 < fov < 180:
             raise InputError(f"expected degrees between 0 and 180, got {fov}", parameter="fov")
@@ -76,14 +77,11 @@ class Camera:
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """(3,) the camera's centre in the world."""
+        """Centre of the camera in world coordinates, (3,)."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def holds(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Which of some points, (N, 3) in the world, lie within the image, as (N,) bool.
-
-        What hides them does not count.
-        """
+        """Return which of the (N, 3) world points lie within the image, as (N,) bool, ignoring occlusion."""
         x, y, z = self.viewmat[:3, :3] @ (np.asarray(points, np.float64) - self.position).T
         K, front = self.K, z > 0
         ahead = np.where(front, z, 1.0)
@@ -100,16 +98,16 @@ class Cameras:
         Ks: (C, 3, 3) float64 pinhole intrinsics in pixels; pixel centres at +0.5.
         widths: (C,) int64 pixels.
         heights: (C,) int64 pixels.
-        names: C unique names (of photos, or of poses).
-        image_paths: C paths, None where a view has no photo.
-        mask_paths: C paths of masks, None where all of a photo counts.
+        names: C unique names of photos or poses.
+        image_paths: C paths of photos or None.
+        mask_paths: C paths of masks or None.
         distortions: (C, 5) float64, OpenCV k1 k2 p1 p2 k3 of the *photo*; `g2ard.scene.images` undistorts on
-            loading, to these very Ks. Zero for a pinhole photo.
-        source: the file or folder that lists the views, for messages; None for views made in memory.
+            loading, to these Ks. Zero for a pinhole photo.
+        source: the file or folder that lists the views, for messages; None for views created in memory.
 
     Raises:
-        InputError: shapes that do not fit, a non-finite pose, an empty image, or one of more than
-            160 million pixels.
+        InputError: mismatched shapes, a non-finite pose, an empty image, or one of more than 160 million
+            pixels.
     """
 
     viewmats: NDArray[np.float64]
@@ -148,7 +146,7 @@ class Cameras:
             if not all(np.isfinite(values).all() for values in given):
                 raise self._error(i, "has a pose or intrinsics that are not finite")
             if max(np.abs(values).max() for values in given) > _LARGEST:
-                raise self._error(i, f"has a pose or intrinsics past {_LARGEST:.0e}")
+                raise self._error(i, f"has a pose or intrinsics above {_LARGEST:.0e}")
             if self.widths[i] < 1 or self.heights[i] < 1:
                 raise self._error(i, f"has an empty image, {self.widths[i]}×{self.heights[i]}")
             check_image(int(self.widths[i]), int(self.heights[i]), index=i, item="view")
@@ -162,7 +160,7 @@ class Cameras:
         return len(self.viewmats)
 
     def __getitem__(self, index: int) -> Camera:
-        """One view; several are `take`n."""
+        """Return one view; use `take` for several."""
         i = range(len(self))[index]
         return Camera(
             self.viewmats[i],
@@ -180,10 +178,10 @@ class Cameras:
 
     @classmethod
     def of(cls, views: Iterable[Camera]) -> Cameras:
-        """Single views, together.
+        """Combine single views.
 
         Raises:
-            InputError: as `Cameras`.
+            InputError: as for `Cameras`.
 
         >>> pair = [Camera.facing([0, y, 0], [0, 0, 0], name=str(y)) for y in (-2, -3)]
         >>> Cameras.of(pair)[1].name, len(Cameras.of(pair))
@@ -202,26 +200,28 @@ class Cameras:
 
     @property
     def positions(self) -> NDArray[np.float64]:
-        """(C, 3) camera centres in the world."""
+        """Camera centres in world coordinates, (C, 3)."""
         R, t = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
         return -np.einsum("cji,cj->ci", R, t)
 
     @property
     def forwards(self) -> NDArray[np.float64]:
-        """(C, 3) unit viewing directions in the world."""
+        """Unit viewing directions in world coordinates, (C, 3)."""
         return self.viewmats[:, 2, :3]
 
     @property
     def extent(self) -> float:
-        """1.1 × the greatest distance of a camera from the middle of them all, scene units (3DGS's
-        `cameras_extent`); 0 where they all stand in one place, or there are none."""
+        """1.1 × the largest distance of a camera from their mean, scene units (3DGS's `cameras_extent`).
+
+        It is 0 if all cameras are in one place, or there are none.
+        """
         if not len(self):
             return 0.0
         away = np.linalg.norm(self.positions - self.positions.mean(0), axis=1).max()
         return 1.1 * float(away) if away > 1e-9 * np.abs(self.positions).max() else 0.0
 
     def take(self, index: ArrayLike) -> Cameras:
-        """The views `index` selects (a mask or indices), in its order."""
+        """Return the views that `index` selects (a mask or indices), in its order."""
         index = np.asarray(index)
         rows = np.flatnonzero(index) if index.dtype == bool else index.astype(int).reshape(-1)
         return replace(
@@ -237,7 +237,7 @@ class Cameras:
         )
 
     def resized(self, longest: int | None) -> Cameras:
-        """The same views with their longer side shrunk to at most `longest` pixels (None keeps them)."""
+        """Return the views with their longer side shrunk to at most `longest` pixels (None keeps them)."""
         if longest is None:
             return self
         factor = np.minimum(1.0, longest / np.maximum(self.widths, self.heights))
@@ -249,10 +249,10 @@ class Cameras:
         return replace(self, Ks=Ks, widths=widths, heights=heights)
 
     def facing(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Which views have any of some points in front of them and within their image.
+        """Return which views contain any of the points within their image.
 
         Args:
-            points: (N, 3) world.
+            points: (N, 3) world coordinates.
 
         Returns:
             (C,) bool.
@@ -263,16 +263,16 @@ class Cameras:
         [True, False]
         """
         world = np.asarray(points, np.float64)
-        few = world[:: max(1, len(world) // 1024)]  # usually tell
+        few = world[:: max(1, len(world) // 1024)]  # usually enough
         return np.array([view.holds(few).any() or view.holds(world).any() for view in self], bool)
 
     def usual_share(self, points: ArrayLike) -> float:
-        """Share of some points, (N, 3) in the world, that a view holds: the median over 16 views at most."""
+        """Return the share of (N, 3) world points in a view, as the median over at most 16 views."""
         some = np.unique(np.linspace(0, len(self) - 1, min(len(self), _MEDIAN_OF)).round().astype(int))
         return float(np.median([self[int(view)].holds(points).mean() for view in some]))
 
     def recentred(self, offset: ArrayLike) -> Cameras:
-        """The same views in coordinates whose origin is the world point `offset` (see `Splats.offset`)."""
+        """Return the views in coordinates relative to the world point `offset` (see `Splats.offset`)."""
         shift = np.asarray(offset, np.float64)
         viewmats = self.viewmats.copy()
         viewmats[:, :3, 3] += viewmats[:, :3, :3] @ shift
@@ -291,7 +291,7 @@ class Cameras:
     ) -> Cameras:
         """Stack per-view lists; `sizes` holds (width, height)."""
         n = len(viewmats)
-        for i, (width, height) in enumerate(sizes):  # before they must fit an int64
+        for i, (width, height) in enumerate(sizes):  # check before converting to int64
             check_image(int(width), int(height), index=i, item="view")
         return cls(
             viewmats=np.asarray(viewmats, np.float64).reshape(n, 4, 4),
@@ -306,12 +306,12 @@ class Cameras:
 
 
 def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
-    """(4, 4) camera_from_world of a camera at `position` facing `target`, image top towards `up`.
+    """Return camera_from_world of a camera at `position` facing `target`, image top towards `up`.
 
     Args:
         position: (3,) the camera's centre, world coordinates.
         target: (3,) a point it faces.
-        up: (3,) a direction, of any length but 0; where the camera faces along it, some right axis is taken.
+        up: (3,) a direction of any nonzero length; if the camera faces along it, the roll is arbitrary.
 
     Returns:
         (4, 4) float64, rigid; OpenCV axes: x right, y down, z forward.
@@ -329,7 +329,7 @@ def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
         raise InputError("position and target coincide", parameter="look_at")
     z = forward / length
     x = np.cross(z, np.asarray(up, np.float64))
-    if np.linalg.norm(x) < 1e-9 * np.linalg.norm(up):  # looking along `up`: any right axis will do
+    if np.linalg.norm(x) < 1e-9 * np.linalg.norm(up):  # facing along `up`: any right axis works
         x = np.cross(z, np.roll(np.asarray(up, np.float64), 1))
     x /= np.linalg.norm(x)
     R = np.stack([x, np.cross(z, x), z])
@@ -339,12 +339,12 @@ def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
 
 
 def unseeing(cameras: Cameras, what: str) -> str:
-    """What an error says where no view sees `what`, and what to do.
+    """Return the error message for views that do not see `what`.
 
     >>> unseeing(Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0])]), "the scene").partition(" (")[0]
-    'none of 1 view sees the scene; the views and the scene must be of one world'
+    'none of 1 view sees the scene; the views and the scene must use the same coordinates'
     """
     return (
-        f"none of {plural(len(cameras), 'view')} sees {what}; the views and the scene must be of one world "
-        "(`g2ard info` shows both, `g2ard convert --transform` moves a scene)"
+        f"none of {plural(len(cameras), 'view')} sees {what}; the views and the scene must use the same "
+        "coordinates (see `g2ard info`; `g2ard convert --transform` moves a scene)"
     )

@@ -1,4 +1,4 @@
-"""Photos as arrays that fit their cameras, PNGs, and sheets that show images side by side."""
+"""Photos as arrays that fit their cameras, PNGs, and contact sheets."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from g2ard.io.limits import opened_image
 from g2ard.scene.cameras import Cameras
 
 _ASPECT_SLACK = 0.02
-"""Relative difference of aspect ratio that rounding a resized photo may cause; more is another photo."""
+"""Relative difference in aspect ratio that rounding may cause; more means another photo."""
 
 _GAP = 6
-"""Pixels between the images of a sheet."""
+"""Pixels between the images of a contact sheet."""
 
 
 def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
-    """The photo of one view, as a pinhole camera with the view's K and size would have taken it.
+    """Read the photo of a view as an image of its pinhole camera.
 
-    A distorted photo is undistorted at its own resolution, then resized by area. Where the undistorted
-    view looks past the photo's edge, the edge is repeated. EXIF orientation is ignored, for poses are of
-    the stored pixels; grey becomes three equal channels, alpha is composited over black.
+    A distorted photo is undistorted at its own resolution, then resized by area. Beyond the photo's edge, the
+    edge is repeated. EXIF orientation is ignored, because poses refer to stored pixels. Grey becomes three
+    equal channels; alpha is composited over black.
 
     Args:
         cameras: C views.
-        index: which one.
+        index: index of the view.
 
     Returns:
         (H, W, 3) float32 in [0, 1].
 
     Raises:
-        InputError: the view has no photo, it is absent or broken, or of another aspect ratio.
+        InputError: the view has no photo, or the photo is missing, broken, or of another aspect ratio.
     """
     path, name = cameras.image_paths[index], cameras.names[index]
     if path is None:
-        raise InputError(f"({name}) has no photo", index=index, item="view", hint="give views with photos")
+        raise InputError(f"({name}) has no photo", index=index, item="view", hint="pass views with photos")
     named = None if cameras.source is None else f"{cameras.source} names it as view {name!r}"
     try:
         image = _open(path)
@@ -55,7 +55,7 @@ def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
         raise InputError(
             f"the photo is {width}×{height}, its view {target[0]}×{target[1]}: the aspects differ",
             path=path,
-            hint="give the photos as their poses were made from, uncropped",
+            hint="pass the uncropped photos that the poses were estimated from",
         )
     distortion = cameras.distortions[index]
     if distortion.any():
@@ -65,17 +65,17 @@ def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
 
 
 def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
-    """Where the photo of one view counts, in the pixels of `load_image`.
+    """Read the mask of a view's photo, in the pixels of `load_image`.
 
     Args:
         cameras: C views.
-        index: which one.
+        index: index of the view.
 
     Returns:
-        (H, W), true where the mask is brighter than half; None if the view has no mask.
+        (H, W), True if the mask is brighter than half; None if the view has no mask.
 
     Raises:
-        InputError: as `load_image`, of the mask.
+        InputError: as for `load_image`.
     """
     path = cameras.mask_paths[index]
     if path is None:
@@ -87,7 +87,7 @@ def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
 def _open(path: Path) -> NDArray[np.float32]:
     try:
         with opened_image(path) as image:
-            if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey, whatever PIL calls it
+            if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey has several modes
                 values = np.asarray(image, np.float32)
                 top = 1.0 if image.mode == "F" else 65535.0
                 return np.repeat((values / np.float32(top))[..., None], 3, axis=2)
@@ -102,7 +102,7 @@ def _open(path: Path) -> NDArray[np.float32]:
 def _undistorted(
     image: NDArray[np.float32], K: NDArray[np.float64], distortion: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """Look up, for each pixel of the pinhole image, where the lens put it; bilinear."""
+    """Sample the distorted photo for each pixel of the pinhole image, bilinearly."""
     height, width = image.shape[:2]
     rows, columns, down, right = _lookup(width, height, tuple(K.ravel()), tuple(distortion))
     flat = image.reshape(-1, 3)
@@ -112,11 +112,11 @@ def _undistorted(
     return (top * (1 - down) + bottom * down).reshape(image.shape)
 
 
-@lru_cache(maxsize=2)  # one lens for all photos is the rule
+@lru_cache(maxsize=2)  # usually all photos share one lens
 def _lookup(width: int, height: int, K: tuple[float, ...], distortion: tuple[float, ...]) -> tuple[Any, ...]:
-    """Row, column and fraction of each pixel's source: OpenCV's model, pixel centres at +0.5.
+    """Return row, column and fractions of each pixel's source: OpenCV's model, pixel centres at +0.5.
 
-    x' = x·(1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²), y' alike with p1 and p2 exchanged.
+    x' = x·(1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²), y' likewise with p1 and p2 exchanged.
     """
     if width < 2 or height < 2:
         raise InputError(f"a photo of {width}×{height} pixels cannot be undistorted")
@@ -142,8 +142,7 @@ def _lookup(width: int, height: int, K: tuple[float, ...], distortion: tuple[flo
 
 
 def resized(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """An image (H, W, C) float32 at another (width, height): each pixel the mean of the area it covers;
-    bilinear along an axis that grows.
+    """Resize an (H, W, C) float32 image to (width, height): by area when shrinking, bilinearly when growing.
 
     >>> resized(np.full((4, 8, 3), 0.5, np.float32), (2, 1)).tolist()
     [[[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]]
@@ -160,7 +159,7 @@ def resized(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.flo
 
 
 def _averaged(image: NDArray[np.float32], length: int, axis: int) -> NDArray[np.float32]:
-    """Exact means over `length` equal stretches of an axis, from differences of its running sum."""
+    """Return exact means over `length` equal parts of an axis, from differences of its running sum."""
     count = image.shape[axis]
     pad = [(1, 0) if i == axis else (0, 0) for i in range(3)]
     sums = np.pad(np.cumsum(image, axis=axis, dtype=np.float64), pad)
@@ -172,7 +171,7 @@ def _averaged(image: NDArray[np.float32], length: int, axis: int) -> NDArray[np.
 
 
 def to_bytes(image: ArrayLike) -> NDArray[np.uint8]:
-    """Values in [0, 1] as bytes, clipped and rounded to nearest; bytes stay as they are. NaN is black.
+    """Convert values in [0, 1] to bytes, clipped and rounded to nearest; bytes are unchanged, NaN is black.
 
     >>> to_bytes([[-1.0, 0.5, 2.0]]).tolist()
     [[0, 128, 255]]
@@ -184,7 +183,7 @@ def to_bytes(image: ArrayLike) -> NDArray[np.uint8]:
 
 
 def as_saved(image: ArrayLike) -> NDArray[np.float32]:
-    """An image in [0, 1] as it comes back from an 8-bit PNG: clipped, and rounded to multiples of 1/255.
+    """Round an image in [0, 1] like an 8-bit PNG: clipped, in multiples of 1/255.
 
     >>> (255 * as_saved([[-1.0, 0.5, 2.0]])).tolist()
     [[0.0, 128.0, 255.0]]
@@ -193,22 +192,22 @@ def as_saved(image: ArrayLike) -> NDArray[np.float32]:
 
 
 def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) -> None:
-    """Write an image as an 8-bit PNG, whole or not at all.
+    """Write an image as an 8-bit PNG, atomically.
 
     Args:
         path: the file.
         image: (H, W, 3), (H, W, 4) or (H, W), floats in [0, 1] or bytes.
-        overwrite: whether an existing file may be replaced.
+        overwrite: replace an existing file.
 
     Raises:
-        InputError: a shape that is no image.
+        InputError: the shape is not an image's.
         OutputError: see `atomic_output`.
     """
     values = to_bytes(image)
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if not values.size or not (values.ndim == 2 or (values.ndim == 3 and values.shape[2] in (3, 4))):
-        raise InputError(f"an array of shape {values.shape} is not an image", path=path)
+        raise InputError(f"expected an image, got an array of shape {values.shape}", path=path)
     with atomic_output(path, overwrite) as temporary:
         Image.fromarray(np.ascontiguousarray(values)).save(temporary, format="PNG")
 
@@ -220,7 +219,7 @@ def contact_sheet(
     row_labels: Sequence[str] = (),
     cell_width: int | None = None,
 ) -> NDArray[np.uint8]:
-    """Images in a grid: one row a view, one column a kind (photo, simplified, recovered…).
+    """Arrange images in a grid: one row per view, one column per kind (photo, simplified, recovered…).
 
     Args:
         rows: rows of images (H, W, 3), floats in [0, 1] or bytes, of any sizes; rows may be short.
@@ -229,7 +228,7 @@ def contact_sheet(
         cell_width: resize every image to this width; None keeps sizes.
 
     Returns:
-        (H, W, 3) bytes, on a dark ground.
+        (H, W, 3) bytes, on a dark background.
 
     Raises:
         InputError: no images.

@@ -1,4 +1,4 @@
-"""Scenes as the kernels take them: finite, contiguous, cut to what float32 can follow, put in order once."""
+"""Scenes in the form that kernels take: finite, contiguous, within float32's range, sorted once."""
 
 from __future__ import annotations
 
@@ -19,47 +19,47 @@ MAX_OPACITY: float = _LIMITS["max_opacity"]
 """Renderers clip α here, so simplification makes no Gaussian more opaque."""
 
 DRAWN_LOGITS: tuple[float, float] = _LIMITS["drawn_logits"]
-"""Where float32 can follow the sigmoid."""
+"""Range of logits in which float32 represents the sigmoid."""
 
 DRAWN_LOG_SCALES: tuple[float, float] = _LIMITS["drawn_log_scales"]
-"""Natural logarithms of the scales between which float32 can follow a projected covariance."""
+"""Range of log-scales in which float32 represents a projected covariance."""
 
 LARGEST_SCALE = np.float32(np.exp(43))
-"""A scale whose square is a float32; files' readers clamp to it too."""
+"""Largest scale whose square fits float32; readers clamp to it too."""
 
 _FAINTEST = np.float32(-_LIMITS["logit_of_opaque"])
-"""A logit; files' readers clamp to it too."""
+"""Least logit; readers clamp to it too."""
 
 
 class PreparedScene(Splats):
-    """A scene whose arrays are as the kernels take them; do not change them while it is in use.
+    """A scene whose arrays are in the form that kernels take; do not modify them.
 
-    Its order is found when first asked for, and shared by all stages that are given the same object.
+    Its Morton order is computed on first use and shared by all stages that use the same object.
     """
 
     @cached_property
     def core(self) -> _core.Scene:
-        """The scene's arrays and their order."""
+        """Arrays of the scene and their order in Rust."""
         return _core.Scene(self)
 
     def restore(self, order: NDArray[np.uint32], bounds: NDArray[np.float64]) -> None:
-        """Take what `core.order` and `core.bounds` were found to be of the same scene before.
+        """Restore `core.order` and `core.bounds` of the same scene.
 
         Raises:
-            InputError: not each row once.
+            InputError: `order` is not a permutation.
         """
         vars(self)["core"] = _core.Scene(self, (order, bounds.tolist()))
 
 
 def as_prepared(splats: Splats) -> PreparedScene:
-    """The same object where it is prepared, else one of its arrays, which must be C-contiguous and finite."""
+    """Return a prepared scene of the same arrays, which must be C-contiguous and finite."""
     if isinstance(splats, PreparedScene):
         return splats
     return PreparedScene(**{f.name: getattr(splats, f.name) for f in fields(splats)})
 
 
 def finite_rows_of(splats: Splats) -> tuple[PreparedScene, NDArray[np.bool_] | slice]:
-    """The finite rows of a scene, prepared, and which they are.
+    """Return the finite rows of a scene, prepared, and their mask.
 
     Raises:
         InputError: no row is finite.
@@ -68,7 +68,7 @@ def finite_rows_of(splats: Splats) -> tuple[PreparedScene, NDArray[np.bool_] | s
     everything = all(_all_finite(a) for a in arrays) and not np.isnan(splats.logit_opacities).any()
     finite = np.ones(len(splats), bool) if everything else splats.finite_rows()
     if not finite.any():
-        raise InputError(f"none of {len(splats)} rows is finite", parameter="splats")
+        raise InputError(f"none of the {len(splats)} rows is finite", parameter="splats")
     scene = splats if everything else splats.take(finite)
     kind = np.float64 if scene.means.dtype == np.float64 else np.float32
     scales = np.ascontiguousarray(scene.scales, np.float32)
@@ -88,22 +88,22 @@ def finite_rows_of(splats: Splats) -> tuple[PreparedScene, NDArray[np.bool_] | s
 
 
 def with_some_opacity(scene: PreparedScene) -> PreparedScene:
-    """A scene of which nothing shows, with an α that leaves every row some weight in sums.
+    """Raise the α of an invisible scene so that every row has some weight in sums.
 
-    Dropping the transparent would leave nothing, and a mass of 0 no reason to keep one place over another.
+    Otherwise all rows would be dropped, or all have mass 0.
     """
     logits = scene.logit_opacities
     return replace(scene, logit_opacities=np.where(np.isinf(logits), logits, np.maximum(logits, _FAINTEST)))
 
 
 def _all_finite(values: NDArray[Any]) -> bool:
-    """A sum is finite only if all its terms are; where it overflows they are tested one by one."""
+    """Return whether all values are finite; tests the sum first, which is faster."""
     with np.errstate(over="ignore", invalid="ignore"):
         return bool(np.isfinite(values.sum()) or np.isfinite(values).all())
 
 
 def _used_degree(scene: Splats) -> int:
-    """The highest SH degree that any Gaussian has a coefficient of."""
+    """Return the highest SH degree with a nonzero coefficient."""
     degree = scene.sh_degree
     while degree > 0:
         band = scene.shN[:, degree**2 - 1 :]

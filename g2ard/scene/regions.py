@@ -1,4 +1,4 @@
-"""Regions that a user points at: spheres and boxes in world coordinates."""
+"""Regions given by the user: spheres and boxes in world coordinates."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.transform import in_box, in_sphere
 
 Region = tuple[float, ...]
-"""(x, y, z, r), a sphere, or (x, y, z, x, y, z), the lower and the upper corner of a box."""
+"""Sphere (x, y, z, r), or box (x, y, z, x, y, z) with its lower and upper corner."""
 
 
 def check_region(region: Sequence[float]) -> Region:
-    """The region, as plain numbers.
+    """Validate a region and return it as plain numbers.
 
     Raises:
-        InputError: neither 4 nor 6 finite numbers, a radius that is not positive, a box that holds nothing.
+        InputError: neither 4 nor 6 finite numbers, a radius that is not positive, or an empty box.
 
     >>> check_region([0, 0, 0, 2])
     (0.0, 0.0, 0.0, 2.0)
@@ -34,15 +34,15 @@ def check_region(region: Sequence[float]) -> Region:
     if len(numbers) == 4 and not numbers[3] > 0:
         raise InputError(f"expected a radius > 0, got {numbers[3]:g}", parameter="region")
     if len(numbers) == 6 and not all(low < high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
-        raise InputError("a box with nothing in it; the lower corner comes first", parameter="region")
+        raise InputError("empty box; the lower corner comes first", parameter="region")
     return numbers
 
 
 def as_regions(given: Sequence[Any]) -> tuple[Region, ...]:
-    """Regions, or one alone, as plain numbers.
+    """Validate one or several regions and return them as plain numbers.
 
     Raises:
-        InputError: as `check_region`, or no numbers.
+        InputError: as for `check_region`, or not numbers.
 
     >>> as_regions((0, 0, 0, 2)), as_regions([[0, 0, 0, 2]])
     (((0.0, 0.0, 0.0, 2.0),), ((0.0, 0.0, 0.0, 2.0),))
@@ -59,7 +59,7 @@ def as_regions(given: Sequence[Any]) -> tuple[Region, ...]:
 
 
 def in_any(splats: Splats, regions: Sequence[Region]) -> NDArray[np.bool_]:
-    """(N,) whose means lie in one of the regions.
+    """Return the (N,) mask of means in any of the regions.
 
     >>> pair = Splats.create([[0, 0, 0], [5, 0, 0]], scales=np.ones((2, 3)))
     >>> in_any(pair, [(4.0, -1.0, -1.0, 6.0, 1.0, 1.0)]).tolist()

@@ -1,4 +1,4 @@
-"""The scene type that every stage passes on."""
+"""The scene type shared by all stages."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ SH_C0 = 0.28209479177387814
 """Band-0 spherical harmonic: colour = 0.5 + SH_C0 · sh0."""
 
 DRAWN_LOGIT = -5.54
-"""Below it α < 1/255, which no renderer draws."""
+"""Logit below which α < 1/255, which no renderer draws."""
 
 _UNIT_SLACK = 1e-6
-"""How far from 1 the length of a quaternion may be that counts as rounded: some ulps of float32."""
+"""Deviation of a quaternion's length from 1 that counts as rounding: a few ulps of float32."""
 
 _DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
 
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """N Gaussians, structure of arrays, each name saying its space.
+    """N Gaussians as a structure of arrays.
 
     Args:
         means: (N, 3) float32 or float64, scene units, relative to `offset`.
-        quats: (N, 4) float32 wxyz of any length but 0; what g2ard returns and writes has length 1.
+        quats: (N, 4) float32 wxyz of any nonzero length; g2ard returns and writes unit quaternions.
         scales: (N, 3) float32, linear standard deviations along the rotated axes.
         logit_opacities: (N,) float32; opacity = sigmoid(logit).
         sh0: (N, 1, 3) float32, band-0 coefficients; colour = 0.5 + SH_C0·sh0 + higher bands.
         shN: (N, K−1, 3) float32, K−1 in {0, 3, 8, 15}: SH degree 0–3.
-        offset: (3,) float64, world = means + offset. Large map coordinates (UTM) live here.
+        offset: (3,) float64, world = means + offset. Large map coordinates (UTM) go here.
 
     Raises:
-        InputError: an array's shape does not fit the others.
+        InputError: mismatched array shapes.
 
     >>> s = Splats.create(means=np.zeros((2, 3)), scales=np.ones((2, 3)))
     >>> len(s), s.sh_degree, s.opacities
@@ -83,7 +83,7 @@ class Splats:
         shN: ArrayLike | None = None,
         offset: ArrayLike = (0.0, 0.0, 0.0),
     ) -> Splats:
-        """Build from anything array-like; defaults: no rotation, opacity 0.5, mid grey, SH degree 0."""
+        """Create from array-likes; by default no rotation, opacity 0.5, mid grey, SH degree 0."""
         points = np.asarray(means)
         if points.dtype != np.float64:
             points = points.astype(np.float32)
@@ -110,35 +110,35 @@ class Splats:
 
     @property
     def sh_degree(self) -> int:
-        """0, 1, 2 or 3."""
+        """SH degree, 0 to 3."""
         return _DEGREE_OF_REST[self.shN.shape[1]]
 
     @property
     def opacities(self) -> NDArray[np.float32]:
-        """(N,) in [0, 1]: sigmoid of `logit_opacities`, without overflow."""
+        """Opacities in [0, 1], (N,): the sigmoid of `logit_opacities`, without overflow."""
         x = self.logit_opacities.astype(np.float64)
         e = np.exp(-np.abs(x))
         return np.where(x >= 0, 1 / (1 + e), e / (1 + e)).astype(np.float32)
 
     @property
     def log_scales(self) -> NDArray[np.float32]:
-        """(N, 3) natural logarithms of `scales`, as files store them."""
+        """Natural logarithms of `scales`, (N, 3), as files store them."""
         return np.log(self.scales.astype(np.float64)).astype(np.float32)
 
     @property
     def colors(self) -> NDArray[np.float32]:
-        """(N, 3) base colours 0.5 + SH_C0·sh0, not clamped."""
+        """Base colours 0.5 + SH_C0·sh0, (N, 3), not clamped."""
         return (0.5 + SH_C0 * self.sh0[:, 0]).astype(np.float32)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all arrays in float32, the form a .ply holds."""
+        """Bytes of all arrays in float32, as in a .ply."""
         return 4 * len(self) * (14 + 3 * self.shN.shape[1])
 
     def fingerprint(self) -> str:
-        """A hash of every array: the same scene, the same text.
+        """Return a hash of all arrays.
 
-        It is computed once; arrays that are changed in place later do not change it.
+        It is computed once; later changes of arrays in place do not affect it.
         """
         return self._digest
 
@@ -150,7 +150,7 @@ class Splats:
         return digest.hexdigest()
 
     def take(self, index: Any) -> Splats:
-        """The rows `index` selects (a mask, a slice or indices), in its order."""
+        """Return the rows that `index` selects (a mask, a slice or indices), in its order."""
         return replace(
             self,
             means=self.means[index],
@@ -162,7 +162,7 @@ class Splats:
         )
 
     def with_sh_degree(self, degree: int) -> Splats:
-        """The same scene with higher bands cut off, or padded with zeros.
+        """Return the scene with higher bands cut off or padded with zeros.
 
         Raises:
             InputError: the degree is not 0–3.
@@ -178,14 +178,14 @@ class Splats:
         return replace(self, shN=shN)
 
     def recentred(self, offset: ArrayLike) -> Splats:
-        """The same world scene with means relative to another offset (subtracted in float64)."""
+        """Return the scene with means relative to another offset (subtracted in float64)."""
         target = np.asarray(offset, np.float64)
         shift = self.offset - target
         means = self.means if not shift.any() else (self.means.astype(np.float64) + shift)
         return replace(self, means=means.astype(self.means.dtype), offset=target)
 
     def finite_rows(self) -> NDArray[np.bool_]:
-        """(N,) whether every value of the row is finite; an infinite logit counts as finite (α = 0 or 1)."""
+        """Return the (N,) mask of rows with finite values; infinite logits count as finite (α = 0 or 1)."""
         ok = np.isfinite(self.means).all(1) & ~np.isnan(self.logit_opacities)
         for name in ("quats", "scales", "sh0", "shN"):
             ok &= np.isfinite(getattr(self, name)).reshape(len(self), -1).all(1)
@@ -193,14 +193,14 @@ class Splats:
 
 
 def unit_quats(quats: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The same rotations by quaternions of length 1: q / |q|.
+    """Normalise quaternions: q / |q|.
 
     Args:
         quats: (N, 4) float32 wxyz.
 
     Returns:
         (N, 4) float32. Rows within 1e-6 of length 1 keep every bit, so that writing and reading change
-        nothing; zeros become the identity; rows that are not finite stay, for the writers to name.
+        nothing. Zeros become the identity. Rows that are not finite are kept for writers to report.
 
     >>> unit_quats(np.float32([[-2, 0, 0, 0], [0, 3e30, 4e30, 0], [0, 0, 0, 0]])).round(6).tolist()
     [[-1.0, 0.0, 0.0, 0.0], [0.0, 0.6000000238418579, 0.800000011920929, 0.0], [1.0, 0.0, 0.0, 0.0]]

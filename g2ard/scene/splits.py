@@ -1,4 +1,4 @@
-"""Which views are for training and which are held out."""
+"""Splits of views into training and held-out ones."""
 
 from __future__ import annotations
 
@@ -17,28 +17,29 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
 
 HOLD_OUT = 8
-"""Without a split file every 8th name is test, as in Mip-NeRF 360's and INRIA's evaluations."""
+"""Without a split file every 8th name is in the test split, as in Mip-NeRF 360's and INRIA's evaluations."""
 
 
 def split_mask(
     views: str | Path | None, names: Sequence[str], which: str, *, stated: Sequence[str | None] = ()
 ) -> NDArray[np.bool_]:
-    """Which of the views belong to a split.
+    """Return the mask of views in a split.
 
-    The views' own statement wins, then a split.json beside them ({"train": [names], "test": [names]}, any
-    further keys), then the rule: sorted by name, every 8th from the first on is test, the others train.
+    Splits come from the views themselves, otherwise from a split.json beside them ({"train": [names], "test":
+    [names]}, and further keys), otherwise from the rule: sorted by name, every 8th starting with the first is
+    "test", the others "train".
 
     Args:
-        views: the file or folder the views come from; None where there is none, and the rule holds.
-        names: C view names. A split file may leave out their suffix or folder.
+        views: the file or folder of the views; None applies the rule.
+        names: C view names. A split file may omit their suffix or folder.
         which: "train", "test", "all", or another key of the split file.
-        stated: per view the split it states itself, None where it states none; () if none does.
+        stated: split stated by each view or None; () if none is stated.
 
     Returns:
         (C,) bool.
 
     Raises:
-        InputError: the split is unknown or has none of the views.
+        InputError: the split is unknown or empty.
 
     >>> split_mask("nowhere", ["b", "a", "c"], "test").tolist()
     [False, True, False]
@@ -50,15 +51,15 @@ def split_mask(
         raise InputError(f"no split {which!r} (there are {', '.join(sorted(masks))})", path=views)
     if not masks[which].any():
         of = "its only view is not" if len(names) == 1 else f"none of its {len(names)} views is"
-        raise InputError(f"{of} in split {which!r}; a split.json beside them can say which are", path=views)
+        raise InputError(f"{of} in split {which!r}; add a split.json that says which are", path=views)
     return masks[which]
 
 
 def states_splits(views: str | Path | None, stated: Sequence[str | None] = ()) -> bool:
-    """Whether views say their splits, themselves or by a split.json beside them; see `split_mask`.
+    """Return whether splits are stated by views or by a split.json beside them, see `split_mask`.
 
     Raises:
-        InputError: a split file that is broken.
+        InputError: a broken split file.
     """
     return any(stated) or (views is not None and _split_file(Path(views)) is not None)
 
@@ -66,7 +67,7 @@ def states_splits(views: str | Path | None, stated: Sequence[str | None] = ()) -
 def splits_of(
     views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()
 ) -> tuple[str | None, ...]:
-    """The split each view belongs to, by the rules of `split_mask`: what to write so that it travels along.
+    """Return the split of each view by the rules of `split_mask`, for writing it with the views.
 
     Args:
         views: as for `split_mask`.
@@ -74,11 +75,11 @@ def splits_of(
         stated: as for `split_mask`.
 
     Returns:
-        C words, None for a view that is in no split. Of a view in several, "test" counts before "train", and
-        both before others by name.
+        C split names, or None for a view in no split. For a view in several splits, "test" comes before
+        "train", and both before others by name.
 
     Raises:
-        InputError: as `split_mask`, for a split file that is broken.
+        InputError: a broken split file.
 
     >>> splits_of("nowhere", ["b", "a", "c"])
     ('train', 'test', 'train')
@@ -91,19 +92,13 @@ def splits_of(
 def for_training(
     views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()
 ) -> NDArray[np.bool_]:
-    """Which views may be trained on where scores are taken on other views: the train split of views that
-    state splits (themselves, or by a split.json), else all.
+    """Return the (C,) mask of views to train on when other views are scored: "train" if splits are stated,
+    otherwise all.
 
-    Args:
-        views: as for `split_mask`.
-        names: C view names.
-        stated: as for `split_mask`.
-
-    Returns:
-        (C,) bool.
+    Arguments are those of `split_mask`.
 
     Raises:
-        InputError: splits are stated, and none is "train".
+        InputError: splits are stated, but not "train".
     """
     return split_mask(views, names, "train" if states_splits(views, stated) else "all", stated=stated)
 
@@ -111,26 +106,19 @@ def for_training(
 def for_scores(
     views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()
 ) -> NDArray[np.bool_]:
-    """Which views a file given for scoring alone scores on: all but those that it states as "train".
+    """Return the (C,) mask of views to score on in a file for scoring: all except those stated as "train".
 
-    Args:
-        views: as for `split_mask`.
-        names: C view names.
-        stated: as for `split_mask`.
-
-    Returns:
-        (C,) bool.
+    Arguments are those of `split_mask`.
 
     Raises:
-        InputError: it states all of them as "train".
+        InputError: all views are stated as "train".
     """
     if not states_splits(views, stated):
         return np.ones(len(names), bool)
     mask = np.array([split != "train" for split in splits_of(views, names, stated)], bool)
     if not mask.any():
         raise InputError(
-            f"all of its {len(names)} views are for training, none is left to score on; name views "
-            "with a test split",
+            f"all of its {len(names)} views are for training; pass views with a test split",
             path=views,
         )
     return mask
@@ -139,7 +127,7 @@ def for_scores(
 def _masks(
     views: str | Path | None, names: Sequence[str], stated: Sequence[str | None]
 ) -> dict[str, NDArray[np.bool_]]:
-    """Split → (C,) bool: as stated, else as a split.json lists them, else by the rule."""
+    """Return split → (C,) mask: as stated, as listed in split.json, or by the rule."""
     if any(stated):
         return {word: np.array([s == word for s in stated], bool) for word in {s for s in stated if s}}
     listed = None if views is None else _split_file(Path(views))
@@ -157,7 +145,7 @@ def _masks(
 
 
 def _split_file(views: Path) -> dict[str, list[str]] | None:
-    """split.json in the views' folder; for a COLMAP model also above sparse/0."""
+    """Read split.json from the views' folder; for a COLMAP model also from above sparse/0."""
     folder = views if views.is_dir() else views.parent
     places = [folder, *(folder.parents[:2] if folder.name == "0" or folder.name == "sparse" else ())]
     path = next((p for place in places if (p := place / "split.json").is_file()), None)
@@ -173,7 +161,7 @@ def _split_file(views: Path) -> dict[str, list[str]] | None:
 
 
 def _listed(names: Sequence[str], wanted: Sequence[str]) -> NDArray[np.bool_]:
-    """By stem, so that suffix and folder may differ, unless stems do not tell the views apart."""
+    """Match names by stem, so that suffix and folder may differ, unless stems are ambiguous."""
     stems = [PurePosixPath(name).stem for name in names]
     if len(set(stems)) < len(stems):
         exact = set(wanted)
@@ -183,15 +171,7 @@ def _listed(names: Sequence[str], wanted: Sequence[str]) -> NDArray[np.bool_]:
 
 
 def not_held_out(cameras: Cameras, held_out: Cameras) -> NDArray[np.bool_]:
-    """Which views are none of the held-out ones, by photo or, exactly, by pose.
-
-    Args:
-        cameras: C views to train on.
-        held_out: views to score on, of another file.
-
-    Returns:
-        (C,) bool.
-    """
+    """Return the (C,) mask of views that are not held out, compared by photo or by exact pose."""
     photos = {real_path(path) for path in held_out.image_paths if path is not None}
     poses = {view.tobytes() for view in np.round(held_out.viewmats, 9) + 0.0}
     mine = np.round(cameras.viewmats, 9) + 0.0

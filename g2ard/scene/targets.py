@@ -1,4 +1,4 @@
-"""What recovery and evaluation compare renders with: photos, or the teacher's renders of the same views."""
+"""Targets of recovery and evaluation: photos, or a teacher's renders of the same views."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from g2ard.rendering.renderer import RasterSettings, Renderer
 
 CACHE_BYTES = 2_000_000_000
-"""Targets are kept in memory up to this many bytes; beyond it they are made again when they are asked for."""
+"""Bytes of targets cached in memory; further ones are loaded or rendered again on each access."""
 
 
 class Targets(Protocol):
-    """One (H, W, 3) float32 image in [0, 1] for each view of `cameras`."""
+    """One (H, W, 3) float32 image in [0, 1] per view of `cameras`."""
 
     cameras: Cameras
 
@@ -32,25 +32,25 @@ class Targets(Protocol):
 
 
 def mask_of(targets: Targets, view: int) -> NDArray[np.bool_] | None:
-    """(H, W), where a target counts; None where all of it does, which is the rule."""
+    """Return the (H, W) mask of a target's valid pixels, or None if all are valid."""
     masks = getattr(targets, "mask", None)
     return None if masks is None else masks(view)
 
 
 def against_of(targets: Targets, view: int) -> str | None:
-    """What a view's target is, "photo" or "teacher"; None where the targets do not say."""
+    """Return the kind of a view's target, "photo" or "teacher", or None if unknown."""
     says: Callable[[int], str | None] | None = getattr(targets, "against", None)
     return None if says is None else says(view)
 
 
 def kinds_of(targets: Targets) -> str:
-    """Of how many views the target is a photo, and of how many a teacher's render."""
+    """Describe the kinds of the targets."""
     said = [against_of(targets, view) for view in range(len(targets.cameras))]
     return kinds_told(said.count("photo"), said.count("teacher"))
 
 
 def kinds_told(photos: int, renders: int) -> str:
-    """Targets of two kinds in words, counted where there are both.
+    """Describe the kinds of targets, with counts if there are both.
 
     >>> kinds_told(7, 9), kinds_told(7, 0)
     ('7 photos and 9 teacher renders', 'photos')
@@ -61,7 +61,7 @@ def kinds_told(photos: int, renders: int) -> str:
 
 
 def fingerprint_of(targets: Targets) -> str:
-    """What a checkpoint stores of its targets: the views, and where their images come from."""
+    """Return a hash of the views and the source of their images, for checkpoints."""
     cameras = targets.cameras
     digest = hashlib.sha256(str(getattr(targets, "source", type(targets).__name__)).encode())
     for array in (cameras.viewmats, cameras.Ks, cameras.widths, cameras.heights):
@@ -70,11 +70,11 @@ def fingerprint_of(targets: Targets) -> str:
 
 
 class Subset:
-    """Some of other targets.
+    """Subset of other targets.
 
     Args:
         targets: all of them.
-        rows: which, in which order.
+        rows: indices of the views, in order.
     """
 
     def __init__(self, targets: Targets, rows: ArrayLike) -> None:
@@ -83,23 +83,23 @@ class Subset:
 
     @property
     def source(self) -> str:
-        """As that of all of them."""
+        """Source of the other targets."""
         return str(getattr(self._targets, "source", type(self._targets).__name__))
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         return self._targets[int(self._rows[view])]
 
     def mask(self, view: int) -> NDArray[np.bool_] | None:
-        """See `mask_of`."""
+        """Return the mask, see `mask_of`."""
         return mask_of(self._targets, int(self._rows[view]))
 
     def against(self, view: int) -> str | None:
-        """See `against_of`."""
+        """Return the kind, see `against_of`."""
         return against_of(self._targets, int(self._rows[view]))
 
 
 class _Cached(ABC):
-    """Keeps what `_make` returns, first come first kept, within `limit` bytes."""
+    """Cache of what `_make` returns, up to `limit` bytes, first come first kept."""
 
     def __init__(self, cameras: Cameras, limit: int) -> None:
         self.cameras = cameras
@@ -109,7 +109,7 @@ class _Cached(ABC):
 
     @abstractmethod
     def _make(self, view: int) -> NDArray[Any]:
-        """The image of one view, as it is kept."""
+        """Create the image of one view, as it is cached."""
 
     def _stored(self, view: int) -> NDArray[Any]:
         image = self._kept.get(view)
@@ -121,7 +121,7 @@ class _Cached(ABC):
         return image
 
     def fill(self, progress: Progress, stage: str) -> None:
-        """Make every target now, as far as memory allows, so that later steps take equal time."""
+        """Create all targets now, within the cache's limit, so that later steps take equal time."""
         for view in range(len(self.cameras)):
             self._stored(view)
             progress(stage, view + 1, len(self.cameras))
@@ -130,19 +130,18 @@ class _Cached(ABC):
 
 
 class Photos(_Cached):
-    """The photos of `cameras`, undistorted and at each camera's size; kept as 8-bit.
+    """Photos of `cameras`, undistorted and at each camera's size; cached as 8-bit.
 
-    A photo whose camera has a mask counts only where the mask is bright, and is black elsewhere. A photo
-    with an exposure, the affine colour transform C that trainers fit (photo = C·render), is undone to what
-    the scene shows.
+    A photo with a mask is black outside of it. For a photo with an exposure, the affine colour transform C
+    that trainers fit (photo = C·render), C is inverted.
 
     Args:
-        cameras: every one with a photo.
-        exposures: (3, 4) of the photos that have one, by view name.
-        limit: bytes kept in memory.
+        cameras: views, all with a photo.
+        exposures: (3, 4) exposures by view name, for photos that have one.
+        limit: bytes cached in memory.
 
     Raises:
-        InputError: a view without a photo, an exposure that cannot be undone.
+        InputError: a view without a photo, or an exposure that is not invertible.
     """
 
     def __init__(
@@ -158,7 +157,7 @@ class Photos(_Cached):
         if missing is not None:
             raise InputError(
                 f"view {missing} has no photo",
-                hint="give views with photos, or render them from {teacher=SCENE}",
+                hint="pass views with photos, or render them from {teacher=SCENE}",
             )
         super().__init__(cameras, limit)
         self.source = "photos " + " ".join(str(path) for path in cameras.image_paths)
@@ -174,11 +173,11 @@ class Photos(_Cached):
             self.source += f" exposures {[(v, m.tolist()) for v, m in self._undo.items()]}"
 
     def against(self, view: int) -> str:
-        """See `against_of`."""
+        """Return the kind, see `against_of`."""
         return "photo"
 
     def mask(self, view: int) -> NDArray[np.bool_] | None:
-        """Where the photo counts; None if it has no mask."""
+        """Return the mask of valid pixels, or None."""
         if view not in self._masks:
             from g2ard.scene.images import load_mask
 
@@ -196,7 +195,7 @@ class Photos(_Cached):
         if undo is not None:
             photo = np.ascontiguousarray(photo @ undo[:, :3].T + undo[:, 3], dtype=np.float32)
         mask = self.mask(view)
-        if mask is not None:  # SSIM's window reaches over the mask's edge: what lies there must not matter
+        if mask is not None:  # SSIM's window reaches across the mask's edge
             photo[~mask] = 0
         return photo
 
@@ -210,17 +209,17 @@ def _inverse(name: str, exposure: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 class TeacherRenders(_Cached):
-    """The dense scene rendered into each view: (H, W, 3) float32, clipped to [0, 1], never rounded to 8 bits.
+    """Renders of the dense scene: (H, W, 3) float32, clipped to [0, 1], not rounded to 8 bits.
 
     Args:
         teacher: the dense scene.
         cameras: the views, world coordinates.
         background: RGB in [0, 1] behind the scene.
         settings: the renderer's conventions; None means gsplat's.
-        limit: bytes of renders kept in memory; what is over it is rendered again when asked for.
-        lazy: render a view when it is first asked for, not all at once.
-        renderer: of the same teacher, background and settings, shared by several targets; None makes one.
-        progress: told of views rendered.
+        limit: bytes of renders cached in memory; further ones are rendered again on each access.
+        lazy: render a view on first access instead of all at once.
+        renderer: a shared renderer of the same teacher, background and settings; None creates one.
+        progress: called with the number of views rendered.
 
     Raises:
         InputError: a camera or a background that cannot be rendered.
@@ -248,7 +247,7 @@ class TeacherRenders(_Cached):
 
     @property
     def source(self) -> str:
-        """What the renders are made of; it takes a hash of the teacher."""
+        """Identity of the renders; hashes the teacher."""
         conventions = "" if self._settings is None else f" {self._settings}"
         return f"teacher {self._teacher.fingerprint()} {self._background}{conventions}"
 
@@ -260,7 +259,7 @@ class TeacherRenders(_Cached):
         return self._renderer.clipped(self.cameras[view])
 
     def against(self, view: int) -> str:
-        """See `against_of`."""
+        """Return the kind, see `against_of`."""
         return "teacher"
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
@@ -268,22 +267,23 @@ class TeacherRenders(_Cached):
 
 
 class PhotosOrRenders:
-    """The photo of a view where there is one, else the dense scene's render (sec. 3.1: "real images are used
-    when available, otherwise teacher renders").
+    """The photo of each view, or a render of the dense scene if it has none.
+
+    As in sec. 3.1: "real images are used when available, otherwise teacher renders".
 
     Args:
-        cameras: with photos or without.
+        cameras: views with or without photos.
         teacher: the dense scene.
         background: RGB behind it.
-        exposures: of the photos, see `Photos`.
+        exposures: exposures of the photos, see `Photos`.
         settings: the renderer's conventions; None means gsplat's.
-        limit: bytes kept in memory, of each kind.
-        lazy: render when first asked for.
+        limit: bytes cached in memory per kind.
+        lazy: render on first access.
         renderer: see `TeacherRenders`.
-        progress: told of every render.
+        progress: called after every render.
 
     Raises:
-        InputError: an exposure that cannot be undone.
+        InputError: an exposure that is not invertible.
     """
 
     def __init__(
@@ -320,7 +320,7 @@ class PhotosOrRenders:
 
     @property
     def source(self) -> str:
-        """What photos and renders are made of."""
+        """Identity of photos and renders."""
         return " | ".join(part.source for part in self._parts)
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
@@ -328,10 +328,10 @@ class PhotosOrRenders:
         return targets[row]
 
     def mask(self, view: int) -> NDArray[np.bool_] | None:
-        """See `mask_of`."""
+        """Return the mask, see `mask_of`."""
         targets, row = self._places[view]
         return mask_of(targets, row)
 
     def against(self, view: int) -> str:
-        """See `against_of`."""
+        """Return the kind, see `against_of`."""
         return self._places[view][0].against(view)

@@ -1,4 +1,4 @@
-"""Scenes moved, cut out and put together: what `g2ard convert` does between reading and writing."""
+"""Operations of `g2ard convert`: moving, cropping and joining scenes."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from g2ard.errors import InputError
 from g2ard.scene.splats import Splats
 
 _FAR = 16.0
-"""Extents from the origin past which a move goes into `offset`: float32 means keep their precision."""
+"""Distance in extents beyond which a move goes into `offset`, so that float32 means keep their precision."""
 
 
 def transform(splats: Splats, matrix: ArrayLike) -> Splats:
-    """The scene after x ↦ s·R·x + t: means, scales, rotations and harmonics.
+    """Apply x ↦ s·R·x + t to means, scales, rotations and harmonics.
 
     Args:
         splats: the scene.
         matrix: (4, 4) row-major, a similarity: one scale s > 0, a rotation R, a translation t in scene units.
 
     Returns:
-        The scene; `offset` moves along where there is one, or where t is over 16 extents of the scene.
+        The scene; `offset` is moved if it is not zero or t exceeds 16 extents of the scene.
 
     Raises:
-        InputError: the matrix is no similarity.
+        InputError: the matrix is not a similarity.
 
     >>> quarter = [[0, -2, 0, 5], [2, 0, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
     >>> one = Splats.create([[1, 0, 0]], scales=[[0.1, 0.2, 0.3]])
@@ -55,10 +55,10 @@ def transform(splats: Splats, matrix: ArrayLike) -> Splats:
 
 
 def similarity(matrix: ArrayLike) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """s, R (3, 3) and t (3,) of a 4×4 matrix.
+    """Decompose a 4×4 matrix into s, R (3, 3) and t (3,).
 
     Raises:
-        InputError: it is not 4×4 and finite, mirrors, or scales differently along different axes.
+        InputError: it is not 4×4 and finite, mirrors, shears, or scales axes differently.
     """
     m = np.asarray(matrix, np.float64)
     if m.shape != (4, 4) or not np.isfinite(m).all() or not np.allclose(m[3], [0, 0, 0, 1]):
@@ -80,7 +80,7 @@ def similarity(matrix: ArrayLike) -> tuple[float, NDArray[np.float64], NDArray[n
 
 
 def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4,) wxyz: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
+    """Return (4,) wxyz: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
     r = rotation
     k = np.array(
         [
@@ -95,17 +95,17 @@ def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 4) p·q: q's rotation, then p's."""
+    """Return (N, 4) p·q: rotation q followed by p."""
     w, x, y, z = p
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return q @ left.T
 
 
 def rotate_harmonics(shN: NDArray[np.float32], rotation: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Coefficients of bands 1 to 3 of colours turned by R: c'(d) = c(R⁻¹·d).
+    """Rotate the coefficients of bands 1 to 3 by R: c'(d) = c(R⁻¹·d).
 
-    A band's functions turn among themselves: its matrix M solves Y(d)·M = Y(R⁻¹·d) over more directions than
-    it has functions.
+    Bands rotate separately: the matrix M of a band solves Y(d)·M = Y(R⁻¹·d) by least squares over many
+    directions.
 
     Args:
         shN: (N, K, 3), K in {0, 3, 8, 15}, 3DGS's order and signs.
@@ -125,7 +125,7 @@ def rotate_harmonics(shN: NDArray[np.float32], rotation: NDArray[np.float64]) ->
 
 
 def _basis(d: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 15) the real harmonics of bands 1 to 3 at unit vectors."""
+    """Return the (N, 15) real harmonics of bands 1 to 3 at unit vectors."""
     x, y, z = d.T
     xx, yy, zz = x * x, y * y, z * z
     a, b, c = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
@@ -161,7 +161,7 @@ def join(scenes: Sequence[Splats]) -> Splats:
 
 
 def in_box(splats: Splats, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]:
-    """(N,) whose means lie in an axis-aligned box, bounds included, world coordinates.
+    """Return the (N,) mask of means in an axis-aligned box (inclusive), world coordinates.
 
     Raises:
         InputError: a lower bound above its upper one.
@@ -178,7 +178,7 @@ def in_box(splats: Splats, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]
 
 
 def in_sphere(splats: Splats, center: ArrayLike, radius: float) -> NDArray[np.bool_]:
-    """(N,) whose means lie within `radius` of `center`, world coordinates.
+    """Return the (N,) mask of means within `radius` of `center`, world coordinates.
 
     Raises:
         InputError: a radius that is not positive.

@@ -1,1 +1,1 @@
-"""The stages, one module or package each, over a kernel each; `g2ard.pipeline` joins them."""
+"""Stages: one module or package each; `g2ard.pipeline` joins them."""

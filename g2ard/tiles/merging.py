@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
 
 _POOL, _POOL_ROWS = 96, 4_000_000
-"""Number of poses for each so many Gaussians; larger scenes get proportionally more."""
+"""Number of poses per number of Gaussians; larger scenes get proportionally more."""
 
 _PLANNED_ON = 100_000
 """Sampled Gaussians on which each `_POOL` poses are planned."""

@@ -73,13 +73,17 @@ def test_views_of_another_world_are_told(command_line: CommandLine, folder: Path
         split = ("--split", "all") if ask[0] == "evaluate" else ()
         for name, status, words in (
             ("some.json", 0, "views see nothing of the scene"),
-            ("none.json", int(not split), "16 of 16 views" if split else "the scene must be of one world"),
+            (
+                "none.json",
+                int(not split),
+                "16 of 16 views" if split else "the scene must use the same coordinates",
+            ),
             ("views.json", 0, ""),
         ):
             call = (ask[0], "ball.ply", *ask[1:], "--views", name, "--size", 32, *split)
             found, _, error = command_line(*call, cwd=folder)
             assert (found, words in error) == (status, True), error
-            assert ("of one world" in error or "warning" in error) == bool(words)
+            assert ("same coordinates" in error or "warning" in error) == bool(words)
 
 
 @pytest.mark.parametrize(

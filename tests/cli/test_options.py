@@ -201,7 +201,7 @@ def test_recover_says_what_became_of_steps_that_lost(tmp_path: Path, command_lin
     write_splats(tmp_path / "start.ply", replace(ball, sh0=ball.sh0 + grain))
     write_views(tmp_path / "v.json", around(6))
     asked = ("recover", "start.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "o.ply", "-w")
-    for steps, words in ((4, "kept the simplified scene: every step only"), (24, "recovery fell to ")):
+    for steps, words in ((4, "kept the simplified scene: every step made"), (24, "recovery fell to ")):
         status, _, told = command_line(*asked, "--steps", steps, cwd=tmp_path)
         assert status == 0, told
         assert sum(words in line for line in told.splitlines()) == 1

@@ -109,7 +109,7 @@ def test_a_cloud_takes_the_lift_s_row(folder: Path, command_line: CommandLine) -
     report = run(command_line, folder, *ask, "--preset", "paper", "--set", "lift.neighbors=8")
     regularizers = [f"recover.regularizers.{key}" for key in ("anchor", "shape", "effective_rank")]
     assert [report["settings"][path] for path in regularizers] == [1e-3, 1e-4, True]
-    assert report["preset"].startswith("the paper's for lift (as asked)")
+    assert report["preset"].startswith("the paper's for lift (as requested)")
     assert report["settings"]["lift.neighbors"] == 8
 
 

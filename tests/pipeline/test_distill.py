@@ -301,7 +301,7 @@ def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp
     assert command_line("lift", name, "-o", "lifted.ply", cwd=tmp_path)[0] == 0
     ask = ("recover", "lifted.ply", "--teacher", "lifted.ply", "--views", "away.json", "-o", "r.ply")
     status, _, error = command_line(*ask, "--split", "all", cwd=tmp_path)
-    moved = "of one world (`g2ard info` shows both, `g2ard convert --transform` moves a scene)"
+    moved = "use the same coordinates (see `g2ard info`; `g2ard convert --transform` moves a scene)"
     assert (status, moved in error) == (1, True), error
     plain = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
     plain.x, plain.y, plain.z = cloud.positions.T

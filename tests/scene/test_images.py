@@ -165,7 +165,7 @@ def test_png_round_trip(tmp_path: Path) -> None:
     assert Image.open(tmp_path / "grey.png").mode == "L"
     with pytest.raises(OutputError, match="exists"):
         write_png(tmp_path / "a.png", image)
-    with pytest.raises(InputError, match="is not an image"):
+    with pytest.raises(InputError, match="expected an image"):
         write_png(tmp_path / "b.png", np.zeros((2, 3, 5)))
 
 

@@ -35,7 +35,7 @@ def test_split_file_wins(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no split 'val' \(there are ood, test, train\)"):
         split_names(tmp_path, names, "val")
     with pytest.raises(
-        InputError, match=r"its only view is not in split 'test'; a split\.json beside them can say"
+        InputError, match=r"its only view is not in split 'test'; add a split\.json that says"
     ):
         split_names(tmp_path, ["b.jpg"], "test")
 

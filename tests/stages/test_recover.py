@@ -442,7 +442,7 @@ def test_a_recovery_that_other_views_only_lose_by_ends_at_half(targets: TeacherR
     assert [found.step for found in looks] == [0, 10, 30, 50, 50, 50]
     told = outcome(done.report)
     assert told is not None
-    assert told.startswith("kept the simplified scene: views of another kind only lost by the steps (")
+    assert told.startswith("kept the simplified scene: every step made views of another kind worse (")
 
 
 def test_other_views_gain_where_training_views_can_spare_it(student: Splats, tmp_path: Path) -> None:
@@ -496,6 +496,6 @@ def test_views_that_see_nothing_of_the_scene_are_refused() -> None:
     behind = replace(TEACHER, means=(TEACHER.means - 99 * ahead.forwards[0]).astype(np.float32))
     with pytest.raises(
         InputError,
-        match="none of 1 view sees the scene; the views and the scene must be of one world",
+        match="none of 1 view sees the scene; the views and the scene must use the same coordinates",
     ):
         recover(behind, TeacherRenders(TEACHER, ahead), RecoverConfig(steps=2))

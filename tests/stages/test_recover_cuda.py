@@ -28,7 +28,7 @@ TARGETS = TeacherRenders(BALL, around(6, (40, 30)))
 def ready() -> str | None:
     """Why the GPU tests cannot run here."""
     if not torch.cuda.is_available():
-        return "torch sees no CUDA device"
+        return "torch finds no CUDA device"
     return None if find_spec("gsplat") else "gsplat is not installed"
 
 
@@ -91,14 +91,14 @@ def test_the_loss_in_plain_torch_is_the_fused_one() -> None:
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
 def test_without_cuda_one_line_says_so(tmp_path: Path, command_line: CommandLine) -> None:
-    with pytest.raises(InputError, match="torch sees no CUDA device"):
+    with pytest.raises(InputError, match="torch finds no CUDA device"):
         recover(BALL, TARGETS, RecoverConfig(steps=1, engine="gsplat"))
     io.write_splats(tmp_path / "b.ply", BALL)
     io.write_views(tmp_path / "v.json", TARGETS.cameras)
     asked = ("recover", "b.ply", "--views", "v.json", "--teacher", "b.ply", "-o", "o.ply", "--device", "cuda")
     status, _, told = command_line(*asked, cwd=tmp_path)
     assert status == 1
-    assert "--device cuda: torch sees no CUDA device; " in told.strip().splitlines()[-1]
+    assert "--device cuda: torch finds no CUDA device; " in told.strip().splitlines()[-1]
     assert not (tmp_path / "o.ply").exists()
 
 

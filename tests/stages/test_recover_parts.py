@@ -177,7 +177,7 @@ def test_auto_preset_tells_lift_trained_and_noisy_apart() -> None:
     assert preset_for("auto", round_)[0] == PRESETS["trained"]
     weights, why, measured = preset_for("lift", noisy)
     assert weights == PRESETS["lift"]
-    assert why == "lift (as asked)"
+    assert why == "lift (as requested)"
     assert preset_for("auto", lift, paper=True)[0] == PAPER_PRESETS["lift"] == Regularizers(1e-3, 1e-4, True)
     assert measured.needle == 1
     assert measured.consistency is None

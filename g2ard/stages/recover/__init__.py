@@ -1,4 +1,4 @@
-"""Recovery: appearance and shape of a fixed set of Gaussians against photos or a teacher's renders."""
+"""Recovery: optimisation of a fixed set of Gaussians against photos or a teacher's renders."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 __all__ = ["RecoverConfig", "Recovered", "recover"]
 
 
-def __getattr__(name: str) -> Any:  # numpy loads when recovery is first asked for
+def __getattr__(name: str) -> Any:  # load numpy only when recovery is used
     if name in __all__:
         from g2ard.stages.recover import config, optimize
 

@@ -1,4 +1,4 @@
-"""Construction-time anchors, weights of the two terms that hold a Gaussian to its surface, diagnostics."""
+"""Construction-time anchors, weights of the two regularisers, and geometry diagnostics."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from g2ard.errors import require
 from g2ard.scene.splats import Splats
 
 NEEDLE_RANK = 1.1
-"""A Gaussian whose effective rank is below this is a needle."""
+"""Effective rank below which a Gaussian is a needle."""
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,12 @@ class Regularizers:
     Args:
         anchor: λ_a.
         shape: λ_s.
-        effective_rank: whether L_shape has its barrier against needles.
-        thickness: β, L_shape's weight of the term against Gaussians thicker than their anchor.
+        effective_rank: whether L_shape includes its barrier against needles.
+        thickness: β, weight in L_shape of exceeding the anchor's thickness.
         rank_offset: ε of log(r_eff − 1 + ε).
-        period: steps from one addition to the next.
+        period: steps between two additions.
         in_plane: r∥ of the trust region, over the mean tangential scale; r⊥ is the smallest scale. The paper
-            says r∥ ≫ r⊥ only.
+            only says r∥ ≫ r⊥.
 
     Raises:
         InputError: a value out of range.
@@ -50,14 +50,14 @@ class Regularizers:
 
     @classmethod
     def of(cls, prior: str, *, paper: bool = False) -> Regularizers:
-        """The weights for a kind of dense scene.
+        """Return the weights for a kind of dense scene.
 
         Args:
-            prior: trained, lift (a cloud's, untrained), or noisy (trained, with needles).
-            paper: the row of `tab:s_recovery`, for its rates and steps.
+            prior: trained, lift (from a point cloud, untrained), or noisy (trained, with needles).
+            paper: return the row of `tab:s_recovery`, for the paper's rates and steps.
 
         Raises:
-            InputError: another kind.
+            InputError: an unknown kind.
 
         >>> Regularizers.of("lift").anchor, Regularizers.of("lift", paper=True).anchor
         (0.1, 0.001)
@@ -68,9 +68,9 @@ class Regularizers:
 
     @classmethod
     def named(cls, name: str) -> Regularizers:
-        """Return the weights of a kind of dense scene, or with `paper-` before it the paper's.
+        """Return the weights of a kind of dense scene, or the paper's with the prefix `paper-`.
 
-        `auto` and `paper` stand for what measuring the scene says; without one they are a trained scene's.
+        `auto` and `paper`, which are chosen by measuring the scene, give a trained scene's here.
 
         >>> Regularizers.named("lift").anchor, Regularizers.named("paper-lift").anchor
         (0.1, 0.001)
@@ -80,7 +80,7 @@ class Regularizers:
 
     @property
     def active(self) -> bool:
-        """Whether any term has weight."""
+        """Return whether any term has weight."""
         return self.anchor > 0 or self.shape > 0
 
 
@@ -89,16 +89,17 @@ PAPER_PRESETS = {
     "lift": Regularizers(anchor=1e-3, shape=1e-4, effective_rank=True),
     "noisy": Regularizers(anchor=5e-2, shape=1e-3, effective_rank=True),
 }
-"""`tab:s_recovery`: a faithful trained prior, a point-cloud lift, a less regularised trained prior. For the
-paper's rates and tens of thousands of steps."""
+"""Rows of `tab:s_recovery` (faithful trained prior, lift, less regularised trained prior) for the paper's
+schedule."""
 
 PRESETS = {
     "trained": PAPER_PRESETS["trained"],
     "lift": Regularizers(anchor=1e-1, shape=1.0, effective_rank=True),
     "noisy": Regularizers(anchor=5e-2, shape=1.0, effective_rank=True),
 }
-"""The same for our rates and a thousand steps, of which only ten are regularised: where the table's weights
-are too small to act they are larger (`docs/decisions.md`)."""
+"""Weights for g2ard's schedule of a thousand steps, only ten of them regularised, so that larger weights are
+needed (`docs/decisions.md`).
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +109,7 @@ class Anchors:
     Args:
         means: (N, 3) float32.
         frames: (N, 3, 3) float32, columns t1, t2, n: the normal is the axis of the smallest scale.
-        r_parallel: (N,) float32 in-plane radius, 3 × the mean tangential scale, or what `of` is told.
+        r_parallel: (N,) float32 in-plane radius, 3 × the mean tangential scale, or `in_plane` × it.
         r_perp: (N,) float32 normal radius, the smallest scale.
     """
 
@@ -119,7 +120,7 @@ class Anchors:
 
     @classmethod
     def of(cls, splats: Splats, in_plane: float = 3.0) -> Anchors:
-        """Freeze a scene as it stands; `in_plane` as in `Regularizers`."""
+        """Freeze a scene's geometry; `in_plane` as in `Regularizers`."""
         order = np.argsort(-splats.scales, axis=1, kind="stable")
         frames = np.take_along_axis(rotation_matrices(splats.quats), order[:, None, :], axis=2)
         scales = np.take_along_axis(splats.scales, order, axis=1).astype(np.float64)
@@ -133,13 +134,13 @@ class Anchors:
         )
 
     def displacements(self, means: NDArray[np.float32]) -> NDArray[np.float64]:
-        """(N, 3) δ̃ = R̄ᵀ(μ − μ̄): two tangential components, then the normal one."""
+        """Return (N, 3) δ̃ = R̄ᵀ(μ − μ̄): two tangential components, then the normal one."""
         delta = means.astype(np.float64) - self.means
         return np.einsum("nji,nj->ni", self.frames.astype(np.float64), delta)
 
 
 def rotation_matrices(quats: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(N, 3, 3) of (N, 4) wxyz quaternions, normalised first; a zero quaternion is the identity."""
+    """Return (N, 3, 3) matrices of (N, 4) wxyz quaternions of any length; zero is the identity."""
     q = quats.astype(np.float64)
     largest = np.abs(q).max(1, keepdims=True)
     q = np.where(largest > 0, q / np.where(largest > 0, largest, 1), [1.0, 0.0, 0.0, 0.0])
@@ -153,7 +154,7 @@ def rotation_matrices(quats: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def effective_rank(scales: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(N,) exp(−Σ q log q), q = s/Σs, in [1, 3].
+    """Return (N,) exp(−Σ q log q), q = s/Σs, in [1, 3].
 
     >>> effective_rank(np.array([[1, 1, 1], [1, 1, 1e-9], [1, 1e-9, 1e-9]])).round(3).tolist()
     [3.0, 2.0, 1.0]
@@ -164,12 +165,12 @@ def effective_rank(scales: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def needle(scales: NDArray[np.float32]) -> float:
-    """Share of Gaussians whose effective rank is below `NEEDLE_RANK`."""
+    """Return the share of Gaussians whose effective rank is below `NEEDLE_RANK`."""
     return float((effective_rank(scales) < NEEDLE_RANK).mean()) if len(scales) else 0.0
 
 
 def drift95(anchors: Anchors, means: NDArray[np.float32]) -> float:
-    """95th percentile of |δ̃₃| / r⊥: how far Gaussians left their surface, in their own thickness."""
+    """Return the 95th percentile of |δ̃₃| / r⊥: distances from the surface in thicknesses."""
     if not len(means):
         return 0.0
     return float(np.percentile(np.abs(anchors.displacements(means)[:, 2]) / anchors.r_perp, 95))

@@ -1,4 +1,4 @@
-"""Saving recovery's state, and stopping between two steps rather than within one."""
+"""Checkpoints of recovery, and interruption between steps instead of within one."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.system import interrupt
 
-_ANEW = "{overwrite=True} starts again"
+_ANEW = "{overwrite=True} starts over"
 
 PERIOD = 60.0
 """Seconds between two checkpoints."""
 
 
 def save(path: Path, key: str, meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-    """Write a checkpoint; `key` says what work it belongs to."""
+    """Write a checkpoint; `key` identifies the run."""
     text = json.dumps({"key": key, **meta}, default=_plain)
     everything: dict[str, Any] = {"meta": np.array(text), **arrays}
     with atomic_output(path, overwrite=True) as temporary:
@@ -36,14 +36,14 @@ def load(path: Path, key: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]
     """Read a checkpoint back.
 
     Raises:
-        InputError: it cannot be read, or belongs to other work than `key`.
+        InputError: it cannot be read, or belongs to another run than `key`.
     """
     try:
         with np.load(path) as data:
             arrays = dict(data)
         meta: dict[str, Any] = json.loads(str(arrays.pop("meta")))
         known = meta.pop("key")
-    except Exception:  # numpy and zipfile raise whatever their parsing stumbles over
+    except Exception:  # numpy and zipfile raise many kinds of exceptions
         raise InputError("not a checkpoint of g2ard, or a damaged one", path=path, hint=_ANEW) from None
     if known != key:
         raise InputError("belongs to a run with another scene or other options", path=path, hint=_ANEW)
@@ -56,8 +56,7 @@ def _plain(value: Any) -> Any:
 
 @contextmanager
 def deferred_interrupt() -> Iterator[threading.Event]:
-    """Within it Ctrl-C, and SIGTERM in the program, set the event instead of breaking into a step; the loop
-    looks at it and raises."""
+    """Turn Ctrl-C (and SIGTERM in the program) into an event that the loop checks between steps."""
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield asked
@@ -68,7 +67,7 @@ def deferred_interrupt() -> Iterator[threading.Event]:
         asked.set()
 
     numbers = [signal.SIGINT]
-    if signal.getsignal(signal.SIGTERM) is interrupt.terminate:  # else it is the caller's own
+    if signal.getsignal(signal.SIGTERM) is interrupt.terminate:  # otherwise it is the caller's own handler
         numbers.append(signal.SIGTERM)
     before = [(number, signal.signal(number, note)) for number in numbers]
     try:

@@ -1,4 +1,4 @@
-"""How a recovery goes."""
+"""Options of recovery."""
 
 from __future__ import annotations
 
@@ -12,21 +12,20 @@ from g2ard.stages.recover.schedule import TUNED, Schedule
 
 @dataclass(frozen=True)
 class RecoverConfig:
-    """How recovery goes.
+    """Options of recovery.
 
     Args:
-        schedule: rates, horizon and decay.
-        steps: overrides the schedule's horizon.
-        recovery_time: seconds; the horizon becomes what fits into them, so that the result depends on the
-            machine's speed.
+        schedule: rates, number of steps and decay.
+        steps: number of steps; overrides the schedule's.
+        recovery_time: time limit in seconds instead of steps; the result then depends on the machine's speed.
         regularizers: weights of L_anchor and L_shape (`tab:s_recovery`).
-        sh_degree: of the result; None keeps the student's.
-        ssim_weight: λ in (1−λ)·L1 + λ·(1−SSIM); 0.2 as 3DGS has it.
+        sh_degree: SH degree of the result; None keeps the input's.
+        ssim_weight: λ in (1−λ)·L1 + λ·(1−SSIM); 0.2 as in 3DGS.
         background: RGB behind the scene.
-        final: whether this is the recovery at the target count; the paper decays rounds differently.
-        seed: of the order of views.
-        engine: "fused" takes whole steps in Rust; "torch" goes through autograd and `SelectiveAdam`, with the
-            same result to rounding; "gsplat" is that on an NVIDIA GPU.
+        final: whether this is the recovery at the target count; the paper's rounds have another decay.
+        seed: seed of the order of views.
+        engine: "fused" runs whole steps in Rust; "torch" uses autograd and `SelectiveAdam`, with equal
+            results up to rounding; "gsplat" is the same on an NVIDIA GPU.
 
     Raises:
         InputError: a value out of range.
@@ -48,14 +47,14 @@ class RecoverConfig:
             raise InputError(f"expected at least 1, got {self.steps}", parameter="steps")
         if self.recovery_time is not None and not 0 < self.recovery_time < float("inf"):
             raise InputError(
-                f"expected seconds, more than 0, got {self.recovery_time}", parameter="recovery_time"
+                f"expected more than 0 seconds, got {self.recovery_time}", parameter="recovery_time"
             )
         if not 0 <= self.ssim_weight <= 1:
             raise InputError(f"expected a value in [0, 1], got {self.ssim_weight}", parameter="ssim_weight")
 
     @property
     def horizon(self) -> int:
-        """Steps this recovery takes."""
+        """Number of steps of this recovery."""
         if self.steps is not None:
             return self.steps
         return self.schedule.steps if self.final else self.schedule.round_steps

@@ -1,4 +1,4 @@
-"""Objective and interface of the engines that take the steps of a recovery."""
+"""Objective and interface of the engines that run recovery's steps."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from g2ard.stages.recover.schedule import Rates
 
 @dataclass(frozen=True, eq=False)
 class Photometric:
-    """How views are rendered and compared with their targets.
+    """Settings for rendering views and comparing them with targets.
 
     Args:
         settings: the renderer's conventions.
@@ -32,15 +32,15 @@ class Photometric:
 
 @dataclass(frozen=True, eq=False)
 class Objective(Photometric):
-    """What an engine minimises, from where, in which variables.
+    """Objective, start and variables of an engine.
 
     Args:
-        start: the scene to begin with.
-        cameras: of the views, relative to its offset.
-        anchors: that the regularisers hold it to.
-        regularizers: their weights.
-        means_in_scales: the means' variables are multiples of each Gaussian's initial radius.
-        frozen: (N,) bool, Gaussians that no step changes; None freezes none.
+        start: the initial scene.
+        cameras: cameras of the views, relative to its offset.
+        anchors: anchors of the regularisers.
+        regularizers: weights of the regularisers.
+        means_in_scales: optimise means in multiples of each Gaussian's initial radius.
+        frozen: (N,) bool, Gaussians that stay unchanged; None freezes none.
     """
 
     start: Splats

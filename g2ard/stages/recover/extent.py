@@ -1,4 +1,4 @@
-"""How large each Gaussian is in a view, and what that leaves of its geometry's rates."""
+"""Size of each Gaussian in a view, and the resulting reduction of its rates."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from g2ard.scene.cameras import Cameras
 def extents(
     means: Tensor, quats: Tensor, log_scales: Tensor, cameras: Cameras, view: int, near: float
 ) -> tuple[Tensor, Tensor]:
-    """Squared sizes on the screen before dilation, px²; 0 behind the near plane.
+    """Return squared sizes on the screen before dilation, px²; 0 behind the near plane.
 
-    With M = J·W·R·S, J clamped as the rasteriser clamps it, Σ₂ = MMᵀ.
+    Σ₂ = MMᵀ with M = J·W·R·S, and J clamped like in the rasteriser.
 
     Args:
         means: (N, 3) in the coordinates of `cameras`.
         quats: (N, 4) wxyz, any length.
         log_scales: (N, 3).
-        cameras: the views.
-        view: which of them.
+        cameras: the views' cameras.
+        view: index of the view.
         near: its near plane.
 
     Returns:
-        (N,) the larger eigenvalue of Σ₂, and (N, 3) the squared lengths of M's columns: each axis alone.
+        (N,) the larger eigenvalue of Σ₂, and (N, 3) the squared lengths of M's columns, one per axis.
     """
     pose = torch.from_numpy(cameras.viewmats[view]).to(means)
     K = cameras.Ks[view]
     focal = torch.tensor([K[0, 0], K[1, 1]]).to(means)
     size = np.array([cameras.widths[view], cameras.heights[view]])
-    centre, margin = K[:2, 2], 0.15 * size  # the rasteriser's: 1.3 half-fields of view
+    centre, margin = K[:2, 2], 0.15 * size  # as in the rasteriser: 1.3 half-fields of view
     low, high = (
         torch.from_numpy(edge / K.diagonal()[:2]).to(means)
         for edge in (-centre - margin, size - centre + margin)
@@ -51,7 +51,7 @@ def extents(
 
 
 def share_of_rate(variance: Tensor, reach: float) -> Tensor:
-    """1/(1 + (σ/reach)¹⁶) of what has the variance σ², in pixels as `reach` is.
+    """Return 1/(1 + (σ/reach)¹⁶) for the variance σ², in the same unit as `reach`.
 
     >>> share_of_rate(torch.tensor([0.0, 1.0, 4.0, 16.0]), 2.0).tolist()
     [1.0, 0.99998..., 0.5, 1.5258...e-05]
@@ -61,8 +61,7 @@ def share_of_rate(variance: Tensor, reach: float) -> Tensor:
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """(N, 3, 3) of (N, 4) wxyz quaternions, normalised first: `g2ard.recover.anchors.rotation_matrices` with
-    gradients, in the tensors' precision."""
+    """Return (N, 3, 3) matrices of (N, 4) wxyz quaternions of any length, differentiably."""
     w, x, y, z = normalize(quats, dim=1).unbind(1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

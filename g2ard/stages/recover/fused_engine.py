@@ -1,4 +1,4 @@
-"""Recovery steps whole in Rust: forward, loss, backward, regularisers and a sparse Adam in one call."""
+"""Engine that runs whole steps in Rust: forward, loss, backward, regularisers and sparse Adam."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from g2ard.stages.recover.sizes import radii
 
 
 class FusedEngine:
-    """Does what `TorchEngine` does, to rounding."""
+    """Engine equivalent to `TorchEngine` up to rounding."""
 
     def __init__(self, objective: Objective) -> None:
         self._objective = objective
@@ -42,7 +42,7 @@ class FusedEngine:
         regularize: bool,
         mask: NDArray[np.bool_] | None = None,
     ) -> float:
-        """One optimiser step on one view; returns its photometric loss."""
+        """Take one optimiser step on one view; return its photometric loss."""
         objective = self._objective
         loss, _ = self._trainer.step(
             view_of(objective.cameras, view, objective.settings),
@@ -54,7 +54,7 @@ class FusedEngine:
         return loss
 
     def splats(self) -> Splats:
-        """The scene as it stands, quaternions normalised."""
+        """Return the current scene, with normalised quaternions."""
         means, quats, log_scales, logit_opacities, sh0, shN = self._trainer.arrays()
         length = np.linalg.norm(quats, axis=1, keepdims=True)
         quats = np.where(length > 0, quats / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
@@ -69,20 +69,20 @@ class FusedEngine:
         )
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Everything a bitwise resume needs."""
+        """Return everything that a bitwise resume needs."""
         return self._trainer.state()
 
     def load(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take up a `state` again."""
+        """Restore a `state`."""
         self._trainer.load(state)
         self._trainer.anchor(*self._anchors)
 
     @property
     def counts(self) -> NDArray[Any]:
-        """(N,) steps that each Gaussian has taken."""
+        """Number of steps that each Gaussian has taken, (N,)."""
         return self._trainer.state()["steps"]
 
     @property
     def skipped(self) -> int:
-        """Steps of single Gaussians left out because a gradient was not finite."""
+        """Number of single-Gaussian steps skipped because a gradient was not finite."""
         return self._trainer.skipped

@@ -1,4 +1,4 @@
-"""Recovery steps on an NVIDIA GPU: gsplat's rasteriser, torch's loss, Adam by rows."""
+"""Engine for NVIDIA GPUs: gsplat's rasteriser, torch's loss, Adam by rows."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from g2ard.stages.recover.torch_engine import TorchEngine
 
 
 def check_cuda() -> None:
-    """See to it that gsplat can run.
+    """Check that gsplat can run.
 
     Raises:
-        InputError: torch sees no CUDA device.
+        InputError: torch finds no CUDA device.
         MissingDependencyError: gsplat is not installed.
     """
     if not torch.cuda.is_available():
         raise InputError(
-            "torch sees no CUDA device",
+            "torch finds no CUDA device",
             parameter="engine",
             hint="gsplat needs an NVIDIA GPU, torch for CUDA and g2ard[cuda]; {engine='fused'} needs none",
         )
@@ -31,7 +31,7 @@ def check_cuda() -> None:
 
 
 class GsplatEngine(TorchEngine):
-    """`TorchEngine` on the GPU. gsplat adds gradients atomically: runs differ in their last bits."""
+    """`TorchEngine` on the GPU; gsplat adds gradients atomically, so runs differ in the last bits."""
 
     device = torch.device("cuda")
 

@@ -1,4 +1,4 @@
-"""The steps of one recovery, the trials before them, and what a resume must bring back."""
+"""Steps of one recovery, the trials of rates before them, and checkpoints."""
 
 from __future__ import annotations
 
@@ -31,21 +31,23 @@ from g2ard.system.extras import require_torch
 
 _TRIAL_STEPS = 20
 _TRIAL_SHARE, _CALM_SHARE = 0.1, 0.3
-"""Under a time limit: steps of a trial, and the share of the limit that all trials may take; the second where
-rates that are too large would spend it on nothing."""
+"""Under a time limit: steps per trial, and share of the limit for all trials; the second share applies if
+rates are too large.
+"""
 
 _SHORT = 20
-"""Steps under which there is no way back: none would be left to go on with."""
+"""Fewest steps for going back to an earlier scene; shorter recoveries have no steps left to repeat."""
 
 _LOG_POINTS = 10
-"""How often Drift95 and Needle are logged over a recovery."""
+"""Number of log entries of Drift95 and Needle per recovery."""
 
 Watch = Callable[[int, float, Callable[[], Splats]], None]
-"""Called after every step with its number, the seconds so far and what gives the scene as it stands."""
+"""Callback after every step: its number, the seconds so far, and a function that returns the current scene.
+"""
 
 
 class Loop:
-    """The steps of one recovery; what a resume must bring back lives in `engine`, `done` and `losses`."""
+    """Steps of one recovery; `engine`, `done` and `losses` hold the state for resuming."""
 
     def __init__(
         self,
@@ -71,36 +73,36 @@ class Loop:
         self.probe = probe
         self.guard = guard
         self.frozen = frozen
-        self._skipped = 0  # by engines before this one
+        self._skipped = 0  # by earlier engines
         self.done = 0
         self.seconds = 0.0
         self.resumed: float | None = None
         self.losses: list[float] = []
         self.geometry: list[dict[str, float]] = []
-        self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised? → steps, seconds
+        self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised → steps, seconds
         self._held = held
         self._epoch: tuple[int, NDArray[np.int64]] | None = None
 
     @cached_property
     def key(self) -> str:
-        """What a checkpoint must be of; needed only where one is written or read."""
+        """Fingerprint that a checkpoint must have; computed only with a checkpoint."""
         return _fingerprint(
             self.student, self.targets, self.config, self.weights, self.anchors, self._held, self.frozen
         )
 
     @cached_property
     def engine(self) -> Engine:
-        """Made when first needed: trials need theirs before, and two at once would double the memory."""
+        """Engine, created on first use; another one beside those of trials would double the memory."""
         return self._new_engine()
 
     @property
     def skipped(self) -> int:
-        """Steps of single Gaussians left out because a gradient was not finite."""
+        """Number of single-Gaussian steps skipped because a gradient was not finite."""
         return self._skipped + self.engine.skipped
 
     @property
     def views_seen(self) -> NDArray[np.float64]:
-        """(N,) how many of the views have touched each Gaussian, from the steps it has taken."""
+        """Estimated number of views that contributed to each Gaussian, (N,), from its steps."""
         steps = self.done - (int(self.guard.backed_off[-1]["step"]) if self.guard.backed_off else 0)
         return self.engine.counts * (len(self.targets.cameras) / max(1, steps))
 
@@ -120,12 +122,10 @@ class Loop:
         return engine_class(config.engine)(objective)
 
     def choose_rates(self, start: float) -> None:
-        """The schedule's reach and multiplier, or what the start suggests, and short trials like best.
+        """Choose reach and multiplier: the schedule's, or from the initial error and short trials.
 
-        The time of the trials counts.
-
-        Args:
-            start: PSNR before recovery: where the search begins, and all there is for short horizons.
+        The time of the trials counts. `start` is the PSNR before recovery; for short horizons it alone
+        decides.
         """
         rmse = 10 ** (-start / 20)
         typical = typical_share(self.student, self.targets.cameras)
@@ -157,14 +157,14 @@ class Loop:
             self.multiplier, _ = search_multiplier(score, guess, start)
             tight = reach_for(0.0, typical)
             if seen[self.multiplier] < start and self.config.schedule.reach is None and tight < self.reach:
-                self.reach = tight  # not as untrained as it looked
+                self.reach = tight  # better trained than its error suggested
                 seen.clear()
                 self.multiplier, _ = search_multiplier(score, guess, start)
-            if seen[self.multiplier] < start:  # a few steps on photos that are nearly met say nothing
+            if seen[self.multiplier] < start:  # on nearly fitted photos a few steps say nothing
                 self.multiplier, share = guess, _CALM_SHARE
                 if nearly_there:
                     self.multiplier, _ = calm(score, min(MULTIPLIERS), seen, start)
-        except TimeoutError:  # the best of what was seen, or calmer than all of it
+        except TimeoutError:  # take the best multiplier tried, or a calmer one
             best = max(seen, key=lambda m: seen[m], default=guess)
             if seen.get(best, -math.inf) >= start:
                 self.multiplier = best
@@ -205,7 +205,7 @@ class Loop:
                     raise KeyboardInterrupt
 
     def _share(self) -> float:
-        """How much of the horizon, of steps or of seconds, has been used."""
+        """Return the used share of the steps or of the time limit."""
         if self.config.recovery_time is not None:
             return self.seconds / self.config.recovery_time
         return self.done / self.config.horizon
@@ -222,7 +222,7 @@ class Loop:
         self.done += 1
 
     def _look(self) -> None:
-        """Where too much is lost to come back, go on from the best scene with a third of the rates."""
+        """After too large a loss, continue from the best scene with a third of the rates."""
         share = self._share()
         short = self.config.recovery_time is None and self.config.horizon < _SHORT
         if short or not self.guard.due(share):
@@ -230,11 +230,11 @@ class Loop:
         if self.guard.look(self.engine.splats(), share, self.done) == "back":
             self.multiplier /= 3
             self._skipped += self.engine.skipped
-            del self.engine  # two at once would double the memory
+            del self.engine  # two engines at once would double the memory
             self.engine = self._new_engine(self.guard.best)
 
     def _log(self) -> None:
-        """Drift95 and Needle at every tenth of the horizon."""
+        """Log Drift95 and Needle at every tenth of the recovery."""
         if len(self.geometry) < int(min(1.0, self._share()) * _LOG_POINTS):
             scene = self.engine.splats()
             figures = {"drift95": drift95(self.anchors, scene.means), "needle": needle(scene.scales)}
@@ -242,8 +242,8 @@ class Loop:
 
     @property
     def regularizers(self) -> dict[str, float]:
-        """How many steps were regularised, which share of the time that cost above plain steps, and their
-        period, 0 where none has weight."""
+        """Number of regularised steps, their share of the time beyond plain steps, and their period (0 if
+        inactive)."""
         (plain, plain_s), (held, held_s) = self._seconds_of[False], self._seconds_of[True]
         extra = held_s - held * plain_s / plain if plain and held else 0.0
         weights = self.config.regularizers
@@ -264,11 +264,12 @@ class Loop:
         progress(stage, self.done, total, figures)
 
     def curve(self) -> list[float]:
-        """Up to 100 means of the loss over equal stretches of the horizon."""
+        """Return up to 100 means of the loss over equal parts of the recovery."""
         return [float(part.mean()) for part in np.array_split(np.array(self.losses), 100) if len(part)]
 
     def _view(self, step: int) -> int:
-        """Views in a fresh random order each epoch; depends on seed, weights and step alone."""
+        """Return the view of a step: a new random order each epoch that depends on seed, weights and step
+        only."""
         count = len(self.targets.cameras)
         epoch, position = divmod(step, count)
         if self._epoch is None or self._epoch[0] != epoch:
@@ -305,7 +306,7 @@ class Loop:
 
 
 def finite(reach: float) -> float | None:
-    """JSON knows no infinity."""
+    """Return `reach`, or None for infinity, which JSON lacks."""
     return None if math.isinf(reach) else reach
 
 
@@ -330,7 +331,7 @@ def _fingerprint(
 
 
 def engine_class(name: str) -> Callable[[Objective], Engine]:
-    """Return an engine's class by its name in `RecoverConfig.engine`, importing its packages only now."""
+    """Return the engine class of a name in `RecoverConfig.engine`, importing its packages on demand."""
     if name == "fused":
         from g2ard.stages.recover.fused_engine import FusedEngine
 

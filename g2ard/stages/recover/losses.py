@@ -1,4 +1,4 @@
-"""Losses of recovery in torch: the photometric loss, L_shape and L_anchor (`eq:shape`, `eq:anchor`)."""
+"""Losses of recovery in torch: photometric, L_shape and L_anchor (`eq:shape`, `eq:anchor`)."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class _L1Ssim(torch.autograd.Function):
 
 
 def l1_ssim(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """(1 − λ)·L1 + λ·(1 − SSIM), means over pixels and channels (3DGS's loss, its λ = 0.2 the default).
+    """Return (1 − λ)·L1 + λ·(1 − SSIM), means over pixels and channels (3DGS's loss with its λ = 0.2).
 
-    SSIM has an 11×11 Gaussian window, σ 1.5, zero-padded, and values in 0–1. The sums have a fixed order.
+    SSIM has an 11×11 Gaussian window, σ 1.5, zero-padded, and values in 0–1. Sums have a fixed order.
 
     Args:
         image: (H, W, C) float32 on the CPU; the loss is differentiated with respect to it.
@@ -45,7 +45,7 @@ def l1_ssim(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
         The loss, a scalar.
 
     Raises:
-        InputError: other shapes or types.
+        InputError: wrong shapes or dtypes.
 
     >>> import torch
     >>> x = torch.rand(20, 30, 3, requires_grad=True)
@@ -64,7 +64,7 @@ def l1_ssim(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
 
 
 def l1_ssim_anywhere(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """`l1_ssim` in torch's own operations, for tensors on any device.
+    """Compute `l1_ssim` with torch operations, on any device.
 
     >>> import torch
     >>> x, y = torch.rand(2, 20, 30, 3)
@@ -99,14 +99,14 @@ class TorchAnchors:
         self.r_perp = torch.from_numpy(anchors.r_perp)
 
     def to(self, device: torch.device) -> TorchAnchors:
-        """Itself, moved."""
+        """Move all tensors to a device, in place."""
         for name, value in vars(self).items():
             setattr(self, name, value.to(device))
         return self
 
 
 def anchor_loss(means: Tensor, anchors: TorchAnchors) -> Tensor:
-    """(1/N) Σ log(1 + [D² − 1]₊): nothing inside the trust region, robust outside it."""
+    """Return (1/N) Σ log(1 + [D² − 1]₊): zero inside the trust region, robust outside."""
     local = torch.einsum("nji,nj->ni", anchors.frames, means - anchors.means)
     inside = (local[:, :2] / anchors.r_parallel[:, None]).square().sum(1)
     squared = inside + (local[:, 2] / anchors.r_perp).square()
@@ -114,7 +114,7 @@ def anchor_loss(means: Tensor, anchors: TorchAnchors) -> Tensor:
 
 
 def shape_loss(log_scales: Tensor, quats: Tensor, anchors: TorchAnchors, weights: Regularizers) -> Tensor:
-    """(1/N) Σ max(0, −log(r_eff − 1 + ε)) + β[log s⊥ − log s̄⊥]₊; s⊥ is taken along the anchor's normal."""
+    """Return (1/N) Σ max(0, −log(r_eff − 1 + ε)) + β[log s⊥ − log s̄⊥]₊, with s⊥ along the anchor's normal."""
     normal = anchors.frames[:, :, 2]
     extent = torch.einsum("nji,nj->ni", rotations(quats), normal) * log_scales.exp()
     thickness = extent.square().sum(1).clamp_min(1e-38).log() / 2 - anchors.r_perp.log()
@@ -129,7 +129,7 @@ def shape_loss(log_scales: Tensor, quats: Tensor, anchors: TorchAnchors, weights
 def regularization(
     means: Tensor, quats: Tensor, log_scales: Tensor, anchors: TorchAnchors, weights: Regularizers
 ) -> Tensor:
-    """λ_a·L_anchor + λ_s·L_shape."""
+    """Return λ_a·L_anchor + λ_s·L_shape."""
     total = means.new_zeros(())
     if weights.anchor > 0:
         total = total + weights.anchor * anchor_loss(means, anchors)

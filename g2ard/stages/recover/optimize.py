@@ -1,4 +1,4 @@
-"""Recovery: fixed topology, one view a step, anchors frozen at the start."""
+"""Recovery: fixed topology, one view per step, anchors frozen at the start."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ __all__ = ["Recovered", "Watch", "recover"]
 
 @dataclass(frozen=True, eq=False)
 class Recovered:
-    """The recovered scene and what recovery did.
+    """A recovered scene and a report.
 
     Args:
-        splats: same count and order as the student.
-        report: what was done, in numbers.
+        splats: the scene, in count and order of the student.
+        report: figures of the recovery.
     """
 
     splats: Splats
@@ -61,46 +61,44 @@ def recover(
 ) -> Recovered:
     """Optimise every attribute of a fixed set of Gaussians against targets (`eq:objective`).
 
-    L = (1−λ)·L1 + λ·(1−SSIM), and every `period` steps + λ_a·L_anchor + λ_s·L_shape. No Gaussian is added
-    or removed. Where the steps lose against the student, by PSNR of some training views, recovery goes back,
-    and on with a third of the rates; a student that is only made worse is returned as it is.
-    A schedule that is not `guarded`, as the paper's, takes all its steps, whatever comes of them.
+    L = (1−λ)·L1 + λ·(1−SSIM), plus λ_a·L_anchor + λ_s·L_shape every `period` steps. No Gaussian is added or
+    removed. If PSNR on a sample of training views falls below the student's, recovery returns to the best
+    scene and continues with a third of the rates. A student that only gets worse is returned unchanged. A
+    schedule that is not `guarded`, such as the paper's, always takes all its steps.
 
     Args:
-        student: the scene to recover; its offset counts, cameras are in world coordinates.
+        student: the scene to recover; cameras are in world coordinates, including its offset.
         targets: photos or teacher renders with their cameras.
         config: see `RecoverConfig`.
-        weights: (C,) how often each view is drawn, in proportion; None draws all equally often.
-        anchors: frozen geometry; None freezes the student as given. A student that has been recovered before
-            wants those of its construction.
-        validation: a few views of another kind than `targets` (nearer, or from where people stand), never
-            learned from: where they lose, they decide how much of what the steps changed stays, Gaussian by
-            Gaussian as it was seen (`recover.guard`), and end a recovery that they only lose by. At
-            most eight are looked at.
-        frozen: (N,) bool, Gaussians of the student that stay as they are, such as those of another tile; the
-            engine must be `fused`. None freezes none.
-        checkpoint: a file written every minute and at Ctrl-C; if it is there, recovery goes on from it, and
-            the result is bitwise that of never having stopped.
-        progress: told of every step, with loss, PSNR of a few training views and steps/s.
-        stage: the name progress is reported under.
-        watch: called after every step; the time it takes does not count.
+        weights: (C,) sampling weight of each view; None draws all equally often.
+        anchors: frozen geometry; None takes the student's. For a student that was recovered before, pass the
+            anchors of its construction.
+        validation: views of another kind than `targets`, such as nearer ones, not trained on. If they lose
+            quality, changes are scaled back per Gaussian by how often it was seen (`recover.guard`), and a
+            recovery that only harms them ends early. At most eight are used.
+        frozen: (N,) bool, mask of Gaussians that stay unchanged, such as those of another tile; requires the
+            engine `fused`. None freezes none.
+        checkpoint: a file written every minute and at Ctrl-C. If it exists, recovery resumes from it, with a
+            bitwise equal result.
+        progress: called after every step with loss, PSNR of a few training views and steps/s.
+        stage: stage name for progress.
+        watch: called after every step; its time does not count.
 
     Returns:
-        A `Recovered` with as many Gaussians as the student, in its order.
+        The recovered scene, its Gaussians in the student's order, and a report.
 
     Raises:
-        InputError: no Gaussians, no views, weights that are none, or a checkpoint of another run.
-        KeyboardInterrupt: after Ctrl-C, once the checkpoint is written.
+        InputError: no Gaussians, no views, invalid weights, or a checkpoint of another run.
+        KeyboardInterrupt: after Ctrl-C, when the checkpoint is written.
     """
     config = config or RecoverConfig()
     if not len(student) or not len(targets.cameras):
-        raise InputError(f"{len(student)} Gaussians and {len(targets.cameras)} views: nothing to recover")
+        raise InputError(f"nothing to recover: got {len(student)} Gaussians and {len(targets.cameras)} views")
     if not targets.cameras.facing(student.means.astype(np.float64) + student.offset).any():
         raise InputError(unseeing(targets.cameras, "the scene"))
     if frozen is not None and (config.engine != "fused" or frozen.shape != (len(student),)):
         raise InputError(
-            f"expected bool of shape ({len(student)},) and the engine fused, got {frozen.shape} and "
-            f"{config.engine}",
+            f"expected shape ({len(student)},) and engine fused, got {frozen.shape} and {config.engine}",
             parameter="frozen",
         )
     if config.sh_degree is not None:

@@ -1,4 +1,4 @@
-"""Which regularisers a prior needs: named, or chosen by measuring it."""
+"""Choice of regularisers for a prior: by name, or by measuring it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS, Regularizers, n
 
 _LIFT_THICKNESS = 0.2
 _LIFT_SPREAD = 2.5
-"""Discs of one mould: the lift's normal scale is a tenth of the tangential ones, give or take its anisotropy.
-Measured, median and spread: lifts .12 and 1.2, simplified ten times .10–.14 and 1.9–2.3; trained scenes
-.17–.30 and 3.5–7.3, simplified .44–.49 and 2.2–2.7."""
+"""Limits for a lift, whose discs are all alike: the normal scale is about a tenth of the tangential ones.
+Measured median and spread: lifts .12 and 1.2, simplified tenfold .10–.14 and 1.9–2.3; trained scenes .17–.30
+and 3.5–7.3, simplified .44–.49 and 2.2–2.7.
+"""
 
 _MANY_NEEDLES = 0.10
 _INCONSISTENT = 0.95
-"""Trained scenes .977–.988; a tenth of their Gaussians strewn about: .81–.97."""
+"""Least view consistency of a faithful scene. Trained scenes have .977–.988; with a tenth of the Gaussians
+displaced .81–.97.
+"""
 
 _SAMPLE_VIEWS = 4
 _SAMPLE_PIXELS = 160
@@ -28,14 +31,14 @@ _SAME_DEPTH = 0.05
 
 @dataclass(frozen=True)
 class PriorMeasures:
-    """What tells a lift, a faithful and a noisy trained scene apart.
+    """Measures that distinguish a lift, a faithful and a noisy trained scene.
 
     Args:
         needle: share of Gaussians with an effective rank below 1.1.
         thickness: median of smallest scale over middle scale.
-        thickness_spread: its upper over its lower quartile; a lift's discs are all alike.
+        thickness_spread: upper over lower quartile of the thickness; a lift's discs are all alike.
         view_dependent: whether any colour depends on the view.
-        consistency: see `view_consistency`; None where there were no two views to compare.
+        consistency: see `view_consistency`; None without two views to compare.
     """
 
     needle: float
@@ -45,12 +48,12 @@ class PriorMeasures:
     consistency: float | None
 
     def as_dict(self) -> dict[str, float | bool | None]:
-        """For reports."""
+        """Return the measures by name."""
         return asdict(self)
 
 
 def measure_prior(prior: Splats, cameras: Cameras | None = None) -> PriorMeasures:
-    """Measure a scene, and its view consistency where there are views.
+    """Measure a scene, including its view consistency if there are views.
 
     >>> flat = Splats.create(np.zeros((4, 3)), scales=[[1, 1, 0.1]] * 4)
     >>> found = measure_prior(flat)
@@ -71,14 +74,13 @@ def measure_prior(prior: Splats, cameras: Cameras | None = None) -> PriorMeasure
 
 
 def view_consistency(scene: Splats, cameras: Cameras) -> float | None:
-    """Share of surface points seen in one view that its nearest neighbour does not see through.
+    """Return the share of surface points of a view that its nearest neighbour does not see through.
 
-    The median depth of a few small views is carried into the nearest other view. A point that lies behind
-    what that view sees is hidden and says nothing; one in front of it floats. Points within 5 % in depth
-    agree.
+    The median depth of a few small views is projected into the nearest other view. Points within 5 % of that
+    view's depth agree, points in front of it float, and points behind it are hidden and ignored.
 
     Args:
-        scene: the prior; its offset counts, cameras are in world coordinates.
+        scene: the prior; cameras are in world coordinates, including its offset.
         cameras: at least two views.
 
     Returns:
@@ -113,7 +115,7 @@ def view_consistency(scene: Splats, cameras: Cameras) -> float | None:
 def _carried(
     depth: np.ndarray, other: np.ndarray, cameras: Cameras, a: int, b: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points of view `a` that fall into view `b`: their depth there, and the depth that `b` sees."""
+    """Project points of view `a` into view `b`; return their depth there, and the depth that `b` sees."""
     rows, columns = np.nonzero(depth > 0)
     pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
     rays = np.linalg.inv(cameras.Ks[a]) @ pixels * depth[rows, columns]
@@ -129,31 +131,31 @@ def _carried(
 def preset_for(
     name: str, prior: Splats, cameras: Cameras | None = None, *, paper: bool = False
 ) -> tuple[Regularizers, str, PriorMeasures]:
-    """The regularisers of preset `name`, a line that says which and why, and what was measured.
+    """Choose regularisers by name or by measuring the prior.
 
-    `auto` measures the prior: thin discs of one mould without view-dependent colour are an untrained lift;
-    more than a tenth of needles, or views that see through each other's surfaces, mean a noisy trained
-    scene; anything else is taken for a faithful one.
+    `auto` measures: uniform thin discs without view-dependent colour are an untrained lift. Over a tenth of
+    needles, or views that see through each other's surfaces, mean a noisy trained scene. Anything else is a
+    faithful one.
 
     Args:
-        name: auto, trained, lift or noisy; paper is auto with the paper's weights, paper-trained, paper-lift
+        name: auto, trained, lift or noisy; paper is auto with the paper's weights; paper-trained, paper-lift
             and paper-noisy are rows of its table.
-        prior: the scene the anchors come from, before simplification where it is at hand.
-        cameras: views to measure consistency in; None leaves that out.
-        paper: take the paper's weights, which go with its schedule.
+        prior: the scene of the anchors, before simplification if available.
+        cameras: views for measuring consistency; None skips it.
+        paper: use the paper's weights, for its schedule.
 
     Returns:
-        The weights, the reason and the measures.
+        The weights, a line that names and explains the choice, and the measures.
 
     Raises:
-        InputError: no such preset.
+        InputError: an unknown preset.
     """
     kind = {"paper": "auto"}.get(name, name.removeprefix("paper-"))
     if kind != "auto" and kind not in PRESETS:
         raise InputError(f"expected auto, paper, {', '.join(PRESETS)}, got {name!r}", parameter="preset")
     paper = paper or name.startswith("paper")
     found = measure_prior(prior, cameras)
-    kind, why = (kind, "as asked") if kind != "auto" else _judged(found)
+    kind, why = (kind, "as requested") if kind != "auto" else _judged(found)
     said = f"the paper's for {kind}" if paper else kind
     return (PAPER_PRESETS if paper else PRESETS)[kind], f"{said} ({why})", found
 
@@ -161,9 +163,9 @@ def preset_for(
 def _judged(m: PriorMeasures) -> tuple[str, str]:
     figures = f"{m.needle:.1%} needles, thickness {m.thickness:.2f} within ×{m.thickness_spread:.1f}"
     if m.consistency is not None:
-        figures += f", {m.consistency:.0%} of the surface seen alike by neighbouring views"
+        figures += f", {m.consistency:.0%} of the surface consistent between neighbouring views"
     if not m.view_dependent and m.thickness <= _LIFT_THICKNESS and m.thickness_spread <= _LIFT_SPREAD:
-        return "lift", f"thin discs of one mould: nothing was trained; {figures}"
+        return "lift", f"uniform thin discs, not trained; {figures}"
     if m.needle > _MANY_NEEDLES:
         return "noisy", f"over {_MANY_NEEDLES:.0%} needles; {figures}"
     if m.consistency is not None and m.consistency < _INCONSISTENT:

@@ -1,4 +1,4 @@
-"""The rasteriser as a differentiable torch function: any loss and any optimiser on top."""
+"""The rasteriser as a differentiable torch function, for custom losses and optimisers."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from g2ard.scene.cameras import Cameras
 _NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
 _idle: list[_core.Rasterizer] = []
-"""Rasterizers whose forward pass no backward pass needs any more: their buffers are used again."""
+"""Rasterizers that no backward pass needs any more, kept to reuse their buffers."""
 
 
 class _Lease:
-    """A Rasterizer for as long as an autograd node may need what its forward pass left."""
+    """Exclusive use of a Rasterizer while an autograd node may need its forward pass."""
 
     def __init__(self) -> None:
         try:
@@ -31,7 +31,7 @@ class _Lease:
             self.rasterizer = _core.Rasterizer()
 
     def __del__(self) -> None:
-        if len(_idle) < 4:  # more than this would only hold memory
+        if len(_idle) < 4:  # more would only waste memory
             _idle.append(self.rasterizer)
 
 
@@ -77,10 +77,10 @@ def rasterize(
     background: Sequence[float] = BLACK,
     settings: RasterSettings | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Render view `index` on the CPU, differentiably in all six parameter tensors.
+    """Render a view on the CPU, differentiable in all six parameter tensors.
 
-    Calls are independent: several views may be rendered before one backward pass. Bit for bit the same for
-    any number of threads.
+    Calls are independent: several views may be rendered before one backward pass. Results are equal to the
+    bit for any number of threads.
 
     Args:
         means: (N, 3) float32, in the coordinates of `cameras`.
@@ -89,8 +89,8 @@ def rasterize(
         logit_opacities: (N,) float32.
         sh0: (N, 1, 3) float32.
         shN: (N, K−1, 3) float32, SH degree 0–3.
-        cameras: the views.
-        index: which of them.
+        cameras: the views' cameras.
+        index: index of the view.
         background: RGB behind the scene; not differentiated.
         settings: conventions; None means gsplat's.
 
@@ -98,7 +98,7 @@ def rasterize(
         image (H, W, 3), alpha (H, W) and depth (H, W) = Σ αT·z (not divided by alpha), float32.
 
     Raises:
-        InputError: a tensor that is not float32 on the CPU, shapes that do not fit, an index out of range.
+        InputError: a tensor that is not float32 on the CPU, mismatched shapes, or an index out of range.
 
     >>> import torch
     >>> from g2ard.scene.cameras import Cameras, look_at
@@ -114,7 +114,7 @@ def rasterize(
     """
     settings = settings or RasterSettings()
     if not 0 <= index < len(cameras):
-        raise InputError(f"view {index}: there are {len(cameras)} views")
+        raise InputError(f"expected a view index below {len(cameras)}, got {index}")
     params = (means, quats, log_scales, logit_opacities, sh0, shN)
     for name, tensor in zip(_NAMES, params, strict=True):
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":

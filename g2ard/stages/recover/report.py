@@ -1,4 +1,4 @@
-"""Recovery report, and messages about recoveries that did not simply go well."""
+"""Recovery report, and messages about unusual outcomes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from g2ard.report.base import LEFT_OUT, Report
 
 @dataclass(frozen=True)
 class Gain(Report):
-    """PSNR over a sample of the training views, dB."""
+    """PSNR before and after, on a sample of the training views, dB."""
 
     before: float
     after: float
@@ -18,7 +18,7 @@ class Gain(Report):
 
 @dataclass(frozen=True)
 class Trial(Report):
-    """A multiplier of the rates that was tried on a few steps, and the PSNR they led to, dB."""
+    """A trial multiplier of the rates, and the PSNR after a few steps, dB."""
 
     multiplier: float
     psnr: float
@@ -43,8 +43,8 @@ class Geometry(Report):
 
 @dataclass(frozen=True)
 class Regularized(Report):
-    """Steps that were regularised, which share of the time that cost above plain ones, and how many lie from
-    one to the next, 0 where no term has weight."""
+    """Number of regularised steps, their share of the time beyond plain steps, and their period (0 if
+    inactive)."""
 
     steps: int
     share: float
@@ -53,12 +53,12 @@ class Regularized(Report):
 
 @dataclass(frozen=True)
 class Validation(Report):
-    """What views of another kind had to say.
+    """Validation on views of another kind.
 
     Args:
-        looks: at some steps, the last of the result.
-        prior_views: k of the shrinkage towards the student: a Gaussian that v views touched keeps v/(v + k)
-            of its change; None where all keep the same part, or none.
+        looks: PSNR at some steps; the last is the result's.
+        prior_views: k of the shrinkage towards the student: a Gaussian seen by v views keeps v/(v + k) of its
+            change; None if all keep the same share, or none.
     """
 
     looks: tuple[Look, ...]
@@ -67,30 +67,29 @@ class Validation(Report):
 
 @dataclass(frozen=True)
 class RecoverReport(Report):
-    """A recovery in numbers.
+    """Figures of a recovery.
 
     Args:
-        steps: taken.
-        seconds: for them, trials included.
-        loss: one mean for each 1 % of the horizon.
-        psnr: of a sample of the training views.
-        multiplier: of the schedule's rates.
-        reach: how large a Gaussian may be in a view before it stands still; None is no limit.
-        extent: of the cameras, scene units.
-        trials: those that chose the multiplier.
-        drift95: of the result.
-        needle: of the result.
-        geometry: at ten steps, evenly spaced.
-        regularizers: how much they cost.
-        backed_off: where so much was lost that recovery went on from the best scene with a third of the
-            rates.
-        stopped: the step at which it was given up, else None.
-        blend: weight of where the steps ended in the result, which is interpolated between the student (0)
-            and that (1): 1 but where that lost.
-        kept_start: the student was better than all that came of it, and is the result.
-        validation: None without such views.
-        skipped: `non_finite`: steps of single Gaussians whose gradient was not finite.
-        resumed: of `seconds`, those before this call, which went on from a checkpoint; None where it did not.
+        steps: number of steps.
+        seconds: time, including trials.
+        loss: means over each 1 % of the steps.
+        psnr: PSNR before and after on a sample of the training views.
+        multiplier: factor on the schedule's rates.
+        reach: size in a view above which a Gaussian hardly moves; None means no limit.
+        extent: extent of the cameras, scene units.
+        trials: trials that chose the multiplier.
+        drift95: Drift95 of the result.
+        needle: share of needles of the result.
+        geometry: Drift95 and Needle at ten evenly spaced steps.
+        regularizers: their steps and cost.
+        backed_off: losses after which recovery continued from the best scene with a third of the rates.
+        stopped: step at which it was given up, or None.
+        blend: weight of the last step's scene in the result, interpolated with the student: 1 unless the
+            steps lost quality.
+        kept_start: whether the result is the student, because all steps made it worse.
+        validation: validation, or None without such views.
+        skipped: `non_finite`: single-Gaussian steps whose gradient was not finite.
+        resumed: part of `seconds` before this call resumed; None if it did not resume.
     """
 
     steps: int
@@ -115,7 +114,7 @@ class RecoverReport(Report):
 
 
 def outcome(report: RecoverReport) -> str | None:
-    """Return one line about a recovery that did not simply go well, otherwise None.
+    """Return a message about an unusual recovery, or None.
 
     >>> from dataclasses import replace
     >>> rest = [(), Regularized(1, 0.0, 100), (), None, 1.0, False, None, {}]
@@ -123,43 +122,46 @@ def outcome(report: RecoverReport) -> str | None:
     >>> outcome(well) is None
     True
     >>> outcome(replace(well, backed_off=(Look(30, 23.35),)))
-    'recovery fell to 23.35 dB (start 32.90) at step 30: it went on from the best with a third of the rates'
+    'recovery fell to 23.35 dB (start 32.90) at step 30: continued from the best scene with a third of the
+    rates'
     """
     start = f"(start {report.psnr.before:.2f})"
     lines = [f"{found.psnr:.2f} dB {start} at step {found.step}" for found in report.backed_off]
     if report.kept_start:
-        why = "every step only made the training views worse"
+        why = "every step made the training views worse"
         looks = report.validation.looks if report.validation else ()
         if len(looks) > 2 and looks[-1].psnr == looks[0].psnr:
             first, worst = looks[0].psnr, looks[-2].psnr
-            why = f"views of another kind only lost by the steps ({first:.2f} → {worst:.2f} dB)"
+            why = f"every step made views of another kind worse ({first:.2f} → {worst:.2f} dB)"
         if lines:
             why = f"recovery fell to {', '.join(lines)}, and slower rates gained nothing"
         given_up = "" if report.stopped is None else f"; given up at step {report.stopped}"
         return f"kept the simplified scene: {why}{given_up}"
     if lines:
         thirds = "a third" if len(lines) == 1 else f"1/{3 ** len(lines)}"
-        return f"recovery fell to {', '.join(lines)}: it went on from the best with {thirds} of the rates"
+        return (
+            f"recovery fell to {', '.join(lines)}: continued from the best scene with {thirds} of the rates"
+        )
     if report.blend < 1:
         return (
-            "recovery ended below its start in the training views: the scene goes"
-            f" {report.blend:.0%} of the way to where it ended, which is above both"
+            "recovery ended below its start in the training views: the result is"
+            f" {report.blend:.0%} of the way to its end, which is better than both"
         )
     return None
 
 
 def unregularized(report: RecoverReport) -> str | None:
-    """Return one line about regularisers that never acted for want of steps, otherwise None."""
+    """Return a message if regularisers never acted because there were too few steps, or None."""
     if not _idle(report):
         return None
     return (
-        f"the regularisers never acted: they do every {report.regularizers.period} steps, and there were "
+        f"the regularisers never acted: they act every {report.regularizers.period} steps, and there were "
         f"{report.steps} (--set regularizers.period=…)"
     )
 
 
 def unregularized_rounds(rounds: Sequence[Sequence[RecoverReport]]) -> str | None:
-    """Return the same line for all recoveries of a run, naming the rounds."""
+    """Return the message of `unregularized` for all recoveries of a run, naming the rounds."""
     if sum(map(len, rounds)) == 1:
         return next(unregularized(done) for entry in rounds for done in entry)
     idle = {
@@ -174,7 +176,7 @@ def unregularized_rounds(rounds: Sequence[Sequence[RecoverReport]]) -> str | Non
     steps = sorted({done.steps for done in idle.values()})
     least = f"{steps[0]}" if len(steps) == 1 else f"{steps[0]} to {steps[-1]}"
     return (
-        f"the regularisers never acted in {', '.join(idle)}: they do every {period} steps, and there were "
+        f"the regularisers never acted in {', '.join(idle)}: they act every {period} steps, and there were "
         f"{least} (--set regularizers.period=…)"
     )
 

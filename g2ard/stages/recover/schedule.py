@@ -13,35 +13,35 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
 _REACH = 0.01
-"""Gaussians larger than a hundredth of the image hardly move, unless that is the scene's typical size."""
+"""Default `reach`: Gaussians larger than a hundredth of the image hardly move, unless that is typical."""
 
 _UNTRAINED_RMSE = 0.1
-"""A start further from its targets must yet become surfaces: large Gaussians have to move."""
+"""Initial RMSE above which a scene counts as untrained, so that large Gaussians must move."""
 
 _POINTS = 4096
-"""Gaussians by which `steps_for` measures views."""
+"""Gaussians that `steps_for` measures views with."""
 
 _MOST_TIMES = 2.25
-"""Times the schedule's steps, at most: recovery must end in minutes."""
+"""Limit of the factor on the schedule's steps."""
 
 
 @dataclass(frozen=True)
 class Rates:
     """Adam's learning rate of each attribute, in the space it is optimised in.
 
-    What is large in a step's view hardly moves: a Gaussian whose largest standard deviation there
-    is σ, as a share of the image's longer side, takes steps of 1/(1 + (σ/reach)¹⁶) times the rate in means
-    and rotations, and each of its scales by the σ of that axis alone (`recover.extent`). Many layers
-    that move together, as those of a sky do, move the image by the sum of their steps.
+    Large Gaussians hardly move: with σ the largest standard deviation in the view as a share of the image's
+    longer side, rates of means and rotations are multiplied by 1/(1 + (σ/reach)¹⁶), and that of each scale by
+    the same for its own axis (`recover.extent`). Otherwise many layers moving together, such as a sky's,
+    would move the image by the sum of their steps.
 
     Args:
-        means: of the Gaussian's own radius when the schedule says `means_in_scales`, else scene units.
+        means: in units of the Gaussian's radius if `means_in_scales`, otherwise scene units.
         log_scales: natural-log units.
         quats: components of the unnormalised quaternion.
         logit_opacities: logits.
         sh0: band-0 coefficients.
         shN: higher-band coefficients.
-        reach: share of the image's longer side; infinite lets all sizes learn alike. The schedule says it.
+        reach: share of the image's longer side; infinite treats all sizes alike. Set by the schedule.
 
     Raises:
         InputError: a value out of range.
@@ -62,7 +62,7 @@ class Rates:
         require("reach", self.reach, self.reach > 0, "more than 0")
 
     def scaled(self, geometry: float, appearance: float) -> Rates:
-        """Means, scales and rotations times `geometry`; opacity and SH times `appearance`."""
+        """Multiply rates of means, scales and rotations by `geometry`, of opacity and SH by `appearance`."""
         return Rates(
             self.means * geometry,
             self.log_scales * geometry,
@@ -76,23 +76,22 @@ class Rates:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Rates and their decay over a horizon fixed in advance.
+    """Rates and their decay over a fixed number of steps.
 
     Args:
-        rates: at the first step.
-        steps: the horizon of the final (or only) recovery.
+        rates: rates at the first step.
+        steps: steps of the final (or only) recovery.
         round_steps: recovery steps of each intermediate round; 0 recovers at the final count only.
         means_in_scales: `rates.means` is a share of each Gaussian's radius, the geometric mean of its longer
-            scales, so that the step does not depend on the scene's unit.
-        cosine_floor: every rate follows a cosine down to this share of itself; None keeps geometry constant.
-        appearance_decay: (rounds, final) share that appearance rates decay to exponentially; 1 keeps them.
-        multiplier: of all rates; None chooses it by short trials, which begin at `multiplier_for`.
-        reach: see `Rates`; None chooses by the start (`reach_for`).
-        reference_extent: `rates.means` holds where the cameras' extent (`Cameras.extent`) is this many scene
-            units, and in proportion elsewhere, so that the scene's unit does not matter; None takes it in
-            scene units whatever they are.
-        guarded: whether a recovery that loses goes back to the best scene, or to its start; else all steps
-            are taken and kept.
+            scales, and thus independent of the scene's unit.
+        cosine_floor: rates follow a cosine down to this share; None keeps geometry rates constant.
+        appearance_decay: shares (rounds, final) to which appearance rates decay exponentially; 1 keeps them.
+        multiplier: factor on all rates; None chooses it by short trials, starting at `multiplier_for`.
+        reach: see `Rates`; None chooses it from the initial error (`reach_for`).
+        reference_extent: `rates.means` is scaled by the cameras' extent (`Cameras.extent`) over this, so that
+            the scene's unit does not matter; None takes it in scene units.
+        guarded: whether a recovery that loses quality returns to the best scene or its start; otherwise all
+            steps are taken and kept.
 
     Raises:
         InputError: a value out of range.
@@ -121,7 +120,7 @@ class Schedule:
 
     @classmethod
     def named(cls, name: str) -> Schedule:
-        """Return a schedule of `SCHEDULES`.
+        """Return the schedule of this name in `SCHEDULES`.
 
         Raises:
             InputError: an unknown name.
@@ -133,7 +132,7 @@ class Schedule:
         return SCHEDULES[name]
 
     def within(self, extent: float) -> Schedule:
-        """The schedule for cameras of this extent; where they all stand in one place the rate stays as it is.
+        """Return the schedule for cameras of this extent; an extent of 0 changes nothing.
 
         >>> PAPER.within(11.5).rates.means / PAPER.rates.means, TUNED.within(11.5) == TUNED
         (2.0, True)
@@ -144,7 +143,7 @@ class Schedule:
         return replace(self, rates=replace(self.rates, means=means))
 
     def scaled(self, steps: int) -> Schedule:
-        """The same schedule over a final horizon of `steps`, the rounds' in proportion.
+        """Return the schedule with `steps` final steps, and rounds in proportion.
 
         >>> PAPER.scaled(3000).round_steps
         800
@@ -154,7 +153,7 @@ class Schedule:
         return replace(self, steps=steps, round_steps=rounds)
 
     def at(self, t: float, *, final: bool, multiplier: float = 1.0, reach: float = math.inf) -> Rates:
-        """The rates at the share `t` of the horizon, from 0 at the first step to 1 after the last."""
+        """Return the rates at the share `t` of the steps, from 0 at the first to 1 after the last."""
         cosine = 1.0
         if self.cosine_floor is not None:
             cosine = self.cosine_floor + (1 - self.cosine_floor) * 0.5 * (1 + math.cos(math.pi * t))
@@ -166,7 +165,7 @@ TUNED = Schedule(
     rates=Rates(means=0.05, log_scales=6e-2, quats=1.5e-2, logit_opacities=7e-2, sh0=3e-2, shN=3e-3),
     steps=1000,
 )
-"""Rates in the Gaussian's own unit and a cosine to 1 %; `docs/decisions.md` holds the figures behind it."""
+"""g2ard's schedule: rates in units of each Gaussian and a cosine to 1 % (figures in `docs/decisions.md`)."""
 
 PAPER = Schedule(
     rates=Rates(means=9.2e-4, log_scales=5e-3, quats=1e-3, logit_opacities=5e-3, sh0=2.5e-3, shN=1.25e-4),
@@ -180,10 +179,10 @@ PAPER = Schedule(
     reference_extent=5.75,
     guarded=False,
 )
-"""The supplement's `tab:s_config`: 8,000 steps a round, 30,000 at the end; the rates it leaves out are 3DGS's
-own. Its rate of means bears no unit: 3DGS's is 1.6e-4 times the cameras' extent, 9.2e-4 is that at an extent
-of 5.75, and so it is read here (`docs/decisions.md`). `PAPER.scaled(3000)` is the same at a tenth of the
-length."""
+"""The paper's schedule (supplement, `tab:s_config`): 8,000 steps per round and 30,000 at the end, with 3DGS's
+rates where the paper states none. Its rate of means lacks a unit; 9.2e-4 is 3DGS's 1.6e-4 × extent at an
+extent of 5.75, so it is read that way (`docs/decisions.md`). `PAPER.scaled(3000)` has a tenth of the steps.
+"""
 
 SCHEDULES: dict[str, Schedule] = {
     "fast": replace(TUNED, steps=300),
@@ -194,10 +193,10 @@ SCHEDULES: dict[str, Schedule] = {
 
 
 def multiplier_for(start_rmse: float, least: float = 1 / 3) -> float:
-    """A guess at the rate multiplier from the RMSE before recovery: 1 from 0.039 up, a third from 0.013 down.
+    """Guess the rate multiplier from the RMSE before recovery: 1 from 0.039 up, a third from 0.013 down.
 
-    The better a start already is, the smaller the steps that improve it. A third is the `least` that trials
-    begin at; where there is no time for trials, starts that are nearly there want less.
+    Better starts need smaller steps. Trials start at no less than a third (`least`); without time for trials,
+    nearly fitted starts need less.
 
     >>> multiplier_for(0.05), round(multiplier_for(0.026), 3), round(multiplier_for(0.001), 3)
     (1.0, 0.667, 0.333)
@@ -206,10 +205,10 @@ def multiplier_for(start_rmse: float, least: float = 1 / 3) -> float:
 
 
 def reach_for(start_rmse: float, typical: float) -> float:
-    """`Schedule.reach` of a start: .01, or the typical size if that is more; no limit for an untrained start.
+    """Return the reach for a start: .01, or the typical size if larger; infinite for an untrained start.
 
     Args:
-        start_rmse: before recovery.
+        start_rmse: RMSE before recovery.
         typical: see `g2ard.stages.recover.sizes.typical_share`.
 
     >>> reach_for(0.02, 0.005), reach_for(0.05, 0.04), reach_for(0.15, 0.005)
@@ -219,18 +218,18 @@ def reach_for(start_rmse: float, typical: float) -> float:
 
 
 def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
-    """Return `steps` times 1/√share for views that hold a share of the scene.
+    """Return `steps` times 1/√share for views that show a share of the scene.
 
-    An object is whole in every view of an orbit; in a room or on a path a view holds a tenth. At equal steps
-    its Gaussians would learn a tenth as often; the root is the middle between that and equal time.
+    A view of an orbit shows the whole object, but a view in a room a tenth of it. At equal steps, a room's
+    Gaussians would be trained a tenth as often; the square root is a compromise with time.
 
     Args:
-        scene: what is to be recovered.
-        cameras: the views it learns from, in world coordinates.
-        steps: the schedule's.
+        scene: the scene to recover.
+        cameras: the training views, in world coordinates.
+        steps: the schedule's steps.
 
     Returns:
-        Between `steps` and 2.25 times that.
+        A number from `steps` to 2.25 × `steps`.
 
     >>> import numpy as np
     >>> from g2ard.scene.cameras import Cameras, look_at

@@ -1,4 +1,4 @@
-"""Adam that leaves Gaussians alone that a view did not touch."""
+"""Adam that skips Gaussians without a gradient."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from torch import Tensor
 
 _BETAS, _EPS = (0.9, 0.999), 1e-15
 _LARGEST = 1e18
-"""Beyond this the square of a gradient leaves float32."""
+"""Largest gradient whose square fits float32."""
 
 
 class SelectiveAdam(torch.optim.Optimizer):
-    """`torch.optim.Adam` row by row, as the fused engine has it: rows are Gaussians, in all parameters alike.
+    """`torch.optim.Adam` by rows (Gaussians), like in the fused engine.
 
-    A row whose gradients are all zero keeps its values and its moments, and each row has a count of steps t
-    of its own: p ← p − lr · m/(1 − β₁ᵗ) / (√(v/(1 − β₂ᵗ)) + ε), with the bias terms in float64. A row with a
-    gradient that is not finite, or over 1e18, is left alone too, and counted. A group's "share", if there is
-    one, multiplies its lr row by row or value by value.
+    A row whose gradients are all zero keeps its values and moments, and each row has its own step count t: p
+    ← p − lr · m/(1 − β₁ᵗ) / (√(v/(1 − β₂ᵗ)) + ε), with the bias terms in float64. A row with a gradient that
+    is not finite, or over 1e18, is skipped too, and counted. A group's optional "share" multiplies its lr per
+    row or value.
 
     Args:
-        parameters: by name, (N, …) each; parameter groups are in this order, with the name and lr 0.
+        parameters: (N, …) tensors by name; they become parameter groups in this order, with lr 0.
 
     >>> p = torch.zeros(3, 2, requires_grad=True)
     >>> adam = SelectiveAdam({"p": p})
@@ -34,7 +34,7 @@ class SelectiveAdam(torch.optim.Optimizer):
     """
 
     skipped = 0
-    """Steps of single rows left out because a gradient was not finite; not part of `state_dict`."""
+    """Number of row steps skipped because a gradient was not finite; not part of `state_dict`."""
 
     def __init__(self, parameters: Mapping[str, Tensor]) -> None:
         groups = [{"params": [p], "name": name} for name, p in parameters.items()]
@@ -46,7 +46,7 @@ class SelectiveAdam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> None:  # type: ignore[override]
-        """One step of every row that has a gradient."""
+        """Take one step for every row that has a gradient."""
         if closure is not None:
             raise ValueError("SelectiveAdam takes no closure")
         groups = [group for group in self.param_groups if group["params"][0].grad is not None]

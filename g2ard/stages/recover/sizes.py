@@ -1,4 +1,4 @@
-"""A Gaussian's own unit of length, and how large a scene's Gaussians are in its views."""
+"""Length unit of each Gaussian, and the typical size of Gaussians in views."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 
 _NEEDLE = 1e-2
-"""A needle's unit is not less than a tenth of its length."""
+"""Least ratio of the middle to the largest scale, so that a needle's unit is at least a tenth of its length.
+"""
 
 _VIEWS = 8
 
 
 def radii(splats: Splats) -> NDArray[np.float32]:
-    """(N,) √(s₁·s₂) of the two longer scales s₁ ≥ s₂, s₂ at least s₁/100: what a mean's rate is a share of.
+    """Return (N,) √(s₁·s₂) of the two longer scales s₁ ≥ s₂, with s₂ at least s₁/100: the unit of a mean's
+    rate.
 
-    The largest scale would move a needle by several of its widths.
+    With the largest scale as unit, needles would move by several widths.
 
     >>> radii(Splats.create([[0, 0, 0]], scales=[[9.0, 1e-9, 4.0]])).tolist()
     [6.0]
@@ -28,11 +30,11 @@ def radii(splats: Splats) -> NDArray[np.float32]:
 
 
 def typical_share(splats: Splats, cameras: Cameras) -> float:
-    """The median of f·s₁/z over Gaussians and a few views, as a share of the longer side; 0 if none is seen.
+    """Return the median of f·s₁/z over Gaussians and a few views, as a share of the longer side, or 0.
 
     Args:
-        splats: the scene; its offset counts, cameras are in world coordinates.
-        cameras: evenly spaced ones of them are used; occlusion does not matter.
+        splats: the scene; cameras are in world coordinates, including its offset.
+        cameras: views, of which a few evenly spaced are used; occlusion is ignored.
 
     >>> from g2ard.scene.cameras import look_at
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1, 0.2, 0.01]])

@@ -1,4 +1,4 @@
-"""Recovery steps in torch: autograd over the Rust rasteriser and loss, Adam by rows."""
+"""Engine in torch: autograd over the Rust rasteriser and loss, Adam by rows."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _NAMES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 
 
 class TorchEngine:
-    """Holds the parameters and `SelectiveAdam`'s moments; one `step` a view.
+    """Parameters and `SelectiveAdam`'s moments, advanced by one `step` per view.
 
     With `means_in_scales` the means are optimised as multiples of each Gaussian's initial radius (`radii`):
-    Adam is indifferent to the scale of a gradient, so a rate of 0.05 moves a Gaussian by 5 % of its own size.
-    Rendering, loss and device are what subclasses change.
+    Adam ignores the scale of gradients, so a rate of 0.05 moves a Gaussian by 5 % of its size. Subclasses
+    replace rendering, loss and device.
     """
 
     device = torch.device("cpu")
@@ -63,12 +63,12 @@ class TorchEngine:
         regularize: bool,
         mask: NDArray[np.bool_] | None = None,
     ) -> float:
-        """One optimiser step on one view; returns its photometric loss."""
+        """Take one optimiser step on one view; return its photometric loss."""
         p = self._parameters
         means = self._base + self._unit * p["means"]
         image = self._render(means, view)
         wanted, share = torch.from_numpy(target).to(self.device), 1.0
-        if mask is not None:  # nothing differs where nothing counts
+        if mask is not None:  # no difference outside the mask
             image = torch.where(torch.from_numpy(mask).to(self.device)[..., None], image, wanted)
             share = mask.size / max(1, int(mask.sum()))
         loss = share * self._loss(image, wanted)
@@ -85,7 +85,7 @@ class TorchEngine:
         return float(loss.detach())
 
     def _shares(self, means: Tensor, view: int, reach: float) -> dict[str, Tensor]:
-        """What is left of each rate, by row or by value, for the size of things in this view."""
+        """Return factors on each rate, per row or value, from sizes in this view."""
         if math.isinf(reach):
             return {}
         p, near, cameras = self._parameters, self._settings.near_of(view), self._objective.cameras
@@ -95,7 +95,7 @@ class TorchEngine:
         return {"means": whole, "quats": whole, "log_scales": share_of_rate(axes, pixels)}
 
     def _render(self, means: Tensor, view: int) -> Tensor:
-        """(H, W, 3) of one view, differentiable."""
+        """Render one view (H, W, 3), differentiably."""
         p = self._parameters
         image, _, _ = rasterize(
             means,
@@ -115,7 +115,7 @@ class TorchEngine:
         return l1_ssim(image, target, self._objective.ssim_weight)
 
     def splats(self) -> Splats:
-        """The scene as it stands, quaternions normalised."""
+        """Return the current scene, with normalised quaternions."""
         p = {name: value.detach().cpu() for name, value in self._parameters.items()}
         return Splats(
             means=(self._base.cpu() + self._unit.cpu() * p["means"]).numpy().copy(),
@@ -128,7 +128,7 @@ class TorchEngine:
         )
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Everything a bitwise resume needs."""
+        """Return everything that a bitwise resume needs."""
         arrays = {f"p.{name}": value.detach().cpu().numpy() for name, value in self._parameters.items()}
         arrays["base"], arrays["unit"] = self._base.cpu().numpy(), self._unit.cpu().numpy()
         arrays["skipped"] = np.array(self._adam.skipped)
@@ -137,7 +137,7 @@ class TorchEngine:
         return arrays
 
     def load(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take up a `state` again."""
+        """Restore a `state`."""
         with torch.no_grad():
             for name, parameter in self._parameters.items():
                 parameter.copy_(torch.from_numpy(state[f"p.{name}"]))
@@ -154,10 +154,10 @@ class TorchEngine:
 
     @property
     def counts(self) -> NDArray[Any]:
-        """(N,) steps that each Gaussian has taken."""
+        """Number of steps that each Gaussian has taken, (N,)."""
         return self._adam.state[self._parameters["means"]]["count"].cpu().numpy()
 
     @property
     def skipped(self) -> int:
-        """Steps of single Gaussians left out because a gradient was not finite."""
+        """Number of single-Gaussian steps skipped because a gradient was not finite."""
         return self._adam.skipped

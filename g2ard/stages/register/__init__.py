@@ -97,7 +97,7 @@ def register(
     >>> view = Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0], name="a.png")])
     >>> report = register(dot, view, starts={"a.png": view.viewmats[0]}).report
     >>> report.photos[0].status, report.photos[0].reason
-    ('refused', 'view 0 (a.png) has no photo; give views with photos')
+    ('refused', 'view 0 (a.png) has no photo; pass views with photos')
     """
     config = config or RegisterConfig()
     if not len(photos):

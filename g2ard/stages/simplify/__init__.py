@@ -1,4 +1,4 @@
-"""Fewer Gaussians at an exact budget: rounds of drop, merge and trim (section 3.2 of the paper)."""
+"""Simplification to an exact budget: rounds of drop, merge and trim (section 3.2 of the paper)."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ _DEFAULTS = SimplifyConfig()
 
 @dataclass(frozen=True, eq=False)
 class Simplified:
-    """What simplification made.
+    """Result of simplification.
 
     Args:
-        splats: exactly the budget of Gaussians, in an order that only the scene's content decides. Their
-            geometry is what recovery takes as anchors.
-        parents: (N,) int64, the output row each input row went to; −1 if it was dropped or trimmed.
-        protected: (M,) bool, flags inherited by OR from everything merged into the row.
-        report: what was done, in numbers.
+        splats: exactly `budget` Gaussians, in an order that depends only on the scene's content. Their
+            geometry serves as recovery's anchors.
+        parents: (N,) int64, output row of each input row; −1 if it was dropped or trimmed.
+        protected: (M,) bool, flags, the OR of all rows merged into each.
+        report: figures of the simplification.
     """
 
     splats: Splats
@@ -61,16 +61,16 @@ class Simplified:
 def flag(
     splats: Splats, budget: int, *, config: SimplifyConfig = _DEFAULTS, progress: Progress = silent
 ) -> NDArray[np.bool_]:
-    """Protection flags of a raw prior: p_i = 1[E_c(i) > ε_h] (eq. `frequency`).
+    """Compute protection flags of a raw prior: p_i = 1[E_c(i) > ε_h] (eq. `frequency`).
 
     E_j is the mean squared residual of an affine predictor of colour, clamped to [0, 1], within cell j, over
-    about `budget` cells; a cell of few members borrows those of its face neighbours for the fit.
+    about `budget` cells; a cell with few members borrows those of its face neighbours for the fit.
 
     Args:
-        splats: the raw prior, never a recovered scene: fitting hides the residual.
+        splats: the raw prior; in a recovered scene fitting hides the residual.
         budget: the final count N_S, which sets the cell size.
-        config: `flag_threshold` and `flag_members` are read.
-        progress: told when done.
+        config: uses `flag_threshold` and `flag_members`.
+        progress: called when done.
 
     Returns:
         (N,) bool; False for rows that are not finite.
@@ -106,40 +106,39 @@ def simplify(
 ) -> Simplified:
     """Reduce a scene to exactly `budget` Gaussians.
 
-    `default` aims at the error in the image. Down to three times the budget it merges along Morton order,
-    wherever that costs least; then, in rounds that lock what they merge, the cheapest pairs of neighbours
-    become one. Mean, covariance and SH are averaged by mass, and mass m = α·A *as rendered* is conserved,
-    with A = √tr adj(Σ + e²I) and e the blur of a renderer. A merge costs the squared error of its projections
-    times how much of it the views see. Without `visibility` it needs no cameras at all; with a function
-    of it the rows' opacities are fitted last to what the views see of them.
+    `default` minimises the error in the image. Down to three times the budget it merges along Morton order,
+    cheapest first. Then it merges the cheapest pairs of neighbours, in rounds in which each cluster merges at
+    most once. Mean, covariance and SH are averaged by mass, and the mass *as rendered* m = α·A is conserved,
+    with A = √tr adj(Σ + e²I) and e the renderer's blur. The cost of a merge is the squared error of its
+    projections times its visibility. Without `visibility` no cameras are needed. If `visibility` is a
+    function, opacities are finally fitted to what the views see.
 
-    `fast` merges along Morton order all the way, on two lattices in turn: no graph of neighbours.
+    `fast` merges only along Morton order, on two lattices in turn, without a neighbour graph.
 
-    `paper`: rounds of 75 %; each drops α < 0.01, merges cell × colour-bin groups by moment matching where the
-    affine-energy and surface-coverage guards pass, at most down to the round's count, and trims what is left
-    by π = −log(1 − α)·A·(1 + λ_h·p) (eq. `importance`). There is about one cell for each Gaussian of the
-    final budget, in every round (`docs/paper.md` holds how the paper is read).
+    `paper` works in rounds that keep 75 %. Each drops α < 0.01, merges cell × colour-bin groups by moment
+    matching if the affine-energy and surface-coverage guards pass, down to the round's count, and trims the
+    rest by π = −log(1 − α)·A·(1 + λ_h·p) (eq. `importance`). Every round has about one cell per Gaussian of
+    the final budget (see `docs/paper.md` for our reading of the paper).
 
-    Rows below the methods' α are dropped first, unless the budget needs them, or there are no others.
-
-    The result does not depend on the order of the rows, the unit, or the number of threads.
+    Rows below the method's least α are dropped first, unless the budget needs them. The result does not
+    depend on the order of the rows, the unit, or the number of threads.
 
     Args:
-        splats: the scene. Infinite logits mean α = 0 or 1, scales over e⁴³ count as that; rows with other
+        splats: the scene. Infinite logits mean α = 0 or 1, scales are limited to e⁴³; rows with other
             non-finite values are dropped and counted.
-        budget: Gaussians to keep, at most as many as there are.
+        budget: Gaussians to keep, at most those of the scene.
         method: overrides the config's.
-        visibility: for `default` and `fast`: what views see of each Gaussian (`g2ard.rendering.visibility`),
-            or a function that finds it for a scene, asked again for the result, whose opacities it fits.
-        protected: (N,) bool flags to inherit. With None, `paper` computes them (see `flag`), the others,
-            which have no use for them, go without.
-        final_budget: for `paper`: N_S, where this call is one round on the way to a smaller count; it sets
-            the size of all cells. None means `budget`.
+        visibility: for `default` and `fast`: visibility of each Gaussian (`g2ard.rendering.visibility`), or a
+            function scene → visibility, also called on the result to fit its opacities.
+        protected: (N,) bool flags to inherit. If None, `paper` computes them (see `flag`); the other methods
+            do not use them.
+        final_budget: for `paper`: N_S, if this call is one round on the way to a smaller count; it sets the
+            size of cells. None means `budget`.
         config: the constants.
-        progress: told of Gaussians shed, round by round.
+        progress: called with the number of Gaussians removed.
 
     Returns:
-        The scene, where each row went, the inherited flags and a report.
+        The scene, the new row of each row, the inherited flags and a report.
 
     Raises:
         InputError: a budget below 1 or above the count of finite rows, arrays of another length, or an
@@ -163,7 +162,7 @@ def simplify(
         scene, config = with_some_opacity(scene), replace(config, min_opacity=0.0)
     if config.keep_region and (method == "paper" or visibility is None):
         raise InputError(
-            "needs views; `paper` looks from none, `fast` from given ones alone", parameter="keep_region"
+            "needs views; `paper` uses none, and `fast` only given ones", parameter="keep_region"
         )
     if method == "paper":
         out = _paper(scene, budget, flags, final_budget or budget, config, progress)
@@ -212,7 +211,7 @@ def _check_budget(budget: int, count: int | None) -> None:
         raise InputError(f"expected at least 1, got {budget}", parameter="budget")
     if count is not None and budget > count:
         raise InputError(
-            f"expected at most the {count} Gaussians there are, got {budget}", parameter="budget"
+            f"expected at most {count} (the scene's Gaussians), got {budget}", parameter="budget"
         )
 
 
@@ -231,7 +230,7 @@ def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str
     parents = np.full(len(splats), -1, np.int64)
     parents[finite] = out["parents"]
     small = splats_of(splats, out).with_sh_degree(splats.sh_degree)
-    small = replace(small, quats=unit_quats(small.quats))  # rows that stayed alone have them as they came
+    small = replace(small, quats=unit_quats(small.quats))  # unmerged rows keep their quaternions
     kept = int(np.count_nonzero(parents >= 0))
     alone = int(np.count_nonzero(np.bincount(parents[parents >= 0], minlength=len(small)) == 1))
     protected: NDArray[np.bool_] = out["protected"]
@@ -257,8 +256,8 @@ def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str
 
 
 def _faded(splats: Splats, small: Splats, parents: NDArray[np.int64]) -> int:
-    """Merged rows that no renderer draws, though it drew a member: floaters so far apart that their mass,
-    which is conserved, stops no light any more."""
+    """Count merged rows too faint to draw although a member was drawn: distant floaters whose mass is spread
+    too thin."""
     faint = small.logit_opacities < DRAWN_LOGIT
     if not faint.any():
         return 0
@@ -268,7 +267,7 @@ def _faded(splats: Splats, small: Splats, parents: NDArray[np.int64]) -> int:
 
 
 def _spared(rounds: list[dict[str, Any]]) -> dict[str, int]:
-    """What the paper's rounds need not have done."""
+    """Count work that the paper's rounds skipped."""
     if not rounds or "cells" not in rounds[0]:
         return {}
     return {

@@ -1,4 +1,4 @@
-"""What the policies of simplification share: their constants and the counts of their rounds."""
+"""Constants of simplification, and the counts of its rounds."""
 
 from __future__ import annotations
 
@@ -16,60 +16,59 @@ __all__ = ["METHODS", "SimplifyConfig", "round_counts"]
 _RETENTION: dict[str, float] = {"default": 0.65, "fast": 0.65, "paper": 0.75}
 
 _CORE = _core.defaults()
-"""The core's constants by method: the one place of the defaults below."""
+"""Defaults of the Rust core, by method."""
 
 _PAIRWISE, _PAPER = _CORE["default"], _CORE["paper"]
 
 
 _OF_METHOD = ("min_opacity", "morton_premerge_ratio", "morton_premerge_steps")
-"""Constants whose default is the method's own."""
+"""Constants whose default depends on the method."""
 
 
 @dataclass(frozen=True)
 class SimplifyConfig:
-    """The constants of simplification: those of `paper` are the paper's (`tab:s_config`) where it states
-    them, the others are measured (`docs/paper.md`, `docs/decisions.md`).
+    """Constants of simplification: the paper's (`tab:s_config`) if it states them, otherwise measured ones
+    (`docs/paper.md`, `docs/decisions.md`).
 
     Args:
         method: "default", "fast" or "paper", see `g2ard.stages.simplify.simplify`.
-        retention: share of the Gaussians that a round keeps; None means the method's own, 0.75 in the paper,
-            0.65 for the others (fewer rounds, as good).
-        fold: a last cut by less than this share is folded into the round before, in 0–1; not in the paper. A
-            cut of a few Gaussians would cost a whole recovery.
-        min_opacity: below this α a Gaussian is dropped; None means the method's own, 0.01 in the paper, 0.004
-            (what no renderer draws) for the others.
-        morton_premerge_ratio: of `default` and `fast`: down to this many times the budget rows merge along
-            Morton order alone, before pairs of neighbours do; at least 1, infinite for never. None means the
-            method's own, 3 for `default`, 1 for `fast`.
-        morton_premerge_steps: of `default` and `fast`: in how many steps, each on a shifted lattice. None
-            means the method's own, 1 for `default`, 2 for `fast`.
-        neighbors: `default`: nearest clusters that one may merge with. More lets far ones in: 16 is worse.
-        geometric_weight: of `default` and `fast`: weight of the error of coverage beside that of colour; half
-            of it without views, for much of what it would then weigh lies hidden.
-        dilation: of `default` and `fast`: standard deviation of the blur that renderers add, in pixels
-            (√0.3 would be all of it; 0.4 measured best).
-        pixel_scale: of `default` and `fast` without views: the size of a pixel over the median of the largest
-            scales.
-        max_growth: of `default` and `fast`: how many times the area that its moments say a cluster may take,
-            along its two longer axes, where α ≤ 0.99 alone cannot hold its mass. At 1 opaque surfaces show
-            gaps.
-        keep_region: of `default` and `fast` with views: spheres (x, y, z, r) and boxes (x, y, z, x, y, z), in
-            world coordinates, which get more of the budget.
-        keep_times: views count in them as if they stood √keep_times times as near: each Gaussian covers
-            keep_times as many pixels.
-        color_bin: `paper`: edge of the colour bins that part [0, 1] within a cell, in colour units
+        retention: share of the Gaussians that a round keeps; None means 0.75 for `paper` and 0.65 for the
+            others (fewer rounds, equally good).
+        fold: a last round that removes less than this share (0–1) is merged into the previous one, to save
+            its recovery; not in the paper.
+        min_opacity: α below which Gaussians are dropped; None means 0.01 for `paper` and 0.004 (invisible)
+            for the others.
+        morton_premerge_ratio: `default`, `fast`: multiple of the budget down to which rows merge along Morton
+            order, before pairs of neighbours; at least 1, infinite for never. None means 3 for `default`, 1
+            for `fast`.
+        morton_premerge_steps: `default`, `fast`: number of steps of this, each on a shifted lattice. None
+            means 1 for `default`, 2 for `fast`.
+        neighbors: `default`: number of nearest clusters considered for merging; 16 is worse, because it
+            includes distant ones.
+        geometric_weight: `default`, `fast`: weight of the coverage error relative to the colour error; halved
+            without views, because much of the scene is hidden.
+        dilation: `default`, `fast`: standard deviation of the renderer's blur, in pixels (fully √0.3; 0.4
+            measured best).
+        pixel_scale: `default`, `fast` without views: pixel size over the median of the largest scales.
+        max_growth: `default`, `fast`: factor by which a cluster's area may grow, along its two longer axes,
+            if α ≤ 0.99 cannot hold its mass. With 1, opaque surfaces show gaps.
+        keep_region: `default`, `fast` with views: spheres (x, y, z, r) and boxes (x, y, z, x, y, z), in world
+            coordinates, that get more of the budget.
+        keep_times: weight of these regions: views count as if √keep_times times closer, so that each Gaussian
+            covers keep_times as many pixels.
+        color_bin: `paper`: edge of the colour bins within a cell, in colour units
             (`tab:s_config`).
         max_energy: `paper`: largest affine energy of a merged group, summed over channels, colour units
             squared (`tab:s_config`; E_j of eq. `frequency`).
         min_coverage: `paper`: least share of the members' footprint area that the merged footprint covers
             (`tab:s_config`).
-        support: `paper`: where a footprint ends for that, in standard deviations; not in the paper. 3 is
-            where 3DGS's renderer ends it.
+        support: `paper`: radius of a footprint for that, in standard deviations, 3 as in 3DGS's renderer; not
+            in the paper.
         flag_threshold: ε_h, the affine residual of a cell above which its Gaussians are protected, colour
             units squared (eq. `frequency`, `tab:s_config`).
         flag_members: a cell with fewer Gaussians borrows those of its face neighbours for the fit behind its
-            residual; not in the paper. 8 are two for each of the four affine coefficients; 1 borrows nothing.
-        protection: `paper`: λ_h, what a protected Gaussian's priority π is raised by (eq. `importance`,
+            residual; not in the paper. 8 are two per affine coefficient; 1 borrows nothing.
+        protection: `paper`: λ_h, relative increase of a protected Gaussian's priority π (eq. `importance`,
             `tab:s_config`).
     """
 
@@ -136,7 +135,7 @@ class SimplifyConfig:
             raise InputError(f"expected a number in [0, 1], got {self.min_opacity}", parameter="min_opacity")
 
     def resolved(self, method: str | None = None) -> SimplifyConfig:
-        """Return the config of a method, its own unless named, with the method's constants in place of None.
+        """Return the config for a method (by default its own), with None replaced by the method's constants.
 
         >>> SimplifyConfig().resolved("paper").retention
         0.75
@@ -150,18 +149,18 @@ class SimplifyConfig:
         return replace(self, method=method, retention=self.retention_of(method), **own)
 
     def retention_of(self, method: str) -> float:
-        """The share a round of `method` keeps."""
+        """Return the share of Gaussians that a round of `method` keeps."""
         return _RETENTION[method] if self.retention is None else self.retention
 
     def min_opacity_of(self, method: str) -> float:
-        """The α below which `method` drops."""
+        """Return the α below which `method` drops Gaussians."""
         return self.resolved(method).min_opacity or 0.0
 
 
 def round_counts(
     count: int, budget: int, retention: float = _RETENTION["paper"], fold: float = 0.05
 ) -> list[int]:
-    """Counts after each round: N_r = max(N_S, ⌈retention·N_{r−1}⌉), a last cut by less than `fold` folded in.
+    """Return the count after each round, N_r = max(N_S, ⌈retention·N_{r−1}⌉), folding in a small last round.
 
     >>> round_counts(500_000, 50_000)
     [375000, 281250, 210938, 158204, 118653, 88990, 66743, 50000]

@@ -1,5 +1,5 @@
-"""The methods `default` and `fast`, which the core calls pairwise: merging weighed by what views see, then
-opacities fitted to it."""
+"""The methods `default` and `fast` ("pairwise" in the core): merging weighted by visibility, then fitting
+opacities."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ from g2ard.scene.splats import DRAWN_LOGIT, Splats
 from g2ard.stages.simplify.config import SimplifyConfig, round_counts
 
 _FIT = 1 / 4
-"""Exponent of the ratio of what views saw to what they see: ½ fits the views looked from by up to 0.1 dB
-better, and others by up to 0.7 dB worse (decision 0009)."""
+"""Exponent of the ratio of wanted to current visibility: ½ fits the given views by up to 0.1 dB better, and
+others by up to 0.7 dB worse (decision 0009).
+"""
 
 _RATIO = (0.5, 2.0)
-"""What that ratio is cut to."""
+"""Limits of that ratio."""
 
 _FLOOR = 0.05
-"""Share of the mean that is added to both: what is hardly seen stays as it is."""
+"""Share of the mean added to both sides of the ratio, so that hardly visible rows stay unchanged."""
 
 DRAWN_OPACITY = float(1 / (1 + np.exp(-DRAWN_LOGIT)))
-"""Renderers draw nothing fainter."""
+"""Least α that renderers draw."""
 
 
 class Visibility(Protocol):
-    """What views see of N Gaussians, such as `g2ard.rendering.visibility.visibility` returns."""
+    """Visibility of N Gaussians in views, such as `g2ard.rendering.visibility.visibility` returns."""
 
     @property
     def weight(self) -> NDArray[Any]:
@@ -41,11 +42,11 @@ class Visibility(Protocol):
 
     @property
     def pixel_size(self) -> NDArray[Any]:
-        """(N,) the size of a pixel there, scene units; ∞ where no view contains it."""
+        """(N,) pixel size at the Gaussian, scene units; ∞ if no view contains it."""
 
 
 VisibilitySource = Callable[[Splats], Visibility]
-"""Finds what views see of a scene, such as `g2ard.rendering.visibility.visibility_source` returns."""
+"""Function scene → visibility, such as `g2ard.rendering.visibility.visibility_source` returns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,7 @@ class RowVisibility:
 
 
 def rows_of(visibility: Visibility, count: int, finite: NDArray[np.bool_] | slice) -> RowVisibility:
-    """The finite rows of a visibility, contiguous."""
+    """Return the finite rows of a visibility, contiguous."""
     for name in ("weight", "pixel_size"):
         shape = getattr(visibility, name).shape
         if shape != (count,):
@@ -67,14 +68,9 @@ def rows_of(visibility: Visibility, count: int, finite: NDArray[np.bool_] | slic
 
 
 def emphasised(scene: Splats, visibility: Visibility, config: SimplifyConfig) -> Visibility:
-    """Return a visibility as if views stood √t times as near to the regions to keep, t = keep_times.
+    """Emphasise the regions to keep, as if views were √keep_times times closer.
 
-    A Gaussian there covers t times as many pixels, which are 1/√t as wide.
-
-    Args:
-        scene: N Gaussians.
-        visibility: of its N rows.
-        config: `keep_region` and `keep_times` are read.
+    Inside them, weights are multiplied by keep_times and pixel sizes divided by √keep_times.
     """
     if not config.keep_region:
         return visibility
@@ -94,7 +90,7 @@ def merge(
     config: SimplifyConfig,
     tell: Callable[[int, int], None],
 ) -> dict[str, Any]:
-    """`default` or `fast`; `visibility` has a row for each of the scene's."""
+    """Merge by `default` or `fast`; `visibility` has one row per Gaussian of the scene."""
     config = config.resolved(method)
     return _core.simplify_pairwise(
         scene.core,
@@ -115,11 +111,11 @@ def merge_and_fit(
     config: SimplifyConfig,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Merge by what views see of the scene, then fit each row's opacity to what they see of the result."""
+    """Merge by visibility, then fit each opacity to the visibility of the result."""
     visibility = rows_of(source(scene), len(scene), slice(None))
     out = merge(scene, budget, method, visibility, flags, config, counter(progress, "simplify"))
     merged, parents = splats_of(scene, out), out["parents"]
-    order = scene.core.order  # sums round alike whatever the order of the rows
+    order = scene.core.order  # fixed order, so that sums do not depend on the order of the rows
     of, wanted = parents[order], visibility.weight[order]
     members, target = (np.bincount(of[of >= 0], w, len(merged)) for w in (None, wanted[of >= 0]))
     fitted = fit_opacities(merged, members, target, source(merged).weight, target.mean())
@@ -137,25 +133,25 @@ def merge_and_fit(
 def fit_opacities(
     scene: Splats, members: NDArray[Any], wanted: NDArray[Any], now: NDArray[Any], mean: float
 ) -> Splats:
-    """The scene with opacities by which views see about as much of each row as they saw of its members.
+    """Fit opacities so that views see about as much of each row as of its members.
 
-    α is multiplied by ratio^¼, the ratio cut to 0.5–2: neighbours share what is missing, and other views than
-    these want less of it. What α ≤ 0.99 cannot hold goes to the area of the two longer axes.
-    A floor of 5 % of the mean keeps what is hardly seen as it is.
+    α is multiplied by ratio^¼, with the ratio limited to 0.5–2, because neighbours share a deficit and other
+    views need less. Excess over α = 0.99 goes to the area of the two longer axes. A floor of 5 % of the mean
+    keeps hardly visible rows unchanged.
 
     Args:
         scene: M merged Gaussians.
-        members: (M,) how many Gaussians each was merged from.
-        wanted: (M,) Σ αT of those.
-        now: (M,) Σ αT of the M.
-        mean: of `wanted`; over all tiles, where these are one's.
+        members: (M,) number of Gaussians merged into each.
+        wanted: (M,) Σ αT of those Gaussians.
+        now: (M,) Σ αT of the merged Gaussians.
+        mean: mean of `wanted`, for tiles over all of them.
     """
     floor = _FLOOR * mean
     factor = np.clip((wanted + floor) / np.maximum(now + floor, np.finfo(float).tiny), *_RATIO) ** _FIT
     alone = (members < 2) | ~np.isfinite(factor)
     alpha = scene.opacities.astype(np.float64)
     held = np.minimum(alpha * factor, np.maximum(alpha, MAX_OPACITY))
-    faint = (held < DRAWN_OPACITY) & (alpha >= DRAWN_OPACITY)  # what was drawn still is
+    faint = (held < DRAWN_OPACITY) & (alpha >= DRAWN_OPACITY)  # visible rows stay visible
     held = np.where(faint | (alpha <= 0) | alone, alpha, held)
     growth = np.where(alone | faint | (held <= 0), 1.0, alpha * factor / np.maximum(held, 1e-30))
     changed = held != alpha

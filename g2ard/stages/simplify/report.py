@@ -1,4 +1,4 @@
-"""What simplification tells of its work."""
+"""Reports of simplification."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from g2ard.report.base import LEFT_OUT, Report
 
 @dataclass(frozen=True)
 class SimplifyRound(Report):
-    """One round: before − dropped − merged − trimmed = after.
+    """Report of one round: before − dropped − merged − trimmed = after.
 
     Args:
-        before: Gaussians.
-        dropped: for their opacity.
-        merged: by how many merging shrank the scene.
-        trimmed: for their priority.
-        after: Gaussians.
-        cells: `paper`: locality cells, 0 where none were needed.
-        refused: `paper`: groups that a guard refused, by guard.
-        skipped_alone: `paper`: rows without another in their cell and colour bin.
-        undone_groups: `paper`: merges taken back, for the budget needs their rows.
-        clamped_opacities: `paper`: merged α that reached 0.99.
+        before: Gaussians before the round.
+        dropped: dropped for low opacity.
+        merged: removed by merging.
+        trimmed: trimmed for low priority.
+        after: Gaussians after the round.
+        cells: `paper`: number of locality cells; 0 if none were needed.
+        refused: `paper`: groups rejected, by guard.
+        skipped_alone: `paper`: rows alone in their cell and colour bin.
+        undone_groups: `paper`: merges undone to reach the budget.
+        clamped_opacities: `paper`: merged rows whose α was limited to 0.99.
     """
 
     before: int
@@ -38,24 +38,23 @@ class SimplifyRound(Report):
 
 @dataclass(frozen=True)
 class SimplifyReport(Report):
-    """A reduction in numbers.
+    """Report of a simplification.
 
     Args:
-        input_count: Gaussians given.
-        output_count: Gaussians left.
-        merged_members: rows of the input that share an output row.
-        rounds: one after another.
-        protected: rows of the output that are flagged.
-        nonfinite_rows: of the input, left out.
-        infinite_logits: taken as α = 0 or 1.
-        clamped_opacities: merged α that reached 0.99: what `max_growth` could not take was lost.
-        fitted: rows whose opacity or, where that is full, area was fitted to what views see.
-        unseen: rows of the input that are kept though no view sees them; None without views.
-        faded: merged α < 1/255 where a member's was not.
-        skipped: `alone`: rows passed on as they were; `sh_bands`: of zeros, left out of all sums; of the
-            paper's, `coverages`: groups that the cheaper guard had refused; rounds without `binnings`, or
-            `trims`: few rows were left already.
-        seconds: in the pipeline, what the stage took, visibility included.
+        input_count: Gaussians of the input.
+        output_count: Gaussians of the output.
+        merged_members: input rows that share an output row.
+        rounds: report of each round.
+        protected: flagged output rows.
+        nonfinite_rows: input rows dropped because they are not finite.
+        infinite_logits: infinite logits, taken as α = 0 or 1.
+        clamped_opacities: merged rows whose α was limited to 0.99, losing what `max_growth` could not absorb.
+        fitted: rows whose opacity (or area, at full opacity) was fitted to visibility.
+        unseen: kept input rows that no view sees; None without views.
+        faded: merged rows with α < 1/255 although a member's was not.
+        skipped: `alone`: unmerged rows; `sh_bands`: bands of zeros, not computed; for `paper`, `coverages`:
+            groups already rejected by the cheaper guard, and rounds that needed no `binnings` or `trims`.
+        seconds: in the pipeline, time of the stage including visibility.
     """
 
     input_count: int
