@@ -270,7 +270,7 @@ def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_
     assert sum(tile["pixels"] for tile in tiles) == report["scores"]["pixels"]
     page = (tmp_path / "run" / "report.html").read_text()
     assert "town.ply: 9,000 → 900" in page
-    assert f"{sum(tile['steps'] for tile in tiles):,} steps of recovery, those of all tiles summed" in page
+    assert f"{sum(tile['steps'] for tile in tiles):,} recovery steps of all tiles together" in page
     assert all(f"{tile['recovered']:.2f}" in page for tile in tiles)
     assert not list(tmp_path.glob("run/.*"))
 
