@@ -1,15 +1,13 @@
-"""Files: Gaussian scenes, coloured clouds and views, read and written by extension or by content.
+"""File formats: Gaussian scenes, coloured point clouds and views, chosen by extension or content.
 
 | reads | from |
 |---|---|
 | `read_splats`, `read_scene` | 3DGS .ply, .compressed.ply, SOG folder or .sog, .spz, .glb, .splat |
 | `read_points`, `read_cloud` | .ply, .las, .laz, COLMAP points3D |
-| `read_views`, `read_view_set` | COLMAP, transforms.json, INRIA's, nerfstudio, gsplat, Cambridge, g2ard's |
+| `read_views`, `read_view_set` | COLMAP, transforms.json, INRIA, nerfstudio, gsplat, Cambridge, g2ard |
 
-`find_views` looks for the cameras that trainers leave beside a scene.
-
-The short forms return the data; the long ones also say what was noticed (`Note`). Nothing heavy is imported
-until a function is called.
+The first function of each row returns data; the second also returns notes about the file (`Note`).
+`find_views` finds the cameras that trainers leave beside a scene. Readers are imported on first use.
 """
 
 from __future__ import annotations
@@ -70,18 +68,17 @@ def __getattr__(name: str) -> Any:
 
 
 def read_splats(path: str | Path) -> Splats:
-    """Read a Gaussian scene; `read_scene` also says what was noticed.
+    """Read a Gaussian scene.
 
     Args:
-        path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .glb, .splat; or a folder that
-            `distill` or `ingest` wrote.
+        path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .glb, .splat; or a folder written by
+            `distill` or `ingest`.
 
     Returns:
         The scene: linear scales, logit opacities, means relative to `offset`.
 
     Raises:
-        InputError: the file is absent, broken, truncated, not a scene, or has no finite row; the message
-            names the file and what is wrong.
+        InputError: the file is missing, damaged, not a scene, or has no finite row.
 
     >>> import tempfile
     >>> from g2ard.scene.splats import Splats
@@ -94,17 +91,7 @@ def read_splats(path: str | Path) -> Splats:
 
 
 def read_scene(path: str | Path) -> Scene:
-    """Read a Gaussian scene and what was noticed on the way: rows dropped, values clamped, extra properties.
-
-    Args:
-        path: as for `read_splats`.
-
-    Returns:
-        A `Scene` of splats and notes.
-
-    Raises:
-        InputError: as for `read_splats`.
-    """
+    """Read a Gaussian scene with notes on dropped rows, clamped values and ignored properties."""
     from importlib import import_module
 
     path, found = check_scene(path)
@@ -112,15 +99,10 @@ def read_scene(path: str | Path) -> Scene:
 
 
 def open_stream(path: str | Path | Sequence[str | Path]) -> SceneStream:
-    """Open a scene, or several as one, to be read block by block.
+    """Open a scene, or several as one, for reading in blocks.
 
-    Args:
-        path: a scene in any format that `read_scene` reads, or several. A .ply, .compressed.ply or .splat is
-            held a block at a time, a SOG a chunk at a time, tiles one at a time, other formats as a whole.
-            Several scenes get the offset of the first and the highest of their SH degrees.
-
-    Raises:
-        InputError: nothing is there, or its header is broken.
+    Memory holds one block of a .ply, .compressed.ply or .splat, one chunk of a SOG, one tile, or the whole
+    file of other formats. Several scenes get the offset of the first and the highest of their SH degrees.
     """
     from importlib import import_module
 
@@ -130,7 +112,7 @@ def open_stream(path: str | Path | Sequence[str | Path]) -> SceneStream:
     if not isinstance(path, str | Path):
         streams = [open_stream(part) for part in path]
         if not streams:
-            raise InputError("no scene was given")
+            raise InputError("no scene given")
         return streams[0] if len(streams) == 1 else JoinedScenes(streams)
     path, found = check_scene(path)
     module = import_module(f"g2ard.io.{found}")
@@ -144,14 +126,7 @@ def open_stream(path: str | Path | Sequence[str | Path]) -> SceneStream:
 
 
 def check_scene(path: str | Path) -> tuple[Path, str]:
-    """Refuse what `read_scene` would refuse for its kind, before any work; damage is found by reading.
-
-    Returns:
-        The scene's file or folder, and its format.
-
-    Raises:
-        InputError: nothing is there, or it is no Gaussian scene.
-    """
+    """Return a scene's file or folder and its format; raise an `InputError` if it is not a scene."""
     from g2ard.errors import InputError
     from g2ard.io.detect import KINDS, file_format, run_scene
 
@@ -161,17 +136,16 @@ def check_scene(path: str | Path) -> tuple[Path, str]:
         words = {
             "cloud_ply": "a point cloud (no f_dc, scale, rot)",
             "las": "a point cloud",
-            "views": "g2ard's views",
+            "views": "views",
         }
         what = words.get(found, found)
         is_cloud = KINDS[found] == "points"
-        hint = "`g2ard lift` makes a scene of it" if is_cloud else "name the scene's own file"
-        raise InputError(f"a Gaussian scene is needed, this is {what}", path=path, hint=hint)
+        hint = "`g2ard lift` turns it into a scene" if is_cloud else "give the scene's file"
+        raise InputError(f"expected a Gaussian scene, found {what}", path=path, hint=hint)
     return path, found
 
 
 def _named(path: str | Path, suffixes: tuple[str, ...], rule: str) -> Path:
-    """`path`, if its name ends in one of `suffixes`."""
     from g2ard.errors import OutputError
 
     path = Path(path)
@@ -181,11 +155,7 @@ def _named(path: str | Path, suffixes: tuple[str, ...], rule: str) -> Path:
 
 
 def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
-    """As `check_output`, for a scene: its format must be one that `write_splats` knows.
-
-    Raises:
-        OutputError: as `write_splats` would, before the work rather than after it.
-    """
+    """Raise the `OutputError` that `write_splats` would raise, before any work."""
     from g2ard.io.scene_formats import scene_format
 
     if scene_format(path).function == "write_folder":
@@ -195,29 +165,24 @@ def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
 
 
 def check_views_output(path: str | Path, overwrite: bool = False) -> Path:
-    """As `check_output`, for views: their format must be one that `write_views` knows.
-
-    Raises:
-        OutputError: as `write_views` would, before the work rather than after it.
-    """
+    """Raise the `OutputError` that `write_views` would raise, before any work."""
     return check_output(_named(path, (".json",), "views are written as .json"), overwrite)
 
 
 def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, **options: Any) -> None:
-    """Write a Gaussian scene, whole or not at all.
+    """Write a Gaussian scene atomically.
 
     Args:
-        path: .ply (3DGS), .compressed.ply, .sog, .spz, .glb (KHR_gaussian_splatting) or .splat, in any case;
-            NAME/meta.json for a SOG folder. What each holds: `docs/formats.md`.
+        path: .ply (3DGS), .compressed.ply, .sog, .spz, .glb (KHR_gaussian_splatting) or .splat;
+            NAME/meta.json for a SOG folder.
         splats: the scene.
-        overwrite: whether an existing file may be replaced.
-        **options: of the format; `normals=True` adds nx ny nz to a .ply, `spz_version=4` writes that version
-            of .spz rather than 3.
+        overwrite: whether to replace an existing file.
+        **options: format options: `normals=True` adds nx ny nz to a .ply, `spz_version=4` writes .spz
+            version 4 instead of 3.
 
     Raises:
-        OutputError: the file exists, its folder is absent or not writable, or the extension is no format that
-            g2ard writes, or has no such option.
-        InputError: the scene is empty, has a value that is not finite, or one that the format cannot hold.
+        OutputError: the file exists or cannot be written, or the extension or an option is unsupported.
+        InputError: the scene is empty, has a non-finite value, or one that the format cannot store.
         MissingDependencyError: .spz of version 4 before Python 3.14 without `pip install backports.zstd`.
     """
     from importlib import import_module
@@ -230,7 +195,7 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
 
 
 def read_points(path: str | Path) -> Points:
-    """Read a coloured cloud; `read_cloud` also says what was noticed.
+    """Read a coloured point cloud.
 
     Args:
         path: .ply with x y z red green blue, .las, .laz, COLMAP's points3D.bin or .txt, or a COLMAP folder.
@@ -239,32 +204,21 @@ def read_points(path: str | Path) -> Points:
         Positions in float64, world units; colours in [0, 1].
 
     Raises:
-        InputError: the file is absent, broken, has no colour, or no finite point.
+        InputError: the file is missing, damaged, has no colours, or no finite point.
         MissingDependencyError: .las or .laz without `pip install g2ard[las]`.
     """
     return read_cloud(path).points
 
 
 def read_cloud(path: str | Path) -> Cloud:
-    """Read a coloured cloud and what was noticed on the way.
-
-    Args:
-        path: as for `read_points`.
-
-    Returns:
-        A `Cloud` of points and notes.
-
-    Raises:
-        InputError: as for `read_points`.
-        MissingDependencyError: as for `read_points`.
-    """
+    """Read a coloured point cloud with notes on the file."""
     path, module = _cloud_reader(path)
     cloud: Cloud = module.read(path)
     return cloud
 
 
 def _cloud_reader(path: str | Path) -> tuple[Path, ModuleType]:
-    """Return the path of a cloud and the module that reads it."""
+    """Return the path of a point cloud and the module that reads it."""
     from importlib import import_module
 
     from g2ard.errors import InputError
@@ -275,21 +229,16 @@ def _cloud_reader(path: str | Path) -> tuple[Path, ModuleType]:
     if found not in modules:
         scene = kind(path) == "splats"
         what = "a Gaussian scene" if scene else found
-        hint = "it is ready for `simplify` and `distill`" if scene else "name the cloud's own file"
-        raise InputError(f"a coloured point cloud is needed, this is {what}", path=path, hint=hint)
+        hint = "run `simplify` or `distill` on it" if scene else "give the point cloud's file"
+        raise InputError(f"expected a coloured point cloud, found {what}", path=path, hint=hint)
     return path, import_module(f"g2ard.io.{modules[found]}")
 
 
 def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
-    """Open a coloured cloud, or several as one, to be read block by block.
+    """Open a coloured point cloud, or several as one, for reading in blocks.
 
-    Args:
-        path: a cloud in any format that `read_cloud` reads, or several. A .ply, .las or .laz is held a block
-            at a time, other formats as a whole. Several clouds get the offset of the first.
-
-    Raises:
-        InputError: nothing is there, or its header is broken.
-        MissingDependencyError: .las or .laz without `pip install g2ard[las]`.
+    Memory holds one block of a .ply, .las or .laz, or the whole file of other formats. Several clouds get
+    the offset of the first.
     """
     from g2ard.errors import InputError
     from g2ard.io.point_stream import JoinedClouds, WholeCloud
@@ -297,7 +246,7 @@ def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
     if not isinstance(path, str | Path):
         streams = [open_point_stream(part) for part in path]
         if not streams:
-            raise InputError("no cloud was given")
+            raise InputError("no point cloud given")
         return streams[0] if len(streams) == 1 else JoinedClouds(streams)
     path, module = _cloud_reader(path)
     if hasattr(module, "stream"):
@@ -307,41 +256,31 @@ def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
 
 
 def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -> None:
-    """Write a coloured cloud as .ply (float64 positions, 8-bit colours), whole or not at all.
-
-    Args:
-        path: the .ply to write.
-        points: the cloud.
-        overwrite: whether an existing file may be replaced.
-
-    Raises:
-        OutputError: it exists, cannot be written, or is not a .ply.
-        InputError: the cloud is empty or has a value that is not finite.
-    """
+    """Write a coloured point cloud as .ply (float64 positions, 8-bit colours) atomically."""
     from g2ard.errors import OutputError
     from g2ard.io import cloud_ply
 
     path = Path(path)
     if path.suffix.lower() != ".ply":
-        raise OutputError("clouds are written as .ply", path=path)
+        raise OutputError("point clouds are written as .ply", path=path)
     cloud_ply.write(path, points, overwrite=overwrite)
 
 
 def read_views(path: str | Path, *, images: str | Path | None = None, split: str = "all") -> Cameras:
-    """Read views; `read_view_set` also says what was noticed, and per view its split and weight.
+    """Read views.
 
     Args:
-        path: a COLMAP folder (or its images_4), a transforms.json or its folder, a Cambridge Landmarks
-            scene, or a .json that g2ard wrote.
-        images: the folder of the photos, where they are not where the file says.
+        path: a COLMAP folder (or its images_4), a transforms.json or its folder, a nerfstudio, gsplat or
+            INRIA run, a Cambridge Landmarks scene, or a .json written by g2ard.
+        images: folder of the photos, if they have moved.
         split: "train", "test", or "all"; see `g2ard.scene.splits.split_mask`.
 
     Returns:
-        The views in OpenCV axes, COLMAP's sorted by name, others in file order. Views whose photo is
-        missing are left out, unless none has one.
+        The views in OpenCV axes, sorted by name for COLMAP, otherwise in file order. Views whose photo is
+        missing are skipped, unless all photos are missing.
 
     Raises:
-        InputError: the file is absent, broken or holds no views, or the split has none.
+        InputError: the file is missing or damaged, or has no views in the split.
     """
     return read_view_set(path, images=images, split=split).cameras
 
@@ -353,20 +292,7 @@ def read_view_set(
     split: str = "all",
     unpictured: bool = False,
 ) -> ViewSet:
-    """Read views and what their file says beside the cameras.
-
-    Args:
-        path: as for `read_views`.
-        images: as for `read_views`.
-        split: as for `read_views`.
-        unpictured: keep views without a photo beside those with one; else they are left out, and counted.
-
-    Returns:
-        A `ViewSet` of cameras, notes, splits and weights.
-
-    Raises:
-        InputError: as for `read_views`.
-    """
+    """Read views with their splits, weights and notes; `unpictured` keeps views without photos."""
     from importlib import import_module
 
     from g2ard.errors import InputError
@@ -377,15 +303,15 @@ def read_view_set(
     path = run_views(path)
     found = file_format(path)
     if KINDS[found] != "views":
-        what = "a Gaussian scene" if KINDS[found] == "splats" else "a cloud"
+        what = "a Gaussian scene" if KINDS[found] == "splats" else "a point cloud"
         raise InputError(
-            f"views are needed (a COLMAP folder, transforms.json, g2ard's .json), this is {what}", path=path
+            f"expected views (a COLMAP folder, transforms.json, g2ard's .json), found {what}", path=path
         )
     if images is not None and not Path(images).is_dir():
-        raise InputError(f"{images}: no such folder of photos")
+        raise InputError("no such folder of photos", path=images)
     try:
         views = import_module(f"g2ard.io.{found}").read(path, Path(images) if images else None)
-    except OSError as error:  # a photo's name that no file system takes, a folder that may not be read
+    except OSError as error:  # invalid photo name, unreadable folder
         raise InputError(error.strerror or str(error), path=path) from error
     views = views if unpictured else pictured(views)
     return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
@@ -399,18 +325,18 @@ def write_views(
     weights: ArrayLike | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write views as g2ard's own .json, which `read_views` gives back bit by bit.
+    """Write views as g2ard's .json, which `read_views` restores to the same bits.
 
     Args:
-        path: the .json to write; photos are named relative to it.
+        path: the .json to write; photo paths are stored relative to it.
         cameras: C views.
-        splits: per view "train", "test" or None; () for none.
-        weights: (C,) how often each view should be drawn, NaN where a view states none; None for none.
-        overwrite: whether an existing file may be replaced.
+        splits: "train", "test" or None per view, or ().
+        weights: (C,) sampling weights, NaN for views without one, or None.
+        overwrite: whether to replace an existing file.
 
     Raises:
-        OutputError: it exists, cannot be written, or is not a .json.
-        InputError: no views, or splits or weights of another length.
+        OutputError: the file exists, cannot be written, or is not a .json.
+        InputError: there are no views, or `splits` or `weights` have another length.
     """
     from g2ard.io import views
 

@@ -1,4 +1,4 @@
-"""Poses as text, one photo a line, as ACE and its successors write them."""
+"""Reader for ACE's pose files: text, one photo per line."""
 
 from __future__ import annotations
 
@@ -12,15 +12,9 @@ from g2ard.io.photos import rotation
 
 
 def read(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Read `NAME qw qx qy qz tx ty tz …`: a photo and its camera_from_world, whatever follows.
+    """Read lines `NAME qw qx qy qz tx ty tz …` as photo → (4, 4) camera_from_world.
 
-    Empty lines and those that begin with # are passed over.
-
-    Returns:
-        Name → (4, 4) camera_from_world, in the file's order.
-
-    Raises:
-        InputError: the file is absent, a line is no pose, a name comes twice, or there is no pose.
+    Empty lines and lines that begin with # are skipped.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -39,10 +33,10 @@ def read(path: Path) -> dict[str, NDArray[np.float64]]:
             pose = np.zeros(0)
         if len(pose) != 7 or not np.isfinite(pose).all() or not np.linalg.norm(pose[:4]) > 0:
             raise InputError(
-                f"line {number}: expected a name, a quaternion wxyz and a translation", path=path
+                "expected a name, a quaternion wxyz and a translation", path=path, index=number, item="line"
             )
         if words[0] in out:
-            raise InputError(f"line {number}: {words[0]} comes twice", path=path)
+            raise InputError(f"repeats the name {words[0]!r}", path=path, index=number, item="line")
         out[words[0]] = np.eye(4)
         out[words[0]][:3, :3], out[words[0]][:3, 3] = rotation(pose[:4].tolist()), pose[4:]
     if not out:

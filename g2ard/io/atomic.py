@@ -1,4 +1,4 @@
-"""Outputs that are there whole or not at all."""
+"""Atomic outputs: written under a temporary name, then renamed."""
 
 from __future__ import annotations
 
@@ -13,19 +13,12 @@ from g2ard.errors import OutputError
 
 
 def check_output(path: str | Path, overwrite: bool = False, *, folder: bool = False) -> Path:
-    """Refuse an output that cannot be written, before hours of work rather than after.
+    """Return `path`, or raise an `OutputError` if an output cannot be written there.
 
     Args:
-        path: where the output is to go.
+        path: the output.
         overwrite: whether a file, or a folder that is not empty, may be replaced.
         folder: whether the output is a folder.
-
-    Returns:
-        `path` as a Path.
-
-    Raises:
-        OutputError: it exists and may not be overwritten, is of the other kind, or its folder is not
-            writable. A folder that is absent is made when the output is written.
     """
     path = Path(path)
     try:
@@ -33,14 +26,16 @@ def check_output(path: str | Path, overwrite: bool = False, *, folder: bool = Fa
         parent = path.absolute().parent
         there = next(folder for folder in (parent, *parent.parents) if folder.exists())
         if not there.is_dir():
-            raise OutputError(f"{there} is a file; a folder is needed there", path=path)
+            raise OutputError(f"{there} is a file, not a folder", path=path)
         probe = _beside(there / path.name)
         probe.mkdir()
         probe.rmdir()
     except OutputError:
         raise
     except OSError as error:
-        raise OutputError(f"cannot write there: {error.strerror}; name another place", path=path) from error
+        raise OutputError(
+            f"cannot write there: {error.strerror}", path=path, hint="give another output"
+        ) from error
     return path
 
 
@@ -48,35 +43,24 @@ def _refuse_existing(path: Path, overwrite: bool, folder: bool) -> None:
     if not path.exists():
         return
     if path.is_dir() and not folder:
-        raise OutputError("is a folder; a file is to be written there: name one in it", path=path)
+        raise OutputError("is a folder", path=path, hint="give the name of a file")
     if folder and not path.is_dir():
-        raise OutputError("is a file; a folder is to be written there: name another", path=path)
+        raise OutputError("is a file", path=path, hint="give the name of a folder")
     if not overwrite and (not folder or any(path.iterdir())):
         raise OutputError("exists", path=path, hint="{overwrite=True} replaces it")
 
 
 def _beside(path: Path) -> Path:
-    """A hidden name in the same folder, so that the rename stays on one disk; the suffix is kept for
-    writers that choose a format by it."""
+    """Return a hidden name in the same folder, so that renaming is atomic, with the same suffix."""
     path = path.absolute()  # "." has no name
     return path.with_name(f".{path.stem}.{uuid4().hex[:12]}{path.suffix}")
 
 
 @contextmanager
 def atomic_output(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
-    """Yield a temporary path to write to; on success it becomes `path` in one step.
+    """Yield a temporary path with the same suffix, and rename it to `path` on success.
 
-    On any failure, Ctrl-C included, the temporary file goes and what was at `path` stays.
-
-    Args:
-        path: the file to write.
-        overwrite: whether an existing file may be replaced.
-
-    Yields:
-        A path in the same folder, with the same suffix, where nothing exists yet.
-
-    Raises:
-        OutputError: see `check_output`; or the disk refuses while writing.
+    On failure or Ctrl-C, the temporary file is removed and an existing `path` is kept.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
@@ -101,13 +85,9 @@ def atomic_output(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
-    """Yield a temporary folder to fill; on success it becomes `path`.
+    """Yield a temporary folder, and rename it to `path` on success.
 
-    Where `path` already is a folder (and `overwrite` allows it) files of the same name are replaced one by
-    one and others are left alone: a mistyped output folder loses nothing of its own.
-
-    Raises:
-        OutputError: see `check_output`; or the disk refuses while writing.
+    If `path` exists, files of the same name are replaced and other files are kept.
     """
     path = check_output(path, overwrite, folder=True)
     temporary, made = _beside(path), parents_made(path)
@@ -128,14 +108,14 @@ def atomic_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
 
 
 def parents_made(path: Path) -> list[Path]:
-    """Make the folders above `path` that are absent; those made, innermost first."""
+    """Create missing parent folders and return them, innermost first."""
     absent = [folder for folder in path.absolute().parents if not folder.exists()]
     path.absolute().parent.mkdir(parents=True, exist_ok=True)
     return absent
 
 
 def drop_empty(folders: list[Path]) -> None:
-    """Nothing came of an output: the folders made for it go again."""
+    """Remove those of the folders that are empty."""
     for folder in folders:
         with suppress(OSError):
             folder.rmdir()

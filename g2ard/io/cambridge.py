@@ -1,4 +1,4 @@
-"""Cambridge Landmarks: poses of dataset_*.txt, focal lengths of reconstruction.nvm."""
+"""Reader for Cambridge Landmarks: poses from dataset_*.txt, focal lengths from reconstruction.nvm."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from g2ard.io.photos import Frame, photo_size, rotation, view_set
 from g2ard.io.types import Note, ViewSet
 
 _SIZE = (1920, 1080)
-"""Of every photo of the data set, which the focal lengths are pixels of; smaller copies shrink them."""
+"""Size of the original photos, for which focal lengths are given."""
 
 _LISTS = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
 _MODEL = "reconstruction.nvm"
@@ -26,23 +26,16 @@ class _Lens(NamedTuple):
 
 
 def is_cambridge(folder: Path) -> bool:
-    """Whether the folder holds a scene of the data set."""
+    """Return whether a folder holds a scene of the data set."""
     return (folder / _MODEL).is_file() and any((folder / name).is_file() for name in _LISTS.values())
 
 
 def read(path: Path, images: Path | None = None) -> ViewSet:
-    """Read both lists; each view states its split.
+    """Read the train and test lists of a scene's folder.
 
     A line is the photo's name, the camera's centre and the quaternion (wxyz) of camera_from_world.
-    VisualSFM's radial parameter r undistorts, m_u = (1 + r·|m|²)·m; OpenCV's k1 distorts, and is −r to first
+    VisualSFM's radial parameter r undistorts, m_u = (1 + r·|m|²)·m. OpenCV's k1 distorts; it is −r to first
     order.
-
-    Args:
-        path: the scene's folder.
-        images: the folder of the photos (with its seq1/ …); None means the scene's.
-
-    Raises:
-        InputError: a line that is not a pose, or no focal length at all.
     """
     lenses = _lenses(path / _MODEL)
     median = _Lens(float(np.median([lens.focal for lens in lenses.values()])), 0.0)
@@ -58,7 +51,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     found = view_set(path, frames)
     if not guessed:
         return found
-    text = f"{guessed} views are not in {_MODEL}: the median focal length, {median.focal:.1f}, stands in"
+    text = f"{guessed} views are not in {_MODEL}; they get the median focal length, {median.focal:.1f}"
     return replace(found, notes=(*found.notes, Note("guessed_focal", guessed, text)))
 
 
@@ -73,12 +66,12 @@ def _frame(where: Path, name: str, pose: list[float], lens: _Lens, photo: Path, 
 
 
 def _stem(name: str) -> str:
-    """The model lists .jpg where the photos are .png."""
+    """Return a name without its suffix, since the model lists .jpg for .png photos."""
     return name.rsplit(".", 1)[0]
 
 
 def _lenses(path: Path) -> dict[str, _Lens]:
-    """Of the first model in an NVM file: name, focal, quaternion, centre, radial distortion, 0."""
+    """Read the lenses of an NVM file's first model: name, focal, quaternion, centre, radial, 0 per line."""
     with parsing(path):
         lines = path.read_text(encoding="utf-8").splitlines()
         if not lines or not lines[0].startswith("NVM_V3"):
@@ -89,12 +82,12 @@ def _lenses(path: Path) -> dict[str, _Lens]:
         rows = [line.replace("\t", " ").split() for line in lines[at + 1 : at + 1 + int(lines[at])]]
         lenses = {_stem(row[0]): _Lens(float(row[1]), float(row[9])) for row in rows}
     if not lenses:
-        raise InputError("lists no camera", path=path)
+        raise InputError("has no cameras", path=path)
     return lenses
 
 
 def _poses(path: Path) -> list[tuple[str, list[float]]]:
-    """Three lines of heading, then a pose a line."""
+    """Read poses, one per line after three lines of heading."""
     out = []
     with parsing(path):
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines()[3:], 4):
@@ -103,10 +96,13 @@ def _poses(path: Path) -> list[tuple[str, list[float]]]:
                 continue
             if len(words) != 8:
                 raise InputError(
-                    f"line {number}: expected a name and 7 numbers, got {len(words)} words", path=path
+                    f"expected a name and 7 numbers, got {len(words)} words",
+                    path=path,
+                    index=number,
+                    item="line",
                 )
             pose = [float(word) for word in words[1:]]
             if not np.isfinite(pose).all() or not np.linalg.norm(pose[3:]) > 0:
-                raise InputError(f"line {number}: not a pose", path=path)
+                raise InputError("is not a valid pose", path=path, index=number, item="line")
             out.append((words[0], pose))
     return out

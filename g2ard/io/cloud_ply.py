@@ -1,4 +1,4 @@
-"""Coloured point clouds in .ply files, through plyfile."""
+"""Reader and writer for coloured point clouds in .ply files."""
 
 from __future__ import annotations
 
@@ -21,21 +21,13 @@ _COLOR_NAMES = (["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diff
 
 
 def read(path: Path) -> Cloud:
-    """Read x y z and red green blue (integers scaled by their range, floats taken as they are, in [0, 1]).
-
-    Raises:
-        InputError: not a PLY, truncated, a position or colour property is missing, nothing finite in it.
-    """
+    """Read x y z and red green blue: integers, scaled by their range, or floats in [0, 1]."""
     rows, names = _vertices(path)
     return finite_cloud(path, *_points(path, np.asarray(rows), names))
 
 
 def stream(path: Path) -> PointStream:
-    """The same cloud in blocks. A text file, or one with lists before its points, is held as a whole.
-
-    Raises:
-        InputError: as for `read`; rows are looked at later.
-    """
+    """Open a cloud for reading in blocks; text files and those with leading lists are read whole."""
     return _PlyPoints(path)
 
 
@@ -55,7 +47,7 @@ class _PlyPoints(PointStream):
 
 
 def _vertices(path: Path) -> tuple[NDArray[Any], list[str]]:
-    """The rows, and the names of their colours."""
+    """Return the rows and the names of their colour properties."""
     header = read_header(path)
     properties = header.properties.get("vertex", [])
     require(path, properties, _POSITION, "a point cloud")
@@ -75,13 +67,13 @@ def _unit(path: Path, values: NDArray[Any], name: str) -> NDArray[np.float32]:
     if values.dtype.kind in "iu":
         least, most = int(values.min(initial=0)), int(np.iinfo(values.dtype).max)
         if least < 0:
-            raise InputError(f"colour {name!r} falls to {least}; expected values in [0, {most}]", path=path)
+            raise InputError(f"has a value of {least}, expected [0, {most}]", path=path, property=name)
         return (values / np.float32(most)).astype(np.float32)
     finite = values[np.isfinite(values)]
     low, top = float(finite.min(initial=0.0)), float(finite.max(initial=0.0))
     if low < -0.5 or top > 1.5:
-        beyond = f"reaches {top:g}" if top > 1.5 else f"falls to {low:g}"
-        raise InputError(f"float colour {name!r} {beyond}; expected values in [0, 1]", path=path)
+        beyond = top if top > 1.5 else low
+        raise InputError(f"has a value of {beyond:g}, expected floats in [0, 1]", path=path, property=name)
     with np.errstate(invalid="ignore"):  # a signalling NaN
         return values.astype(np.float32)
 
@@ -89,13 +81,9 @@ def _unit(path: Path, values: NDArray[Any], name: str) -> NDArray[np.float32]:
 def finite_cloud(
     path: Path, positions: NDArray[np.float64], colors: NDArray[np.float32], notes: tuple[Note, ...] = ()
 ) -> Cloud:
-    """Drop and count the non-finite points; clip colours to [0, 1].
-
-    Raises:
-        InputError: no point is left.
-    """
+    """Drop non-finite points with a note, and clip colours to [0, 1]."""
     if not len(positions):
-        raise InputError("holds no points", path=path)
+        raise InputError("has no points", path=path)
     good = np.all(np.isfinite(positions), axis=1) & np.all(np.isfinite(colors), axis=1)
     dropped = len(good) - int(np.count_nonzero(good))
     if dropped == len(good):
@@ -108,22 +96,12 @@ def finite_cloud(
 
 
 def write(path: Path, points: Points, *, overwrite: bool = False) -> None:
-    """Write a binary .ply: x y z as float64, red green blue as bytes.
-
-    Raises:
-        OutputError: see `atomic_output`.
-        InputError: the cloud is empty or has a non-finite value.
-    """
+    """Write a binary .ply: x y z as float64, red green blue as bytes."""
     write_blocks(path, len(points), [points], overwrite=overwrite)
 
 
 def write_blocks(path: Path, count: int, blocks: Iterable[Points], *, overwrite: bool = False) -> None:
-    """As `write`, of `count` points that come in blocks.
-
-    Raises:
-        OutputError: see `atomic_output`.
-        InputError: there are none, other than `count`, or one with a non-finite value.
-    """
+    """Write `count` points that arrive in blocks, as `write` does."""
     from plyfile import PlyData, PlyElement
 
     names = [(n, "<f8") for n in _POSITION] + [(n, "u1") for n in _COLOR_NAMES[0]]
@@ -134,7 +112,7 @@ def write_blocks(path: Path, count: int, blocks: Iterable[Points], *, overwrite:
         file.write(header.encode("ascii") + b"\n")
         for points in blocks:
             if not (np.isfinite(points.positions).all() and np.isfinite(points.colors).all()):
-                raise InputError("not written: a non-finite point", path=path)
+                raise InputError("not written: a point is not finite", path=path)
             rows = np.empty(len(points), names)
             for axis in range(3):
                 rows[_POSITION[axis]] = points.positions[:, axis]

@@ -1,4 +1,4 @@
-"""COLMAP models: cameras and images, binary or text. Rigs and frames (COLMAP 4) add nothing to poses here."""
+"""Reader for COLMAP models: cameras and images, binary or text. Rigs and frames (COLMAP 4) are ignored."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 
 
 
 class _Camera(NamedTuple):
-    """One camera's size, pinhole matrix and OpenCV distortion k1 k2 p1 p2 k3."""
+    """A camera's size, pinhole matrix and OpenCV distortion k1 k2 p1 p2 k3."""
 
     size: tuple[int, int]
     K: NDArray[np.float64]
     distortion: tuple[float, ...]
 
     def at(self, size: tuple[int, int]) -> _Camera:
-        """The same lens where its photos were resized."""
+        """Return the camera for resized photos."""
         if size == self.size:
             return self
         K = self.K.copy()
@@ -50,24 +50,21 @@ class _Image(NamedTuple):
 
 
 def model_folder(path: Path) -> Path | None:
-    """The folder that holds cameras and images of the model at `path`, or None.
-
-    Looks at `path` itself, then sparse/0, sparse, colmap/sparse/0 in it.
-    """
+    """Return the model's folder: `path`, or sparse/0, sparse or colmap/sparse/0 in it, or None."""
     path = path.parent if path.is_file() else path
     places = (path, path / "sparse" / "0", path / "sparse", path / "colmap" / "sparse" / "0")
     return next((folder for folder in places if _tables(folder)), None)
 
 
 def photos_beside(path: Path) -> tuple[Path, Path] | None:
-    """(project, photos) where `path` is a folder of photos beside a model, as images_4 is; else None."""
+    """Return (project, photos) if `path` is a folder of photos beside a model, such as images_4."""
     if not path.is_dir() or model_folder(path) is not None or not path.name.startswith("images"):
         return None
     return (path.parent, path) if model_folder(path.parent) is not None else None
 
 
 def _tables(folder: Path) -> tuple[Path, Path] | None:
-    """The tables of cameras and images, binary before text; None if either is absent."""
+    """Return the files of cameras and images, binary before text; None if either is missing."""
     for suffix in (".bin", ".txt"):
         cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
         if cameras.is_file() and images.is_file():
@@ -77,7 +74,7 @@ def _tables(folder: Path) -> tuple[Path, Path] | None:
 
 @contextmanager
 def parsing(path: Path) -> Iterator[None]:
-    """Turn what a broken table causes into one line that names the file."""
+    """Turn parsing errors into an `InputError` that names the file."""
     try:
         yield
     except InputError:
@@ -94,12 +91,8 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     Args:
         path: the project folder, the model's folder, one of its files, or a folder of photos beside the
             model, such as images_4.
-        images: the folder of the photos; None looks for `images` beside the model or above it. Photos of
-            another size than the model's (Mip-NeRF 360's images_2, images_4) shrink their cameras.
-
-    Raises:
-        InputError: no model there, a truncated file, a camera model that is not pinhole with OpenCV
-            distortion, or no registered image.
+        images: folder of the photos; by default `images` beside or above the model. Cameras are scaled to
+            resized photos (Mip-NeRF 360's images_2, images_4).
     """
     from g2ard.io.photos import view_set
 
@@ -107,11 +100,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
 
 
 def frames(path: Path, images: Path | None = None) -> tuple[Path, list[Frame]]:
-    """As `read`, before photos that are missing are left out; and the folder of the model.
-
-    Raises:
-        InputError: as `read`.
-    """
+    """Return the model's folder and its frames, with or without photos."""
     from g2ard.io.photos import Frame, photo_size
 
     if images is None and (beside := photos_beside(path)):
@@ -119,20 +108,20 @@ def frames(path: Path, images: Path | None = None) -> tuple[Path, list[Frame]]:
     folder = model_folder(path)
     tables = _tables(folder) if folder else None
     if folder is None or tables is None:
-        raise InputError("no COLMAP model there (cameras and images, .bin or .txt)", path=path)
+        raise InputError("has no COLMAP model (cameras and images, .bin or .txt)", path=path)
     binary = tables[0].suffix == ".bin"
     with parsing(tables[0]):
         cameras = (_cameras_bin if binary else _cameras_txt)(tables[0])
     with parsing(tables[1]):
         found = (_images_bin if binary else _images_txt)(tables[1])
     if not found:
-        raise InputError("lists no image", path=tables[1])
+        raise InputError("has no images", path=tables[1])
     photos = images or _photo_folder(path, folder)
     listed = []
     sizes: dict[int, tuple[int, int]] = {}
     for image in sorted(found, key=lambda i: i.name):
         if image.camera not in cameras:
-            raise InputError(f"{image.name!r} names camera {image.camera}, which is absent", path=tables[1])
+            raise InputError(f"{image.name!r} has the unknown camera {image.camera}", path=tables[1])
         camera = cameras[image.camera]
         photo = photos / image.name if photos else None
         if images is not None and photo is not None and photo.is_file():
@@ -169,7 +158,7 @@ def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...])
     if model not in _PARAMETERS:
         known = ", ".join(_PARAMETERS)
         raise InputError(
-            f"camera model {model} is not supported ({known} are); undistort with COLMAP", path=path
+            f"unsupported camera model {model}; expected {known}", path=path, hint="undistort with COLMAP"
         )
     if len(p) != _PARAMETERS[model]:
         raise InputError(f"{model} takes {_PARAMETERS[model]} parameters, got {len(p)}", path=path)
@@ -177,7 +166,7 @@ def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...])
     fx, fy, cx, cy, *k = (p[0], *p) if single_focal else p
     if min(size) < 1 or min(fx, fy) <= 0:
         raise InputError(
-            f"a camera of {size[0]:,}×{size[1]:,} pixels and focal lengths {fx}, {fy}", path=path
+            f"invalid camera of {size[0]:,}×{size[1]:,} pixels and focal lengths {fx}, {fy}", path=path
         )
     k1, k2, p1, p2 = (*k, 0.0, 0.0, 0.0, 0.0)[:4]
     return _Camera(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), (k1, k2, p1, p2, 0.0))
@@ -238,7 +227,7 @@ _POSE_COLUMNS = tuple((name, at) for at, name in enumerate(_POSE, 1))
 
 
 def text_lines(path: Path) -> list[str]:
-    """The lines of a COLMAP text table that are no comments; empty ones stay, they may be a row."""
+    """Return the lines of a COLMAP text table without comments; empty lines may be rows."""
     return [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
 
 
@@ -262,7 +251,7 @@ def number(
         raise InputError("is missing", path=path, property=name, index=i, item=item)
     word = words[at]
     try:
-        if "_" in word or not word.isascii():  # which Python's own numbers may have
+        if "_" in word or not word.isascii():  # float() accepts both
             raise ValueError(word)
         return kind(word)
     except ValueError:
@@ -281,7 +270,7 @@ def _images_txt(path: Path) -> list[_Image]:
     while lines and not lines[0].strip():
         lines.pop(0)
     images = []
-    for i, line in enumerate(lines[::2]):  # each second lists the image's points, and may be empty
+    for i, line in enumerate(lines[::2]):  # every second line has the image's points and may be empty
         if words := line.split(maxsplit=9):
             pose = tuple(number(path, "image", i, words, name, at, _finite) for name, at in _POSE_COLUMNS)
             camera = int(number(path, "image", i, words, "CAMERA_ID", 8))

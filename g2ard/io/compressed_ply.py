@@ -1,4 +1,4 @@
-"""SuperSplat's .compressed.ply: 16 bytes a Gaussian, quantised within chunks of 256."""
+"""Reader and writer for SuperSplat's .compressed.ply: 16 bytes per Gaussian, quantised in chunks of 256."""
 
 from __future__ import annotations
 
@@ -25,27 +25,18 @@ from g2ard.scene.splats import SH_C0, Splats
 
 _CHUNK = 256
 _SCALE_LIMIT = 20.0
-"""Log-scales are held to ±20, as SuperSplat does: one stray would coarsen its whole chunk."""
+"""Log-scales are clamped to ±20, as in SuperSplat, since an outlier would coarsen its chunk."""
 
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
 def read(path: Path) -> Scene:
-    """Read a .compressed.ply, with its spherical harmonics where it has them.
-
-    Raises:
-        InputError: a property is missing, the file is truncated, or nothing in it is finite.
-    """
     layout = _layout(path)
     return cleaned(path, _raw(layout, 0, layout.vertex, layout.sh))
 
 
 def stream(path: Path) -> SceneStream:
-    """The same scene in blocks; the bounds of its chunks are held as a whole, 72 bytes for 256 Gaussians.
-
-    Raises:
-        InputError: as for `read`; rows are looked at later.
-    """
+    """Open a scene for reading in blocks; memory holds all chunk bounds, 72 bytes per 256 Gaussians."""
     return _PackedStream(path)
 
 
@@ -69,7 +60,7 @@ class _PackedStream(SceneStream):
 
 @dataclass(frozen=True)
 class _Layout:
-    """The elements of a file: `chunk` in memory, the others mapped."""
+    """Elements of a file: `chunk` in memory, the others mapped."""
 
     vertex: NDArray[Any]
     chunk: NDArray[Any]
@@ -89,10 +80,10 @@ def _layout(path: Path) -> _Layout:
         bounds += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
     missing = [name for name in bounds if name not in chunk_properties]
     if missing:
-        raise InputError(f"its 'chunk' element lacks {', '.join(map(repr, missing))}", path=path)
+        raise InputError(f"element 'chunk' lacks {', '.join(map(repr, missing))}", path=path)
     rest = [p for p in header.properties.get("sh", []) if re.fullmatch(r"f_rest_\d+", p)]
     if len(rest) not in (0, 9, 24, 45) or set(rest) != {f"f_rest_{k}" for k in range(len(rest))}:
-        raise InputError(f"its 'sh' element has {len(rest)} coefficients; expected 9, 24 or 45", path=path)
+        raise InputError(f"element 'sh' has {len(rest)} coefficients; expected 9, 24 or 45", path=path)
 
     names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")
     vertex, chunk, *sh = read_element(path, header, *names)
@@ -100,14 +91,14 @@ def _layout(path: Path) -> _Layout:
         raise InputError(f"{len(chunk)} chunks and {plural(len(vertex), 'Gaussian')} do not fit", path=path)
     for name in _PACKED:
         if vertex.dtype[name] != np.uint32:
-            raise InputError(f"{name!r} is of {vertex.dtype[name]}, not uint", path=path)
+            raise InputError(f"has type {vertex.dtype[name]}, expected uint", path=path, property=name)
     bands, colored = sh[0] if sh else None, "min_r" in chunk_properties
     offset = offset_of(path, header)
     return _Layout(vertex, np.array(chunk), bands, len(rest) // 3, colored, offset)
 
 
 def _raw(layout: _Layout, first: int, vertex: NDArray[Any], sh: NDArray[Any] | None) -> Raw:
-    """What some rows hold, the first of which is number `first` of the file."""
+    """Decode rows, the first of which is row `first` of the file."""
     raw, chunk, rest = Raw.empty(len(vertex), layout.rest), layout.chunk, layout.rest
     raw.offset = layout.offset
     of = np.arange(first, first + len(vertex)) // _CHUNK
@@ -133,14 +124,14 @@ def _unit(packed: NDArray[Any], shift: int, bits: int) -> NDArray[np.float64]:
 
 
 def _three(packed: NDArray[Any]) -> NDArray[np.float64]:
-    """(N, 3) in [0, 1] from 11, 10 and 11 bits."""
+    """Decode 11, 10 and 11 bits to (N, 3) in [0, 1]."""
     return np.stack([_unit(packed, 21, 11), _unit(packed, 11, 10), _unit(packed, 0, 11)], axis=1)
 
 
 def _between(
     chunk: NDArray[Any], of: NDArray[Any], pattern: str, axes: str, t: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Where `t` lies between the bounds of each Gaussian's chunk."""
+    """Interpolate by `t` between the bounds of each Gaussian's chunk."""
     low, high = (
         np.stack([chunk[pattern.format(end, axis)][of].astype(np.float64) for axis in axes], axis=1)
         for end in ("min", "max")
@@ -149,7 +140,7 @@ def _between(
 
 
 def _quats(packed: NDArray[Any]) -> NDArray[np.float64]:
-    """(N, 4) wxyz: 2 bits name the largest component, 10 bits each hold the others in ±1/√2."""
+    """Decode (N, 4) wxyz: 2 bits for the index of the largest component, 10 bits per other one in ±1/√2."""
     three = (np.stack([_unit(packed, shift, 10) for shift in (20, 10, 0)], axis=1) - 0.5) * np.sqrt(2)
     largest = np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))
     quats = np.empty((len(packed), 4))
@@ -161,20 +152,16 @@ def _quats(packed: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _coefficient(codes: NDArray[Any]) -> NDArray[np.float64]:
-    """Bytes to [−4, 4]: bucket centres, but the first and last bucket mean the ends."""
+    """Decode bytes to [−4, 4]: bucket centres, except that the first and last bucket are the ends."""
     t = (codes.astype(np.float64) + 0.5) / 256
     return (np.select([codes == 0, codes == 255], [0.0, 1.0], t) - 0.5) * 8
 
 
 def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
-    """Write a .compressed.ply: 16 bytes a Gaussian, and one for each harmonic past band 0.
+    """Write a .compressed.ply: 16 bytes per Gaussian, plus one per harmonic past band 0.
 
-    Gaussians are written along a Morton curve, so that the bounds of each chunk of 256 are tight. An `offset`
-    goes into a comment as in .ply.
-
-    Raises:
-        OutputError: see `atomic_output`.
-        InputError: the scene is empty or has a non-finite value.
+    Gaussians are written in Morton order, which keeps the bounds of chunks tight. An `offset` is stored in a
+    comment, as in .ply.
     """
     from plyfile import PlyData, PlyElement
 
@@ -206,7 +193,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
 def _within(
     bounds: dict[str, NDArray[np.float32]], what: str, axes: str, values: NDArray[Any]
 ) -> NDArray[np.float64]:
-    """Where values lie between the bounds of their chunk, which go into `bounds`."""
+    """Scale values to [0, 1] within their chunk, and add the chunk's bounds to `bounds`."""
     starts = np.arange(0, len(values), _CHUNK)
     low = np.minimum.reduceat(values, starts).astype(np.float32)
     high = np.maximum.reduceat(values, starts).astype(np.float32)
@@ -219,7 +206,7 @@ def _within(
 
 
 def _packed(values: NDArray[np.float64], bits: tuple[int, ...]) -> NDArray[np.uint32]:
-    """(N, C) in [0, 1] as words, the first column highest."""
+    """Pack (N, C) in [0, 1] into words, the first column in the highest bits."""
     word = np.zeros(len(values), np.uint32)
     for k, width in enumerate(bits):
         word = word << np.uint32(width) | coded(values[:, k], (1 << width) - 1).astype(np.uint32)
@@ -232,7 +219,7 @@ def _rotations(splats: Splats) -> NDArray[np.uint32]:
 
 
 def _harmonics(splats: Splats) -> NDArray[Any]:
-    """Bytes over [−4, 4], channel-major."""
+    """Quantise coefficients in [−4, 4] to bytes, channel-major."""
     rest = splats.shN.shape[1]
     rows = np.empty(len(splats), [(f"f_rest_{k}", "u1") for k in range(3 * rest)])
     for k in range(3 * rest):

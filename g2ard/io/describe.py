@@ -1,4 +1,4 @@
-"""What is in a file, as plain figures: `g2ard info` shows them."""
+"""Figures of a file, for `g2ard info`."""
 
 from __future__ import annotations
 
@@ -20,19 +20,13 @@ _QUANTILES = (0, 1, 25, 50, 75, 99, 100)
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """Read a scene, cloud or views and sum it up.
-
-    Args:
-        path: whatever `g2ard.io.kind` knows.
+    """Summarise a scene, point cloud or views.
 
     Returns:
-        `path`, `kind`, `format`, `bytes`, `count`, `notes` [{code, count, text}], and per kind: `sh_degree`,
-        `extent` {min, max, robust_min, robust_max: the 1st and 99th percentiles}, `opacity`,
-        `largest_scale`, `smallest_scale`, `elongation` (quantiles by percentage), `odd`; `color`;
-        `photos`, `sizes`, `fov_degrees`, `splits`.
-
-    Raises:
-        InputError: as the readers do.
+        `path`, `kind`, `format`, `bytes`, `count`, `extent` {min, max, robust_min, robust_max: the 1st and
+        99th percentiles} and `notes` [{code, count, text}]. Scenes add `sh_degree`, `odd`, and `opacity`,
+        `largest_scale`, `smallest_scale`, `elongation` as quantiles by percentage. Point clouds add `color`,
+        views `photos`, `sizes`, `fov_degrees`, `splits`.
     """
     path, what = Path(path), kind(path)
     if what == "splats":
@@ -55,7 +49,7 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 
 def bytes_of(path: Path) -> int:
-    """Size on disk; of a SOG folder only the chunks that are read, of a run's only the scene."""
+    """Return the size on disk: only the chunks that are read of a SOG folder, only the scene of a run."""
     path = run_scene(path)
     folders = chunks_of(path) or [path]
     files = [file for folder in folders for file in (folder.rglob("*") if folder.is_dir() else [folder])]
@@ -127,5 +121,5 @@ def _views(views: ViewSet) -> dict[str, Any]:
 
 
 def _fov(cameras: Cameras) -> NDArray[np.float64]:
-    """(C,) horizontal field of view in degrees."""
+    """Return the (C,) horizontal fields of view, degrees."""
     return np.degrees(2 * np.arctan(cameras.widths / (2 * cameras.Ks[:, 0, 0])))

@@ -1,4 +1,4 @@
-"""Which format a path holds, by extension and then by content."""
+"""Format detection by extension, then by content."""
 
 from __future__ import annotations
 
@@ -41,36 +41,29 @@ KINDS: dict[str, Kind] = {
 }
 
 MANIFEST, JOURNAL, POINTS = "tiles.json", "journal.json", ".points"
-"""Files of a folder of tiles, finished and unfinished, and its folder for points to be lifted."""
+"""Files of finished and unfinished folders of tiles, and their folder of points to lift."""
 
 _LOOKED_INTO = 64
-"""Files of a folder at most, for what may be meant of them."""
+"""Maximum files of a folder to inspect for suggestions."""
 _READ = (".ply", ".sog", ".spz", ".glb", ".splat", ".las", ".laz", ".json")
 
 
 def kind(path: str | Path) -> Kind:
-    """What `path` holds: "splats" (a Gaussian scene), "points" (a coloured cloud) or "views".
+    """Return the kind of a file or folder: "splats", "points" or "views".
 
-    A COLMAP folder is "views", though `read_points` takes its sparse points too.
-
-    Raises:
-        InputError: nothing is there, or it is nothing g2ard reads.
+    A COLMAP folder is "views", although `read_points` reads its sparse points too.
     """
     return KINDS[file_format(path)]
 
 
 def file_format(path: str | Path) -> Format:
-    """The format of a file or folder.
-
-    Raises:
-        InputError: nothing is there, or it is nothing g2ard reads.
-    """
+    """Return the format of a file or folder; raise an `InputError` if it is missing or unsupported."""
     path = run_scene(path)
     if path.is_dir():
         return _folder_format(path)
     if not path.exists():
         if path.is_symlink():
-            raise InputError("a link that leads to no file", path=path)
+            raise InputError("is a broken link", path=path)
         raise InputError(f"no such file or folder{_near(path)}", path=path)
     check_regular(path)
     name, suffix = path.name.lower(), path.suffix.lower()
@@ -97,14 +90,14 @@ def file_format(path: str | Path) -> Format:
     if suffix == ".json":
         return _json_format(path)
     raise InputError(
-        f"unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .splat; clouds: .ply .las "
-        ".laz; views: a COLMAP folder, a .json, or a trainer's run)",
+        f"unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .splat; point clouds: .ply .las "
+        ".laz; views: a COLMAP folder, a .json, or a training run)",
         path=path,
     )
 
 
 def run_scene(path: str | Path) -> Path:
-    """The scene's file in a folder that `distill` wrote; any other path as it is."""
+    """Return the scene's file in the folder of a `distill` run, or `path` itself."""
     path = Path(path)
     if not (path / "report.json").is_file():
         return path
@@ -115,14 +108,13 @@ def run_scene(path: str | Path) -> Path:
 
 
 def run_views(path: str | Path) -> Path:
-    """The views that `distill` made, where `path` is its folder; any other path as it is."""
+    """Return the generated views in the folder of a `distill` run, or `path` itself."""
     path = Path(path)
     made = path / "views.json"
     return made if run_scene(path) != path and made.is_file() else path
 
 
 def is_photo(path: Path) -> bool:
-    """Whether a file's name is a photo's."""
     return path.suffix.lower() in (".png", ".jpg", ".jpeg", ".webp")
 
 
@@ -140,7 +132,7 @@ def _folder_format(path: Path) -> Format:
     from g2ard.io.nerfstudio_export import exported
     from g2ard.io.transforms import files_of
 
-    if (path / nerfstudio.NAME).is_file():  # before its data, whose world is another
+    if (path / nerfstudio.NAME).is_file():  # before its data, which has another world
         return "nerfstudio"
     if model_folder(path) is not None:
         return "colmap"
@@ -157,12 +149,12 @@ def _folder_format(path: Path) -> Format:
     if gsplat_run.is_run(path / gsplat_run.NAME):
         return "gsplat_run"
     if any((path / journal).is_file() for journal in (JOURNAL, f"{POINTS}/{JOURNAL}")):
-        raise InputError("tiles that `g2ard ingest` has not finished; the same call goes on", path=path)
-    raise InputError(f"nothing known in this folder{_instead(path)}", path=path)
+        raise InputError("has unfinished tiles", path=path, hint="run the same `g2ard ingest` to continue")
+    raise InputError(f"is not a supported folder{_instead(path)}", path=path)
 
 
 def _near(path: Path) -> str:
-    """Names alike in the folder where something was looked for, or that there is no such folder."""
+    """Suggest similar names in the parent folder, or say that it is missing."""
     if not path.parent.is_dir():
         return f", nor a folder {path.parent}"
     close = get_close_matches(path.name, [file.name for file in path.parent.iterdir()], 2)
@@ -170,27 +162,27 @@ def _near(path: Path) -> str:
 
 
 def _instead(path: Path) -> str:
-    """What to do with a folder that is nothing: name a file in it, find poses; else what was looked for."""
+    """Suggest what to do with an unsupported folder."""
     held: dict[Kind, list[str]] = {"splats": [], "points": [], "views": []}
     files = (file for file in sorted(path.iterdir()) if file.suffix.lower() in _READ and file.is_file())
     for file in islice(files, _LOOKED_INTO):
         with suppress(InputError):
             held[kind(file)].append(file.name)
-    words = {"splats": "a scene", "points": "a cloud", "views": "views"}
+    words = {"splats": "a scene", "points": "a point cloud", "views": "views"}
     found = [f"{', '.join(names[:5])} ({words[what]})" for what, names in held.items() if names]
     if found:
-        return f"; name what is meant of its files: {', '.join(found)}"
+        return f"; give one of its files: {', '.join(found)}"
     if runs := [folder.name for folder in sorted(path.iterdir()) if run_scene(folder) != folder]:
-        return f"; name one of its runs: {', '.join(runs[:5])}"
+        return f"; give one of its runs: {', '.join(runs[:5])}"
     photos = next(
         (p for p in (path, path / "images") if p.is_dir() and any(map(is_photo, p.iterdir()))), None
     )
     if photos is not None:
         if (poses := _poses_above(path)) is not None:
-            return f": photos; their poses lie in {poses}: give that"
+            return f"; give {poses}, which has the poses of its photos"
         return (
-            ": photos, without their poses; COLMAP finds them: colmap automatic_reconstructor "
-            f"--workspace_path project --image_path {photos}, then give project"
+            "; it has photos without poses: estimate them with `colmap automatic_reconstructor "
+            f"--workspace_path project --image_path {photos}` and give project"
         )
     return (
         " (looked for SOG's meta.json, `ingest`'s tiles.json, a COLMAP sparse/0, transforms.json, "
@@ -199,7 +191,7 @@ def _instead(path: Path) -> str:
 
 
 def _poses_above(path: Path) -> Path | None:
-    """The transforms.json, or the folder of a COLMAP model, beside a folder of photos."""
+    """Return the transforms.json, or the folder of a COLMAP model, beside a folder of photos."""
     from g2ard.io.colmap import model_folder
     from g2ard.io.transforms import files_of
 
@@ -214,7 +206,7 @@ def _ply_format(path: Path) -> Format:
     header = read_header(path)
     properties = header.properties.get("vertex")
     if properties is None:
-        raise InputError("the PLY has no 'vertex' element", path=path)
+        raise InputError("has no 'vertex' element", path=path)
     if "packed_position" in properties:
         return "compressed_ply"
     scene_words = ("f_dc_", "rot_", "scale_", "opacity")
@@ -233,7 +225,7 @@ def _json_format(path: Path) -> Format:
         return "nerfstudio_export"
     if not isinstance(content, dict):
         raise InputError(
-            "a JSON list, but neither INRIA's cameras nor those of nerfstudio's ns-export", path=path
+            "is a JSON list, but not cameras of INRIA's trainer or of nerfstudio's ns-export", path=path
         )
     if isinstance(content.get("views"), list) or ("views" in content and "format" in content):
         return "views"
@@ -241,4 +233,4 @@ def _json_format(path: Path) -> Format:
         return "transforms"
     if {"transform", "scale"} <= set(content):
         return "nerfstudio"
-    raise InputError("neither a transforms.json ('frames') nor g2ard's views ('views')", path=path)
+    raise InputError("is neither a transforms.json ('frames') nor g2ard's views ('views')", path=path)

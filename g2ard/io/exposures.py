@@ -1,4 +1,4 @@
-"""exposure.json, as 3DGS writes it: an affine colour transform for each photo."""
+"""Reader for exposure.json of 3DGS: an affine colour transform per photo."""
 
 from __future__ import annotations
 
@@ -14,22 +14,15 @@ _NAME = "exposure.json"
 
 
 def read(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Read {photo: 3×4 matrix C}, photo = C·(render, 1).
-
-    Raises:
-        InputError: anything else.
-    """
+    """Read photo → 3×4 matrix C with photo = C·(render, 1)."""
     content = fields_of(path, read_json(path))
     return {name: np.array(numbers(content, name, 3, 4)) for name in content}
 
 
 def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:
-    """By view name, from an exposure.json beside the photos' folder; none if there is no such file.
+    """Return exposures by view name from an exposure.json beside the photos' folder, if there is one.
 
     Its keys are photo names, with or without the suffix.
-
-    Raises:
-        InputError: as `read`.
     """
     found: dict[str, NDArray[np.float64]] = {}
     tables: dict[Path, dict[str, NDArray[np.float64]]] = {}

@@ -1,4 +1,4 @@
-"""Cameras that trainers leave beside a scene."""
+"""Search for the cameras that trainers leave beside a scene."""
 
 from __future__ import annotations
 
@@ -12,23 +12,18 @@ from g2ard.errors import InputError
 
 
 def find_views(scene: str | Path) -> Path | None:
-    """The cameras a scene was trained with, where its own folder or its trainer's layout tells them.
+    """Return the cameras that a scene was trained with, for `read_view_set`, or None.
 
-    Looked at, in this order, and only where no guess is needed whose world the cameras are in:
+    Searched in this order:
 
-    - cameras.json (INRIA) in the scene's own folder, or in the model's folder above
-      point_cloud/iteration_N/;
-    - nerfstudio's dataparser_transforms.json, else the lists of `ns-export cameras`, in the scene's own
-      folder;
+    - cameras.json (INRIA) in the scene's folder, or in the model's folder above point_cloud/iteration_N/;
+    - nerfstudio's dataparser_transforms.json, then the lists of `ns-export cameras`, in the scene's folder;
     - cfg.yml (gsplat's simple_trainer) above ply/.
 
-    A transforms.json or a COLMAP model beside a scene is not taken: trainers move the world they read.
+    A transforms.json or COLMAP model beside a scene is ignored, since trainers may move the world they read.
 
     Args:
         scene: a scene's file or folder; it need not exist.
-
-    Returns:
-        A path for `read_view_set`, which may still find it broken; None if nothing is there.
     """
     from g2ard.io import gsplat_run, inria, nerfstudio, nerfstudio_export
 
@@ -45,7 +40,7 @@ def find_views(scene: str | Path) -> Path | None:
         found = own
     if found is None and own.name == "ply" and _is_run(own.parent / gsplat_run.NAME):
         found = own.parent / gsplat_run.NAME
-    if found is None:  # one that cannot be read is told of by whoever reads it
+    if found is None:  # a damaged file: its reader raises the error
         found = next((file for file in places if file.is_file()), None)
     return found if found is None or scene.is_absolute() else Path(os.path.relpath(found))
 
@@ -60,7 +55,7 @@ def _is_run(file: Path) -> bool:
 
 
 def _holds(file: Path, test: Callable[[Any], bool]) -> bool:
-    """Whether a JSON file is there and holds what `test` knows."""
+    """Return whether a JSON file exists and passes `test`."""
     from g2ard.io.jsonfile import read_any_json
 
     try:

@@ -1,7 +1,7 @@
-"""glTF 2.0 with KHR_gaussian_splatting, as one .glb: float32 attributes of a point primitive.
+"""Reader and writer for .glb with KHR_gaussian_splatting: float32 attributes of a point primitive.
 
-glTF has y up and z forward; a 3DGS .ply has y down and z forward. Both are the same turned by half a turn
-about z, which only changes signs: of x and y, of the quaternion's x and y, of harmonics of odd order m.
+glTF has y up and z forward; a 3DGS .ply has y down and z forward. They differ by half a turn about z, which
+changes the signs of x and y, of the quaternion's x and y, and of harmonics of odd order m.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from g2ard.io.jsonfile import (
 from g2ard.io.packing import unit_quats, writable
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
+from g2ard.progress import plural
 from g2ard.scene.splats import Splats
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -47,12 +48,8 @@ _TURN = np.array([-1.0, -1, 1])
 def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
     """Write a .glb with KHR_gaussian_splatting; equal scenes give equal bytes.
 
-    SCALE and OPACITY are linear, ROTATION is x y z w. COLOR_0 is for viewers that know points alone: the base
-    colour clipped to [0, 1], decoded from sRGB as glTF wants it, and α. `offset` is the node's translation.
-
-    Raises:
-        OutputError: see `atomic_output`.
-        InputError: the scene is empty, has a non-finite value, or more than a .glb's 4 GiB hold.
+    SCALE and OPACITY are linear, ROTATION is x y z w. COLOR_0 is for viewers that only draw points: the base
+    colour clipped to [0, 1] and decoded from sRGB, and α. `offset` is the node's translation.
     """
     splats = writable(path, splats)
     attributes = _attributes(splats)
@@ -81,7 +78,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + 8 + start
     if total >= 1 << 32:
-        raise InputError(f"not written: {total:,} bytes are more than a .glb holds", path=path)
+        raise InputError(f"not written: {total:,} bytes exceed the 4 GiB of a .glb", path=path)
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         file.write(struct.pack("<III", _MAGIC, 2, total))
         file.write(struct.pack("<II", len(text), _JSON) + text)
@@ -90,7 +87,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
 
 
 def _attributes(splats: Splats) -> dict[str, NDArray[Any]]:
-    """The primitive's attributes, (N, C) each."""
+    """Return the primitive's attributes, (N, C) each."""
     linear = np.clip(splats.colors.astype(np.float64), 0, 1)
     linear = np.where(linear <= 0.04045, linear / 12.92, ((linear + 0.055) / 1.055) ** 2.4)
     alphas = splats.opacities[:, None]
@@ -110,7 +107,7 @@ def _attributes(splats: Splats) -> dict[str, NDArray[Any]]:
 
 
 def _harmonics(degree: int) -> list[tuple[str, int]]:
-    """The names of the coefficients past band 0, and where they are in `shN`."""
+    """Return the attributes of the coefficients past band 0, with their indices in `shN`."""
     return [
         (f"{EXTENSION}:SH_DEGREE_{band}_COEF_{c}", band * band - 1 + c)
         for band in range(1, degree + 1)
@@ -151,17 +148,13 @@ def _document(
 
 
 def read(path: Path) -> Scene:
-    """Read the one splat primitive of a .glb, its data in the file; its node's translation gives `offset`.
-
-    Raises:
-        InputError: not a .glb, no splat primitive or several, packed, turned or scaled by a node, or broken.
-    """
+    """Read the splat primitive of a .glb; its node's translation becomes the `offset`."""
     content, binary = _chunks(path)
     return _scene(path, fields_of(path, content), binary)
 
 
 def _chunks(path: Path) -> tuple[Any, bytes]:
-    """The document, which should be an object, and the binary chunk."""
+    """Return the JSON document and the binary chunk."""
     data = path.read_bytes()
     if len(data) < 20 or struct.unpack_from("<II", data) != (_MAGIC, 2):
         raise InputError(f"not a .glb of glTF 2.0 (begins with {data[:4]!r})", path=path)
@@ -182,18 +175,18 @@ def _scene(path: Path, document: Fields, binary: bytes) -> Scene:
     primitives = [objects(mesh, "primitives") for mesh in objects(document, "meshes")]
     splatting = [(at, p) for at, held in enumerate(primitives) for p in held if EXTENSION in _extensions(p)]
     if len(splatting) != 1:
-        raise InputError(f"holds {len(splatting)} primitives of {EXTENSION}; one is read", path=path)
+        raise InputError(f"has {len(splatting)} primitives with {EXTENSION}, expected 1", path=path)
     mesh, primitive = splatting[0]
     splats = object_of(_extensions(primitive), EXTENSION)
     if packed := sorted(_extensions(splats)):
-        raise InputError(f"{packed[0]!r} is not read", path=path)
+        raise InputError(f"unsupported extension {packed[0]!r}", path=path)
     if splats.get("kernel") != "ellipse":
-        raise InputError("kernels other than 'ellipse' are not read", path=path)
+        raise InputError("unsupported kernel; expected 'ellipse'", path=path)
     names = object_of(primitive, "attributes")
 
     def values(name: str, width: int) -> NDArray[np.float32]:
         if name not in names:
-            raise InputError(f"its splats lack the attribute {name!r}", path=path)
+            raise InputError(f"attribute {name!r} is missing", path=path)
         return _accessor(path, document, binary, names, name, width)
 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names)
@@ -210,7 +203,7 @@ def _scene(path: Path, document: Fields, binary: bytes) -> Scene:
             raw.shN[:, k] = values(name, 3) * _FLIPS[k]
     raw.offset = _translation(path, document, mesh)
     others = sum(map(len, primitives)) - 1
-    notes = [Note("ignored_meshes", others, f"{others} other primitive(s) left out")] if others else []
+    notes = [Note("ignored_meshes", others, f"{plural(others, 'other primitive')} ignored")] if others else []
     return cleaned(path, raw, notes)
 
 
@@ -219,7 +212,7 @@ def _extensions(of: Fields) -> Fields:
 
 
 def _pointed(document: Fields, table: str, holder: Fields, name: str) -> Fields:
-    """The entry of one of the document's tables that a property names by its index."""
+    """Return the entry of a table whose index is a property of `holder`."""
     entries = listed(document, table)
     return object_of(entries, index_of(holder, name, len(entries)))
 
@@ -227,11 +220,11 @@ def _pointed(document: Fields, table: str, holder: Fields, name: str) -> Fields:
 def _accessor(
     path: Path, document: Fields, binary: bytes, names: Fields, name: str, width: int
 ) -> NDArray[np.float32]:
-    """(count, width) of an accessor; normalised integers become fractions."""
+    """Return the (count, width) values of an accessor; normalised integers become fractions."""
     accessor = _pointed(document, "accessors", names, name)
     kind = whole(accessor, "componentType")
     if kind not in _DTYPES or _TYPES.get(text(accessor, "type")) != width or "sparse" in accessor:
-        raise InputError(f"attribute {name!r} is of a form that is not read", path=path)
+        raise InputError(f"attribute {name!r} has an unsupported type", path=path)
     view = _pointed(document, "bufferViews", accessor, "bufferView")
     if view["buffer"] != 0 or "uri" in _pointed(document, "buffers", view, "buffer"):
         raise InputError(f"attribute {name!r} lies outside the file", path=path)
@@ -240,7 +233,7 @@ def _accessor(
     start = whole(view, "byteOffset", 0) + whole(accessor, "byteOffset", 0)
     if step < width * dtype.itemsize:
         raise InputError(
-            f"attribute {name!r} takes {step} bytes each, less than its elements have", path=path
+            f"attribute {name!r} has a stride of {step} bytes, less than its elements", path=path
         )
     if count and start + step * (count - 1) + width * dtype.itemsize > len(binary):
         raise InputError(f"truncated: attribute {name!r} ends past the file", path=path, hint=DAMAGED)
@@ -252,11 +245,7 @@ def _accessor(
 
 
 def _translation(path: Path, document: Fields, mesh: int) -> NDArray[np.float64]:
-    """(3,) where the mesh's one node puts it.
-
-    Raises:
-        InputError: several nodes, one that does more than translate, or one that is its own ancestor.
-    """
+    """Return the (3,) translation of the mesh's only node."""
     nodes = objects(document, "nodes")
     parents: dict[int, list[int]] = {}
     for i, node in enumerate(nodes):
@@ -265,7 +254,7 @@ def _translation(path: Path, document: Fields, mesh: int) -> NDArray[np.float64]
             parents.setdefault(index_of(children, k, len(nodes)), []).append(i)
     at = [i for i, node in enumerate(nodes) if node.get("mesh") == mesh]
     if len(at) > 1:
-        raise InputError(f"{len(at)} nodes show its splats; one is read", path=path)
+        raise InputError(f"{len(at)} nodes show the splats, expected 1", path=path)
     total = np.zeros(3)
     seen: set[int] = set()
     while at:
@@ -278,17 +267,17 @@ def _translation(path: Path, document: Fields, mesh: int) -> NDArray[np.float64]
         turned = (_numbers(node, "rotation", (0, 0, 0, 1)) != (0, 0, 0, 1)).any()
         scaled = (_numbers(node, "scale", (1, 1, 1)) != 1).any()
         if turned or scaled or (matrix[:3, :3] != np.eye(3)).any():
-            raise InputError("a node turns or scales its splats, which is not read", path=path)
+            raise InputError("a node rotates or scales the splats, which is not supported", path=path)
         with np.errstate(over="ignore", invalid="ignore"):
             total += moved + matrix[:3, 3]
         at = parents.get(at[0], [])
         if len(at) > 1:
             raise InputError(f"a node has {len(at)} parents", path=path)
     if not np.isfinite(total).all():
-        raise InputError(f"its nodes move it by {tuple(total.tolist())}", path=path)
+        raise InputError(f"invalid translation {tuple(total.tolist())}", path=path)
     return total * _TURN
 
 
 def _numbers(node: Fields, key: str, default: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-    """A node's vector or matrix, as long as its default."""
+    """Return a node's vector or matrix, of the same length as its default."""
     return np.array(numbers(node, key, len(default)) if key in node else default, np.float64)

@@ -1,4 +1,4 @@
-"""cameras.json, as INRIA's 3D Gaussian Splatting writes it beside point_cloud/ in a model's folder."""
+"""Reader for cameras.json, which INRIA's trainer writes into a model's folder."""
 
 from __future__ import annotations
 
@@ -15,28 +15,24 @@ from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
 
 NAME = "cameras.json"
-"""How the file is called."""
 
 
 def is_inria(content: Any) -> bool:
-    """Whether what a JSON file holds is a list of such cameras."""
+    """Return whether JSON content is a list of such cameras."""
     first = content[0] if isinstance(content, list) and content else None
     return isinstance(first, dict) and {"position", "rotation"} <= set(first)
 
 
 def read(path: Path, images: Path | None = None) -> ViewSet:
-    """Read the cameras a model was trained and tested on.
+    """Read a model's training and test cameras.
 
     Each is {id, img_name, width, height, position, rotation, fx, fy}: the camera's centre in the world, and
-    world_from_camera as rows, with OpenCV's axes. The principal point is not stored: INRIA's trainer takes
-    the image's middle. Names that repeat (NeRF's synthetic scenes have an r_0 in each split) get their id.
+    world_from_camera as rows, in OpenCV axes. The principal point is the image's centre, as in INRIA's
+    trainer. The id is appended to repeated names, such as r_0 of each split of NeRF's synthetic scenes.
 
     Args:
         path: the JSON, or the model's folder.
-        images: a folder to look for photos in, by their names; None means there are none.
-
-    Raises:
-        InputError: no cameras, or one that makes no sense.
+        images: folder to search for photos by name; None reads poses only.
     """
     file = path / NAME if path.is_dir() else path
     listed = read_json_list(file)
@@ -51,7 +47,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     ]
     found = view_set(file, named)
     count = sum(times[name] for name in twice)
-    text = f"{plural(count, 'camera')} of {len(frames)} share a name with another, and get their id"
+    text = f"{plural(count, 'camera')} of {len(frames)} have repeated names; their ids are appended"
     return replace(found, notes=(*found.notes, Note("repeated_names", count, text)))
 
 

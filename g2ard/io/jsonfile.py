@@ -1,4 +1,4 @@
-"""JSON files, read with errors that name the file and the line."""
+"""JSON files with typed access; errors name the file and the property."""
 
 from __future__ import annotations
 
@@ -18,15 +18,11 @@ if TYPE_CHECKING:
 
 _LARGEST = sys.float_info.max
 _SHOWN = 40
-"""Characters of a value that a message tells."""
+"""Longest value in a message, characters."""
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file.
-
-    Raises:
-        InputError: the file is absent, is not JSON, or holds something else than an object.
-    """
+    """Return the object in a JSON file."""
     content = read_any_json(path)
     if not isinstance(content, dict):
         raise InputError("expected a JSON object", path=path)
@@ -34,11 +30,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_json_list(path: Path) -> list[Any]:
-    """Return the list in a JSON file.
-
-    Raises:
-        InputError: the file is absent, is not JSON, or holds something else than a list.
-    """
+    """Return the list in a JSON file."""
     content = read_any_json(path)
     if not isinstance(content, list):
         raise InputError("expected a JSON list", path=path)
@@ -46,11 +38,7 @@ def read_json_list(path: Path) -> list[Any]:
 
 
 def read_any_json(path: Path) -> Any:
-    """Return whatever a JSON file holds.
-
-    Raises:
-        InputError: the file is absent or is not JSON.
-    """
+    """Return the content of a JSON file."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -59,11 +47,7 @@ def read_any_json(path: Path) -> Any:
 
 
 def parse_json(path: str | Path, data: bytes) -> Any:
-    """Return whatever some JSON text holds; `path` names it in errors.
-
-    Raises:
-        InputError: it is not JSON, or nested deeper than Python follows.
-    """
+    """Return the content of JSON text; `path` is for errors."""
     try:
         return json.loads(data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
@@ -71,14 +55,14 @@ def parse_json(path: str | Path, data: bytes) -> Any:
     except json.JSONDecodeError as error:
         raise InputError(f"is not JSON ({error.msg})", path=path, index=error.lineno, item="line") from error
     except RecursionError as error:
-        raise InputError("JSON nested too deeply", path=path) from error
+        raise InputError("is nested too deeply", path=path) from error
     except ValueError as error:  # an integer of thousands of digits
         raise InputError(f"not JSON ({error})", path=path) from error
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A value's place in a JSON file: which entry of the file, and which property of it, as a.b[2]."""
+    """Location of a value in a JSON file: an entry of the file and a property, such as a.b[2]."""
 
     path: Path | None = None
     index: int | None = None
@@ -102,7 +86,7 @@ class Place:
 
 
 class Fields(dict[str, Any]):
-    """A JSON object that knows its place, and whose objects and lists know theirs.
+    """A JSON object that knows its place in the file, as do the objects and lists in it.
 
     >>> fields = Fields({"means": {"shape": [3, "four"]}})
     >>> fields["means"]["shape"].place.property
@@ -127,7 +111,7 @@ class Fields(dict[str, Any]):
 
 
 class Items(list[Any]):
-    """A JSON list that knows its place; indices are never counted from the end."""
+    """A JSON list that knows its place in the file; negative indices are invalid."""
 
     def __init__(self, entries: list[Any], place: Place) -> None:
         super().__init__(entries)
@@ -149,16 +133,13 @@ def _placed(value: Any, place: Place) -> Any:
 
 
 def fields_of(path: str | Path, entry: Any, index: int | None = None, item: str = "entry") -> Fields:
-    """Return an object of a JSON file as `Fields`.
+    """Return `entry` as `Fields`, or raise an error if it is not an object.
 
     Args:
         path: the file.
         entry: the object.
-        index: which of the file's entries it is; None for the whole document.
-        item: what `index` counts.
-
-    Raises:
-        InputError: `entry` is no object.
+        index: index of the entry in the file; None for the whole document.
+        item: unit of `index`.
     """
     place = Place(Path(path), index, item)
     if not isinstance(entry, dict):
@@ -172,8 +153,8 @@ def numbers(holder: Fields, key: str, *shape: int, most: float = _LARGEST, gaps:
     Args:
         holder: the object.
         key: the property.
-        shape: how long the lists are, the outermost first; none for one number.
-        most: the largest magnitude.
+        shape: lengths of the lists, outermost first; empty for one number.
+        most: largest magnitude.
         gaps: whether null (which becomes NaN), NaN and infinities are allowed.
     """
 
@@ -195,7 +176,7 @@ def numbers(holder: Fields, key: str, *shape: int, most: float = _LARGEST, gaps:
 
 
 def number(holder: Fields, key: str, default: float | None = None) -> float:
-    """Return a number, or the default where the property is absent."""
+    """Return a number, or the default if the property is missing."""
     if default is not None and key not in holder:
         return default
     return float(numbers(holder, key))
@@ -210,7 +191,7 @@ def matrix(holder: Fields, key: str) -> NDArray[np.float64]:
 
 
 def text(holder: Fields, key: str, default: str | None = None) -> str:
-    """Return a string, or the default where the property is absent."""
+    """Return a string, or the default if the property is missing."""
     value = holder[key] if default is None else holder.get(key, default)
     if not isinstance(value, str):
         raise holder.place.to(key).unexpected(value, "a string")
@@ -218,17 +199,17 @@ def text(holder: Fields, key: str, default: str | None = None) -> str:
 
 
 def optional_text(holder: Fields, key: str) -> str | None:
-    """Return a string, or None where the property is absent or null."""
+    """Return a string, or None if the property is missing or null."""
     return None if holder.get(key) is None else text(holder, key)
 
 
 def objects(holder: Fields, key: str) -> list[Fields]:
-    """Return a list of objects; an empty one where the property is absent."""
+    """Return a list of objects, empty if the property is missing."""
     return [object_of(entries, at) for entries in [listed(holder, key)] for at in range(len(entries))]
 
 
 def listed(holder: Fields, key: str) -> Items:
-    """Return a list; an empty one where the property is absent."""
+    """Return a list, empty if the property is missing."""
     value = holder.get(key, Items([], holder.place.to(key)))
     if not isinstance(value, Items):
         raise holder.place.to(key).unexpected(value, "a list")
@@ -236,7 +217,7 @@ def listed(holder: Fields, key: str) -> Items:
 
 
 def names_of(holder: Fields, key: str, count: int) -> list[str]:
-    """Return the first `count` of a list of file names."""
+    """Return the first `count` file names of a list."""
     value, found = holder[key], []
     if not isinstance(value, Items):
         raise holder.place.to(key).unexpected(value, "a list")
@@ -249,7 +230,7 @@ def names_of(holder: Fields, key: str, count: int) -> list[str]:
 
 
 def object_of(holder: Fields | Items, key: Any) -> Fields:
-    """Return a property, or an entry of a list, that holds an object."""
+    """Return an object from a property or a list."""
     value = holder[key]
     if not isinstance(value, Fields):
         raise holder.place.to(key).unexpected(value, "an object")
@@ -257,7 +238,7 @@ def object_of(holder: Fields | Items, key: Any) -> Fields:
 
 
 def index_of(holder: Fields | Items, key: Any, count: int) -> int:
-    """Return a property, or an entry of a list, that holds an index of a list of `count`."""
+    """Return an index below `count` from a property or a list."""
     value = holder[key]
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < count:
         expected = f"an index from 0 to {count - 1}" if count else "no index of an empty list"
@@ -266,7 +247,7 @@ def index_of(holder: Fields | Items, key: Any, count: int) -> int:
 
 
 def whole(holder: Fields | Items, key: Any, default: int | None = None) -> int:
-    """Return a whole number ≥ 0 (as 80 or 80.0), or the default where the property is absent."""
+    """Return a whole number ≥ 0 (80 or 80.0), or the default if the property is missing."""
     value = holder[key] if default is None or key in holder else default
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not (is_number and 0 <= value <= _LARGEST and value % 1 == 0):

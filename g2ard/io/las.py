@@ -1,4 +1,4 @@
-"""LiDAR clouds, .las and .laz, through laspy with lazrs."""
+"""Reader for LiDAR point clouds, .las and .laz, with laspy and lazrs."""
 
 from __future__ import annotations
 
@@ -17,34 +17,22 @@ from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
 from g2ard.io.types import Cloud, Note
 
 _LARGEST_CHUNK = 1 << 30
-"""Bytes of points that lazrs may make room for where a file has fewer points than a chunk holds."""
+"""Largest chunk, in bytes of unpacked points, of a file with fewer points than a chunk holds."""
 
 
 def read(path: Path) -> Cloud:
-    """Read positions in float64 and colours; colours that never pass 255 are taken as 8-bit and noted.
-
-    Raises:
-        InputError: not a LAS file, truncated, its point format has no colour, or no finite point.
-        MissingDependencyError: laspy or its lazrs backend is not installed.
-    """
+    """Read positions and colours; colours up to 255 are treated as 8-bit, with a note."""
     with _opened(path) as reader:
         las, promised = reader.read(), reader.header.point_count
     if len(las.points) < promised:
-        raise InputError(
-            f"truncated: {promised:,} points promised, {len(las.points):,} there", path=path, hint=DAMAGED
-        )
+        raise InputError(f"truncated: {len(las.points):,} of {promised:,} points", path=path, hint=DAMAGED)
     positions, rgb = _points(las)
     notes, divisor = _depth(len(rgb), float(rgb.max(initial=0)))
     return finite_cloud(path, positions, rgb / np.float32(divisor), notes)
 
 
 def stream(path: Path) -> PointStream:
-    """The same cloud in blocks; of a .laz one chunk at a time is unpacked.
-
-    Raises:
-        InputError: as for `read`; points are looked at later.
-        MissingDependencyError: as for `read`.
-    """
+    """Open a cloud for reading in blocks; one chunk of a .laz is unpacked at a time."""
     return _LasPoints(path)
 
 
@@ -71,10 +59,8 @@ class _LasPoints(PointStream):
                 las = reader.read_points(wanted)
                 if len(las) < wanted:
                     there = first + len(las)
-                    raise InputError(
-                        f"{self.path}: truncated: {self.count:,} points promised, {there:,} there",
-                        hint=DAMAGED,
-                    )
+                    text = f"truncated: {there:,} of {self.count:,} points"
+                    raise InputError(text, path=self.path, hint=DAMAGED)
                 yield _points(las)
 
 
@@ -85,7 +71,7 @@ def _points(las: Any) -> RawPoints:
 
 
 def _depth(count: int, brightest: float) -> tuple[tuple[Note, ...], float]:
-    """What colours are divided by, by the largest there is; and the note if that was unusual."""
+    """Return a note if colours are 8-bit, and the divisor of colours."""
     if brightest > 255:
         return (), 65535.0
     return (Note("eight_bit_colors", count, "8-bit colours in 16-bit fields"),), 255.0
@@ -93,12 +79,12 @@ def _depth(count: int, brightest: float) -> tuple[tuple[Note, ...], float]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """laspy's reader of a file whose header promises nothing that the file has no room for."""
+    """Open a file with laspy, after checking its header against the file's size."""
     try:
         import laspy
-        import lazrs  # noqa: F401 - what laspy reads .laz with; its absence is told here
+        import lazrs  # noqa: F401 - used by laspy for .laz
     except ImportError as error:
-        raise missing("a .las or .laz", "g2ard[las]", path=path) from error
+        raise missing("reading .las and .laz", "g2ard[las]", path=path) from error
     _check_records(path)
     try:
         with laspy.open(path) as reader:
@@ -106,9 +92,9 @@ def _opened(path: Path) -> Iterator[Any]:
             names = set(header.point_format.dimension_names)
             if not {"red", "green", "blue"} <= names:
                 raise InputError(
-                    f"its point format {header.point_format.id} has no 'red', 'green', 'blue'; "
-                    "points must be coloured (as by PDAL's filters.colorization)",
+                    f"point format {header.point_format.id} has no colours ('red', 'green', 'blue')",
                     path=path,
+                    hint="add colours, for example with PDAL's filters.colorization",
                 )
             if header.are_points_compressed:
                 _check_chunk_table(path, header.offset_to_point_data, header.point_count)
@@ -118,14 +104,14 @@ def _opened(path: Path) -> Iterator[Any]:
             yield reader
     except (InputError, GeneratorExit):
         raise
-    except BaseException as error:  # on damage laspy raises whatever it stumbles over, and lazrs may panic
+    except BaseException as error:  # laspy raises any exception for damaged files, and lazrs may panic
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         raise InputError(f"cannot be read as LAS: {str(error) or type(error).__name__}", path=path) from error
 
 
 def _check_records(path: Path) -> None:
-    """Refuse a count of variable-length records that the file has no room for: laspy would try them all."""
+    """Check the number of variable-length records against the file's size, since laspy tries to read all."""
     with path.open("rb") as file:
         head = file.read(375).ljust(375, b"\0")
     if head[:4] != b"LASF":
@@ -135,7 +121,7 @@ def _check_records(path: Path) -> None:
     size = path.stat().st_size
     if points_at > size:
         raise InputError(
-            f"truncated: its points begin at byte {points_at:,} of {size:,}", path=path, hint=DAMAGED
+            f"truncated: points begin at byte {points_at:,} of {size:,}", path=path, hint=DAMAGED
         )
     if records * 54 > points_at or extended * 60 > size:
         raise InputError(
@@ -146,21 +132,20 @@ def _check_records(path: Path) -> None:
 def _check_size(path: Path, points_at: int, promised: int, point_size: int) -> None:
     there = max(0, path.stat().st_size - points_at) // point_size
     if there < promised:
-        raise InputError(f"truncated: {promised:,} points promised, {there:,} there", path=path, hint=DAMAGED)
+        raise InputError(f"truncated: {there:,} of {promised:,} points", path=path, hint=DAMAGED)
 
 
 def _check_chunk_table(path: Path, points_at: int, promised: int) -> None:
-    """Refuse a table of more chunks than points, or than bytes they take: lazrs would end the whole process
-    for want of memory."""
+    """Check the number of chunks against points and bytes, since lazrs aborts when out of memory."""
     with path.open("rb") as file:
         file.seek(points_at)
         (table,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
         size = file.seek(0, 2)
-        if table == -1:  # written without seeking back: its place is the last thing in the file
+        if table == -1:  # streamed file: the offset is at its end
             file.seek(-8, 2)
             (table,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
         if not points_at < table <= size - 8:
-            raise InputError("truncated: its chunk table is cut off", path=path, hint=DAMAGED)
+            raise InputError("truncated: the chunk table is cut off", path=path, hint=DAMAGED)
         file.seek(table)
         _version, chunks = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     if chunks > max(promised, 1):
@@ -174,12 +159,12 @@ def _check_chunk_table(path: Path, points_at: int, promised: int) -> None:
 
 
 def _check_chunks(path: Path, header: Any) -> None:
-    """Refuse chunks the file has no room for, or too few points: lazrs would abort for want of memory."""
+    """Check the sizes of chunks against the file's size, since lazrs aborts when out of memory."""
     import lazrs
 
     records = header.vlrs.get("LasZipVlr")
     if not records:
-        raise InputError("broken header: nothing says how its points are compressed", path=path, hint=DAMAGED)
+        raise InputError("broken header: the LASzip record is missing", path=path, hint=DAMAGED)
     layout = lazrs.LazVlr(records[0].record_data)
     size, wanted = layout.item_size(), header.point_format.size
     if size != wanted:
@@ -199,7 +184,7 @@ def _check_chunks(path: Path, header: Any) -> None:
         raise InputError(f"broken chunk table: chunks of {taken:,} bytes", path=path, hint=DAMAGED)
     if room < header.point_count:
         raise InputError(
-            f"truncated: {header.point_count:,} points promised, at most {room:,} in its chunks",
+            f"truncated: at most {room:,} of {header.point_count:,} points",
             path=path,
             hint=DAMAGED,
         )

@@ -1,4 +1,4 @@
-"""One process at a time in a folder: a lock that the operating system takes back when its holder dies."""
+"""Folder locks between processes, released by the operating system when the holder dies."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from pathlib import Path
 from g2ard.errors import OutputError
 
 LOCK = ".lock"
-"""The file in the folder; it names the process, which removes it. One of a killed process is used again."""
+"""Lock file with the holder's process id. The holder removes it; one left by a killed process is reused."""
 
 if sys.platform == "win32":
     import msvcrt
 
     _FAR = 1 << 30
-    """The byte that is locked: behind the text, which could not be read under a lock."""
+    """Locked byte, past the text, since locked bytes cannot be read."""
 
     def _lock(file: int) -> None:
         os.lseek(file, _FAR, os.SEEK_SET)
         msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
 
     def _release(path: Path, file: int) -> None:
-        os.close(file)  # what is open cannot be removed
+        os.close(file)  # open files cannot be removed
         with suppress(OSError):
             path.unlink()
 
@@ -35,16 +35,15 @@ else:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def _release(path: Path, file: int) -> None:
-        path.unlink(missing_ok=True)  # while it is held: who opened it before sees that it is gone
+        path.unlink(missing_ok=True)  # before releasing, so that waiting processes see that it is gone
         os.close(file)
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold a folder that is there; where the file system knows no locks it is held by nobody.
+    """Lock an existing folder, or raise an `OutputError` if another process holds it.
 
-    Raises:
-        OutputError: another process holds it, or nothing can be written there.
+    File systems without locks are not locked.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
@@ -56,7 +55,7 @@ def locked(folder: Path) -> Iterator[None]:
     """
     path = folder / LOCK
     file = _opened(path)
-    while not _held(path, file):  # its holder removed it after it was opened
+    while not _held(path, file):  # removed by its holder after it was opened
         os.close(file)
         file = _opened(path)
     try:
@@ -76,7 +75,7 @@ def _opened(path: Path) -> int:
 
 
 def _held(path: Path, file: int) -> bool:
-    """Whether the lock is had, on the file that is at `path` still."""
+    """Lock the file and return whether it is still the one at `path`."""
     try:
         _lock(file)
     except (BlockingIOError, PermissionError):
@@ -84,7 +83,8 @@ def _held(path: Path, file: int) -> bool:
         holder = os.read(file, 20).decode("ascii", "replace").strip("\0 ")
         os.close(file)
         who = f"process {holder}" if holder.isdecimal() else "another process"
-        raise OutputError(f"in use by {who}; wait for it, or name another folder", path=path.parent) from None
+        hint = "wait for it, or give another folder"
+        raise OutputError(f"in use by {who}", path=path.parent, hint=hint) from None
     except OSError:
         return True  # no locks on this file system
     try:

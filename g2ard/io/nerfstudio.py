@@ -1,4 +1,4 @@
-"""The folder of a nerfstudio run: the cameras of its data, moved into the world it trained in."""
+"""Reader for nerfstudio runs: the cameras of the data, moved into the training world."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from g2ard.io.settings import Settings, below, read_settings
 from g2ard.io.types import Note, ViewSet
 
 NAME = "dataparser_transforms.json"
-"""What a run leaves beside its config.yml: `transform`, 3×4, and `scale`."""
+"""File beside config.yml with `transform`, 3×4, and `scale`."""
 CONFIG = "config.yml"
 
 _PARSERS = ("NerfstudioDataParser", "ColmapDataParser", "BlenderDataParser")
@@ -26,20 +26,16 @@ _EYE = np.eye(4)
 
 
 def read(path: Path, images: Path | None = None) -> ViewSet:
-    """Read the cameras a run was trained and tested on, in the world of the scene it exports.
+    """Read a run's training and test cameras in the world of the exported scene.
 
-    x_trained = s·(D·A⁻¹·x): D and the run's scale come from dataparser_transforms.json and start from the
-    original data; A (`applied_transform`) and `applied_scale` of the data's transforms.json led from there
-    to the poses that file holds, s = scale / applied_scale. COLMAP's poses are the original data: A = 1.
+    x_trained = s·(D·A⁻¹·x) with s = scale / applied_scale. D and `scale`, from dataparser_transforms.json,
+    start from the original data. A (`applied_transform`) and `applied_scale`, from the data's
+    transforms.json, lead from the original data to its poses. For COLMAP data, A = 1.
 
     Args:
-        path: the run's folder, its dataparser_transforms.json or its config.yml. config.yml tells where the
-            data is; without it, a transforms.json in the folder is the data.
-        images: a folder to look for photos in, by their file names; None takes the data's.
-
-    Raises:
-        InputError: the run's files or its data are absent or broken, its data were read in a way that is not
-            known, or nothing tells A.
+        path: the run's folder, its dataparser_transforms.json or its config.yml. config.yml names the data;
+            without it, the data is a transforms.json in the folder.
+        images: folder to search for photos by file name; None uses the data's photos.
     """
     folder = path if path.is_dir() else path.parent
     file = folder / NAME
@@ -53,24 +49,25 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     mode = _optimized(settings)
     if mode is None:
         return found
-    text = f"the run optimised its poses ({mode}), and these are as they were before"
+    text = f"the run optimised its poses ({mode}); these are the poses before training"
     return replace(found, notes=(*found.notes, Note("optimised_poses", len(found.cameras), text)))
 
 
 def _data(
     folder: Path, settings: Settings | None, images: Path | None
 ) -> tuple[list[Frame], NDArray[np.float64], float]:
-    """The frames of the data, and A and the scale that had been applied to them."""
+    """Return the data's frames, and A and the scale that were applied to them."""
     if settings is None:
         if not (folder / "transforms.json").is_file():
             raise InputError(
-                f"neither a {CONFIG} nor a transforms.json beside it tells its data", path=folder / NAME
+                f"neither {CONFIG} nor transforms.json, which name the data, exist beside it",
+                path=folder / NAME,
             )
         return _saved(folder / "transforms.json", images, None)
     parser, options, data = _parser(folder / CONFIG, settings)
     place = below(folder / CONFIG, data)
     if place is None:
-        raise InputError(f"its data {data.as_posix()} is not there", path=folder / CONFIG)
+        raise InputError(f"data {data.as_posix()} does not exist", path=folder / CONFIG)
     if parser == "ColmapDataParser":
         model = place / (options.path("colmap_path") or "colmap/sparse/0")
         photos = images or place / (options.path("images_path") or "images")
@@ -79,7 +76,7 @@ def _data(
 
 
 def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
-    """Which parser read the data, its options, and where the data was."""
+    """Return the parser's name, its options and the path of the data."""
     pipeline = settings.block("pipeline")
     manager = pipeline and pipeline[1].block("datamanager")
     parser = manager and manager[1].block("dataparser")
@@ -88,19 +85,19 @@ def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
     name = parser[0].rsplit(".", 1)[-1].removesuffix("Config")
     if name not in _PARSERS:
         raise InputError(
-            f"data read by {name or 'no known parser'} are not supported ({', '.join(_PARSERS)} are)",
+            f"unsupported data parser {name!r}; expected {', '.join(_PARSERS)}",
             path=path,
         )
     data = settings.path("data") or manager[1].path("data") or parser[1].path("data")
     if data is None:
-        raise InputError("names no folder", path=path, property="data")
+        raise InputError("is missing", path=path, property="data")
     return name, parser[1], data
 
 
 def _saved(
     data: Path, images: Path | None, options: Settings | None
 ) -> tuple[list[Frame], NDArray[np.float64], float]:
-    """The frames of a transforms.json, or of a folder with one or with transforms_train.json and its kin."""
+    """Return the frames, A and scale of a transforms.json, or of a folder with transforms*.json."""
     file = data / "transforms.json" if (data / "transforms.json").is_file() else data
     frames = transforms.frames(file, images)
     if not frames:
@@ -109,19 +106,19 @@ def _saved(
     given = content.get("applied_transform")
     if given is None and options is not None and (file.parent / "colmap" / "sparse" / "0").is_dir():
         raise content.place.to("applied_transform").error(
-            "is missing, and versions of nerfstudio differ in what they take for it"
+            "is missing, and its default differs between versions of nerfstudio"
         )
     A = _EYE if given is None else _affine(content, "applied_transform")
     if options is not None and not any(frame.split for frame in frames):
         try:
             frames = _split(frames, options)
         except (ValueError, OverflowError) as error:
-            raise InputError(f"the run's split of it is malformed ({error})", path=data) from error
+            raise InputError(f"invalid split in the run's {CONFIG} ({error})", path=data) from error
     return frames, A, _scale(content, "applied_scale", 1.0)
 
 
 def _split(frames: Sequence[Frame], options: Settings) -> list[Frame]:
-    """The run's own split by `eval_mode`, over the sorted paths of photos; none where all are for both."""
+    """Assign the run's split by `eval_mode` over sorted photo paths, if views are split at all."""
     count, mode = len(frames), options.word("eval_mode")
     order = sorted(range(count), key=lambda i: frames[i].photo or Path(frames[i].name))
     rank = np.argsort(order)
@@ -145,7 +142,7 @@ def _split(frames: Sequence[Frame], options: Settings) -> list[Frame]:
 
 
 def _optimized(settings: Settings | None) -> str | None:
-    """How the run optimised its poses; None where it did not, or nothing says so."""
+    """Return the mode of pose optimisation, or None if it is off or unknown."""
     pipeline = settings and settings.block("pipeline")
     model = pipeline and pipeline[1].block("model")
     optimizer = model and model[1].block("camera_optimizer")
@@ -154,7 +151,7 @@ def _optimized(settings: Settings | None) -> str | None:
 
 
 def _moved(frame: Frame, transform: NDArray[np.float64], scale: float) -> Frame:
-    """The frame after x → scale·(transform·x): its axes turn, only its centre scales."""
+    """Move a frame by x → scale·(transform·x); the scale only applies to its centre."""
     world_from_camera = transform @ inverse(frame.viewmat)
     world_from_camera[:3, 3] *= scale
     return frame._replace(viewmat=inverse(world_from_camera))
@@ -165,7 +162,7 @@ def _affine(holder: Fields, key: str) -> NDArray[np.float64]:
     out = np.eye(4)
     out[:3] = matrix(holder, key)[:3]
     if not 0.99 < abs(np.linalg.det(out[:3, :3])) < 1.01:
-        raise holder.place.to(key).error("is no rotation")
+        raise holder.place.to(key).error("is not a rotation")
     return out
 
 

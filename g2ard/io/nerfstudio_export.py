@@ -1,4 +1,4 @@
-"""Poses as nerfstudio's `ns-export cameras` lists them: transforms_train.json and transforms_eval.json."""
+"""Reader for `ns-export cameras` of nerfstudio: transforms_train.json and transforms_eval.json."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from g2ard.io.settings import below
 from g2ard.io.types import ViewSet
 
 LISTS = {"transforms_train.json": "train", "transforms_eval.json": "test"}
-"""The files, and the split each stands for."""
+"""File → its split."""
 
 
 class _Lens(NamedTuple):
-    """What the data says of a photo that the export leaves out."""
+    """Intrinsics of a photo, which the export does not store."""
 
     K: Any
     size: tuple[int, int]
@@ -27,30 +27,25 @@ class _Lens(NamedTuple):
 
 
 def is_export(content: Any) -> bool:
-    """Whether what a JSON file holds is such a list."""
+    """Return whether JSON content is such a list."""
     first = content[0] if isinstance(content, list) and content else None
     return isinstance(first, dict) and {"file_path", "transform"} <= set(first)
 
 
 def exported(folder: Path) -> list[Path]:
-    """The lists in a folder."""
+    """Return the exported lists in a folder."""
     found = [folder / name for name in LISTS if (folder / name).is_file()]
     return [file for file in found if is_export(read_any_json(file))]
 
 
 def read(path: Path, images: Path | None = None) -> ViewSet:
-    """Read exported poses, {file_path, transform}: world_from_camera, 3×4, OpenGL's axes, in the world of the
-    exported scene. Views of the train list are "train", those of the eval list "test".
+    """Read exported poses, {file_path, transform}: world_from_camera, 3×4, OpenGL axes, in the scene's world.
 
-    They hold no intrinsics: those come from the data the photos lie in (a transforms.json or a COLMAP
-    model above them), scaled to the photo's size where that is another.
+    Intrinsics come from a transforms.json or a COLMAP model above the photos, scaled to the photos' size.
 
     Args:
         path: one of the lists, or the folder of both.
-        images: a folder to look for photos in, by their file names; None takes `file_path`.
-
-    Raises:
-        InputError: no poses, one that makes no sense, or nothing tells their intrinsics.
+        images: folder to search for photos by file name; None uses `file_path`.
     """
     files = exported(path) if path.is_dir() else [path]
     lenses: dict[Path, dict[str, _Lens]] = {}
@@ -86,17 +81,17 @@ def _frame(
 
 
 def _lens(camera: Fields, named: Path, place: Path | None, known: dict[Path, dict[str, _Lens]]) -> _Lens:
-    """By the photo's file name, out of the data in the nearest folder above it that holds any."""
+    """Return a photo's intrinsics by file name, from the nearest folder above it that has them."""
     for folder in () if place is None else (place, *place.parents[:3]):
         if folder not in known:
             known[folder] = _lenses(folder)
         if named.name in known[folder]:
             return known[folder][named.name]
     error = camera.place.error(
-        "has no intrinsics, which ns-export does not write, and no transforms.json or COLMAP model above "
-        f"{named.as_posix()} has them"
+        f"has no intrinsics in a transforms.json or COLMAP model above {named.as_posix()}, "
+        "and ns-export does not write them"
     )
-    raise error.at(hint="give the run's folder (with its dataparser_transforms.json) instead")
+    raise error.at(hint="give the run's folder with its dataparser_transforms.json")
 
 
 def _lenses(folder: Path) -> dict[str, _Lens]:
@@ -108,7 +103,5 @@ def _lenses(folder: Path) -> dict[str, _Lens]:
         return {}
     names = [Path(frame.photo.name if frame.photo else frame.name).name for frame in frames]
     if len(set(names)) < len(names):
-        raise InputError(
-            "photos of one name in several folders: which is whose is not to be told", path=folder
-        )
+        raise InputError("several photos have the same name, so their intrinsics are ambiguous", path=folder)
     return {name: _Lens(f.K, f.size, f.distortion) for name, f in zip(names, frames, strict=True)}

@@ -1,4 +1,4 @@
-"""What writers of packed formats share: rows that can be written, their order, unit quaternions."""
+"""Helpers for writers of packed formats: checks, row order, quaternions."""
 
 from __future__ import annotations
 
@@ -16,13 +16,9 @@ _MORTON_BITS = 21
 
 
 def writable(path: Path, splats: Splats) -> Splats:
-    """The scene, if it can be written.
-
-    Raises:
-        InputError: it is empty or has a value that is not finite.
-    """
+    """Return the scene, or raise an `InputError` if it is empty or not finite."""
     if not len(splats):
-        raise InputError("a scene without Gaussians is not written", path=path)
+        raise InputError("not written: the scene has no Gaussians", path=path)
     bad = np.flatnonzero(~splats.finite_rows())
     if len(bad):
         raise InputError(f"not written: Gaussian {bad[0]} is not finite", path=path)
@@ -30,10 +26,10 @@ def writable(path: Path, splats: Splats) -> Splats:
 
 
 def world_means(path: Path, splats: Splats, what: str) -> NDArray[np.float64]:
-    """(N, 3) means + offset, for a format that stores no offset and holds float32.
+    """Return (N, 3) means + offset for a float32 format `what` without an offset.
 
     Raises:
-        InputError: float32 there is coarser than half of the Gaussians are thin.
+        InputError: steps of float32 exceed the median smallest scale.
     """
     means = splats.means.astype(np.float64) + splats.offset
     if splats.offset.any():
@@ -41,16 +37,16 @@ def world_means(path: Path, splats: Splats, what: str) -> NDArray[np.float64]:
         thin = float(np.median(splats.scales.min(axis=1)))
         if step > thin:
             raise InputError(
-                f"{what} stores no offset, and steps of {step:g} at these coordinates; write "
-                ".ply, .compressed.ply, .sog or .glb, or drop the offset with `g2ard convert --recentre`",
+                f"{what} has no offset, and float32 is too coarse at these coordinates (steps of {step:g})",
                 path=path,
+                hint="write .ply, .compressed.ply, .sog or .glb, or drop the offset with "
+                "`g2ard convert --recentre`",
             )
     return means
 
 
 def morton_order(means: NDArray[Any]) -> NDArray[np.intp]:
-    """The rows along a Morton curve of 2²¹ cells an axis, ties by row: neighbours in space become neighbours
-    in the file, which packs better.
+    """Return rows in Morton order (2²¹ cells per axis, ties by row), which packs better.
 
     >>> morton_order(np.array([[1.0, 1, 1], [0, 0, 0], [0.9, 1, 1]])).tolist()
     [1, 2, 0]
@@ -65,7 +61,7 @@ def morton_order(means: NDArray[Any]) -> NDArray[np.intp]:
 
 
 def _spread(v: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Every third bit of the result is a bit of `v`."""
+    """Spread the bits of `v` to every third bit."""
     for shift, mask in (
         (32, 0x001F00000000FFFF),
         (16, 0x001F0000FF0000FF),
@@ -78,14 +74,14 @@ def _spread(v: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def log_scales(splats: Splats) -> NDArray[np.float64]:
-    """(N, 3) natural logarithms, a scale of 0 at the least that readers keep."""
+    """Return the (N, 3) natural logarithms of scales, clamped to the limits of readers."""
     with np.errstate(divide="ignore"):
         logs = np.log(splats.scales.astype(np.float64))
     return np.clip(logs, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
 
 
 def unit_quats(quats: NDArray[Any]) -> NDArray[np.float64]:
-    """(N, 4) of length 1; zeros become the identity."""
+    """Normalise (N, 4) quaternions; zeros become the identity."""
     q = quats.astype(np.float64)
     q /= np.maximum(np.abs(q).max(axis=1, keepdims=True), np.finfo(float).tiny)
     norms = np.linalg.norm(q, axis=1, keepdims=True)
@@ -93,8 +89,9 @@ def unit_quats(quats: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def smallest_three(quats: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Which component of each unit quaternion is the largest, and the other three in order, all of the sign
-    that makes it positive: each within ±1/√2.
+    """Return the index of each unit quaternion's largest component, and the other three.
+
+    The sign is chosen so that the largest is positive; the others are within ±1/√2.
 
     >>> largest, others = smallest_three(np.array([[0.6, 0, -0.8, 0]]))
     >>> largest.tolist(), others.tolist()
@@ -108,5 +105,5 @@ def smallest_three(quats: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArra
 
 
 def coded(values: NDArray[Any], top: int) -> NDArray[np.int64]:
-    """Values in [0, 1] as integers in 0 … top, the nearest."""
+    """Round values in [0, 1] to integers in 0 … top."""
     return np.clip(np.rint(values * top), 0, top).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Paths as users give them: links that go in a circle, files that are none, names that leave their folder."""
+"""Checks for paths: links, special files, names that leave their folder."""
 
 from __future__ import annotations
 
@@ -10,35 +10,31 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from g2ard.errors import InputError
 
 _LONGEST = 200
-"""Bytes of a name of a file: systems take 255, of which a suffix and temporary names need some."""
+"""Longest file name, bytes; systems allow 255, including suffixes and temporary names."""
 
 
 def real_path(path: str | Path) -> Path:
-    """The path without links; one whose links go in a circle stays (`Path.resolve` raises there)."""
+    """Return the path with links resolved; circular links are kept (`Path.resolve` would raise)."""
     return Path(os.path.realpath(path))
 
 
 def check_regular(path: Path) -> None:
-    """Refuse a pipe, a device or a socket: reading it could wait for ever, or never end.
-
-    Raises:
-        InputError: the path is neither a file, nor a folder, nor free.
-    """
+    """Raise an `InputError` for a pipe, device or socket, which might block forever."""
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise InputError("not a regular file", path=path)
 
 
 def output_names(path: str | Path, names: Sequence[str]) -> list[str]:
-    """What views' names become as files of one folder, without suffix: no name leads out of it.
+    """Return file names for views, without suffix, that stay inside one folder.
 
-    Roots, drives and `..` go. Where two names differ in their suffix alone, both keep it.
+    Roots, drives and `..` are removed. Names that only differ in their suffix keep it.
 
     Args:
         path: the file of views, for errors.
-        names: of the views.
+        names: names of the views.
 
     Raises:
-        InputError: a name holds no name of a file, one of over 200 bytes, or comes to another's.
+        InputError: a name is invalid, longer than 200 bytes, or equals another one.
 
     >>> output_names("v.json", ["../images/a.png", "/b/c.jpg", "d.png", "d.jpg"])
     ['images/a', 'b/c', 'd.png', 'd.jpg']
@@ -58,5 +54,5 @@ def _inside(path: str | Path, i: int, name: str) -> PurePosixPath:
     kept = [part for part in parts if part not in ("..", "/", "//") and not part.endswith((":", ":/"))]
     if not kept or "\0" in name or max(len(part.encode(errors="replace")) for part in kept) > _LONGEST:
         short = name if len(name) <= _LONGEST else f"{name[:_LONGEST]}…"
-        raise InputError(f"has the name {short!r}, which cannot be a file's", path=path, index=i, item="view")
+        raise InputError(f"has the invalid file name {short!r}", path=path, index=i, item="view")
     return PurePosixPath(*kept)

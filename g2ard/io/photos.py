@@ -1,4 +1,4 @@
-"""What every reader of views shares: which frames have a photo, and how frames become Cameras."""
+"""Helpers for readers of views: photos of frames, and frames to cameras."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 
 
 class Frame(NamedTuple):
-    """One view as a file lists it; `photo` need not exist."""
+    """A view as listed in a file; its `photo` may be missing."""
 
     name: str
     viewmat: NDArray[np.float64]
@@ -36,7 +36,7 @@ class Frame(NamedTuple):
 
 
 def find_photo(path: Path) -> Path:
-    """`path`, or the photo that a name without suffix means (as NeRF's synthetic scenes write it)."""
+    """Return `path`, or an existing photo with a suffix added, as for NeRF's synthetic scenes."""
     if path.is_file() or path.suffix in _SUFFIXES:
         return path
     tried = (path.with_name(path.name + suffix) for suffix in _SUFFIXES)
@@ -44,25 +44,17 @@ def find_photo(path: Path) -> Path:
 
 
 def photo_size(path: Path, listed_in: Path | None = None) -> tuple[int, int]:
-    """Return width and height of a photo, from its header.
-
-    Args:
-        path: the photo.
-        listed_in: the file that names it, for errors.
-
-    Raises:
-        InputError: it is not an image, or past `LARGEST_IMAGE`.
-    """
+    """Read width and height from a photo's header; `listed_in`, the file that names it, is for errors."""
     try:
         with opened_image(path) as image:
             return image.size
     except InputError as error:
-        raise error if listed_in is None else error.at(hint=f"{listed_in} names it") from None
+        raise error if listed_in is None else error.at(hint=f"it is listed in {listed_in}") from None
 
 
 def rotation(quat: Sequence[float]) -> NDArray[np.float64]:
-    """(3, 3) of a wxyz quaternion of any length but 0."""
-    q = np.asarray(quat, np.float64) / np.abs(quat).max()  # of 1e308 the norm would be infinite
+    """Return the (3, 3) rotation of a wxyz quaternion of any length except 0."""
+    q = np.asarray(quat, np.float64) / np.abs(quat).max()  # avoids an infinite norm
     w, x, y, z = q / np.linalg.norm(q)
     return np.array(
         [
@@ -74,10 +66,10 @@ def rotation(quat: Sequence[float]) -> NDArray[np.float64]:
 
 
 def rigid(matrix: NDArray[np.float64], place: Place) -> NDArray[np.float64]:
-    """Return the rigid transform nearest to a (4, 4) or (3, 4) pose, which may carry rounding or one scale.
+    """Return the rigid transform nearest to a (4, 4) or (3, 4) pose with rounding errors or a uniform scale.
 
     Raises:
-        InputError: it is not finite, mirrored, or further than 1 % from a rotation.
+        InputError: the pose is not finite, is mirrored, or differs from a rotation by over 1 %.
     """
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise place.error("is not a finite 4×4 matrix")
@@ -91,7 +83,7 @@ def rigid(matrix: NDArray[np.float64], place: Place) -> NDArray[np.float64]:
 
 
 def inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The inverse of a (4, 4) rigid transform."""
+    """Invert a (4, 4) rigid transform."""
     R, t = matrix[:3, :3], matrix[:3, 3]
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = R.T, -R.T @ t
@@ -112,11 +104,11 @@ def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
     except InputError as error:
         raise error.at(path=path) from error
     except OverflowError as error:
-        raise InputError("a view is larger than any image", path=path) from error
+        raise InputError("the size of a view is too large", path=path) from error
 
 
 def _mask(frame: Frame) -> Path | None:
-    """The frame's own mask, else one of the photo's name in a folder `masks` beside the photos' folder."""
+    """Return the frame's mask, or one named like its photo in `masks` beside the folder of photos."""
     if frame.mask is not None or frame.photo is None:
         return frame.mask
     folder = frame.photo.parent.parent / "masks"
@@ -125,11 +117,7 @@ def _mask(frame: Frame) -> Path | None:
 
 
 def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
-    """Stack frames; those whose photo is missing become poses alone (`pictured` leaves them out).
-
-    Raises:
-        InputError: no frame, or two of one name.
-    """
+    """Stack frames with unique names; frames whose photo is missing keep their pose only."""
     if not frames:
         raise InputError("no views found", path=path)
     name, times = Counter(frame.name for frame in frames).most_common(1)[0]
@@ -143,15 +131,13 @@ def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
         frames = [f if f.name in there else f._replace(photo=None, mask=None) for f in frames]
     elif not present and listed:
         notes.append(
-            Note("no_photos", len(listed), f"none of {plural(len(listed), 'photo')} found: poses only")
+            Note("no_photos", len(listed), f"none of {plural(len(listed), 'photo')} found; using poses only")
         )
         frames = [frame._replace(photo=None) for frame in frames]
     cameras = replace(_cameras(path, frames), source=path)
     masked = sum(mask is not None for mask in cameras.mask_paths)
     if masked:
-        notes.append(
-            Note("masks", masked, f"{plural(masked, 'photo')} of {len(present)} counted in part: masks")
-        )
+        notes.append(Note("masks", masked, f"{plural(masked, 'photo')} of {len(present)} have masks"))
     splits = tuple(f.split for f in frames)
     weights = [f.weight for f in frames]
     return ViewSet(
@@ -163,7 +149,7 @@ def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
 
 
 def pictured(found: ViewSet) -> ViewSet:
-    """The views that have a photo, with a note that counts the others; all of them where none has any."""
+    """Return the views with a photo, and a note on the others; all views if none has a photo."""
     has = np.array([path is not None for path in found.cameras.image_paths], bool)
     missing = int(np.count_nonzero(~has))
     if not missing or missing == len(has):

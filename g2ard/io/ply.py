@@ -1,4 +1,4 @@
-"""Standard 3DGS .ply files (the layout of INRIA's trainer), through plyfile."""
+"""Reader and writer for standard 3DGS .ply files, in the layout of INRIA's trainer."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _REST_OF_BANDS = (0, 3, 8, 15)
 
 @dataclass(frozen=True)
 class _Layout:
-    """What a header says of the rows."""
+    """Rows of a file and their layout."""
 
     rows: NDArray[Any]
     rest: list[str]
@@ -54,12 +54,9 @@ class _Layout:
         return cls(rows, rest, stored, kept, offset, shift, _ignored(properties, rest, stored, kept))
 
     def raw(self, rows: NDArray[Any]) -> Raw:
-        """What `rows` of the file hold."""
         raw = Raw.empty(len(rows), self.kept)
         raw.offset = self.offset
-        with np.errstate(
-            over="ignore", invalid="ignore"
-        ):  # float64 past float32 becomes inf: such a row is dropped
+        with np.errstate(over="ignore", invalid="ignore"):  # rows beyond float32 become inf and are dropped
             for start in range(0, len(rows), BLOCK):
                 at = slice(start, start + BLOCK)
                 _read_block(rows[at], raw, at, self.rest, self.stored, self.shift)
@@ -67,23 +64,16 @@ class _Layout:
 
 
 def read(path: Path) -> Scene:
-    """Read a 3DGS .ply: any SH degree, property order, scalar type, byte order, or ascii.
+    """Read a 3DGS .ply of any SH degree, property order, scalar type and byte order, or ascii.
 
-    Positions stored as float64 that float32 cannot hold are recentred and the shift kept in `offset`.
-
-    Raises:
-        InputError: not a PLY, a property is missing, the file is truncated, nothing finite in it.
+    float64 positions that float32 cannot represent are recentred; the shift is stored in `offset`.
     """
     layout = _Layout.of(path)
     return cleaned(path, layout.raw(np.asarray(layout.rows)), layout.notes)
 
 
 def stream(path: Path) -> SceneStream:
-    """The same scene in blocks. A text file, or one with lists before its Gaussians, is held as a whole.
-
-    Raises:
-        InputError: as for `read`; rows are looked at later.
-    """
+    """Open a scene for reading in blocks; text files and those with leading lists are read whole."""
     return _PlyStream(path)
 
 
@@ -106,7 +96,7 @@ class _PlyStream(SceneStream):
 
 
 def _bands(path: Path, rest: list[str]) -> tuple[int, int]:
-    """How many higher-band coefficients a channel are stored, and how many of them are kept."""
+    """Return the numbers of stored and of kept coefficients past band 0 per channel."""
     if [int(p[7:]) for p in rest] != list(range(len(rest))) or len(rest) not in (0, 9, 24, 45, 72):
         raise InputError(
             f"expected f_rest_0 to f_rest_n with 0, 9, 24 or 45 of them, got {len(rest)}", path=path
@@ -127,9 +117,9 @@ def _ignored(properties: list[str], rest: list[str], stored: int, kept: int) -> 
 
 
 def _recentre(sample: NDArray[Any]) -> NDArray[np.float64]:
-    """The whole-unit shift that lets float32 hold float64 positions; zero where it holds them anyway.
+    """Return the whole-unit shift for which float32 can represent float64 positions; zero if not needed.
 
-    Judged on percentiles of a sample of rows, so that a stray floater decides nothing.
+    Percentiles of a sample of rows decide, so that outliers have no effect.
     """
     positions = np.stack([sample[name] for name in _MEANS], axis=1)
     positions = positions[np.isfinite(positions).all(1)]
@@ -152,7 +142,7 @@ def _read_block(
     raw.logit_opacities[at] = block["opacity"]
     if rest:  # channel-major: all of red's coefficients, then green's, then blue's
         bands = structured_to_unstructured(block[rest]).reshape(-1, 3, stored)
-        for channel in range(3):  # numpy's own transposed copy takes thrice as long
+        for channel in range(3):  # three times as fast as a transposed copy
             raw.shN[at, :, channel] = bands[:, channel, : raw.shN.shape[1]]
 
 
@@ -166,18 +156,8 @@ def _means(block: NDArray[Any], shift: NDArray[np.float64]) -> NDArray[np.float3
 def write(path: Path, splats: Splats, *, overwrite: bool = False, normals: bool = False) -> None:
     """Write a binary little-endian 3DGS .ply: x y z, f_dc, f_rest, opacity, scale, rot.
 
-    An `offset` other than zero goes into a comment, which `read` restores.
-
-    Args:
-        path: the file to write.
-        splats: the scene.
-        overwrite: whether an existing file may be replaced.
-        normals: also write nx ny nz, all zero: 12 bytes a Gaussian that only programs with a fixed
-            layout, such as INRIA's SIBR viewer (which wants SH degree 3 too), ask for.
-
-    Raises:
-        OutputError: see `atomic_output`.
-        InputError: the scene is empty or has a non-finite value; nothing is written.
+    A non-zero `offset` is stored in a comment, which `read` restores. `normals` adds zero nx ny nz, 12 bytes
+    per Gaussian, for programs with a fixed layout such as INRIA's SIBR viewer (which also needs SH degree 3).
     """
     write_parts(
         path,
@@ -200,11 +180,11 @@ def write_parts(
     overwrite: bool = False,
     normals: bool = False,
 ) -> None:
-    """As `write`, of a scene that comes in parts: `count` Gaussians in all, of one SH degree and offset."""
+    """Write parts of one SH degree and offset, `count` Gaussians in total, as `write` does."""
     from plyfile import PlyData, PlyElement
 
     if not count:
-        raise InputError("a scene without Gaussians is not written", path=path)
+        raise InputError("not written: the scene has no Gaussians", path=path)
     names = [*_MEANS, *(_NORMALS if normals else []), *_DC]
     rest = 3 * ((sh_degree + 1) ** 2 - 1)
     names += [f"f_rest_{k}" for k in range(rest)] + ["opacity", *_SCALES, *_QUATS]
@@ -222,7 +202,7 @@ def write_parts(
                 file.write(block.data)
             first += len(part)
         if first != count:
-            raise InputError(f"not written: {first:,} Gaussians came, {count:,} were announced", path=path)
+            raise InputError(f"not written: got {first:,} Gaussians, expected {count:,}", path=path)
 
 
 def _blocks(

@@ -1,4 +1,4 @@
-"""What every PLY reader shares: a look at the header, and plyfile with errors that name the file."""
+"""Helpers for PLY readers: headers, rows and errors that name the file."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 _OFFSET = re.compile(r"g2ard offset (\S+) (\S+) (\S+)$")
 _HEADER_LIMIT = 1 << 20
-"""No sane header is longer; a file without `end_header` by then is not a PLY."""
+"""Longest header, bytes."""
 
 _END = re.compile(rb"^end_header[ \t]*[\r\n]", re.MULTILINE)
 
 
 @dataclass
 class PlyHeader:
-    """A PLY header: per element its row count and its properties in file order; and the comments."""
+    """A PLY header: row counts and properties per element, and comments."""
 
     counts: dict[str, int] = field(default_factory=dict)
     properties: dict[str, list[str]] = field(default_factory=dict)
@@ -32,30 +32,26 @@ class PlyHeader:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """Read the header alone, without touching the data.
-
-    Raises:
-        InputError: the file is absent, empty, not a PLY, or its header is broken.
-    """
+    """Read a header without the data."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEADER_LIMIT)
     except OSError as error:
         raise InputError(f"{error.strerror}", path=path) from error
     if not head:
-        raise InputError("the file is empty", path=path)
+        raise InputError("is empty", path=path)
     if head[:3] != b"ply" or head[3:4] not in b"\r\n":
         raise InputError(
-            f"not a PLY file (begins with {head[:8]!r}, expected 'ply'); export the scene as .ply "
-            "again, or give the file the suffix of what it is",
+            f"is not a PLY file (begins with {head[:8]!r}, expected 'ply')",
             path=path,
+            hint="export it again, or rename it to the suffix of its format",
         )
-    end = _END.search(head)  # a line of its own: comments may hold the word
+    end = _END.search(head)  # on a line of its own, since comments may contain it
     if end is None:
-        raise InputError("broken PLY: its header has no end_header line", path=path, hint=DAMAGED)
+        raise InputError("broken PLY header: no end_header line", path=path, hint=DAMAGED)
     header = PlyHeader()
     for number, line in enumerate(re.split(r"\r\n|\r|\n", head[: end.start()].decode("latin-1")), 1):
-        if not line.isascii():  # PLY is ASCII, and plyfile insists
+        if not line.isascii():  # required by plyfile
             raise InputError(f"PLY header, line {number}: a character that is not ASCII", path=path)
         try:
             _header_line(header, line.split())
@@ -82,11 +78,7 @@ def _header_line(header: PlyHeader, words: list[str]) -> None:
 
 
 def offset_of(path: Path, header: PlyHeader) -> NDArray[np.float64]:
-    """(3,) what a comment `g2ard offset X Y Z` says; zeros without one.
-
-    Raises:
-        InputError: the comment holds no finite numbers.
-    """
+    """Return the (3,) offset of a comment `g2ard offset X Y Z`; zeros without one."""
     import numpy as np
 
     for comment in header.comments:
@@ -102,18 +94,14 @@ def offset_of(path: Path, header: PlyHeader) -> NDArray[np.float64]:
 
 
 def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any]]:
-    """The rows of the elements `names`, mapped from the file where it is binary.
-
-    Raises:
-        InputError: the file ends before all promised rows, or plyfile cannot parse it.
-    """
+    """Return the rows of elements, memory-mapped if the file is binary."""
     from plyfile import PlyData, PlyElementParseError, PlyParseError
 
     size = path.stat().st_size
-    for name, count in header.counts.items():  # before room is made for them: a row takes a byte at least
+    for name, count in header.counts.items():  # before allocating memory: a row has at least a byte
         if count > size:
             raise InputError(
-                f"truncated: the header promises {count:,} rows of {name!r}, the file has {size:,} bytes",
+                f"truncated: {count:,} rows of {name!r} in {size:,} bytes",
                 path=path,
                 hint=DAMAGED,
             )
@@ -124,7 +112,7 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
         except PlyElementParseError:
             if not triangles:
                 raise
-            ply = PlyData.read(path, mmap="r")  # a mesh of polygons: slow, but its vertices are wanted
+            ply = PlyData.read(path, mmap="r")  # polygons: slower
     except PlyElementParseError as error:
         raise _parse_error(path, header, error) from error
     except (PlyParseError, ValueError, OSError, OverflowError, MemoryError) as error:
@@ -135,13 +123,9 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
 def row_blocks(
     path: Path, every: NDArray[Any], rows: int, start: int = 0
 ) -> Iterator[tuple[int, NDArray[Any]]]:
-    """An element's rows from `start` on, `rows` at a time, each block with the number of its first row.
+    """Yield an element's rows from `start` in blocks of `rows`, each with the index of its first row.
 
-    They are read, not mapped, where `read_element` mapped them: pages of a mapping count as memory of the
-    process.
-
-    Raises:
-        InputError: the file ends before them.
+    Mapped rows are read with file reads, since mapped pages count as memory of the process.
     """
     import numpy as np
 
@@ -152,12 +136,12 @@ def row_blocks(
             continue
         block = np.fromfile(path, every.dtype, count, offset=every.offset + first * every.itemsize)
         if len(block) < count:
-            raise InputError("became shorter while it was read", path=path)
+            raise InputError("was truncated while it was read", path=path)
         yield first, block
 
 
 def spread_rows(rows: NDArray[Any]) -> NDArray[Any]:
-    """Some 100,000 rows, evenly spread; of a mapped file without touching the pages between them."""
+    """Return about 100,000 evenly spaced rows, without loading the pages between them."""
     import numpy as np
 
     step = max(1, len(rows) // 100_000)
@@ -184,7 +168,8 @@ def _parse_error(path: Path, header: PlyHeader, error: Any) -> InputError:
 
 
 def require(path: Path, present: list[str], wanted: list[str], what: str) -> None:
-    """Raise InputError naming the `wanted` properties that are not `present`."""
+    """Raise an `InputError` that lists the `wanted` properties that are not `present`."""
     missing = [name for name in wanted if name not in present]
     if missing:
-        raise InputError(f"{what} needs the vertex property {', '.join(map(repr, missing))}", path=path)
+        words = ", ".join(map(repr, missing))
+        raise InputError(f"{what} needs the vertex property {words}", path=path)

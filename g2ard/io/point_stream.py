@@ -1,4 +1,4 @@
-"""Coloured clouds read block by block, so that memory does not bound their size."""
+"""Coloured point clouds in blocks, for clouds larger than memory."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from g2ard.io.types import Cloud, Note
 from g2ard.progress import plural
 
 RawPoints = tuple[NDArray[np.float64], NDArray[np.float32]]
-"""(n, 3) positions, world units, and (n, 3) colours as stored: in [0, 1] once divided by `divisor`."""
+"""(n, 3) positions, world units, and (n, 3) colours; colours / `divisor` are in [0, 1]."""
 
 
 @dataclass
 class PointTally:
-    """What was met in the rows so far."""
+    """Counts over the rows read so far."""
 
     rows: int = 0
     dropped: int = 0
@@ -30,7 +30,7 @@ class PointTally:
     brightest: float = 0.0
 
     def finite(self, points: RawPoints) -> NDArray[np.bool_]:
-        """(n,) which of the next rows are to be kept."""
+        """Return an (n,) mask of the finite rows, and count them."""
         good = np.all(np.isfinite(points[0]), axis=1) & np.all(np.isfinite(points[1]), axis=1)
         lost = len(good) - int(np.count_nonzero(good))
         if lost and not self.dropped:
@@ -42,13 +42,13 @@ class PointTally:
 
 
 class PointStream(ABC):
-    """A coloured cloud as a sequence of points, any part of which can be read again.
+    """Coloured point cloud that can be read from any row.
 
     Attributes:
-        path: names the cloud in messages.
-        count: points in the source, those that will be dropped included.
-        offset: (3,) float64, what positions should be relative to, so that float32 holds them.
-        tally: counts over the points that `blocks` has been through.
+        path: path for messages.
+        count: points in the source, including those that will be dropped.
+        offset: (3,) float64 origin for which float32 can represent the positions.
+        tally: counts over the points that `blocks` has read.
     """
 
     def __init__(self, path: Path, count: int, offset: NDArray[np.float64]) -> None:
@@ -56,36 +56,32 @@ class PointStream(ABC):
 
     @abstractmethod
     def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
-        """The source's points from `start` on, at most `rows` at a time."""
+        """Yield the source's points from `start`, at most `rows` at a time."""
 
     @property
     def divisor(self) -> float:
-        """What colours are to be divided by, known once `blocks` is through."""
+        """The divisor of colours, known once `blocks` has finished."""
         return 1.0
 
     def notes(self) -> tuple[Note, ...]:
-        """What was noticed beside points that are not finite."""
+        """Return notes other than on non-finite points."""
         return ()
 
     def identity(self) -> list[Any]:
-        """What tells this source from another, as JSON."""
+        """Return JSON that identifies this source."""
         return file_identity([self.path])
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[RawPoints]:
-        """All points from `start` on that are finite."""
+        """Yield the finite points from `start`."""
         for points in self.raw(rows, start):
             good = self.tally.finite(points)
             yield points if good.all() else (points[0][good], points[1][good])
 
     def all_notes(self) -> tuple[Note, ...]:
-        """What was noticed, once `blocks` is through.
-
-        Raises:
-            InputError: there was no point, or none that is finite.
-        """
+        """Return all notes once `blocks` has finished; raise an `InputError` if no point is finite."""
         tally = self.tally
         if not tally.rows:
-            raise InputError("holds no points", path=self.path)
+            raise InputError("has no points", path=self.path)
         if tally.dropped == tally.rows:
             raise InputError(f"none of its {plural(tally.rows, 'point')} is finite", path=self.path)
         if not tally.dropped:
@@ -95,14 +91,14 @@ class PointStream(ABC):
 
 
 def cloud_middle(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The whole-unit middle of a cloud's bounds; zero where the cloud lies around the origin as it is."""
+    """Return the centre of a cloud's bounds in whole units, or zero for a cloud around the origin."""
     middle = (low + high) / 2
     far = np.abs(middle) > np.linalg.norm(high - low)
     return np.where(np.isfinite(middle).all() and far.any(), np.rint(middle), 0.0)
 
 
 class WholeCloud(PointStream):
-    """A cloud that is in memory."""
+    """Point cloud in memory."""
 
     def __init__(self, path: Path, cloud: Cloud) -> None:
         self._cloud, at = cloud, cloud.points.positions
@@ -123,7 +119,7 @@ class WholeCloud(PointStream):
 
 
 class JoinedClouds(PointStream):
-    """Several clouds, one after the other; each one's colours are brought to [0, 1] as they are read."""
+    """Several point clouds as one, with colours scaled to [0, 1]."""
 
     def __init__(self, streams: list[PointStream]) -> None:
         super().__init__(streams[0].path, sum(s.count for s in streams), streams[0].offset)
@@ -139,7 +135,7 @@ class JoinedClouds(PointStream):
             start = max(0, start - stream.count)
 
     def _divisor(self, number: int, rows: int) -> float:
-        """A file's divisor is known after its last point: it is read once more for that alone."""
+        """Return a file's divisor, which takes an additional pass over its points."""
         known = self._divisors[number]
         if known is None:
             stream = self._streams[number]

@@ -1,4 +1,4 @@
-"""COLMAP's sparse points as a coloured cloud."""
+"""Reader for COLMAP's sparse points as a coloured point cloud."""
 
 from __future__ import annotations
 
@@ -19,16 +19,12 @@ _POINT = Record(["POINT3D_ID", *"XYZRGB", "ERROR", "TRACK"], "QdddBBBdQ")
 
 
 def read(path: Path) -> Cloud:
-    """Read points3D.bin or .txt, or that of the model in a COLMAP folder.
-
-    Raises:
-        InputError: no such file in the folder, it is truncated or malformed, or holds no finite point.
-    """
+    """Read points3D.bin or .txt, or that of the model in a COLMAP folder."""
     if path.is_dir() or path.stem.lower() != "points3d":
         folder = model_folder(path) or path
         found = next((p for s in (".bin", ".txt") if (p := folder / f"points3D{s}").is_file()), None)
         if found is None:
-            raise InputError("no points3D.bin or points3D.txt", path=folder)
+            raise InputError("has no points3D.bin or points3D.txt", path=folder)
         path = found
     with parsing(path):
         positions, rgb = (_binary if path.suffix == ".bin" else _text)(path)
@@ -36,11 +32,11 @@ def read(path: Path) -> Cloud:
 
 
 def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Rows of id, x y z, r g b, error, and a track of varying length: walked, since no stride is fixed."""
+    """Read rows of id, x y z, r g b, error and a track of variable length."""
     data = path.read_bytes()
     (count,) = _COUNT.read(path, "table", 0, data, 0)
     if count * _POINT.size > len(data):
-        raise InputError(f"truncated: {count:,} points promised", path=path, hint=DAMAGED)
+        raise InputError(f"truncated: {count:,} points in {len(data):,} bytes", path=path, hint=DAMAGED)
     positions, rgb, at = np.empty((count, 3)), np.empty((count, 3), np.uint8), _COUNT.size
     for i in range(count):
         _key, x, y, z, r, g, b, _error, track = _POINT.read(path, "point", i, data, at)
@@ -55,7 +51,7 @@ def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     lines = [line for line in text_lines(path) if line.strip()]
     rows = [line.split(maxsplit=7) for line in lines]
     for i, line in enumerate(lines):
-        if "_" in line or not line.isascii():  # float() takes 1_0, and digits of other scripts
+        if "_" in line or not line.isascii():  # float() accepts both
             for name, word in zip(_COLUMNS, rows[i][1:7], strict=False):
                 if "_" in word or not word.isascii():
                     raise InputError(f"is {word!r}", path=path, property=name, index=i, item="point")

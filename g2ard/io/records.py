@@ -1,4 +1,4 @@
-"""Rows of binary tables without a fixed stride, read one at a time: what is cut or not finite is named."""
+"""Rows of binary tables, with errors that name the truncated or invalid column."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from g2ard.errors import DAMAGED, InputError
 
 
 class Record:
-    """Little-endian columns without padding.
+    """Layout of little-endian columns without padding.
 
     Args:
-        names: of the columns, in the file's order.
-        letters: struct's format of each.
+        names: names of the columns in file order.
+        letters: struct format of each.
 
     >>> Record(("ID", "X", "Y"), "Qdd").size
     24
@@ -29,11 +29,7 @@ class Record:
         self.size = self._layout.size
 
     def read(self, path: Path, entry: str, i: int, data: bytes, at: int) -> tuple[Any, ...]:
-        """The values of the record at byte `at`; `entry` and `i` say which it is: "camera", 3.
-
-        Raises:
-            InputError: the data end within it; names the column.
-        """
+        """Return the values at byte `at`; `entry` and `i`, such as "camera" and 3, are for errors."""
         try:
             return self._layout.unpack_from(data, at)
         except struct.error:
@@ -44,11 +40,7 @@ class Record:
             ) from None
 
     def read_finite(self, path: Path, entry: str, i: int, data: bytes, at: int) -> tuple[Any, ...]:
-        """As `read`.
-
-        Raises:
-            InputError: as `read`, and where a value is NaN or infinite; names the column.
-        """
+        """Return the values as `read` does, or raise an `InputError` if one is not finite."""
         values = self.read(path, entry, i, data, at)
         for name, value in zip(self._names, values, strict=True):
             if not math.isfinite(value):

@@ -1,4 +1,4 @@
-"""The one gate every scene passes on its way in: non-finite rows go, infinities that mean something stay."""
+"""Cleaning of scenes after reading: drop non-finite rows, clamp extreme values."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from g2ard.progress import plural
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
 
 BLOCK = 8192
-"""Rows handled at a time: 60 float32 columns of them are 2 MB and stay in the cache."""
+"""Rows per block: 2 MB for 60 float32 columns, which fits into the cache."""
 
 LOGIT_LIMIT = 16.0
-"""Logits past this are clamped to it: sigmoid(16) = 1 − 1.1e-7, far past the 0.99 at which a rasteriser clips
-and far within an 8-bit step of 1, while −log(1 − α) is still exact enough in float32."""
+"""Limit of logits: sigmoid(16) = 1 − 1.1e-7 is above the rasteriser's clip at 0.99 and within an 8-bit step
+of 1, and −log(1 − α) is still accurate in float32."""
 
 LOG_SCALE_LIMIT = 43.0
-"""exp(43)² = 2.2e37 and exp(−43)² = 4.5e-38 are the last squares that are normal float32."""
+"""Limit of log-scales: exp(43)² = 2.2e37 and exp(−43)² = 4.5e-38 are still normal float32."""
 
 
 @dataclass
 class Raw:
-    """A scene as files store it: logarithmic scales, logits; every array float32, C-contiguous, writable."""
+    """A scene as stored in files: log-scales and logits, in writable C-contiguous float32 arrays."""
 
     means: NDArray[np.float32]
     quats: NDArray[np.float32]
@@ -39,7 +39,7 @@ class Raw:
 
     @classmethod
     def empty(cls, count: int, rest: int) -> Raw:
-        """Room for `count` Gaussians with `rest` higher-band coefficients each."""
+        """Allocate `count` Gaussians with `rest` coefficients past band 0."""
 
         def room(*shape: int) -> NDArray[np.float32]:
             return np.empty((count, *shape), np.float32)
@@ -47,7 +47,7 @@ class Raw:
         return cls(room(3), room(4), room(3), room(), room(1, 3), room(rest, 3), np.zeros(3))
 
     def take(self, rows: slice) -> Raw:
-        """A view of some rows."""
+        """Return a view of some rows."""
         return Raw(
             self.means[rows],
             self.quats[rows],
@@ -59,21 +59,18 @@ class Raw:
         )
 
     def activated(self) -> Splats:
-        """The scene, once `Tally.clean` has exponentiated `log_scales` in place."""
+        """Return the scene, after `Tally.clean` has exponentiated `log_scales` in place."""
         return Splats(
             self.means, self.quats, self.log_scales, self.logit_opacities, self.sh0, self.shN, self.offset
         )
 
 
 def cleaned(path: Path, raw: Raw, notes: list[Note] | None = None) -> Scene:
-    """Check, clamp and activate what a reader found. `raw` is consumed: its arrays become the scene's.
+    """Check, clamp and activate a scene, whose arrays become those of the result.
 
-    Rows with a NaN, or with an infinity where none has a meaning, are dropped and counted. Infinite or
-    extreme logits (|x| > 16) and log-scales (|x| > 43) are clamped, quaternions of length zero become
-    the identity; both counted. A scene of which nothing shows is noted.
-
-    Raises:
-        InputError: no row is left.
+    Rows with NaN or meaningless infinities are dropped. Logits (|x| > 16) and log-scales (|x| > 43) are
+    clamped, and quaternions of length zero become the identity. Notes count all changes, and tell if the
+    whole scene is invisible.
     """
     count = len(raw.means)
     keep, tally = np.ones(count, bool), Tally()
@@ -87,7 +84,7 @@ def cleaned(path: Path, raw: Raw, notes: list[Note] | None = None) -> Scene:
 
 @dataclass
 class Tally:
-    """Counts of what was dropped, clamped and mended in the rows so far, of a scene taken in blocks."""
+    """Counts of dropped, clamped and repaired values over the blocks of a scene."""
 
     rows: int = 0
     dropped: int = 0
@@ -98,11 +95,7 @@ class Tally:
     brightest: float = -LOGIT_LIMIT
 
     def clean(self, raw: Raw) -> NDArray[np.bool_]:
-        """Clamp and activate the next rows in place, so that `raw.log_scales` hold linear scales.
-
-        Returns:
-            (N,) which rows are to be kept.
-        """
+        """Clamp and activate rows in place, making `log_scales` linear; return an (N,) mask to keep."""
         logits, scales, quats = raw.logit_opacities, raw.log_scales, raw.quats
         good = ~np.isnan(logits) & ~(np.isnan(scales) | (scales == np.inf)).any(1)
         for values in (raw.means, quats, raw.sh0, raw.shN):
@@ -126,17 +119,14 @@ class Tally:
         return good
 
     def notes(self, path: Path) -> list[Note]:
-        """What was done to all rows.
-
-        Raises:
-            InputError: there were none, or none is left.
-        """
+        """Return notes on all rows; raise an `InputError` if none remains."""
         if not self.rows:
-            raise InputError("holds no Gaussians", path=path)
+            raise InputError("has no Gaussians", path=path)
         if self.dropped == self.rows:
             raise InputError(
-                f"none of its {plural(self.rows, 'Gaussian')} is finite; take an earlier state of it",
+                f"none of its {plural(self.rows, 'Gaussian')} is finite",
                 path=path,
+                hint="use an earlier checkpoint of the training",
             )
         notes = []
         if self.dropped:
@@ -151,7 +141,7 @@ class Tally:
                 notes.append(Note(code, count, f"{plural(count, what)} {then}"))
         if self.brightest < DRAWN_LOGIT:
             left = self.rows - self.dropped
-            notes.append(Note("invisible", left, "nothing of it shows: every α is below 1/255"))
+            notes.append(Note("invisible", left, "the scene is invisible: every opacity is below 1/255"))
         return notes
 
 

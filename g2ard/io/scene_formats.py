@@ -1,4 +1,4 @@
-"""Which writer a scene's path names: by its suffix, in any case, or by meta.json for a SOG folder."""
+"""Writers of scenes by suffix, in any case, or by meta.json for a SOG folder."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from g2ard.errors import OutputError
 
 
 class SceneFormat(NamedTuple):
-    """A format that scenes are written in.
+    """A format to write scenes in.
 
     Args:
-        suffix: that names it.
-        module: in `g2ard.io`, with `write` or what `function` says.
-        function: `fn(path, splats, *, overwrite, **options)`.
-        options: what it takes beside.
+        suffix: suffix of its files.
+        module: its module in `g2ard.io`.
+        function: the writer in the module, `fn(path, splats, *, overwrite, **options)`.
+        options: names of its options.
     """
 
     suffix: str
@@ -33,16 +33,13 @@ FORMATS: dict[FormatName, SceneFormat] = {
     "glb": SceneFormat(".glb", "glb"),
     "splat": SceneFormat(".splat", "splat"),
 }
-"""By name, the longer suffixes first."""
+"""Formats by name, longer suffixes first."""
 
 _FOLDER = SceneFormat("meta.json", "sog_write", "write_folder")
 
 
 def scene_format(path: str | Path) -> SceneFormat:
-    """The format that a path to write names.
-
-    Raises:
-        OutputError: it names none.
+    """Return the format of an output path, or raise an `OutputError` if it is unsupported.
 
     >>> scene_format("a.COMPRESSED.PLY").module, scene_format("room/meta.json").function
     ('compressed_ply', 'write_folder')
@@ -58,11 +55,7 @@ def scene_format(path: str | Path) -> SceneFormat:
 
 
 def check_options(path: str | Path, options: dict[str, object]) -> SceneFormat:
-    """`scene_format`, if it takes these options.
-
-    Raises:
-        OutputError: it does not.
-    """
+    """Return the format of an output path, or raise an `OutputError` if it lacks one of the options."""
     found = scene_format(path)
     for name in options:
         if name not in found.options:

@@ -1,7 +1,7 @@
-"""The settings that trainers leave beside a model as YAML with Python's tags: of those, words and paths.
+"""Reader for words and paths in trainers' settings, YAML with Python tags.
 
-What PyYAML writes of dataclasses is read line by line: `key: value`, a block below a key, and paths as
-`!!python/object/apply:pathlib.PosixPath` with a part an item. It is no reader of YAML at large.
+It only supports what PyYAML writes for dataclasses: `key: value`, nested blocks, and
+`!!python/object/apply:pathlib.PosixPath` with a list of parts.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ _PATH = re.compile(r"(?:&(?P<anchor>\w+)\s+)?!!python/object/apply:pathlib\.(?P<
 
 
 class Settings:
-    """One block of settings.
+    """A block of settings.
 
     Args:
         lines: all lines of the file.
-        first: the block's first line.
+        first: index of the block's first line.
         indent: spaces before its keys.
     """
 
@@ -28,12 +28,12 @@ class Settings:
         self._lines, self._first, self._indent = lines, first, indent
 
     def word(self, key: str) -> str | None:
-        """The value of a key as text, without quotes; None where it is absent, null, empty or an object."""
+        """Return a value as text without quotes; None if it is missing, null, empty or an object."""
         at = self._find(key)
         text = "" if at is None else self._text(at, key)
         if at is None or text[:1] in ("", *"!&*[{"):
             return None
-        for line in self._lines[at + 1 :]:  # a long value goes on in deeper lines
+        for line in self._lines[at + 1 :]:  # continuation lines are indented
             if _indent(line) <= self._indent or not line.strip():
                 break
             text += " " + line.strip()
@@ -41,7 +41,7 @@ class Settings:
         return None if text in ("null", "~") else text
 
     def path(self, key: str) -> Path | None:
-        """The value of a key as a path; None where it is absent, null or empty."""
+        """Return a value as a path; None if it is missing, null or empty."""
         at = self._find(key)
         if at is None:
             return None
@@ -59,7 +59,7 @@ class Settings:
         return Path(pure(*parts).as_posix()) if parts else None
 
     def block(self, key: str) -> tuple[str, Settings] | None:
-        """The tag of a key (what it is an object of) and what stands below it; None where it is absent."""
+        """Return a key's tag (the class of the object) and its block; None if it is missing."""
         at = self._find(key)
         if at is None:
             return None
@@ -88,11 +88,7 @@ class Settings:
 
 
 def read_settings(path: Path) -> Settings:
-    """The settings in a file.
-
-    Raises:
-        InputError: it is absent or no text.
-    """
+    """Read a file of settings."""
     try:
         return Settings(path.read_text(encoding="utf-8").splitlines())
     except OSError as error:
@@ -102,8 +98,10 @@ def read_settings(path: Path) -> Settings:
 
 
 def below(start: Path, path: Path) -> Path | None:
-    """Where a path that a trainer wrote into `start` leads to now, or None: trainers write paths relative to
-    where they ran, mostly a folder above their output."""
+    """Resolve a path that a trainer wrote into `start`, or return None if it does not exist.
+
+    Trainers write paths relative to where they ran, usually a folder above their output.
+    """
     if path.is_absolute():
         return path if path.exists() else None
     places = (*real_path(start).parents, Path())

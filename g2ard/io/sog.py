@@ -1,7 +1,7 @@
-"""SOG scenes (PlayCanvas): a meta.json and lossless images, in a folder, in several, or zipped as .sog.
+"""Reader for SOG scenes (PlayCanvas): a meta.json and lossless images, in folders or zipped as .sog.
 
-A folder may hold one scene as spatial chunks, named `{lod}_{chunk}` or listed by a lod-meta.json. Levels of
-detail are alternatives, not parts: only the finest is read.
+A folder may hold a scene in spatial chunks, named `{lod}_{chunk}` or listed by a lod-meta.json. Only the
+finest level of detail is read.
 """
 
 from __future__ import annotations
@@ -37,16 +37,13 @@ from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.sog_chunk import Chunk, Decoder, count_of, means_of, rest_of
 from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Note, Scene
+from g2ard.progress import plural
 
 _CHUNK_NAME = re.compile(r"(\d+)_(\d+)")
 
 
 def chunks_of(path: Path) -> list[Path]:
-    """The folders whose meta.json together are the scene at `path`, finest level only; [] if there are none.
-
-    Raises:
-        InputError: lod-meta.json is broken or names a chunk that is absent.
-    """
+    """Return the folders of a scene's chunks at the finest level; [] if `path` is not a SOG scene."""
     if path.is_file():
         path = path.parent if path.name == "meta.json" else path
     if (path / "meta.json").is_file():
@@ -65,7 +62,7 @@ def chunks_of(path: Path) -> list[Path]:
 
 
 def _listed(index: Path) -> list[Path]:
-    """The chunks that lod-meta.json's tree uses at level 0, in the order of its list."""
+    """Return the chunks that lod-meta.json's tree uses at level 0, in the order of its list."""
     content = fields_of(index, read_json(index))
     names = names_of(content, "filenames", len(listed(content, "filenames")))
     files = [index.parent / Path(name).parent for name in names]
@@ -82,17 +79,14 @@ def _listed(index: Path) -> list[Path]:
         except OSError as error:  # a name too long
             raise content.place.to("filenames").to(i).error(f"cannot be found ({error.strerror})") from error
         if not there:
-            raise content.place.to("filenames").to(i).error(f"names {names[i]}, which is absent")
+            raise content.place.to("filenames").to(i).error(f"is {names[i]}, which does not exist")
     return [files[i] for i in sorted(used)]
 
 
 def read(path: Path) -> Scene:
     """Read a SOG scene, version 1 or 2: a .sog, a meta.json or its folder, or a folder of chunks.
 
-    Chunks of different SH degrees are padded with zeros to the highest.
-
-    Raises:
-        InputError: a part is missing or broken, or nothing in it is finite.
+    Chunks are padded with zeros to the highest SH degree.
     """
     with _opened(path) as chunks:
         counts = [count_of(chunk) for chunk in chunks]
@@ -106,11 +100,7 @@ def read(path: Path) -> Scene:
 
 
 def stream(path: Path) -> SceneStream:
-    """The same scene chunk by chunk: of one chunk at a time the images are held, 20 to 28 bytes a Gaussian.
-
-    Raises:
-        InputError: a part is missing or broken; images are looked at later.
-    """
+    """Open a scene for reading by chunk; memory holds a chunk's images, 20 to 28 bytes per Gaussian."""
     with _opened(path) as chunks:
         counts = [count_of(chunk) for chunk in chunks]
         rest = max(map(rest_of, chunks), default=0)
@@ -122,7 +112,7 @@ def stream(path: Path) -> SceneStream:
 
 
 def _offset(chunks: list[Chunk]) -> NDArray[np.float64]:
-    """What g2ard's own writer left under "g2ard"; zeros without it, or where chunks differ."""
+    """Return the offset that g2ard stored under "g2ard"; zeros if it is missing or chunks differ."""
     found = set()
     for chunk in chunks:
         own = object_of(chunk.meta, "g2ard") if "g2ard" in chunk.meta else Fields({})
@@ -131,26 +121,26 @@ def _offset(chunks: list[Chunk]) -> NDArray[np.float64]:
 
 
 def _left_out(path: Path, read_count: int) -> list[Note]:
-    """Say that coarser levels, or an environment, lie beside the chunks that were read."""
+    """Note coarser levels or an environment beside the chunks."""
     folder = path if path.is_dir() else path.parent
     if path.suffix.lower() == ".sog" or (folder / "meta.json").is_file():
         return []
     others = len(list(folder.glob("*/meta.json"))) - read_count
-    text = f"{others} other SOG folder(s) left out (coarser levels of detail, environment)"
+    text = f"{plural(others, 'other SOG folder')} ignored (coarser levels of detail, environment)"
     return [Note("ignored_chunks", others, text)] if others > 0 else []
 
 
 class _SogStream(SceneStream):
-    """A scene of one or many chunks; blocks end where chunks do.
+    """Scene of one or more chunks; blocks do not cross chunks.
 
     Args:
-        path: names the scene.
-        counts: Gaussians of each chunk.
-        rest: coefficients past band 0, the most of any chunk.
+        path: path for messages.
+        counts: Gaussians per chunk.
+        rest: largest number of coefficients past band 0.
         offset: (3,) float64.
-        notes: what was noticed so far.
-        files: what the scene is made of.
-        opened: gives the chunks, open to be read.
+        notes: notes so far.
+        files: files of the scene.
+        opened: function that opens the chunks.
     """
 
     def __init__(
@@ -201,7 +191,7 @@ def _opened(path: Path) -> Iterator[list[Chunk]]:
         with zipfile.ZipFile(path) as bundle:
             inside = [name for name in bundle.namelist() if name.rpartition("/")[2] == "meta.json"]
             if not inside:
-                raise InputError("no meta.json in it", path=path)
+                raise InputError("has no meta.json", path=path)
             prefix = min(inside, key=len).removesuffix("meta.json")
             load = _bundle_loader(path, bundle, prefix)
             file = path / "meta.json"
@@ -209,11 +199,11 @@ def _opened(path: Path) -> Iterator[list[Chunk]]:
     except InputError:
         raise
     except (zipfile.BadZipFile, EOFError, OSError, ValueError, struct.error, OverflowError) as error:
-        raise InputError(f"not a whole .sog archive ({error})", path=path, hint=DAMAGED) from error
+        raise InputError(f"is not a complete .sog archive ({error})", path=path, hint=DAMAGED) from error
 
 
 def _bundle_loader(path: Path, bundle: zipfile.ZipFile, prefix: str) -> Callable[[str], bytes]:
-    """Reads a file of the archive: whole, and of a size within `check_unpacked`."""
+    """Return a function that reads a file of the archive within `check_unpacked`."""
 
     def load(name: str) -> bytes:
         info = bundle.getinfo(prefix + name)
@@ -221,7 +211,7 @@ def _bundle_loader(path: Path, bundle: zipfile.ZipFile, prefix: str) -> Callable
         try:
             return bundle.read(info)
         except (zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError, zlib.error) as error:
-            raise InputError(f"not whole in the archive ({error})", path=path / name) from error
+            raise InputError(f"is damaged in the archive ({error})", path=path / name) from error
 
     return load
 

@@ -1,4 +1,4 @@
-"""One chunk of a SOG scene: its meta.json, its images, and the Gaussians they stand for."""
+"""Decoder for a chunk of a SOG scene: a meta.json and images."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 _COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
 _LARGEST = float.fromhex("0x1.fffffep+127")
-"""Of float32."""
+"""Largest float32."""
 _LARGEST_LOG = math.log1p(_LARGEST)
 _PALETTE_COLUMNS = 64
-"""Entries of the SH palette beside each other in one row of its image."""
+"""Entries of the SH palette per row of its image."""
 
 
 class Chunk(NamedTuple):
-    """One meta.json, the folder or archive it is in, and how to read the files beside it."""
+    """A meta.json, its folder or archive, and a function that reads files beside it."""
 
     place: Path
     meta: Fields
@@ -42,7 +42,7 @@ def count_of(chunk: Chunk) -> int:
     means = object_of(chunk.meta, "means")
     (first,) = names_of(means, "files", 1)
     count = whole(chunk.meta, "count") if version == 2 else whole(listed(means, "shape"), 0)
-    with _opened_image(chunk, first) as image:  # before room is made for them
+    with _opened_image(chunk, first) as image:  # before allocating memory
         if image.width * image.height < count:
             pixels = image.width * image.height
             raise InputError(f"has {pixels:,} pixels for {count:,} Gaussians", path=chunk.place / first)
@@ -50,7 +50,7 @@ def count_of(chunk: Chunk) -> int:
 
 
 def rest_of(chunk: Chunk) -> int:
-    """How many coefficients past band 0; version 1 tells only by the width of its palette image."""
+    """Return the number of coefficients past band 0; version 1 only implies it by the palette's width."""
     if "shN" not in chunk.meta:
         return 0
     if "bands" in (part := object_of(chunk.meta, "shN")):
@@ -60,7 +60,7 @@ def rest_of(chunk: Chunk) -> int:
     file = _sh_files(chunk)[0]
     rest, left = divmod(_image(chunk, file).shape[1], _PALETTE_COLUMNS)
     if left or rest not in _COEFFICIENTS.values():
-        raise InputError("is not as wide as a palette of SH degree 1 to 3", path=chunk.place / file)
+        raise InputError("does not have the width of a palette of SH degree 1 to 3", path=chunk.place / file)
     return rest
 
 
@@ -89,7 +89,7 @@ def _opened_image(chunk: Chunk, name: str) -> Iterator[Image]:
 
 
 def _image(chunk: Chunk, name: str) -> NDArray[np.uint8]:
-    """(height, width, 4) bytes."""
+    """Return (height, width, 4) bytes."""
     import numpy as np
 
     with _opened_image(chunk, name) as image:
@@ -97,7 +97,7 @@ def _image(chunk: Chunk, name: str) -> NDArray[np.uint8]:
 
 
 def _rows(chunk: Chunk, name: str, count: int) -> NDArray[np.uint8]:
-    """(count, 4) bytes, one pixel a Gaussian."""
+    """Return (count, 4) bytes, one pixel per Gaussian."""
     pixels = _image(chunk, name).reshape(-1, 4)
     if len(pixels) < count:
         raise InputError(f"has {len(pixels):,} pixels for {count:,} Gaussians", path=chunk.place / name)
@@ -105,11 +105,7 @@ def _rows(chunk: Chunk, name: str, count: int) -> NDArray[np.uint8]:
 
 
 class Decoder:
-    """A chunk's images, 20 to 28 bytes a Gaussian, and the tables that its bytes are looked up in.
-
-    Raises:
-        InputError: a part is missing or broken.
-    """
+    """Images of a chunk, 20 to 28 bytes per Gaussian, and the lookup tables of their bytes."""
 
     def __init__(self, chunk: Chunk, count: int) -> None:
         meta, self.chunk = chunk.meta, chunk
@@ -127,7 +123,7 @@ class Decoder:
             self._palette, self._labels = _palette(chunk, self._rest, count)
 
     def fill(self, rows: slice, raw: Raw) -> None:
-        """Decode the Gaussians `rows` into `raw`, in blocks that stay in the cache."""
+        """Decode the Gaussians `rows` into `raw` in blocks that fit into the cache."""
         from g2ard.io.sanitize import BLOCK
 
         for start in range(rows.start, rows.stop, BLOCK):
@@ -145,14 +141,14 @@ class Decoder:
             self._fill_rest(rows, raw.shN)
 
     def _fill_rest(self, rows: slice, out: NDArray[np.float32]) -> None:
-        """Each Gaussian's label picks a palette entry."""
+        """Look up palette entries by label."""
         import numpy as np
 
         index = self._labels[rows, 0] + (self._labels[rows, 1].astype(np.intp) << 8)
         if index.max() >= len(self._palette):
             row = int(np.argmax(index >= len(self._palette)))
             raise InputError(
-                f"names entry {index[row]} of {len(self._palette)}",
+                f"has palette entry {index[row]} of {len(self._palette)}",
                 path=self.chunk.place / _sh_files(self.chunk)[1],
                 index=rows.start + row,
                 item="Gaussian",
@@ -161,11 +157,7 @@ class Decoder:
 
 
 def means_of(chunk: Chunk, count: int) -> NDArray[np.float32]:
-    """(count, 3) means alone.
-
-    Raises:
-        InputError: a part is missing or broken.
-    """
+    """Decode only the (count, 3) means."""
     import numpy as np
 
     part = object_of(chunk.meta, "means")
@@ -178,13 +170,13 @@ def means_of(chunk: Chunk, count: int) -> NDArray[np.float32]:
 def _fill_means(
     out: NDArray[np.float32], low: NDArray[np.uint8], high: NDArray[np.uint8], positions: NDArray[Any]
 ) -> None:
-    """Positions of 16-bit codes, a byte in each of two images."""
+    """Decode positions from 16-bit codes, a byte from each of two images."""
     for axis in range(3):
         out[:, axis] = positions[axis][low[:, axis] + (high[:, axis].astype(int) << 8)]
 
 
 def _positions(part: Fields) -> NDArray[Any]:
-    """(3, 65536) what each code stands for on each axis; stored as sign(x)·ln(|x| + 1)."""
+    """Return the (3, 65536) values of codes per axis, which are stored as sign(x)·ln(|x| + 1)."""
     import numpy as np
 
     low, high = (_bound(part, end, slice(3), _LARGEST_LOG) for end in ("mins", "maxs"))
@@ -193,7 +185,7 @@ def _positions(part: Fields) -> NDArray[Any]:
 
 
 def _logits(part: Fields) -> NDArray[Any]:
-    """(256,) what each byte of opacity stands for: an α (version 2), or a logit (version 1)."""
+    """Return the (256,) logits of opacity bytes, which are α in version 2 and logits in version 1."""
     import numpy as np
 
     alpha = np.arange(256) / 255
@@ -205,7 +197,7 @@ def _logits(part: Fields) -> NDArray[Any]:
 
 
 class _Values:
-    """What bytes stand for: by codebook (version 2), or between mins and maxs (version 1)."""
+    """Values of bytes: from a codebook (version 2), or between mins and maxs (version 1)."""
 
     def __init__(self, part: Fields) -> None:
         import numpy as np
@@ -229,7 +221,7 @@ class _Values:
 
 
 def _bound(part: Fields, key: str, channels: slice | int, most: float = _LARGEST) -> NDArray[Any]:
-    """One number for all channels, or a list of one each, opacity's the fourth."""
+    """Return a bound: one number for all channels, or a list per channel with opacity as the fourth."""
     import numpy as np
 
     if not isinstance(value := part[key], list):
@@ -240,13 +232,13 @@ def _bound(part: Fields, key: str, channels: slice | int, most: float = _LARGEST
 
 
 def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:
-    """(N, 4) wxyz: three components in ±1/√2; the fourth byte − 252 says which is left out, the largest.
+    """Decode (N, 4) wxyz: three components in ±1/√2; the fourth byte − 252 is the index of the largest.
 
-    Any other fourth byte gives a zero quaternion, which is counted and made the identity later.
+    Other fourth bytes give a zero quaternion, which later becomes the identity, with a note.
     """
     import numpy as np
 
-    parts = np.zeros((len(codes), 5))  # the three, the largest, and nothing
+    parts = np.zeros((len(codes), 5))  # three components, the largest, zero
     parts[:, :3] = (codes[:, :3] / 255 - 0.5) * np.sqrt(2)
     parts[:, 3] = np.sqrt(np.maximum(0, 1 - (parts[:, :3] ** 2).sum(1)))
     source = np.full((256, 4), 4)
@@ -256,14 +248,14 @@ def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:
 
 
 def _palette(chunk: Chunk, rest: int, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """(entries, K−1, 3) coefficients, whose bytes pick values, and the image of labels."""
+    """Return the (entries, K−1, 3) coefficients of the palette, and the labels."""
     import numpy as np
 
     centroids, labels = _sh_files(chunk)
     image = _image(chunk, centroids)
     if image.shape[1] != _PALETTE_COLUMNS * rest:
         raise InputError(
-            f"is {image.shape[1]} wide, not {_PALETTE_COLUMNS * rest}", path=chunk.place / centroids
+            f"has width {image.shape[1]}, expected {_PALETTE_COLUMNS * rest}", path=chunk.place / centroids
         )
     values = _Values(object_of(chunk.meta, "shN"))
     palette = values.of(image[:, :, :3].reshape(-1, rest, 3)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Writing SOG, version 2 (PlayCanvas): codes of each attribute as pixels of lossless images.
+"""Writer for SOG version 2 (PlayCanvas): attributes as pixels of lossless images.
 
 | attribute | code |
 |---|---|
@@ -27,22 +27,17 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
 _COLUMNS = 64
-"""Entries of the palette beside each other in a row of its image."""
+"""Entries of the palette per row of its image."""
 
 _LONGEST = 16_383
-"""Pixels: WebP holds no longer side."""
+"""Longest side of a WebP image, pixels."""
 
 _STEPS = 6
-"""Of k-means after the split: 10 more gain 0.01 dB on the guitar."""
+"""Steps of k-means after the split; 10 more gain 0.01 dB."""
 
 
 def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
-    """Write a .sog: the files of `sog_files`, zipped without further packing; equal scenes give equal bytes.
-
-    Raises:
-        OutputError: see `atomic_output`.
-        InputError: the scene is empty, has a non-finite value, or more Gaussians than images hold.
-    """
+    """Write a .sog: the files of `sog_files`, zipped without compression; equal scenes give equal bytes."""
     from g2ard.io.atomic import atomic_output
 
     with atomic_output(path, overwrite) as temporary:
@@ -50,11 +45,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
 
 
 def sog_bytes(path: Path, splats: Splats) -> bytes:
-    """What `write` writes; `path` names the scene in messages.
-
-    Raises:
-        InputError: as `write`.
-    """
+    """Return the bytes of a .sog; `path` is for messages."""
     room = io.BytesIO()
     with zipfile.ZipFile(room, "w") as bundle:
         for name, content in sog_files(path, splats).items():
@@ -63,12 +54,7 @@ def sog_bytes(path: Path, splats: Splats) -> bytes:
 
 
 def write_folder(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
-    """Write the folder of `path`, a meta.json, with its images beside.
-
-    Raises:
-        OutputError: see `atomic_folder`.
-        InputError: as `write`.
-    """
+    """Write `path`, a meta.json, and its images beside it."""
     from g2ard.io.atomic import atomic_folder
 
     with atomic_folder(path.parent, overwrite) as temporary:
@@ -77,7 +63,7 @@ def write_folder(path: Path, splats: Splats, *, overwrite: bool = False) -> None
 
 
 def palette_size(count: int) -> int:
-    """K, the most entries that N Gaussians' harmonics get: min(64, 2^⌊log₂(N/1024)⌋)·1024.
+    """Return the largest palette for the harmonics of N Gaussians: min(64, 2^⌊log₂(N/1024)⌋)·1024.
 
     >>> palette_size(1), palette_size(100_000), palette_size(9_000)
     (1, 65536, 8192)
@@ -86,13 +72,9 @@ def palette_size(count: int) -> int:
 
 
 def sog_files(path: Path, splats: Splats, *, ordered: bool = False) -> dict[str, bytes]:
-    """The files of a scene by name, meta.json last; rows in Morton order, or `ordered` as they are.
+    """Return the files of a scene by name, meta.json last; rows in Morton order unless already `ordered`.
 
-    An `offset` is kept under "g2ard" in meta.json, which `read` restores; other programs see the recentred
-    scene.
-
-    Raises:
-        InputError: as `write`.
+    An `offset` is stored under "g2ard" in meta.json; other programs show the recentred scene.
     """
     import numpy as np
 
@@ -141,11 +123,11 @@ def sog_files(path: Path, splats: Splats, *, ordered: bool = False) -> dict[str,
 
 
 def _size(path: Path, count: int) -> tuple[int, int]:
-    """Width and height of an image of `count` pixels, multiples of 4."""
+    """Return width and height, multiples of 4, of an image of `count` pixels."""
     width = math.ceil(math.sqrt(count) / 4) * 4
     height = math.ceil(count / width / 4) * 4
     if max(width, height) > _LONGEST:
-        raise InputError(f"not written: {count:,} Gaussians are more than an image of SOG holds", path=path)
+        raise InputError(f"not written: {count:,} Gaussians exceed the largest SOG image", path=path)
     return width, height
 
 
@@ -156,13 +138,13 @@ def _webp(pixels: NDArray[np.uint8]) -> bytes:
     )
 
     buffer = io.BytesIO()
-    # exact: without it the colours of pixels of A = 0, which are codes, would be lost
+    # exact keeps the colours of pixels with A = 0, which are codes
     Image.fromarray(pixels).save(buffer, "WEBP", lossless=True, exact=True, quality=50, method=2)
     return buffer.getvalue()
 
 
 def _means(splats: Splats) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Bounds of each axis of the logarithms, and (N, 3) codes of 16 bits between them."""
+    """Return the bounds of the logarithms per axis, and (N, 3) 16-bit codes between them."""
     import numpy as np
 
     from g2ard.io.packing import coded
@@ -174,7 +156,7 @@ def _means(splats: Splats) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
 
 
 def _numbers(values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-    """A codebook of 256 and of every value the nearest entry."""
+    """Return a codebook of 256 entries, and the nearest entry of every value."""
     import numpy as np
 
     from g2ard import _core
@@ -185,7 +167,7 @@ def _numbers(values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.intp
 
 
 def nearest(book: NDArray[np.float32], values: NDArray[np.float32]) -> NDArray[np.intp]:
-    """The entry of an ascending codebook nearest to each value."""
+    """Return the entry of an ascending codebook nearest to each value."""
     import numpy as np
 
     wide = book.astype(np.float64)
@@ -193,8 +175,10 @@ def nearest(book: NDArray[np.float32], values: NDArray[np.float32]) -> NDArray[n
 
 
 def _weights(splats: Splats) -> NDArray[np.float32]:
-    """(N,) √(α·A) over its mean, A the product of the two longer scales: what shows more is kept truer. The
-    root gains .35 dB over no weights on a scene at a tenth, α·A itself nothing."""
+    """Return (N,) weights √(α·A) over their mean, A the product of the two larger scales.
+
+    The root gains 0.35 dB over equal weights on a scene at 10×; α·A itself gains nothing.
+    """
     import numpy as np
 
     longer = np.sort(splats.scales.astype(np.float64), axis=1)[:, 1:].prod(axis=1)
@@ -204,7 +188,7 @@ def _weights(splats: Splats) -> NDArray[np.float32]:
 
 
 def _rest(splats: Splats) -> tuple[int, NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint32]]:
-    """K, the codebook, the image of the palette, and (N,) each Gaussian's entry."""
+    """Return the palette's size, codebook and image, and the (N,) entries of Gaussians."""
     import numpy as np
 
     from g2ard import _core

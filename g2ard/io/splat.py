@@ -1,4 +1,4 @@
-"""antimatter15's .splat: 32 bytes a Gaussian, no header, no harmonics past band 0."""
+"""Reader and writer for antimatter15's .splat: 32 bytes per Gaussian, no header, SH degree 0."""
 
 from __future__ import annotations
 
@@ -21,20 +21,12 @@ _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("q
 
 
 def read(path: Path) -> Scene:
-    """Read a .splat: linear scales, 8-bit colour and opacity, quaternions as bytes around 128.
-
-    Raises:
-        InputError: the size is not a multiple of 32, or nothing in it is finite.
-    """
+    """Read a .splat: linear scales, 8-bit colour and opacity, quaternions as bytes around 128."""
     return cleaned(path, _raw(np.fromfile(path, _ROW, _count(path))))
 
 
 def stream(path: Path) -> SceneStream:
-    """The same scene in blocks.
-
-    Raises:
-        InputError: the size is not a multiple of 32.
-    """
+    """Open a scene for reading in blocks."""
     return _SplatStream(path)
 
 
@@ -49,7 +41,7 @@ class _SplatStream(SceneStream):
         for first in range(start, self.count, rows):
             block = np.fromfile(self.path, _ROW, rows, offset=first * _ROW.itemsize)
             if len(block) < min(rows, self.count - first):
-                raise InputError("became shorter while it was read", path=self.path)
+                raise InputError("was truncated while it was read", path=self.path)
             yield _raw(block)
 
 
@@ -57,7 +49,7 @@ def _count(path: Path) -> int:
     size = path.stat().st_size
     if not size or size % _ROW.itemsize:
         raise InputError(
-            f"not a whole .splat: {size:,} bytes are not a multiple of 32", path=path, hint=DAMAGED
+            f"is not a complete .splat: {size:,} bytes are not a multiple of 32", path=path, hint=DAMAGED
         )
     return size // _ROW.itemsize
 
@@ -65,7 +57,9 @@ def _count(path: Path) -> int:
 def _raw(rows: NDArray[Any]) -> Raw:
     raw = Raw.empty(len(rows), 0)
     raw.means[:] = rows["mean"]
-    with np.errstate(divide="ignore", invalid="ignore"):  # a negative scale becomes NaN: the row is dropped
+    with np.errstate(
+        divide="ignore", invalid="ignore"
+    ):  # rows with a negative scale become NaN and are dropped
         raw.log_scales[:] = np.log(rows["scale"].astype(np.float64))
         alphas = rows["rgba"][:, 3] / 255
         raw.logit_opacities[:] = np.log(alphas) - np.log1p(-alphas)
@@ -75,12 +69,7 @@ def _raw(rows: NDArray[Any]) -> Raw:
 
 
 def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
-    """Write a .splat, biggest and most opaque first as its viewers expect; bands past 0 are lost.
-
-    Raises:
-        OutputError: see `atomic_output`.
-        InputError: the scene is empty, has a non-finite value, or an offset that float32 does not hold.
-    """
+    """Write a .splat, largest and most opaque first as its viewers expect; bands past 0 are dropped."""
     splats = writable(path, splats)
     weight = splats.scales.astype(np.float64).prod(1) * splats.opacities
     splats = splats.take(np.argsort(-weight, kind="stable"))

@@ -1,6 +1,6 @@
-"""Niantic's .spz: 8-bit attributes, gzipped as a whole (versions 2, 3) or in Zstandard frames (version 4).
+"""Reader and writer for Niantic's .spz: 8-bit attributes, gzipped (versions 2, 3) or in Zstandard (4).
 
-SPZ stores right-up-back axes; a 3DGS .ply is right-down-forward. Both y and z change sign, and with them the
+SPZ has right-up-back axes; a 3DGS .ply has right-down-forward. Therefore y and z change sign, as do the
 quaternion's y and z and every harmonic odd in them.
 """
 
@@ -36,36 +36,29 @@ from g2ard.scene.splats import Splats
 
 _MAGIC = b"NGSP"
 _HEADER = 16
-"""Bytes."""
+"""Size of the header, bytes."""
 
 _POSITION_BITS = 24
 _COEFFICIENTS = (0, 3, 8, 15, 24)
 _HAS_EXTENSIONS = 0x2
 _COLOR_SCALE = 0.15
-"""SPZ's own factor for band 0, wider than the harmonic's so that colours past [0, 1] survive."""
+"""SPZ's factor for band 0, which leaves room for colours outside [0, 1]."""
 
 FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 """Sign of each harmonic of bands 1–3 when y and z change sign (PLY order: y z x | xy yz z² xz x²−y² | …)."""
 
 _USUAL_BITS, _MOST_BITS = 12, 20
 _BUCKETS = (8, 16)
-"""Steps that band 1, and bands past it, are rounded to: 5 and 4 of their 8 bits, as SPZ's own packer does."""
+"""Rounding steps of band 1 and of higher bands, 5 and 4 of 8 bits, as in SPZ's packer."""
 
 
 def read(path: Path) -> Scene:
-    """Read an .spz of version 2, 3 or 4; bands past degree 3 are ignored and noted.
-
-    Raises:
-        InputError: not an SPZ, an unknown version, truncated, or nothing in it finite.
-        MissingDependencyError: version 4 before Python 3.14 without `pip install backports.zstd`.
-    """
+    """Read an .spz of version 2, 3 or 4; bands past degree 3 are ignored with a note."""
     data = path.read_bytes()
     if data[:2] == b"\x1f\x8b":
         data = _gunzip(path, data)
     if data[:4] == _MAGIC and len(data) < _HEADER:
-        raise InputError(
-            f"truncated: its header has {_HEADER} bytes, {len(data)} are there", path=path, hint=DAMAGED
-        )
+        raise InputError(f"truncated: {len(data)} of {_HEADER} bytes of the header", path=path, hint=DAMAGED)
     if data[:4] != _MAGIC:
         raise InputError(f"not an SPZ file (begins with {data[:4]!r})", path=path)
     sizes = _sizes(path, data)
@@ -93,7 +86,7 @@ def read(path: Path) -> Scene:
 
 
 def _gunzip(path: Path, data: bytes) -> bytes:
-    """The header and what it promises: no byte past that is unpacked."""
+    """Unpack the header and as many bytes as it announces."""
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         head = stream.decompress(data, _HEADER)
@@ -108,41 +101,39 @@ def _gunzip(path: Path, data: bytes) -> bytes:
 
 
 def _sizes(path: Path, head: bytes) -> list[int]:
-    """Bytes of the positions, alphas, colours, scales, rotations and harmonics that a header promises."""
+    """Return the header's sizes of positions, alphas, colours, scales, rotations and harmonics, bytes."""
     version, count, degree, fraction_bits = struct.unpack_from("<IIBB", head, 4)
     if head[:4] != _MAGIC:
         raise InputError(f"not an SPZ file (begins with {head[:4]!r})", path=path)
     if version not in (2, 3, 4):
-        raise InputError(f"SPZ version {version} is not known (2, 3 and 4 are)", path=path)
+        raise InputError(f"unsupported SPZ version {version}; expected 2, 3 or 4", path=path)
     if degree >= len(_COEFFICIENTS):
-        raise InputError(f"SH degree {degree} is not known (0 to 4 are)", path=path)
+        raise InputError(f"unsupported SH degree {degree}; expected 0 to 4", path=path)
     if fraction_bits > _POSITION_BITS:
         raise InputError(
-            f"fractionalBits is {fraction_bits}, more than the {_POSITION_BITS} bits of a position", path=path
+            f"is {fraction_bits}, expected at most {_POSITION_BITS}", path=path, property="fractionalBits"
         )
     rotation = 3 if version == 2 else 4
     return [9 * count, count, 3 * count, 3 * count, rotation * count, 3 * _COEFFICIENTS[degree] * count]
 
 
 def _slices(path: Path, data: bytes, sizes: list[int]) -> list[bytes]:
-    """Versions 2 and 3: the attributes follow the 16-byte header one after the other."""
+    """Return the attributes of versions 2 and 3, which follow the header."""
     ends = 16 + np.cumsum(sizes)
     if len(data) < ends[-1]:
-        raise InputError(
-            f"truncated: {ends[-1]:,} bytes promised, {len(data):,} there", path=path, hint=DAMAGED
-        )
+        raise InputError(f"truncated: {len(data):,} of {ends[-1]:,} bytes", path=path, hint=DAMAGED)
     return [data[end - size : end] for end, size in zip(ends, sizes, strict=True)]
 
 
 def _zstd_streams(path: Path, data: bytes, stream_count: int, sizes: list[int]) -> list[bytes]:
-    """Version 4: a table of (packed, unpacked) sizes where the header says, then one frame a stream."""
+    """Unpack the streams of version 4: a table of (packed, unpacked) sizes, then a frame per stream."""
     decompress = _zstd(path)
     check_unpacked(path, len(data), sum(sizes))
     try:
         (table,) = struct.unpack_from("<I", data, 16)
         entries = [struct.unpack_from("<QQ", data, table + 16 * i) for i in range(stream_count)]
     except struct.error as error:
-        raise InputError("truncated: its table of streams is cut off", path=path, hint=DAMAGED) from error
+        raise InputError("truncated: the table of streams is cut off", path=path, hint=DAMAGED) from error
     streams, start = [], table + 16 * stream_count
     for i, size in enumerate(sizes):
         packed, unpacked = entries[i] if i < stream_count else (0, 0)
@@ -163,11 +154,7 @@ def _zstd_streams(path: Path, data: bytes, stream_count: int, sizes: list[int]) 
 
 
 def _zstandard(path: Path) -> Any:
-    """Return the module that packs and unpacks Zstandard frames.
-
-    Raises:
-        MissingDependencyError: there is none.
-    """
+    """Return the module for Zstandard."""
     try:
         if sys.version_info >= (3, 14):
             from compression import zstd
@@ -179,7 +166,7 @@ def _zstandard(path: Path) -> Any:
 
 
 def _zstd(path: Path) -> Callable[[bytes, int], bytes]:
-    """What unpacks a frame of a size: no more than one byte past it."""
+    """Return a function that unpacks a frame, at most one byte past its expected size."""
     zstd = _zstandard(path)
 
     def decompress(frame: bytes, size: int) -> bytes:
@@ -192,26 +179,27 @@ def _zstd(path: Path) -> Callable[[bytes, int], bytes]:
 
 
 def _fixed24(triples: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """Signed 24-bit little-endian integers: shifted to the top of 32 bits, and back with their sign."""
+    """Decode signed 24-bit little-endian integers."""
     wide = np.zeros((len(triples), 4), np.uint8)
     wide[:, 1:] = triples
     return wide.view("<i4")[:, 0] >> 8
 
 
 def _quats_xyz(codes: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Version 2: x y z as bytes over [−1, 1]; w ≥ 0 follows."""
+    """Decode quaternions of version 2: x y z as bytes in [−1, 1], with w ≥ 0."""
     xyz = codes.reshape(-1, 3) / 127.5 - 1
     w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1)))
     return np.concatenate([w[:, None], xyz], axis=1)
 
 
 def _quats_packed(codes: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Versions 3, 4: 2 bits name the largest of x y z w; the others are a sign and 9 bits of |q|·√2."""
+    """Decode quaternions of versions 3 and 4: 2 bits for the largest of x y z w, and 9 bits of |q|·√2 plus a
+    sign for the others."""
     packed = codes.view("<u4").astype(np.uint32)
     largest = packed >> np.uint32(30)
     xyzw = np.zeros((len(packed), 4))
     left = packed.copy()
-    for i in (3, 2, 1, 0):  # the last component written lies lowest
+    for i in (3, 2, 1, 0):  # the last component is in the lowest bits
         rows = largest != i
         part: NDArray[Any] = left[rows]
         magnitude = (part & np.uint32(511)) / (511 * np.sqrt(2))
@@ -225,18 +213,8 @@ def _quats_packed(codes: NDArray[np.uint8]) -> NDArray[np.float64]:
 def write(path: Path, splats: Splats, *, overwrite: bool = False, spz_version: int = 3) -> None:
     """Write an .spz; equal scenes give equal bytes.
 
-    Scales are held to e^−10 … e^5.94, harmonics to ±1, colours to a little past [0, 1].
-
-    Args:
-        path: the file to write.
-        splats: the scene.
-        overwrite: whether an existing file may be replaced.
-        spz_version: 3 (gzip), 4 (Zstandard streams: smaller files) or 2 (gzip, coarser rotations).
-
-    Raises:
-        OutputError: see `atomic_output`.
-        InputError: the scene is empty, has a non-finite value, or an offset that 24 bits do not hold.
-        MissingDependencyError: version 4 before Python 3.14 without `pip install backports.zstd`.
+    Scales are clamped to e^−10 … e^5.94, harmonics to ±1, colours to slightly more than [0, 1].
+    Version 3 uses gzip, 4 Zstandard (smaller files), 2 gzip with coarser rotations.
     """
     if spz_version not in (2, 3, 4):
         raise InputError(f"expected 2, 3 or 4, got {spz_version}", parameter="spz_version")
@@ -259,11 +237,13 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False, spz_version: i
 
 
 def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats) -> int:
-    """Fractional bits of the 24 of a coordinate: the usual 12, more where a step of 2^−12 would be more than
-    a quarter of the middle scale of one Gaussian in a hundred, as many as the extent leaves.
+    """Return the fractional bits of 24-bit coordinates.
+
+    Usually 12. More, as far as the extent allows, if a step of 2^−12 exceeds a quarter of the 1st percentile
+    of the Gaussians' middle scales.
 
     Raises:
-        InputError: the steps left are coarser than half of the Gaussians are thin.
+        InputError: steps exceed both 2^−12 and the median middle scale.
     """
     farthest = float(np.abs(means).max())
     room = 23 - math.ceil(math.log2(max(farthest, 2.0**-20) * (1 + 2**-20)))
@@ -273,15 +253,15 @@ def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats) -> int
     bits = min(max(_USUAL_BITS, wanted), _MOST_BITS, room)
     if bits < 0 or 2.0**-bits > max(float(np.median(middle)), 2.0**-_USUAL_BITS):
         raise InputError(
-            f".spz holds steps of {2.0**-bits:g} at {farthest:g} from the origin; "
-            "write another format, or drop the offset with `g2ard convert --recentre`",
+            f".spz is too coarse at {farthest:g} from the origin (steps of {2.0**-bits:g})",
             path=path,
+            hint="write another format, or drop the offset with `g2ard convert --recentre`",
         )
     return bits
 
 
 def _streams(splats: Splats, means: NDArray[np.float64], bits: int, version: int) -> list[bytes]:
-    """Positions, alphas, colours, scales, rotations and, where there are any, harmonics."""
+    """Pack positions, alphas, colours, scales, rotations and, if any, harmonics."""
     fixed = np.rint(means * (1, -1, -1) * (1 << bits)).astype("<i4")
     quats = unit_quats(splats.quats) * (1, 1, -1, -1)
     streams = [
@@ -301,12 +281,12 @@ def _bytes(values: NDArray[Any]) -> bytes:
 
 
 def _xyz(quats: NDArray[np.float64]) -> bytes:
-    """Version 2: x y z of the sign that makes w ≥ 0."""
+    """Pack quaternions for version 2: x y z, with the sign for which w ≥ 0."""
     return _bytes(quats[:, 1:] * np.where(quats[:, :1] < 0, -1, 1) * 127.5 + 127.5)
 
 
 def _packed(quats: NDArray[np.float64]) -> bytes:
-    """2 bits name the largest of x y z w; then sign and 9 bits of |q|·√2 of the others, in order."""
+    """Pack quaternions for versions 3 and 4, see `_quats_packed`."""
     largest, others = smallest_three(quats[:, [1, 2, 3, 0]])
     words = largest.astype(np.uint32)
     for k in range(3):
@@ -318,7 +298,7 @@ def _packed(quats: NDArray[np.float64]) -> bytes:
 
 
 def _harmonics(splats: Splats) -> bytes:
-    """128x + 128, rounded to the buckets' middles."""
+    """Pack harmonics as 128x + 128, rounded to the centres of buckets."""
     rest = splats.shN.shape[1]
     codes = np.rint(splats.shN.astype(np.float64) * FLIPS[:rest, None] * 128 + 128)
     bucket = np.where(np.arange(rest) < 3, *_BUCKETS)[:, None]

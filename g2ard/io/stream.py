@@ -1,4 +1,4 @@
-"""Scenes read block by block, so that memory does not bound their size."""
+"""Scenes in blocks, for scenes larger than memory."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from g2ard.io.types import Note
 from g2ard.scene.splats import Splats
 
 _ENDS = 1 << 16
-"""Bytes at each end of a file that tell it from others of its name, size and time."""
+"""Bytes at each end of a file to hash."""
 
 _DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
 
 
 class SceneStream(ABC):
-    """A scene as a sequence of rows, any part of which can be read again.
+    """Scene that can be read from any row.
 
     Attributes:
-        path: names the scene in messages.
-        count: rows in the source, those that will be dropped included.
+        path: path for messages.
+        count: rows in the source, including those that will be dropped.
         sh_degree: 0–3.
         offset: (3,) float64, world = means + offset.
-        notes: what the header told; what the rows told is in `tally`.
-        tally: counts over the rows that `blocks` has been through.
+        notes: notes on the header.
+        tally: counts over the rows that `blocks` has read.
     """
 
     def __init__(
@@ -49,23 +49,18 @@ class SceneStream(ABC):
 
     @abstractmethod
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
-        """The source's rows from `start` on, at most `rows` at a time; the caller may change the arrays."""
+        """Yield the source's rows from `start`, at most `rows` at a time; callers may change the arrays."""
 
     @abstractmethod
     def identity(self) -> list[Any]:
-        """What tells this source from another, as JSON: files by name, size, time and ends."""
+        """Return JSON that identifies this source, see `file_identity`."""
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
-        """(n, 3) means of all rows in order, in blocks; not cleaned."""
+        """Yield the (n, 3) means of all rows in blocks, without cleaning."""
         return (raw.means for raw in self.raw(rows, 0))
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
-        """All rows from `start` on, cleaned as `g2ard.io.read_scene` cleans them.
-
-        Args:
-            rows: rows of the source a block is made of, at the most; dropped rows make it shorter.
-            start: the first row of the source.
-        """
+        """Yield rows from `start` in blocks of at most `rows`, cleaned as in `g2ard.io.read_scene`."""
         for raw in self.raw(rows, start):
             keep, before = np.ones(len(raw.means), bool), self.tally.dropped
             for first in range(0, len(keep), BLOCK):
@@ -75,25 +70,21 @@ class SceneStream(ABC):
             yield splats if self.tally.dropped == before else splats.take(keep)
 
     def all_notes(self) -> tuple[Note, ...]:
-        """What was noticed, once `blocks` is through.
-
-        Raises:
-            InputError: there was no row, or none that is finite.
-        """
+        """Return all notes once `blocks` has finished; raise an `InputError` if no row is finite."""
         return (*self.notes, *self.tally.notes(self.path))
 
 
 class PartsStream(SceneStream):
-    """A scene of parts that are there as a whole when they are asked for, clean already.
+    """Scene of clean parts that are loaded one at a time.
 
     Args:
-        path: names the scene in messages.
-        counts: Gaussians of each part.
-        part: gives one by its number.
-        sh_degree: of all.
-        offset: (3,) float64 of all.
-        identity: what tells this scene from another, as JSON.
-        notes: what was noticed.
+        path: path for messages.
+        counts: Gaussians per part.
+        part: function that loads a part by index.
+        sh_degree: SH degree of all parts.
+        offset: (3,) float64 offset of all parts.
+        identity: JSON that identifies the scene.
+        notes: notes on the scene.
     """
 
     def __init__(
@@ -143,7 +134,7 @@ class PartsStream(SceneStream):
 
 
 class JoinedScenes(SceneStream):
-    """Several scenes, one after the other."""
+    """Several scenes as one."""
 
     def __init__(self, streams: list[SceneStream]) -> None:
         highest = max(stream.sh_degree for stream in streams)
@@ -183,7 +174,7 @@ class JoinedScenes(SceneStream):
 
 
 def file_identity(files: Sequence[Path]) -> list[Any]:
-    """Of each file its name, size, time of change and the hash of its ends."""
+    """Return name, size, modification time and a hash of both ends per file."""
     identity = []
     for path in files:
         try:

@@ -1,4 +1,4 @@
-"""Folders of tiles (`g2ard ingest`) as scenes, where a scene is wanted in one piece or in blocks."""
+"""Reader for folders of tiles (`g2ard ingest`) as scenes."""
 
 from __future__ import annotations
 
@@ -9,11 +9,7 @@ from g2ard.io.types import Scene
 
 
 def read(path: Path) -> Scene:
-    """All tiles as one scene, tile after tile.
-
-    Raises:
-        InputError: the manifest or a tile is broken.
-    """
+    """Read all tiles as one scene, in order."""
     from g2ard.scene.transform import join
     from g2ard.tiles.store import TileStore
 
@@ -22,11 +18,7 @@ def read(path: Path) -> Scene:
 
 
 def stream(path: Path) -> PartsStream:
-    """The same, a tile at a time.
-
-    Raises:
-        InputError: the manifest is broken.
-    """
+    """Open tiles for reading one at a time."""
     from g2ard.tiles.store import TileStore
 
     store = TileStore.open(path)

@@ -1,4 +1,4 @@
-"""transforms.json, as instant-ngp, nerfstudio and NeRF's synthetic scenes write it."""
+"""Reader for transforms.json of instant-ngp, nerfstudio and NeRF's synthetic scenes."""
 
 from __future__ import annotations
 
@@ -17,41 +17,32 @@ from g2ard.io.types import ViewSet
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 _LEAST_ANGLE = 1e-6
-"""Radians from 0 and π: past them a focal length is no number of pixels that means something."""
+"""Smallest distance of a field of view from 0 and π, radians."""
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL camera axes (y up, looking along −z) to OpenCV's (y down, looking along z)."""
 
 
 def read(path: Path, images: Path | None = None) -> ViewSet:
-    """Read frames, their intrinsics (a frame's own win over the file's) and photos.
+    """Read frames with their photos and intrinsics, which override those of the file.
 
     Args:
-        path: the JSON, or the folder that holds transforms.json, or transforms_train.json and
-            transforms_test.json, whose views then state their split.
-        images: a folder to look for photos in, by their file names; None takes paths as written, relative
-            to the JSON.
-
-    Raises:
-        InputError: no frames, a pose or intrinsics that make no sense, or a fisheye lens.
+        path: the JSON, or a folder with transforms.json, or with transforms_train.json and
+            transforms_test.json, which then are the splits.
+        images: folder to search for photos by file name; None uses the paths in the JSON.
     """
     return view_set(path, frames(path, images))
 
 
 def frames(path: Path, images: Path | None = None) -> list[Frame]:
-    """As `read`, before photos that are missing are left out.
-
-    Raises:
-        InputError: as `read`.
-    """
+    """Return the frames of `read`, with or without photos."""
     if path.is_file():
         return _frames(path, images)
     return [frame for file, split in files_of(path).items() for frame in _frames(file, images, split)]
 
 
 def files_of(folder: Path) -> dict[Path, str | None]:
-    """The files of a folder and the split each stands for: transforms.json, else transforms_train.json and
-    its kin (NeRF's synthetic scenes, MatrixCity's pose folders)."""
+    """Return a folder's transforms.json, or its transforms_{train,val,test}.json with their splits."""
     whole = folder / "transforms.json"
     if whole.is_file():
         return {whole: None}
@@ -73,7 +64,7 @@ def _frames(path: Path, images: Path | None, split: str | None = None) -> list[F
 
 
 def _stated(path: Path, content: dict[str, Any]) -> dict[str, str]:
-    """file_path → split, where the file lists them as nerfstudio's data may (train_filenames and its kin)."""
+    """Return file_path → split from nerfstudio's lists train_filenames, val_filenames and test_filenames."""
     stated: dict[str, str] = {}
     for split in ("train", "val", "test"):
         names = content.get(f"{split}_filenames", ())
@@ -103,9 +94,9 @@ def _frame(path: Path, index: int, content: dict[str, Any], entry: Any, images: 
 
 
 def _from_matrix_city(path: Path, frame: Fields) -> dict[str, Any]:
-    """A frame of one of its blocks: photos by number, and rotations a hundredth of what they should be.
+    """Convert a frame of MatrixCity's blocks: photos by number, rotations scaled by 0.01.
 
-    Positions stay as written, metres; its pose folders (transforms_train.json) count in 100 m instead.
+    Positions are in metres; MatrixCity's pose folders (transforms_train.json) use 100 m instead.
     """
     name = f"{whole(frame, 'frame_index'):04d}.png"
     places = [folder for folder in ("", "rgb/", "input/") if (path.parent / folder / name).is_file()]
@@ -114,12 +105,12 @@ def _from_matrix_city(path: Path, frame: Fields) -> dict[str, Any]:
 
 def _there(frame: Fields, mask: Path) -> Path:
     if not mask.is_file():
-        raise frame.place.to("mask_path").error(f"names {mask}, which does not exist")
+        raise frame.place.to("mask_path").error(f"is {mask}, which does not exist")
     return mask
 
 
 def opencv_view(world_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4, 4) camera_from_world with OpenCV's axes, of a rigid world_from_camera with OpenGL's."""
+    """Convert a rigid world_from_camera in OpenGL axes to a (4, 4) camera_from_world in OpenCV axes."""
     return inverse(world_from_camera @ _FLIP)
 
 
@@ -127,7 +118,8 @@ def _intrinsics(path: Path, values: Fields, photo: Path) -> dict[str, Any]:
     model = text(values, "camera_model", "OPENCV")
     if model not in _MODELS or values.get("is_fisheye"):
         known = ", ".join(_MODELS)
-        error = values.place.error(f"has a {model} lens, or a fisheye, which is not supported ({known} are)")
+        lens = "fisheye" if values.get("is_fisheye") else model
+        error = values.place.error(f"has an unsupported {lens} lens; expected {known}")
         raise error.at(hint="undistort the photos")
     width, height = _size(path, values, photo)
     fx = _focal(values, "x", width)
@@ -146,7 +138,7 @@ def _focal(values: Fields, axis: str, pixels: int) -> float | None:
     if f"fl_{axis}" in values:
         return number(values, f"fl_{axis}")
     if axis == "y" and "fl_x" in values:
-        return None  # square pixels, rather than an angle of another camera
+        return None  # square pixels; camera_angle_y may be of another camera
     key = f"camera_angle_{axis}"
     if values.get(key) is None:
         return None
@@ -161,4 +153,4 @@ def _size(path: Path, values: Fields, photo: Path) -> tuple[int, int]:
         return whole(values, "w"), whole(values, "h")
     if photo.is_file():
         return photo_size(photo, path)
-    raise values.place.error("has neither w and h nor a photo that tells its size")
+    raise values.place.error("has neither w and h nor an existing photo")

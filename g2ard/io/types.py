@@ -1,4 +1,4 @@
-"""What readers hand back: the data, and what was noticed on the way."""
+"""Results of readers: data and notes."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Note:
-    """One thing a reader did that its caller should hear of.
+    """A note of a reader on changed or ignored data.
 
     Args:
-        code: a stable word for machines: `dropped_rows`, `clamped_logits`, `missing_photos`, …
-        count: how many rows, properties or files it concerns.
-        text: one line for people.
+        code: stable identifier: `dropped_rows`, `clamped_logits`, `missing_photos`, …
+        count: number of affected rows, properties or files.
+        text: message.
     """
 
     code: str
@@ -35,14 +35,14 @@ class Note:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """A coloured cloud of N points.
+    """A coloured point cloud of N points.
 
     Args:
-        positions: (N, 3) float64, world units: map coordinates keep their precision.
+        positions: (N, 3) float64, world units.
         colors: (N, 3) float32 in [0, 1].
 
     Raises:
-        InputError: shapes that do not fit.
+        InputError: the shapes do not match.
     """
 
     positions: NDArray[np.float64]
@@ -62,7 +62,7 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A scene file's Gaussians, and what was noticed while reading."""
+    """Gaussians of a file, with notes."""
 
     splats: Splats
     notes: tuple[Note, ...] = ()
@@ -70,7 +70,7 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """A cloud file's points, and what was noticed while reading."""
+    """Points of a file, with notes."""
 
     points: Points
     notes: tuple[Note, ...] = ()
@@ -78,13 +78,13 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class ViewSet:
-    """Views, and what their file says beside the cameras.
+    """Views of a file, with splits, weights and notes.
 
     Args:
         cameras: C views.
-        notes: what was noticed while reading.
-        splits: per view "train", "test" or None where the file names no split; () if it has none at all.
-        weights: (C,) float64, how often a view should be drawn; None if the file has none.
+        notes: notes of the reader.
+        splits: "train", "test" or None per view; () if the file has no splits.
+        weights: (C,) float64 sampling weights; None if the file has none.
     """
 
     cameras: Cameras
@@ -93,12 +93,12 @@ class ViewSet:
     weights: NDArray[np.float64] | None = None
 
     def take(self, mask: NDArray[np.bool_]) -> ViewSet:
-        """The views that `mask` (C,) selects, with all that belongs to them."""
+        """Select views by a (C,) mask."""
         rows = np.flatnonzero(mask)
         splits = tuple(self.splits[i] for i in rows) if self.splits else ()
         weights = None if self.weights is None else self.weights[rows]
         return ViewSet(self.cameras.take(rows), self.notes, splits, weights)
 
     def resized(self, longest: int | None) -> ViewSet:
-        """The same views with their longer side shrunk to at most `longest` pixels (None keeps them)."""
+        """Shrink views to a longer side of at most `longest` pixels; None keeps them."""
         return replace(self, cameras=self.cameras.resized(longest))

@@ -1,4 +1,4 @@
-"""g2ard's own views .json: what `poses`, `select` and `distill` write. docs/formats.md describes it."""
+"""Reader and writer for g2ard's views .json, described in docs/formats.md."""
 
 from __future__ import annotations
 
@@ -36,20 +36,12 @@ _VERSION = 1
 
 
 def read(path: Path, images: Path | None = None) -> ViewSet:
-    """Read views; photo paths are relative to the file.
-
-    Args:
-        path: the JSON.
-        images: a folder to look for photos in, by their file names, instead.
-
-    Raises:
-        InputError: another format or version, no views, or a view that makes no sense.
-    """
+    """Read views; photo paths are relative to the file unless `images`, a folder of photos, is given."""
     content = read_json(path)
     if content.get("format") != _FORMAT:
-        raise InputError(f"not g2ard's views ('format' is {content.get('format')!r})", path=path)
+        raise InputError(f"is {content.get('format')!r}, expected {_FORMAT!r}", path=path, property="format")
     if content.get("version") != _VERSION:
-        raise InputError(f"version {content.get('version')!r} is not known ({_VERSION} is)", path=path)
+        raise InputError(f"unsupported version {content.get('version')!r}; expected {_VERSION}", path=path)
     views = content.get("views")
     if not isinstance(views, list) or not views:
         raise InputError("no views found ('views' is empty)", path=path)
@@ -91,26 +83,14 @@ def write(
     weights: ArrayLike | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write views, one line each, every float to its last bit.
-
-    Args:
-        path: the .json to write.
-        cameras: C views.
-        splits: per view "train", "test" or None; () for none.
-        weights: (C,) how often each view should be drawn, NaN where a view states none; None for none.
-        overwrite: whether an existing file may be replaced.
-
-    Raises:
-        OutputError: see `atomic_output`.
-        InputError: no views, or splits or weights of another length.
-    """
+    """Write views, one per line, with exact floats; see `g2ard.io.write_views`."""
     count = len(cameras)
     given = np.full(count, np.nan) if weights is None else np.asarray(weights, np.float64)
     drawn = [None if np.isnan(weight) else weight for weight in given.tolist()]
     parts = list(splits) or [None] * count
     if not count or len(parts) != count or len(drawn) != count:
         raise InputError(
-            f"{plural(count, 'view')}, {len(parts)} splits and {len(drawn)} weights do not fit", path=path
+            f"{plural(count, 'view')}, {len(parts)} splits and {len(drawn)} weights do not match", path=path
         )
     lines = []
     for i in range(count):

@@ -108,7 +108,7 @@ def test_spz_of_more_fractional_bits_than_a_position_has(tmp_path: Path, version
         if allowed:
             np.testing.assert_allclose(read_splats(path).means, truth(3, 0).means / 4096, atol=1e-7)
             continue
-        with pytest.raises(InputError, match=rf"a\.spz: fractionalBits is {bits}, more than the 24 bits"):
+        with pytest.raises(InputError, match=rf"'fractionalBits' is {bits}, expected at most 24"):
             read_splats(path)
 
 

@@ -174,7 +174,7 @@ def test_nothing_finite(tmp_path: Path) -> None:
 
 def test_no_rows(tmp_path: Path) -> None:
     path = save(tmp_path / "a.ply", {k: v[:0] for k, v in columns(scene()).items()})
-    with pytest.raises(InputError, match="holds no Gaussians"):
+    with pytest.raises(InputError, match="has no Gaussians"):
         read_splats(path)
 
 

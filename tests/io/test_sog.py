@@ -108,7 +108,7 @@ def test_lod_meta_lists_the_chunks(tmp_path: Path) -> None:
     np.testing.assert_array_equal(splats.means[:4], read_splats(tmp_path / "b").means)
     index["filenames"] = ["b/meta.json", "gone/meta.json", "coarse/meta.json"]
     (tmp_path / "lod-meta.json").write_text(json.dumps(index))
-    with pytest.raises(InputError, match=r"names gone/meta\.json") as caught:
+    with pytest.raises(InputError, match=r"is gone/meta\.json") as caught:
         read_splats(tmp_path)
     check_fault(caught.value, tmp_path / "lod-meta.json", ("filenames[1]", None))
 
@@ -142,7 +142,7 @@ def within(files: dict[str, bytes], part: str, key: str, value: Any) -> dict[str
     ("change", "fault"),
     [
         (lambda f: {k: v for k, v in f.items() if k != "scales.webp"}, "scales.webp: no such file"),
-        (lambda f: f | {"quats.webp": f["quats.webp"][:40]}, "quats.webp: not a whole image"),
+        (lambda f: f | {"quats.webp": f["quats.webp"][:40]}, "quats.webp: cannot be decoded"),
         (lambda f: edit(f, version=3), ("version", None)),
         (lambda f: edit(f, count=17), "16 pixels for 17 Gaussians"),
         (lambda f: edit(f, count="ten"), ("count", None)),
@@ -195,7 +195,7 @@ def within(files: dict[str, bytes], part: str, key: str, value: Any) -> dict[str
         (lambda f: edit(f, quats="x"), ("quats", None)),
         (lambda f: edit(f, count=True), ("count", None)),
         (lambda f: edit(f, g2ard={"offset": [0, "x", 1]}), ("g2ard.offset[1]", None)),
-        (lambda f: edit(f, count=0), "holds no Gaussians"),
+        (lambda f: edit(f, count=0), "has no Gaussians"),
         (lambda f: f | {"meta.json": b"{"}, "is not JSON"),
         (lambda f: f | {"shN_labels.webp": webp(square(np.full((10, 2), 200)))}, "of 128"),
     ],
@@ -262,7 +262,7 @@ def test_broken_lod_meta_is_named(tmp_path: Path, tree: Any, fault: Fault) -> No
 
 def test_broken_zip_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.sog").write_bytes(b"PK\x03\x04nonsense")
-    with pytest.raises(InputError, match=r"a\.sog: not a whole \.sog archive"):
+    with pytest.raises(InputError, match=r"a\.sog: is not a complete \.sog archive"):
         read_splats(tmp_path / "a.sog")
     with zipfile.ZipFile(tmp_path / "b.sog", "w") as bundle:
         bundle.writestr("other.txt", "x")

@@ -173,7 +173,7 @@ def test_a_run_with_an_odd_split(tmp_path: Path) -> None:
     data_of(tmp_path)
     run = run_of(tmp_path, mode="interval")
     (run / "config.yml").write_text((run / "config.yml").read_text().replace("interval: 4", "interval: 0"))
-    with pytest.raises(InputError, match="the run's split of it is malformed"):
+    with pytest.raises(InputError, match=r"invalid split in the run's config.yml"):
         read_view_set(run)
 
 
@@ -205,7 +205,7 @@ def test_a_run_without_config_takes_the_transforms_beside(tmp_path: Path) -> Non
     beside.write_text(json.dumps({"transform": (T @ A)[:3].tolist(), "scale": SCALE * APPLIED}))
     np.testing.assert_allclose(read_view_set(beside).cameras.viewmats[1], trained(POSES[1]), atol=1e-9)
     path.unlink()
-    with pytest.raises(InputError, match=r"neither a config\.yml nor a transforms\.json beside it"):
+    with pytest.raises(InputError, match=r"neither config\.yml nor transforms\.json"):
         read_view_set(beside)
 
 
@@ -216,10 +216,10 @@ def test_a_run_without_config_takes_the_transforms_beside(tmp_path: Path) -> Non
             {"parser": "Phototourism"},
             {},
             "config.yml",
-            "data read by PhototourismDataParser are not supported",
+            "unsupported data parser 'PhototourismDataParser'",
         ),
         ({"data": "null", "manager": "null"}, {}, "config.yml", ("data", None)),
-        ({"data": "gone"}, {}, "config.yml", "its data gone is not there"),
+        ({"data": "gone"}, {}, "config.yml", "data gone does not exist"),
         ({}, {"transform": None}, "dataparser_transforms.json", ("transform", None)),
         ({}, {"transform": [[1, 2], [3, 4]]}, "dataparser_transforms.json", ("transform[0][2]", None)),
         ({}, {"transform": (2 * T[:3]).tolist()}, "dataparser_transforms.json", ("transform", None)),
@@ -296,9 +296,9 @@ def test_a_result_folder_follows_its_data(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"normalize": "true"}, r"cfg\.yml: trained in a normalised world"),
-        ({"data_dir": "data/gone"}, r"cfg\.yml: its data_dir data/gone is not there"),
-        ({"data_dir": "data"}, r"data: no COLMAP model there"),
+        ({"normalize": "true"}, r"cfg\.yml: was trained in a normalised world"),
+        ({"data_dir": "data/gone"}, r"cfg\.yml: data_dir data/gone does not exist"),
+        ({"data_dir": "data"}, r"data: has no COLMAP model"),
     ],
 )
 def test_bad_results(tmp_path: Path, settings: dict[str, str], message: str) -> None:

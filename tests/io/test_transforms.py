@@ -128,9 +128,9 @@ def test_bad_transforms(tmp_path: Path, change: Callable[[dict[str, Any]], Any],
     ("content", "message"),
     [
         ("", "not JSON"),
-        ("[1]", "a JSON list, but neither"),
+        ("[1]", "is a JSON list, but not"),
         ("{}", "neither"),
-        ('{"views": []}', "not g2ard's"),
+        ('{"views": []}', "'format' is None"),
     ],
 )
 def test_other_json(tmp_path: Path, content: str, message: str) -> None:

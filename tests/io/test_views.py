@@ -82,7 +82,7 @@ def test_a_whole_width_may_be_a_float(tmp_path: Path) -> None:
 
 
 def test_own_views_refuse_what_does_not_fit(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="do not fit"):
+    with pytest.raises(InputError, match="do not match"):
         write_views(tmp_path / "a.json", views(2), weights=[1])
     with pytest.raises(OutputError, match=r"written as \.json"):
         write_views(tmp_path / "a.txt", views(2))
@@ -90,5 +90,5 @@ def test_own_views_refuse_what_does_not_fit(tmp_path: Path) -> None:
 
 
 def test_no_views_in_a_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="nothing known in this folder"):
+    with pytest.raises(InputError, match="is not a supported folder"):
         read_views(tmp_path)
