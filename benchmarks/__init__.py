@@ -1,1 +1,1 @@
-"""Measuring: speed against the machine's limit, quality against the baselines."""
+"""Benchmarks: speed against the machine's limits, quality against other methods."""

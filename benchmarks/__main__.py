@@ -8,7 +8,6 @@ __all__ = ["main"]
 
 
 def main() -> None:
-    """Run the command that the arguments name."""
     interrupt.ends_the_program()
     from benchmarks.commands import app
     from benchmarks.synth.command import synth

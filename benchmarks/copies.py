@@ -1,7 +1,7 @@
-"""Copies of a .ply scene side by side, to try sizes: `python benchmarks/copies.py IN.ply OUT.ply 6 4`.
+"""Tile a .ply scene to test large sizes: `python benchmarks/copies.py IN.ply OUT.ply 6 4`.
 
-So many along the scene's second longest side (0.5th to 99.5th percentile) and along its longest; rows as they
-lie in the file. Binary little-endian files of float32 alone.
+The numbers are copies along the scene's longest and second longest side (0.5th to 99.5th percentile).
+Supports binary little-endian files of float32 only.
 """
 
 from __future__ import annotations

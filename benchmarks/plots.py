@@ -1,6 +1,6 @@
-"""Draws docs/plots/*.svg from the recorded CSVs: run `python benchmarks/plots.py` from the repository's root.
+"""Draw docs/plots/*.svg from the recorded CSVs: `python benchmarks/plots.py` in the repository's root.
 
-The same rows give the same bytes: tests/test_docs.py draws them again and compares.
+tests/test_docs.py checks that the plots are up to date.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def rows(path: str) -> list[dict[str, str]]:
 
 
 def standalone(svg: str, series: Iterable[str]) -> str:
-    """A chart with its colours, a legend below and a background, to stand in a file of its own."""
+    """Return a chart as an SVG file with colours, legend and background."""
     names = list(series)
     colors = "".join(f".dot.s{i}{{fill:{c}}}.line.s{i}{{stroke:{c}}}" for i, c in enumerate(COLORS))
     legend = []
@@ -45,7 +45,7 @@ def standalone(svg: str, series: Iterable[str]) -> str:
 
 
 def lead(kind: str) -> str:
-    """dB of `default` over the better peer, by ratio, in one kind of views."""
+    """Plot the gain of `default` over the better peer by ratio, dB, in one kind of views."""
     recorded = [r for r in rows("intel-xeon-2c/simplify-standing-2026-11-22.csv") if r["views_kind"] == kind]
     psnr = {(r["scene"], float(r["ratio"]), r["method"]): float(r["psnr"]) for r in recorded}
     scenes = sorted({scene for scene, _, _ in psnr})
@@ -59,7 +59,7 @@ def lead(kind: str) -> str:
 
 
 def curve(scene: str, variants: tuple[str, ...]) -> str:
-    """PSNR on unseen views against seconds of recovery, at 10×, once the final count is reached."""
+    """Plot PSNR on held-out views against seconds of recovery, at 10×, after reaching the final count."""
     recorded = [
         r
         for r in rows("amd-epyc-2c/recover-curves-2026-11-21.csv")
@@ -77,7 +77,7 @@ def curve(scene: str, variants: tuple[str, ...]) -> str:
 
 
 def plots() -> dict[str, str]:
-    """File names and their contents."""
+    """Return file names and their contents."""
     return {
         "simplify-pool.svg": lead("pool"),
         "simplify-standing.svg": lead("standing"),

@@ -1,4 +1,4 @@
-"""Commands as processes of their own with their cost, and the machine they run on."""
+"""Processes with their cost, and the machine they run on."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
 
 _LAUNCHER = """
 import os, signal, sys, time
-if sys.platform == "linux":  # a signal when whoever started us is gone
+if sys.platform == "linux":  # end with the parent process
     import ctypes
     ctypes.CDLL(None).prctl(1, signal.SIGTERM)
 began = time.perf_counter()
@@ -36,7 +36,7 @@ _, status, usage = os.wait4(pid, 0)
 cpu, wall = usage.ru_utime + usage.ru_stime, time.perf_counter() - began
 print(os.waitstatus_to_exitcode(status), cpu, wall, usage.ru_maxrss)
 """
-"""A small process between ours and the child: Linux counts the memory of the starter in the child's peak."""
+"""A small process between ours and the child, since Linux counts the parent's memory in the child's peak."""
 
 
 @dataclass(frozen=True)
@@ -55,13 +55,9 @@ class Usage:
 
 
 def check_measurable() -> None:
-    """Check that the system reports the cost of a process.
-
-    Raises:
-        G2ardError: it does not (Windows).
-    """
+    """Raise a `G2ardError` if the system does not report the cost of a process (Windows)."""
     if not hasattr(os, "posix_spawnp"):
-        raise G2ardError("this benchmark measures processes by POSIX's calls, which Windows lacks")
+        raise G2ardError("this benchmark needs POSIX; it does not run on Windows")
 
 
 def measured(command: Sequence[str], log: Path) -> Usage:
@@ -83,11 +79,11 @@ def measured(command: Sequence[str], log: Path) -> Usage:
         ) as launcher:
             try:
                 told = launcher.communicate()[0].split()
-            except BaseException:  # Ctrl-C to us alone: nothing is left running
+            except BaseException:  # Ctrl-C may only reach this process
                 launcher.terminate()
                 raise
     said = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    last = said[-1] if said else "it said nothing"
+    last = said[-1] if said else "no output"
     if len(told) != 4:
         raise InputError(f"{command[0]}: did not start: {last}")
     status, cpu, wall, peak = (float(value) for value in told)
@@ -98,11 +94,7 @@ def measured(command: Sequence[str], log: Path) -> Usage:
 
 
 def splat_transform(*arguments: str, program: str | None = None) -> list[str]:
-    """Return a call of splat-transform: the given program, otherwise the one on PATH.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return a call of splat-transform: the given program, otherwise the one on PATH."""
     found = shutil.which(program or "splat-transform")
     if found is None and program is not None:
         raise InputError(f"{program}: no such program")
@@ -126,7 +118,7 @@ def machine() -> str:
 
 
 def cpu_name() -> str:
-    """Return the processor's name, as its maker gives it where the system tells."""
+    """Return the processor's model name if known, otherwise its architecture."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:

@@ -1,4 +1,4 @@
-"""The report of a run: error against time and count, a table, and the views that came out worst."""
+"""HTML report of a run: charts, tables and the worst views."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _MARKS = ("steps", "seconds", "released")
 
 
 def write_report(folder: Path, studies: Sequence[Study], rows: Sequence[Row]) -> None:
-    """Write `folder`/report.html: one file that needs no network.
+    """Write a self-contained `folder`/report.html.
 
     Args:
-        folder: of the run, with its images/.
-        studies: in the order of the page.
-        rows: as `benchmarks.runner.run` returns them.
+        folder: folder of the run, with its images/.
+        studies: studies in the order of the page.
+        rows: rows of `benchmarks.runner.run`.
     """
     page = Page("g2ard benchmarks", f"g2ard {__version__} on {machine()}")
     page.paragraph(
@@ -82,14 +82,14 @@ def _name(row: Row) -> str:
 
 
 def _label(row: Row) -> str:
-    """Return a row's cell in words."""
+    """Return a label for a row's cell."""
     parts = (row["scene"], f"{row['ratio']:g}×" if "ratio" in row else "", _name(row))
     matched = f"({row['matched']} {row.get('amount', 0):g})" if row.get("amount") else ""
     return " ".join(part for part in (*parts, matched) if part)
 
 
 def _notes(row: Row) -> list[str]:
-    """Return what a reader must know of a row: errors, views that were not used, black renders."""
+    """Return notes on a row: errors, unused views, black renders."""
     lines = []
     if "error" in row:
         lines.append(f"Failed: {_label(row)}: {row['error']}")
@@ -134,7 +134,7 @@ def _point(row: Row, x: float, names: Sequence[str]) -> Point:
 
 
 def _best(rows: Sequence[Row], columns: Sequence[str]) -> set[tuple[int, int]]:
-    """Return the cells (row, column) of the best figures among comparable rows."""
+    """Return the (row, column) of the best scores among comparable rows."""
     groups: dict[tuple[Any, ...], list[int]] = {}
     for number, row in enumerate(rows):
         if row.get("matched") != "none":
@@ -148,7 +148,7 @@ def _best(rows: Sequence[Row], columns: Sequence[str]) -> set[tuple[int, int]]:
 
 
 def _over_seeds(rows: Sequence[Row]) -> list[str]:
-    """Return mean ± standard deviation (n − 1) of PSNR and SSIM for all that was run with several seeds."""
+    """Return mean ± standard deviation (n − 1) of PSNR and SSIM for cells with several seeds."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         if row.get("final", 1) and "psnr" in row:
@@ -165,7 +165,7 @@ def _over_seeds(rows: Sequence[Row]) -> list[str]:
 
 
 def _views(page: Page, folder: Path, rows: Sequence[Row]) -> None:
-    """Show the worst pictured views of the first method, for every ratio."""
+    """Show the views with the worst scores of the first method, for every ratio."""
     pictured = [row for row in rows if "pictures" in row and row["matched"] != "none"]
     for ratio in sorted({row["ratio"] for row in pictured}):
         first: dict[str, Row] = {}

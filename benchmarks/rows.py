@@ -1,4 +1,4 @@
-"""The one row format of all benchmarks: flat columns, kept in a CSV that a later run continues."""
+"""Row format of all benchmarks: flat columns in a CSV that later runs extend."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Row = dict[str, Any]
 
 
 class Column(NamedTuple):
-    """One column: its type, its format in tables ("" as text, None not shown) and its meaning."""
+    """A column: its type, its format in tables ("" for text, None if hidden) and its meaning."""
 
     type: Callable[[str], Any]
     form: str | None
@@ -136,15 +136,11 @@ _SURVEY = {
     "bytes": "Size [Bytes]",
     "count": "#Gaussians",
 }
-"""Names of the 3DGS compression survey, whose plots take a CSV of matched rows as it is."""
+"""Column names of the 3DGS compression survey, so that its plots can read CSVs of matched rows."""
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Read the rows of a CSV, also of one that lacks later columns; none if there is no such file.
-
-    Raises:
-        InputError: the file holds other columns, or a value that does not fit.
-    """
+    """Read the rows of a CSV, which may lack columns or not exist."""
     if not path.exists():
         return []
     names = {survey: name for name, survey in _SURVEY.items()}
@@ -163,7 +159,7 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows, whole or not at all."""
+    """Write rows atomically."""
     present = {name for row in rows for name in row}
     names = [name for name in COLUMNS if name in present]
     heads = _SURVEY if "submethod" in present else {}
@@ -177,7 +173,7 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
 
 
 def rounded(row: Mapping[str, Any]) -> Row:
-    """Return a row as it will be read again: six digits, nothing empty."""
+    """Round a row as writing and reading it would: six digits, no empty columns."""
     texts = {name: _text(value) for name, value in row.items()}
     return {name: COLUMNS[name].type(text) for name, text in texts.items() if text}
 
@@ -187,11 +183,11 @@ def _text(value: Any) -> str:
 
 
 def shown(rows: Iterable[Row], *, brief: bool = False) -> tuple[list[str], list[list[str]]]:
-    """Return columns and cells of a table: what any of the rows has and `COLUMNS` gives a format.
+    """Return columns and cells of a table of rows.
 
     Args:
-        rows: what to show.
-        brief: leave out columns that are the same in several rows, except the first.
+        rows: rows to show.
+        brief: whether to drop columns that are the same in all rows, except the first column.
     """
     rows = list(rows)
     names = [n for n, column in COLUMNS.items() if column.form is not None and any(n in row for row in rows)]

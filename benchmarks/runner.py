@@ -1,4 +1,4 @@
-"""The runner of all benchmarks: cells are measured once, and each is written as it is done."""
+"""Runner of all benchmarks, which measures each cell once and saves it when it is done."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ __all__ = ["Cell", "fingerprint", "folder_of", "run", "scene_key"]
 
 @dataclass(frozen=True)
 class Cell:
-    """One measurement.
+    """A measurement.
 
     Args:
-        names: the columns that tell it from other cells of the study, apart from the scene.
-        measure: returns its rows, without those columns.
-        views: the kinds of views that it has a row for each of; empty means any rows.
-        more: what else its figures depend on.
+        names: columns that identify it among the cells of a study and scene.
+        measure: function that returns its rows, without those columns.
+        views: kinds of views with a row each; empty allows any rows.
+        more: other values that the result depends on.
     """
 
     names: Mapping[str, Any]
@@ -45,25 +45,17 @@ def run(
     again: bool = False,
     progress: Progress = silent,
 ) -> list[Row]:
-    """Measure every cell of some studies that `folder`/rows.csv does not hold yet.
+    """Measure all cells that are not in `folder`/rows.csv, and return the rows of the studies in order.
 
-    A cell that fails is a row with its error, and is tried again by the next call. A cell whose scene,
-    settings or version changed is measured anew. Rows of other studies and cells stay.
+    A failed cell becomes a row with its error and is measured again by the next call. So is a cell whose
+    scene, settings or version changed. Rows of other studies are kept.
 
     Args:
-        studies: what to measure.
-        folder: of the run; need not exist.
-        keep: whether intermediate scenes, in work/, stay once all cells are done.
-        again: measure everything anew.
-        progress: told of every cell.
-
-    Returns:
-        The rows of these studies, in their order.
-
-    Raises:
-        InputError: a path with an environment variable that is not set, or a foreign rows.csv.
-        G2ardError: the system does not tell what a process took (Windows).
-        KeyboardInterrupt: after Ctrl-C; the next call continues.
+        studies: studies to run.
+        folder: folder of the run; need not exist.
+        keep: whether to keep intermediate scenes, in work/, after success.
+        again: whether to measure all cells again.
+        progress: callback per cell.
     """
     for study in studies:
         study.check()
@@ -90,7 +82,7 @@ def run(
             about = {"version": f"g2ard {__version__}", "machine": machine(), "cell": key}
             try:
                 found = [rounded({**about, **named, **row}) for row in cell.measure()]
-            except Exception as error:  # one cell must not end hours of others; its row and the status tell
+            except Exception as error:  # reported in its row and by the exit status
                 text = " ".join(str(error).split()) or type(error).__name__
                 found = [rounded({**about, **named, "error": text})]
             own = rounded(named).items()
@@ -103,7 +95,7 @@ def run(
     if not keep and not any("error" in row for row in rows):
         for study, scene in places:
             shutil.rmtree(folder_of(work, study, scene), ignore_errors=True)
-        with suppress(OSError):  # others' work stays
+        with suppress(OSError):  # not empty
             work.rmdir()
     return rows
 
@@ -126,7 +118,7 @@ def _short(value: Any) -> str:
 
 
 def fingerprint(value: Any) -> str:
-    """Return a short hash of anything that JSON can hold."""
+    """Return a short hash of a JSON value."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
@@ -139,12 +131,12 @@ def scene_key(study: Study, scene: SceneSpec) -> str:
 
 
 def folder_of(work: Path, study: Study, scene: SceneSpec) -> Path:
-    """Return where a scene's intermediate files lie."""
+    """Return the folder of a scene's intermediate files."""
     return work / f"{scene.name.replace('/', '_')}-{scene_key(study, scene)}"
 
 
 def _stamp(path: Path) -> Any:
-    """Return what tells one version of a file or folder from another, without reading it."""
+    """Return names, sizes and modification times of a file or folder."""
     if not path.exists():
         return None
     files = sorted(path.rglob("*")) if path.is_dir() else [path]

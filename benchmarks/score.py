@@ -1,4 +1,4 @@
-"""Scores of a result: figures of every view, and pictures of some."""
+"""Scores of a scene, and pictures of some views."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _QUALITY = 88
 
 @dataclass(frozen=True)
 class ViewFigures:
-    """One view's figures.
+    """Scores of a view.
 
     Args:
-        luma: mean luma of the render less the target's.
-        black: whether all pixels of the render are 0 in 8 bits, and not those of the target.
+        luma: mean luma of the render minus that of the target.
+        black: whether the render is black in 8 bits and the target is not.
     """
 
     name: str
@@ -44,11 +44,7 @@ class ViewFigures:
 
 @dataclass(frozen=True)
 class Scored:
-    """Means over the views that did not come out black (`tab:geobase`, †), or over all if all did.
-
-    Args:
-        views: in the cameras' order.
-    """
+    """Scores of all views, with means over those that are not black (`tab:geobase`, †) unless all are."""
 
     views: tuple[ViewFigures, ...]
 
@@ -58,7 +54,7 @@ class Scored:
         return tuple(view for view in self.views if not view.black) or self.views
 
     def mean(self, name: str) -> float | None:
-        """Return the mean of one figure, or None if it was not measured."""
+        """Return the mean of one score, or None if it was not measured."""
         values = [getattr(view, name) for view in self.counted]
         return None if None in values else float(np.mean(values))
 
@@ -90,16 +86,16 @@ def score(
     eight_bit: bool = False,
     pictures: Path | None = None,
 ) -> Scored:
-    """Render and score every view; JPEGs of `pictured` ones go to `pictures`, by the view's number.
+    """Render and score every view.
 
     Args:
         splats: the scene.
         targets: photos or renders.
         background: RGB behind the scene.
-        lpips: networks to score with as well.
-        settings: the renderer's conventions; None means gsplat's.
-        eight_bit: as for `g2ard.stages.evaluate.evaluate`.
-        pictures: a folder; None keeps no pictures.
+        lpips: LPIPS networks, if any.
+        settings: conventions of the renderer; None means gsplat's.
+        eight_bit: as in `g2ard.stages.evaluate.evaluate`.
+        pictures: folder for JPEGs of the `pictured` views, named by index.
     """
     renderer = Renderer(splats, background=background, settings=settings)
     views = []
@@ -126,7 +122,7 @@ def score(
 
 
 def pictured(count: int) -> list[int]:
-    """Return the views that are kept as pictures: all, or 32 evenly spaced.
+    """Return the views to save as pictures: all, or 32 evenly spaced.
 
     >>> pictured(3), len(pictured(100))
     ([0, 1, 2], 32)
@@ -136,6 +132,6 @@ def pictured(count: int) -> list[int]:
 
 
 def save_jpeg(path: Path, image: NDArray[np.float32]) -> None:
-    """Write an image in [0, 1], making its folder."""
+    """Write an image in [0, 1], and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(to_bytes(image)).save(path, quality=_QUALITY)

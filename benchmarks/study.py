@@ -1,4 +1,4 @@
-"""Studies: what is measured on which scenes. Read from TOML, narrowed by options."""
+"""Studies: scenes, methods and settings, read from TOML and changed by options."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ KINDS = {
     "register": "Register",
     "raster": "Raster",
 }
-"""Each kind of study is a subclass of `Study` in the module of its name under `benchmarks.kinds`."""
+"""Kind of study → its subclass of `Study` in the module of `benchmarks.kinds` with the kind's name."""
 
 _VARIABLE = re.compile(r"\$\{?(\w+)")
 _TYPES: dict[str, tuple[Any, str]] = {
@@ -47,10 +47,10 @@ def key(
     """Declare a key of a TOML table.
 
     Args:
-        default: its value where the table lacks it.
-        least: the smallest number it may be.
-        choices: the values it may have.
-        axis: whether it only spans the cells, so that a cell's figures do not depend on the other values.
+        default: default value.
+        least: smallest number allowed.
+        choices: allowed values.
+        axis: whether it only lists cells, so that a cell does not depend on its other values.
     """
     metadata = {"least": least, "choices": tuple(choices), "axis": axis}
     if isinstance(default, dict):
@@ -94,30 +94,30 @@ class SceneSpec:
 
     def __post_init__(self) -> None:
         if self.adapt_last and (self.adapt is not None or self.train is None):
-            raise InputError("adapt_last is for a scene with `train` and without `adapt`")
+            raise InputError("adapt_last needs a scene with `train` and without `adapt`")
 
 
 @dataclass(frozen=True)
 class Study:
-    """A study: the keys that all kinds have.
+    """Base class of studies, with the keys that all kinds have.
 
     Args:
-        name: of the file.
-        title: one line.
-        scenes: where to measure.
-        methods: what is compared; the first is ours.
+        name: name of the file.
+        title: title in reports.
+        scenes: scenes to measure.
+        methods: methods to compare, ours first.
         ratios: budget = round(N / ratio). `keep = [0.1]` in a file is `ratios = [10]`.
-        seeds: of everything random.
+        seeds: random seeds.
         size: longer side of the views, pixels; None keeps them.
-        pool_seed: of generated pools of views.
-        differs: how the study differs from the paper's, a line each, for the report.
-        folder: what relative paths are relative to.
+        pool_seed: seed of generated views.
+        differs: differences from the paper's study, one per line, for the report.
+        folder: base of relative paths.
     """
 
     METHODS: ClassVar[Mapping[str, Any]] = {}
-    """What `methods` may name."""
+    """Methods by name."""
     PROCESSES: ClassVar[bool] = False
-    """Whether cells are measured as processes of their own."""
+    """Whether cells run in separate processes."""
 
     name: str
     title: str = key("", axis=True)
@@ -131,33 +131,29 @@ class Study:
     folder: Path = field(default=Path(), metadata={"axis": True})
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
-        """Yield all that is to be measured on a scene; nothing is loaded before a cell is measured."""
+        """Yield the cells of a scene, without loading it."""
         raise NotImplementedError
 
     def derived(self, rows: list[Row]) -> list[Row]:
-        """Return the rows with columns that follow from several of them."""
+        """Return the rows with columns that depend on several rows."""
         return rows
 
     def summary(self, rows: list[Row]) -> tuple[str, list[str], list[list[str]]] | None:
-        """Return a table (title, columns, cells) that sums the rows up, or None."""
+        """Return a summary table (title, columns, cells), or None."""
         return None
 
     @classmethod
     def method(cls, name: str, values: Mapping[str, Any]) -> Any:
-        """Return the method that a table `[method.NAME]` describes."""
+        """Return the method of a table `[method.NAME]`."""
         raise InputError(f"method {name}: this kind of study takes names only")
 
     @property
     def settings(self) -> dict[str, Any]:
-        """All keys that a cell's figures depend on besides what names it."""
+        """The keys, other than those in its name, that a cell depends on."""
         return {f.name: getattr(self, f.name) for f in fields(self) if not f.metadata.get("axis")}
 
     def check(self) -> None:
-        """Check that environment variables in paths are set.
-
-        Raises:
-            InputError: one is not; the message names the scene and the variable.
-        """
+        """Check that environment variables in paths are set."""
         for scene in self.scenes:
             paths = (scene.prior, scene.train, scene.adapt, *scene.score.values())
             missing = next(filter(None, (_VARIABLE.search(path) for path in paths if path)), None)
@@ -165,11 +161,7 @@ class Study:
                 raise InputError(f"{self.name}: scene {scene.name}: ${missing[1]} is not set")
 
     def narrowed(self, options: Mapping[str, Any]) -> Self:
-        """Return the study with some keys given anew; `scene.KEY` sets a key of all scenes.
-
-        Raises:
-            InputError: an unknown key, method or value.
-        """
+        """Return the study with changed keys; `scene.KEY` sets a key of all scenes."""
         own = {name: _spread(type(self), name, value) for name, value in options.items() if "." not in name}
         scene = {n[6:]: _spread(SceneSpec, n[6:], v) for n, v in options.items() if n.startswith("scene.")}
         unknown = next((name for name in options if "." in name and not name.startswith("scene.")), None)
@@ -189,13 +181,10 @@ class Study:
 
 
 def read_study(path: Path) -> Study:
-    """Read a study from a file, or by the name of one in benchmarks/definitions.
+    """Read a study from a TOML file.
 
-    `kind` names one of `KINDS` (default "matched"), tables `[[scene]]` are `SceneSpec`s, and `methods` lists
-    names that the kind knows or tables `[method.NAME]`. All other keys are fields of the kind's class.
-
-    Raises:
-        InputError: the file cannot be read, or a key or value is unknown; the message names the file.
+    `kind` is one of `KINDS` (default "matched"), tables `[[scene]]` are `SceneSpec`s, and `methods` lists
+    methods of the kind or tables `[method.NAME]`. Other keys are fields of the kind's class.
     """
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
@@ -212,7 +201,7 @@ def read_study(path: Path) -> Study:
         scenes = tuple(_scene(values) for values in content.pop("scene", []))
         twice = next((s.name for i, s in enumerate(scenes) if s.name in {o.name for o in scenes[:i]}), None)
         if twice is not None:
-            raise InputError(f"scene {twice}: there are two of that name")
+            raise InputError(f"scene {twice}: the name is used twice")
         if "keep" in content:
             content["ratios"] = _ratios_of(content.pop("keep"), "ratios" in content)
         values = checked(cls, {"title": path.stem, **content}, {"name", "scenes", "methods", "folder"})
@@ -227,7 +216,7 @@ def read_study(path: Path) -> Study:
 
 
 def scene_label(path: Path) -> str:
-    """Return a short name: a folder's with its parent's, a file's without its extension.
+    """Return a short name: a folder with its parent, or a file without its extension.
 
     >>> scene_label(Path("data/guitar.compressed.ply"))
     'guitar'
@@ -236,11 +225,7 @@ def scene_label(path: Path) -> str:
 
 
 def checked(kind: type, values: Mapping[str, Any], withheld: set[str]) -> dict[str, Any]:
-    """Return the values as the dataclass's keys take them: types, limits, environment variables in paths.
-
-    Raises:
-        InputError: an unknown key, or a value that does not fit.
-    """
+    """Check types and limits of values for a dataclass, and expand environment variables."""
     known = {f.name: f for f in fields(kind) if f.name not in withheld}
     unknown = next((name for name in values if name not in known), None)
     if unknown is not None:

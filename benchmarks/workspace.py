@@ -1,4 +1,4 @@
-"""A scene of a study made ready: its prior, views to train on, views to score on, and what they show."""
+"""Prepared scene of a study: its prior, and its views and targets for training and scoring."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ PROTOCOLS: dict[str, tuple[str, ...]] = {
     "both": ("pool", "near", "standing"),
     "anywhere": ("anywhere",),
 }
-"""By protocol, the kinds of views that are scored."""
+"""Protocol → kinds of views to score."""
 
 _POOL = 128
 _MAX_LOGIT = 20.0
-"""An opacity of exactly 1 has no finite logit; here it is 1 − 2e-9, which every program can read."""
+"""Largest logit. Opacities of exactly 1 become 1 − 2e-9, since some programs cannot read infinite logits."""
 
 
 def budget_of(count: int, ratio: float) -> int:
-    """Return the count that a ratio leaves."""
+    """Return the count for a ratio."""
     return max(1, int(np.floor(count / ratio + 0.5)))
 
 
 def reduced(splats: Splats, ratio: float, views: Cameras) -> Splats:
-    """Return the scene simplified by a ratio, looked at from some views; 1 leaves it as it is."""
+    """Simplify a scene by a ratio with visibility from views; 1 returns the scene."""
     budget = budget_of(len(splats), ratio)
     if budget == len(splats):
         return splats
@@ -58,14 +58,14 @@ def reduced(splats: Splats, ratio: float, views: Cameras) -> Splats:
 
 
 class Workspace:
-    """One scene of a study; files that it makes lie in `folder`, and nothing is loaded before it is used."""
+    """Lazily loaded scene of a study, with intermediate files in `folder`."""
 
     def __init__(self, work: Path, study: Study, scene: SceneSpec) -> None:
         self.work, self.study, self.scene = work, study, scene
 
     @cached_property
     def folder(self) -> Path:
-        """Where the scene's intermediate files lie."""
+        """The folder of intermediate files."""
         folder = folder_of(self.work, self.study, self.scene)
         folder.mkdir(parents=True, exist_ok=True)
         return folder
@@ -77,7 +77,7 @@ class Workspace:
 
     @cached_property
     def place(self) -> Path:
-        """The folder that the scene's paths are relative to; a city is generated here."""
+        """The base of the scene's paths; generates the city if the scene is one."""
         if self.scene.synth is None:
             return self.study.folder
         from benchmarks.synth import CityConfig, write_city
@@ -92,12 +92,12 @@ class Workspace:
 
     @cached_property
     def lifted(self) -> bool:
-        """Whether the prior is a cloud, which is lifted."""
+        """Whether the prior is lifted from a point cloud."""
         return io.kind(self.place / self.scene.prior) != "splats"
 
     @cached_property
     def splats(self) -> Splats:
-        """The prior, in values that every program can read."""
+        """The prior, with finite logits."""
         source = self.place / self.scene.prior
         if self.lifted:
             points = io.read_points(source)
@@ -116,7 +116,7 @@ class Workspace:
 
     @cached_property
     def train(self) -> Path:
-        """Training views at the study's size, photos by absolute path; none that is scored on."""
+        """The training views at the study's size, without those that are scored."""
         path = self.folder / "train.json"
         if not path.exists():
             self.write_views(path, self._training(), "train")
@@ -136,17 +136,13 @@ class Workspace:
         return self.views(whole, "train")
 
     def write_views(self, path: Path, cameras: Cameras, what: str) -> None:
-        """Write views to train on, except those that a split scores on; dropped.json counts these.
-
-        Raises:
-            InputError: all of them are scored on.
-        """
+        """Write training views without those that are scored, and count the dropped ones in dropped.json."""
         keep = np.ones(len(cameras), bool)
         for name, scored in self.scored.items():
-            if what == "adapt" or name != "adapt-val":  # another light's photos may be of places trained on
+            if what == "adapt" or name != "adapt-val":  # new appearance may show trained places
                 keep &= not_held_out(cameras, scored)
         if not keep.any():
-            raise InputError(f"all {plural(len(keep), 'view')} to {what} on are scored on")
+            raise InputError(f"all {plural(len(keep), 'view')} to {what} on are scored; none remain")
         counts = {**self._dropped, what: int(np.count_nonzero(~keep))}
         (self.folder / "dropped.json").write_text(json.dumps(counts), encoding="utf-8", newline="\n")
         io.write_views(path, cameras.take(keep), splits=["train"] * int(np.count_nonzero(keep)))
@@ -159,11 +155,11 @@ class Workspace:
 
     @property
     def dropped(self) -> int:
-        """How many views were given both to train or adapt on and to score on; they are scored on alone."""
+        """The number of views that were dropped from training or adaptation because they are scored."""
         return sum(self._dropped.values())
 
     def read(self, path: Path) -> io.ViewSet:
-        """Read views, without photos where the scene's targets allow it."""
+        """Read views; those without photos are kept if the scene's targets allow it."""
         return io.read_view_set(path, unpictured=self.scene.targets == "either")
 
     def views(self, path: Path, split: str) -> Cameras:
@@ -172,16 +168,16 @@ class Workspace:
         return self.small(found, split_mask(path, found.cameras.names, split, stated=found.splits))
 
     def small(self, found: io.ViewSet, mask: NDArray[np.bool_]) -> Cameras:
-        """Return some views at the study's size."""
+        """Select views and shrink them to the study's size."""
         return found.take(mask).resized(self.study.size).cameras
 
     def _apart(self, path: Path, chosen: Callable[..., NDArray[np.bool_]]) -> Cameras:
-        """Return the views that `for_training` or `for_scores` chooses, for files that are only scored on."""
+        """Return the views that `for_training` or `for_scores` chooses."""
         found = self.read(path)
         return self.small(found, chosen(path, found.cameras.names, found.splits))
 
     def _pool(self, split: str) -> Cameras:
-        """Return a part of a generated pool; every 8th pose is scored."""
+        """Return a split of a generated pool; every 8th view is scored."""
         path = self.folder / "pool.json"
         if not path.exists():
             pool = make_pool(self.splats, _POOL, seed=self.study.pool_seed)
@@ -199,15 +195,11 @@ class Workspace:
         return {"test": self._pool("test")}
 
     def targets(self, cameras: Cameras, settings: RasterSettings | None = None, **options: Any) -> Targets:
-        """Return what views show: photos, or renders of the prior.
-
-        Raises:
-            InputError: the prior is a lifted cloud, which cannot render training images.
-        """
+        """Return the targets of views: photos, or renders of the prior."""
         if self.scene.targets == "photos":
             return Photos(cameras, **options)
         if self.lifted:
-            raise InputError(f"scene {self.scene.name}: a cloud is no teacher: targets must be photos")
+            raise InputError(f"scene {self.scene.name}: a point cloud has no renders; set targets = 'photos'")
         kind = TeacherRenders if self.scene.targets == "teacher" else PhotosOrRenders
         look = {"background": self.scene.background, "settings": settings, **options}
         return kind(teacher=self.splats, cameras=cameras, **look)

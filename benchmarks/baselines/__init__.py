@@ -1,8 +1,7 @@
-"""Other people's methods, built from their papers to be measured beside ours, each at an exact count.
+"""Other simplification methods, implemented from their papers at an exact count, without recovery.
 
-`reduce(name, splats, budget, cameras)` runs any of `METHODS`; `python -m benchmarks.baselines NAME SCENE
-COUNT OUT.ply --views VIEWS` does so as a whole command. None of them recovers: that is the caller's, and the
-same for all.
+`reduce(name, splats, budget, cameras)` runs a method; so does the command `python -m benchmarks.baselines
+NAME SCENE COUNT OUT.ply --views VIEWS`.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ __all__ = ["METHODS", "NEED_VIEWS", "reduce"]
 
 METHODS = ("random", "opacity-area", "lightgaussian", "pup", "mini-splatting", "nanogs")
 NEED_VIEWS = ("lightgaussian", "pup", "mini-splatting")
-"""Those that score Gaussians by what the training views see."""
+"""Methods that score Gaussians by training views."""
 
 
 def reduce(
@@ -34,19 +33,13 @@ def reduce(
     """Reduce a scene to exactly `budget` Gaussians by a baseline of `METHODS`, without recovery.
 
     Args:
-        name: of the method.
+        name: name of the method.
         splats: the scene.
         budget: Gaussians to keep, 1 to N.
-        cameras: the training views, for those in `NEED_VIEWS`.
-        seed: of the methods that draw (random, Mini-Splatting).
-        indoor: Mini-Splatting's importance for rooms instead of its one for outdoor scenes.
-        progress: told of views looked at.
-
-    Returns:
-        The reduced scene.
-
-    Raises:
-        InputError: an unknown method, a budget that does not fit, or views that are missing.
+        cameras: training views, for methods in `NEED_VIEWS`.
+        seed: seed of random methods (random, Mini-Splatting).
+        indoor: whether Mini-Splatting uses its importance for rooms.
+        progress: callback per view.
 
     >>> import numpy as np
     >>> from g2ard.scene.splats import Splats
@@ -61,7 +54,7 @@ def reduce(
     if name not in METHODS:
         raise InputError(f"baseline: expected one of {', '.join(METHODS)}, got {name!r}")
     if name in NEED_VIEWS and cameras is None:
-        raise InputError(f"{name}: scores Gaussians by training views, and none were given")
+        raise InputError(f"{name}: needs training views; give --views")
     if name == "nanogs":
         from benchmarks.baselines.nanogs import nanogs
 

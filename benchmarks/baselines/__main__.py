@@ -1,4 +1,4 @@
-"""A baseline as a command: `python -m benchmarks.baselines METHOD SCENE COUNT OUT.ply [--views VIEWS]`."""
+"""Command for baselines: `python -m benchmarks.baselines METHOD SCENE COUNT OUT.ply [--views VIEWS]`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ def _main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("count", type=int)
     parser.add_argument("output", type=Path)
-    parser.add_argument("--views", type=Path, help="training views: the file's split `train`, if it has one")
+    parser.add_argument(
+        "--views", type=Path, help="views to train on (only the split train, if the file has splits)"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--indoor", action="store_true")
     given = parser.parse_args()

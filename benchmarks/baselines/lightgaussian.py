@@ -1,7 +1,7 @@
-"""LightGaussian's pruning (arXiv 2311.17245): what a Gaussian gives to the training views, by its volume.
+"""LightGaussian's pruning (arXiv 2311.17245) by contribution to the training views and volume.
 
-Its fine-tuning afterwards (5,000 Adam steps at the rates of 3DGS) is recovery, and not done here; its
-distillation of SH and its quantisation are another matter than the count.
+Its fine-tuning (5,000 Adam steps at the rates of 3DGS) counts as recovery. SH distillation and quantisation
+are not included.
 """
 
 from __future__ import annotations
@@ -30,17 +30,11 @@ def global_significance(
     kernel: Literal["transmittance", "hits"] = "transmittance",
     progress: Progress = silent,
 ) -> NDArray[np.float64]:
-    """(N,) scores I_j·(V_j / V*)^0.1.
+    """Return (N,) scores I_j·(V_j / V*)^0.1.
 
-    I_j = Σ σ_j·T over the pixels of all views that j touches (α = min(0.99, σG) ≥ 1/255, light left), or
-    Σ σ_j as an older release of its kernel had it; V is the product of the scales and V* the one at rank
-    ⌊0.9 N⌋ from the largest.
-
-    Args:
-        splats: the scene.
-        cameras: the training views.
-        kernel: "transmittance" for Σ σT, "hits" for Σ σ.
-        progress: told after each view.
+    I_j = Σ σ_j·T over the pixels of all views that j touches (α = min(0.99, σG) ≥ 1/255, before the pixel
+    stops), or Σ σ_j with `kernel="hits"`, as in an older release. V is the product of the scales and V* the
+    one at rank ⌊0.9 N⌋ from the largest.
     """
     seen = visibility(splats, cameras, progress)
     touched = seen.transmittance if kernel == "transmittance" else seen.hits.astype(np.float64)
@@ -58,9 +52,5 @@ def lightgaussian(
     kernel: Literal["transmittance", "hits"] = "transmittance",
     progress: Progress = silent,
 ) -> Splats:
-    """The `budget` Gaussians of highest `global_significance`.
-
-    Raises:
-        InputError: the budget does not fit.
-    """
+    """Keep the `budget` Gaussians of highest `global_significance`."""
     return keep_best(splats, global_significance(splats, cameras, kernel=kernel, progress=progress), budget)

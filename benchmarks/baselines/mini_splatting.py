@@ -1,7 +1,6 @@
 """Mini-Splatting's simplification (arXiv 2403.14166): sampling by importance over the training views.
 
-Only the step that reduces: its blur split, depth reinitialisation and training from scratch belong to
-making a scene, not to reducing one.
+Its blur split, depth reinitialisation and training from scratch are not included.
 """
 
 from __future__ import annotations
@@ -21,15 +20,10 @@ __all__ = ["importance", "mini_splatting", "sample"]
 def importance(
     splats: Splats, cameras: Cameras, *, indoor: bool = False, progress: Progress = silent
 ) -> NDArray[np.float64]:
-    """(N,) importance summed over views, 0 for what never has the largest αT of a pixel.
+    """Return (N,) importance summed over views, 0 for Gaussians that never have the largest αT of a pixel.
 
-    A view adds w = Σ αT indoors; outdoors w / (pixels touched), where the Gaussian leads in a pixel of it.
-
-    Args:
-        splats: the scene.
-        cameras: the training views.
-        indoor: which of the release's two metrics.
-        progress: told after each view.
+    A view adds w = Σ αT indoors. Outdoors it adds w / (pixels touched) if the Gaussian has the largest αT of
+    one of its pixels.
     """
     total, leads = np.zeros(len(splats)), np.zeros(len(splats), np.uint64)
     for view in range(len(cameras)):
@@ -45,10 +39,10 @@ def importance(
 
 
 def sample(weights: NDArray[np.float64], count: int, *, seed: int = 0) -> NDArray[np.intp]:
-    """`count` indices without replacement, each draw with p ∝ weight of those left, in ascending order.
+    """Sample `count` ascending indices without replacement, each draw with p ∝ the remaining weights.
 
-    The `count` first arrivals of exponential clocks of rate `weights` are such a sample. Zero weights come
-    only after all others, in random order.
+    The first `count` arrivals of exponential clocks of rate `weights` are such a sample. Zero weights come
+    last, in random order.
 
     >>> sample(np.array([0.0, 1, 0, 5]), 2).tolist()
     [1, 3]
@@ -69,11 +63,7 @@ def mini_splatting(
     indoor: bool = False,
     progress: Progress = silent,
 ) -> Splats:
-    """Exactly `budget` Gaussians, sampled by `importance`.
-
-    Raises:
-        InputError: the budget does not fit.
-    """
+    """Sample exactly `budget` Gaussians by `importance`."""
     check_budget(splats, budget)
     weights = importance(splats, cameras, indoor=indoor, progress=progress)
     return splats.take(sample(weights, budget, seed=seed))

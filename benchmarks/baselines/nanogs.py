@@ -1,8 +1,8 @@
-"""NanoGS (arXiv 2603.16103) on numpy: the training-free pairwise merger, from its description.
+"""NanoGS (arXiv 2603.16103), training-free pairwise merging, in NumPy.
 
-Two departures, both for an exact count, which the original misses by one: the last pass stops at the budget,
-and where its opacity cut would leave too few, the most opaque of what it cut stay. "One shared
-standard-normal sample a component" is read as one draw for each of a pair's two, the same for all pairs.
+Two changes give an exact count, which the original misses by one: the last pass stops at the budget, and the
+opacity cut keeps at least as many Gaussians as the budget. "One shared standard-normal sample a component"
+is implemented as one draw per member of a pair, shared by all pairs.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _CHUNK = 1 << 17
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """float64 Gaussians: means, axes (columns) and variances along them, α, all SH coefficients in a row."""
+    """Gaussians in float64: means, axes (columns) and variances along them, α, flat SH coefficients."""
 
     means: _Floats
     axes: _Floats
@@ -46,7 +46,7 @@ class _Rows:
 
     @property
     def mass(self) -> _Floats:
-        """(2π)^1.5·α·volume."""
+        """The mass (2π)^1.5·α·volume."""
         return (2 * np.pi) ** 1.5 * self.alpha * np.sqrt(self.variances.prod(1)) + _EPSILON_MASS
 
     @property
@@ -57,17 +57,8 @@ class _Rows:
 def nanogs(splats: Splats, budget: int) -> Splats:
     """Reduce a scene to exactly `budget` Gaussians by NanoGS's passes of disjoint pair merges.
 
-    A pass takes the edges of the 16-nearest-neighbour graph by ascending cost KL(pair ‖ merged) + ‖ΔSH‖².
-
-    Args:
-        splats: the scene.
-        budget: Gaussians to keep.
-
-    Returns:
-        The reduced scene; rows neither merged nor cut come first, in their order.
-
-    Raises:
-        InputError: a value that is not finite, or a budget below 1 or above the count.
+    A pass takes edges of the 16-nearest-neighbour graph by ascending cost KL(pair ‖ merged) + ‖ΔSH‖².
+    Unmerged rows come first in the result, in their order.
 
     >>> rng = np.random.default_rng(0)
     >>> scene = Splats.create(rng.normal(size=(200, 3)), scales=np.full((200, 3), 0.1))
@@ -93,13 +84,13 @@ def nanogs(splats: Splats, budget: int) -> Splats:
 
 
 def _opaque(alpha: _Floats, budget: int) -> NDArray[np.intp]:
-    """Rows not below min(0.1, median α), or the `budget` most opaque if those are more."""
+    """Return rows with at least min(0.1, median α), or the `budget` most opaque if that is more."""
     least = max(budget, int(np.count_nonzero(alpha >= min(0.1, float(np.median(alpha))))))
     return np.sort(np.argsort(-alpha, kind="stable")[:least])
 
 
 def _pairs(rows: _Rows, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """At most `most` disjoint edges, greedily by ascending cost."""
+    """Return at most `most` disjoint edges, chosen greedily by ascending cost."""
     n = len(rows.means)
     near = _core.knn(np.ascontiguousarray(rows.means), min(_NEIGHBORS, n - 1)).astype(np.int64)
     a = np.repeat(np.arange(n), near.shape[1])
@@ -116,9 +107,9 @@ def _pairs(rows: _Rows, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _greedy(i: NDArray[np.intp], j: NDArray[np.intp], n: int) -> NDArray[np.intp]:
-    """What a walk in rank order would take, in that order.
+    """Return the edges that a greedy walk in rank order takes, in that order.
 
-    An edge that is the first one left at both its ends is taken whatever comes between: all such go at once.
+    All edges that are the first remaining one at both ends can be taken at once.
     """
     left, taken = np.arange(len(i)), []
     while len(left):
@@ -141,7 +132,7 @@ def _cost(
     for k, own, weight in ((0, i, share), (1, j, 1 - share)):
         step = np.sqrt(rows.variances[own] + _EPSILON_VARIANCE) * _SAMPLES[k]
         x = rows.means[own] + np.einsum("nij,nj->ni", rows.axes[own], step)
-        with np.errstate(divide="ignore"):  # a share of 0 weighs nothing
+        with np.errstate(divide="ignore"):  # a share of 0 has no weight
             logs = np.logaddexp(
                 np.log(share) + _log_density(rows, i, x), np.log1p(-share) + _log_density(rows, j, x)
             )
@@ -198,7 +189,7 @@ def _splats(rows: _Rows, like: Splats) -> Splats:
 
 
 def _quats(axes: _Floats) -> _Floats:
-    """wxyz: the eigenvector of largest eigenvalue of Bar-Itzhack's symmetric matrix; no branches."""
+    """Return wxyz quaternions: the top eigenvector of Bar-Itzhack's symmetric matrix."""
     r = axes
     k = np.zeros((len(r), 4, 4))
     k[:, 0, 0] = r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2]

@@ -1,4 +1,4 @@
-"""PUP 3D-GS's pruning (arXiv 2406.10219): how sharply the views determine each Gaussian's place and size."""
+"""PUP 3D-GS's pruning (arXiv 2406.10219) by the views' sensitivity to each Gaussian's position and size."""
 
 from __future__ import annotations
 
@@ -17,21 +17,15 @@ from g2ard.scene.splats import Splats
 __all__ = ["fisher", "pup", "rounds", "sensitivity"]
 
 _FIRST, _TOTAL = 0.2, 0.1
-"""The release keeps a fifth, then half of it."""
+"""Shares kept after the release's first and second round."""
 
 _DOWNSAMPLE = 4
 _SINGULAR = 1e-7
-"""Least eigenvalue of F with unit diagonal; pixels are summed in float32, so below this it is rounding."""
+"""Smallest eigenvalue of F with unit diagonal above rounding errors, since pixels are summed in float32."""
 
 
 def fisher(splats: Splats, cameras: Cameras, *, progress: Progress = silent) -> NDArray[np.float64]:
-    """(N, 6, 6) F = Σ g gᵀ over views, pixels and channels, g = ∂C/∂(mean, log scale).
-
-    Args:
-        splats: the scene.
-        cameras: the views, at the size they are to be rendered at.
-        progress: told after each view.
-    """
+    """Return (N, 6, 6) F = Σ g gᵀ over views, pixels and channels, g = ∂C/∂(mean, log scale)."""
     splats, cameras = centred(splats, cameras)
     settings = settings_for(splats.means)
     views = [view_of(cameras, i, settings) for i in range(len(cameras))]
@@ -43,22 +37,19 @@ def fisher(splats: Splats, cameras: Cameras, *, progress: Progress = silent) -> 
 
 
 def sensitivity(splats: Splats, cameras: Cameras, *, progress: Progress = silent) -> NDArray[np.float64]:
-    """(N,) log det F at a quarter of the views' size; −∞ where F is singular."""
+    """Return (N,) log det F at a quarter of the views' size; −∞ if F is singular."""
     return _log_det(fisher(splats, _quarter(cameras), progress=progress))
 
 
 def pup(splats: Splats, budget: int, cameras: Cameras, *, progress: Progress = silent) -> Splats:
-    """The `budget` Gaussians of highest `sensitivity`: one round. See `rounds` for the release's two.
-
-    Raises:
-        InputError: the budget does not fit.
-    """
+    """Keep the `budget` Gaussians of highest `sensitivity` in one round (the release has two, `rounds`)."""
     return keep_best(splats, sensitivity(splats, cameras, progress=progress), budget)
 
 
 def rounds(count: int, budget: int) -> list[int]:
-    """Counts after each round: for 10× a fifth, then half of that, as released; other ratios split in like
-    proportion of their logarithm.
+    """Return the count after each round: for 10× a fifth, then half of that, as in the release.
+
+    Other ratios are split in the same proportion of their logarithm.
 
     >>> rounds(1000, 100), rounds(1000, 1000)
     ([200, 100], [1000])
@@ -69,7 +60,7 @@ def rounds(count: int, budget: int) -> list[int]:
 
 
 def _quarter(cameras: Cameras) -> Cameras:
-    """⌈W/4⌉ × ⌈H/4⌉."""
+    """Shrink views to ⌈W/4⌉ × ⌈H/4⌉."""
     widths, heights = -(-cameras.widths // _DOWNSAMPLE), -(-cameras.heights // _DOWNSAMPLE)
     Ks = cameras.Ks.copy()
     Ks[:, 0] *= (widths / cameras.widths)[:, None]
@@ -78,7 +69,7 @@ def _quarter(cameras: Cameras) -> Cameras:
 
 
 def _log_det(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of F scaled to a unit diagonal, whose eigenvalues tell rank from rounding, plus the scale's."""
+    """Return log det F, from F scaled to a unit diagonal, whose eigenvalues separate rank from rounding."""
     diagonal = np.einsum("nii->ni", F)
     lively = (diagonal > 0).all(1) & np.isfinite(F).all((1, 2))
     root = np.sqrt(diagonal[lively])

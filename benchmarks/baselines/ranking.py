@@ -1,4 +1,4 @@
-"""What every pruning baseline ends with: the budget of highest scores."""
+"""Selection of the highest scores, shared by pruning baselines."""
 
 from __future__ import annotations
 
@@ -14,17 +14,13 @@ __all__ = ["check_budget", "keep_best"]
 
 
 def check_budget(splats: Splats, budget: int) -> None:
-    """Refuse a budget that no subset has.
-
-    Raises:
-        InputError: it is below 1 or above the count.
-    """
+    """Raise an `InputError` unless the budget is between 1 and the count."""
     if not 1 <= budget <= len(splats):
         raise InputError(f"budget: expected 1 to {len(splats)}, got {budget}")
 
 
 def keep_best(splats: Splats, scores: NDArray[Any], budget: int) -> Splats:
-    """The `budget` rows of highest score in their own order; the lower index wins a tie, NaN is lowest.
+    """Keep the `budget` rows of highest score in order; lower indices win ties, NaN is lowest.
 
     >>> keep_best(Splats.create(np.eye(3), scales=np.ones((3, 3))), np.array([1, 3, 3]), 1).means.tolist()
     [[0.0, 1.0, 0.0]]

@@ -1,1 +1,1 @@
-"""The kinds of studies, a module each."""
+"""Kinds of studies, one per module."""

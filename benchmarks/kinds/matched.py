@@ -1,7 +1,7 @@
-"""Methods under matched compute: each reduces, then recovers in the same steps or seconds on the same views.
+"""Methods under matched compute: reduction, then recovery in the same steps or seconds on the same views.
 
-Every reduction and recovery is a process of its own (`benchmarks.kinds.worker`) and runs once, whichever
-cells share it.
+Every reduction and recovery runs once in a process of its own (`benchmarks.kinds.worker`), and is shared by
+all cells that need it.
 """
 
 from __future__ import annotations
@@ -53,15 +53,15 @@ class Matched(Study):
     Args:
         steps: budgets in optimiser steps; each is a cell.
         seconds: budgets in wall seconds of reduction and recovery together; each is a cell.
-        released: also each method's own schedule, where it has one.
-        schedule: rates of the matched cells of methods that state none.
-        sh_degree: of the results; None keeps the prior's, and 3 if photos are the targets.
-        adapt_steps: steps of appearance on frozen geometry before scoring; 0 does not adapt.
-        adapt_schedule: "default", or "paper": all steps at its rates, nothing blended.
-        adapt_on: "train", or "all" views of `adapt` that are not stated as another split.
-        convention: of the renderer that scores.
-        eight_bit: round renders and targets to 8 bits before they are scored, as saved PNGs are.
-        lpips: folder of the networks' weights.
+        released: whether to add each method's own schedule, if it has one.
+        schedule: rates of matched cells, for methods without their own.
+        sh_degree: SH degree of the results; None keeps the prior's, or 3 if photos are the targets.
+        adapt_steps: steps of adaptation before scoring; 0 does not adapt.
+        adapt_schedule: "default", or "paper": all steps at its rates, without blending.
+        adapt_on: "train", or "all" views of `adapt` that are not of another split.
+        convention: conventions of the renderer for scores.
+        eight_bit: whether to round renders and targets to 8 bits before scoring, as in saved PNGs.
+        lpips: folder of LPIPS weights.
         lpips_input: "scaled" to [−1, 1], or "unscaled" as in 3DGS's evaluation (`g2ard.rendering.lpips`).
     """
 
@@ -83,11 +83,11 @@ class Matched(Study):
 
     def __post_init__(self) -> None:
         if not (self.steps or self.seconds or self.released):
-            raise InputError("no steps, no seconds, and not released: there is nothing to measure")
+            raise InputError("nothing to measure; give steps, seconds or released")
 
     @classmethod
     def method(cls, name: str, values: Mapping[str, Any]) -> MethodSpec:
-        """Return the method of a table: the fields of its `base` with those that the table gives."""
+        """Return the method of a table, whose keys override those of its `base`."""
         base = values.get("base", "g2ard")
         if base not in METHODS:
             raise InputError(f"method {name}: base: no {base!r}")
@@ -98,7 +98,7 @@ class Matched(Study):
             raise InputError(f"method {name}: {error}") from None
 
     def budgets(self, method: MethodSpec) -> list[Budget]:
-        """Return what a method's cells may spend."""
+        """Return the budgets of a method's cells."""
         if not method.recovers:
             return [Budget("none")]
         out = [Budget("steps", n) for n in self.steps] + [Budget("seconds", s) for s in self.seconds]
@@ -107,7 +107,7 @@ class Matched(Study):
         return out
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
-        """Yield a cell for each ratio, method, budget and seed; a teacher's row once per scene."""
+        """Yield a cell per ratio, method, budget and seed, and one per scene for the teacher."""
         place = MatchedWorkspace(work, self, scene)
         whole = [(1.0, m, Budget("none"), self.seeds[0]) for m in self.methods if not m.recovers]
         grid = [
@@ -131,12 +131,12 @@ class Matched(Study):
             yield Cell(names, measure, more=[asdict(method), shared])
 
     def check(self) -> None:
-        """Check paths, and load the networks before hours of work."""
+        """Check paths and load the LPIPS networks early."""
         super().check()
         self.networks  # noqa: B018
 
     def derived(self, rows: list[Row]) -> list[Row]:
-        """Add each row's distance from the teacher's row of its scene, prior and split."""
+        """Add the difference to the teacher's row of the same scene, prior and split."""
 
         def place(row: Row) -> tuple[Any, ...]:
             return row["scene"], row.get("prior"), row.get("split")
@@ -163,7 +163,7 @@ class Matched(Study):
         result = pipeline.run()
         splats = io.read_splats(result.output)
         if len(splats) != pipeline.budget:
-            raise InputError(f"{len(splats)} Gaussians came out, {pipeline.budget} were requested")
+            raise InputError(f"got {len(splats)} Gaussians, expected {pipeline.budget}")
         folder = place.work.parent
         shared = {
             **pipeline.figures(),
@@ -197,7 +197,7 @@ class Matched(Study):
 
 @dataclass(frozen=True)
 class _Stage:
-    """A stage that has run: a hash of all that went into it, its scene or views, its cost and its report."""
+    """A finished stage: a hash of its inputs, its output, cost and report."""
 
     key: str
     output: Path
@@ -227,17 +227,13 @@ class MatchedWorkspace(Workspace):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The priors there are, the usual one first."""
+        """The available priors, the default first."""
         if not self.lifted:
             return ("given",)
         return ("trained", "lift") if self.scene.train_prior else ("lift",)
 
     def prior(self, kind: str | None) -> _Stage:
-        """Return a prior as a .ply.
-
-        Raises:
-            InputError: the scene has no prior of that kind.
-        """
+        """Return a prior as a .ply."""
         kind = kind or self.kinds[0]
         if kind not in self.kinds:
             raise InputError(f"scene {self.scene.name}: no {kind} prior (it has {', '.join(self.kinds)})")
@@ -259,7 +255,7 @@ class MatchedWorkspace(Workspace):
         return cameras.take(~self._last(cameras)) if self.scene.adapt_last else cameras
 
     def _last(self, cameras: Cameras) -> NDArray[np.bool_]:
-        """Return which views are the scene's `adapt_last`, the last by name."""
+        """Return a mask of the scene's `adapt_last` views, the last by name."""
         last, given = self.scene.adapt_last, len(cameras)
         if last >= given:
             raise InputError(f"adapt_last: {last} of {given} views leave none to train on")
@@ -269,7 +265,7 @@ class MatchedWorkspace(Workspace):
     def adaptation(self, split: str) -> Cameras | None:
         """Return views of new appearance: "train" to adapt on, or "test".
 
-        Where they state no split, every third by name is "test", or none if the study adapts on all.
+        Without stated splits, every third by name is "test", or none if the study adapts on all.
         """
         if self.scene.adapt_last and self.scene.train is not None:
             if split == "test":
@@ -277,7 +273,7 @@ class MatchedWorkspace(Workspace):
             cameras = self.views(self.place / self.scene.train, "train")
             return cameras.take(self._last(cameras))
         if self.scene.adapt is None:
-            raise InputError("the study adapts, and the scene has no `adapt` views and no `adapt_last`")
+            raise InputError("the study adapts; the scene needs `adapt` views or `adapt_last`")
         path = self.place / self.scene.adapt
         found = self.read(path)
         if states_splits(path, found.splits):
@@ -290,7 +286,7 @@ class MatchedWorkspace(Workspace):
 
     @cached_property
     def adapted(self) -> Path:
-        """The views to adapt on, written out."""
+        """The file of views to adapt on."""
         path = self.folder / "adapt.json"
         if not path.exists():
             cameras = self.adaptation("train")
@@ -327,11 +323,11 @@ class MatchedWorkspace(Workspace):
         return folder
 
     def reduce(self, source: _Stage, views: Path, job: dict[str, Any], flags: Path | None) -> _Stage:
-        """Reduce a scene; `job` holds the options of the worker's job."""
+        """Reduce a scene with the worker's options `job`."""
         if job["method"].startswith("splat-transform"):
             mode = "--decimate-adaptive" if job["method"].endswith("adaptive") else "--decimate"
             given = (str(source.output), mode, str(job["count"]))
-            splat_transform()  # before a stage is begun: is it there?
+            splat_transform()  # check early that it is installed
             return self._run(
                 {"kind": "rival", **job}, source, "out.ply", {}, lambda out: splat_transform(*given, str(out))
             )
@@ -339,7 +335,7 @@ class MatchedWorkspace(Workspace):
         return self._run({"kind": "reduce", **job, "indoor": self.scene.indoor}, source, "out.ply", files)
 
     def select(self, source: _Stage, policy: str, k: float, seed: int) -> _Stage:
-        """Choose a part of the training views by what the prior shows."""
+        """Select training views by the prior."""
         count = max(1, round(k * len(self.train_cameras)))
         job = {"kind": "select", "policy": policy, "k": count, "seed": seed}
         return self._run(job, source, "views.json", {"scene": source.output, "views": self.train})
@@ -347,7 +343,7 @@ class MatchedWorkspace(Workspace):
     def recover(
         self, source: _Stage, views: Path, options: dict[str, Any], anchors: _Stage | None = None
     ) -> _Stage:
-        """Recover against the training targets, held to the geometry of `anchors` or of the source."""
+        """Recover against the training targets, anchored to the geometry of `anchors` or of the source."""
         job = {"kind": "recover", **options, "background": list(self.scene.background)}
         files = {"scene": source.output, "views": views}
         files["targets"] = self._stored("targets-train", self.read(self.train).cameras)
@@ -378,7 +374,7 @@ class MatchedWorkspace(Workspace):
         files: dict[str, Path],
         command: Callable[[Path], list[str]] | None = None,
     ) -> _Stage:
-        """Run a job in a process unless it has run, and return its stage."""
+        """Run a job in a process, unless it has run before, and return its stage."""
         views = files.get("views", self.train)
         chosen = None if views.parent == self.folder else views.read_text(encoding="utf-8")
         name = fingerprint([job, source.key, chosen, __version__])
@@ -399,7 +395,7 @@ class MatchedWorkspace(Workspace):
 
 
 class _Pipeline:
-    """One cell's stages, from the prior to the scene that is scored."""
+    """The stages of a cell, from the prior to the scored scene."""
 
     def __init__(
         self, place: MatchedWorkspace, method: MethodSpec, ratio: float, matched: Budget, seed: int
@@ -418,7 +414,7 @@ class _Pipeline:
         self.last: dict[str, Any] = {}
 
     def figures(self) -> Row:
-        """Return the columns of cost and of the last recovery."""
+        """Return the columns on cost and on the last recovery."""
         costs = {f"{name}_cpu_s": spent.cpu for name, spent in self.spent.items()}
         peaks = {f"{name}_peak_mb": spent.peak for name, spent in self.spent.items()}
         walls = {f"{name}_wall_s": self.spent[name].wall for name in ("reduce", "recover")}
@@ -427,7 +423,7 @@ class _Pipeline:
             "prior": self.prior,
             "input_count": self.count,
             "budget": self.budget,
-            "drift95": self.last.get("drift95", 0.0),  # what was not recovered has not moved
+            "drift95": self.last.get("drift95", 0.0),  # scenes without recovery have not moved
             "steps": self.steps,
             **costs,
             **walls,
@@ -437,7 +433,7 @@ class _Pipeline:
         }
 
     def _regularizers(self, prior: Splats) -> dict[str, Any]:
-        """Return the weights that the method asks for: the paper's for this kind of prior, or ours."""
+        """Return the method's weights of regularisers: the paper's for this kind of prior, or ours."""
         method = self.method
         papers = method.lambdas == "paper"
         known = self.prior if papers and self.prior != "given" else "auto"
@@ -461,7 +457,7 @@ class _Pipeline:
         return pup_rounds(self.count, self.budget) if self.method.rounds == "pup" else [self.budget]
 
     def run(self) -> _Stage:
-        """Return the scene that is scored."""
+        """Run all stages and return the scored scene."""
         method, place = self.method, self.place
         views = place.train
         if method.policy is not None:
@@ -484,7 +480,7 @@ class _Pipeline:
         return state
 
     def _seed(self, final: bool) -> int:
-        """Return the seed; what comes before a shared start's last recovery is every row's."""
+        """Return the seed; stages before a shared start's last recovery are shared by all rows."""
         return self.place.study.seeds[0] if self.method.shared_start and not final else self.seed
 
     def _reduce(self, state: _Stage, views: Path, count: int, flags: Path | None) -> _Stage:
@@ -497,7 +493,7 @@ class _Pipeline:
         return done
 
     def _recover(self, state: _Stage, views: Path, leg: Leg, legs: list[Leg], built: _Stage) -> _Stage:
-        """Recover; a second recovery at the same count stays held to the geometry as `built`."""
+        """Recover; a second recovery at the same count stays anchored to the geometry as `built`."""
         spend = self._spend(leg, legs)
         if spend is None:
             return state
@@ -515,7 +511,7 @@ class _Pipeline:
         return done
 
     def _spend(self, leg: Leg, legs: list[Leg]) -> dict[str, Any] | None:
-        """Return rates, and steps or seconds, of a recovery; None if nothing is left."""
+        """Return rates, and steps or seconds, of a recovery; None if none remain."""
         method, matched = self.method, self.matched
         if matched.kind == "released":
             if not method.released_steps:
@@ -532,7 +528,7 @@ class _Pipeline:
             return {"schedule": schedule, "steps": steps, "seconds": None} if steps else None
         counted = ("select",) if method.shared_start else ("select", "reduce", "recover")
         left = matched.amount - sum(self.spent[name].wall for name in counted if name in self.spent)
-        if left <= 0:  # scored as it is: the row's seconds show that they were not enough
+        if left <= 0:  # scored without recovery; the row has the seconds
             return None
         limit = left if leg.final else left * leg.share / (1 - sum(b.share for b in before))
         return {"schedule": schedule, "steps": None, "seconds": round(limit, 3)}

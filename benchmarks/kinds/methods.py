@@ -1,4 +1,4 @@
-"""Methods of a matched study: how each reduces, in which rounds, and how it recovers."""
+"""Methods of a matched study: reduction, rounds and recovery."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from g2ard.errors import InputError
 __all__ = ["FINAL_STEPS", "METHODS", "REDUCERS", "ROUND_STEPS", "Leg", "Matched", "MethodSpec"]
 
 REDUCERS = (*SIMPLIFIERS, "no-views", "splat-transform", "splat-transform-adaptive", *baselines.METHODS)
-"""What reduces a scene: g2ard's methods, another program, baselines."""
+"""Reductions: g2ard's methods, splat-transform, baselines."""
 
 ROUND_STEPS, FINAL_STEPS = 8_000, 30_000
-"""Of the paper's recoveries (`tab:s_config`): after each round, and once more at the target count."""
+"""Steps of the paper's recoveries after each round and at the target count (`tab:s_config`)."""
 
 
 @dataclass(frozen=True)
 class Matched:
-    """What a cell may spend: `amount` steps or seconds, what the method's release spends, or nothing."""
+    """The budget of a cell: `amount` steps or seconds, the steps of the method's release, or nothing."""
 
     kind: str
     amount: float = 0.0
 
     @property
     def label(self) -> str:
-        """Its name in rows and charts."""
+        """The budget's name in rows and charts."""
         named = {"steps": f"{self.amount:g} steps", "seconds": f"{self.amount:g} s", "none": "as it is"}
         return named.get(self.kind, self.kind)
 
 
 @dataclass(frozen=True)
 class Leg:
-    """One recovery of a method.
+    """A recovery of a method.
 
     Args:
-        round: the reduction it follows, from 0.
-        final: whether it is the last, in which the paper's appearance rates decay otherwise (`tab:s_config`).
-        share: of the matched steps or seconds.
+        round: index of the reduction before it.
+        final: whether it is the last, for which the paper has other appearance rates (`tab:s_config`).
+        share: share of the matched steps or seconds.
     """
 
     round: int
@@ -50,30 +50,29 @@ class Leg:
 
 @dataclass(frozen=True)
 class MethodSpec:
-    """One method.
+    """A method.
 
     Args:
-        name: its name in the rows.
-        reduce: one of `REDUCERS`, or "none": the prior as it is, a teacher's row.
-        rounds: "one" shot; "paper", 75 % a round with recovery after each and once more at the end; "pup",
-            its two.
-        prior: "lift", "trained" or "given"; None means the scene's usual one.
-        policy: of view selection; None trains on all views.
-        k: share of the training views that the policy keeps.
-        shared_start: the policy's views serve the last recovery only. What comes before takes all views and
-            the study's first seed, so that rows continue from one checkpoint (`tab:s_policy`). The matched
-            amount is the last recovery's.
-        preset: of the regularisers; auto goes by the prior's kind if that is known, otherwise measures it.
-        lambdas: "own" weights of the regularisers, or the "paper"'s (`tab:s_recovery`).
+        name: name in rows.
+        reduce: one of `REDUCERS`, or "none" for the prior itself, the teacher's row.
+        rounds: "one" shot; "paper": 75 % per round, with recovery after each and at the end; "pup": two.
+        prior: "lift", "trained" or "given"; None means the scene's default.
+        policy: policy of view selection; None trains on all views.
+        k: share of training views that the policy keeps.
+        shared_start: whether only the last recovery uses the policy's views. Earlier stages use all views
+            and the study's first seed, so that rows continue from one checkpoint (`tab:s_policy`), and only
+            the last recovery is matched.
+        preset: preset of the regularisers; auto uses the prior's kind if known, or measures it.
+        lambdas: weights of the regularisers: "own" or "paper" (`tab:s_recovery`).
         anchor: overrides the weight of L_anchor.
-        shape: overrides the weight of L_shape; 0 also ends the effective rank's barrier.
+        shape: overrides the weight of L_shape; 0 also disables the barrier on effective rank.
         effective_rank: overrides whether the needle barrier of L_shape is on.
-        period: overrides the steps between two additions of the regularisers.
-        protection: λ_h of the `paper` policy; 0 takes the flags away.
-        schedule: rates of the matched cells; None means the study's.
-        released_steps: steps of each recovery in the method's own release, of the last one if rounds are the
-            paper's (8,000 after each round come before). None means that there is no release.
-        released_schedule: their rates.
+        period: overrides the steps between applications of the regularisers.
+        protection: λ_h of the `paper` policy; 0 disables flags.
+        schedule: rates of matched cells; None means the study's.
+        released_steps: steps per recovery in the method's release, or of the last one with the paper's
+            rounds (after 8,000 per round). None if there is no release.
+        released_schedule: rates of the release.
     """
 
     name: str
@@ -100,11 +99,11 @@ class MethodSpec:
 
     @property
     def recovers(self) -> bool:
-        """Whether there is anything to match; a teacher's row is the prior alone."""
+        """Whether the method recovers; the teacher's row does not."""
         return self.reduce != "none"
 
     def legs(self, rounds: int) -> list[Leg]:
-        """Return the recoveries over so many reductions; the shares add up to 1, except a shared start's.
+        """Return the recoveries for a number of reductions; shares sum to 1, except with a shared start.
 
         >>> [(leg.round, leg.final, round(leg.share, 3)) for leg in METHODS["g2ard-paper"].legs(2)]
         [(0, False, 0.174), (1, False, 0.174), (1, True, 0.652)]
@@ -145,6 +144,5 @@ METHODS: dict[str, MethodSpec] = {
         MethodSpec("teacher", "none"),
     )
 }
-"""What a study may name without describing it. Released steps of PUP and LightGaussian are those of their
-papers. Mini-Splatting trains on for 15,000 once it has simplified. NanoGS and splat-transform do not
-recover."""
+"""Predefined methods. Released steps of PUP and LightGaussian are from their papers. Mini-Splatting trains
+for 15,000 steps after simplification. NanoGS and splat-transform do not recover."""

@@ -1,4 +1,4 @@
-"""The recovery step, pass by pass, against the machine's measured limits."""
+"""Study of a recovery step's passes against the machine's measured limits."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from g2ard.stages.recover.schedule import Rates
 __all__ = ["Raster", "built_in_view", "drawn"]
 
 FLOPS_FORWARD, FLOPS_BACKWARD = 36, 55
-"""Per contributing pixel–Gaussian: what the formulas need, counted by hand (an FMA is two)."""
+"""Operations per contributing pixel–Gaussian pair, counted by hand (an FMA is two)."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class Raster(Study):
     Args:
         methods: "best" instruction set, or "all" of them.
         counts: Gaussians drawn from the scene.
-        image: width and height of the view, unless the scene has views; then its first is used.
+        image: width and height of the view, for scenes without views.
         threads: thread counts; 0 means the current one.
-        repeats: steps timed; the fastest counts.
+        repeats: timed steps; the fastest is recorded.
     """
 
     METHODS: ClassVar[Mapping[str, Any]] = {"best": "best", "all": "all"}
@@ -49,7 +49,7 @@ class Raster(Study):
     repeats: int = key(15, least=1)
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
-        """Yield a cell for each count, instruction set and number of threads."""
+        """Yield a cell per count, instruction set and number of threads."""
         place = Workspace(work, self, scene)
         isas = _core.instruction_sets()
         for count in self.counts:
@@ -71,7 +71,7 @@ class Raster(Study):
 
 
 def drawn(splats: Splats, count: int, *, seed: int = 0) -> Splats:
-    """Return a seeded random subset of SH degree 3, with scales × √(N/n) to cover what the scene covers.
+    """Return a random subset of SH degree 3, with scales × √(N/n) to cover the same area.
 
     >>> s = Splats.create(np.zeros((100, 3)), scales=np.ones((100, 3)))
     >>> small = drawn(s, 25)
@@ -79,7 +79,7 @@ def drawn(splats: Splats, count: int, *, seed: int = 0) -> Splats:
     (25, 2.0, 3)
     """
     if not 1 <= count <= len(splats):
-        raise InputError(f"the scene has only {plural(len(splats), 'Gaussian')}, not {count:,}")
+        raise InputError(f"the scene has {plural(len(splats), 'Gaussian')}, expected at least {count:,}")
     rows = np.sort(np.random.default_rng(seed).permutation(len(splats))[:count])
     taken = splats.take(rows).with_sh_degree(3)
     return replace(taken, scales=taken.scales * np.float32(np.sqrt(len(splats) / count)))
@@ -115,7 +115,7 @@ def _row(splats: Splats, cameras: Cameras, isa: str, repeats: int) -> Row:
     for _ in range(repeats):
         trainer.gradients_only(view, upside_down)
         rehearsals.append(trainer.passes())
-        trainer.step(view, upside_down, Rates(*[0.0] * 6))  # rates of 0: every repeat times the same scene
+        trainer.step(view, upside_down, Rates(*[0.0] * 6))  # rates of 0 keep the scene
         steps.append(trainer.passes())
     memory = trainer.memory()
     again = _core.machine_limits()
@@ -149,10 +149,10 @@ def _row(splats: Splats, cameras: Cameras, isa: str, repeats: int) -> Row:
 
 
 def _bytes(splats: Splats, counts: dict[str, int], pixels: int) -> int:
-    """Return what a forward and a backward pass must move.
+    """Return the minimum memory traffic of a forward and a backward pass, bytes.
 
-    Visible rows' parameters in twice and gradients out once, each pair's splat in twice and its ten sums out
-    and in, five values per pixel each way.
+    Parameters of visible rows are read twice and gradients written once. Each pair reads its splat twice, and
+    writes and reads ten sums. Each pixel has five values each way.
     """
     rows = 3 * 4 * (14 + 3 * splats.shN.shape[1]) * counts["visible"]
     return rows + counts["pairs"] * (2 * 8 + 2 * 64 + 2 * 40) + 2 * 4 * pixels * (3 + 1 + 1)

@@ -1,4 +1,4 @@
-"""Recovery on unseen views against seconds: schedules, regularisers and rounds side by side."""
+"""Study of recovery: scores on held-out views against seconds, by schedule, regularisers and rounds."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ from g2ard.stages.simplify import simplify
 __all__ = ["Recover", "Variant"]
 
 _FIRST_LOOK = 25
-"""Unseen views are scored after this many steps of a recovery, then after twice as many, and so on."""
+"""Steps before the first score; the steps then double."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One variant of recovery.
+    """A variant of recovery.
 
     Args:
-        name: its name in the rows.
+        name: name in rows.
         schedule: "default" or "paper".
-        each: one variant for each of the study's `steps`, NAME@STEPS.
-        horizon: scales the paper's schedule to this many steps; without it the schedule keeps its own.
-        decay: whether the paper's schedule takes the default's decay.
-        multiplier: of the rates; None chooses it.
-        round_share: steps of a round over those of the last recovery; 0 recovers once.
+        each: whether to run a variant NAME@STEPS for each of the study's `steps`.
+        horizon: steps to scale the paper's schedule to; by default its own.
+        decay: whether the paper's schedule uses the default's decay.
+        multiplier: multiplier of the rates; None chooses it.
+        round_share: steps per round relative to the last recovery; 0 recovers once.
         anchor: factor of the weight of L_anchor.
         shape: factor of the weight of L_shape.
     """
@@ -72,12 +72,12 @@ class Variant:
 
 @dataclass(frozen=True)
 class Recover(Study):
-    """A study of recovery. Every run starts from the same simplification; looks do not count as time.
+    """A study of recovery. All runs start from the same simplification; scoring does not count as time.
 
     Args:
         methods: tables of `Variant`.
-        steps: of variants that keep the default's schedule; the last of them unless a variant takes each.
-        seconds: of recovery instead of steps, over all rounds.
+        steps: steps of variants with the default schedule; only the last unless a variant runs each.
+        seconds: seconds of recovery over all rounds, instead of steps.
         protocol: "pool", "standing" (near and standing views), "both" or "anywhere".
     """
 
@@ -94,9 +94,9 @@ class Recover(Study):
             raise InputError(f"method {name}: {error}") from None
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
-        """Yield a cell for each ratio, variant and seed."""
+        """Yield a cell per ratio, variant and seed."""
         if self.protocol != "pool" and scene.targets == "photos":
-            raise InputError("protocol: no photos show it from elsewhere; a trained scene is needed")
+            raise InputError("protocol: expected 'pool' for photos; other views need a trained scene")
         place = _Workspace(work, self, scene)
         label = scene.name + (f" {self.size}px" if self.size else "")  # decibels depend on it
         for ratio in self.ratios:
@@ -122,7 +122,7 @@ class Recover(Study):
         return _Run(place, ratio, variant, steps, seed, kinds).rows()
 
     def summary(self, rows: list[Row]) -> tuple[str, list[str], list[list[str]]] | None:
-        """Return how much sooner the default reaches what other variants end with."""
+        """Return the default's time to reach the final PSNR of other variants."""
         lines = []
         for other in rows:
             if not other.get("final") or other["variant"].startswith("default@"):
@@ -147,18 +147,18 @@ class Recover(Study):
 
 
 class _Workspace(Workspace):
-    """A scene with what all its recoveries share."""
+    """A scene with data shared by its recoveries."""
 
     study: Recover
 
     @property
     def sh_degree(self) -> int | None:
-        """The SH degree of the results: 3 from a cloud, otherwise the scene's own."""
+        """The SH degree of the results: 3 for point clouds, otherwise that of the scene."""
         return 3 if self.lifted else None
 
     @cached_property
     def train_targets(self) -> Targets:
-        """The training targets, made before any clock starts."""
+        """The training targets, loaded before timing starts."""
         targets = self.targets(self.train_cameras)
         for view in range(len(targets.cameras)):
             targets[view]
@@ -166,7 +166,7 @@ class _Workspace(Workspace):
 
     @cached_property
     def starts(self) -> dict[int, tuple[Splats, float]]:
-        """Count → the simplified scene that one-shot runs start from, and the seconds of making it."""
+        """Count → the simplified scene for one-shot runs, and the seconds to make it."""
         return {}
 
     def start(self, budget: int) -> tuple[Splats, float]:
@@ -188,7 +188,7 @@ class _Workspace(Workspace):
 
 
 class _Run:
-    """One recovery, or a chain of them, scored along the way."""
+    """A recovery, or a chain of recoveries, with scores along the way."""
 
     def __init__(
         self,
@@ -211,15 +211,11 @@ class _Run:
         }
         self.found: list[Row] = []
         self.simplify_s = 0.0
-        self.before = self.now = 0.0  # seconds of finished recoveries, and of the one in progress
+        self.before = self.now = 0.0  # seconds of finished recoveries and of the current one
         self.cpu, self.cpu_began = 0.0, time.process_time()
 
     def rows(self) -> list[Row]:
-        """Run, and return a row for each look and kind of views.
-
-        Raises:
-            InputError: a loss or a value of the result is not finite.
-        """
+        """Run, and return a row per score and kind of views."""
         done, started, reports = (self._chain if self.plan.round_steps else self._once)()
         self._count_cpu()
         _check_finite(done, [loss for report in reports for loss in report.loss])
@@ -252,7 +248,7 @@ class _Run:
         if step == 1:
             self.before += self.now
             if self.plan.round_steps:
-                self.cpu_began = time.process_time()  # what came before was mostly simplification
+                self.cpu_began = time.process_time()  # excludes simplification
         self.now = seconds
         self._count_cpu()
         if step >= _FIRST_LOOK and (step // _FIRST_LOOK).bit_count() == 1 and step % _FIRST_LOOK == 0:
@@ -267,7 +263,7 @@ class _Run:
     def _looks(self, splats: Splats, step: int, seconds: float, final: int) -> Iterator[Row]:
         for kind in self.kinds:
             if kind not in self.place.kinds_of_views:
-                raise InputError(f"no place for {kind} views")
+                raise InputError(f"the scene has no {kind} views")
             scored = score(splats, self.place.kinds_of_views[kind], self.place.scene.background)
             yield {
                 "views_kind": kind,

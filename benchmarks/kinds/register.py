@@ -1,4 +1,4 @@
-"""Registration of photos against maps of any size, from known starts."""
+"""Study of photo registration against maps of several sizes, from known starts."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ STARTS: dict[str, tuple[float, float] | None] = {
     "C": (0.15, 15.0),
     "D": None,
 }
-"""How far off a start is: share of the view's median depth, and degrees. D: only a pool of other views."""
+"""Errors of starts: share of the view's median depth, and degrees. D starts from a pool of other views."""
 _NEAR, _NEARER = 1, 0
-"""Of `score.RECALLS`: 10 cm/5° and 5 cm/5°."""
+"""Indices of 10 cm/5° and 5 cm/5° in the report's recalls."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,10 @@ class Register(Study):
 
     Args:
         methods: matchers: auto, sift, direct, MODULE:FUNCTION.
-        ratios: merged to, not recovered; 1 is the map as it is.
-        seeds: draws of each start.
-        starts: of `STARTS`.
-        metres_per_unit: of the scene, for centimetres and recalls.
+        ratios: ratios of maps simplified without recovery; 1 is the original map.
+        seeds: seeds of the starts.
+        starts: names of `STARTS`.
+        metres_per_unit: scale of the scene, for errors in cm and recalls.
     """
 
     METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in ("auto", "sift", "direct")}
@@ -57,9 +57,9 @@ class Register(Study):
     metres_per_unit: float | None = key(None, least=1e-9)
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
-        """Yield a cell for each ratio, matcher, start and seed; the pool alone (D) has no seeds."""
+        """Yield a cell per ratio, matcher, start and seed; the pool (D) has no seeds."""
         if scene.train is None:
-            raise InputError(f"scene {scene.name}: lacks photos with true poses (--views)")
+            raise InputError(f"scene {scene.name}: needs photos with true poses; give --views")
         place, views = Workspace(work, self, scene), self.folder / scene.train
         pool = cache(lambda: read_view_set(views, split="train", unpictured=True).cameras)
         photos = cache(lambda: photos_of(views, split="test", say=lambda text: None))
@@ -129,7 +129,7 @@ def displaced(
 
 
 def _depths(splats: Splats, views: Cameras) -> list[float]:
-    """Return the median depth of each view where it is opaque enough; 1 where nothing is."""
+    """Return the median depth of each view over opaque pixels, or 1 without any."""
     renderer, out = Renderer(splats), []
     for view in views.resized(250):
         depth = renderer.render(view, median=True).median

@@ -1,4 +1,4 @@
-"""Policies of view selection: equal prior, student, K and steps, scored on unseen views."""
+"""Study of view selection: policies with equal prior, student, K and steps, scored on held-out views."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ __all__ = ["ARMS", "Pool", "Select", "Universe", "pool_of"]
 
 ARMS = ("random", "pose-diverse", "coverage", "directional", "auto", "auto+weights", "pool", "pool+weights")
 _CELLS = 50_000
-"""Surface cells of coverage and directional: as many as a study's small images can tell apart."""
+"""Surface cells of coverage and directional, matched to the resolution of a study's small images."""
 _CROWD = 24
-"""Views held out where a pool is crowded."""
+"""Held-out views in the crowded part of a pool."""
 
 Rows = NDArray[np.int64]
 Image = NDArray[np.float32]
@@ -48,19 +48,19 @@ Image = NDArray[np.float32]
 class Select(Study):
     """A study of selection policies. Each seed draws a pool; each arm chooses K of its views.
 
-    Scenes are trained ones, which teach themselves, COLMAP folders with photos, and `city`.
+    Scenes are trained scenes, COLMAP folders with photos, or `city`.
 
     Args:
-        methods: arms: policies, "+weights" where recovery draws by the selection's weights; pool is all
-            candidates.
+        methods: arms: policies, with "+weights" to sample views by the selection's weights, or "pool" for
+            all candidates.
         size: longer side of the views.
         pools: biased (a quarter drawn evenly, the rest from one sector), even.
-        percents: K as shares of the pool.
-        draws: random subsets of each pool.
-        steps: of each recovery.
+        percents: K in percent of the pool.
+        draws: random subsets per pool.
+        steps: steps per recovery.
         count: Gaussians of the student.
-        candidates: views of a pool, where there are that many; at least 420 in the city.
-        tests: views in each set that is scored.
+        candidates: maximum views per pool; at least 420 in the city.
+        tests: views per scored set.
     """
 
     METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in ARMS}
@@ -75,7 +75,7 @@ class Select(Study):
     tests: int = key(24, least=1)
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
-        """Yield a cell for each pool, arm, K and draw; deterministic policies draw once."""
+        """Yield a cell per pool, arm, K and draw; deterministic policies draw once."""
         universe = Universe(work, self, scene)
         orders: dict[tuple[str, int, str], tuple[Selection, float]] = {}
         for seed in self.seeds:
@@ -106,7 +106,7 @@ class Select(Study):
             if weighted or policy == "random":
                 chosen, select_s = _selected(universe, pool, k, policy, 1000 * seed + draw)
                 weights = chosen.weights if weighted else None
-            else:  # one order serves every K
+            else:  # the order is the same for every K
                 if (kind, seed, policy) not in orders:
                     orders[kind, seed, policy] = _selected(universe, pool, len(pool.rows), policy, seed)
                 chosen, select_s = orders[kind, seed, policy]
@@ -145,9 +145,9 @@ class Select(Study):
         return [row]
 
     def summary(self, rows: list[Row]) -> tuple[str, list[str], list[list[str]]] | None:
-        """Return gains over mean random on the same pool; those of random itself are absolute.
+        """Return gains over mean random on the same pool; values of random are absolute.
 
-        Deviations are of single trials over pools and draws.
+        Deviations are those of single trials over pools and draws.
         """
         rows = [row for row in rows if "psnr_in" in row]
         lines = []
@@ -181,14 +181,14 @@ def _both(row: Row) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Pool:
-    """Candidates, rows of the universe, and rows held out where the pool is crowded (none if it is even)."""
+    """Candidates as rows of the universe, and held-out rows in the crowded part, if any."""
 
     rows: Rows
     crowd: Rows
 
 
 class _Made(Targets):
-    """Images made when first used, and kept in half precision."""
+    """Images that are made on first use and kept in half precision."""
 
     def __init__(self, cameras: Cameras, make: Callable[[Cameras, int], Image]) -> None:
         self.cameras, self._make = cameras, make
@@ -201,9 +201,9 @@ class _Made(Targets):
 
 
 class Universe(Workspace):
-    """A scene with every view that a pool or a test may take, `shown`, and views `outside` of them.
+    """A scene with all views for pools and tests, `shown`, and `outside` views.
 
-    `held` are the rows of `shown` that are scored. Every 8th view of a planned pool is a fair sample of it.
+    `held` are the rows of `shown` that are scored, every 8th view of a generated pool.
     """
 
     study: Select
@@ -216,12 +216,12 @@ class Universe(Workspace):
 
     @cached_property
     def lifted(self) -> bool:
-        """Whether the prior is a cloud, which is lifted."""
+        """Whether the prior is lifted from a point cloud."""
         return self.scene.synth is not None or super().lifted
 
     @cached_property
     def splats(self) -> Splats:
-        """What views are selected from."""
+        """The scene that views are selected for."""
         if self.scene.synth is None:
             return super().splats
         scan = self.town.points()
@@ -229,27 +229,27 @@ class Universe(Workspace):
 
     @cached_property
     def student(self) -> Splats:
-        """What is recovered, simplified without views, so that no pool influences it."""
+        """The student, simplified without views so that it does not depend on a pool."""
         return simplify(self.splats, min(self.study.count, len(self.splats))).splats
 
     @property
     def candidates(self) -> int:
-        """How many views a pool has."""
+        """The number of views per pool."""
         return max(420, self.study.candidates) if self.scene.synth else self.study.candidates
 
     @property
     def shown(self) -> Targets:
-        """Targets of the universe."""
+        """The targets of the universe."""
         return self._sets[0]
 
     @property
     def held(self) -> Rows:
-        """Rows held out evenly over the universe's extent."""
+        """The rows held out evenly over the universe."""
         return self._sets[1]
 
     @property
     def outside(self) -> Targets:
-        """Targets of views out of the universe's distribution."""
+        """The targets of views outside the universe's distribution."""
         return self._sets[2]
 
     @cached_property
@@ -276,7 +276,7 @@ class Universe(Workspace):
         return shown, _evenly(rows[::8], tests), _Made(outside, image)
 
     def _city(self) -> tuple[Targets, Rows, Targets]:
-        """Return views of the generated city, whose photos are cast from rays when they are used."""
+        """Return views of the generated city, whose photos are rendered on first use."""
         town, tests = self.town, self.study.tests
         universe, outside = town.views["train"], town.views["ood"]
         shown = _Made(universe, town.photo)
@@ -284,8 +284,7 @@ class Universe(Workspace):
         return shown, _evenly(np.arange(len(universe)), tests), far
 
     def _photos(self) -> tuple[Targets, Rows, Targets]:
-        """Return photos: outside is the eighth at one end of the site; the others' stated tests, or every
-        8th, are held out."""
+        """Return photos: outside are the eighth at one end of the site, held out the tests or every 8th."""
         folder = self.place / (self.scene.train or self.scene.prior)
         found = self.read(folder)
         stated = states_splits(folder, found.splits)
@@ -301,10 +300,10 @@ class Universe(Workspace):
 
 
 def pool_of(universe: Universe, kind: str, seed: int) -> Pool:
-    """Return candidates out of the universe.
+    """Draw candidates from the universe.
 
-    even: drawn uniformly. biased: a quarter drawn uniformly, the others out of the sixth of the universe
-    (a third of a small one) that is nearest to one of its views, as real trajectories crowd somewhere.
+    even: uniformly. biased: a quarter uniformly, the rest from the sixth of the universe (a third of a small
+    one) nearest to one of its views, since real trajectories are crowded somewhere.
     """
     rng = np.random.default_rng([seed, 11])
     free = np.setdiff1d(np.arange(len(universe.shown.cameras)), universe.held)
@@ -331,7 +330,7 @@ def _selected(universe: Universe, pool: Pool, k: int, policy: str, seed: int) ->
 
 
 def _nearer(prior: Splats, cameras: Cameras) -> Cameras:
-    """Move views 40 % of the way to the scene's middle, along their gaze."""
+    """Move views along their direction by 40 % of the distance to the scene's centre."""
     middle = np.median(prior.means, axis=0) + prior.offset
     steps = 0.4 * np.einsum("ci,ci->c", middle - cameras.positions, cameras.forwards)
     viewmats = cameras.viewmats.copy()

@@ -1,4 +1,4 @@
-"""File formats: megabytes against decibels on unseen views, for every format and ratio."""
+"""Study of file formats: size against PSNR on held-out views, by format and ratio."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Ship(Study):
     """A study of formats: each scene is reduced, written, read back and scored against the dense scene.
 
     Args:
-        methods: formats, or "splat-transform sog", that program's.
-        splat_transform: its program; None takes the one on PATH.
+        methods: formats, or "splat-transform sog" for the SOG of that program.
+        splat_transform: path of splat-transform; None uses PATH.
     """
 
     METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in (*FORMATS, PEER)}
@@ -39,7 +39,7 @@ class Ship(Study):
     splat_transform: str | None = key(None, axis=True)
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
-        """Yield a cell for each ratio and format; .ply comes first, because `lost` is against it."""
+        """Yield a cell per ratio and format; .ply comes first, since `lost` is relative to it."""
         place = Workspace(work, self, scene)
         small = cache(lambda ratio: reduced(place.splats, ratio, place.train_cameras))
         for ratio in self.ratios:
@@ -48,7 +48,7 @@ class Ship(Study):
                 yield Cell(names, partial(self._measured, place, partial(small, ratio), name))
 
     def derived(self, rows: list[Row]) -> list[Row]:
-        """Add what each format alone takes: the PSNR of the .ply less its own."""
+        """Add the loss of each format: the PSNR of the .ply minus its own."""
         plain = {
             (row["scene"], row["ratio"], row["views_kind"]): row["psnr"]
             for row in rows
@@ -73,7 +73,7 @@ class Ship(Study):
             yield {**row, **score(back, targets, place.scene.background).figures()}
 
     def _write(self, path: Path, splats: Splats, name: str) -> float:
-        """Write a file and return the CPU seconds, for the other program with those of reading the .ply."""
+        """Write a file and return the CPU seconds; for splat-transform they include reading the .ply."""
         if name != PEER:
             began = time.process_time()
             io.write_splats(path, splats)

@@ -1,4 +1,4 @@
-"""Simplifiers as their users run them: file to file, a process each, scored on unseen views."""
+"""Study of simplifiers as users run them: from file to file in a process, scored on held-out views."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Simplify(Study):
 
     Args:
         protocol: "pool", "standing" (near and standing views), "both" or "anywhere".
-        splat_transform: its program; None takes the one on PATH.
+        splat_transform: path of splat-transform; None uses PATH.
     """
 
     METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in REDUCERS}
@@ -44,7 +44,7 @@ class Simplify(Study):
     splat_transform: str | None = key(None, axis=True)
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
-        """Yield a cell for each ratio and method."""
+        """Yield a cell per ratio and method."""
         place, kinds = Workspace(work, self, scene), PROTOCOLS[self.protocol]
         for ratio in self.ratios:
             for method in self.methods:

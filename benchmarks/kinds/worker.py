@@ -1,7 +1,7 @@
-"""One stage of a matched cell as a process of its own: `python -m benchmarks.kinds.worker JOB.json`.
+"""Process for a stage of a matched cell: `python -m benchmarks.kinds.worker JOB.json`.
 
-A job names its `kind` (reduce, select, recover or adapt), its inputs by path and its `output`. The stage's
-report is written beside the output, as report.json.
+A job has a `kind` (reduce, select, recover or adapt), paths of inputs and an `output`. The stage's report is
+written to report.json beside the output.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Job = dict[str, Any]
 
 
 class StoredTargets:
-    """Targets stored once for all cells: one .npy per view, photos as bytes."""
+    """Targets stored for all cells: one .npy per view, photos as bytes."""
 
     def __init__(self, cameras: Cameras, folder: Path) -> None:
         self.cameras = cameras
@@ -52,7 +52,7 @@ class StoredTargets:
         return image.astype(np.float32) / np.float32(255) if image.dtype == np.uint8 else image
 
     def mask(self, view: int) -> NDArray[np.bool_] | None:
-        """Return where the target counts, or None if everywhere."""
+        """Return the mask of a view, or None."""
         path = self._paths[view].with_suffix(".mask.npy")
         return np.load(path) if path.exists() else None
 
@@ -88,7 +88,7 @@ def _reduce(job: Job) -> dict[str, Any]:
     looks = job["method"] in ("default", "fast")
     config = SimplifyConfig()
     if job["method"] == "paper":
-        config = replace(config, retention=1e-9)  # one reduction to the count: rounds are cells' own
+        config = replace(config, retention=1e-9)  # one reduction; the cell runs rounds
     if job["protection"] is not None:
         config = replace(config, protection=job["protection"])
     done = simplify(
@@ -111,13 +111,13 @@ def _select(job: Job) -> dict[str, Any]:
 
     cameras = _cameras(job["views"])
     chosen = select(io.read_splats(job["scene"]), cameras, job["k"], policy=job["policy"], seed=job["seed"])
-    kept = cameras.take(np.sort(chosen.order))  # of training views alone: the workspace holds the others out
+    kept = cameras.take(np.sort(chosen.order))  # all are training views
     io.write_views(job["output"], kept, splits=["train"] * len(kept), overwrite=True)
     return {"views": len(chosen.order)}
 
 
 def _cameras(path: str) -> Cameras:
-    """Read all views of a file that the workspace has written, with a photo or without."""
+    """Read all views of a file of the workspace, with or without photos."""
     return io.read_view_set(path, unpictured=True).cameras
 
 
@@ -129,7 +129,7 @@ def _recover(job: Job) -> dict[str, Any]:
     from g2ard.stages.recover import RecoverConfig, recover
 
     student, targets = io.read_splats(job["scene"]), _targets(job)
-    for view in range(len(targets.cameras)):  # read before the clock of a time limit starts
+    for view in range(len(targets.cameras)):  # load before a time limit starts
         targets[view]
     config = RecoverConfig(
         schedule=_schedule(job["schedule"], targets.cameras),
@@ -166,7 +166,7 @@ def _adapt(job: Job) -> dict[str, Any]:
 
 
 def _schedule(name: str, cameras: Cameras) -> Schedule:
-    """Return a schedule of recovery, or 3DGS's rates at the end of its training, as fine-tuning uses them."""
+    """Return a schedule of recovery, or 3DGS's final training rates, as for fine-tuning."""
     if name != "3dgs":
         return Schedule.named(name)
     positions = cameras.positions

@@ -1,4 +1,4 @@
-"""A small procedural city: coloured laser cloud, photos with exact poses and depth, four splits."""
+"""Procedural city: coloured LiDAR point cloud, photos with exact poses and depth, four splits."""
 
 from __future__ import annotations
 

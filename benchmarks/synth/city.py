@@ -1,4 +1,4 @@
-"""The city as an object: sample it as a cloud, photograph it, ask what a ray meets."""
+"""Procedural city: point clouds, photos and ray casts."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ __all__ = ["City", "CityConfig", "Hits", "Scan", "city"]
 
 _TILE = 32
 _BEAM = 0.01, 4e-4
-"""A laser spot's width: metres at the scanner, and radians of divergence."""
+"""Width of the laser at the scanner, metres, and divergence, radians."""
 _CHUNK = 1 << 16
 
 
 @dataclass(frozen=True)
 class CityConfig:
-    """What a city is made of.
+    """Configuration of a city.
 
     Args:
-        points: laser returns in the cloud.
-        views: photos in all four splits together; at least 8.
+        points: laser returns in the point cloud.
+        views: photos in all four splits, at least 8.
         size: (width, height) of a photo, pixels.
-        blocks: city blocks along each side; one is 72 m × 58 m, streets included.
-        seed: of everything random.
-        noise: standard deviation of the laser's range, metres; that of a good survey scanner.
+        blocks: city blocks per side; one is 72 m × 58 m, including streets.
+        seed: random seed.
+        noise: standard deviation of the laser's range, metres.
         fov: horizontal field of view of the photos, degrees.
-        supersample: samples a pixel along each axis; two suffice, for textures are averaged in closed form.
-        sky: colour in [0, 1] where a ray meets nothing; the default is exact in eight bits.
-        offset: (3,) world coordinates of the city's middle; map coordinates are large (UTM).
+        supersample: samples per pixel along each axis; 2 suffices, since textures are averaged exactly.
+        sky: colour in [0, 1] of rays without a hit; the default is exact in 8 bits.
+        offset: (3,) world coordinates of the city's centre, such as UTM coordinates.
 
     Raises:
-        InputError: a value no city can be built from.
+        InputError: a value is out of range.
     """
 
     points: int = 500_000
@@ -80,9 +80,9 @@ class Scan:
     """n laser returns.
 
     Args:
-        positions: (n, 3) float64 world coordinates, range noise included.
+        positions: (n, 3) float64 world coordinates with range noise.
         colors: (n, 3) float32 in [0, 1].
-        primitives: (n,) which surface each one was returned from.
+        primitives: (n,) indices of the surfaces.
     """
 
     positions: Float
@@ -92,13 +92,13 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What n rays meet first.
+    """First hits of n rays.
 
     Args:
-        depth: (n,) float64, in lengths of the ray's direction; inf where it meets nothing.
-        color: (n, 3) float32 in [0, 1]; the sky's where it meets nothing.
-        normal: (n, 3) float64 outward unit normal; zero where it meets nothing.
-        primitive: (n,) int64, −1 where it meets nothing.
+        depth: (n,) float64, in lengths of the ray's direction; inf without a hit.
+        color: (n, 3) float32 in [0, 1]; the sky's without a hit.
+        normal: (n, 3) float64 outward unit normal; zero without a hit.
+        primitive: (n,) int64, −1 without a hit.
     """
 
     depth: Float
@@ -108,7 +108,7 @@ class Hits:
 
 
 class City:
-    """A procedural city; build it with `city`."""
+    """Procedural city; build it with `city`."""
 
     def __init__(self, config: CityConfig) -> None:
         self.config = config
@@ -119,7 +119,7 @@ class City:
         self.views: dict[str, Cameras] = {k: v.recentred(-self._offset) for k, v in local.items()}
 
     def points(self, count: int | None = None) -> Scan:
-        """A laser scan of `count` returns (default: the configuration's), coloured as photos are."""
+        """Return a laser scan of `count` points (default: the configuration's), coloured like photos."""
         parts = list(self.scans(count))
         positions, colors, primitives = zip(
             *((p.positions, p.colors, p.primitives) for p in parts), strict=True
@@ -127,7 +127,7 @@ class City:
         return Scan(np.concatenate(positions), np.concatenate(colors), np.concatenate(primitives))
 
     def scans(self, count: int | None = None) -> Iterator[Scan]:
-        """The returns of `points` in its order, in blocks: some two million are in memory at a time."""
+        """Yield the scan of `points` in blocks of about two million."""
         config = self.config
         rng = np.random.default_rng([config.seed, 2])
         for returns in scan(self.layout, config.points if count is None else count, config.seed):
@@ -139,15 +139,12 @@ class City:
                 yield Scan(noisy.T + self._offset, color.T, part.primitives)
 
     def cast(self, origins: ArrayLike, directions: ArrayLike, width: float = 0.01) -> Hits:
-        """Exact first hits of any rays, in world coordinates.
+        """Return the exact first hits of rays.
 
         Args:
             origins: (n, 3) or (3,) world coordinates.
-            directions: (n, 3), any length but zero.
-            width: metres across which a sample's texture is averaged.
-
-        Raises:
-            InputError: shapes that do not fit, or a direction that is zero or not finite.
+            directions: (n, 3), of any length except zero.
+            width: width over which textures are averaged, metres.
         """
         d = np.asarray(directions, np.float64)
         o = np.atleast_2d(np.asarray(origins, np.float64)) - self._offset
@@ -177,7 +174,7 @@ class City:
         return Hits(depth, color, normal, primitive)
 
     def photo(self, cameras: Cameras, index: int) -> NDArray[np.float32]:
-        """(H, W, 3) colours in [0, 1] of one view: the mean of supersample² rays a pixel."""
+        """Return the (H, W, 3) colours of a view in [0, 1], the mean of supersample² rays per pixel."""
         view = self._local(cameras, index)
         width, height = int(view.widths[0]), int(view.heights[0])
         image = np.empty((height, width, 3), np.float32)
@@ -191,7 +188,7 @@ class City:
         return image
 
     def depth(self, cameras: Cameras, index: int) -> Float:
-        """(H, W) metres along the optical axis at the pixels' centres; inf where there is sky."""
+        """Return the (H, W) depth along the optical axis at pixel centres, metres; inf for sky."""
         view = self._local(cameras, index)
         width, height = int(view.widths[0]), int(view.heights[0])
         image = np.empty((height, width))
@@ -210,10 +207,10 @@ class City:
     def _pixels(
         self, o: Float, d: Float, t: Float, hit: NDArray[np.int64], scale: float, count: int
     ) -> NDArray[np.float32]:
-        """(count, 3) colours of pixels, each seen along n/count consecutive rays.
+        """Return the (count, 3) colours of pixels with n/count consecutive rays each.
 
-        Patterns are averaged in closed form: a pixel all of whose rays meet one face is painted once, at
-        the rays' mean; only pixels on edges are painted ray by ray.
+        Patterns are averaged in closed form: a pixel whose rays all hit one face is painted once, at their
+        mean. Only pixels on edges are painted per ray.
         """
         each = d.shape[1] // count
         hits = hit.reshape(count, each)
@@ -231,7 +228,7 @@ class City:
     def _flat(
         self, o: Float, d: Float, t: Float, hit: NDArray[np.int64], first: NDArray[np.int64], each: int
     ) -> NDArray[np.bool_]:
-        """Whether the first and last of the `each` rays from `first` on meet one face of their primitive."""
+        """Return whether the first and the last of `each` rays from `first` hit the same face."""
         last = first + each - 1
         normals = [self.layout.shapes.normals(o + d[:, i] * t[i], hit[i]) for i in (first, last)]
         return (normals[0] * normals[1]).sum(0) > 0.9
@@ -256,16 +253,11 @@ class City:
 def city(config: CityConfig | None = None, **options: object) -> City:
     """Build a small procedural city: ground with road markings, facades, roofs, trees, lamps, cars.
 
+    Equal configurations give equal bits.
+
     Args:
-        config: its configuration; None is `CityConfig()`.
-        options: fields of `CityConfig` to set over `config`.
-
-    Returns:
-        The city: `views` (its four splits), `points()`, `photo()`, `depth()`, `cast()`. The same
-        configuration gives the same bits.
-
-    Raises:
-        InputError: a value no city can be built from.
+        config: its configuration; None means `CityConfig()`.
+        options: fields of `CityConfig` that override `config`.
 
     >>> town = city(blocks=1, points=1000, views=8, size=(32, 24))
     >>> town.points().positions.shape, town.photo(town.views["train"], 0).shape
@@ -275,7 +267,7 @@ def city(config: CityConfig | None = None, **options: object) -> City:
 
 
 def _coherent(o: Float, d: Float) -> NDArray[np.int64]:
-    """An order of rays in which neighbours start near each other and look the same way."""
+    """Return an order of rays in which neighbours have similar origins and directions."""
     span = np.ptp(o, axis=0).max() or 1.0
     start = np.floor((o - o.min(0)) / span * 15.99).astype(np.int64)
     facing = np.floor((d + 1) * 5.99).astype(np.int64)
@@ -284,11 +276,10 @@ def _coherent(o: Float, d: Float) -> NDArray[np.int64]:
 
 
 def _pixel_rays(view: Cameras, row: int, rows: int, s: int) -> tuple[NDArray[np.int64], Float, Float, float]:
-    """Rays through s × s samples of each pixel in `rows` rows from `row`, tile after tile, pixel after pixel.
+    """Return rays through s × s samples per pixel in `rows` rows from `row`, ordered by tile and pixel.
 
     Returns:
-        order (n/s²,), each pixel's place in raster order; origin (3, 1); unit directions (3, n);
-        how wide a pixel is at distance 1.
+        (n/s²,) raster indices of pixels; (3, 1) origin; (3, n) unit directions; pixel width at distance 1.
     """
     width = int(view.widths[0])
     R, K = view.viewmats[0, :3, :3], view.Ks[0]

@@ -1,4 +1,4 @@
-"""The command `python -m benchmarks synth city`."""
+"""Command `python -m benchmarks synth city`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class _Size(tuple[int, int]):
 def _size(text: str) -> _Size:
     match = re.fullmatch(r"(\d+)[x×](\d+)", text.strip())
     if match is None or not (int(match[1]) and int(match[2])):
-        raise typer.BadParameter(f"a size such as 800x600, not {text!r}")
+        raise typer.BadParameter(f"expected a size such as 800x600, got {text!r}")
     return _Size((int(match[1]), int(match[2])))
 
 
@@ -42,42 +42,43 @@ def _offset(text: str) -> Triple:
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
-        raise typer.BadParameter(f"three numbers such as 443000,4428000,1600, not {text!r}") from None
+        raise typer.BadParameter(
+            f"expected three numbers such as 443000,4428000,1600, got {text!r}"
+        ) from None
     return Triple((x, y, z))
 
 
 @command("city", parent=synth, example="python -m benchmarks synth city -o city/ --points 1M --views 120")
 def city(
     run: Run,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for all of it.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Output folder.")],
     points: Annotated[
         Count | None,
-        typer.Option(parser=Count.parse, metavar="COUNT", help="Points of the cloud; 500k if not given."),
+        typer.Option(parser=Count.parse, metavar="COUNT", help="Points of the cloud; 500k by default."),
     ] = None,
     million: Annotated[
         float | None,
-        typer.Option(
-            min=0.001, max=1000, metavar="N", help="Million points instead, on a city as large as that."
-        ),
+        typer.Option(min=0.001, max=1000, metavar="N", help="Million points, with a city of matching size."),
     ] = None,
-    views: Annotated[int, typer.Option(min=8, help="Photos in all four splits together.")] = 120,
+    views: Annotated[int, typer.Option(min=8, help="Photos in all four splits.")] = 120,
     size: Annotated[
         _Size | None,
-        typer.Option(parser=_size, metavar="WxH", help="Size of a photo; 800x600 if not given."),
+        typer.Option(parser=_size, metavar="WxH", help="Size of photos; 800x600 by default."),
     ] = None,
     blocks: Annotated[
-        int | None, typer.Option(min=1, max=40, help="City blocks along each side; 3, or as --million needs.")
+        int | None,
+        typer.Option(min=1, max=40, help="City blocks per side; by default 3, or as --million needs."),
     ] = None,
     offset: Annotated[
         Triple | None,
-        typer.Option(parser=_offset, metavar="X,Y,Z", help="World coordinates of the middle, as maps have."),
+        typer.Option(parser=_offset, metavar="X,Y,Z", help="World coordinates of the centre."),
     ] = None,
 ) -> None:
-    """Generate a city: coloured LiDAR cloud, photos with exact poses, splits train/val/adapt/ood."""
+    """Generate a city: coloured LiDAR point cloud, photos with exact poses, splits train/val/adapt/ood."""
     from benchmarks.synth import CityConfig, write_city
 
     if points is not None and points.is_share:
-        raise typer.BadParameter("--points: a count, not a share")
+        raise typer.BadParameter("--points: expected a count, got a share")
     if points is not None and million is not None:
         raise typer.BadParameter("give --points or --million, not both")
     began = time.monotonic()

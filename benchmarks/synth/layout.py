@@ -1,4 +1,4 @@
-"""Where everything stands: blocks on a street grid, with houses, perimeter buildings, towers and parks."""
+"""Layout of the city: blocks on a street grid, with houses, perimeter buildings, towers and parks."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from benchmarks.synth.shapes import Float, Kind, Shapes
 __all__ = ["CURB", "PITCH", "ROAD", "Layout", "Material", "plan"]
 
 PITCH = (72.0, 58.0)
-"""Metres from one street's centre to the next, along x and along y."""
+"""Distance between street centres along x and y, metres."""
 ROAD = 5.0
-"""Half the width of a carriageway: a lane and a parking strip each way."""
+"""Half the width of a carriageway, metres: a lane and a parking strip."""
 PAVEMENT = 3.0
 CURB = 0.15
 MARGIN = 45.0
-"""How far the ground reaches beyond the outermost street."""
+"""Ground beyond the outermost street, metres."""
 
 Colour = Sequence[float] | Float
 
@@ -48,7 +48,7 @@ _CARS = (
 
 
 class Material(IntEnum):
-    """How a primitive is painted; `paint` has one function for each."""
+    """Materials of primitives, with a function each in `paint`."""
 
     GROUND = 0
     BLOCK = 1  # pavement round a lot: parameter 0 is 1 for grass within, 1 is 1 where paths cross it
@@ -91,7 +91,7 @@ class _Builder:
         colour: Colour,
         material: Material = Material.PLAIN,
     ) -> None:
-        """A shape by its centre in x and y, its foot in z, and half its widths and its height."""
+        """Add a shape by its centre in x and y, its foot in z, its half widths and its height."""
         x, y, foot = center
         a, b, height = half
         self.add(kind, (x - a, y - b, foot), (x + a, y + b, foot + height), colour, material)
@@ -99,14 +99,14 @@ class _Builder:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """A city: primitives and their paint; z up, metres, the middle of the city at the origin, ground at 0.
+    """Primitives of a city and their materials; metres, z up, centre at the origin, ground at 0.
 
     Args:
         shapes: P primitives.
         materials: (P,) `Material`.
         colours: (P, 3) float32 base colours.
-        parameters: (P, 5) float32, what each material says.
-        blocks: how many blocks along each side.
+        parameters: (P, 5) float32 parameters of the materials.
+        blocks: blocks per side.
     """
 
     shapes: Shapes
@@ -116,12 +116,12 @@ class Layout:
     blocks: int
 
     def streets(self, axis: int) -> Float:
-        """Coordinates, along `axis`, of the centre lines of the streets that cross it."""
+        """Return the coordinates along `axis` of the centre lines of streets that cross it."""
         return (np.arange(self.blocks + 1, dtype=np.float64) - self.blocks / 2) * PITCH[axis]
 
     @property
     def reach(self) -> Float:
-        """(2,) half the extent of the built-up part, to the outermost street centres."""
+        """The (2,) half extent up to the outermost street centres."""
         return np.array(PITCH) * self.blocks / 2
 
 
@@ -264,7 +264,7 @@ def _park(b: _Builder, rng: Generator, lo: Float, hi: Float) -> None:
 
 
 def _furnish(b: _Builder, rng: Generator, lo: Float, hi: Float) -> None:
-    """Trees, lamps and parked cars along the four sides of a block."""
+    """Add trees, lamps and parked cars along the four sides of a block."""
     for axis in (0, 1):
         for edge, inwards in ((lo[1 - axis], 1.0), (hi[1 - axis], -1.0)):
 
@@ -286,7 +286,7 @@ def _furnish(b: _Builder, rng: Generator, lo: Float, hi: Float) -> None:
 
 
 def _outskirts(b: _Builder, rng: Generator, reach: Float) -> None:
-    """A belt of trees and a few houses beyond the outermost streets."""
+    """Add trees and a few houses beyond the outermost streets."""
     total = reach + MARGIN
     for _ in range(int(0.006 * 4 * (total.prod() - reach.prod()))):
         at = (2 * rng.random(2) - 1) * (total - 4)
@@ -300,7 +300,7 @@ def _outskirts(b: _Builder, rng: Generator, reach: Float) -> None:
 
 
 def plan(blocks: int, seed: int) -> Layout:
-    """Lay out `blocks` × `blocks` blocks; the same seed, the same city."""
+    """Lay out `blocks` × `blocks` blocks; equal seeds give equal cities."""
     rng = np.random.default_rng([seed, 0])
     b = _Builder()
     reach = np.array(PITCH) * blocks / 2

@@ -1,4 +1,4 @@
-"""A surveyor's cloud: first hits of rays from scanners along every street and from passes over the roofs."""
+"""Laser scan: first hits of rays from scanners along every street and from flight lines."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from benchmarks.synth.shapes import Float, cast
 __all__ = ["PART", "Returns", "scan"]
 
 _SPACING = 12.0
-"""Metres between two positions of a scanner."""
+"""Distance between scanner positions, metres."""
 _MAST = 2.4
 _FLIGHT = 130.0
 _STREET_RANGE = 120.0
 _AERIAL_SHARE = 0.4
 _RAYS = 5000
-"""At least so many a position: fewer positions serve a thin cloud, and cost less."""
+"""Minimum rays per position; thin clouds use fewer positions."""
 _LEAST = 12
-"""Rays of a position at the least."""
+"""Minimum rays per position in any case."""
 _PACKET = 128, 512
-"""Rays that are cast together, at the least and at the most; some forty packets a position."""
+"""Minimum and maximum rays per packet; a position has about forty packets."""
 _SQUARE = 2.5
-"""How many times more packets a full turn is wide than high."""
+"""Ratio of packets per full turn to packets in elevation."""
 PART = 2_000_000
-"""Returns in memory at a time: a larger cloud is several scans, each from every so-manieth position."""
+"""Maximum returns in memory; a larger cloud is several scans from interleaved positions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +37,10 @@ class Returns:
     """n laser returns before noise.
 
     Args:
-        origins: (3, n) where each ray left from.
-        directions: (3, n) unit.
-        ranges: (n,) metres to the first surface.
-        primitives: (n,) which one.
+        origins: (3, n) origins of rays.
+        directions: (3, n) unit directions.
+        ranges: (n,) distances to the first surface, metres.
+        primitives: (n,) indices of surfaces.
     """
 
     origins: Float
@@ -55,7 +55,7 @@ class Returns:
 
 
 def _stations(layout: Layout) -> tuple[Float, Float]:
-    """(n, 3) scanner positions on the streets, and (m, 3) on flight lines."""
+    """Return (n, 3) scanner positions on streets and (m, 3) on flight lines."""
     street: list[Float] = []
     flight: list[Float] = []
     for axis in (0, 1):
@@ -71,7 +71,7 @@ def _stations(layout: Layout) -> tuple[Float, Float]:
 
 
 def _spin(rng: Generator, count: int) -> Float:
-    """(3, count) directions of a spinning scanner: all round, denser near the horizon, sorted by sector."""
+    """Return (3, count) directions of a spinning scanner, denser near the horizon, sorted by sector."""
     turn = (np.arange(count) + rng.random(count)) / count * 2 * np.pi
     lift = 2 * rng.random(count) - 1
     angle = np.deg2rad(np.where(lift > 0, 75.0, 50.0)) * np.sign(lift) * np.abs(lift) ** 1.6
@@ -79,7 +79,7 @@ def _spin(rng: Generator, count: int) -> Float:
 
 
 def _swath(rng: Generator, count: int) -> Float:
-    """(3, count) downward directions within 35° of the vertical, sorted by sector."""
+    """Return (3, count) downward directions within 35° of the vertical, sorted by sector."""
     turn = (np.arange(count) + rng.random(count)) / count * 2 * np.pi
     off = np.tan(np.deg2rad(35.0)) * np.sqrt(rng.random(count))
     d = np.stack([np.cos(turn) * off, np.sin(turn) * off, np.full(count, -1.0)])
@@ -87,7 +87,7 @@ def _swath(rng: Generator, count: int) -> Float:
 
 
 def _fire(layout: Layout, rng: Generator, stations: Float, rays: int, aerial: bool) -> Returns:
-    """About `rays` rays shared among the stations; the first hits of those that hit."""
+    """Return the first hits of about `rays` rays shared among the stations."""
     count = int(np.clip(rays // _RAYS, min(8 * layout.blocks, len(stations)), len(stations)))
     stations = stations[((np.arange(count) + rng.random()) * len(stations) / count).astype(int)]
     each = max(_LEAST, -(-rays // count))
@@ -108,9 +108,9 @@ def _fire(layout: Layout, rng: Generator, stations: Float, rays: int, aerial: bo
 
 
 def _cast_in_patches(layout: Layout, origin: Float, d: Float, far: float) -> tuple[Float, NDArray[np.int64]]:
-    """First hits of rays that are sorted by azimuth, in packets narrow in azimuth and elevation.
+    """Return the first hits of rays sorted by azimuth, cast in packets narrow in azimuth and elevation.
 
-    A packet tests all that its bounds may meet, and one ray into the sky keeps it from stopping early.
+    A packet tests all primitives that its bounds may hit; a single ray into the sky prevents early stops.
     """
     n = d.shape[1]
     packet = int(np.clip(n // 40, *_PACKET))
@@ -122,7 +122,7 @@ def _cast_in_patches(layout: Layout, origin: Float, d: Float, far: float) -> tup
 
 
 def scan(layout: Layout, count: int, seed: int) -> Iterator[Returns]:
-    """Exactly `count` returns, at the most `PART` at a time: of each part from the streets, then the air."""
+    """Yield exactly `count` returns in parts of at most `PART`, each from the streets, then from the air."""
     street, flight = _stations(layout)
     parts = min(-(-count // PART), len(street), len(flight))
     for part in range(parts):

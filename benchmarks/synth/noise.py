@@ -1,4 +1,4 @@
-"""Patterns averaged over a pixel's footprint: periodic bands in closed form, value noise that fades out."""
+"""Patterns averaged over a pixel's footprint: periodic bands in closed form, and fading value noise."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SIDE = 256
 
 
 def hash01(*keys: Array | int) -> Array:
-    """A number in [0, 1) for each tuple of integers: the same on every machine.
+    """Hash tuples of integers to [0, 1), equally on every machine.
 
     >>> hash01(np.array([1, 2]), 7).round(3).tolist()
     [0.647..., 0.486...]
@@ -30,7 +30,7 @@ def hash01(*keys: Array | int) -> Array:
 
 
 def band(x: Array, lo: Array | float, hi: Array | float, width: Array, period: float = 1.0) -> Array:
-    """The share of [x − width/2, x + width/2] that lies in [lo, hi) repeated every `period`."""
+    """Return the share of [x − width/2, x + width/2] in [lo, hi), repeated every `period`."""
 
     def integral(at: Array) -> Array:
         whole = np.floor(at / period)
@@ -41,19 +41,19 @@ def band(x: Array, lo: Array | float, hi: Array | float, width: Array, period: f
 
 
 def ramp(x: Array, edge: Array | float, width: Array) -> Array:
-    """The share of [x − width/2, x + width/2] that lies above `edge`."""
+    """Return the share of [x − width/2, x + width/2] above `edge`."""
     return np.clip((x - edge) / np.maximum(width, 1e-3) + 0.5, 0.0, 1.0)
 
 
 class Noise:
-    """Tiling 2D value noise, one table a seed."""
+    """Tiling 2D value noise with a table per seed."""
 
     def __init__(self, seed: int) -> None:
         cell = np.arange(_SIDE)
         self._table = (hash01(cell[:, None], cell[None], seed) * 2 - 1).astype(np.float32).ravel()
 
     def __call__(self, u: Array, v: Array, wavelength: float, width: Array) -> Array:
-        """(n,) in [−1, 1], mean 0, smooth over `wavelength` metres, fading where `width` exceeds it."""
+        """Return (n,) noise in [−1, 1] of mean 0 and a `wavelength` in metres, fading for larger `width`."""
         x, y = u * np.float32(1 / wavelength), v * np.float32(1 / wavelength)
         x0, y0 = np.floor(x), np.floor(y)
         fx, fy = x - x0, y - y0

@@ -23,7 +23,7 @@ _SHADOW_CELL = 0.1
 
 @dataclass(frozen=True, eq=False)
 class _Spots:
-    """What paint functions see of n surface points: all arrays float32 and (n,), or (3, n)."""
+    """Surface points for paint functions: float32 arrays, (n,) or (3, n)."""
 
     p: Array
     n: Array
@@ -46,13 +46,13 @@ def _mix(base: Array, over: Array | tuple[float, ...], share: Array) -> Array:
 
 
 def _tones(s: _Spots, u: Array, v: Array, cell: tuple[float, float], amplitude: float) -> Array:
-    """(n,) a tone for each cell of a primitive's grid, mean 0, fading where a pixel spans many cells."""
+    """Return (n,) random tones per cell of a primitive's grid, mean 0, fading if a pixel spans many cells."""
     tone = hash01(np.floor(u / cell[0]), np.floor(v / cell[1]), s.primitive) - np.float32(0.5)
     return tone * np.float32(amplitude) / (1 + (np.maximum(s.wu, s.wv) / min(cell)) ** 4)
 
 
 def _to_edge(s: _Spots) -> Array:
-    """(n,) metres, seen from above, from the nearest side of the primitive's bounding box."""
+    """Return (n,) horizontal distances to the nearest side of the primitive's bounding box, metres."""
     inset = np.minimum(s.p - s.lo, s.hi - s.p)
     return np.minimum(inset[0], inset[1])
 
@@ -75,7 +75,7 @@ class _Shadows:
         self._depth = self._trace(layout)
 
     def _trace(self, layout: Layout) -> NDArray[np.float32]:
-        """(rows, columns) height along the sun's direction of what the sun sees first."""
+        """Return the (rows, columns) height along the sun's direction of the first surface."""
         tile = 64
         depth = np.empty((self._rows, self._columns), np.float32)
         for row in range(0, self._rows, tile):
@@ -96,12 +96,12 @@ class _Shadows:
         return depth
 
     def lit(self, p: Float, facing: Array) -> Array:
-        """(n,) share of the sun's light that reaches points p (3, n) whose normals have cosine `facing`."""
+        """Return the (n,) share of sunlight at points p (3, n), whose normals have cosine `facing`."""
         x = (self._east @ p - self._start[0]) / self.cell
         y = (self._north @ p - self._start[1]) / self.cell
         level = (SUN @ p).astype(np.float32)
         slope = np.sqrt(1 - np.minimum(facing, 1) ** 2) / np.maximum(facing, 0.1)
-        level += (0.02 + self.cell * (0.5 + slope)).astype(np.float32)  # above the grid's own steps
+        level += (0.02 + self.cell * (0.5 + slope)).astype(np.float32)  # above the grid's steps
         x0 = np.clip(x.astype(np.int64), 0, self._columns - 2)
         y0 = np.clip(y.astype(np.int64), 0, self._rows - 2)
         fx, fy = (x - x0).astype(np.float32), (y - y0).astype(np.float32)
@@ -113,7 +113,7 @@ class _Shadows:
 
 
 class Painter:
-    """Colours for points on a layout's surfaces; one and the same for photos and for the cloud."""
+    """Colours of points on a layout's surfaces, for photos and point clouds."""
 
     def __init__(self, layout: Layout, seed: int) -> None:
         self._layout = layout
@@ -131,14 +131,14 @@ class Painter:
     def __call__(
         self, p: Float, normal: Float, direction: Float, primitive: NDArray[np.int64], width: Float
     ) -> NDArray[np.float32]:
-        """(3, n) colours in [0, 1].
+        """Return (3, n) colours in [0, 1].
 
         Args:
             p: (3, n) points on the surfaces.
-            normal: (3, n) outward unit normals there.
-            direction: (3, n) unit directions they are seen along.
-            primitive: (n,) which surface.
-            width: (n,) metres across what one sample averages, measured across the ray.
+            normal: (3, n) outward unit normals.
+            direction: (3, n) unit viewing directions.
+            primitive: (n,) indices of surfaces.
+            width: (n,) sample widths across the ray, metres.
         """
         spots = self._spots(p, normal, direction, primitive, width)
         albedo = np.empty(p.shape, np.float32)
@@ -148,7 +148,7 @@ class Painter:
             albedo[:, at] = self._paints[Material(material)](_select(spots, at))
         facing = np.maximum(SUN @ normal, 0.0).astype(np.float32)
         sun = facing * self._shadows.lit(p + 0.02 * normal, facing)
-        # Ambient light: the sky above, a share bounced from the ground, less of it low between walls.
+        # Ambient light from the sky and the ground, less near the ground.
         open_ = (0.72 + 0.28 * normal[2] + 0.12 * np.minimum(p[2] / 6, 1.0) - 0.06).astype(np.float32)
         light = _SUNLIGHT[:, None] * sun + _SKYLIGHT[:, None] * open_
         return np.clip(albedo * light * 1.12, 0.0, 1.0)
@@ -182,7 +182,7 @@ class Painter:
         )
 
     def _grain(self, s: _Spots, *octaves: tuple[float, float]) -> Array:
-        """1 ± noise: (wavelength, amplitude) each; each primitive has its own corner of the table."""
+        """Return 1 ± noise of (wavelength, amplitude) octaves, with an offset per primitive."""
         shift = hash01(s.primitive) * np.float32(199.0)
         wide = np.maximum(s.wu, s.wv)
         out: Array = np.ones_like(wide)
@@ -197,7 +197,7 @@ class Painter:
         return (green + tint * dry) * self._grain(s, (0.12, 0.22), (0.5, 0.14), (2.0, 0.10))
 
     def _ground(self, s: _Spots) -> Array:
-        """Asphalt with markings on the street grid, grass beyond it."""
+        """Paint asphalt with markings on the street grid, and grass beyond it."""
         reach = self._layout.reach
         x, y, wx, wy = s.p[0], s.p[1], s.wu, s.wv
         off_x, off_y = (self._from_street(x, 0), self._from_street(y, 1))
@@ -216,7 +216,7 @@ class Painter:
         return _mix(road, self._grass(s), outside)
 
     def _from_street(self, at: Array, axis: int) -> Array:
-        """Signed distance from the nearest street's centre line."""
+        """Return the signed distance to the nearest street's centre line."""
         pitch = np.float32(PITCH[axis])
         first = np.float32(self._layout.streets(axis)[0])
         k = np.clip(np.rint((at - first) / pitch), 0, self._layout.blocks)
@@ -224,7 +224,7 @@ class Painter:
 
     @staticmethod
     def _markings(across: Array, along: Array, w_across: Array, w_along: Array, crossing: Array) -> Array:
-        """Coverage by white paint: dashed centre line, edge lines, a zebra before each crossing."""
+        """Return the coverage by white paint: dashed centre line, edge lines, zebra crossings."""
         line = band(np.abs(across), -0.08, 0.08, w_across, 1e3) * band(along, 0.0, 3.0, w_along, 7.5)
         edge = band(np.abs(across), 3.0, 3.12, w_across, 1e3)
         to_crossing = np.abs(crossing)
@@ -236,7 +236,7 @@ class Painter:
         return np.maximum(np.maximum(line, edge) * free, np.maximum(zebra * (np.abs(across) < 4.6), stop))
 
     def _block(self, s: _Spots) -> Array:
-        """Paving slabs round the lot, a curb, and grass or a yard within."""
+        """Paint paving slabs around the lot, a curb, and grass or a yard inside."""
         wide = np.maximum(s.wu, s.wv)
         joint = 1 - 0.28 * np.maximum(band(s.u, 0.0, 0.025, s.wu, 0.6), band(s.v, 0.0, 0.025, s.wv, 0.6))
         slab = _tones(s, s.u, s.v, (0.6, 0.6), 0.14)
@@ -269,7 +269,7 @@ class Painter:
         return _mix(gravel, s.colour * np.float32(0.9), 1 - ramp(edge, 0.4, s.wu))
 
     def _windows(self, s: _Spots, wall: Array) -> Array:
-        """A grid of framed panes, each with its own tone; shop fronts below, a cornice above."""
+        """Paint a grid of framed panes with random tones, shop fronts below and a cornice above."""
         pitch, storey, share_u, share_v, _ = s.parameters
         along_y = np.abs(s.n[0]) > 0.5
         start = np.where(along_y, s.lo[1], s.lo[0])

@@ -1,7 +1,7 @@
 """Convex primitives and their first hits.
 
-Every shape is a canonical convex body stretched to an axis-aligned box: a ray's entry and exit are found in
-the body's own coordinates q = (p − centre)/half, where the ray parameter t is unchanged.
+A shape is a canonical convex body stretched to an axis-aligned box. A ray's entry and exit are computed in
+the body's coordinates q = (p − centre)/half, which keep the ray parameter t.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ __all__ = ["Float", "Kind", "Shapes", "Spans", "cast"]
 Float = NDArray[np.float64]
 
 PACKET = 8192
-"""Rays tested together: enough to hide numpy's cost per call, few enough to share a narrow cone."""
+"""Rays per packet: enough to hide NumPy's overhead, few enough for a narrow cone."""
 
 _TINY = 1e-12
 
 
 class Kind(IntEnum):
-    """The canonical bodies, each within [−1, 1]³; z is up."""
+    """Canonical bodies in [−1, 1]³, z up."""
 
     BOX = 0
     ELLIPSOID = 1
@@ -61,7 +61,7 @@ class Shapes:
         return (self.hi - self.lo) / 2
 
     def normals(self, points: Float, primitives: NDArray[np.int64]) -> Float:
-        """(3, n) outward unit normals at the points (3, n) of the given primitives' surfaces."""
+        """Return (3, n) outward unit normals at points (3, n) on the surfaces of primitives."""
         half = self.halves[primitives].T
         q = (points - self.centers[primitives].T) / half
         normal = np.zeros_like(q)
@@ -73,17 +73,17 @@ class Shapes:
         return normal / np.linalg.norm(normal, axis=0)
 
     def inside(self, points: Float, margin: float = 0.0) -> NDArray[np.bool_]:
-        """(n,) whether a point (n, 3) lies in any primitive's bounding box grown by `margin` metres."""
+        """Return (n,) whether points (n, 3) are in a primitive's bounding box, grown by `margin` metres."""
         p = points[:, None]
         return np.all((p > self.lo - margin) & (p < self.hi + margin), axis=2).any(1)
 
 
 Spans = tuple[Float, Float]
-"""Entry and exit parameters of n rays; entry > exit where a ray misses."""
+"""Entry and exit parameters of n rays; entry > exit for misses."""
 
 
 def _quadratic(a: Float, b: Float, c: Float) -> Spans:
-    """Where a·t² + 2b·t + c ≤ 0 for a > 0."""
+    """Return the span of a·t² + 2b·t + c ≤ 0 for a > 0."""
     disc = b * b - a * c
     root = np.sqrt(np.maximum(disc, 0.0))
     miss = disc < 0
@@ -91,13 +91,13 @@ def _quadratic(a: Float, b: Float, c: Float) -> Spans:
 
 
 def _slab(o: Float, d: Float) -> Spans:
-    """Where −1 ≤ o + t·d ≤ 1; d is never zero."""
+    """Return the span of −1 ≤ o + t·d ≤ 1; d must not be zero."""
     m, r = -o / d, 1.0 / np.abs(d)
     return m - r, m + r
 
 
 def _below(level: float, o: Float, d: Float) -> Spans:
-    """Where o + t·d ≤ level."""
+    """Return the span of o + t·d ≤ level."""
     t = (level - o) / d
     return np.where(d > 0, -np.inf, t), np.where(d > 0, t, np.inf)
 
@@ -123,7 +123,7 @@ def _cylinder(o: Float, d: Float) -> Spans:
 
 
 def _cone(o: Float, d: Float) -> Spans:
-    """x² + y² ≤ w², w = (1 − z)/2: a ray steeper than the mantle is inside before or after both roots."""
+    """Return the span of x² + y² ≤ w², w = (1 − z)/2; steep rays are inside before or after both roots."""
     w, dw = (1.0 - o[2]) / 2, -d[2] / 2
     a = (d[:2] ** 2).sum(0) - dw * dw
     a = np.where(np.abs(a) < _TINY, _TINY, a)

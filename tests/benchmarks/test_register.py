@@ -59,4 +59,4 @@ def test_rows_say_what_was_found_and_from_where(tmp_path: Path, command_line: Co
     status, _, err = command_line(*call, "--set", "starts=Z", cwd=tmp_path)
     assert (status, "starts: expected one of A, B, C, D, got 'Z'" in err) == (1, True)
     status, _, err = command_line("benchmarks", "run", "register", "ball.ply", cwd=tmp_path)
-    assert (status, "lacks photos with true poses" in err) == (1, True)
+    assert (status, "needs photos with true poses" in err) == (1, True)

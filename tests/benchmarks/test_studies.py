@@ -128,12 +128,12 @@ def test_the_report_shows_rows_seeds_and_failures(tmp_path: Path) -> None:
         (("ratios = [4]", "ratios = 10"), "ratios: expected a list"),
         (("ratios = [4]", "ratios = [4]\nkeep = [0.1]"), "keep and ratios exclude each other"),
         (("ratios = [4]", "keep = [1.5]"), "keep: expected a list of shares"),
-        (("steps = [9]\nseconds = [3]\n", ""), "no steps"),
+        (("steps = [9]\nseconds = [3]\n", ""), "nothing to measure"),
         (("steps = [9]", "steps = [2.5]"), "steps: expected a whole number"),
         (("seconds = [3]", "seconds = [nan]"), "seconds"),
         (("steps = [9]", "size = 0"), "size"),
         (("steps = [9]", 'schedule = "nope"'), "schedule"),
-        (("[[scene]]", '[[scene]]\nname = "ball"\n[[scene]]'), "there are two of that name"),
+        (("[[scene]]", '[[scene]]\nname = "ball"\n[[scene]]'), "the name is used twice"),
         (('title = "Balls"', "title = 3"), "title: expected text"),
         (('title = "Balls"', 'kind = "cake"'), "kind: expected one of matched"),
     ],
@@ -258,5 +258,5 @@ def test_what_cannot_be_measured_is_refused_at_once(
     for kind in ("simplify", "matched"):
         status, _, error = command_line("benchmarks", "run", kind, "ball.ply", "-o", "out", cwd=tmp_path)
         assert status == 1
-        assert "measures processes by POSIX's calls, which Windows lacks" in error
+        assert "needs POSIX; it does not run on Windows" in error
     assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]
