@@ -1,27 +1,26 @@
-"""g2ard: distil a dense 3D Gaussian scene into a compact, standard 3DGS model at an exact budget.
+"""Distil dense 3D Gaussian scenes into compact, standard 3DGS scenes of an exact size.
 
-| function | does |
+| function | purpose |
 |---|---|
-| `load`, `save` | scenes, by extension |
-| `load_views`, `save_views`, `load_points` | cameras, and coloured clouds |
-| `distill` | the whole job, as `g2ard distill` does it |
-| `distill_against` | the same on a scene, against targets of one's own |
-| `ingest` | a scene or cloud of any size → tiles in a folder |
-| `lift` | coloured points → surface-aligned discs |
-| `simplify` | fewer Gaussians, at an exact count, as `g2ard simplify` does it |
-| `make_pool`, `select` | views for a scene that has none; the views worth having |
-| `recover` | a fixed set of Gaussians against photos or a teacher's renders |
-| `adapt` | new appearance on frozen geometry |
-| `register` | poses of photos, by aligning renders with them |
-| `lod`, `save_levels` | levels of detail, as streamed SOG |
-| `render`, `Renderer`, `evaluate` | images, depths; PSNR, SSIM |
+| `load`, `save` | read and write scenes, by extension |
+| `load_views`, `save_views`, `load_points` | read and write cameras, read coloured point clouds |
+| `distill` | run the whole pipeline, like `g2ard distill` |
+| `distill_against` | run it on a scene in memory, against your own targets |
+| `ingest` | split a scene or point cloud of any size into tiles |
+| `lift` | turn coloured points into surface-aligned discs |
+| `simplify` | reduce a scene to an exact count, like `g2ard simplify` |
+| `make_pool`, `select` | generate views; select the most useful views |
+| `recover` | optimise a fixed set of Gaussians against photos or a teacher's renders |
+| `adapt` | fit a new appearance on frozen geometry |
+| `register` | estimate poses of photos |
+| `lod`, `save_levels` | compute levels of detail, write them as streamed SOG |
+| `render`, `Renderer`, `evaluate` | render images and depths; measure PSNR and SSIM |
 
-They pass on `Splats`, a `Camera` or many `Cameras`, coloured `Points`, and targets: `Photos`,
-`TeacherRenders`, or anything that has `cameras` and gives an image for each. Configurations
-of stages are dataclasses (`SimplifyConfig`, `RecoverConfig`, …); `preset` holds the paper's. What stages do
-with them is in `g2ard.stages`, how they are joined in `g2ard.pipeline`. All errors are `G2ardError`s.
+They exchange `Splats`, `Camera`, `Cameras`, `Points`, and targets: `Photos`, `TeacherRenders`, or any object
+with `cameras` and an image for each. Stages are configured by dataclasses (`SimplifyConfig`,
+`RecoverConfig`, …); `preset` returns the paper's settings. All errors are `G2ardError`s.
 
-Nothing heavy loads before it is used.
+Modules load on first use.
 
 >>> import numpy as np
 >>> import g2ard
@@ -154,7 +153,7 @@ _HOMES = {
     "tiles.ingest": ("ingest",),
     "tiles.store": ("TileStore",),
 }
-"""Module → what it gives under its own name."""
+"""Module → its public names."""
 
 _ALIASES = {
     "distill_against": ("pipeline", "distill"),
@@ -164,7 +163,7 @@ _ALIASES = {
     "save": ("io", "write_splats"),
     "save_views": ("io", "write_views"),
 }
-"""Name → module, and what that calls it."""
+"""Public name → module, name in the module."""
 
 
 def __getattr__(name: str) -> Any:
@@ -174,7 +173,7 @@ def __getattr__(name: str) -> Any:
     from importlib import import_module
 
     found = getattr(import_module(f"g2ard.{home}"), own)
-    globals()[name] = found  # asked for once
+    globals()[name] = found
     return found
 
 

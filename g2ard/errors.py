@@ -1,4 +1,4 @@
-"""Exceptions of g2ard. What they say is kept in fields; `str()` joins the fields to one line."""
+"""Exceptions with structured fields; `str()` joins the fields into one line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Self
 
 DAMAGED = "the file is damaged: copy or export it again"
-"""Hint for files that are not as their writer left them."""
+"""Hint for damaged files."""
 
 _PARAMETER = re.compile(r"\{(\w+)(?:=([^{}]*))?\}")
 
@@ -19,16 +19,16 @@ def _as_argument(name: str, value: str | None = None) -> str:
 
 
 class G2ardError(Exception):
-    """Base of all exceptions of g2ard.
+    """Base class of all g2ard exceptions.
 
     Args:
-        message: what is wrong; after `property` or `index` the rest of a sentence ("is missing").
-        parameter: the argument or constant at fault, by its Python name.
-        path: the file or folder.
-        property: the property, column or key at fault in the file.
-        index: which row, line or view.
-        item: what `index` counts.
-        hint: what to do. `{name}` and `{name=VALUE}` stand for arguments; the command line prints flags.
+        message: what is wrong; after `property` or `index`, the rest of a sentence ("is missing").
+        parameter: Python name of the invalid argument or constant.
+        path: file or folder.
+        property: property, column or key in the file.
+        index: row, line or view.
+        item: unit of `index`.
+        hint: what to do. `{name}` and `{name=VALUE}` are arguments, which the command line prints as flags.
 
     >>> str(InputError("is missing", path="a.ply", property="scale_2", hint="export the scene again"))
     "a.ply: property 'scale_2' is missing; export the scene again"
@@ -67,7 +67,7 @@ class G2ardError(Exception):
         """Return the fields as one line.
 
         Args:
-            spelled: how to write a parameter, and a value for it or None.
+            spelled: function from a parameter and its value, or None, to text.
         """
         parts = [] if self.parameter is None else [spelled(self.parameter, None)]
         if self.path is not None:
@@ -82,7 +82,7 @@ class G2ardError(Exception):
         return f"{line}; {_PARAMETER.sub(lambda found: spelled(found[1], found[2]), self.hint)}"
 
     def at(self, **fields: Any) -> Self:
-        """Return a copy with other fields, for callers that know more than the code that raised it.
+        """Return a copy with changed fields.
 
         >>> str(InputError("is empty").at(path="a.ply"))
         'a.ply: is empty'
@@ -99,11 +99,11 @@ class InputError(G2ardError, ValueError):
 
 
 class OutputError(G2ardError, OSError):
-    """The output cannot be written, or exists and may not be overwritten."""
+    """Output that cannot be written, or exists and must not be overwritten."""
 
 
 class MissingDependencyError(G2ardError, ImportError):  # type: ignore[misc]  # ImportError.path is a string
-    """An optional package is not installed; the hint names the command that installs it."""
+    """Missing optional package; the hint is the command that installs it."""
 
 
 def missing(what: str, package: str, **fields: Any) -> MissingDependencyError:
@@ -111,8 +111,8 @@ def missing(what: str, package: str, **fields: Any) -> MissingDependencyError:
 
     Args:
         what: the feature.
-        package: what to install with pip.
-        fields: of the error.
+        package: package to install with pip.
+        fields: other fields of the error.
 
     >>> str(missing("the engine 'torch'", "g2ard[torch]"))
     "the engine 'torch' needs a package that is not installed; pip install 'g2ard[torch]'"
@@ -124,6 +124,6 @@ def missing(what: str, package: str, **fields: Any) -> MissingDependencyError:
 
 
 def require(name: str, value: object, fits: bool, expected: str) -> None:
-    """Raise an `InputError` for the value of a parameter unless it fits."""
+    """Raise an `InputError` for a parameter's value unless `fits`."""
     if not fits:
         raise InputError(f"expected {expected}, got {value}", parameter=name)

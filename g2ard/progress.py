@@ -1,4 +1,4 @@
-"""One way to report progress: a callback. Only the command line draws bars."""
+"""Progress and status callbacks, and helpers for messages."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 
 class Progress(Protocol):
-    """Called with the stage's name, units done, units in all (0 if unknown) and figures worth showing."""
+    """Callback with the stage's name, units done, total units (0 if unknown) and figures to show."""
 
     def __call__(self, stage: str, done: int, total: int, info: Mapping[str, Any] = ...) -> None: ...
 
@@ -17,7 +17,7 @@ def silent(stage: str, done: int, total: int, info: Mapping[str, Any] | None = N
 
 
 def counter(progress: Progress, stage: str) -> Callable[[int, int], None]:
-    """The `(done, total)` callback that Rust kernels take, bound to one stage.
+    """Return the `(done, total)` callback that Rust kernels take, for one stage.
 
     >>> seen = []
     >>> tell = counter(lambda *a: seen.append(a), "simplify")
@@ -29,7 +29,7 @@ def counter(progress: Progress, stage: str) -> Callable[[int, int], None]:
 
 
 Say = Callable[[str], None]
-"""Called with a line of status: what was noticed in the data, what was decided and why."""
+"""Callback with a line of status, such as a warning or a decision and its reason."""
 
 
 def unsaid(text: str) -> None:
@@ -37,7 +37,7 @@ def unsaid(text: str) -> None:
 
 
 def plural(count: int, one: str, many: str | None = None) -> str:
-    """A count with its noun.
+    """Format a count with its noun.
 
     >>> plural(1, "row"), plural(1234, "row"), plural(2, "vertex", "vertices")
     ('1 row', '1,234 rows', '2 vertices')

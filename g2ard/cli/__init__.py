@@ -1,4 +1,4 @@
-"""The command line. Only this package prints; stages, numpy and torch load when a command runs."""
+"""The command line. Only this package prints; stages, numpy and torch load only when a command runs."""
 
 from __future__ import annotations
 
@@ -21,24 +21,19 @@ _COMPLETION = ("--show-completion", "--install-completion")
 
 
 def main() -> None:
-    """Entry point of the `g2ard` program."""
+    """Run the `g2ard` program."""
     _name_shell(sys.argv[1:])
-    register_commands(next(iter(sys.argv[1:]), None))  # the others would only take time
+    register_commands(next(iter(sys.argv[1:]), None))  # importing the others takes time
     run_program(app, "g2ard")
 
 
 def run_program(app: typer.Typer, name: str) -> None:
-    """Run a command line to its exit status; usage errors are one line and exit status 2.
-
-    Args:
-        app: the commands.
-        name: the program's name in messages.
-    """
-    # Kernels have threads of their own; those of numpy's BLAS only spin, for a thirtieth of a short command.
+    """Run the command line and exit; usage errors print one line and exit with status 2."""
+    # BLAS threads would only spin (3 % of a short command), since kernels use their own threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     outlive_readers()
     defer_rich()
-    gc.set_threshold(50_000)  # importing makes many objects and no garbage: looking for it took a twentieth
+    gc.set_threshold(50_000)  # imports create no garbage; looking for it takes 5 % of a short command
     try:
         status = app(prog_name=name, standalone_mode=False)
     except typer.Abort:
@@ -49,12 +44,12 @@ def run_program(app: typer.Typer, name: str) -> None:
         if message:  # empty when a group without arguments has already shown its help
             print(f"{where}: {message} (see {where} --help)", file=sys.stderr)
         status = e.exit_code
-    gc.freeze()  # nor is there any to look for at the end
+    gc.freeze()  # skip the final collection
     sys.stdout.flush()
     sys.exit(status)
 
 
 def _name_shell(words: list[str]) -> None:
-    """`--show-completion zsh`: typer takes a shell's name, or it looks for the shell, by the environment."""
+    """Let `--show-completion zsh` name the shell; otherwise typer detects it from the environment."""
     if len(words) > 1 and words[0] in _COMPLETION and not words[1].startswith("-"):
         os.environ["_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION"] = "1"

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 app = typer.Typer(
-    help="Distil a dense 3D Gaussian scene into a compact, standard 3DGS model at an exact budget.",
+    help="Distil dense 3D Gaussian scenes into compact, standard 3DGS scenes of an exact size.",
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,

@@ -1,4 +1,4 @@
-"""Budgets as people have them: -n 250k, -r 10, --fit 5MB, --fit quest3, --min-psnr 38."""
+"""Budget options: -n 250k, -r 10, --fit 5MB, --fit quest3, --min-psnr 38."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _DOTTED = re.compile(r"[1-9]\d{0,2}(?:\.\d{3})+")
 
 @dataclass(frozen=True)
 class Count:
-    """A count as typed: absolute, or a share of what there is."""
+    """A count as typed: absolute, or a share of the scene."""
 
     value: float
     is_share: bool
@@ -39,30 +39,34 @@ class Count:
             plain = re.sub("[,_]", "", plain)
         if _DOTTED.fullmatch(plain):
             bare = plain.replace(".", "")
-            raise typer.BadParameter(f"thousands have no dots: write {bare} or {int(bare):_}, not {text!r}")
+            raise typer.BadParameter(
+                f"dots cannot separate thousands: write {bare} or {int(bare):_}, not {text!r}"
+            )
         match = _COUNT.fullmatch(plain)
         if match is None or not float(match[1]) > 0:
-            raise typer.BadParameter(f"a positive count such as 250000, 250k, 1.5M or 25%, not {text!r}")
+            raise typer.BadParameter(
+                f"expected a positive count such as 250000, 250k, 1.5M or 25%, got {text!r}"
+            )
         number, unit = float(match[1]), match[2].lower()
         if unit == "%":
             if number > 100:
-                raise typer.BadParameter(f"a share is at most 100%, not {text!r}")
+                raise typer.BadParameter(f"expected at most 100%, got {text!r}")
             return cls(number / 100, True, text)
         if not unit and "." in match[1]:
-            raise typer.BadParameter(f"a whole number without a dot, or a share such as 25%, not {text!r}")
+            raise typer.BadParameter(f"expected a whole number, or a share such as 25%, got {text!r}")
         number *= {"": 1, "k": 1_000, "m": 1_000_000}[unit]
         if number != round(number):
-            raise typer.BadParameter(f"a whole number, not {text!r}")
+            raise typer.BadParameter(f"expected a whole number, got {text!r}")
         return cls(round(number), False, text)
 
     @classmethod
     def parse_absolute(cls, text: str) -> Count:
-        """Read what `parse` does, but for shares.
+        """Read an absolute count, as `parse` does.
 
         >>> Count.parse_absolute("2M").of(0)
         2000000
         """
-        expected = f"a positive count such as 250000, 250k or 1.5M, not {text!r}"
+        expected = f"expected a positive count such as 250000, 250k or 1.5M, got {text!r}"
         try:
             count = cls.parse(text)
         except typer.BadParameter as error:
@@ -72,16 +76,15 @@ class Count:
         return count
 
     def of(self, total: int) -> int:
-        """The count out of `total`; a share is rounded up and at least 1."""
+        """Return the count for a scene of `total` Gaussians; shares are rounded up, at least 1."""
         return max(1, math.ceil(self.value * total - 1e-9)) if self.is_share else int(self.value)
 
     @property
     def number(self) -> int | float:
-        """A whole number, or a share in (0, 1]."""
+        """The whole number, or the share in (0, 1]."""
         return float(self.value) if self.is_share else int(self.value)
 
     def budget(self) -> Budget:
-        """As the library takes it."""
         from g2ard.policy.budget import Budget
 
         return Budget(share=self.value) if self.is_share else Budget(count=int(self.value))
@@ -97,16 +100,16 @@ def parse_ratio(text: str) -> float:
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value >= 1):
-        raise typer.BadParameter(f"a ratio of at least 1, such as 10, not {text!r}")
+        raise typer.BadParameter(f"expected a ratio of at least 1, such as 10, got {text!r}")
     return value
 
 
 class Counts(tuple[Count, ...]):
-    """Several in one argument, 10k,20k; a class, for typer reads a bare tuple as several arguments."""
+    """Counts in one argument, 10k,20k. Typer would read a plain tuple as several arguments."""
 
     @classmethod
     def parse(cls, text: str) -> Counts:
-        """Counts between commas; a comma before a group that begins with 0, as in 1,000, is of one number.
+        """Read comma-separated counts; commas before a group such as 000 belong to a single number.
 
         >>> [count.of(10**6) for count in Counts.parse("10k,20k")], len(Counts.parse("250,000"))
         ([10000, 20000], 1)
@@ -115,14 +118,12 @@ class Counts(tuple[Count, ...]):
         if _GROUPED.fullmatch(text.strip()) and any(group.startswith("0") for group in groups[1:]):
             return cls([Count.parse(text)])
         if any(re.fullmatch(r"0\d\d", group.strip()) for group in groups[1:]):
-            raise typer.BadParameter(
-                f"commas part counts here: write several as 5_000,4_000 or 5k,4k, not {text!r}"
-            )
+            raise typer.BadParameter(f"commas separate counts: write 5_000,4_000 or 5k,4k, not {text!r}")
         return cls(Count.parse(part) for part in groups)
 
 
 class Ratios(tuple[float, ...]):
-    """Several in one argument, 5,10,20."""
+    """Ratios in one argument, 5,10,20."""
 
     @classmethod
     def parse(cls, text: str) -> Ratios:
@@ -136,7 +137,7 @@ CountsOption = Annotated[
         "--count",
         parser=Counts.parse,
         metavar="COUNT",
-        help="Budget: 250000, 250k, 1.5M or 25%; several, 10k,20k, want {count} in the output's name.",
+        help="Gaussians to keep: 250000, 250k, 1.5M or 25%. Several (10k,20k) need {count} in --output.",
     ),
 ]
 RatiosOption = Annotated[
@@ -146,7 +147,7 @@ RatiosOption = Annotated[
         "--ratio",
         parser=Ratios.parse,
         metavar="RATIO",
-        help="Budget as a ratio: 10 keeps a tenth; several, 5,10,20, want {ratio} in the output's name.",
+        help="Reduction ratio: 10 keeps a tenth. Several (5,10,20) need {ratio} in --output.",
     ),
 ]
 LooksOption = Annotated[
@@ -156,31 +157,33 @@ LooksOption = Annotated[
         "--count",
         parser=Count.parse,
         metavar="COUNT",
-        help="How many views to make of the scene; with --color flags, cells or parents the budget.",
+        help="Number of views to generate; with --color flags, cells or parents the Gaussians to keep.",
     ),
 ]
 RatioOption = Annotated[
     float | None,
     typer.Option(
-        "-r", "--ratio", parser=parse_ratio, metavar="RATIO", help="Budget as a ratio: 10 keeps a tenth."
+        "-r", "--ratio", parser=parse_ratio, metavar="RATIO", help="Reduction ratio: 10 keeps a tenth."
     ),
 ]
 FitOption = Annotated[
     str | None,
-    typer.Option("--fit", metavar="5MB|quest3|mobile|web", help="Budget: bytes of the file, or a device."),
+    typer.Option(
+        "--fit", metavar="5MB|quest3|mobile|web", help="Largest scene that fits a file size or a device."
+    ),
 ]
 MinPsnrOption = Annotated[
     float | None,
-    typer.Option(min=1, help="Budget: the fewest that keep this PSNR, dB, against the scene itself."),
+    typer.Option(min=1, help="Smallest scene with at least this PSNR against the original, dB."),
 ]
 MinSsimOption = Annotated[
     float | None,
-    typer.Option(min=0.01, max=0.9999, help="Budget: the fewest that keep this SSIM.", hidden=True),
+    typer.Option(min=0.01, max=0.9999, help="Smallest scene with at least this SSIM.", hidden=True),
 ]
 
 
 def one_budget(count: Count | None, ratio: float | None) -> Budget:
-    """Usage check, before anything is read: exactly one of -n and -r."""
+    """Return the budget of -n or -r, and check that exactly one is given."""
     from g2ard.policy.budget import Budget
 
     if (count is None) == (ratio is None):

@@ -1,4 +1,4 @@
-"""Options in a TOML file: read as a command's defaults, and written as they stand."""
+"""Config files: options in TOML, read by --config and written by --print-config."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from g2ard.cli.budget_options import Count
 from g2ard.cli.usage import meant
 
 _NOT_KEPT = ("config", "print_config", "overwrite", "resume")
-"""Options that belong to one call."""
+"""Options that are not written to config files."""
 
 
 def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
-    """Make a TOML file's values the defaults: those at its top, and over them its table of this command.
+    """Use the values of a TOML file as defaults: those at its top, then those in the command's table.
 
-    Keys are the flags' long names. What the command does not know is refused; other tables are others'.
+    Keys are long flag names; unknown keys raise an error. Tables of other commands are ignored.
     """
     if path is None:
         return None
@@ -30,7 +30,7 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     unknown = {_dashed(key) for key in table if key not in params or len(key) == 1}
     if unknown:
         near = _meant(unknown, ctx.command)
-        raise typer.BadParameter(f"{path}: no option of `{ctx.info_name}` is called {near}")
+        raise typer.BadParameter(f"{path}: `{ctx.info_name}` has no option {near}")
     found: dict[str, Any] = {}
     for key, value in table.items():
         many = getattr(params[key], "multiple", False) or params[key].nargs == -1
@@ -38,7 +38,7 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     if constants:
         found["set"] = [f"{name}={_as_typed(value)}" for name, value in constants.items()]
         if "set" not in params:
-            raise typer.BadParameter(f"{path}: `{ctx.info_name}` has no settings")
+            raise typer.BadParameter(f"{path}: `{ctx.info_name}` has no settings; remove `set`")
     ctx.default_map = {**(ctx.default_map or {}), **found}
     return path
 
@@ -57,31 +57,33 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _of_command(ctx: typer.Context, path: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """What is at the top of the file for all commands, and over it this command's own table."""
+    """Return the file's top-level options, overridden by those in the command's table."""
     from g2ard.cli.commands import COMMANDS
 
     name = str(ctx.info_name)
     top = {key: value for key, value in values.items() if key == "set" or not isinstance(value, dict)}
     strange = sorted(set(values) - set(top) - {*COMMANDS, name})
     if strange:
-        raise typer.BadParameter(f"{path}: no command is called {meant(strange, {*COMMANDS, name})}")
+        raise typer.BadParameter(f"{path}: unknown command {meant(strange, {*COMMANDS, name})}")
     own = values.get(name, {})
     if not isinstance(own, dict):
-        raise typer.BadParameter(f"{path}: {name}: a table of options")
+        raise typer.BadParameter(f"{path}: {name}: expected a table of options")
     known = _options(ctx.command)
-    if own or len(top) < len(values):  # a file for several commands: what is not for this one is for others
+    if own or len(top) < len(
+        values
+    ):  # a file for several commands: top-level options may belong to another one
         of_others = _check_others(path, {key: values[key] for key in values if key not in {*top, name}})
         strange = [key for key in top if _dashed(key) not in known | of_others and key != "set"]
         if strange:
             near = meant(strange, known | of_others)
-            raise typer.BadParameter(f"{path}: no command it is for has an option {near}")
+            raise typer.BadParameter(f"{path}: none of its commands has an option {near}")
         top = {key: value for key, value in top.items() if _dashed(key) in known or key == "set"}
     constants = {**_flat(top.pop("set", {})), **_flat(own.get("set", {}))}
     return {**top, **own} | ({"set": constants} if constants else {})
 
 
 def _check_others(path: Path, tables: dict[str, Any]) -> set[str]:
-    """The options of the other commands that a file has tables of; a table's keys are among its command's."""
+    """Check the tables of other commands, and return the options of those commands."""
     from g2ard.cli.app import app
     from g2ard.cli.commands import register_commands
 
@@ -92,21 +94,21 @@ def _check_others(path: Path, tables: dict[str, Any]) -> set[str]:
     for name, table in tables.items():
         command = commands.get(name)
         if command is None or not isinstance(table, dict) or hasattr(command, "commands"):
-            continue  # a group's tables are of tables
+            continue  # a group of commands
         options = _options(command)
         if strange := [key for key in table if key != "set" and _dashed(key) not in options]:
-            raise typer.BadParameter(f"{path}: no option of `{name}` is called {meant(strange, options)}")
+            raise typer.BadParameter(f"{path}: `{name}` has no option {meant(strange, options)}")
         found |= options
     return found
 
 
 def _options(command: Any) -> set[str]:
-    """Names of a command's options, with dashes."""
+    """Return the names of a command's options, with dashes."""
     return {_dashed(flag.lstrip("-")) for p in command.params for flag in (*p.opts, str(p.name))}
 
 
 def _meant(keys: Iterable[str], command: Any) -> str:
-    """Keys that are none, each with the long names near to it: of a letter, that of the flag."""
+    """List unknown keys, each with similar long names; for a letter, with the long name of that flag."""
     flags = ((flag, max(p.opts, key=len)) for p in command.params for flag in p.opts)
     long = {flag[1:]: name.lstrip("-") for flag, name in flags if len(flag) == 2}
     known = {name for name in _options(command) if len(name) > 1}
@@ -119,9 +121,11 @@ def _dashed(key: str) -> str:
 
 
 def _flat(table: Any, prefix: str = "") -> dict[str, Any]:
-    """Return a table of settings by dotted path: `simplify.max_energy = 0.02` is a table within one."""
+    """Return a nested table of settings by dotted path, since TOML nests `simplify.max_energy = 0.02`."""
     if not isinstance(table, dict):
-        raise typer.BadParameter("set: a table of settings, such as set = { simplify.max_energy = 0.02 }")
+        raise typer.BadParameter(
+            "set: expected a table of settings, such as set = { simplify.max_energy = 0.02 }"
+        )
     out: dict[str, Any] = {}
     for key, value in table.items():
         out |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
@@ -129,19 +133,18 @@ def _flat(table: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def _as_typed(value: Any) -> Any:
-    """A TOML value as it would be typed: options parse text; [1, 1, 1] is 1,1,1."""
+    """Return a TOML value as typed on the command line, such as 1,1,1 for [1, 1, 1]."""
     if isinstance(value, list):
         return ",".join(str(item) for item in value)
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _several(value: Any) -> list[str]:
-    """What an option that may be repeated is given."""
     return [_as_typed(item) for item in value] if isinstance(value, list) else [_as_typed(value)]
 
 
 def printed(ctx: typer.Context, values: dict[str, Any]) -> str:
-    """A call's inputs and options, defaults included, as `load_config` reads them; None is left out."""
+    """Format a call's inputs and options, with defaults but without None, for `load_config`."""
     lines = [f"[{ctx.info_name}]"]
     constants: list[str] = []
     for parameter in ctx.command.params:
@@ -162,7 +165,7 @@ def printed(ctx: typer.Context, values: dict[str, Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """An option's value in the types of TOML: 5,10 is [5, 10], 10.0 is 10; what has none there is text."""
+    """Return an option's value as a TOML type: 5,10 becomes [5, 10], 10.0 becomes 10, the rest text."""
     if isinstance(value, list):
         items = [item for one in map(_plain, value) for item in (one if isinstance(one, list) else [one])]
         return items if len(items) > 1 or not isinstance(value[0], tuple) else items[0]

@@ -1,4 +1,4 @@
-"""Status on stderr: bars with ETA on a terminal, plain lines elsewhere, nothing when quiet."""
+"""Status on stderr: progress bars on a terminal, plain lines elsewhere, nothing with --quiet."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 _PLAIN_PERIOD = 10.0
-"""Seconds between two progress lines of one stage when stderr is no terminal."""
+"""Seconds between progress lines of a stage when stderr is not a terminal."""
 
 
 def duration(seconds: float) -> str:
-    """Seconds as people read them.
+    """Format a duration.
 
     >>> duration(3.14159), duration(75), duration(4000)
     ('3.1 s', '1 min 15 s', '1 h 06 min')
@@ -29,7 +29,7 @@ def duration(seconds: float) -> str:
 
 
 class Console:
-    """A progress callback (see `g2ard.progress`) that draws; used as a context so that bars end cleanly."""
+    """Progress callback (see `g2ard.progress`) that draws bars, as a context that ends them."""
 
     def __init__(self, *, quiet: bool = False) -> None:
         self.quiet = quiet
@@ -58,7 +58,7 @@ class Console:
         print(f"g2ard: {text}", file=sys.stderr, flush=True)
 
     def table(self, title: str, columns: list[str], rows: list[list[str]]) -> None:
-        """A table on stderr; the first column is left-aligned, figures right-aligned; no names, no header."""
+        """Print a table; all columns but the first are right-aligned, and empty names show no header."""
         if self.quiet:
             return
         self._end_bars()
@@ -88,7 +88,7 @@ class Console:
             from rich.table import Column
 
             def whole() -> Column:
-                return Column(min_width=len("0:00:00"))  # in a narrow window the figures are cut, not these
+                return Column(min_width=len("0:00:00"))  # narrow windows cut the figures instead
 
             self._bars = Progress(
                 TextColumn("{task.description:<12}"),
@@ -112,7 +112,7 @@ class Console:
         if now - last < _PLAIN_PERIOD and not finished:
             return
         if finished and now - began < 1.0:
-            del self._plain[stage]  # too short to be worth a line
+            del self._plain[stage]  # too short for a line
             return
         elapsed = now - began
         parts = [f"{stage}: {done}/{total}" if total else f"{stage}: {done}", duration(elapsed)]

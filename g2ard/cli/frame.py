@@ -1,8 +1,7 @@
-"""What every command shares: common options, one-line errors, exit statuses, the JSON result.
+"""The frame of all commands: common options, one-line errors, exit statuses, the JSON result.
 
 A command is a function `fn(run: Run, ...)`; `@command` adds the common options to its signature.
-Exit status: 0 done · 1 failed · 2 usage · 3 a stated requirement was not met · 130 interrupted,
-143 by SIGTERM.
+Exit status: 0 success · 1 failure · 2 usage error · 3 requirement not met · 130 interrupted · 143 SIGTERM.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ _RIVALS = (
 
 
 def _flags_win(ctx: typer.Context, values: dict[str, Any], defaults: dict[str, Any]) -> None:
-    """Forget what the config file says where a flag that excludes it was typed."""
+    """Let typed flags override options of the config file that they exclude."""
     for pair in _RIVALS:
         for flag, other in (pair, pair[::-1]):
             if typed(ctx, flag) and not typed(ctx, other) and other in defaults:
@@ -52,21 +51,25 @@ def _flags_win(ctx: typer.Context, values: dict[str, Any], defaults: dict[str, A
 
 _COMMON: dict[str, tuple[Any, Any, Any]] = {
     "quiet": (bool, False, typer.Option("-q", "--quiet", help="Print errors only.")),
-    "verbose": (bool, False, typer.Option("-v", "--verbose", help="Say more.")),
+    "verbose": (bool, False, typer.Option("-v", "--verbose", help="Print more details.")),
     "overwrite": (bool, False, typer.Option("-w", "--overwrite", help="Replace existing outputs.")),
-    "json": (str | None, None, typer.Option("--json", metavar="FILE|-", help="Write the result as JSON.")),
-    "seed": (int, 0, typer.Option(min=0, help="Seed of everything random.")),
-    "threads": (int, 0, typer.Option(min=0, max=256, help="Threads; 0 means every core.")),
+    "json": (
+        str | None,
+        None,
+        typer.Option("--json", metavar="FILE|-", help="Write the result as JSON; - is stdout."),
+    ),
+    "seed": (int, 0, typer.Option(min=0, help="Random seed.")),
+    "threads": (int, 0, typer.Option(min=0, max=256, help="CPU threads; 0 uses all cores.")),
     "device": (str, "auto", typer.Option(metavar="auto|cpu|gpu|cuda", help="Where to compute.")),
     "print_config": (
         bool,
         False,
-        typer.Option("--print-config", help="Print the options as a file for --config, and do nothing."),
+        typer.Option("--print-config", help="Print the options as a --config file, then exit."),
     ),
     "config": (
         Path | None,
         None,
-        typer.Option(metavar="FILE.toml", callback=load_config, is_eager=True, help="Defaults; flags win."),
+        typer.Option(metavar="FILE.toml", callback=load_config, is_eager=True, help="Read default options."),
     ),
 }
 """Name → type, default and option."""
@@ -74,7 +77,7 @@ _COMMON: dict[str, tuple[Any, Any, Any]] = {
 _SET = typer.Option(
     "--set",
     metavar="PATH=VALUE",
-    help="A setting, such as recover.schedule.steps=300 (docs/options.md); reports list all. Repeatable.",
+    help="Change a setting, such as recover.schedule.steps=300; repeatable. See docs/options.md.",
 )
 
 
@@ -97,10 +100,10 @@ class Run:
         self.verbose: bool = common["verbose"]
         self.json: str | None = common["json"]
         self.console = Console(quiet=common["quiet"])
-        self.only_checks = False  # whether the call ends once its settings are checked
+        self.only_checks = False  # end after checking the settings
         self.noted = False  # whether a GPU failed
-        self._adapter: str | None = None  # the last that was in use
-        self.kept: list[str] = []  # what a Ctrl-C leaves, in words
+        self._adapter: str | None = None  # last adapter in use
+        self.kept: list[str] = []  # what remains after Ctrl-C, for its message
         given = (*options.values(), common["config"])
         paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
         written = (options.get("output"), options.get("work"))
@@ -111,12 +114,12 @@ class Run:
             self.config["set"] = common["set"]
 
     def settings(self, config: Any, *names: str, preset: str | None = None) -> dict[str, Any]:
-        """Collect values of a config by path, as a usage check: --set, and under it the options `names`.
+        """Collect config values by path from options and --set, which wins.
 
         Args:
             config: the defaults.
-            names: options called like a field, or like the tail of its path; those not given are left out.
-            preset: under which the values of --set are checked as far as they can be alone.
+            names: options named like a field or like the end of its path.
+            preset: preset to check the values of --set with.
         """
         from g2ard.config.paths import full_paths, parsed
         from g2ard.config.presets import configured
@@ -138,12 +141,12 @@ class Run:
         return values
 
     def progress(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
-        """The callback that stages report to; what befell the GPU in the meantime is told first."""
+        """Report progress, after GPU messages since the last call."""
         self.tell_notes()
         self.console(stage, done, total, info)
 
     def tell_notes(self) -> None:
-        """Why the CPU took over from a GPU, if it has since last told, and that a GPU is none."""
+        """Report GPU fallbacks since the last call, and warn once if the adapter is a software renderer."""
         if self.device in ("auto", "gpu"):
             from g2ard.system import devices
 
@@ -152,17 +155,17 @@ class Run:
                 self.console.say(note)
             adapter = devices.state().adapter
             if adapter not in (None, self._adapter) and devices.is_software():
-                told = f"{adapter} is software on this CPU, as a rule slower than --device cpu"
-                self.console.say(f"--device {self.device}: {told}")
+                told = f"{adapter} is a software renderer, usually slower than --device cpu"
+                self.console.say(f"warning: --device {self.device}: {told}")
             self._adapter = adapter
 
     def say(self, text: str) -> None:
-        """A line of status on stderr, unless --quiet."""
+        """Print a line of status to stderr, unless --quiet."""
         self.tell_notes()
         self.console.say(text)
 
     def result(self, data: dict[str, Any]) -> None:
-        """Write the machine-readable result to where --json says; the resolved options go with it."""
+        """Write the result and the resolved options to --json."""
         if self.json is None:
             return
         import json
@@ -177,7 +180,7 @@ class Run:
             temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
     def _used(self) -> dict[str, Any]:
-        """What ran on a GPU, if anything did."""
+        """Describe GPU use, if any."""
         if self.device not in ("auto", "gpu"):
             return {}
         from g2ard.system import devices
@@ -189,31 +192,29 @@ class Run:
         return {"device": used}
 
     def spare_inputs(self, *outputs: Path) -> None:
-        """Usage check: nothing is written over what is read, not even under --overwrite."""
+        """Raise a usage error if an output is also an input, even with --overwrite."""
         from g2ard.io.detect import run_scene
         from g2ard.io.paths import real_path
 
         taken = {real_path(place) for path in self._inputs for place in (path, run_scene(path))}
         for output in outputs:
             if real_path(output) in taken:
-                raise typer.BadParameter(
-                    f"{output} would be written over, and is an input; name another output"
-                )
+                raise typer.BadParameter(f"{output} is both an input and the output; name another output")
 
     def reads(self, scenes: list[Path], output: Path) -> None:
-        """Of the paths given as `scenes` the last one was `output`; as a usage check, see `spare_inputs`."""
+        """Record that the last positional path is the output, and check it with `spare_inputs`."""
         self.config |= {"scenes": scenes, "output": output}
         self._inputs = [path for path in self._inputs if path is not output]
         self.spare_inputs(output)
 
     def unmet(self, requirement: str) -> NoReturn:
-        """End with status 3: all is written, but a stated requirement was not met."""
+        """Exit with status 3: outputs are written, but a requirement is not met."""
         self.console.error(requirement)
         raise typer.Exit(3)
 
 
 def _flat(value: Any) -> Any:
-    """Budgets of an option that takes several at once, and more than once, as one list."""
+    """Flatten the budgets of a repeated option with several values each."""
     if isinstance(value, list) and value and all(isinstance(one, Counts | Ratios) for one in value):
         return [budget for several in value for budget in several]
     return value
@@ -224,7 +225,7 @@ def _plain(value: Any) -> Any:
 
 
 def group(name: str, text: str) -> typer.Typer:
-    """A command with subcommands, such as `python -m benchmarks synth`."""
+    """Register a command with subcommands, such as `python -m benchmarks synth`."""
     sub = typer.Typer(help=text, no_args_is_help=True)
     app.add_typer(sub, name=name)
     return sub
@@ -233,14 +234,14 @@ def group(name: str, text: str) -> typer.Typer:
 def command(
     name: str, *, example: str, parent: typer.Typer = app, cuda: bool = False, settings: bool = False
 ) -> Callable[[Any], Any]:
-    """Register `fn(run, **options)` as a command; `example` ends its help.
+    """Register `fn(run, **options)` as a command.
 
     Args:
-        name: of the command.
-        example: a line.
-        parent: the group it belongs to.
-        cuda: it knows --device cuda.
-        settings: it takes --set, see `Run.settings`.
+        name: name of the command.
+        example: command line shown at the end of its help.
+        parent: group it belongs to.
+        cuda: whether it supports --device cuda.
+        settings: whether it takes --set, see `Run.settings`.
     """
 
     def register(fn: Callable[..., None]) -> Callable[..., None]:
@@ -260,7 +261,7 @@ def command(
         def call(ctx: typer.Context, **values: Any) -> None:
             _flags_win(ctx, values, {p.name: p.default for p in own})
             shared = {key: values.pop(key) for key in shared_options}
-            if typed(ctx, "set"):  # after those of the config file, for the last counts
+            if typed(ctx, "set"):  # after the config file's, since the last value wins
                 shared["set"] = [*(ctx.default_map or {}).get("set", []), *shared["set"]]
             printing = shared.pop("print_config")
             run = Run(name, shared, dict(values), flags_of(ctx.command))
@@ -288,11 +289,11 @@ def command(
 
 
 class _Checked(Exception):
-    """The settings are known and in range."""
+    """Signal that settings are valid."""
 
 
 def _check_settings(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None:
-    """Check the values of --set, and do nothing else."""
+    """Check the values of --set without running the command."""
     run.only_checks = True
     with contextlib.suppress(_Checked):
         fn(run, **options)
@@ -300,18 +301,18 @@ def _check_settings(run: Run, fn: Callable[..., None], options: dict[str, Any]) 
 
 def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: bool) -> None:
     if run.device not in ("auto", "cpu", "gpu", "cuda"):
-        raise typer.BadParameter(f"--device: auto, cpu, gpu or cuda, not {run.device!r}")
+        raise typer.BadParameter(f"--device: expected auto, cpu, gpu or cuda, got {run.device!r}")
     from g2ard.io.paths import real_path
 
     outputs = [Path(o) for o in (options.get("output"), run.json) if o not in (None, "-")]
     if len({real_path(output) for output in outputs}) < len(outputs):
-        raise typer.BadParameter(f"--json and --output are both {run.json}; name another file for one")
+        raise typer.BadParameter(f"--json and --output are the same file {run.json}; name another one")
     work = options.get("work")
     if work is not None and real_path(work) in {real_path(output) for output in outputs}:
         raise typer.BadParameter(f"--work: {work} is an output; name another folder")
     run.spare_inputs(*outputs)
     if run.device == "cuda" and not cuda:
-        run.say("--device cuda: this command computes on the CPU only, and does")
+        run.say("--device cuda: this command does not use CUDA; it runs on the CPU")
     try:
         if run.json not in (None, "-"):
             from g2ard.io.atomic import check_output
@@ -321,7 +322,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
             from g2ard import _core
 
             _core.set_num_threads(run.threads)
-            os.environ["RAYON_NUM_THREADS"] = str(run.threads)  # for the processes that benchmarks start
+            os.environ["RAYON_NUM_THREADS"] = str(run.threads)  # for child processes
         with run.console, _device(run):
             fn(run, **options)
     except KeyboardInterrupt:
@@ -335,13 +336,15 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
     except Exception as e:
         if run.verbose:
             traceback.print_exc()
-        run.console.error(f"internal error, please report it: {type(e).__name__}: {e} (-v shows where)")
+        run.console.error(
+            f"internal error, please report it: {type(e).__name__}: {e} (-v shows the traceback)"
+        )
         raise typer.Exit(1) from None
 
 
 @contextmanager
 def _device(run: Run) -> Iterator[None]:
-    """Kernels run where --device says."""
+    """Run kernels on --device, and report GPU use at the end."""
     if run.device not in ("auto", "gpu"):
         yield
         return
@@ -356,7 +359,7 @@ def _device(run: Run) -> Iterator[None]:
         run.tell_notes()
         state = devices.state()
         if ended and run.device == "gpu" and not (state.served or run.noted):
-            run.say("--device gpu: only `simplify --method paper` and `select` use one; all ran on the CPU")
+            run.say("--device gpu: not used; only `simplify --method paper` and `select` use it")
         elif state.served and run.verbose:
             longest = sorted(state.seconds.items(), key=lambda item: -item[1])[:6]
             took = "".join(f", {name} {seconds:.3f} s" for name, seconds in longest)

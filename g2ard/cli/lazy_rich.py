@@ -1,4 +1,4 @@
-"""Parts of rich that typer's help imports and never uses, a sixth of its time: they load if they are used."""
+"""Lazy loading of rich modules that typer imports but rarely uses, a sixth of the time of --help."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from types import ModuleType
 from typing import Any
 
 _UNUSED = {"rich.markdown": "Markdown", "rich.traceback": "Traceback"}
-"""Module and the class that typer imports from it: for Markdown in help texts, and for tracebacks."""
+"""Module → the class that typer imports from it."""
 
 
 class _Deferred(type):
-    """A class that stands for the one of its name in the module of its name."""
+    """Metaclass of a placeholder for the class of its module and name."""
 
     def __call__(cls, *args: Any, **options: Any) -> Any:
         return getattr(_loaded(cls.__module__), cls.__name__)(*args, **options)
 
     def __getattr__(cls, name: str) -> Any:
-        if name.startswith("__"):  # what Python itself asks of a class
+        if name.startswith("__"):  # looked up by Python itself
             raise AttributeError(name)
         return getattr(getattr(_loaded(cls.__module__), cls.__name__), name)
 
 
 class _Stand(ModuleType):
-    """A module that stands for the one of its name."""
+    """Placeholder for the module of its name."""
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # what the import system asks of a module
+        if name.startswith("__"):  # looked up by the import system
             raise AttributeError(name)
         return getattr(_loaded(self.__name__), name)
 
@@ -39,7 +39,7 @@ def _loaded(name: str) -> ModuleType:
 
 
 def defer_rich() -> None:
-    """Let the modules load when something of them is used, not when they are imported."""
+    """Install placeholders that load the modules on first use."""
     for name, of in _UNUSED.items():
         if name not in sys.modules:
             stand = _Stand(name)

@@ -1,4 +1,4 @@
-"""Option types that several commands share; budgets are in `budget_options`."""
+"""Options that several commands share; budgets are in `budget_options`."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
 SceneArgument = Annotated[
-    Path, typer.Argument(metavar="SCENE", help="A .ply (3DGS), SOG, .spz, .glb, .splat or .compressed.ply.")
+    Path,
+    typer.Argument(metavar="SCENE", help="Scene: .ply (3DGS), SOG, .spz, .glb, .splat or .compressed.ply."),
 ]
 Protocol = Literal["pool", "standing", "both"]
 ProtocolOption = Annotated[
     Protocol,
     typer.Option(
-        help="Views that are scored: held out of the pool, or near ones and those where people stand.",
+        help="Views to score: held out of the pool, near and at eye level (standing), or both.",
     ),
 ]
 ViewsOption = Annotated[
@@ -42,18 +43,18 @@ ViewsOption = Annotated[
     typer.Option(
         "--views",
         metavar="VIEWS",
-        help="A COLMAP folder, transforms.json, cameras.json, a trainer's run or g2ard's own .json.",
+        help="Cameras: COLMAP folder, transforms.json, cameras.json, training run or g2ard's .json.",
     ),
 ]
 
 
 def _views_or_made(text: str) -> Path | str:
-    """A word beside all paths: a folder of that name is ./made."""
+    """Read a path, or the word "made"; a folder of that name is ./made."""
     return "made" if text == "made" else Path(text)
 
 
 def is_made(views: object) -> bool:
-    """Whether `--views made` was given."""
+    """Return whether `--views made` was given."""
     return views == "made"
 
 
@@ -63,26 +64,28 @@ ViewsOrMadeOption = Annotated[
         "--views",
         parser=_views_or_made,
         metavar="VIEWS|made",
-        help="A COLMAP folder, transforms.json, cameras.json, a trainer's run or g2ard's own .json; "
-        "what lies beside the scene if not given; made: generated views instead.",
+        help="Cameras: COLMAP folder, transforms.json, cameras.json, training run or g2ard's .json. "
+        "By default those found beside the scene; 'made' generates views.",
     ),
 ]
-LookOption = Annotated[Path, typer.Option("--views", metavar="VIEWS", help="Where to look from.")]
+LookOption = Annotated[
+    Path, typer.Option("--views", metavar="VIEWS", help="Cameras, with photos unless --teacher is given.")
+]
 OutputOption = Annotated[
     Path,
-    typer.Option("-o", "--output", metavar="OUT", help="Where the result goes."),
+    typer.Option("-o", "--output", metavar="OUT", help="Output file."),
 ]
 
 
 def picture(text: str) -> Path:
-    """Read the name of a picture that is written."""
+    """Read the name of an output picture."""
     if Path(text).suffix.lower() != ".png":
-        raise typer.BadParameter(f"pictures are written as .png, not {text!r}")
+        raise typer.BadParameter(f"expected a name that ends in .png, got {text!r}")
     return Path(text)
 
 
 class Triple(tuple[float, float, float]):
-    """Three numbers in one argument; a class, for typer reads a bare tuple as several."""
+    """Three numbers in one argument. Typer would read a plain tuple as several arguments."""
 
 
 def _colour(text: str) -> Triple:
@@ -94,12 +97,14 @@ def _colour(text: str) -> Triple:
     except ValueError:
         values = ()
     if len(values) != 3 or not all(0 <= v <= 1 for v in values):
-        raise typer.BadParameter(f"black, white or three numbers in [0, 1] such as 0.2,0.3,0.4, not {text!r}")
+        raise typer.BadParameter(
+            f"expected black, white or R,G,B in [0, 1] such as 0.2,0.3,0.4, got {text!r}"
+        )
     return Triple((values[0], values[1], values[2]))
 
 
 def numbers(option: str, text: str, count: int) -> list[float]:
-    """`count` finite numbers, parted by commas or blanks.
+    """Read `count` finite numbers, separated by commas or spaces.
 
     >>> numbers("--box", "0, 0,0 1,1,1e1", 6)
     [0.0, 0.0, 0.0, 1.0, 1.0, 10.0]
@@ -109,7 +114,7 @@ def numbers(option: str, text: str, count: int) -> list[float]:
     except ValueError:
         found = []
     if len(found) != count or not all(map(math.isfinite, found)):
-        raise typer.BadParameter(f"{option}: expected {count} numbers with commas between, got {text!r}")
+        raise typer.BadParameter(f"{option}: expected {count} comma-separated numbers, got {text!r}")
     return found
 
 
@@ -119,7 +124,7 @@ def _direction(text: str) -> Triple:
     except ValueError:
         x = y = z = math.nan
     if not (all(abs(v) < 1e30 for v in (x, y, z)) and any((x, y, z))):
-        raise typer.BadParameter(f"a direction such as 0,0,1 or 0,-1,0, not {text!r}")
+        raise typer.BadParameter(f"expected a direction such as 0,0,1 or 0,-1,0, got {text!r}")
     return Triple((x, y, z))
 
 
@@ -128,13 +133,13 @@ UpOption = Annotated[
     typer.Option(
         parser=_direction,
         metavar="X,Y,Z",
-        help="Away from the ground, for generated views; estimated unless given.",
+        help="Up direction for generated views; estimated by default.",
     ),
 ]
 
 
 class Spot(tuple[float, ...]):
-    """A region as typed."""
+    """Sphere or box as typed."""
 
     def __str__(self) -> str:
         return ",".join(f"{number:.17g}" for number in self)
@@ -149,7 +154,7 @@ def _spot(text: str) -> Spot:
     except InputError as error:
         raise typer.BadParameter(error.message) from None
     except ValueError:
-        raise typer.BadParameter(f"expected X,Y,Z,R or X,Y,Z,X,Y,Z, not {text!r}") from None
+        raise typer.BadParameter(f"expected X,Y,Z,R or X,Y,Z,X,Y,Z, got {text!r}") from None
 
 
 KeepRegionOption = Annotated[
@@ -158,44 +163,51 @@ KeepRegionOption = Annotated[
         "--keep-region",
         parser=_spot,
         metavar="X,Y,Z,R|X,Y,Z,X,Y,Z",
-        help="More of the budget for a sphere or a box, scene units, as if views stood twice as near "
-        "(--set keep_times=4); may be repeated.",
+        help="Keep more detail in a sphere or box, scene units; repeatable. "
+        "--set keep_times=N changes how much (4).",
     ),
 ]
 SplitOption = Annotated[
-    str, typer.Option(metavar="train|test|all", help="By the views' split file, else every 8th name is test.")
+    str,
+    typer.Option(metavar="train|test|all", help="Views to use; every 8th is test unless a split is given."),
 ]
 ShDegreeOption = Annotated[
     int | None,
-    typer.Option("--sh-degree", min=0, max=3, help="Of the result; the scene's own if not given."),
+    typer.Option("--sh-degree", min=0, max=3, help="SH degree of the result; by default that of the scene."),
 ]
 FormatOption = Annotated[
     FormatName,
-    typer.Option("--format", case_sensitive=False, help="Of the scene's file in RUN."),
+    typer.Option("--format", case_sensitive=False, help="Format of the scene in RUN."),
 ]
-ResumeOption = Annotated[bool, typer.Option("--resume", help="Resume an interrupted run.")]
+ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")]
 SizeOption = Annotated[
     int | None,
-    typer.Option(min=16, metavar="PIXELS", help="Shrink views to this longer side."),
+    typer.Option(min=16, metavar="PIXELS", help="Shrink images to this longer side."),
 ]
 BackgroundOption = Annotated[
     Triple | None,
-    typer.Option(parser=_colour, metavar="COLOUR", help="black (the default), white or R,G,B in [0, 1]."),
+    typer.Option(
+        parser=_colour, metavar="COLOUR", help="Background: black (default), white or R,G,B in [0, 1]."
+    ),
 ]
 SkyOption = Annotated[
     Triple | None,
     typer.Option(
-        parser=_colour, metavar="COLOUR", help="black, white or R,G,B in [0, 1]; 0.6,0.8,1 if not given."
+        parser=_colour, metavar="COLOUR", help="Sky: black, white or R,G,B in [0, 1]; 0.6,0.8,1 by default."
     ),
 ]
 TeacherOption = Annotated[
     Path | None,
-    typer.Option("--teacher", metavar="SCENE", help="Its renders are the targets; without it, the photos."),
+    typer.Option(
+        "--teacher",
+        metavar="SCENE",
+        help="Train on or score against renders of this scene instead of photos.",
+    ),
 ]
 
 ConventionOption = Annotated[
     Convention,
-    typer.Option(help="The renderer's conventions; inria: near plane 0.2, splats cut to their 3σ tiles."),
+    typer.Option(help="Renderer to follow; inria has near plane 0.2 and cuts splats at 3σ tiles."),
 ]
 
 
@@ -214,8 +226,8 @@ CropOption = Annotated[
         "--crop",
         parser=_crop,
         metavar="[VIEW:]X,Y,W,H",
-        help="Magnify this in the report: left, top, width, height in shares of the image "
-        "(front.png:0.4,0.3,0.2,0.2); may be repeated.",
+        help="Magnify a part in the report: left, top, width, height as shares of the image "
+        "(front.png:0.4,0.3,0.2,0.2); repeatable.",
         hidden=True,
     ),
 ]
@@ -223,36 +235,36 @@ CropOption = Annotated[
 PresetOption = Annotated[
     PresetName,
     typer.Option(
-        help="Settings by name: regularisers that hold the geometry, measured by auto; or all as in the"
-        " paper, except what other options say."
+        help="Named settings: regularisers for a trained, lifted or noisy scene (auto measures it), or all "
+        "settings of the paper. Other options win."
     ),
 ]
 PaperOption = Annotated[
     PaperPresetName | None,
     typer.Option(
         "--preset",
-        help="paper, or with a row of its regularisers paper-trained, paper-lift, paper-noisy: all as in the"
-        " paper, except what other options say.",
+        help="Settings of the paper, or paper-trained, paper-lift, paper-noisy for its regularisers. "
+        "Other options win.",
         metavar="[paper|paper-…]",
     ),
 ]
 ScheduleOption = Annotated[
     ScheduleName | None,
     typer.Option(
-        help="Rates and horizon: fast, 300 steps, default, 1,000, or best, 6,000; paper also goes by rounds."
+        help="Recovery schedule: fast (300 steps), default (1,000), best (6,000) or paper (in rounds)."
     ),
 ]
 StepsOption = Annotated[
     int | None,
-    typer.Option(min=1, help="Steps of the last recovery, instead of the schedule's."),
+    typer.Option(min=1, help="Steps of the last recovery; by default the schedule's."),
 ]
-MethodOption = Annotated[Method | None, typer.Option(help="How to simplify: default unless given.")]
+MethodOption = Annotated[Method | None, typer.Option(help="Simplification method.")]
 
 
 def _duration(text: str) -> float:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|min|h)?", text.strip())
     if match is None or not float(match[1]) > 0:
-        raise typer.BadParameter(f"a time such as 90s, 2m or 1h, not {text!r}")
+        raise typer.BadParameter(f"expected a time such as 90s, 2m or 1h, got {text!r}")
     return float(match[1]) * {"s": 1, "m": 60, "min": 60, "h": 3600}[match[2] or "s"]
 
 
@@ -262,7 +274,7 @@ RecoveryTimeOption = Annotated[
         "--recovery-time",
         parser=_duration,
         metavar="TIME",
-        help="Fit recovery, and no other part, into 90s, 2m or 1h.",
+        help="Time limit for recovery alone: 90s, 2m or 1h.",
     ),
 ]
 
@@ -272,15 +284,11 @@ def views_count(text: str) -> Count | str:
     return "auto" if text.strip() == "auto" else Count.parse(text)
 
 
-PolicyOption = Annotated[Policy | None, typer.Option("--policy", help="What makes views good.")]
+PolicyOption = Annotated[Policy | None, typer.Option("--policy", help="Selection criterion.")]
 
 
 def recovery_engine(run: Run) -> Engine:
-    """What takes recovery's steps on the device asked for.
-
-    Raises:
-        InputError: CUDA was asked for and is not to be had.
-    """
+    """Return the recovery engine for --device; raise an error if CUDA is requested and not available."""
     if run.device != "cuda":
         return "fused"
     from g2ard.system.extras import require_torch
@@ -293,20 +301,20 @@ def recovery_engine(run: Run) -> Engine:
 
 
 def trained_on(split: str) -> str:
-    """What to call the views that a command has fitted."""
+    """Return the name of the views a command trains on, for messages."""
     return "training views" if split == "train" else f"{split} views"
 
 
 def can_be_made(views: Path | None, teacher: Path | None) -> None:
-    """Usage check: where no views are given, a teacher is there to be looked at."""
+    """Check that there is a teacher to generate views of, unless views are given."""
     if teacher is None and is_made(views):
-        raise typer.BadParameter("--teacher is missing: views that are made have no photos; name a scene")
+        raise typer.BadParameter("--views made needs a --teacher: generated views have no photos")
     if teacher is None and views is None:
-        raise typer.BadParameter("give --views, or a --teacher to make views of")
+        raise typer.BadParameter("give --views, or a --teacher to generate views of")
 
 
 def views_or_teacher(run: Run, views: Path | None, teacher: Path | None, dense: Splats | None) -> Any:
-    """The views given, else those beside the teacher, else a pool of it; see `can_be_made`."""
+    """Return the given views, or those found beside the teacher, or generated ones."""
     from g2ard.policy.views import views_or_pool
 
     if dense is None:

@@ -1,4 +1,4 @@
-"""Where results go: one place for each budget, named by a pattern where there are several."""
+"""Output paths: one per budget, from a pattern if there are several."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def budgets_of(
     min_psnr: float | None = None,
     min_ssim: float | None = None,
 ) -> list[Budget]:
-    """Usage check, before anything is read: budgets of one kind, and at least one."""
+    """Return the budgets of the options, and check that exactly one kind is given."""
     from g2ard.errors import InputError
     from g2ard.policy.budget import Budget
 
     quality = min_psnr is not None or min_ssim is not None
     if [bool(counts), bool(ratios), fit is not None, quality].count(True) != 1:
         raise typer.BadParameter(
-            "give the budget as either -n COUNT or -r RATIO, or as --fit, or as --min-psnr and --min-ssim"
+            "give the budget as one of -n COUNT, -r RATIO, --fit, or --min-psnr and --min-ssim"
         )
     if fit is not None or quality:
         try:
@@ -46,13 +46,13 @@ def budgets_of(
 
 
 class Outputs:
-    """One output for each budget: `{ratio}` and `{count}` in the name stand for the budget's.
+    """Outputs of a command, one per budget; `{ratio}` and `{count}` in the pattern are the budget's.
 
     Args:
         run: the command.
-        pattern: as given.
-        budgets: what is asked for.
-        name: of the option.
+        pattern: path as given.
+        budgets: requested budgets.
+        name: flag of the pattern, for messages.
     """
 
     def __init__(self, run: Run, pattern: Path, budgets: Sequence[Budget], *, name: str = "--output") -> None:
@@ -60,37 +60,39 @@ class Outputs:
         self._checked: set[Path] = set()
         if strange := set(re.findall(r"{[^{}]*}", self._pattern)) - {"{ratio}", "{count}"}:
             raise typer.BadParameter(
-                f"{name}: {min(strange)} stands for nothing; {{ratio}} and {{count}} stand for the budget's"
+                f"{name}: unknown placeholder {min(strange)}; use {{ratio}} or {{count}}"
             )
         if len(set(budgets)) < len(budgets):
-            raise typer.BadParameter(
-                f"{name}: a budget is given twice, and would be written to the same place; give each once"
-            )
+            raise typer.BadParameter(f"{name}: a budget is given twice; give each budget once")
         named = any(word in self._pattern for word in ("{ratio}", "{count}"))
         if named and any(budget.is_measured for budget in budgets):
-            raise typer.BadParameter(f"{name}: {{ratio}} and {{count}} stand for budgets of -r and -n")
+            raise typer.BadParameter(f"{name}: {{ratio}} and {{count}} need a budget by -r or -n")
         by_count = budgets[0].ratio is None
         if len(budgets) > 1 and not named:
             raise typer.BadParameter(
-                f"{name}: {len(budgets)} budgets want {{ratio}} or {{count}} in its name, such as "
+                f"{name}: {len(budgets)} budgets need {{ratio}} or {{count}} in its name, such as "
                 f"{_suggested(pattern, by_count=by_count)}"
-                + ("; one number has no commas, or reads 10_000" if by_count else "")
+                + ("; commas separate counts, so write a single one as 10_000" if by_count else "")
             )
 
     def paths(self, total: int | None = None) -> list[Path]:
-        """The places in the budgets' order; () as long as `total`, the scene's Gaussians, must be known."""
+        """Return the paths in the order of the budgets, or [] if they depend on an unknown `total`.
+
+        Args:
+            total: Gaussians of the input scene.
+        """
         if total is None and self._unknown():
             return []
         found = [Path(self._named(budget, total)) for budget in self._budgets]
         if len(set(found)) < len(found):
             raise typer.BadParameter(
-                f"{self._pattern}: two budgets would be written to the same place; "
-                "give budgets that differ more, or name both {ratio} and {count}"
+                f"{self._pattern}: two budgets have the same output; "
+                "give budgets that differ more, or use both {ratio} and {count}"
             )
         return found
 
     def check(self, check: Callable[[Path, Budget], object], total: int | None = None) -> None:
-        """Refuse places that cannot be written, each once, as soon as their names are known."""
+        """Run `check` on each path once, as soon as the paths are known."""
         for path, budget in zip(self.paths(total), self._budgets, strict=False):
             if path not in self._checked:
                 check(path, budget)

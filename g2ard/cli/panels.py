@@ -1,4 +1,4 @@
-"""Panels that `--help` groups the options of long commands in."""
+"""Panels that group options in `--help`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, get_args
 COMMON = "Common"
 
 GROUPED = ("distill", "simplify", "recover", "adapt", "register", "lod")
-"""Commands with so many options that they are grouped."""
+"""Commands whose own options are grouped."""
 
 _PANELS = {
     "Budget": ("count", "ratio", "ratios", "fit", "min_psnr"),
@@ -32,7 +32,7 @@ _PANELS = {
 
 
 def into_panels(name: str, annotation: Any, panel: str | None = None) -> None:
-    """Put the option of a parameter into a panel, or into the one that its name belongs to."""
+    """Put a parameter's option into `panel`, by default the one that lists its name."""
     found = panel or next((title for title, names in _PANELS.items() if name in names), None)
     for option in get_args(annotation)[1:]:
         option.rich_help_panel = found

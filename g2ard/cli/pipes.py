@@ -1,4 +1,4 @@
-"""Streams whose reader has gone: what is left to say is dropped, and the work goes on."""
+"""Output streams that survive a closed pipe (`| head`): the rest of the output is dropped."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import TextIO
 
 
 def outlive_readers() -> None:
-    """From here on a closed pipe (`| head`) ends neither a command nor the files that it is to write."""
+    """Replace stdout and stderr so that a closed pipe does not end the command."""
     sys.stdout, sys.stderr = _Outliving(sys.stdout), _Outliving(sys.stderr)
 
 
 class _Outliving:
-    """A text stream that goes to nowhere once its reader has gone."""
+    """Text stream that discards its output once the reader has closed the pipe."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -35,7 +35,7 @@ class _Outliving:
             self._to_nowhere()
 
     def _to_nowhere(self) -> None:
-        """What is still in the buffer goes there too, at the program's end."""
+        """Redirect the file descriptor, so that buffered text is discarded too."""
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, self._stream.fileno())
         os.close(nowhere)

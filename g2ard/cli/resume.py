@@ -1,4 +1,4 @@
-"""Commands that can be stopped: what a stopped run left is gone on from, or replaced when -w says so."""
+"""Resume an interrupted run, or discard it with `-w`."""
 
 from __future__ import annotations
 
@@ -13,37 +13,37 @@ from g2ard.cli.frame import Run
 from g2ard.errors import OutputError
 
 OPTIONS = "options.json"
-"""In a folder of checkpoints: what they belong to. Alone it is nothing to go on from."""
+"""File in a folder of checkpoints with the options of their run."""
 
 
 def check_stopped(run: Run, place: Path, resume: bool, output: Path) -> bool:
-    """Before the work: whether there is something to go on from at `place`, a checkpoint or a folder of them.
+    """Return whether to resume from `place`, a checkpoint or a folder of checkpoints.
 
     Raises:
-        OutputError: there is, and neither --resume nor --overwrite says what is to become of it.
-        Exit: `output` is there already, and nothing is left to go on with.
+        OutputError: checkpoints exist, and neither --resume nor --overwrite is given.
+        Exit: `output` is finished, and there is nothing to resume.
     """
     left = left_at(place)
     if resume and not left and not run.overwrite and output.exists():
-        run.say(f"{output}: finished already, nothing is left to resume (-w without --resume starts anew)")
+        run.say(f"{output}: already finished; -w without --resume starts over")
         raise typer.Exit
     if resume and not left:
-        run.say(f"nothing to go on from ({place}): starts anew")
+        run.say(f"{output}: nothing to resume, starting over")
     if left and not (resume or run.overwrite):
-        raise OutputError(f"{place}: left by a stopped run; --resume goes on from it, -w starts anew")
+        raise OutputError(f"{place}: left by an interrupted run; --resume continues it, -w starts over")
     return resume and left
 
 
 @contextmanager
 def stoppable(run: Run, place: Path, resume: bool) -> Iterator[None]:
-    """While it lasts checkpoints may wait at `place`; its end removes them, Ctrl-C says how to go on."""
+    """Keep checkpoints at `place` if the command is interrupted, and remove them when it succeeds."""
     if not resume:
         _remove(place)
     try:
         yield
     except KeyboardInterrupt:
         if left_at(place):
-            run.kept.append(f"the same command with --resume goes on from {place}")
+            run.kept.append(f"run the same command with --resume to continue from {place}")
         raise
     else:
         _remove(place)
@@ -54,18 +54,18 @@ def stoppable(run: Run, place: Path, resume: bool) -> Iterator[None]:
 
 @contextmanager
 def rows_kept(run: Run, table: Path, *, goes_on: bool) -> Iterator[None]:
-    """While it lasts a table grows; Ctrl-C says that its rows stay, and whether another call goes on."""
+    """Report finished rows of a table on Ctrl-C, and whether running the command again continues."""
     try:
         yield
     except KeyboardInterrupt:
         if table.exists():
-            onward = "the same command goes on" if goes_on else "the same command with -w starts anew"
-            run.kept.append(f"{table} holds what is done; {onward}")
+            onward = "run the same command to continue" if goes_on else "-w starts over"
+            run.kept.append(f"finished rows are in {table}; {onward}")
         raise
 
 
 def left_at(place: Path) -> bool:
-    """Whether there is a checkpoint, or a folder that holds some."""
+    """Return whether `place` is a checkpoint or a folder with checkpoints."""
     return any(item.name != OPTIONS for item in place.iterdir()) if place.is_dir() else place.exists()
 
 

@@ -1,4 +1,4 @@
-"""The folder of a `distill` run: what an earlier run left there, and with which options."""
+"""The folder of a `distill` run: its files, and earlier runs in it."""
 
 from __future__ import annotations
 
@@ -17,23 +17,22 @@ if TYPE_CHECKING:
     from g2ard.policy.budget import Budget
 
 WORK = ".unfinished"
-"""In the folder of the run: finished rounds and checkpoints. Nobody else has a folder of this name."""
+"""Folder in a run's folder for finished rounds and checkpoints."""
 KEPT = Path("simplified", "scene.ply")
-"""In the folder of the run, with --keep: the anchors of the last recovery, for `evaluate --anchors`."""
+"""The simplified scene, with --keep, for `evaluate --anchors`."""
 REPORT = "report.json"
-"""In the folder of the run, written last."""
+"""The run's numbers, written last."""
 
 _OF_THE_CALL = (
     *("output", "resume", "keep", "view", "crop", "dry_run", "threads", "device"),
     *("memory", "workers", "scheduler", "work"),
 )
-"""Options that another call may have other values of, and yet go on with a run; of devices all but CUDA."""
+"""Options that may change when a run is resumed. `device` may change except to or from CUDA."""
 _OF_THE_BUDGET = ("count", "ratio")
-"""Several are one budget for each folder."""
+"""Budget options; each folder has one budget."""
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> None:
-    """A run's numbers, the last file of its folder."""
     from g2ard.io.atomic import atomic_output
 
     with atomic_output(folder / REPORT, overwrite=True) as temporary:
@@ -41,17 +40,14 @@ def write_report(folder: Path, report: dict[str, Any]) -> None:
 
 
 def check_place(run: Run, place: Path, budget: Budget, given: bool, resume: bool) -> None:
-    """Refuse a place whose folder holds an input, another result, or an earlier run that is not asked for.
+    """Raise an `OutputError` unless the run may write to the folder of `place`, its scene file.
 
     Args:
         run: the command.
-        place: of the scene's file.
-        budget: of this folder.
-        given: whether the views are given; else they are written beside the scene.
+        place: the scene's file.
+        budget: budget of this folder.
+        given: whether views are given; otherwise views.json is written too.
         resume: --resume.
-
-    Raises:
-        OutputError: the folder may not be written to, or was begun with other options.
     """
     from g2ard.io.atomic import check_output
 
@@ -70,28 +66,27 @@ def check_place(run: Run, place: Path, budget: Budget, given: bool, resume: bool
 
 
 def is_done(run: Run, place: Path, resume: bool) -> bool:
-    """Whether there is nothing left to go on with in a folder."""
+    """Return whether --resume finds a finished run."""
     return resume and not run.overwrite and _is_finished(place)
 
 
 def tell_finished(run: Run, place: Path) -> dict[str, Any]:
-    """Say that there is nothing left to do; the report that is there."""
+    """Say that a run is finished, and return its report."""
     from g2ard.io.jsonfile import read_json
 
-    run.say(f"{place.parent}: finished already, nothing is left to resume (-w without --resume starts anew)")
+    run.say(f"{place.parent}: already finished; -w without --resume starts over")
     return read_json(place.parent / REPORT)
 
 
 def tell_anew(run: Run, folder: Path, resume: bool) -> None:
-    """Say so where --resume finds nothing."""
+    """Say that --resume starts over if there is nothing to resume."""
     if resume and not left_at(folder / WORK):
-        run.say(f"{folder}: nothing to go on from: starts anew")
+        run.say(f"{folder}: nothing to resume, starting over")
 
 
 @contextmanager
 def work_folder(run: Run, output: Path, resume: bool, counts: tuple[int, int] = (0, 0)) -> Iterator[Path]:
-    """Where finished rounds and checkpoints wait for --resume; an error leaves nothing behind, nor does a
-    Ctrl-C before the first of them.
+    """Create the folder for checkpoints; after an error or Ctrl-C, keep it only if it can be resumed.
 
     Args:
         run: the command.
@@ -110,7 +105,7 @@ def work_folder(run: Run, output: Path, resume: bool, counts: tuple[int, int] = 
         yield work
     except (Exception, KeyboardInterrupt) as error:
         if left_at(work) and (resume or isinstance(error, KeyboardInterrupt)):
-            run.kept.append(f"the same command with --resume goes on in {output}")
+            run.kept.append(f"run the same command with --resume to continue in {output}")
             if not isinstance(error, KeyboardInterrupt | InputError):
                 run.say(run.kept[-1])
         else:
@@ -119,7 +114,7 @@ def work_folder(run: Run, output: Path, resume: bool, counts: tuple[int, int] = 
 
 
 def note_options(run: Run, work: Path, told: Mapping[str, Any] = MappingProxyType({})) -> None:
-    """Write beside what will wait for --resume which options it belongs to, unless it waits already."""
+    """Write the run's options beside its checkpoints, unless there are checkpoints already."""
     work.mkdir(parents=True, exist_ok=True)
     if not left_at(work):
         (work / OPTIONS).write_text(
@@ -128,17 +123,12 @@ def note_options(run: Run, work: Path, told: Mapping[str, Any] = MappingProxyTyp
 
 
 def check_same_options(run: Run, work: Path, besides: Sequence[str] = ()) -> None:
-    """Refuse to go on from a stopped run with other options, those `besides` excepted.
-
-    Raises:
-        OutputError: it had others.
-    """
+    """Raise an `OutputError` if the interrupted run had other options, except for those in `besides`."""
     _check_same(run, work, work / OPTIONS, None, "begun", besides)
 
 
 def stopped_run(folder: Path) -> dict[str, Any] | None:
-    """What a stopped run left in its folder: what is kept, counts and options as far as they are told; None
-    where nothing is to be gone on from."""
+    """Describe an interrupted run (checkpoints, counts, options), or return None if there is none."""
     from g2ard.io.jsonfile import read_json
 
     work = folder / WORK
@@ -150,36 +140,31 @@ def stopped_run(folder: Path) -> dict[str, Any] | None:
 
 
 def drop_older(place: Path) -> None:
-    """Remove the scenes of an earlier run in other formats: one folder, one scene."""
+    """Remove an earlier run's scenes in other formats, since a folder holds one scene."""
     for other in _other_scenes(place):
         other.unlink(missing_ok=True)
 
 
 def _other_scenes(place: Path) -> list[Path]:
-    """The files that a run writes its scene to in other formats."""
+    """Return the scene's file names in other formats."""
     from g2ard.io.scene_formats import FORMATS
 
     return [path for name in FORMATS if (path := place.with_name(f"scene.{name}")) != place]
 
 
 def _is_finished(place: Path) -> bool:
-    """Whether a run has ended there."""
     return place.exists() and (place.parent / REPORT).exists() and not left_at(place.parent / WORK)
 
 
 def _is_bare(folder: Path) -> bool:
-    """Whether all that is there is what a run leaves that was killed before it kept anything."""
+    """Return whether a folder only holds an empty checkpoint folder, as a killed run leaves it."""
     return folder.is_dir() and [path.name for path in folder.iterdir()] == [WORK]
 
 
 def _check_same(
     run: Run, folder: Path, told: Path, budget: Budget | None, how: str, besides: Sequence[str] = ()
 ) -> None:
-    """Refuse to go on from a run with other options, as far as what it wrote of them tells.
-
-    Raises:
-        OutputError: it had others.
-    """
+    """Raise an `OutputError` if a run's recorded options differ."""
     from g2ard.errors import OutputError
     from g2ard.io.jsonfile import read_json
 
@@ -188,12 +173,14 @@ def _check_same(
     before = read_json(told)
     if other := [name for name in _others(run, before, budget) if name not in besides]:
         raise OutputError(
-            f"{folder}: {how} with other options ({', '.join(other)}); -w without --resume starts anew"
+            f"{how} with other options ({', '.join(other)})",
+            path=folder,
+            hint="-w without --resume starts over",
         )
 
 
 def _others(run: Run, before: Mapping[str, Any], budget: Budget | None) -> list[str]:
-    """Names of the options whose values differ."""
+    """Return the names of options whose values differ."""
     then = before.get("config", {})
     now = json.loads(json.dumps(run.config, default=str))
     names = [name for name in now if name in then and name not in (*_OF_THE_CALL, *_OF_THE_BUDGET)]
@@ -204,7 +191,7 @@ def _others(run: Run, before: Mapping[str, Any], budget: Budget | None) -> list[
 
 
 def _is_budget(budget: Budget, before: Mapping[str, Any]) -> bool:
-    """Whether a run came to what a budget means; those that measure the scene are told by their options."""
+    """Return whether a run's count is that of the budget; measured budgets are compared by their options."""
     from g2ard.errors import InputError
 
     if budget.is_measured or "output_count" not in before:

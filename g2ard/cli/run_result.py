@@ -1,4 +1,4 @@
-"""What `g2ard distill` says of its result: the table, warnings, what was made of the views."""
+"""Summary of a `g2ard distill` run: table, warnings, views."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
 _LOSS, _SSIM_LOSS = 0.05, 0.001
-"""dB, and SSIM, under the simplified scene that the command speaks of."""
+"""Losses against the simplified scene that are reported, in dB and SSIM."""
 
 _FEW = 0.005
-"""Share of the scene that rounds to nothing."""
+"""Share of the scene too small to report."""
 
 
 def write_table(run: Run, report: dict[str, Any]) -> None:
-    """Both scenes beside the dense one: counts, bytes, figures in each kind of views."""
+    """Print counts, sizes and scores of the dense, the simplified and the recovered scene."""
     kinds = [report["scores"]] + ([report["apart"]] if report["apart"] else [])
 
     def row(name: str, count: int, size: int) -> list[str]:
@@ -30,14 +30,14 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
             figures += [f"{score['psnr']:.2f}", f"{score['ssim']:.4f}"] if score else ["–", "–"]
         return [name, f"{count:,}", f"{size / 1e6:.2f}", f"{size / count:.0f}", *figures]
 
-    given = "start" if run.config.get("scene", "") is None else "dense"  # of photos alone there is no scene
+    given = "start" if run.config.get("scene", "") is None else "dense"  # started from photos alone
     size = report["bytes"]
     seconds = {name: value for name, value in report["seconds"].items() if name != "resumed"}
     times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
     counts = [len(scores["recovered"]["views"]) for scores in kinds]
-    apart = f" and {counts[1]:,} of another kind (nearer)" if len(kinds) > 1 else ""
+    apart = f" and {counts[1]:,} near views" if len(kinds) > 1 else ""
     run.console.table(
-        f"{plural(counts[0], 'unseen view')}{apart} against {report['against']}; {times}",
+        f"{plural(counts[0], 'held-out view')}{apart} against {report['against']}; {times}",
         [
             "scene",
             "Gaussians",
@@ -56,26 +56,25 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
 
 
 def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
-    """What recovery kept, where it lost, and what no view saw, a line each; if `verbose`, regularisers that
-    never acted too."""
+    """Return lines on recovery's outcome, losses and unseen parts; `verbose` adds idle regularisers."""
     from g2ard.stages.recover.report import RecoverReport, outcome, unregularized_rounds
 
     rounds = [[RecoverReport.of(done) for done in entry.get("recover", [])] for entry in report["rounds"]]
     lines = [outcome(one) for entry in rounds for one in entry]
     lines += [unregularized_rounds(rounds)] if verbose else []
     found = [line for line in lines if line is not None]
-    for kind, what in (("scores", "unseen views"), ("apart", "views of another kind")):
+    for kind, what in (("scores", "held-out views"), ("apart", "near views")):
         if not report[kind]:
             continue
         before, after = (report[kind][name] for name in ("simplified", "recovered"))
         lost_db, lost_ssim = before["psnr"] - after["psnr"], before["ssim"] - after["ssim"]
-        if lost_ssim > _SSIM_LOSS and lost_db < 0:  # neither scene is the better one
-            found.append(f"recovery lost {lost_ssim:.3f} of SSIM in {what}, and gained {-lost_db:.2f} dB")
+        if lost_ssim > _SSIM_LOSS and lost_db < 0:  # neither scene is better
+            found.append(f"recovery lost {lost_ssim:.3f} SSIM and gained {-lost_db:.2f} dB in {what}")
             continue
         if lost_db > _LOSS or lost_ssim > _SSIM_LOSS:
-            how = f"{lost_db:.2f} dB" if lost_db > _LOSS else f"{lost_ssim:.3f} of SSIM"
+            how = f"{lost_db:.2f} dB" if lost_db > _LOSS else f"{lost_ssim:.3f} SSIM"
             found.append(
-                f"warning: recovery lost {how} in {what}: the simplified scene is better there"
+                f"warning: recovery lost {how} in {what}; the simplified scene is better there"
                 " (--keep writes it too)"
             )
             continue
@@ -83,31 +82,30 @@ def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
         lost = sum(b["psnr"] < a["psnr"] - _LOSS for a, b in pairs)
         if lost:
             found.append(
-                f"{lost} of {len(report[kind]['recovered']['views'])} {what} lost, though all together gained"
+                f"{lost} of {len(report[kind]['recovered']['views'])} {what} lost PSNR; their mean gained"
             )
     if report["unseen"] and report["unseen"] > _FEW:
-        found.append(f"no view sees {report['unseen']:.0%} of the scene: that is simplified, not recovered")
+        found.append(f"no view sees {report['unseen']:.0%} of the scene; it is simplified but not recovered")
     return found
 
 
 def say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:
-    """What was made of the candidates, where it is not simply all of them."""
+    """Print the number of unused and selected views, if not all candidates are used."""
     if views is None:
         return
     if views["refused"]:
         count = plural(len(views["refused"]), "view")
-        run.say(f"{count} not used: nothing of the scene in sight, or within its matter")
+        run.say(f"{count} not used: the scene is not in sight, or the camera is inside it")
     if chosen:
         run.say(
             f"views: {len(views['chosen'])} of {views['candidates']} by {views['policy']};"
-            f" those left out would have added {100 * views['left_out']:.1f} %"
+            f" the rest would have added {100 * views['left_out']:.1f} %"
         )
 
 
 def say_weight(run: Run, source: Path, output: Path, splats: Splats, *, lifted: Splats | None = None) -> None:
-    """A result that outweighs what it was made from, the file or the points `lifted`: what of it is colour by
-    direction, and how to be rid of it."""
-    inputs = [] if lifted is None else [(lifted.nbytes, "the points, lifted as they are, have")]
+    """Print a hint if the output is larger than its source file, or than the `lifted` points."""
+    inputs = [] if lifted is None else [(lifted.nbytes, "the lifted points have")]
     if source.is_file() and source.suffix.lower() != ".json":
         inputs.append((source.stat().st_size, f"{source.name} has"))
     made = output.stat().st_size
@@ -118,12 +116,12 @@ def say_weight(run: Run, source: Path, output: Path, splats: Splats, *, lifted: 
     share = splats.shN.nbytes / splats.nbytes
     hint = "packed formats are smaller than .ply"
     if share:
-        hint = f"{share:.0%} of it is SH above degree 0 (--set recover.sh_degree=0 leaves it out)"
+        hint = f"{share:.0%} of it is SH above degree 0 (--set recover.sh_degree=0 removes it)"
     run.say(f"{sizes}: {hint}")
 
 
 def tell_quality(run: Run, aim: Aim, splats: Splats) -> None:
-    """What a result keeps of a quality that was asked for; status 3 where that is not met."""
+    """Print the quality of a result with a quality budget; exit with status 3 if it is too low."""
     judgement = aim.judge(splats)
     if judgement is None:
         return

@@ -1,4 +1,4 @@
-"""The page for the browser that `g2ard distill` puts beside its report."""
+"""The viewer page that `g2ard distill` writes beside its report."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
 def run_view(
     path: Path, scene: Path, splats: Splats, cameras: Cameras, background: tuple[float, float, float]
 ) -> tuple[int | None, str]:
-    """Write the page of a run's scene, unless a browser would not show it smoothly.
+    """Write the page of a run's scene, unless it is too large for smooth rendering in browsers.
 
     Args:
-        path: the .html; what an earlier run left there is replaced, or goes.
-        scene: the scene's file, whose name labels it.
+        path: the .html; an earlier run's is replaced or removed.
+        scene: the scene's file, for its name.
         splats: the scene.
-        cameras: one of them is the start, see `g2ard.policy.viewer_frame.frame_with`.
+        cameras: candidates for the first view.
         background: RGB in [0, 1].
 
     Returns:
-        Bytes of the page, None if there is none, and what to say of it.
+        Size of the page in bytes, None if it was not written, and a line to print.
     """
     from g2ard.policy.budget import DEVICES
     from g2ard.policy.viewer_frame import frame_with
@@ -34,7 +34,7 @@ def run_view(
     count, most = len(splats), DEVICES["web"]
     if count > most:
         path.unlink(missing_ok=True)
-        return None, f"no {path}: over {most:,} Gaussians (`g2ard view` writes one all the same)"
+        return None, f"{path} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)"
     stand = frame_with(splats, cameras)
     shown = [(f"{scene.name}: {plural(count, 'Gaussian')}", stand.of(splats))]
     written = write_page(path, shown, start=stand.start, background=background, overwrite=True)

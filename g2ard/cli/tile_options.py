@@ -19,23 +19,23 @@ TileRowsOption = Annotated[
     typer.Option(
         parser=Count.parse_absolute,
         metavar="COUNT",
-        help="A scene of more Gaussians is worked on in tiles of at most so many; 5M if not given.",
+        help="Maximum Gaussians per tile; larger scenes are processed in tiles. 5M by default.",
         hidden=True,
     ),
 ]
 MemoryOption = Annotated[
     str | None,
-    typer.Option(metavar="SIZE", help="Memory that all workers together may take, such as 4GB."),
+    typer.Option(metavar="SIZE", help="Memory limit for all workers together, such as 4GB."),
 ]
 WorkersOption = Annotated[
     int | None,
-    typer.Option(min=1, help="Processes that work on tiles; as many as cores and memory allow if not given."),
+    typer.Option(min=1, help="Processes for tiles; by default as many as cores and memory allow."),
 ]
 SchedulerOption = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Tiles on a Dask cluster: tcp://HOST:PORT, or local (extra distributed).",
+        help="Dask scheduler for tiles: tcp://HOST:PORT or local (needs g2ard[distributed]).",
         hidden=True,
     ),
 ]
@@ -43,8 +43,8 @@ WorkOption = Annotated[
     Path | None,
     typer.Option(
         metavar="DIR",
-        help="Keep tiles and steps here, for other budgets; else, until all is done, beside the output "
-        "in .NAME.tiles.",
+        help="Keep tiles and finished steps here, for other budgets; by default in .NAME.tiles beside the "
+        "output, until the command succeeds.",
         hidden=True,
     ),
 ]
@@ -60,7 +60,7 @@ def tiling_of(
     scheduler: str | None,
     work: Path | None,
 ) -> Tiling:
-    """The options as the library takes them, after a usage check."""
+    """Check the options and return them as a `Tiling`."""
     from g2ard.errors import InputError
     from g2ard.policy.tiling import Tiling, bytes_of
 
@@ -71,7 +71,7 @@ def tiling_of(
     except InputError as error:
         raise typer.BadParameter(in_flags(error, run.flags)) from None
     if scheduler is not None and scheduler != "local" and "://" not in scheduler:
-        raise typer.BadParameter(f"--scheduler: tcp://HOST:PORT or local, not {scheduler!r}")
+        raise typer.BadParameter(f"--scheduler: expected tcp://HOST:PORT or local, got {scheduler!r}")
     return Tiling(
         None if tile_rows is None else tile_rows.of(0),
         size,
@@ -84,13 +84,12 @@ def tiling_of(
 
 
 def _beside(output: Path) -> Path:
-    """Where tiles and steps lie: beside what is made, never within it, nor in a folder that {ratio} or
-    {count} names.
+    """Return the default folder for tiles: beside the output, outside folders with {ratio} or {count}.
 
     >>> [_beside(Path(name)).as_posix() for name in ("a/b.ply", "a/{ratio}x/run", "a/meta.json")]
     ['a/.b.ply.tiles', 'a/.ratiox.tiles', '.a.tiles']
     """
-    if output.name == "meta.json":  # of a folder of SOG
+    if output.name == "meta.json":  # a SOG folder
         output = output.parent
     while "{" in str(output.parent):
         output = output.parent
@@ -99,10 +98,10 @@ def _beside(output: Path) -> Path:
 
 
 def _check_rows(scene: Path, rows: int) -> None:
-    """Tiles in a folder have the rows they were made with."""
+    """Raise a usage error if a folder of tiles was written with another --tile-rows."""
     from g2ard.policy.tiling import cut_into
     from g2ard.tiles.store import MANIFEST, TileStore
 
     if (scene / MANIFEST).is_file() and (made := TileStore.open(scene).settings.get("tile_rows")) != rows:
-        held = f"is in tiles of {made:,} already" if made else "is in tiles already"
-        raise typer.BadParameter(f"--tile-rows: {scene} {held}; {cut_into(scene, rows)} makes others")
+        held = f"already has tiles of {made:,}" if made else "already has tiles"
+        raise typer.BadParameter(f"--tile-rows: {scene} {held}; to change them, run {cut_into(scene, rows)}")

@@ -31,7 +31,7 @@ class TiledCommand:
         self, run: Run, scene: Path, outputs: Outputs, tiling: Tiling, budgets: Sequence[Budget]
     ) -> None:
         self.run, self.scene, self.outputs, self.tiling, self.budgets = run, scene, outputs, tiling, budgets
-        run.kept = [f"what is done stands in {tiling.folder}, and the same command goes on"]
+        run.kept = [f"finished steps are in {tiling.folder}; run the same command to continue"]
 
     def simplify(self, config: SimplifyConfig, views: Any, blind: bool, up: Sequence[float] | None) -> None:
         """Run `g2ard simplify`."""
@@ -86,7 +86,7 @@ class TiledCommand:
             given = [*whole_options(options), *whole_budgets(self.budgets)]
             refuse_whole(self.scene, given + [f"--{name.replace('_', '-')}" for name in own])
             run.kept = [
-                f"what is done stands in {self.tiling.folder}; the same command with --resume goes on"
+                f"finished steps are in {self.tiling.folder}; run the same command with --resume to continue"
             ]
             places = [folder / name for folder in self.outputs.paths()]
             finished = [at for at, place in enumerate(places) if is_done(run, place, resume)]
@@ -116,8 +116,8 @@ class TiledCommand:
                 write_report(folder, report)
                 run.say(
                     f"{folder}: {len(small):,} of {store.count:,} Gaussians; held-out views "
-                    f"{scores.simplified:.2f} → {scores.recovered:.2f} dB over the pixels that tiles own; "
-                    f"{plural(scores.steps, 'step')}, those of all tiles summed"
+                    f"{scores.simplified:.2f} → {scores.recovered:.2f} dB; "
+                    f"{plural(scores.steps, 'step')} in all tiles together"
                 )
                 run.kept.append(f"{folder} is finished")
                 reports[at] = report

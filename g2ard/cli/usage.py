@@ -1,4 +1,4 @@
-"""One-line messages about options: usage errors, and errors of the library with flags for parameters."""
+"""One-line messages: usage errors, and library errors with flags for parameters."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import typer
 from g2ard.errors import G2ardError
 
 _FLAGS = {"overwrite=True": "-w (--overwrite)", "engine": "--device cuda", "engine='fused'": "--device cpu"}
-"""Parameters, or parameters with a value, whose flag has another name."""
+"""Parameters, alone or with a value, whose flag has another name."""
 
 
 def flags_of(command: Any) -> dict[str, str]:
-    """Return the long flag of each option of a command by the name of its parameter."""
+    """Return the long flag of each option of a command, by parameter."""
     options = (p for p in command.params if p.param_type_name == "option")
     return {str(option.name): max(option.opts, key=len) for option in options}
 
 
 def in_flags(error: G2ardError, flags: Mapping[str, str]) -> str:
-    """Return the line of an error with flags for parameters, and Python's names for those without one.
+    """Return an error's line with flags instead of parameters.
 
     >>> from g2ard.errors import InputError, OutputError
     >>> in_flags(OutputError("exists", path="a.ply", hint="{overwrite=True} replaces it"), {})
@@ -59,22 +59,23 @@ def meant(words: Iterable[str], known: Iterable[str]) -> str:
 
 
 def usage_line(error: typer.TyperException) -> str:
-    """Return the line for a usage error: typer's message, or a shorter one for a value of the wrong kind."""
+    """Return the line for a usage error: typer's message, or a shorter one for an invalid value."""
     refused = getattr(error.__cause__, "errors", None)
     parameter: Any = getattr(error, "param", None)
     if (long := _of_one_dash(error)) is not None:
-        return f"{long[1:]}: long options have two dashes: {long}"
+        return f"{long[1:]}: long options need two dashes; write {long}"
     if isinstance(error, typer.BadParameter) and parameter is None:  # a check of several options at once
         return error.message
     if refused is None or parameter is None:
         return " ".join(error.format_message().split())
     given = refused()[0]["input"]
     source = _config_of(error, parameter.name)
-    return f"Invalid value for {parameter.get_error_hint()}: {_allowed(parameter)}, not {given!r}{source}"
+    expected = f"expected {_allowed(parameter)}, got {given!r}"
+    return f"Invalid value for {parameter.get_error_hint()}: {expected}{source}"
 
 
 def _of_one_dash(error: typer.TyperException) -> str | None:
-    """Return a long option that was typed with one dash, which typer reads as several letters."""
+    """Return a long option that was typed with a single dash, if any."""
     command: Any = getattr(getattr(error, "ctx", None), "command", None)
     long = {flag for parameter in getattr(command, "params", ()) for flag in parameter.opts}
     words = (f"-{word.partition('=')[0]}" for word in sys.argv[1:] if len(word) > 2)
@@ -96,7 +97,7 @@ def _config_of(error: typer.TyperException, name: str) -> str:
 
 
 def _allowed(parameter: Any) -> str:
-    """Describe the values an option takes: one of several words, a truth value, or a number within bounds."""
+    """Describe the values an option accepts: choices, true or false, or a number within bounds."""
     descriptor = parameter.type_descriptor
     if descriptor.choices is not None:
         return f"one of {', '.join(map(str, descriptor.choices))}"

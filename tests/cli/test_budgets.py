@@ -42,7 +42,10 @@ def test_counts_take_separators(text: str, counts: list[int]) -> None:
 
 def test_several_counts_are_named_by_count(command_line: CommandLine, folder: Path) -> None:
     status, _, error = command_line("simplify", "ball.ply", "-n", "200,100", "-o", "s.ply", cwd=folder)
-    assert (status, "such as s_{count}.ply; one number has no commas, or reads 10_000" in error) == (2, True)
+    assert (
+        status,
+        "such as s_{count}.ply; commas separate counts, so write a single one as 10_000" in error,
+    ) == (2, True)
     g2ard.save(folder / "larger.ply", checkered_ball(1200))
     status, _, error = command_line("simplify", "larger.ply", "-n", "1,000", "-o", "s.ply", cwd=folder)
     assert (status, "1,000 of 1,200 Gaussians" in error) == (0, True), error
@@ -53,14 +56,14 @@ def test_several_counts_are_named_by_count(command_line: CommandLine, folder: Pa
     [
         ("9.000", "write 9000 or 9_000"),
         ("1.234.567", "write 1234567 or 1_234_567"),
-        ("9.0", "without a dot"),
-        ("0.500", "without a dot"),
+        ("9.0", "expected a whole number"),
+        ("0.500", "expected a whole number"),
         ("5,000,4,000", "5_000,4_000 or 5k,4k"),
         ("5,000,10k", "5_000,4_000 or 5k,4k"),
     ],
 )
 def test_counts_that_could_be_others_are_refused(text: str, words: str) -> None:
-    with pytest.raises(Exception, match="not '") as refusal:
+    with pytest.raises(Exception, match=r"expected|dots|commas") as refusal:
         Counts.parse(text)
     assert words in str(refusal.value)
     assert Count.parse("1.500M").of(2_000_000) == 1_500_000
@@ -72,12 +75,12 @@ def test_budgets_that_come_to_one_place_are_refused_before_any_work(
     ask = ("distill", "ball.ply", "--json", "-")
     for budgets, name in (("20,20", "{ratio}"), ("20,20", "{count}"), ("20,20.01", "{count}")):
         error = refused(command_line, folder, *ask, "-r", budgets, "-o", name)
-        assert "written to the same place" in error
+        assert "given twice" in error or "the same output" in error
     assert "poses" not in error
 
 
 @pytest.mark.parametrize("command", ["simplify", "distill"])
 def test_a_name_has_no_unknown_words(command: str, command_line: CommandLine, folder: Path) -> None:
     error = refused(command_line, folder, command, "ball.ply", "-r", 4, "-o", "{foo}_{ratio}.ply")
-    assert "{foo} stands for nothing; {ratio} and {count}" in error
+    assert "unknown placeholder {foo}; use {ratio} or {count}" in error
     assert sorted(path.name for path in folder.iterdir()) == ["ball.ply", "views.json"]

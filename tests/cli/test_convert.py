@@ -37,10 +37,10 @@ def test_convert_says_what_is_wrong(tmp_path: Path, command_line: CommandLine) -
     for words, code, message in (
         (("b.ksplat",), 1, "scenes are written as"),
         (("b.ply", "--spz-version", "3"), 1, "no option 'spz_version'"),
-        (("b.ply", "--box", "1,2"), 2, "expected 6 numbers"),
-        (("b.ply", "--box", "8,8,8,9,9,9"), 1, "nothing is left"),
-        (("b.ply", "--transform", "1 2 3"), 2, "expected 16 numbers"),
-        (("a.ply", "-w"), 2, "is an input"),
+        (("b.ply", "--box", "1,2"), 2, "expected 6 comma-separated numbers"),
+        (("b.ply", "--box", "8,8,8,9,9,9"), 1, "are within --box and --sphere"),
+        (("b.ply", "--transform", "1 2 3"), 2, "expected 16 comma-separated numbers"),
+        (("a.ply", "-w"), 2, "both an input and the output"),
     ):
         found, _, told = command_line("convert", "a.ply", *words, cwd=tmp_path)
         assert (found, message in told, told.count("\n")) == (code, True, 1), told
@@ -64,4 +64,4 @@ def test_convert_takes_its_output_as_the_others_do(command_line: CommandLine, fo
     assert len(g2ard.load(folder / "two.ply")) == 800
     assert "SCENE… OUT, or SCENE… -o OUT" in refused(command_line, folder, "convert", "ball.ply")
     for arguments in (("ball.ply", "./ball.ply"), ("ball.ply", "-o", "ball.ply")):
-        assert "is an input" in refused(command_line, folder, "convert", *arguments, "-w")
+        assert "is both an input and the output" in refused(command_line, folder, "convert", *arguments, "-w")

@@ -18,7 +18,7 @@ def test_resuming_a_finished_run_says_so(command_line: CommandLine, folder: Path
     before = (folder / "run" / "scene.ply").stat().st_mtime_ns
     status, _, error = command_line(*ask, "--resume", cwd=folder)
     assert (status, error.count("\n")) == (0, 1), error
-    assert "run: finished already" in error
+    assert "run: already finished" in error
     assert (folder / "run" / "scene.ply").stat().st_mtime_ns == before
     ask = (
         "recover",
@@ -35,7 +35,7 @@ def test_resuming_a_finished_run_says_so(command_line: CommandLine, folder: Path
     assert command_line(*ask, cwd=folder)[0] == 0
     status, _, error = command_line(*ask, "--resume", cwd=folder)
     assert status == 0
-    assert "b.ply: finished already" in error
+    assert "b.ply: already finished" in error
 
 
 SHORT = ("distill", "ball.ply", "--steps", 5, "--size", 48)
@@ -59,12 +59,12 @@ def test_a_finished_run_is_not_taken_for_another(command_line: CommandLine, fold
     for other, words in others:
         status, _, error = command_line(*other, "--resume", cwd=folder)
         assert status == 1, error
-        assert f"run: finished with other options ({words}); -w without --resume starts anew" in error
+        assert f"run: finished with other options ({words}); -w without --resume starts over" in error
     (folder / "away.ply").rename(folder / "ball.ply")
     assert command_line(*SHORT, "-o", "run", "-n", 40, "--resume", cwd=folder)[0] == 0
     (folder / "run" / "report.json").unlink()
     status, _, error = command_line(*ask, "--resume", cwd=folder)
-    assert (status, error) == (1, "g2ard: run: exists; give -w (--overwrite) to replace it\n")
+    assert (status, error) == (1, "g2ard: run: exists; -w (--overwrite) replaces it\n")
 
 
 def test_finished_folders_among_several_budgets_are_told_and_checked(
@@ -79,8 +79,8 @@ def test_finished_folders_among_several_budgets_are_told_and_checked(
     assert not (folder / "5x").exists()
     status, out, error = command_line(*ask, "--json", "-", cwd=folder)
     assert status == 0, error
-    assert "10x: finished already" in error
-    assert "5x: nothing to go on from" in error
+    assert "10x: already finished" in error
+    assert "5x: nothing to resume" in error
     assert [run["output_count"] for run in json.loads(out)["runs"]] == [80, 40]
     assert (folder / "10x" / "scene.ply").stat().st_mtime_ns == before
 
@@ -99,7 +99,7 @@ def test_a_stopped_run_refuses_other_options_before_any_promise(
         asked = ask if words == "steps" else (*ask[:2], *ask[4:])
         status, _, error = command_line(*asked, *other, "--resume", cwd=folder)
         assert (status, error.count("\n")) == (1, 1), error
-        assert f"run: begun with other options ({words}); -w without --resume starts anew" in error
+        assert f"run: begun with other options ({words}); -w without --resume starts over" in error
     g2ard.save(folder / "ball.ply", checkered_ball(1300))
     status, out, error = command_line("info", "run", cwd=folder)
     assert status == 0, error
@@ -108,7 +108,7 @@ def test_a_stopped_run_refuses_other_options_before_any_promise(
     assert json.loads(command_line("info", "run", "--json", "-", cwd=folder)[1])["kept"]
     status, _, error = command_line(*ask, "--steps", 100_000, "--resume", cwd=folder)
     assert status == 1
-    assert "goes on in" not in error
+    assert "--resume to continue" not in error
     assert list(work.glob("*.npz"))
 
 
@@ -119,4 +119,4 @@ def test_a_run_killed_before_it_kept_anything_is_in_nobodys_way(
     work.mkdir(parents=True)
     (work / "options.json").write_text("{}")
     status, _, error = command_line(*SHORT, "-r", 10, "-o", "run", "--resume", cwd=folder)
-    assert (status, "nothing to go on from: starts anew" in error) == (0, True), error
+    assert (status, "nothing to resume, starting over" in error) == (0, True), error

@@ -147,7 +147,7 @@ def test_info_goes_on_after_what_it_cannot_read(command_line: CommandLine, folde
     status, out, error = command_line(*ask, cwd=folder)
     assert (status, error.count("\n")) == (1, 2), error
     assert "gone.ply: no such file" in error
-    assert "give the file the suffix of what it is" in error
+    assert "rename it to the suffix of its format" in error
     assert "ball.ply" in out
     assert "views.json" in out
     status, out, _ = command_line(*ask, "--json", "-", cwd=folder)

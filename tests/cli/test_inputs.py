@@ -19,8 +19,8 @@ from helpers.scenes import checkered_ball
 def test_the_wrong_kind_of_input_is_told_what_takes_it(command_line: CommandLine, folder: Path) -> None:
     photos_of(folder / "photos", points=True)
     for ask, words in (
-        (("distill", "photos", "-n", 100, "-o", "x"), "photos holds views, no scene: give it as --views"),
-        (("simplify", "photos/sparse.ply", "-r", 2, "-o", "x.ply"), "`g2ard lift` makes a scene of it"),
+        (("distill", "photos", "-n", 100, "-o", "x"), "photos holds views, not a scene"),
+        (("simplify", "photos/sparse.ply", "-r", 2, "-o", "x.ply"), "`g2ard lift` turns it into a scene"),
     ):
         status, _, error = command_line(*ask, cwd=folder)
         assert (status != 0, words in error, error.count("\n")) == (True, True, 1), error
@@ -32,7 +32,7 @@ def test_the_wrong_kind_of_input_is_told_what_takes_it(command_line: CommandLine
         (
             ("distill", "--views", "views.json", "--renders", "-n", 9, "-o", "run"),
             2,
-            "--renders: there is no scene to render; leave it out, or give a SCENE",
+            "--renders needs a SCENE to render",
         ),
         (
             ("distill", "ball.ply", "--photos", "-n", 9, "-o", "run"),
@@ -48,17 +48,17 @@ def test_the_wrong_kind_of_input_is_told_what_takes_it(command_line: CommandLine
         (
             ("render", "ball.ply", "-n", 4, "--views", "views.json", "--sheet", "a.png"),
             2,
-            "-n makes views, and --views gives them: leave -n out",
+            "-n generates views, so it excludes --views",
         ),
         (
             ("recover", "ball.ply", "--views", "made", "-o", "o.ply"),
             2,
-            "--teacher is missing: views that are made have no photos",
+            "--views made needs a --teacher",
         ),
         (
             ("simplify", "ball.ply", "-ratio", 5, "-o", "o.ply"),
             2,
-            "-ratio: long options have two dashes: ",
+            "-ratio: long options need two dashes; write ",
         ),
     ],
 )
@@ -75,16 +75,16 @@ def test_photos_below_their_poses_are_told_of_them(folder: Path) -> None:
     (folder / "scan" / "shots").mkdir(parents=True)
     Image.new("RGB", (8, 8)).save(folder / "scan" / "shots" / "a.png")
     shots = folder / "scan" / "shots"
-    with pytest.raises(InputError, match="COLMAP finds them"):
+    with pytest.raises(InputError, match="estimate them with `colmap"):
         g2ard.load_views(shots)
     (folder / "scan" / "transforms.json").write_text("{}")
-    with pytest.raises(InputError, match=r"their poses lie in .*scan/transforms\.json: give that$"):
+    with pytest.raises(InputError, match=r"give .*scan/transforms\.json, which has the poses of its photos$"):
         g2ard.load_views(shots)
     (folder / "scan" / "transforms.json").unlink()
     (folder / "scan" / "sparse" / "0").mkdir(parents=True)
     for name in ("cameras.bin", "images.bin"):
         (folder / "scan" / "sparse" / "0" / name).touch()
-    with pytest.raises(InputError, match=r"their poses lie in .*scan: give that$"):
+    with pytest.raises(InputError, match=r"give .*scan, which has the poses of its photos$"):
         g2ard.load_views(shots)
 
 
@@ -96,13 +96,13 @@ def test_a_folder_that_is_nothing_says_what_in_it_would_do(command_line: Command
             Image.new("RGB", (16, 16)).save(place)
     for name, photos in (("bare", "bare"), ("project", "project/images")):
         error = refused(command_line, folder, "distill", "--views", name, "-n", 9, "-o", "x", status=1)
-        assert "photos, without their poses; COLMAP finds them: colmap automatic_recon" in error
-        assert f"--image_path {photos}, then give project" in error
+        assert "photos without poses: estimate them with `colmap automatic_recon" in error
+        assert f"--image_path {photos}` and give project" in error
     assert "looked for SOG's meta.json" in refused(command_line, folder, "info", "empty", status=1)
     ask = ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 3, "--size", 32, "--no-view")
     assert command_line(*ask, cwd=folder)[0] == 0
     (folder / "run" / "report.json").unlink()  # a folder as `distill` leaves none
-    held = "run: nothing known in this folder; name what is meant of its files: scene.ply (a scene), views"
+    held = "run: is not a supported folder; give one of its files: scene.ply (a scene), views"
     for ask in (
         ("simplify", "run", "-r", 2, "-o", "x.ply"),
         ("evaluate", "ball.ply", "--teacher", "ball.ply", "--views", "run"),
@@ -129,9 +129,9 @@ def test_views_without_photos_say_what_stands_in(command_line: CommandLine, fold
 
 
 def test_what_is_of_the_wrong_kind_says_what_it_is(folder: Path) -> None:
-    with pytest.raises(InputError, match="g2ard's views; name the scene's own file"):
+    with pytest.raises(InputError, match="found views; give the scene's file"):
         g2ard.load(folder / "views.json")
-    with pytest.raises(InputError, match=r"views are needed .*, this is a Gaussian scene"):
+    with pytest.raises(InputError, match=r"expected views .*, found a Gaussian scene"):
         g2ard.load_views(folder / "ball.ply")
 
 
@@ -165,12 +165,12 @@ def test_what_is_missing_or_too_much_is_named(command_line: CommandLine, folder:
     for ask, status, step in (
         (("recover", "ball.ply", "-o", "o.ply", "--steps", 3, "--recovery-time", 9), 2, "; give one"),
         (("simplify", "ball.ply", "-r", 2, "-o", "o.ply", "--views", "v", "--no-views"), 2, "; give one"),
-        (("simplify", "ball.ply", "-r", 2, "-o", "d.ply"), 1, "name one in it"),
+        (("simplify", "ball.ply", "-r", 2, "-o", "d.ply"), 1, "give the name of a file"),
         (("render", "ball.ply", "-n", 1, "-o", "ball.ply"), 2, "name another output"),
-        (("render", "ball.ply", "-n", 1, "-o", "views.json"), 1, "name another"),
-        (("simplify", "ball.ply", "-r", 2, "-o", "o.ply", "--json", "o.ply"), 2, "name another file for one"),
+        (("render", "ball.ply", "-n", 1, "-o", "views.json"), 1, "give the name of a folder"),
+        (("simplify", "ball.ply", "-r", 2, "-o", "o.ply", "--json", "o.ply"), 2, "name another one"),
         (("convert", "ball.ply", "o.ply", "--box", "1,1,1,0,0,0"), 1, "the lower corner comes first"),
-        (("lift", "ball.ply", "-o", "o.ply"), 1, "ready for `simplify` and `distill`"),
+        (("lift", "ball.ply", "-o", "o.ply"), 1, "run `simplify` or `distill`"),
         (("register", "ball.ply", "--photos", "bare", "-o", "o.json", "--pool", 8), 1, "--focal PIXELS"),
         (("evaluate", "ball.ply", "--views", "views.json", "--split", "val"), 1, "there are test, train"),
     ):

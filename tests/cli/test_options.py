@@ -28,11 +28,11 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("option", "value", "words"),
     [
-        ("--method", "best", "'--method': one of default, fast, paper, not 'best'"),
-        ("--min-psnr", "x", "'--min-psnr': a number of at least 1, not 'x'"),
-        ("--seed", "-1", "'--seed': a whole number of at least 0, not '-1'"),
-        ("--seed", "1.5", "'--seed': a whole number of at least 0, not '1.5'"),
-        ("--threads", "1000", "'--threads': a whole number from 0 to 256, not '1000'"),
+        ("--method", "best", "'--method': expected one of default, fast, paper, got 'best'"),
+        ("--min-psnr", "x", "'--min-psnr': expected a number of at least 1, got 'x'"),
+        ("--seed", "-1", "'--seed': expected a whole number of at least 0, got '-1'"),
+        ("--seed", "1.5", "'--seed': expected a whole number of at least 0, got '1.5'"),
+        ("--threads", "1000", "'--threads': expected a whole number from 0 to 256, got '1000'"),
     ],
 )
 def test_a_bad_value_is_named_with_what_is_allowed(
@@ -48,8 +48,14 @@ def test_a_bad_value_is_named_with_what_is_allowed(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("distill", "a.ply", "-n", 5, "-o", "run", "--held-out", "made"), "--held-out: a file of views"),
-        (("distill", "a.ply", "-n", 5, "-o", "run", "--views", "made", "--photos"), "--photos: views that"),
+        (
+            ("distill", "a.ply", "-n", 5, "-o", "run", "--held-out", "made"),
+            "--held-out must be a file of views",
+        ),
+        (
+            ("distill", "a.ply", "-n", 5, "-o", "run", "--views", "made", "--photos"),
+            "--photos: generated views",
+        ),
         (
             ("distill", "a.ply", "-n", 5, "-o", "run", "--steps", 5, "--set", "schedule.steps=9"),
             "--steps and --set recover.schedule.steps exclude each other",
@@ -101,7 +107,7 @@ def test_a_config_that_is_none_is_named(folder: Path, command_line: CommandLine)
     for name, words in (
         ("absent.toml", "absent.toml: No such file"),
         ("a.ply", "a.ply: not a text file"),
-        ("c.toml", "'--min-psnr': a number of at least 1, not 'true'"),
+        ("c.toml", "'--min-psnr': expected a number of at least 1, got 'true'"),
         ("d.toml", "d.toml: Expected"),
     ):
         error = refused(command_line, folder, "simplify", "a.ply", "-n", 5, "-o", "o.ply", "--config", name)
@@ -117,7 +123,7 @@ def test_a_flag_wins_over_what_it_excludes_in_the_config(folder: Path, command_l
         assert status == 0, error
         assert len(read_splats(folder / "small.ply")) == count
     ask = ("simplify", "a.ply", "-r", 10, "-n", 5, "-o", "o.ply", "--config", "c.toml")
-    assert "either -n COUNT or -r RATIO" in refused(command_line, folder, *ask)
+    assert "one of -n COUNT, -r RATIO" in refused(command_line, folder, *ask)
     ask = ("recover", "small.ply", "--views", "views.json", "--teacher", "a.ply", "-o", "o.ply")
     status, _, error = command_line(*ask, "--config", "c.toml", "--recovery-time", "1s", cwd=folder)
     assert status == 0, error
@@ -147,7 +153,7 @@ def test_an_input_is_not_written_over(
         (folder / "sub" / "link.ply").symlink_to("../a.ply")
     before = {path.name: path.read_bytes() for path in folder.glob("*.*")}
     error = refused(command_line, folder, *arguments.split(), "-w")
-    assert f"{output} would be written over, and is an input" in error
+    assert f"{output} is both an input and the output" in error
     assert {path.name: path.read_bytes() for path in folder.glob("*.*")} == before
 
 
@@ -221,6 +227,6 @@ def test_the_time_of_recovery_is_called_so(command_line: CommandLine, folder: Pa
 
 def test_render_tells_what_its_count_is(command_line: CommandLine, folder: Path) -> None:
     shown = " ".join(command_line("render", "--help", cwd=folder)[1].replace("│", " ").split())
-    assert "How many views to make of the scene; with --color flags, cells or parents the budget" in shown
+    assert "Number of views to generate; with --color flags, cells or parents the Gaussians to keep" in shown
     ask = ("render", "a.ply", "-n", 2, "--views", "views.json", "-o", "out")
-    assert "leave -n out" in refused(command_line, folder, *ask)
+    assert "-n generates views" in refused(command_line, folder, *ask)

@@ -34,14 +34,14 @@ def test_a_folder_has_one_scene(command_line: CommandLine, folder: Path) -> None
     assert [path.name for path in (folder / "run").glob("scene*")] == ["scene.sog"]
     again = ("distill", "run/scene.sog", "-r", 2, "-o", "run", "-w", "--steps", 3)
     status, _, error = command_line(*again, cwd=folder)
-    assert (status, "run/scene.sog would be written over, and is an input" in error) == (2, True), error
+    assert (status, "run/scene.sog is both an input and the output" in error) == (2, True), error
 
 
 @pytest.mark.parametrize("option", ["render --sheet", "clean --dry-run --preview"])
 def test_a_picture_is_what_its_name_says(option: str, command_line: CommandLine, folder: Path) -> None:
     command, *options = option.split()
     error = refused(command_line, folder, command, "ball.ply", *options, "a.jpg")
-    assert "written as .png, not 'a.jpg'" in error
+    assert "ends in .png, got 'a.jpg'" in error
     if command == "render":
         ask = ("render", "ball.ply", "-n", 1, "--size", 32, "--sheet", "a.PNG")
         assert command_line(*ask, cwd=folder)[0] == 0

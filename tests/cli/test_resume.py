@@ -47,7 +47,7 @@ def test_a_checkpoint_is_not_thrown_away(
     place.parent.mkdir(parents=True, exist_ok=True)
     place.write_bytes(b"junk")
     for flags, words in (
-        ((), "left by a stopped run; --resume goes on from it, -w starts anew"),
+        ((), "left by an interrupted run; --resume continues it, -w starts over"),
         (("--resume", "-w"), f"{left}: not a checkpoint of g2ard, or a damaged one"),
     ):
         status, _, error = command_line(*ask, *flags, "-q", cwd=folder)
@@ -83,7 +83,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[
 
     with pytest.raises(KeyboardInterrupt), stoppable(run, place, resume=False):
         stopped_later()
-    assert run.kept == [f"the same command with --resume goes on from {place}"]
+    assert run.kept == [f"run the same command with --resume to continue from {place}"]
     assert place.exists()
     with stoppable(run, place, resume=True):
         assert place.exists()
@@ -134,7 +134,7 @@ def test_distill_stopped_before_its_first_checkpoint_leaves_nothing(
 
     with pytest.raises(KeyboardInterrupt), work_folder(run, output, resume=False):
         stopped_later()
-    assert run.kept == [f"the same command with --resume goes on in {output}"]
+    assert run.kept == [f"run the same command with --resume to continue in {output}"]
     assert saved.exists()
 
 
@@ -159,8 +159,8 @@ def test_the_total_of_a_resumed_run_holds_what_was_done_before(
 
 def test_an_interrupt_says_which_rows_stay(folder: Path) -> None:
     common = dict.fromkeys(("overwrite", "verbose", "quiet", "json", "config")) | {"seed": 0, "threads": 0}
-    for table, told in ((folder / "ball.ply", ["goes on"]), (folder / "none.csv", [])):
+    for table, told in ((folder / "a.ply", ["to continue"]), (folder / "none.csv", [])):
         run = Run("simplify", {**common, "device": "cpu"}, {})
         with pytest.raises(KeyboardInterrupt), rows_kept(run, table, goes_on=True):
             raise KeyboardInterrupt
-        assert [line.split("the same command ")[-1] for line in run.kept] == told
+        assert [line.split("run the same command ")[-1] for line in run.kept] == told

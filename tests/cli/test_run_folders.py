@@ -66,11 +66,11 @@ def test_the_size_is_the_scene_files(home: Path, command_line: CommandLine) -> N
 def test_a_runs_scene_is_not_written_over(home: Path, command_line: CommandLine) -> None:
     ask = ("simplify", "runs/a", "-r", 2, "-o", "runs/a/scene.ply", "-w")
     status, _, error = command_line(*ask, cwd=home)
-    assert (status, "would be written over, and is an input" in error) == (2, True), error
+    assert (status, "is both an input and the output" in error) == (2, True), error
 
 
 def test_a_folder_of_runs_names_them(home: Path) -> None:
-    with pytest.raises(InputError, match=r"runs: nothing known in this folder; name one of its runs: a, b$"):
+    with pytest.raises(InputError, match=r"runs: is not a supported folder; give one of its runs: a, b$"):
         g2ard.load(home / "runs")
 
 

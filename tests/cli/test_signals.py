@@ -40,7 +40,7 @@ def test_an_interrupt_says_what_was_kept(by: signal.Signals, status: int, folder
     interrupt_at_checkpoint(running, folder, by)
     _, error = running.communicate(timeout=120)
     assert running.returncode == status, error
-    assert b"g2ard: interrupted; the same command with --resume goes on in run" in error
+    assert b"g2ard: interrupted; run the same command with --resume to continue in run" in error
 
 
 @needs_signals
@@ -57,5 +57,5 @@ def test_stopped_workers_leave_one_line(folder: Path) -> None:
     error = running.stderr.read()
     assert running.wait(timeout=120) == 143, error
     assert error.endswith(
-        b"g2ard: interrupted; what is done stands in .s.ply.tiles, and the same command goes on\n"
+        b"g2ard: interrupted; finished steps are in .s.ply.tiles; run the same command to continue\n"
     )

@@ -161,7 +161,7 @@ def test_settings_in_a_config_file_and_over_it(folder: Path, command_line: Comma
     for content, words in (
         ("[simplify.set]\nmax_grow = 1.5\n", "did you mean simplify.max_growth"),
         ("[simplify]\nset = 3\n", "a table of settings"),
-        ("[simplify]\nparentz = 0.5\n", "no option of `simplify` is called parentz"),
+        ("[simplify]\nparentz = 0.5\n", "`simplify` has no option parentz"),
     ):
         (folder / "c.toml").write_text(content)
         status, _, error = command_line(*ask, "-r", 4, cwd=folder)

@@ -152,7 +152,7 @@ def test_the_command_reports_what_it_left_out(command_line: CommandLine, tmp_pat
     report = json.loads(out)
     assert len(report["views"]["chosen"]) == 7  # of 28 that are not held out
     share = f"{100 * report['views']['left_out']:.1f} %"
-    assert f"views: 7 of 28 by auto; those left out would have added {share}" in error
+    assert f"views: 7 of 28 by auto; the rest would have added {share}" in error
     stored = json.loads((tmp_path / "run" / "report.json").read_text())
     assert stored["views"] == report["views"]
     for wrong, words in (("views_count=0.0", "views_count"), ("select.policy=best", "best")):

@@ -39,7 +39,7 @@ def test_a_result_that_outweighs_the_photos_points_says_so(command_line: Command
     photos_of(tmp_path / "photos", points=True)
     ask = ("distill", "--views", "photos", "-n", 900, "--steps", 3)
     error = command_line(*ask, "-o", "run", cwd=tmp_path)[2]
-    assert "MB, the points, lifted as they are, have 0." in error, error
+    assert "MB, the lifted points have 0." in error, error
     light = command_line(*ask, "--set", "sh_degree=0", "-n", 300, "-o", "light", cwd=tmp_path)[2]
     assert "lifted as they are" not in light, light
 

@@ -76,7 +76,7 @@ def test_poses_as_text_are_camera_from_world(site: Path) -> None:
         ("a 1 0 0 0 1 2", "line 1: expected a name"),
         ("a 1 0 0 0 1 2 nan", "line 1: expected a name"),
         ("a 0 0 0 0 1 2 3", "line 1: expected a name"),
-        ("a 1 0 0 0 1 2 3\n\na 1 0 0 0 1 2 3", "line 3: a comes twice"),
+        ("a 1 0 0 0 1 2 3\n\na 1 0 0 0 1 2 3", "line 3 repeats the name 'a'"),
         ("# nothing\n", "no poses found"),
     ],
 )
@@ -222,7 +222,7 @@ def test_the_command_writes_views_and_says_how_good_they_are(
         ("--photos views.json --report page.txt", 2, "a page is written as .html"),
         ("--photos empty --focal 128", 1, "neither photos nor views in this folder"),
         ("--photos views.json --protocol gs-cpr --matcher direct", 2, "gs-cpr decides --matcher"),
-        ("--photos views.json --report scene.ply -w", 2, "would be written over"),
+        ("--photos views.json --report scene.ply -w", 2, "is also an input or the output"),
         ("--photos views.json --pool absent.json", 1, "absent.json"),
         ("--photos views.json --poses away.txt", 1, "none of 4 photos was registered"),
     ],

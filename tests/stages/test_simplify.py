@@ -267,7 +267,7 @@ def test_command_line(tmp_path, command_line):
         (("-n", "5", "-o", "b.ply", "--no-views", "--views", "x"), 2, "exclude"),
         (("-n", "1001", "-o", "b.ply"), 1, "prior.ply: expected a budget of at most"),
         (("-n", "0", "-o", "b.ply"), 2, "positive count"),
-        (("-o", "b.ply"), 2, "either -n COUNT or -r RATIO"),
+        (("-o", "b.ply"), 2, "one of -n COUNT, -r RATIO"),
         (("-n", "5", "-o", "b.ply", "--method", "best"), 2, "method"),
     ):
         status, _, err = run(*arguments)

@@ -162,11 +162,11 @@ def test_the_command_in_tiles(place: Path, tmp_path: Path, command_line) -> None
     assert len(io.read_splats(tmp_path / "out")) == 6000
     assert {path.name for path in tmp_path.iterdir()} == {"out", "told.json"}  # nothing hidden stays
     status, _, said = command_line(*tiled, "--resume", cwd=tmp_path)
-    assert (status, "finished already" in said) == (0, True)
+    assert (status, "already finished" in said) == (0, True)
     (tmp_path / ".z.tiles" / "steps").mkdir(parents=True)
     (tmp_path / ".z.tiles" / "steps" / "coarse-00000-0123456789abcdef.npz").write_bytes(b"of another run")
     status, _, said = command_line(*tiled[:3], "z", *tiled[4:], "--resume", "--workers", "1", cwd=tmp_path)
-    assert (status, "starts anew" in said) == (0, False), said
+    assert (status, "starting over" in said) == (0, False), said
     assert files_of(tmp_path / "z") == files_of(tmp_path / "out")  # one worker or two
     assert not (tmp_path / ".z.tiles").exists()
     more = [*given[:3], "y", *given[4:], "--tile-rows", "1700", "--memory", "100MB"]

@@ -117,7 +117,7 @@ def test_several_clouds_are_one(tmp_path: Path) -> None:
     colors = np.concatenate([read_cloud(path).points.colors for path in paths])
     expected = np.sort((colors - 0.5) / 0.28209479177387814, axis=0)
     np.testing.assert_allclose(np.sort(rows[:, 11:14], axis=0), expected, atol=1e-5)
-    with pytest.raises(InputError, match="a Gaussian scene is needed"):
+    with pytest.raises(InputError, match="expected a Gaussian scene"):
         ingest([paths[0], saved(tmp_path / "scene.ply", town(50))], tmp_path / "both")
 
 

@@ -33,7 +33,7 @@ def test_a_stopped_distill_goes_on_beside_its_output(
         patch.setattr("g2ard.tiles.recover.recover_tiles", stopped)
         status, _, said = command_line(*call, cwd=folder)
     assert status == 130
-    assert "the same command with --resume goes on" in " ".join(said.split())
+    assert "run the same command with --resume to continue" in " ".join(said.split())
     assert (folder / ".run.tiles").is_dir()
     assert not (folder / "run").exists()
     status, _, said = command_line(*call, "--resume", cwd=folder)
@@ -51,7 +51,7 @@ def test_resuming_several_budgets_makes_those_that_are_not_there(
     assert command_line(*call, "-r", "10,20", cwd=folder)[0] == 1
     status, _, said = command_line(*call, "-r", "10,20", "--resume", cwd=folder)
     assert status == 0, said
-    assert "10x: finished already" in said
+    assert "10x: already finished" in said
     assert (folder / "runs" / "10x" / "scene.ply").stat().st_mtime_ns == first
     assert len(read_splats(folder / "runs" / "20x" / "scene.ply")) == 150
     assert {path.name for path in (folder / "runs").iterdir()} == {"10x", "20x"}

@@ -1,4 +1,4 @@
-"""One module per command; importing it registers the command, in the order `g2ard --help` lists them."""
+"""One module per command, registered on import in the order of `g2ard --help`."""
 
 from importlib import import_module
 
@@ -25,6 +25,6 @@ COMMANDS = (
 
 
 def register_commands(asked: str | None = None) -> None:
-    """Put the command `asked` on the app; all of them if it is none."""
+    """Register the command `asked`, or all commands if there is no such command."""
     for name in (asked,) if asked in COMMANDS else COMMANDS:
         import_module(f"{__name__}.{name}")

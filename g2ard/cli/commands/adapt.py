@@ -27,23 +27,25 @@ from g2ard.progress import plural
 @command("adapt", example="g2ard adapt small.ply --views winter/ -o winter.ply", settings=True)
 def adapt(
     run: Run,
-    compact: Annotated[Path, typer.Argument(metavar="COMPACT", help="The scene whose geometry stays.")],
+    compact: Annotated[Path, typer.Argument(metavar="COMPACT", help="Scene to adapt.")],
     views: LookOption,
     output: OutputOption,
     teacher: TeacherOption = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps at most, 7,000.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Maximum steps; 7,000 by default.")] = None,
     tolerance: Annotated[
         float | None,
-        typer.Option(min=0, help="Stop when a stretch gains less than this, 0.05 dB; 0 takes all steps."),
+        typer.Option(
+            min=0, help="Stop when PSNR gains less than this, dB; 0.05 by default, 0 runs all steps."
+        ),
     ] = None,
     schedule: Annotated[
         AdaptSchedule | None,
-        typer.Option(help="Rates and decay."),
+        typer.Option(help="Learning rates and decay."),
     ] = None,
     prior_views: Annotated[
         float | None,
         typer.Option(
-            min=0, help="Weight of the old appearance, in views, 1; 0 takes the fit as it is, as paper does."
+            min=0, help="Weight of the old appearance, as a number of views; 1 by default, 0 in the paper."
         ),
     ] = None,
     sh_degree: ShDegreeOption = None,
@@ -53,7 +55,7 @@ def adapt(
     background: BackgroundOption = None,
     preset: PaperOption = None,
 ) -> None:
-    """Refit colours and opacities to new images; means, rotations and scales stay as they are."""
+    """Refit colours and opacities to new images; means, rotations and scales stay fixed."""
     from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.config.paths import listed
     from g2ard.config.presets import PRESETS, configured
@@ -65,9 +67,7 @@ def adapt(
 
     schedule = schedule or PRESETS[preset or "auto"].get("adapt.schedule", "default")
     if schedule == "paper" and prior_views:
-        raise typer.BadParameter(
-            "--prior-views: the paper's schedule takes the fit as it is; leave one of them out"
-        )
+        raise typer.BadParameter("--prior-views and the paper's schedule exclude each other; give one")
     start = AdaptConfig.scheduled(schedule)
     names = ("steps", "tolerance", "schedule", "prior_views", "sh_degree", "background", "seed")
     config = configured(start, preset or "auto", run.settings(start, *names, preset=preset))

@@ -30,23 +30,27 @@ def clean(
     run: Run,
     scene: SceneArgument,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="OUT", help="The scene without what was found.")
+        Path | None, typer.Option("-o", "--output", metavar="OUT", help="Output scene.")
     ] = None,
     only: Annotated[
         str | None,
-        typer.Option(metavar="KIND,…", help="Of invisible, giant, needle and floater; all if not given."),
+        typer.Option(
+            metavar="KIND,…", help="Kinds to remove: invisible, giant, needle, floater; all by default."
+        ),
     ] = None,
     preview: Annotated[
         Path | None,
         typer.Option(
-            parser=picture, metavar="FILE.png", help="A picture with what would go painted by its kind."
+            parser=picture, metavar="FILE.png", help="Picture with the removed Gaussians coloured by kind."
         ),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say and show it, write no scene.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Report what would be removed, write no scene.")
+    ] = False,
 ) -> None:
-    """Take out what no picture needs: invisible Gaussians, giants, needles, floaters.
+    """Remove clutter: invisible Gaussians, giants, needles and floaters.
 
-    What is seen is measured from a pool of poses of the scene's own.
+    Visibility is measured from generated views.
     """
     from g2ard import io
     from g2ard.errors import InputError
@@ -55,16 +59,16 @@ def clean(
 
     kinds = KINDS if only is None else tuple(word.strip() for word in only.split(","))
     if wrong := [word for word in kinds if word not in KINDS]:
-        raise typer.BadParameter(f"--only: {', '.join(KINDS)}, not {wrong[0]!r}")
+        raise typer.BadParameter(f"--only: expected {', '.join(KINDS)}, got {wrong[0]!r}")
     if output is None and not dry_run:
-        raise typer.BadParameter("name an output with -o, or ask with --dry-run")
+        raise typer.BadParameter("give an output with -o, or --dry-run")
     if output is not None and not dry_run:
         io.check_scene_output(output, run.overwrite)
     if preview is not None:
         from g2ard.io.paths import real_path
 
         if real_path(preview) in {real_path(path) for path in (scene, output) if path}:
-            raise typer.BadParameter(f"--preview: {preview} is another file already; name a .png of its own")
+            raise typer.BadParameter(f"--preview: {preview} is also the input or output; name another file")
         io.check_output(preview, run.overwrite)
     splats = load_scene(scene, run.say)
     found, cameras = clutter_seen(splats, kinds, seed=run.seed, progress=run.progress, say=run.say)
@@ -75,14 +79,14 @@ def clean(
     kept = int(found.keep.sum())
     if not dry_run and output is not None:
         if not kept:
-            raise InputError(f"{scene}: nothing would be left; look at it with --dry-run --preview")
+            raise InputError(f"{scene}: every Gaussian would be removed; inspect it with --dry-run --preview")
         io.write_splats(output, splats.take(found.keep), overwrite=run.overwrite)
         run.say(f"{output}: {plural(kept, 'Gaussian')}")
     run.result({"input_count": len(splats), "output_count": kept, "found": found.counts})
 
 
 def _paint(path: Path, splats: Splats, found: Cleaning, cameras: Cameras, overwrite: bool) -> None:
-    """Three views: as it is, what would go in the colour of its kind on grey, and what stays."""
+    """Write up to three views of the scene, its clutter coloured by kind on grey, and the result."""
     import numpy as np
 
     from g2ard.rendering.renderer import Renderer

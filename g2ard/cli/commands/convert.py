@@ -19,7 +19,10 @@ def convert(
     run: Run,
     scenes: Annotated[
         list[Path],
-        typer.Argument(metavar="SCENE… OUT", help="What to read, several are merged; and the result, or -o."),
+        typer.Argument(
+            metavar="SCENE… OUT",
+            help="Scenes to read (several are merged), then the output unless -o is given.",
+        ),
     ],
     output: Annotated[
         Path | None,
@@ -27,32 +30,30 @@ def convert(
             "-o",
             "--output",
             metavar="OUT",
-            help=".ply, .compressed.ply, .sog, .spz, .glb, .splat or NAME/meta.json; all else is then read.",
+            help="Output: .ply, .compressed.ply, .sog, .spz, .glb, .splat or NAME/meta.json.",
         ),
     ] = None,
     box: Annotated[
         str | None,
-        typer.Option(metavar="X,Y,Z,X,Y,Z", help="Keep what lies between two corners, scene units."),
+        typer.Option(metavar="X,Y,Z,X,Y,Z", help="Keep Gaussians between two corners, scene units."),
     ] = None,
     sphere: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z,R", help="Keep what lies within R of a point.")
+        str | None, typer.Option(metavar="X,Y,Z,R", help="Keep Gaussians within R of a point.")
     ] = None,
     transform: Annotated[
         str | None,
         typer.Option(
             metavar="FILE.json|NUMBERS",
-            help="Then move all: 4×4 numbers, row-major, of one scale, a rotation and a translation.",
+            help="Then apply a 4×4 matrix (row-major) of uniform scale, rotation and translation.",
         ),
     ] = None,
-    recentre: Annotated[
-        bool, typer.Option("--recentre", help="Drop the offset that keeps map coordinates.")
-    ] = False,
+    recentre: Annotated[bool, typer.Option("--recentre", help="Drop the offset to map coordinates.")] = False,
     sh_degree: ShDegreeOption = None,
     spz_version: Annotated[
-        int | None, typer.Option(min=2, max=4, help="Version of an .spz: 3 if not given; 4 is smaller.")
+        int | None, typer.Option(min=2, max=4, help="Version of .spz files; 3 by default, 4 is smaller.")
     ] = None,
 ) -> None:
-    """Write scenes in another format: merged, cropped, moved, with fewer harmonics."""
+    """Convert scenes to another format, and merge, crop or move them."""
     from dataclasses import replace
 
     import numpy as np
@@ -92,12 +93,12 @@ def convert(
 
 
 def _parted(run: Run, paths: list[Path], output: Path | None) -> tuple[list[Path], Path]:
-    """What is read, and where the result goes: the last of the paths where no option says so."""
+    """Return the scenes and the output, which is the last path unless -o is given."""
     if output is not None:
         return paths, output
     *scenes, output = paths
     if not scenes:
-        raise typer.BadParameter("name what to read and where it goes: SCENE… OUT, or SCENE… -o OUT")
+        raise typer.BadParameter("give an input and an output: SCENE… OUT, or SCENE… -o OUT")
     run.reads(scenes, output)
     return scenes, output
 
@@ -107,12 +108,12 @@ def _check_left(splats: Splats, read: int) -> None:
 
     if not len(splats):
         raise InputError(
-            f"nothing is left: none of {read:,} Gaussians lies in --box and --sphere; see `g2ard info`"
+            f"none of {read:,} Gaussians are within --box and --sphere; `g2ard info` shows the scene's extent"
         )
 
 
 def _size(output: Path) -> int:
-    """Bytes of a file, or of the folder of a meta.json."""
+    """Return the size of a file, or of the folder of a meta.json."""
     from g2ard.io.scene_formats import scene_format
 
     if scene_format(output).function == "write_folder":
@@ -121,7 +122,7 @@ def _size(output: Path) -> int:
 
 
 def _matrix(given: str) -> list[list[float]]:
-    """16 numbers, or a JSON file of them, flat or in rows, alone or as "transform" or "matrix"."""
+    """Read 16 numbers, or a JSON file with them, flat or in rows, bare or under "transform" or "matrix"."""
     path = Path(given)
     if path.suffix.lower() != ".json":
         flat = numbers("--transform", given, 16)

@@ -1,4 +1,4 @@
-"""`g2ard distill`: everything, from a dense scene or cloud to a compact one with its figures and pictures."""
+"""`g2ard distill`: a dense scene or point cloud → a compact scene, its scores and pictures."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def distill(
         Path | None,
         typer.Argument(
             metavar="[SCENE|CLOUD]",
-            help="A trained scene, or a coloured cloud; without either, --views are photos to start from.",
+            help="A trained scene or coloured point cloud. Omit it to start from the photos of --views.",
         ),
     ] = None,
     count: CountsOption = None,
@@ -91,14 +91,14 @@ def distill(
         bool | None,
         typer.Option(
             "--photos/--renders",
-            help="Targets: photos, or the scene's renders; by default each view's photo if it has one.",
+            help="Training images: photos or the scene's renders; by default photos where views have them.",
         ),
     ] = None,
     held_out: Annotated[
         Path | None,
         typer.Option(
             metavar="VIEWS",
-            help="Views to score on. --views is then used for training only, without its own test split.",
+            help="Views to score on. --views is then used for training only.",
         ),
     ] = None,
     method: MethodOption = None,
@@ -111,22 +111,22 @@ def distill(
         bool,
         typer.Option(
             "--keep",
-            help="Keep the simplified scene too, in RUN/simplified: it takes as many bytes again.",
+            help="Keep the simplified scene too, in RUN/simplified.",
             hidden=True,
         ),
     ] = False,
     output: Annotated[
         Path,
-        typer.Option("-o", "--output", metavar="RUN", help="Folder of the run."),
+        typer.Option("-o", "--output", metavar="RUN", help="Output folder."),
     ],
     format: FormatOption = "ply",
     clean: Annotated[
         bool,
-        typer.Option("--clean", help="First remove what no picture needs, as `g2ard clean` does."),
+        typer.Option("--clean", help="First remove invisible and stray Gaussians, as `g2ard clean` does."),
     ] = False,
     view: Annotated[
         bool,
-        typer.Option("--view/--no-view", help="Write view.html, the scene for any browser.", hidden=True),
+        typer.Option("--view/--no-view", help="Write view.html, a viewer page with the scene.", hidden=True),
     ] = True,
     resume: ResumeOption = False,
     crop: CropOption = None,
@@ -135,7 +135,7 @@ def distill(
     up: UpOption = None,
     dry_run: Annotated[
         bool,
-        typer.Option("--dry-run", help="Only estimate the time and the memory."),
+        typer.Option("--dry-run", help="Estimate time and memory, then exit."),
     ] = False,
     tile_rows: TileRowsOption = None,
     memory: MemoryOption = None,
@@ -143,10 +143,11 @@ def distill(
     scheduler: SchedulerOption = None,
     work: WorkOption = None,
 ) -> None:
-    """Distil a dense scene, or a coloured cloud with photos, into a compact one at an exact budget.
+    """Distil a dense scene, or a point cloud with photos, into a compact scene.
 
-    Views are those of --views, else the cameras that lie beside the scene, else a pool of poses of its own.
-    A scene larger than memory, or a folder of tiles, is distilled tile by tile.
+    The result has an exact number of Gaussians and standard 3DGS properties.
+    Views come from --views, or from cameras found beside the scene, or are generated.
+    Scenes larger than memory and folders of tiles are distilled tile by tile.
     """
     from g2ard.pipeline import DistillConfig
 
@@ -154,14 +155,16 @@ def distill(
     settings = run.settings(DistillConfig(), *names, preset=preset)
     budgets = budgets_of(count, ratio, fit, min_psnr, min_ssim)
     if is_made(str(held_out)):
-        raise typer.BadParameter("--held-out: a file of views; those that are made hold out every 8th anyway")
+        raise typer.BadParameter(
+            "--held-out must be a file of views; generated views already hold out every 8th"
+        )
     given = views is not None and not is_made(views)
     if scene is None and not given:
         raise typer.BadParameter("give a SCENE, or photos with their poses as --views")
     if photos and is_made(views):
-        raise typer.BadParameter("--photos: views that are made have none")
+        raise typer.BadParameter("--photos: generated views have no photos; give --views VIEWS")
     if scene is None and photos is False:
-        raise typer.BadParameter("--renders: there is no scene to render; leave it out, or give a SCENE")
+        raise typer.BadParameter("--renders needs a SCENE to render; give one or remove --renders")
     from g2ard.io import kind
     from g2ard.policy.distill import prepare
     from g2ard.policy.distill_options import DistillOptions
@@ -185,10 +188,10 @@ def distill(
         return
     if scene is not None and kind(scene) == "views":
         raise typer.BadParameter(
-            f"{scene} holds views, no scene: give it as --views, with -n COUNT to start from photos"
+            f"{scene} holds views, not a scene; to start from photos, pass it as --views with -n COUNT"
         )
     if scene is not None and kind(scene) != "splats" and not given:
-        raise typer.BadParameter("a cloud is no teacher: give its photos with --views")
+        raise typer.BadParameter("a point cloud cannot render training images; give photos with --views")
     options = DistillOptions(
         views=views,
         photos=photos,
@@ -221,7 +224,7 @@ def distill(
     if len(finished) < len(places):
         check_memory(job, tiling.memory, page=view)
         job.render_targets()
-    reports, others = [], " (--resume makes the others)" if len(places) > 1 else ""
+    reports, others = [], " (--resume continues with the rest)" if len(places) > 1 else ""
     for aim, place in zip(job.aims, places, strict=True):
         if place in finished:
             reports.append(finished[place])
@@ -243,7 +246,7 @@ def _tell_all(run: Run, reports: list[dict[str, Any]]) -> None:
 
 
 def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[Path], *, page: bool) -> None:
-    """About how long each budget takes, and what memory; of several, all together too."""
+    """Print the estimated time and memory of each budget, and the total of several."""
     from dataclasses import asdict
 
     from g2ard.policy.estimate import estimate, total
@@ -261,11 +264,9 @@ def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[Path], *, page:
         told.append({"output": str(folder), "count": budget, **asdict(one), "total_seconds": one.total})
     seconds, size = total(found)
     if len(found) > 1:
-        run.say(
-            f"all {len(found)}, which share their targets: about {seconds:.0f} s and {size / 1e6:,.0f} MB"
-        )
+        run.say(f"all {len(found)} with shared targets: about {seconds:.0f} s and {size / 1e6:,.0f} MB")
     to_file = run.json not in (None, "-")
-    run.say(f"nothing is written but {run.json}" if to_file else "nothing is written")
+    run.say(f"dry run: only {run.json} is written" if to_file else "dry run: nothing is written")
     run.result({"runs": told, "total": {"seconds": seconds, "bytes": size}})
 
 
@@ -285,7 +286,7 @@ def _distil(
     crops: list[Crop],
     began: float,
 ) -> tuple[Distilled, dict[str, Any]]:
-    """One budget's run: all files of its folder, `place` the scene's; and what is said of it."""
+    """Distil to one budget and write the run's folder; `place` is the scene's file."""
     from g2ard.policy.score import report_of
     from g2ard.report.distilled import distill_report
 
@@ -327,7 +328,7 @@ def _distil(
 def _write(
     run: Run, place: Path, result: Distilled, unseen: Targets, colour: Colour, report: dict[str, Any]
 ) -> None:
-    """The picture, the scene and, last, what is said of both."""
+    """Write the picture, the scene and, last, the report."""
     from g2ard.io import write_splats
     from g2ard.report.distilled import preview
 
@@ -340,7 +341,7 @@ def _write(
 
 
 def _view(place: Path, scene: Splats | None, job: DistillJob, report: dict[str, Any]) -> str | None:
-    """Write the page for the browser, and say so; without a scene, none of an earlier run stays."""
+    """Write view.html and return a line about it; without a scene, remove an earlier run's page."""
     from g2ard.cli.run_view import run_view
 
     page = place.parent / "view.html"
@@ -353,7 +354,7 @@ def _view(place: Path, scene: Splats | None, job: DistillJob, report: dict[str, 
 
 
 def _keep(path: Path, scene: Splats | None) -> None:
-    """Write the simplified scene; without one, what an earlier run kept there is no longer of this one."""
+    """Write the simplified scene; without one, remove an earlier run's."""
     from g2ard.io import write_splats
 
     if scene is None:

@@ -30,30 +30,30 @@ def evaluate(
     teacher: TeacherOption = None,
     photos: Annotated[
         bool,
-        typer.Option("--photos", help="With --teacher: each view's photo where it has one, else the render."),
+        typer.Option("--photos", help="With --teacher: use photos where views have them, renders otherwise."),
     ] = False,
     anchors: Annotated[
         Path | None,
-        typer.Option(metavar="SCENE", help="The same Gaussians before recovery: adds Drift95 and its kin."),
+        typer.Option(metavar="SCENE", help="The same Gaussians before recovery; adds Drift95."),
     ] = None,
     lpips: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Weights of LPIPS; without them it is absent.")
+        Path | None, typer.Option(metavar="DIR", help="Folder with LPIPS weights; adds LPIPS.")
     ] = None,
     lpips_input: Annotated[
         LpipsInput,
-        typer.Option(help="Images in [-1, 1], LPIPS's own, or in [0, 1] as 3DGS's evaluation feeds them."),
+        typer.Option(help="Scale images to [-1, 1], as LPIPS expects, or feed [0, 1] as 3DGS does."),
     ] = "scaled",
     convention: ConventionOption = "gsplat",
     eight_bit: Annotated[
-        bool, typer.Option("--8bit", help="Round renders and targets to 8 bits, as saved PNGs are.")
+        bool, typer.Option("--8bit", help="Round renders and targets to 8 bits, as in saved PNGs.")
     ] = False,
     split: SplitOption = "test",
     size: SizeOption = None,
     background: BackgroundOption = None,
 ) -> None:
-    """PSNR, SSIM, size and needle share of scenes, against photos or a teacher's renders.
+    """Score scenes against photos or a teacher's renders: PSNR, SSIM, size, needles.
 
-    3DGS's own evaluation is --convention inria --8bit --lpips-input unscaled.
+    For the evaluation of the original 3DGS, use --convention inria --8bit --lpips-input unscaled.
     """
     from g2ard.errors import InputError
     from g2ard.io import check_scene
@@ -66,9 +66,9 @@ def evaluate(
     from g2ard.stages.recover.anchors import Anchors, drift95, needle
 
     if photos and teacher is None:
-        raise typer.BadParameter("--photos goes with --teacher: without a teacher all targets are photos")
+        raise typer.BadParameter("--photos goes with --teacher; without a teacher, all targets are photos")
     if lpips_input != "scaled" and lpips is None:
-        raise typer.BadParameter("--lpips-input goes with --lpips: without weights there is no LPIPS")
+        raise typer.BadParameter("--lpips-input goes with --lpips; give --lpips DIR")
     can_be_made(views, teacher)
     for path in scenes:
         check_scene(path)
@@ -99,7 +99,7 @@ def evaluate(
         row["file_bytes"] = bytes_of(path)
         if frozen is not None:
             if len(frozen) != len(splats):
-                raise InputError(f"{anchors}: not {path} before recovery: their counts differ")
+                raise InputError(f"{anchors}: has {len(frozen):,} Gaussians, {path} has {len(splats):,}")
             row["drift95"] = drift95(Anchors.of(frozen), splats.means)
         rows.append(row)
     against = _against(rows[0]["views"])
@@ -110,7 +110,7 @@ def evaluate(
 
 
 def _against(views: list[dict[str, Any]]) -> dict[str, int]:
-    """How many of the targets are photos, and how many a teacher's renders."""
+    """Count the targets that are photos and those that are a teacher's renders."""
     counts: dict[str, int] = {}
     for view in views:
         counts[view["against"]] = counts.get(view["against"], 0) + 1

@@ -19,16 +19,16 @@ def info(
         list[Path] | None,
         typer.Argument(
             metavar="SCENE|CLOUD|VIEWS|RUN...",
-            help="Gaussian scenes, coloured clouds, views, or folders that `distill` wrote.",
+            help="Scenes, coloured point clouds, views, or folders of `distill` runs.",
         ),
     ] = None,
     devices: Annotated[
-        bool, typer.Option("--devices", help="List the GPUs, and which one --device would use.")
+        bool, typer.Option("--devices", help="List GPUs and which one --device would use.")
     ] = False,
 ) -> None:
-    """Show what is in a file: counts, extents, SH degree, opacities, scales, odd values.
+    """Show what a file holds: counts, extents, SH degree, opacities, scales, invalid values.
 
-    Of several the others are shown where one cannot be read; the exit status is then 1.
+    Files that cannot be read are reported and skipped; the exit status is then 1.
     """
     if bool(paths) == devices:
         raise typer.BadParameter("give a file, or --devices")
@@ -53,7 +53,7 @@ def info(
 
 
 def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
-    """Figures of a file, or of a run's scene with its scores, and the rows that show them."""
+    """Return a file's figures, with scores for a run, and the table rows that show them."""
     from g2ard.cli.run_folder import stopped_run
     from g2ard.io.describe import describe
     from g2ard.io.detect import run_scene
@@ -76,7 +76,7 @@ def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
 
 
 def _scores(report: dict[str, Any]) -> tuple[str, dict[str, dict[str, float]]]:
-    """What a run was scored against, and its scores; of one in tiles PSNR alone, over the pixels they own."""
+    """Return a run's targets, in words, and its scores; tiled runs have only PSNR."""
     scores = report["scores"]
     if "tiles" in report:
         return "the scene's renders", {name: {"psnr": scores[name]} for name in ("simplified", "recovered")}
@@ -91,12 +91,11 @@ def _rows_of_stopped(path: Path, stopped: dict[str, Any]) -> list[list[str]]:
         rows.append(["Gaussians", f"{stopped['input_count']:,} → {stopped['output_count']:,}"])
         scene, views = (stopped["config"].get(name) for name in ("scene", "views"))
         rows.append(["of", str(scene or views)])
-    rows.append(["to go on", f"the command that began it, with --resume (-o {path})"])
+    rows.append(["to continue", f"run the same command with --resume (-o {path})"])
     return rows
 
 
 def _devices(run: Run) -> None:
-    """Every adapter and its limits, and what --device takes."""
     from dataclasses import asdict
 
     from g2ard.system import devices
@@ -119,7 +118,7 @@ def _devices(run: Run) -> None:
         )
         rows.append(["none", why])
     rows.append(["--device gpu", used["gpu"] or "the CPU"])
-    probed = f"{real}, for scenes of 200,000 rows and more, if a probe says it is right and faster"
+    probed = f"{real} for scenes of at least 200,000 rows, if a test run is correct and faster than the CPU"
     rows.append(["--device auto", probed if real else "the CPU"])
     _show(run, "Devices", rows)
     run.result({"adapters": [asdict(a) for a in found or ()], "used": used})
@@ -133,7 +132,7 @@ def _show(run: Run, title: str, rows: list[list[str]]) -> None:
 
 
 def _print(title: str, rows: list[list[str]]) -> None:
-    """The table is this command's data, so it goes to stdout."""
+    """Print a table to stdout, since it is this command's result."""
     from rich.console import Console
     from rich.table import Table
 
@@ -147,7 +146,7 @@ def _rows(figures: dict[str, Any]) -> list[list[str]]:
     unit = {"splats": "Gaussians", "points": "points", "views": "views"}[figures["kind"]]
     rows = [["format", figures["format"]], [unit, f"{figures['count']:,}"], ["size", _size(figures["bytes"])]]
     if figures["kind"] == "splats":
-        rows.append(["bytes a Gaussian", f"{figures['bytes'] / figures['count']:.1f}"])
+        rows.append(["bytes per Gaussian", f"{figures['bytes'] / figures['count']:.1f}"])
         rows.append(["SH degree", str(figures["sh_degree"])])
     if any(figures.get("offset", ())):
         rows.append(["offset", _vector(figures["offset"])])
@@ -164,7 +163,7 @@ def _rows(figures: dict[str, Any]) -> list[list[str]]:
     rows += [[key, f"{figures[key]:,}"] for key in ("photos", "distorted") if key in figures]
     for key in ("sizes", "splits", "odd"):
         rows += [[name.replace("_", " "), f"{count:,}"] for name, count in figures.get(key, {}).items()]
-    return rows + [["noticed", note["text"]] for note in figures["notes"]]
+    return rows + [["note", note["text"]] for note in figures["notes"]]
 
 
 def _vector(values: list[float]) -> str:

@@ -10,6 +10,7 @@ import typer
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import ResumeOption
+from g2ard.progress import plural
 
 
 @command("ingest", example="g2ard ingest city.ply -o tiles/ --tile-rows 2M", settings=True)
@@ -17,23 +18,25 @@ def ingest(
     run: Run,
     scenes: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="SCENE…", help="A scene, or several as one; or coloured clouds, which are lifted."
-        ),
+        typer.Argument(metavar="SCENE…", help="Scenes to join, or coloured point clouds to lift."),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the tiles.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Output folder for the tiles.")
+    ],
     tile_rows: Annotated[
         Count | None,
         typer.Option(
             parser=Count.parse_absolute,
             metavar="COUNT",
-            help="Gaussians of a tile at the most; 5M if not given.",
+            help="Maximum Gaussians per tile; 5M by default.",
         ),
     ] = None,
     resume: ResumeOption = False,
 ) -> None:
-    """Stream a scene larger than memory into tiles; the same call again goes on where it was stopped, with
-    --resume or without."""
+    """Split a scene of any size into tiles.
+
+    Run the same command again to continue after an interruption.
+    """
     import time
 
     from g2ard.config.paths import changed
@@ -43,10 +46,10 @@ def ingest(
     from g2ard.tiles.ingest import ingest as into_tiles
 
     if resume and not (output.is_dir() and any(output.iterdir())):
-        run.say(f"nothing to go on from ({output}): starts anew")
+        run.say(f"{output}: nothing to resume, starting over")
     config = LiftConfig()
     config = changed(config, run.settings(config))
-    run.kept = [f"what is in {output} stands, and the same command goes on"]
+    run.kept = [f"finished tiles are in {output}; run the same command to continue"]
     began = time.perf_counter()
     store = into_tiles(
         scenes,
@@ -62,8 +65,8 @@ def ingest(
         run.say(f"{scenes[0]}: {note}")
     halo = sum(tile.halo for tile in store.tiles)
     run.say(
-        f"{output}: {store.count:,} Gaussians in {len(store.tiles):,} tile(s), {halo / store.count:.1%} more "
-        f"in halos, {store.nbytes / 1e9:,.2f} GB"
+        f"{output}: {store.count:,} Gaussians in {plural(len(store.tiles), 'tile')}, "
+        f"{halo / store.count:.1%} more in halos, {store.nbytes / 1e9:,.2f} GB"
     )
     run.result(
         {

@@ -1,4 +1,4 @@
-"""`g2ard lift`: coloured cloud → Gaussian prior."""
+"""`g2ard lift`: coloured point cloud → Gaussians."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from g2ard.progress import plural
 def lift(
     run: Run,
     cloud: Annotated[
-        Path, typer.Argument(metavar="CLOUD", help=".ply, .las, .laz or COLMAP points, coloured.")
+        Path, typer.Argument(metavar="CLOUD", help="Coloured points: .ply, .las, .laz or COLMAP.")
     ],
     output: OutputOption,
-    neighbors: Annotated[int, typer.Option(help="Nearest points that each disc's plane is fitted to.")] = 10,
-    normal_ratio: Annotated[float, typer.Option(help="Thickness of a disc over its width.")] = 0.1,
-    max_anisotropy: Annotated[float, typer.Option(help="Longest over shortest width of a disc.")] = 4.0,
+    neighbors: Annotated[int, typer.Option(help="Nearest points to fit each disc's plane to.")] = 10,
+    normal_ratio: Annotated[float, typer.Option(help="Thickness of a disc relative to its width.")] = 0.1,
+    max_anisotropy: Annotated[float, typer.Option(help="Largest ratio of a disc's two widths.")] = 4.0,
     opacity: Annotated[float, typer.Option(help="Opacity of every disc, between 0 and 1.")] = 0.5,
 ) -> None:
-    """Turn a coloured point cloud into surface-aligned discs: a prior to distil from, without training."""
+    """Turn a coloured point cloud into surface-aligned Gaussian discs, without training."""
     import time
 
     from g2ard import io

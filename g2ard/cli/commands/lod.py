@@ -41,7 +41,8 @@ def lod(
         ),
     ],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of lod-meta.json and its files.")
+        Path,
+        typer.Option("-o", "--output", metavar="DIR", help="Output folder for lod-meta.json and its files."),
     ],
     ratios: Annotated[
         Ratios,
@@ -50,23 +51,23 @@ def lod(
             "--ratios",
             parser=Ratios.parse,
             metavar="RATIOS",
-            help="How many times fewer Gaussians each level has, rising.",
+            help="Ratio of each level, rising: 4 keeps a quarter of the Gaussians.",
         ),
     ] = "1,2,4,8,16",  # type: ignore[assignment]
     recover: Annotated[
-        bool, typer.Option("--recover/--merge-only", help="Optimise each level, or only merge.")
+        bool, typer.Option("--recover/--merge-only", help="Recover each level after merging, or only merge.")
     ] = True,
     errors: Annotated[
         bool,
         typer.Option(
             "--errors/--no-errors",
-            help="Measure what each part of the scene loses at each level: viewers load by it.",
+            help="Measure the error of each chunk at each level, which viewers use to choose levels.",
         ),
     ] = True,
     most: Annotated[
         int,
         typer.Option(
-            "--chunk-count", min=1, metavar="K", help="Gaussians of a file, about the most, in units of 1024."
+            "--chunk-count", min=1, metavar="K", help="Target Gaussians per file, in units of 1024."
         ),
     ] = 512,
     extent: Annotated[
@@ -74,7 +75,7 @@ def lod(
         typer.Option(
             "--chunk-extent",
             metavar="UNITS",
-            help="Space is parted until no part, which viewers load on its own, is wider.",
+            help="Largest extent of a chunk, which viewers load as one, in scene units.",
         ),
     ] = 16.0,
     least: Annotated[
@@ -83,11 +84,13 @@ def lod(
             "--chunk-min",
             min=1,
             metavar="K",
-            help="Wider parts of fewer Gaussians stay whole, in units of 1024.",
+            help="Do not split chunks of fewer Gaussians, in units of 1024.",
         ),
     ] = 8,
     views: ViewsOrMadeOption = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Of each recovery; by need if not given.")] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Steps per level; by default until it converges.")
+    ] = None,
     size: SizeOption = None,
     background: BackgroundOption = None,
     up: UpOption = None,
@@ -98,9 +101,10 @@ def lod(
     scheduler: SchedulerOption = None,
     work: WorkOption = None,
 ) -> None:
-    """Write levels of detail that viewers stream: each merged from the one before, and recovered.
+    """Write levels of detail as streamed SOG.
 
-    A scene larger than memory, or a folder of tiles, is worked on tile by tile.
+    Each level is merged from the one before, then recovered.
+    Scenes larger than memory and folders of tiles are processed tile by tile.
     """
     from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.cli.run_folder import check_same_options, note_options
@@ -116,7 +120,7 @@ def lod(
 
     if kind(scene) == "points":
         raise typer.BadParameter(
-            "a cloud has no renders to learn from: distil it first, then `lod` its scene"
+            "a point cloud cannot render training images; distil it first, then run `lod` on the result"
         )
     try:
         check_ratios(ratios)
@@ -179,13 +183,13 @@ def _in_tiles(
     rule: Cut,
     errors: bool,
 ) -> None:
-    """What is done stays in the tiling's folder until all is, longer where the user named the folder."""
+    """Write levels tile by tile; finished steps stay in the tiling's folder until the command succeeds."""
     from g2ard.levels import save_levels
     from g2ard.policy.tiled import lod_in_tiles
     from g2ard.system.memory import peak_rss_of_all
 
     assert tiling.folder is not None
-    run.kept = [f"what is done stands in {tiling.folder}, and the same command goes on"]
+    run.kept = [f"finished steps are in {tiling.folder}; run the same command to continue"]
     levels = lod_in_tiles(scene, ratios, tiling, options, recover=recover, progress=run.progress, say=run.say)
     begun = tiling.folder / f"written-{levels.key(rule, errors)}"
     begun.mkdir(exist_ok=True)
@@ -202,7 +206,7 @@ def _in_tiles(
 
 
 def _check_same(meta: Path, ratios: Sequence[float]) -> None:
-    """Refuse to call a folder finished that holds levels of other ratios."""
+    """Raise an error if a finished folder holds levels of other ratios."""
     import json
 
     from g2ard.errors import OutputError
@@ -211,7 +215,9 @@ def _check_same(meta: Path, ratios: Sequence[float]) -> None:
     wanted = [counts[0] * ratios[0] / ratio for ratio in ratios]
     if len(counts) != len(wanted) or any(abs(c - w) > ratios[0] for c, w in zip(counts, wanted, strict=True)):
         levels = ", ".join(f"{count:,}" for count in counts)
-        raise OutputError(f"{meta}: levels of {levels} Gaussians, made with other -r; -w makes them anew")
+        raise OutputError(
+            f"{meta}: was written with another -r (levels of {levels} Gaussians); -w replaces it"
+        )
 
 
 def _tell(run: Run, output: Path, levels: Levels | TiledLevels, size: int, **more: Any) -> None:
@@ -221,7 +227,7 @@ def _tell(run: Run, output: Path, levels: Levels | TiledLevels, size: int, **mor
             for what, psnr in (("merged", report.simplified), ("recovered", report.recovered))
             if psnr is not None
         ]
-        told = f" ({', '.join(figures)}, in unseen views of {report.size} pixels)" if figures else ""
+        told = f" ({', '.join(figures)}, in held-out views of {report.size} pixels)" if figures else ""
         run.say(f"level {number}: {plural(report.count, 'Gaussian')}{told}")
     run.say(f"{output}: {plural(len(levels.reports), 'level')}, {size / 1e6:.2f} MB")
     result: dict[str, Any] = {"output": str(output), "bytes": size}

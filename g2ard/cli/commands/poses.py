@@ -1,4 +1,4 @@
-"""`g2ard poses`: scene → cameras to look at it from."""
+"""`g2ard poses`: scene → generated views."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from g2ard.config.choices import PoolKind
 from g2ard.progress import plural
 
 _FEW = 0.005
-"""Share of the scene that rounds to nothing."""
+"""Share of the scene too small to report."""
 
 
 class _Size(tuple[int, int]):
@@ -26,7 +26,9 @@ class _Size(tuple[int, int]):
 def _size(text: str) -> _Size:
     match = re.fullmatch(r"(\d+)[x×](\d+)", text.strip())
     if match is None or not all(16 <= int(side) <= 16384 for side in match.groups()):
-        raise typer.BadParameter(f"width x height in pixels from 16 to 16384, such as 800x600, not {text!r}")
+        raise typer.BadParameter(
+            f"expected WIDTHxHEIGHT from 16 to 16384 pixels, such as 800x600, got {text!r}"
+        )
     return _Size((int(match[1]), int(match[2])))
 
 
@@ -38,21 +40,23 @@ def poses(
     kind: Annotated[
         PoolKind,
         typer.Option(
-            help="Around, through rooms and streets, from the air, within rooms, where it is sharp."
+            help="Orbit the scene, walk through it, look from above, from inside, or at its sharpest part."
         ),
     ] = "auto",
-    count: Annotated[int, typer.Option("-n", "--count", min=1, help="How many poses.")] = 128,
+    count: Annotated[int, typer.Option("-n", "--count", min=1, help="Number of poses.")] = 128,
     size: Annotated[
         _Size | None,
-        typer.Option(parser=_size, metavar="WxH", help="Pixels; 800x600 unless given."),
+        typer.Option(parser=_size, metavar="WxH", help="Image size, pixels; 800x600 by default."),
     ] = None,
     fov: Annotated[
         float | None,
-        typer.Option(min=1, max=170, help="Horizontal field of view, degrees; 50 unless given, 70 in rooms."),
+        typer.Option(
+            min=1, max=170, help="Horizontal field of view, degrees; by default 50, and 70 in rooms."
+        ),
     ] = None,
     up: UpOption = None,
 ) -> None:
-    """Make a pool of candidate views for a scene without photos: poses in free space that see it well."""
+    """Generate views for a scene: poses in free space that see it well."""
     from g2ard.io import check_views_output, write_views
     from g2ard.policy.inputs import load_scene
     from g2ard.poses import plan_pool
@@ -74,8 +78,8 @@ def poses(
     write_views(output, pool.cameras, splits=splits, overwrite=run.overwrite)
     direction = ", ".join(f"{v:.2f}" for v in pool.up)
     run.say(f"{output}: {plural(count, 'pose')}, {pool.kind} ({pool.why}; up is {direction})")
-    shares = (("no pose sees", pool.unseen), ("poses see only under a pixel", pool.coarse))
-    if told := [f"{what} {share:.0%} of the scene's matter" for what, share in shares if share > _FEW]:
+    shares = (("is in no view", pool.unseen), ("is smaller than a pixel in all views", pool.coarse))
+    if told := [f"{share:.0%} of the scene {what}" for what, share in shares if share > _FEW]:
         run.say("; ".join(told))
     run.result(
         {

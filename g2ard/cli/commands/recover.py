@@ -41,19 +41,19 @@ if TYPE_CHECKING:
 )
 def recover(
     run: Run,
-    student: Annotated[Path, typer.Argument(metavar="STUDENT", help="The compact scene to recover.")],
+    student: Annotated[Path, typer.Argument(metavar="STUDENT", help="Simplified scene to recover.")],
     output: OutputOption,
     views: ViewsOrMadeOption = None,
     teacher: TeacherOption = None,
     photos: Annotated[
         bool,
-        typer.Option("--photos", help="With --teacher: each view's photo where it has one, else the render."),
+        typer.Option("--photos", help="With --teacher: use photos where views have them, renders otherwise."),
     ] = False,
     anchors: Annotated[
         Path | None,
         typer.Option(
             metavar="SCENE",
-            help="The same Gaussians as they were simplified, where the student has been recovered since.",
+            help="The student before any recovery, if it was recovered before.",
         ),
     ] = None,
     preset: PresetOption = "auto",
@@ -65,12 +65,12 @@ def recover(
     split: SplitOption = "train",
     weighted: Annotated[
         bool | None,
-        typer.Option("--weights/--no-weights", help="Draw views by the weights they carry, if any."),
+        typer.Option("--weights/--no-weights", help="Sample views by their weights, if they have any."),
     ] = None,
     size: SizeOption = None,
     background: BackgroundOption = None,
 ) -> None:
-    """Recover appearance on a fixed set of Gaussians, against photos or a teacher's renders."""
+    """Optimise a fixed set of Gaussians against photos or a teacher's renders."""
     from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.config.paths import listed
     from g2ard.config.presets import PRESETS, configured
@@ -93,7 +93,7 @@ def recover(
     if weighted is None:
         weighted = named.get("select.weighted", True)
     if photos and teacher is None:
-        raise typer.BadParameter("--photos goes with --teacher: without a teacher all targets are photos")
+        raise typer.BadParameter("--photos goes with --teacher; without a teacher, all targets are photos")
     can_be_made(views, teacher)
     checkpoint = output.parent / f".{output.name}.checkpoint.npz"
     if left_at(checkpoint) or not (resume and output.exists()):
@@ -116,7 +116,7 @@ def recover(
     run.say(f"{plural(len(chosen.cameras), 'view')} against {kinds_of(targets)}")
     weights = chosen.weights if weighted else None
     if weights is not None:
-        run.say(f"views are drawn by their weights ({len(weights)})")
+        run.say(f"sampling {plural(len(weights), 'view')} by weight")
     settings["recover.regularizers"], why, measured = preset_for(
         named.get("recover.regularizers", "auto"),
         dense or splats,
@@ -149,11 +149,7 @@ def recover(
 
 
 def _anchors(run: Run, path: Path, student: Splats, in_plane: float) -> Anchors:
-    """The anchors that a file's Gaussians are to those of `student`, row by row, in its coordinates.
-
-    Raises:
-        InputError: there are more or fewer of them.
-    """
+    """Read anchors for the rows of `student`, in its coordinates."""
     from g2ard.errors import InputError
     from g2ard.policy.inputs import load_scene
     from g2ard.stages.recover.anchors import Anchors
@@ -161,7 +157,8 @@ def _anchors(run: Run, path: Path, student: Splats, in_plane: float) -> Anchors:
     scene = load_scene(path, run.say)
     if len(scene) != len(student):
         raise InputError(
-            f"{path}: {plural(len(scene), 'Gaussian')}, the student has {len(student):,}; anchors are the "
-            "student as it was simplified, before any recovery"
+            f"has {plural(len(scene), 'Gaussian')}, the student has {len(student):,}",
+            path=path,
+            hint="anchors are the student before any recovery",
         )
     return Anchors.of(scene.recentred(student.offset), in_plane)

@@ -28,82 +28,81 @@ def register(
         Path,
         typer.Option(
             metavar="DIR|VIEWS",
-            help="Photos to register: a folder, or views that name them and state their lenses. "
-            "Without --poses and --pool, the views' own poses are the start.",
+            help="Photos to register: a folder, or views with photos and intrinsics. By default their own "
+            "poses are the start.",
         ),
     ],
     output: OutputOption,
     poses: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Poses to start from: views in any format, or ACE's text."),
+        typer.Option(metavar="FILE", help="Initial poses: views in any format, or ACE text."),
     ] = None,
     pool: Annotated[
         str | None,
         typer.Option(
             metavar="VIEWS|N",
-            help="For photos without a pose: start from the likest of these views, or of N planned ones.",
+            help="For photos without a pose: start from the most similar of these, or of N generated views.",
         ),
     ] = None,
     intrinsics: Annotated[
         Path | None,
-        typer.Option(metavar="VIEWS", help="Lenses of a folder's photos: by name, or one for all."),
+        typer.Option(metavar="VIEWS", help="Intrinsics for a folder of photos: by name, or one for all."),
     ] = None,
     focal: Annotated[
-        float | None, typer.Option(metavar="PX", min=1, help="Focal length of a folder's photos, pixels.")
+        float | None, typer.Option(metavar="PX", min=1, help="Focal length for a folder of photos, pixels.")
     ] = None,
     size: Annotated[
-        int | None, typer.Option(min=32, metavar="PIXELS", help="Shrink photos to this longer side, 1000.")
+        int | None,
+        typer.Option(min=32, metavar="PIXELS", help="Shrink photos to this longer side; 1000 by default."),
     ] = None,
     matcher: Annotated[
         str | None,
         typer.Option(
             metavar="auto|sift|direct|MODULE:FUNCTION",
-            help="What matches photo and render: SIFT, nothing (direct alignment), or a function of yours. "
-            "All but direct need the extra `register`; auto, the default, takes it where it is there.",
+            help="Feature matcher: SIFT, none (direct alignment only), or your own function. "
+            "All but direct need g2ard[register]; auto, the default, uses SIFT if it is installed.",
         ),
     ] = None,
     refine: Annotated[
         Refinement | None,
-        typer.Option(
-            help="A pose from features as it is, aligned, the mean of both by information, or that polished "
-            "by the exact gradient; auto unless given."
-        ),
+        typer.Option(help="How to refine poses from feature matching; auto by default."),
     ] = None,
-    passes: Annotated[int | None, typer.Option(min=1, help="Renders to match with, at most; 3.")] = None,
+    passes: Annotated[
+        int | None, typer.Option(min=1, help="Maximum renders to match per photo; 3 by default.")
+    ] = None,
     accept: Annotated[
         float | None,
-        typer.Option(min=0.01, max=1, help="ZNCC from which a photo counts as registered, 0.6."),
+        typer.Option(min=0.01, max=1, help="Lowest ZNCC of a registered photo; 0.6 by default."),
     ] = None,
     keep: Annotated[
         Keep,
-        typer.Option(
-            help="Write those that are uncertain as well, or all: what has no pose keeps its start."
-        ),
+        typer.Option(help="Photos to write; with all, photos without a pose keep their initial one."),
     ] = "registered",
     protocol: Annotated[
         Literal["gs-cpr"] | None,
         typer.Option(
-            help="gs-cpr: one pass of matches, no refinement, no fallback, and every photo kept: without a "
-            "pose from 6 matches at least, where it started. Needs the extra `register`."
+            help="gs-cpr: one pass of matches, no refinement and no fallback. Photos with fewer than "
+            "6 matches keep their initial pose. Needs g2ard[register]."
         ),
     ] = None,
     truth: Annotated[
         Path | None,
-        typer.Option(metavar="VIEWS", help="True poses, to score with: as --poses. They decide nothing."),
+        typer.Option(metavar="VIEWS", help="True poses to score against; not used otherwise."),
     ] = None,
     metres_per_unit: Annotated[
         float | None,
-        typer.Option("--metres-per-unit", min=1e-9, help="With --truth: errors in cm, and recalls."),
+        typer.Option("--metres-per-unit", min=1e-9, help="With --truth: report errors in cm and recall."),
     ] = None,
-    split: Annotated[str, typer.Option(metavar="train|test|all", help="Of --photos VIEWS.")] = "all",
+    split: Annotated[str, typer.Option(metavar="train|test|all", help="Split of --photos VIEWS.")] = "all",
     report: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Also write a page of renders laid on photos.")
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Also write a page of renders overlaid on photos."),
     ] = None,
     background: BackgroundOption = None,
 ) -> None:
-    """Find where photos were taken, by matching renders of a scene with them.
+    """Estimate camera poses of photos by matching them with renders of a scene.
 
-    Each photo is registered, uncertain or refused; OUT holds the registered ones as views.
+    Each photo is registered, uncertain or refused; OUT gets the registered ones as views.
     """
     from g2ard.config.paths import changed, listed
     from g2ard.config.presets import GS_CPR
@@ -127,7 +126,7 @@ def register(
         if contradicted := [name for name, said in given.items() if said] + ["--matcher"] * (
             matcher == "direct"
         ):
-            raise typer.BadParameter(f"--protocol gs-cpr decides {contradicted[0]}; leave that out")
+            raise typer.BadParameter(f"--protocol gs-cpr sets {contradicted[0]}; remove {contradicted[0]}")
         settings, keep = GS_CPR | settings, "all"
         run.config |= {"keep": keep}
     config = changed(RegisterConfig(), settings)
@@ -141,14 +140,14 @@ def register(
 
         others = (output, scene, poses, truth, intrinsics, photos)
         if real_path(report) in {real_path(p) for p in others if p}:
-            raise typer.BadParameter(f"--report {report} would be written over; name another output")
+            raise typer.BadParameter(f"--report {report} is also an input or the output; name another file")
         if report.suffix.lower() not in (".html", ".htm"):
-            raise typer.BadParameter(f"--report {report}: a page is written as .html")
+            raise typer.BadParameter(f"--report {report}: expected a name that ends in .html")
         check_output(report, run.overwrite)
     taken = photos_of(photos, split=split, intrinsics=intrinsics, focal=focal, say=run.say)
     folder = photos.is_dir() and (intrinsics is not None or focal is not None)
     if poses is None and pool is None and folder:
-        raise InputError(f"{photos}: photos have no pose to start from; give --poses or --pool")
+        raise InputError(f"{photos}: photos have no initial pose; give --poses or --pool")
     starts = {}
     if poses is not None:
         starts = poses_for(poses, taken.names)
@@ -217,7 +216,7 @@ def _told(summary: Summary) -> list[str]:
 
 def _said(accuracy: Accuracy, summary: Summary) -> str:
     if accuracy.median is None:
-        return f"no pose of {summary.true} to score"
+        return f"0 of {summary.true} poses to score"
     scale, unit = (1.0, "units")
     if summary.metres_per_unit is not None:
         scale, unit = 100 * summary.metres_per_unit, "cm"

@@ -38,31 +38,33 @@ def render(
     run: Run,
     scene: SceneArgument,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder for the PNGs.")
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Output folder for PNGs.")
     ] = None,
     views: ViewsOrMadeOption = None,
     sheet: Annotated[
         Path | None,
-        typer.Option(parser=picture, metavar="FILE.png", help="All views on one picture, for a look."),
+        typer.Option(parser=picture, metavar="FILE.png", help="Write all views as one contact sheet."),
     ] = None,
-    depth: Annotated[bool, typer.Option("--depth", help="Also write NAME.depth.npy, scene units.")] = False,
+    depth: Annotated[
+        bool, typer.Option("--depth", help="Also write NAME.depth.npy, in scene units.")
+    ] = False,
     color: Annotated[
         Color,
-        typer.Option(help="What simplification to -n or -r sees: protection flags, cells, where rows went."),
+        typer.Option(help="Colour by scene, or by simplification to -n or -r: flags, cells or parents."),
     ] = "scene",
     count: LooksOption = None,
     ratio: RatioOption = None,
-    method: Annotated[Method, typer.Option(help="Of --color parents, without views.")] = "default",
+    method: Annotated[Method, typer.Option(help="Method of --color parents.")] = "default",
     parents: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.npy", help="With --color parents: as `simplify --parents` wrote them."),
+        typer.Option(metavar="FILE.npy", help="With --color parents: file from `simplify --parents`."),
     ] = None,
     convention: ConventionOption = "gsplat",
     split: SplitOption = "all",
     size: SizeOption = None,
     background: BackgroundOption = None,
 ) -> None:
-    """Render a scene into every view as PNG, or what simplification makes of it painted on its surfaces."""
+    """Render views of a scene as PNG, or show how it would be simplified."""
     import numpy as np
 
     from g2ard.io.atomic import check_output
@@ -130,7 +132,7 @@ def _folder(path: Path | None, overwrite: bool) -> Iterator[Path | None]:
 def _write_sheet(
     path: Path, images: list[NDArray[np.float32]], names: tuple[str, ...], overwrite: bool
 ) -> None:
-    """A grid about as wide as high; views of several sizes stand in rows of their own."""
+    """Write a roughly square grid of all images, captioned by row."""
     import math
 
     from g2ard.scene.images import contact_sheet, write_png
@@ -144,21 +146,21 @@ def _write_sheet(
 def _looks(
     color: Color, count: Count | None, ratio: float | None, parents: Path | None, views: Path | None
 ) -> int | None:
-    """Usage check: how many views are to be made, where -n says so and is no budget."""
+    """Return the number of views to generate if -n gives it, None if -n is a budget or missing."""
     if color != "scene" or ratio is not None or count is None:
         _check(color, count, ratio, parents)
         return None
     if views is not None and not is_made(views):
-        raise typer.BadParameter("-n makes views, and --views gives them: leave -n out")
+        raise typer.BadParameter("-n generates views, so it excludes --views; give one")
     if parents is not None or count.is_share:
         raise typer.BadParameter(
-            "-n: a number of views to make, where none are given; a budget goes with --color flags or cells"
+            "-n: expected a number of views to generate; a budget needs --color flags, cells or parents"
         )
     return int(count.value)
 
 
 def _check(color: Color, count: Count | None, ratio: float | None, parents: Path | None) -> None:
-    """Usage check: a budget where it decides something, and nothing that would be ignored."""
+    """Check that a budget is given exactly if --color uses it."""
     if parents is not None and color != "parents":
         raise typer.BadParameter("--parents goes with --color parents")
     if color != "scene" and parents is None:
@@ -192,9 +194,7 @@ def _painted(
         assert budget is not None
         labels = simplify(splats, budget, method=method, progress=run.progress).parents
     gone = int((labels < 0).sum())
-    run.say(
-        f"parents: {plural(labels.max() + 1, 'Gaussian')} of {len(splats):,}; {gone:,} went nowhere (black)"
-    )
+    run.say(f"parents: {plural(labels.max() + 1, 'Gaussian')} of {len(splats):,}; {gone:,} dropped (black)")
     return painted(splats, label_colors(labels))
 
 
@@ -206,7 +206,7 @@ def _read_parents(path: Path, count: int) -> NDArray[np.int64]:
     try:
         labels = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: not an array of numpy's ({error})") from None
+        raise InputError(f"{path}: not a NumPy array ({error})") from None
     if not isinstance(labels, np.ndarray) or labels.dtype.kind not in "iu" or labels.shape != (count,):
-        raise InputError(f"{path}: expected {count} whole numbers, one for each Gaussian of the scene")
+        raise InputError(f"{path}: expected {count} whole numbers, one per Gaussian of the scene")
     return labels.astype(np.int64)

@@ -32,7 +32,10 @@ def select(
     k: Annotated[
         Count | None,
         typer.Option(
-            "-k", parser=views_count, metavar="K", help="How many: 100, 25%, or auto (where the curve bends)."
+            "-k",
+            parser=views_count,
+            metavar="K",
+            help="Views to select: 100, 25%, or auto (the knee of the curve).",
         ),
     ] = None,
     views: ViewsOption = None,
@@ -40,9 +43,9 @@ def select(
     split: SplitOption = "train",
     preset: PaperOption = None,
 ) -> None:
-    """Choose the views worth having, best first, with a weight for how often to draw each.
+    """Select the most useful views, best first, each with a sampling weight.
 
-    Views that are not for training follow after them, with their split and no weight, to score on.
+    Views outside the training split are appended without a weight, for scoring.
     """
     from g2ard.config.paths import listed
     from g2ard.config.presets import configured
@@ -57,13 +60,13 @@ def select(
     if k is not None:
         settings["select.views_count"] = k.number if isinstance(k, Count) else k
     if views is None:
-        raise typer.BadParameter("--views VIEWS: the candidates to select from")
+        raise typer.BadParameter("give the candidates with --views VIEWS")
     try:
         config = configured(SelectConfig(), preset or "auto", settings)
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
     if config.views_count is None:
-        raise typer.BadParameter("-k K: how many views to choose")
+        raise typer.BadParameter("give the number of views with -k K")
     check_views_output(output, run.overwrite)
     splats = load_scene(scene, run.say)
     pool, candidates = load_split_views(views, split, run.say)
@@ -82,10 +85,10 @@ def select(
     _write(run, output, pool, candidates.nonzero()[0][chosen.order], chosen.weights)
     if len(chosen.refused):
         count = plural(len(chosen.refused), "view")
-        run.say(f"{count} refused: nothing of the scene in sight, or within its matter")
+        run.say(f"{count} not used: the scene is not in sight, or the camera is inside it")
     run.say(
         f"{output}: {len(kept)} of {plural(len(cameras), 'view')} by {config.policy};"
-        f" those left out would add {100 * chosen.left_out:.1f} %"
+        f" the rest would add {100 * chosen.left_out:.1f} %"
     )
     run.result(
         {
@@ -107,7 +110,7 @@ def select(
 
 
 def _write(run: Run, output: Path, pool: ViewSet, chosen: Any, weights: Any) -> None:
-    """The chosen rows of the pool, best first, then all others that are not for training."""
+    """Write the chosen views, best first, then the other views outside the training split."""
     import numpy as np
 
     from g2ard.io import write_views
@@ -124,7 +127,7 @@ def _write(run: Run, output: Path, pool: ViewSet, chosen: Any, weights: Any) -> 
     )
     tests = sum(pool.splits[i] not in ("train", None) for i in chosen)
     if tests:
-        run.say(f"held out among the chosen ones: {plural(tests, 'view')}, which recovery leaves out")
+        run.say(f"{plural(tests, 'chosen view')} held out: recovery will not train on them")
     if held_out:
         words = ", ".join(sorted({str(pool.splits[i]) for i in held_out}))
-        run.say(f"held out after the chosen ones: {plural(len(held_out), 'view')} ({words})")
+        run.say(f"{plural(len(held_out), 'held-out view')} appended ({words})")

@@ -51,7 +51,7 @@ def simplify(
     views: ViewsOrMadeOption = None,
     no_views: Annotated[
         bool,
-        typer.Option("--no-views", help="Use no cameras at all, neither found nor generated."),
+        typer.Option("--no-views", help="Use no cameras, neither found nor generated."),
     ] = False,
     preset: PaperOption = None,
     method: MethodOption = None,
@@ -60,7 +60,7 @@ def simplify(
     output: OutputOption,
     parents: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.npy", help="Also write the row that each Gaussian went to; -1 is none."),
+        typer.Option(metavar="FILE.npy", help="Also write each Gaussian's row in the result, or -1."),
     ] = None,
     tile_rows: TileRowsOption = None,
     memory: MemoryOption = None,
@@ -70,9 +70,9 @@ def simplify(
 ) -> None:
     """Reduce a scene to an exact number of Gaussians; no images needed.
 
-    The default method weighs errors by what is seen: from --views, else from the cameras that lie beside the
-    scene, else from a pool of poses of its own. The fast one looks only at given views, the paper's at none.
-    A scene larger than memory, or a folder of tiles, is worked on tile by tile, at one exact budget.
+    The default method weighs errors by visibility. It uses --views, or cameras found beside the scene, or
+    generated views. The fast method uses views only if --views is given; the paper's method uses none.
+    Scenes larger than memory and folders of tiles are simplified tile by tile to the same exact budget.
     """
     from g2ard.config.presets import configured
     from g2ard.stages.simplify import SimplifyConfig
@@ -83,7 +83,7 @@ def simplify(
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other; give one")
     if keep_region and (no_views or config.method == "paper"):
-        raise typer.BadParameter("--keep-region: needs views, which --no-views and --method paper do without")
+        raise typer.BadParameter("--keep-region needs views; remove --no-views or --method paper")
     tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)
     from g2ard import io
     from g2ard.policy.fit import aim_of
@@ -164,7 +164,7 @@ def simplify(
 
 
 def _bytes_of(place: Path) -> int:
-    """Bytes of what was written; all files of a SOG folder."""
+    """Return the size of a file, or of all files of a SOG folder."""
     files = place.parent.iterdir() if place.name == "meta.json" else [place]
     return sum(file.stat().st_size for file in files)
 
@@ -199,7 +199,7 @@ def _check_parents(run: Run, parents: Path, scene: Path, views: Path | None) -> 
 
 
 def _write_parents(run: Run, path: Path, small: Simplified) -> None:
-    """(N,) int64 in the order of the scene's rows, for `render --color parents`."""
+    """Write the parents, (N,) int64 in the scene's row order, for `render --color parents`."""
     import numpy as np
 
     from g2ard.io.atomic import atomic_output
@@ -213,7 +213,7 @@ def _tell(run: Run, scene: Path, small: Simplified, output: Path, total: int, se
         _table(run, small)
     share = (small.report.unseen or 0) / total
     if share >= 0.02:
-        run.say(f"no view sees {share:.0%} of the Gaussians: they count by their own size alone")
+        run.say(f"note: no view sees {share:.0%} of the Gaussians; they are weighted by size only")
     say_weight(run, scene, output, small.splats)
     run.say(f"{output}: {len(small.splats):,} of {plural(total, 'Gaussian')} in {seconds:.1f} s")
 

@@ -1,4 +1,4 @@
-"""`g2ard view`: scenes → a page for the browser."""
+"""`g2ard view`: scenes → an HTML page with a viewer."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ def view(
     output: OutputOption,
     other: Annotated[
         Path | None,
-        typer.Argument(metavar="[SCENE|RUN]", help="A second one of the same world, right of a divider."),
+        typer.Argument(metavar="[SCENE|RUN]", help="Second scene to compare with, right of a divider."),
     ] = None,
     views: ViewsOrMadeOption = None,
     start: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="The view to open with; else the one that holds most."),
+        typer.Option(metavar="NAME", help="View to open with; by default the one that shows most."),
     ] = None,
     background: BackgroundOption = None,
     up: UpOption = None,
 ) -> None:
-    """Write a page that shows a scene, or two under one camera, in any browser, offline."""
+    """Write an HTML page that shows one scene, or compares two, in any browser."""
     from g2ard.io.detect import run_scene
     from g2ard.policy.inputs import load_scene
     from g2ard.policy.viewer_frame import frame_of
@@ -87,7 +87,7 @@ def _told(paths: list[Path], scenes: list[Splats], sizes: tuple[int, ...]) -> li
 
 
 def _names(paths: list[Path]) -> list[str]:
-    """Files' names, with their folders' where they are the same."""
+    """Return file names, with their folders if names repeat."""
     names = [path.name for path in paths]
     if len(set(names)) < len(names):
         return ["/".join(path.absolute().parts[-2:]) for path in paths]
