@@ -1,7 +1,5 @@
 """What tests of several stages share: the program as a user types it, and a folder to type it in."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import io
@@ -16,7 +14,7 @@ import pytest
 
 import g2ard
 from g2ard.io import write_views
-from helpers.project import ROOT
+from helpers.project import environment
 from helpers.scenes import around, checkered_ball
 
 Said = tuple[int, str, str]
@@ -34,8 +32,7 @@ def command_line() -> Callable[..., Said]:
 
     def run(*arguments: object, cwd: Path, apart: bool = False) -> Said:
         words = [str(argument) for argument in arguments]
-        path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-        env = {**os.environ, "PYTHONPATH": path, "COLUMNS": "200"}
+        env = environment(COLUMNS="200")
         return (_apart if apart or _OF_THE_PROCESS & set(words) else _here)(words, cwd, env)
 
     return run
@@ -90,7 +87,7 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """ball.ply of 400 Gaussians and views.json of 16 views; files of tests with others have their own."""
+    """ball.ply of 400 Gaussians and views.json of 16 views."""
     g2ard.save(tmp_path / "ball.ply", checkered_ball(400))
     write_views(tmp_path / "views.json", around(16, (48, 36)))
     return tmp_path

@@ -8,8 +8,6 @@ Readers are held to the word that `fuzz_readers` holds them to. A file that brea
 case. Of packed files what lies within is mutated: the stream of a gzip, the meta.json of a zip.
 """
 
-from __future__ import annotations
-
 import argparse
 import gzip
 import importlib
@@ -29,7 +27,7 @@ _DONE = re.compile(r"stat::number_of_executed_units: (\d+)")
 
 
 def packing(content: bytes) -> tuple[bytes, Callable[[bytes], bytes]]:
-    """What of a file is mutated, and how it is packed again."""
+    """Return the part of a file that is mutated, and a function that packs it again."""
     if content[:2] == b"\x1f\x8b":
         return gzip.decompress(content), lambda data: gzip.compress(data, 1)
     if content[:4] != b"PK\x03\x04":
@@ -87,7 +85,7 @@ def run_case(what: str, seconds: int, seed: int) -> None:
 
 
 def main() -> None:
-    """Each case in a process of its own; exit 1 where a reader broke."""
+    """Fuzz each case in its own process; exit with 1 if a reader broke."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=int, default=60, help="of each case")
     parser.add_argument("--seed", type=int, default=1)

@@ -10,8 +10,6 @@ changes numbers and words in text. Packed files are unpacked, mutated and packed
 behind zlib and zip see damage too. The first file of each kind that a reader answers otherwise is kept.
 """
 
-from __future__ import annotations
-
 import argparse
 import gzip
 import io
@@ -84,7 +82,7 @@ def mutated(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def repacked(content: bytes, rng: np.random.Generator) -> bytes:
-    """As `mutated`, behind the packing where there is one, mostly."""
+    """Mutate a file, usually inside its packing if it has one."""
     if rng.random() < 0.3:
         return mutated(content, rng)
     if content[:2] == b"\x1f\x8b":
@@ -103,7 +101,7 @@ def repacked(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def read_checked(path: Path) -> str | None:
-    """Read a file; the error line, if there is one. What is read must make sense."""
+    """Read a file and check the data; return the error line if it is rejected."""
     try:
         match kind(path):
             case "splats":
@@ -129,7 +127,7 @@ def read_checked(path: Path) -> str | None:
 
 
 def answer(path: Path, folder: Path) -> str:
-    """`read`, `refused`, or what a reader did instead. A refusal is one line, naming a file of `folder`."""
+    """Return `read`, `refused` if one line names a file of `folder`, or what a reader did instead."""
     try:
         line = read_checked(path)
     except Exception as error:

@@ -1,7 +1,5 @@
 """`import g2ard`: what it gives, and that it does what the shell does, to the bit."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import subprocess
@@ -16,7 +14,7 @@ import g2ard
 from g2ard.io import Points
 from g2ard.report.base import Report
 from g2ard.scene.splats import Splats
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, succeeds
 from helpers.scenes import ARRAYS, checkered_ball
 
 BALL = checkered_ball(1500)
@@ -29,7 +27,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def assert_same_bits(ours: Splats, theirs: Splats, path: Path) -> None:
-    """Compared as files: a file holds logarithms of scales."""
+    """Compare as files, because a file holds logarithms of scales."""
     g2ard.save(path, ours)
     written = g2ard.load(path)
     for name in ARRAYS:
@@ -62,8 +60,7 @@ def test_every_name_is_there_and_functions_are_no_modules() -> None:
 def test_simplify_does_what_the_shell_does(
     typed: list[object], given: dict[str, object], command_line: CommandLine, folder: Path
 ) -> None:
-    status, _, error = command_line("simplify", "ball.ply", "-o", "small.ply", *typed, cwd=folder)
-    assert status == 0, error
+    succeeds(command_line, folder, "simplify", "ball.ply", "-o", "small.ply", *typed)
     theirs = g2ard.load(folder / "small.ply")
     ours = g2ard.simplify(folder / "ball.ply", **given)  # type: ignore[arg-type]
     assert_same_bits(ours.splats, theirs, folder / "ours.ply")
@@ -85,16 +82,12 @@ def test_simplify_does_what_the_shell_does(
 def test_distill_does_what_the_shell_does(
     typed: list[object], given: dict[str, object], command_line: CommandLine, folder: Path
 ) -> None:
-    status, _, error = command_line(
-        "distill", "ball.ply", "-o", "run", "--size", 64, "--seed", 3, *typed, cwd=folder
-    )
-    assert status == 0, error
+    succeeds(command_line, folder, "distill", "ball.ply", "-o", "run", "--size", 64, "--seed", 3, *typed)
     ours = g2ard.distill(folder / "ball.ply", size=64, seed=3, **given)  # type: ignore[arg-type]
     assert_same_bits(ours.splats, g2ard.load(folder / "run" / "scene.ply"), folder / "ours.ply")
     told = json.loads((folder / "run" / "report.json").read_text())
     rounds = ours.report.as_dict()["rounds"]
     assert [r["recover"][-1]["loss"] for r in rounds] == [r["recover"][-1]["loss"] for r in told["rounds"]]
-    assert ours.held_out is not None
     score = g2ard.evaluate(ours.splats, ours.held_out)
     assert score.psnr == pytest.approx(told["scores"]["recovered"]["psnr"], abs=1e-9)
 

@@ -1,7 +1,5 @@
 """What the documentation says against what there is: links, commands, options, names, records, plots."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import re

@@ -1,7 +1,5 @@
 """Methods under matched compute: budgets, rounds, the paper's weights, shared checkpoints, adaptation."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The peers' methods against naive twins."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -47,7 +45,7 @@ def density(g: dict, x: np.ndarray) -> float:
 
 
 def merge(a: dict, b: dict) -> tuple[float, dict]:
-    """Cost and result."""
+    """Return the cost and the result of merging two."""
     wa, wb = ((2 * np.pi) ** 1.5 * g["alpha"] * g["std"].prod() + 1e-12 for g in (a, b))
     pa, pb = wa / (wa + wb), wb / (wa + wb)
     mean = pa * a["mean"] + pb * b["mean"]

@@ -1,7 +1,5 @@
 """Pruning baselines: their scores against naive float64 twins, and exact counts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The raster study's figures hang together (their size depends on the machine)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The study of recovery: its rows, resuming, and what it makes of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +11,7 @@ from benchmarks.runner import run
 from benchmarks.study import DEFINITIONS, SceneSpec, read_study
 from g2ard import io
 from g2ard.errors import InputError
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, succeeds
 from helpers.scenes import around, checkered_ball
 
 
@@ -58,8 +56,6 @@ def test_curves_compare_schedules(scene: SceneSpec, tmp_path: Path) -> None:
     slow = {**ends[0], "variant": "paper/10", "seconds": 100.0, "psnr": ends[0]["psnr"] - 0.01}
     summary = read_study(DEFINITIONS / "recover-curves.toml").summary
     faster, never = summary([*found, slow]), summary([*found, {**slow, "psnr": 99.0}])
-    assert faster is not None
-    assert never is not None
     assert float(faster[2][0][-2]) <= round(ends[0]["seconds"], 1)
     assert never[2][0][-2:] == ["never", "–"]
 
@@ -94,8 +90,7 @@ def test_standing_views_are_scored_beside_the_pools(scene: SceneSpec, tmp_path: 
 def test_command(scene: SceneSpec, tmp_path: Path, command_line: CommandLine) -> None:
     asked = ("--methods", "×1,chosen", "--steps", "30", "--ratios", "5")
     place = ("benchmarks", "run", "recover-multiplier", scene.prior, "--views", scene.train)
-    status, _, told = command_line(*place, *asked, cwd=tmp_path)
-    assert status == 0, told
+    told = succeeds(command_line, tmp_path, *place, *asked).err
     assert "×1" in told
     assert "chosen" in told
     assert np.isfinite([row["psnr"] for row in read_rows(tmp_path / "figures" / "rows.csv")]).all()

@@ -1,7 +1,5 @@
 """The study of registration: starts are as far off as they say, rows hold what was found."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -14,7 +12,7 @@ from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.images import write_png
 from g2ard.stages.register import pose_error
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball
 
 
@@ -42,8 +40,7 @@ def test_rows_say_what_was_found_and_from_where(tmp_path: Path, command_line: Co
     call = ("benchmarks", "run", "register", "ball.ply", "--views", "views.json", "--methods", "direct")
     few = ("--size", "128", "--seeds", "0", "--set", "metres_per_unit=2", "--json", "-")
     ask = (*call, *few, "--ratios", "1,3", "--set", "starts=A,D")
-    status, out, err = command_line(*ask, cwd=tmp_path)
-    assert status == 0, err
+    out = succeeds(command_line, tmp_path, *ask).out
     cells = json.loads(out)["rows"]
     assert [(c["ratio"], c["count"], c["start"]) for c in cells] == [
         (ratio, count, start) for ratio, count in ((1, 1500), (3, 500)) for start in ("A", "D")
@@ -56,7 +53,9 @@ def test_rows_say_what_was_found_and_from_where(tmp_path: Path, command_line: Co
     assert dense["position"] < 1
     assert dense["found_5"] == 1
     assert dense["worst"] >= dense["position"]
-    status, _, err = command_line(*call, "--set", "starts=Z", cwd=tmp_path)
-    assert (status, "starts: expected one of A, B, C, D, got 'Z'" in err) == (1, True)
-    status, _, err = command_line("benchmarks", "run", "register", "ball.ply", cwd=tmp_path)
-    assert (status, "needs photos with true poses" in err) == (1, True)
+    assert "starts: expected one of A, B, C, D, got 'Z'" in refused(
+        command_line, tmp_path, *call, "--set", "starts=Z", status=1
+    )
+    assert "needs photos with true poses" in refused(
+        command_line, tmp_path, "benchmarks", "run", "register", "ball.ply", status=1
+    )

@@ -1,7 +1,5 @@
 """The study of formats on a small scene."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The study of simplifiers, and views of other kinds than any method's."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,7 +78,6 @@ def test_a_standing_file_beside_the_scene_is_what_counts(tmp_path: Path) -> None
     io.write_views(tmp_path / "standing.json", cameras, splits=["test"] * 4 + ["train"])
     for place in (folder / "ball.ply", folder):
         given = given_views(place)
-        assert given is not None
         assert given.names == cameras.names[:4]
     found = standing_views(splats, folder / "ball.ply")
     np.testing.assert_array_equal(found["standing"].viewmats, cameras.viewmats[:4])

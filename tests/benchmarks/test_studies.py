@@ -1,7 +1,5 @@
 """Studies of any kind: what is read, what is measured once, and what the command and the report show."""
 
-from __future__ import annotations
-
 import json
 import re
 import signal
@@ -21,7 +19,7 @@ from benchmarks.runner import Cell, run
 from benchmarks.study import DEFINITIONS, SceneSpec, Study, read_study
 from g2ard import io
 from g2ard.errors import InputError
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.project import ROOT
 from helpers.scenes import checkered_ball
 from helpers.studies import STUDY, check_page, study
@@ -203,8 +201,7 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
     study(tmp_path)
     few = ["--methods", "g2ard,random", "--ratios", "5", "--steps", "3"]
     ask = ("benchmarks", "run", "matched", "ball.ply", "--views", "views.json", *few, "-o", "out")
-    status, out, err = command_line(*ask, "--json", "-", cwd=tmp_path)
-    assert status == 0, err
+    out, err = succeeds(command_line, tmp_path, *ask, "--json", "-")
     assert [row["method"] for row in json.loads(out)["rows"]] == ["g2ard", "random"]
     assert "rows.csv" in err
     check_page((tmp_path / "out" / "report.html").read_text())
@@ -222,9 +219,7 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
     assert not (tmp_path / "x").exists()
 
 
-def test_a_variable_that_is_not_set_is_told_before_anything_is_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unset_variable_is_named_before_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("G2ARD_NOWHERE", raising=False)
     text = STUDY.replace("ball.ply", "${G2ARD_NOWHERE}/ball.ply")
     with pytest.raises(InputError, match=r"scene ball: \$G2ARD_NOWHERE is not set"):
@@ -247,16 +242,16 @@ def test_nothing_is_left_running(tmp_path: Path) -> None:
     assert not mark.exists()
 
 
-def test_what_cannot_be_measured_is_refused_at_once(
+def test_systems_that_cannot_measure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command_line: CommandLine
 ) -> None:
-    """As on Windows, which has no such call."""
+    """Windows lacks the call."""
     import os
 
     io.write_splats(tmp_path / "ball.ply", checkered_ball(100))
     monkeypatch.delattr(os, "posix_spawnp", raising=False)
     for kind in ("simplify", "matched"):
-        status, _, error = command_line("benchmarks", "run", kind, "ball.ply", "-o", "out", cwd=tmp_path)
-        assert status == 1
-        assert "needs POSIX; it does not run on Windows" in error
+        assert "needs POSIX; it does not run on Windows" in refused(
+            command_line, tmp_path, "benchmarks", "run", kind, "ball.ply", "-o", "out", status=1
+        )
     assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]

@@ -1,7 +1,5 @@
 """The procedural city: exact rays against a naive caster, clouds and photos that agree, disjoint splits."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -14,6 +12,8 @@ from benchmarks.synth.noise import Noise, band, ramp
 from benchmarks.synth.shapes import Kind, Shapes, cast
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_points, read_views
+from helpers.commands import succeeds
+from helpers.interruptions import interrupt_at
 from reference import synth as naive
 
 SYNTH = ("benchmarks", "synth", "city")
@@ -157,8 +157,7 @@ def test_a_scan_in_parts_is_as_the_scan_at_once(large, large_scan, monkeypatch):
 
 def test_a_million_is_so_many_points_on_a_city_of_that_size(tmp_path, command_line):
     few = ("--views", "8", "--size", "32x24")
-    status, _, said = command_line(*SYNTH, "-o", "a", "--million", "0.012", *few, cwd=tmp_path)
-    assert status == 0, said
+    succeeds(command_line, tmp_path, *SYNTH, "-o", "a", "--million", "0.012", *few)
     given = (*SYNTH, "-o", "b", "--points", "12k", "--blocks", "1", *few)
     assert command_line(*given, cwd=tmp_path)[0] == 0
     assert (tmp_path / "a" / "cloud.ply").read_bytes() == (tmp_path / "b" / "cloud.ply").read_bytes()
@@ -285,12 +284,8 @@ def test_writes_a_data_set(tmp_path, town, scan):
 
 
 def test_interrupted_leaves_nothing(tmp_path):
-    def stop(stage, done, total, info=None):
-        if stage == "photos":
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        write_city(tmp_path / "city", replace(SMALL, points=500), progress=stop)
+        write_city(tmp_path / "city", replace(SMALL, points=500), progress=interrupt_at("photos"))
     assert not list(tmp_path.iterdir())
 
 

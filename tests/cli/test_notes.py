@@ -1,7 +1,5 @@
 """Notes and warnings that commands print."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +12,9 @@ import pytest
 import g2ard
 from g2ard.cli.frame import Run
 from g2ard.cli.run_result import told, write_table
-from g2ard.io import Points, write_points, write_views
-from helpers.commands import CommandLine
-from helpers.photos import BALL, photos_of
+from g2ard.io import write_views
+from helpers.commands import CommandLine, succeeds
+from helpers.photos import BALL, cloud_of, photos_of
 from helpers.scenes import around, checkered_ball
 
 
@@ -30,18 +28,18 @@ def test_a_result_that_outweighs_its_input_says_so(command_line: CommandLine, tm
 
 
 def test_a_lift_that_outweighs_its_cloud_says_so(command_line: CommandLine, folder: Path) -> None:
-    colors = np.full((1200, 3), 0.5, np.float32)
-    write_points(folder / "cloud.ply", Points(BALL.means.astype(np.float64), colors))
-    status, _, error = command_line("lift", "cloud.ply", "-o", "lift.ply", cwd=folder)
-    assert (status, "lift.ply: 0.07 MB, cloud.ply has 0.03 MB: packed formats" in error) == (0, True), error
+    cloud_of(folder / "cloud.ply", BALL)
+    assert (
+        "lift.ply: 0.07 MB, cloud.ply has 0.03 MB: packed formats"
+        in succeeds(command_line, folder, "lift", "cloud.ply", "-o", "lift.ply").err
+    )
 
 
 SHORT = ("distill", "ball.ply", "--steps", 5, "--size", 48)
 
 
 def test_a_short_run_has_no_needless_notes(command_line: CommandLine, folder: Path) -> None:
-    status, _, error = command_line(*SHORT, "-r", 10, "-o", "run", cwd=folder)
-    assert status == 0, error
+    error = succeeds(command_line, folder, *SHORT, "-r", 10, "-o", "run").err
     assert "poses: 160, orbit; the up direction is a guess\n" in error
     for needless in ("never acted", "of its box", "times as high"):
         assert needless not in error
@@ -50,8 +48,7 @@ def test_a_short_run_has_no_needless_notes(command_line: CommandLine, folder: Pa
 
 def test_one_is_one(command_line: CommandLine, folder: Path) -> None:
     ask = ("distill", "ball.ply", "-n", 1, "-o", "run", "--steps", 2, "--size", 32, "--format", "splat")
-    status, _, error = command_line(*ask, cwd=folder)
-    assert status == 0, error
+    error = succeeds(command_line, folder, *ask).err
     assert "400 → 1 Gaussian;" in error
     assert "MB as .ply" in error
     for ask in (("simplify", "ball.ply", "-n", 1, "-o", "s.ply"), ("convert", "s.ply", "t.splat")):
@@ -96,28 +93,24 @@ def test_views_of_another_world_are_told(command_line: CommandLine, folder: Path
         ("render", "ball.ply", "-o", "looks"),
     ],
 )
-def test_every_command_tells_of_views_of_another_world(
-    ask: tuple[object, ...], command_line: CommandLine, folder: Path
-) -> None:
+def test_views_of_another_world(ask: tuple[object, ...], command_line: CommandLine, folder: Path) -> None:
     viewmats = around(16, (48, 36)).viewmats.copy()
     viewmats[1:9, :3, 3] += 1e3
     write_views(folder / "some.json", replace(around(16, (48, 36)), viewmats=viewmats))
     for views, warned in (("some.json", True), ("views.json", False)):
-        status, _, error = command_line(*ask, "--views", views, "-w", cwd=folder)
-        assert status == 0, error
+        error = succeeds(command_line, folder, *ask, "--views", views, "-w").err
         assert ("views see nothing of the scene; check" in error) == warned, error
 
 
 def test_photos_of_another_world_are_told(command_line: CommandLine, folder: Path) -> None:
-    """Whose views may see much of the scene: both stand about the origin."""
+    """The views may still see much of the scene, because both lie around the origin."""
     photos_of(folder / "photos")
     ask = ("-n", 50, "--views", "photos", "--steps", 2, "--dry-run")
     own = checkered_ball(1200)
     g2ard.save(folder / "own.ply", own)
     g2ard.save(folder / "other.ply", replace(own, means=6 * own.means, scales=6 * own.scales))
     for scene, warned in (("other.ply", True), ("own.ply", False)):
-        status, _, error = command_line("distill", scene, *ask, "-o", "run", cwd=folder)
-        assert status == 0, error
+        error = succeeds(command_line, folder, "distill", scene, *ask, "-o", "run").err
         assert ("warning: the scene does not look like the photos (correlation" in error) == warned, error
 
 

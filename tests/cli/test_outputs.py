@@ -1,7 +1,5 @@
 """Output paths: folders, suffixes, names and what is overwritten."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -9,17 +7,16 @@ import pytest
 from PIL import Image
 
 import g2ard
-from helpers.commands import CommandLine, refused
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import BALL
 
 
 def test_folders_are_made_and_suffixes_are_of_any_case(command_line: CommandLine, folder: Path) -> None:
     g2ard.save(folder / "a" / "b" / "ball.PLY", BALL)
     assert len(g2ard.load(folder / "a" / "b" / "ball.PLY")) == 1200
-    status, _, error = command_line(
-        "simplify", "a/b/ball.PLY", "-r", 4, "-o", "c/d/small.Ply", "--json", "e/f.json", cwd=folder
+    succeeds(
+        command_line, folder, "simplify", "a/b/ball.PLY", "-r", 4, "-o", "c/d/small.Ply", "--json", "e/f.json"
     )
-    assert status == 0, error
     assert json.loads((folder / "e" / "f.json").read_text())["output_count"] == 300
     assert len(g2ard.load(folder / "c" / "d" / "small.Ply")) == 300
 
@@ -29,12 +26,10 @@ SHORT = ("distill", "ball.ply", "--steps", 5, "--size", 48)
 
 def test_a_folder_has_one_scene(command_line: CommandLine, folder: Path) -> None:
     assert command_line(*SHORT, "-r", 10, "-o", "run", cwd=folder)[0] == 0
-    status, _, error = command_line(*SHORT, "-r", 10, "-o", "run", "-w", "--format", "sog", cwd=folder)
-    assert status == 0, error
+    succeeds(command_line, folder, *SHORT, "-r", 10, "-o", "run", "-w", "--format", "sog")
     assert [path.name for path in (folder / "run").glob("scene*")] == ["scene.sog"]
     again = ("distill", "run/scene.sog", "-r", 2, "-o", "run", "-w", "--steps", 3)
-    status, _, error = command_line(*again, cwd=folder)
-    assert (status, "run/scene.sog is both an input and the output" in error) == (2, True), error
+    assert "run/scene.sog is both an input and the output" in refused(command_line, folder, *again)
 
 
 @pytest.mark.parametrize("option", ["render --sheet", "clean --dry-run --preview"])

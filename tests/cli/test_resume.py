@@ -1,7 +1,5 @@
 """What commands make of a checkpoint that a stopped run left: gone on from, refused, or replaced under -w."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Callable
@@ -20,7 +18,7 @@ from g2ard.io import write_splats, write_views
 from g2ard.pipeline import Distilled
 from g2ard.policy.job import DistillJob
 from g2ard.stages.recover import checkpoint
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball
 
 LEFT = [
@@ -38,9 +36,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("command", "left"), LEFT)
-def test_a_checkpoint_is_not_thrown_away(
-    folder: Path, command_line: CommandLine, command: str, left: str
-) -> None:
+def test_checkpoints_are_kept(folder: Path, command_line: CommandLine, command: str, left: str) -> None:
     teacher = () if command.startswith("distill") else ("--teacher", "a.ply")
     ask = (*command.split(), "--views", "views.json", *teacher)
     place = folder / left
@@ -50,11 +46,9 @@ def test_a_checkpoint_is_not_thrown_away(
         ((), "left by an interrupted run; --resume continues it, -w starts over"),
         (("--resume", "-w"), f"{left}: not a checkpoint of g2ard, or a damaged one"),
     ):
-        status, _, error = command_line(*ask, *flags, "-q", cwd=folder)
-        assert (status, words in error, len(error.splitlines())) == (1, True, 1), error
+        assert words in refused(command_line, folder, *ask, *flags, "-q", status=1)
         assert place.read_bytes() == b"junk"
-    status, _, error = command_line(*ask, "-w", cwd=folder)
-    assert status == 0, error
+    succeeds(command_line, folder, *ask, "-w")
     assert not place.exists()
     assert not list(folder.glob(".*"))
 
@@ -63,12 +57,11 @@ def test_a_checkpoint_is_not_thrown_away(
 def test_what_is_said_names_the_split(folder: Path, command_line: CommandLine, command: str) -> None:
     ask = (command, "a.ply", "--steps", 2, "--views", "views.json", "--teacher", "a.ply", "-wo", "out.ply")
     for split, words in (("train", "training views "), ("test", ", test views "), ("all", ", all views ")):
-        status, _, error = command_line(*ask, "--split", split, cwd=folder)
-        assert (status, words in error) == (0, True), error
+        assert words in succeeds(command_line, folder, *ask, "--split", split).err
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
-def test_ctrl_c_says_how_to_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
+def test_an_interrupt_names_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
     common = ("overwrite", "seed", "threads", "device", "verbose", "json", "quiet", "config")
     run, place = Run("recover", dict.fromkeys(common), {}), tmp_path / "place"
     with pytest.raises(KeyboardInterrupt), stoppable(run, place, resume=False):
@@ -117,9 +110,7 @@ def test_a_file_that_is_no_checkpoint_is_named(tmp_path: Path, content: bytes) -
     assert str(caught.value).startswith(f"{path}: not a checkpoint of g2ard, or a damaged one; ")
 
 
-def test_distill_stopped_before_its_first_checkpoint_leaves_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_distill_stopped_before_a_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     common = ("overwrite", "seed", "threads", "device", "verbose", "json", "quiet", "config")
     run, output = Run("distill", dict.fromkeys(common), {}), tmp_path / "run"
     with pytest.raises(KeyboardInterrupt), work_folder(run, output, resume=False):
@@ -150,8 +141,7 @@ def test_the_total_of_a_resumed_run_holds_what_was_done_before(
 
     monkeypatch.setattr(DistillJob, "run", resumed)
     ask = ("distill", "a.ply", "-r", 2, "--steps", 2, "--size", 32, "--no-view", "-o", "run", "--json", "-")
-    status, out, error = command_line(*ask, cwd=folder)
-    assert status == 0, error
+    out, error = succeeds(command_line, folder, *ask)
     seconds = json.loads(out)["seconds"]
     assert seconds["total"] > seconds["resumed"] == 50.0
     assert f"recover 60.0 s, total {seconds['total']:.1f} s" in " ".join((out + error).split())

@@ -1,7 +1,5 @@
 """Signals and closed pipes."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -18,7 +16,7 @@ from helpers.systems import needs_signals
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
 def test_a_closed_pipe_loses_no_result(stream: str, folder: Path) -> None:
-    """As under `| head -0`: the reader is gone before anything is said."""
+    """As under `| head -0`: the reader exits before anything is written."""
     reader, writer = os.pipe()
     os.close(reader)
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, stream: writer}
@@ -45,11 +43,10 @@ def test_an_interrupt_says_what_was_kept(by: signal.Signals, status: int, folder
 
 @needs_signals
 def test_stopped_workers_leave_one_line(folder: Path) -> None:
-    """Semaphores among them, which Python would tell of when the program is gone."""
+    """Python would also report leaked semaphores after the program has ended."""
     g2ard.save(folder / "large.ply", checkered_ball(20_000))
     ask = ("simplify", "large.ply", "-r", 4, "--tile-rows", "3k", "--workers", 2, "-o", "s.ply")
     running = program(*ask, folder=folder, stderr=subprocess.PIPE)
-    assert running.stderr is not None
     while not (line := running.stderr.readline()).startswith(b"poses: "):  # workers begin to look
         assert line
     time.sleep(0.3)

@@ -1,7 +1,5 @@
 """Every list of names is the keys of what it names."""
 
-from __future__ import annotations
-
 from typing import get_args
 
 import pytest

@@ -1,7 +1,5 @@
 """`--preset paper` and `preset("paper")` mean the whole paper; anchors are those of construction."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
@@ -15,19 +13,16 @@ import g2ard
 from g2ard.config.paths import changed, listed
 from g2ard.config.presets import preset
 from g2ard.errors import InputError
-from g2ard.io import Points, read_splats, write_points, write_splats, write_views
+from g2ard.io import read_splats, write_splats, write_views
 from g2ard.pipeline import SelectConfig, distill
-from g2ard.rendering.renderer import render
-from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import write_png
-from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, drift95
 from g2ard.stages.recover.schedule import PAPER, Schedule
 from g2ard.stages.simplify import simplify
-from helpers.commands import CommandLine
-from helpers.scenes import around, checkered_ball
+from helpers.commands import CommandLine, refused, succeeds
+from helpers.photos import cloud_with_photos
+from helpers.scenes import around, checkered_ball, in_units
 
 PRIOR = checkered_ball()
 FEW = PAPER.scaled(75)  # 20 steps a round
@@ -47,8 +42,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def run(command_line: CommandLine, folder: Path, *arguments: object) -> dict[str, Any]:
-    status, out, error = command_line(*arguments, "-w", "--json", "-", cwd=folder)
-    assert status == 0, error
+    out = succeeds(command_line, folder, *arguments, "-w", "--json", "-").out
     return json.loads(out)
 
 
@@ -73,8 +67,7 @@ def test_distill_does_all_that_the_paper_says(folder: Path, command_line: Comman
 
 
 def test_rounds_without_regularisers_are_named_once(folder: Path, command_line: CommandLine) -> None:
-    status, _, error = command_line(*DISTILL, "--preset", "paper", "-wv", cwd=folder)
-    assert status == 0, error
+    error = succeeds(command_line, folder, *DISTILL, "--preset", "paper", "-wv").err
     assert error.count("never acted") == 1
     assert "never acted in round 1, round 2, round 3, round 4, the last recovery of round 4" in error
     assert "there were 20 to 75" in error
@@ -98,14 +91,8 @@ def test_what_is_said_beside_the_preset_stands(folder: Path, command_line: Comma
 
 
 def test_a_cloud_takes_the_lift_s_row(folder: Path, command_line: CommandLine) -> None:
-    colors = np.clip(0.5 + SH_C0 * PRIOR.sh0[:, 0], 0, 1).astype(np.float32)
-    write_points(folder / "cloud.ply", Points(PRIOR.means.astype(np.float64), colors))
-    views = around(12)
-    paths = tuple(folder / f"{name}.png" for name in views.names)
-    for i, path in enumerate(paths):
-        write_png(path, render(PRIOR, views[i]).image)
-    write_views(folder / "photos.json", replace(views, image_paths=paths))
-    ask = ("distill", "cloud.ply", "-r", 3, "--views", "photos.json", "-o", "run", "--steps", 8)
+    cloud_with_photos(folder, PRIOR)
+    ask = ("distill", "cloud.ply", "-r", 3, "--views", "views.json", "-o", "run", "--steps", 8)
     report = run(command_line, folder, *ask, "--preset", "paper", "--set", "lift.neighbors=8")
     regularizers = [f"recover.regularizers.{key}" for key in ("anchor", "shape", "effective_rank")]
     assert [report["settings"][path] for path in regularizers] == [1e-3, 1e-4, True]
@@ -113,9 +100,7 @@ def test_a_cloud_takes_the_lift_s_row(folder: Path, command_line: CommandLine) -
     assert report["settings"]["lift.neighbors"] == 8
 
 
-def test_recover_raises_sh_for_the_schedule_and_the_rest_for_the_preset(
-    folder: Path, command_line: CommandLine
-) -> None:
+def test_schedule_and_preset_differ_in_recover(folder: Path, command_line: CommandLine) -> None:
     write_views(folder / "w.json", around(24), weights=[1.0] * 24)
     ask = ("recover", "ball.ply", "--views", "w.json", "--teacher", "ball.ply", "-o", "o.ply", "--steps", 4)
     for option, weighted in (("--schedule", True), ("--preset", False)):
@@ -181,22 +166,12 @@ def test_the_paper_s_steps_are_kept_whatever_comes_of_them(targets: TeacherRende
     assert recover(start, targets, guarded).report.kept_start
 
 
-def scaled(scene: Splats, cameras: Cameras, unit: float) -> tuple[Splats, Cameras]:
-    """The same in another unit."""
-    viewmats = cameras.viewmats.copy()
-    viewmats[:, :3, 3] *= unit
-    size = np.float32(unit)
-    return replace(scene, means=scene.means * size, scales=scene.scales * size), replace(
-        cameras, viewmats=viewmats
-    )
-
-
 def test_the_paper_s_rates_do_not_depend_on_the_unit() -> None:
     student = simplify(PRIOR, 500, method="paper").splats
 
     def moved(unit: float, schedule: Schedule = PAPER) -> float:
-        start, cameras = scaled(student, around(), unit)
-        teacher, _ = scaled(PRIOR, around(), unit)
+        start, cameras = in_units(student, around(), unit)
+        teacher, _ = in_units(PRIOR, around(), unit)
         config = RecoverConfig(schedule=schedule, steps=60, regularizers=FREE)
         done = recover(start, TeacherRenders(teacher, cameras), config).splats
         return float(np.abs(done.means - start.means).mean()) / unit
@@ -235,28 +210,21 @@ VIEWED = ("--views", "v.json", "--teacher", "ball.ply", "-w", "--json", "-")
 def test_the_paper_s_adaptation_blends_nothing(folder: Path, command_line: CommandLine) -> None:
     ask = ("adapt", "ball.ply", "-o", "o.ply", "--steps", 2, *VIEWED)
     for paper in (("--preset", "paper"), ("--schedule", "paper")):
-        status, _, error = command_line(*ask, *paper, "--prior-views", 3, cwd=folder)
-        assert (status, "--prior-views" in error) == (2, True), error
-        status, out, error = command_line(*ask, *paper, cwd=folder)
-        assert status == 0, error
+        assert "--prior-views" in refused(command_line, folder, *ask, *paper, "--prior-views", 3)
+        out = succeeds(command_line, folder, *ask, *paper).out
         assert json.loads(out)["prior_share"] == 0
     assert g2ard.preset("paper", g2ard.AdaptConfig()).prior_views == 0
-    status, out, error = command_line(*ask, cwd=folder)
-    assert status == 0, error
+    out = succeeds(command_line, folder, *ask).out
     assert json.loads(out)["prior_share"] > 0
 
 
 @pytest.mark.parametrize("preset", ["paper", "paper-trained", "paper-lift", "paper-noisy"])
-def test_a_preset_above_the_tables_is_for_all_commands(
-    folder: Path, command_line: CommandLine, preset: str
-) -> None:
+def test_a_preset_for_all_commands(folder: Path, command_line: CommandLine, preset: str) -> None:
     (folder / "c.toml").write_text(f'preset = "{preset}"\n[recover]\nsteps = 2\n')
     config = ("-w", "--json", "-", "--config", "c.toml")
-    status, out, error = command_line(
-        "select", "ball.ply", "-k", 3, "--views", "v.json", "-o", "k.json", *config, cwd=folder
-    )
-    assert status == 0, error
+    out = succeeds(
+        command_line, folder, "select", "ball.ply", "-k", 3, "--views", "v.json", "-o", "k.json", *config
+    ).out
     assert json.loads(out)["policy"] == "directional"
-    status, out, error = command_line("simplify", "ball.ply", "-r", 9, "-o", "s.ply", *config, cwd=folder)
-    assert status == 0, error
+    out = succeeds(command_line, folder, "simplify", "ball.ply", "-r", 9, "-o", "s.ply", *config).out
     assert json.loads(out)["method"] == "paper"

@@ -1,7 +1,5 @@
 """Settings by dotted path: any config's fields, in config files and reports as on the command line."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +17,7 @@ from g2ard.pipeline import DistillConfig
 from g2ard.stages.recover.anchors import PRESETS
 from g2ard.stages.recover.schedule import PAPER
 from g2ard.stages.simplify import SimplifyConfig
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, succeeds
 from helpers.scenes import around, checkered_ball
 
 
@@ -86,7 +84,7 @@ def test_regions_are_read_as_text() -> None:
         ("outer.inner.qqqqqq=1", "expected one of outer.inner.brand_new, outer.inner.edges"),
     ],
 )
-def test_what_is_refused_of_a_setting(text: str, words: str) -> None:
+def test_invalid_settings_are_named(text: str, words: str) -> None:
     with pytest.raises(InputError, match=r"^[^\n]*$") as error:
         parsed([text], Outer())
     assert words in str(error.value)
@@ -127,7 +125,7 @@ SOME = {
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda c: c[0])
-def test_commands_take_settings_and_report_them(
+def test_commands_report_settings(
     command: tuple[object, ...], folder: Path, command_line: CommandLine
 ) -> None:
     for wrong, words in (
@@ -141,8 +139,7 @@ def test_commands_take_settings_and_report_them(
         assert words in error
         assert "--set" in error
     name, _, value = SOME[str(command[0])].partition("=")
-    status, out, error = command_line(*command, "--set", f"{name}={value}", "--json", "-", cwd=folder)
-    assert status == 0, error
+    out = succeeds(command_line, folder, *command, "--set", f"{name}={value}", "--json", "-").out
     settings = json.loads(out)["settings"]
     assert settings[name] == float(value)
     if command[0] in ("recover", "distill"):
@@ -153,8 +150,7 @@ def test_settings_in_a_config_file_and_over_it(folder: Path, command_line: Comma
     ask = ("simplify", "a.ply", "-o", "out.ply", "--config", "c.toml", "--json", "-", "-w")
     for tables in ("[simplify]\nratio = 4\n[simplify.set]\n", "ratio = 4\n[set]\n"):
         (folder / "c.toml").write_text(f"{tables}simplify.max_growth = 1.5\nneighbors = 5\n")
-        status, out, error = command_line(*ask, "--set", "neighbors=4", cwd=folder)
-        assert status == 0, error
+        out = succeeds(command_line, folder, *ask, "--set", "neighbors=4").out
         settings = json.loads(out)["settings"]
         found = [settings[f"simplify.{name}"] for name in ("max_growth", "neighbors", "retention")]
         assert found == [1.5, 4, 0.65]
@@ -172,8 +168,7 @@ def test_settings_in_a_config_file_and_over_it(folder: Path, command_line: Comma
 def test_a_setting_does_what_it_says(folder: Path, command_line: CommandLine) -> None:
     for growth in (1, 2):
         ask = ("simplify", "a.ply", "-r", 10, "-o", f"{growth}.ply", "--set", f"max_growth={growth}")
-        status, _, error = command_line(*ask, "--no-views", cwd=folder)
-        assert status == 0, error
+        succeeds(command_line, folder, *ask, "--no-views")
     small, large = (read_splats(folder / f"{growth}.ply") for growth in (1, 2))
     assert large.scales.mean() > small.scales.mean()
 
@@ -198,8 +193,7 @@ def test_a_printed_config_has_no_setting_that_is_not_known(
     assert told in error
     right = (*arguments[:-1], "max_energy=0.02")
     if arguments[0] in ("simplify", "distill"):
-        status, out, error = command_line(*right, "--print-config", cwd=folder)
-        assert status == 0, error
+        out = succeeds(command_line, folder, *right, "--print-config").out
         assert "max_energy" in out
         assert not (folder / "o").exists()
 

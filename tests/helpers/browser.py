@@ -4,8 +4,6 @@ Looked for in $G2ARD_CHROMIUM, then among what is installed (Debian's chromium, 
 tests that need one skip where there is none. It draws on the CPU (SwiftShader) and finds no other host.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import json
@@ -16,7 +14,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pytest
@@ -38,7 +36,7 @@ _SECONDS = 240
 
 
 def chromium() -> str:
-    """The browser's path; skips the test, saying why, where there is none."""
+    """Return the browser's path; skip the test if none is installed."""
     if sys.platform == "win32":
         pytest.skip("the browser is spoken to by file descriptors 3 and 4, which Windows does not pass on")
     given = os.environ.get("G2ARD_CHROMIUM")
@@ -82,7 +80,7 @@ class Browser:
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.send("Emulation.setDeviceMetricsOverride", **size)
 
-    def __enter__(self) -> Browser:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -93,7 +91,7 @@ class Browser:
         self._profile.cleanup()
 
     def send(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Call a method of the protocol; fails with what the browser says."""
+        """Call a method of the protocol; fail with the browser's error."""
         self._number += 1
         call = {"id": self._number, "method": method, "params": parameters}
         if self._session is not None:
@@ -108,17 +106,16 @@ class Browser:
             self._note(answer)
 
     def open(self, url: str) -> None:
-        """Go to a page."""
         self.send("Page.navigate", url=url)
 
     def run(self, expression: str) -> Any:
-        """The value of JavaScript, awaited; fails with the exception it throws."""
+        """Return the awaited value of a JavaScript expression; fail with the exception it throws."""
         done = self.send("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in done, (done["exceptionDetails"], self.messages)
         return done["result"].get("value")
 
     def picture(self) -> np.ndarray:
-        """(H, W, 3) uint8, what the page shows."""
+        """Return what the page shows as (H, W, 3) uint8."""
         shot = self.send("Page.captureScreenshot", format="png")["data"]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(shot))).convert("RGB"))
 

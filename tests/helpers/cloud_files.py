@@ -1,7 +1,5 @@
 """Point clouds as .ply and .las files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import laspy

@@ -1,34 +1,13 @@
 """Data sets in their published layout, with few views."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from g2ard.scene.cameras import look_at
-
-
-def photo(path: Path, size: tuple[int, int], shade: int = 90) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", size, (shade, 40, 10)).save(path)
-
+from helpers.view_files import photo, quaternion
 
 POSES = [look_at([3 * np.cos(a), 3 * np.sin(a), 1.5], [0, 0, 0]) for a in np.linspace(0, 5, 9)]
-
-
-def wxyz(R: np.ndarray) -> np.ndarray:
-    """From the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
-    K = np.zeros((4, 4))
-    for i in range(3):
-        for j in range(3):
-            K[i, j] = R[i, j] + R[j, i]
-    K[:3, :3] -= np.eye(3) * np.trace(R)
-    K[3, :3] = K[:3, 3] = [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]
-    K[3, 3] = np.trace(R)
-    x, y, z, w = np.linalg.eigh(K)[1][:, 3]
-    return np.array([w, x, y, z])
 
 
 def opengl(view: np.ndarray) -> np.ndarray:
@@ -41,7 +20,7 @@ def mip_nerf_360(root: Path) -> None:
     (model / "cameras.txt").write_text("# x\n1 PINHOLE 400 300 380 381 201 149\n")
     rows = []
     for i, view in enumerate(POSES):
-        q, t = wxyz(view[:3, :3]), view[:3, 3]
+        q, t = quaternion(view[:3, :3]), view[:3, 3]
         rows.append(" ".join(map(str, (i + 1, *q, *t, 1, f"DSC{i:04d}.JPG"))) + "\n\n")
         for folder, size in (("images", (400, 300)), ("images_2", (200, 150)), ("images_4", (100, 75))):
             photo(root / folder / f"DSC{i:04d}.JPG", size)
@@ -54,7 +33,7 @@ def cambridge(root: Path, size: tuple[int, int] = (192, 108)) -> None:
     for i, view in enumerate(POSES):
         split = "test" if i >= 6 else "train"
         name = f"seq{2 if split == 'test' else 1}/frame{i:05d}"
-        q, c = wxyz(view[:3, :3]), -view[:3, :3].T @ view[:3, 3]
+        q, c = quaternion(view[:3, :3]), -view[:3, :3].T @ view[:3, 3]
         lines[split].append(" ".join(f"{v:.9f}" for v in (*c, *q)).join((f"{name}.png ", "")))
         if i != 4:
             numbers = " ".join(f"{v:.9f}" for v in (1670.0 + i, *q, *c))

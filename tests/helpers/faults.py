@@ -1,9 +1,11 @@
 """Checks of what an `InputError` names."""
 
-from __future__ import annotations
-
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+import pytest
 
 from g2ard.errors import InputError
 
@@ -19,3 +21,11 @@ def check_fault(error: InputError, path: Path, fault: Fault) -> None:
         assert re.search(fault, str(error)), error
     else:
         assert (error.property, error.index) == fault, error
+
+
+@contextmanager
+def faulty(path: Path, fault: Fault) -> Iterator[None]:
+    """Expect an `InputError` that names a file, and in it a property and an index."""
+    with pytest.raises(InputError) as caught:
+        yield
+    check_fault(caught.value, path, fault)

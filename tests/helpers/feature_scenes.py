@@ -1,7 +1,5 @@
 """A scene with enough texture for feature matching, and photos of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +16,7 @@ CONFIG = RegisterConfig(size=400, align_size=200, matcher="sift")
 
 
 def _blotched(count: int = 6000, blotches: int = 200, seed: int = 5) -> Splats:
-    """A ball none of whose places looks like another: squares of one size match one another."""
+    """Return a ball of which no two places look alike."""
     ball = checkered_ball(count)
     rng = np.random.default_rng(seed)
     middles = rng.normal(size=(blotches, 3))

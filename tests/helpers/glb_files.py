@@ -1,7 +1,5 @@
 """The parts of a .glb file."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scenes streamed into tiles, for tests of ingestion."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +40,7 @@ def halos_of(store: TileStore) -> list[np.ndarray]:
 
 
 def as_set(rows: np.ndarray) -> np.ndarray:
-    """The rows in an order of their own."""
+    """Return the rows in a canonical order."""
     return np.sort(np.ascontiguousarray(rows).view(f"V{4 * rows.shape[1]}").ravel())
 
 

@@ -1,7 +1,5 @@
 """Scenes for levels of detail, and the files written for them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Random LPIPS weights under their published names."""
 
-from __future__ import annotations
-
 import torch
 
 ALEX = ((0, 3, 4, 11, 4, 2), (3, 4, 5, 5, 1, 2), (6, 5, 6, 3, 1, 1), (8, 6, 4, 3, 1, 1), (10, 4, 4, 3, 1, 1))

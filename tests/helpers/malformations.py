@@ -4,8 +4,6 @@ JSON: every property absent or of another kind. Text: every word and line wrong,
 every word of the head at an extreme. All: cut short.
 """
 
-from __future__ import annotations
-
 import gzip
 import json
 import re
@@ -26,7 +24,7 @@ _CUTS = 40
 
 
 def malformed(content: bytes) -> Iterator[tuple[str, bytes]]:
-    """What is wrong, and the file, for a valid file of any format; behind gzip where the file is."""
+    """Yield malformed versions of a valid file of any format, each with a description."""
     if content[:2] == b"\x1f\x8b":
         for what, data in malformed(gzip.decompress(content)):
             yield f"gzip of {what}", gzip.compress(data, 1, mtime=0)
@@ -63,7 +61,7 @@ def _json(content: bytes) -> Iterator[tuple[str, bytes]]:
 
 
 def _paths(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Where every property and the first entries of every list are."""
+    """Yield the paths of every property and of the first entries of every list."""
     inner = value.items() if isinstance(value, dict) else enumerate(value[:_PLACES])
     for key, entry in list(inner):
         yield (*at, key)
@@ -72,7 +70,7 @@ def _paths(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 
 def _changed(document: Any, path: tuple[Any, ...], *value: Any) -> Any:
-    """A copy with another value at a path, or with none there."""
+    """Return a copy with another value at a path, or without that path."""
     copy = json.loads(json.dumps(document))
     holder = copy
     for key in path[:-1]:
@@ -105,7 +103,7 @@ def _binary(content: bytes) -> Iterator[tuple[str, bytes]]:
 
 
 def _cut(content: bytes) -> Iterator[tuple[str, bytes]]:
-    """Cut at even steps, and at each of the first and the last bytes."""
+    """Cut at even steps, and after each of the first and the last bytes."""
     steps = {len(content) * i // _CUTS for i in range(_CUTS)}
     for size in sorted(steps | set(range(12)) | set(range(len(content) - 12, len(content)))):
         if 0 <= size < len(content):

@@ -1,7 +1,5 @@
 """Compressed .ply and .spz files, packed by plain loops."""
 
-from __future__ import annotations
-
 import gzip
 import importlib
 import math

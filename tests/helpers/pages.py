@@ -1,7 +1,5 @@
 """Viewer pages opened in a browser."""
 
-from __future__ import annotations
-
 import base64
 import time
 from collections.abc import Callable
@@ -47,12 +45,12 @@ def drawn(browser: Browser, accept: Callable[[np.ndarray], bool], index: int = 0
 
 
 def like(expected: np.ndarray, decibels: float) -> Callable[[np.ndarray], bool]:
-    """Whether a picture has more than so many decibels against an expected one."""
+    """Return a check that a picture is within some decibels of an expected one."""
     return lambda picture: psnr(picture, expected) > decibels
 
 
 def assert_shows(browser: Browser, expected: np.ndarray, decibels: float, index: int = 0) -> np.ndarray:
-    """What a viewer draws, which must be like an expected picture."""
+    """Check that a viewer draws an expected picture; return what it draws."""
     picture = drawn(browser, like(expected, decibels), index)
     assert psnr(picture, expected) > decibels
     return picture

@@ -4,8 +4,6 @@ Looked for in $G2ARD_NODE_MODULES, where `npm i node@22 @playcanvas/splat-transf
 gltf-validator` has been run; tests that need one skip where it is absent.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -53,18 +51,18 @@ def _run(*arguments: str | Path) -> str:
 
 
 def splat_transform(*arguments: str | Path) -> None:
-    """Run splat-transform; fails with what it said."""
+    """Run splat-transform; fail with its output."""
     _run(_package("@playcanvas", "splat-transform", "bin", "cli.mjs"), "-q", "-w", *arguments)
 
 
 def adobe_spz(path: Path) -> dict[str, np.ndarray]:
-    """What Adobe's and Niantic's own library reads, in the axes of a .ply: flat arrays, rotations x y z w."""
+    """Read an .spz with Adobe's library: flat arrays in the axes of a .ply, rotations x y z w."""
     module = _package("@adobe", "spz", "dist", "spz.js")
     out = _run("--input-type=module", "-e", _ADOBE, "-", module, path)
     return {key: np.array(values) for key, values in json.loads(out.splitlines()[-1]).items()}
 
 
 def gltf_report(path: Path) -> dict[str, Any]:
-    """What Khronos' glTF validator says of a file."""
+    """Return the report of Khronos' glTF validator."""
     modules = _package("gltf-validator").parent
     return json.loads(_run("--input-type=module", "-e", _VALIDATOR, "-", modules, path))

@@ -1,8 +1,6 @@
 """Photos of a small scene in a folder."""
 
-from __future__ import annotations
-
-import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,22 +10,36 @@ from g2ard.io import Points, write_points
 from g2ard.scene.images import write_png
 from g2ard.scene.splats import SH_C0
 from helpers.scenes import around, checkered_ball
-from helpers.view_files import transforms
+from helpers.view_files import edit, transforms
 
 BALL = checkered_ball(1200)
 
 
-def photos_of(folder: Path, points: bool = False) -> None:
-    """Photos of the ball with a transforms.json, and COLMAP-like points beside them if asked for."""
-    views = around(24)
+def cloud_of(path: Path, scene: g2ard.Splats) -> None:
+    """Write the means of a scene as a coloured cloud."""
+    colors = np.clip(0.5 + SH_C0 * scene.sh0[:, 0], 0, 1).astype(np.float32)
+    write_points(path, Points(scene.means.astype(np.float64), colors))
+
+
+def cloud_with_photos(folder: Path, scene: g2ard.Splats) -> None:
+    """Write cloud.ply of a scene, and twelve photos of it that views.json lists."""
+    cloud_of(folder / "cloud.ply", scene)
+    views = around(12)
+    paths = tuple(folder / f"{name}.png" for name in views.names)
+    for view, path in zip(views, paths, strict=True):
+        write_png(path, g2ard.render(scene, view).image)
+    g2ard.save_views(folder / "views.json", replace(views, image_paths=paths))
+
+
+def photos_of(folder: Path, points: bool = False, scene: g2ard.Splats = BALL, count: int = 24) -> None:
+    """Write photos of a scene with a transforms.json, and sparse points beside them if requested."""
+    views = around(count)
     (folder / "images").mkdir(parents=True)
     K = views.Ks[0]
     size = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": 64, "h": 48}
     transforms(folder / "transforms.json", list(views.viewmats), **size)
-    for i in range(24):
-        write_png(folder / "images" / f"{i:03d}.png", g2ard.render(BALL, views[i]).image)
+    for i in range(count):
+        write_png(folder / "images" / f"{i:03d}.png", g2ard.render(scene, views[i]).image)
     if points:
-        colors = np.clip(0.5 + SH_C0 * BALL.sh0[:, 0], 0, 1).astype(np.float32)
-        write_points(folder / "sparse.ply", Points(BALL.means.astype(np.float64), colors))
-        listed = json.loads((folder / "transforms.json").read_text())
-        (folder / "transforms.json").write_text(json.dumps({**listed, "ply_file_path": "sparse.ply"}))
+        cloud_of(folder / "sparse.ply", scene)
+        edit(folder / "transforms.json", lambda content: content.update(ply_file_path="sparse.ply"))

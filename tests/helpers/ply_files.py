@@ -1,7 +1,5 @@
 """Standard 3DGS .ply files, written column by column."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

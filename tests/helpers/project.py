@@ -1,7 +1,12 @@
-"""Where the repository is."""
+"""The repository's folder, and processes that run its sources."""
 
-from __future__ import annotations
-
+import os
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+
+
+def environment(**more: str) -> dict[str, str]:
+    """Return the variables of a process that runs these sources."""
+    paths = filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), **more}

@@ -1,6 +1,6 @@
 """Random scenes and settings for the rasteriser."""
 
-from __future__ import annotations
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
+from reference import raster as reference
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
@@ -62,3 +63,29 @@ VARIANTS = {
     "inria-antialiased": RasterSettings(convention="inria", antialiased=True),
     "clip-0.999": RasterSettings(alpha_max=0.999, near=0.5),
 }
+
+
+def oracle(
+    p: Params,
+    cameras: Cameras,
+    settings: RasterSettings,
+    background: Any,
+    *,
+    grad: bool = False,
+    pose: torch.Tensor | None = None,
+) -> tuple[reference.Oracle, list[torch.Tensor]]:
+    """Return the naive render of a scene from its first view, or from another pose, and the tensors."""
+    tensors = [torch.from_numpy(p[k].astype(np.float64)).requires_grad_(grad) for k in NAMES]
+    out = reference.render(
+        *tensors,
+        viewmat=torch.from_numpy(cameras.viewmats[0]) if pose is None else pose,
+        K=torch.from_numpy(cameras.Ks[0]),
+        width=int(cameras.widths[0]),
+        height=int(cameras.heights[0]),
+        near=settings.near_of(0),
+        background=background,
+        antialiased=settings.antialiased,
+        inria=settings.convention == "inria",
+        alpha_max=settings.alpha_max,
+    )
+    return out, tensors

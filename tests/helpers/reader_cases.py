@@ -1,7 +1,5 @@
 """A small valid file of every kind that g2ard reads, for fuzzing."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Callable
@@ -44,26 +42,26 @@ def table(folder: Path, name: str, text: bool = False) -> Path:
 
 
 def run_file(folder: Path, name: str) -> Path:
-    """A file of a nerfstudio run, or its data."""
+    """Return a file of a nerfstudio run, or its data."""
     data, run = data_of(folder), run_of(folder)
     return data if name == "transforms.json" else run / name
 
 
 def landmarks(folder: Path, name: str) -> Path:
-    """A file of a scene of Cambridge Landmarks."""
+    """Return a file of a scene of Cambridge Landmarks."""
     cambridge(folder / "college")
     return folder / "college" / name
 
 
 def chunks(folder: Path) -> Path:
-    """The meta.json of a SOG folder."""
+    """Return the meta.json of a SOG folder."""
     for name, content in parts().items():
         (folder / name).write_bytes(content)
     return folder / "meta.json"
 
 
 def levels(folder: Path) -> Path:
-    """The lod-meta.json of a folder of SOG chunks."""
+    """Return the lod-meta.json of a folder of SOG chunks."""
     (folder / "0_0").mkdir()
     chunks(folder / "0_0")
     tree = {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 10}}}]}

@@ -1,7 +1,5 @@
 """Real scenes for tests that can use them: $G2ARD_DATA, else ../shared/data beside the repository."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -13,7 +11,7 @@ ROOT = Path(os.environ.get("G2ARD_DATA", project.ROOT.parent / "shared" / "data"
 
 
 def real(*parts: str) -> Path:
-    """The path of a real file or folder; skips the test, saying why, where it is absent."""
+    """Return the path of a real file or folder; skip the test if it is missing."""
     path = ROOT.joinpath(*parts)
     if not path.exists():
         pytest.skip(f"no real data at {path} (set G2ARD_DATA)")

@@ -1,7 +1,5 @@
 """A scene, poses and images for tests of direct alignment."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from g2ard.scene.cameras import Camera, Cameras
@@ -24,7 +22,7 @@ def pyramid_of(camera: Camera, image: np.ndarray, config: RegisterConfig) -> lis
 
 
 def off(viewmat: np.ndarray, distance: float, degrees: float, seed: int) -> np.ndarray:
-    """A pose whose centre is `distance` and whose rotation `degrees` away."""
+    """Return a pose whose centre is `distance` away and whose rotation differs by `degrees`."""
     rng = np.random.default_rng(seed)
     v, w = rng.normal(size=(2, 3))
     turn = rotation_of(np.radians(degrees) * w / np.linalg.norm(w))

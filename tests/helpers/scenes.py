@@ -1,7 +1,5 @@
 """A small scene and views of it, for tests of whole stages."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -38,7 +36,7 @@ def checkered_ball(n: int = 3000, seed: int = 0) -> Splats:
 
 
 def under_a_sky(scene: Splats, count: int = 300, seed: int = 0) -> Splats:
-    """The scene within `count` faint layers, each wider than the scene is and next to nothing thick."""
+    """Surround a scene with `count` faint layers, each wider than the scene and almost flat."""
     rng = np.random.default_rng(seed)
     towards = rng.normal(size=(count, 3))
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
@@ -55,7 +53,7 @@ def under_a_sky(scene: Splats, count: int = 300, seed: int = 0) -> Splats:
 
 
 def around(count: int = 16, size: tuple[int, int] = (64, 48), distance: float = 3.0) -> Cameras:
-    """Views on a Fibonacci sphere, facing the middle."""
+    """Views on a Fibonacci sphere that face its centre."""
     i = np.arange(count) + 0.5
     z = 1 - 2 * i / count
     azimuth = np.pi * (1 + 5**0.5) * i
@@ -69,3 +67,12 @@ def around(count: int = 16, size: tuple[int, int] = (64, 48), distance: float = 
         [size] * count,
         [f"view_{k:03d}" for k in range(count)],
     )
+
+
+def in_units(scene: Splats, cameras: Cameras, unit: float) -> tuple[Splats, Cameras]:
+    """Return a scene and its views with all lengths multiplied."""
+    viewmats = cameras.viewmats.copy()
+    viewmats[:, :3, 3] *= unit
+    factor = scene.means.dtype.type(unit)
+    small = replace(scene, means=scene.means * factor, scales=scene.scales * np.float32(unit))
+    return small, replace(cameras, viewmats=viewmats)

@@ -1,7 +1,5 @@
 """Similarity transforms, and a scene whose look depends on the direction."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,10 +1,9 @@
 """Scenes, views and checks that the tests of simplification share."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import Splats, unit_quats
+from helpers.scenes import ARRAYS
 
 
 def scene(n=2000, rest=3, seed=0, dtype=np.float32):
@@ -24,7 +23,7 @@ def scene(n=2000, rest=3, seed=0, dtype=np.float32):
 
 
 def assert_sound(result, count, budget):
-    """What every result must be, on any input."""
+    """Check what holds for every result, whatever the input."""
     out = result.splats
     assert len(out) == budget
     assert np.isfinite(out.logit_opacities).all()
@@ -39,7 +38,7 @@ def assert_sound(result, count, budget):
 
 
 class Views:
-    """What a caller's views see, as `g2ard.rendering.renderer.visibility` returns it."""
+    """Visibility with given values, as `g2ard.rendering.visibility` returns it."""
 
     def __init__(self, weight, pixel_size):
         self.weight, self.pixel_size = np.asarray(weight), np.asarray(pixel_size)
@@ -61,5 +60,13 @@ def opaque_wall():
 
 
 def all_alike(splats):
-    """Views that see every Gaussian alike."""
+    """Visibility from views that see every Gaussian alike."""
     return Views(np.ones(len(splats)), np.full(len(splats), 0.01))
+
+
+def assert_kept(prior, row, out, at):
+    """Check that a row that merged with no other is unchanged, except that its quaternion has length 1."""
+    for name in ARRAYS:
+        before = getattr(prior, name)[row]
+        before = before if name != "quats" else unit_quats(before[None])[0]
+        np.testing.assert_array_equal(getattr(out, name)[at], before, err_msg=name)

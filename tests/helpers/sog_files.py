@@ -1,7 +1,5 @@
 """SOG folders, built image by image."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

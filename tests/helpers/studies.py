@@ -1,7 +1,5 @@
 """Small studies and checks of their report page."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -40,7 +38,7 @@ def study(folder: Path, text: str = STUDY) -> Path:
 
 
 def check_page(html: str) -> None:
-    """Parses, and asks nothing of a network."""
+    """Check that a page parses and loads nothing from a network."""
 
     class Parser(HTMLParser):
         def __init__(self) -> None:
@@ -65,7 +63,7 @@ def check_page(html: str) -> None:
 
 
 def pictured(folder: Path, which: tuple[int, ...] = (0, 2)):
-    """Four views, of which some have a photo: of one colour, so that they are told from renders."""
+    """Four views; some have a photo of one colour, which tells it apart from a render."""
     views = around(4)
     paths = [folder / f"{name}.png" if i in which else None for i, name in enumerate(views.names)]
     for path in paths:

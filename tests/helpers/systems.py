@@ -1,7 +1,5 @@
 """What tests need of the system, as marks that say what is missing."""
 
-from __future__ import annotations
-
 import os
 import sys
 import tempfile
@@ -47,7 +45,7 @@ needs_links = pytest.mark.skipif(
 
 
 def is_worker(pid: int) -> bool:
-    """Whether a process works on tiles, by what /proc tells; not where it has ended."""
+    """Return whether a running process works on tiles, according to /proc."""
     with suppress(OSError):
         return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
     return False

@@ -1,7 +1,5 @@
 """Scenes and views for tests of tiles."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cameras in the formats of INRIA's trainer, nerfstudio and gsplat."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -17,7 +15,7 @@ POSES = orbit(10)
 
 
 def inria(path: Path, viewmats: list[np.ndarray] = POSES, **extra: Any) -> Path:
-    """As 3DGS writes it: test cameras first, ids in that order, the rotation as rows of world_from_camera."""
+    """As 3DGS writes it: test cameras first, ids in that order, rotations as rows of world_from_camera."""
     order = [*range(0, len(viewmats), 8), *(i for i in range(len(viewmats)) if i % 8)]
     cameras = []
     for number, i in enumerate(order):

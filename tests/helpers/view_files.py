@@ -1,7 +1,5 @@
 """Views as other programs and g2ard itself write them, for the tests of their readers."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct
@@ -15,9 +13,9 @@ from PIL import Image
 from g2ard.scene.cameras import Cameras, look_at
 
 
-def photo(path: Path, size: tuple[int, int] = (8, 6)) -> Path:
+def photo(path: Path, size: tuple[int, int] = (8, 6), red: int = 0) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", size).save(path)
+    Image.new("RGB", size, (red, 0, 0)).save(path)
     return path
 
 

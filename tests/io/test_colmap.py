@@ -1,7 +1,5 @@
 """COLMAP's models as views and as points."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path
@@ -11,7 +9,7 @@ import pytest
 
 from g2ard.errors import DAMAGED, InputError
 from g2ard.io import kind, read_points, read_views
-from helpers.faults import Fault, check_fault
+from helpers.faults import Fault, check_fault, faulty
 from helpers.realdata import real
 from helpers.view_files import MODELS, colmap, orbit, photo
 
@@ -58,16 +56,6 @@ def test_colmap_photos_elsewhere(tmp_path: Path) -> None:
         read_views(folder, images=tmp_path / "gone")
 
 
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-@pytest.mark.parametrize("keep", [4, 30, -10])
-def test_truncated_colmap(tmp_path: Path, name: str, keep: int) -> None:
-    folder = colmap(tmp_path / "project", orbit(3), text=False)
-    path = folder / "sparse" / "0" / name
-    path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(InputError, match=rf"{name}: .*(truncated|is cut off)"):
-        (read_points if "points" in name else read_views)(folder)
-
-
 @pytest.mark.parametrize(
     ("name", "keep", "fault"),
     [
@@ -80,7 +68,7 @@ def test_truncated_colmap(tmp_path: Path, name: str, keep: int) -> None:
         ("points3D.bin", 109, ("B", 1)),
     ],
 )
-def test_the_column_that_is_cut_is_named(tmp_path: Path, name: str, keep: int, fault: Fault) -> None:
+def test_a_cut_column_is_named(tmp_path: Path, name: str, keep: int, fault: Fault) -> None:
     folder = colmap(tmp_path / "project", orbit(3), text=False)
     path = folder / "sparse" / "0" / name
     path.write_bytes(path.read_bytes()[:keep])
@@ -105,7 +93,7 @@ def test_a_binary_value_that_is_not_finite_is_named(tmp_path: Path, name: str, a
     check_fault(caught.value, path, fault)
 
 
-def test_fisheye_is_refused(tmp_path: Path) -> None:
+def test_fisheye_and_absent_cameras_are_rejected(tmp_path: Path) -> None:
     folder = colmap(tmp_path / "project", orbit(2), text=True)
     cameras = folder / "sparse" / "0" / "cameras.txt"
     cameras.write_text("7 OPENCV_FISHEYE 8 6 500 500 4 3 0 0 0 0\n")
@@ -114,51 +102,34 @@ def test_fisheye_is_refused(tmp_path: Path) -> None:
     cameras.write_text("9 PINHOLE 8 6 500 500 4 3\n")
     with pytest.raises(InputError, match="has the unknown camera 7"):
         read_views(folder)
-    cameras.write_text("7 PINHOLE 8 six 500 500 4 3\n")
-    with pytest.raises(InputError) as caught:
-        read_views(folder)
-    check_fault(caught.value, cameras, ("HEIGHT", 0))
-    for word in ("1_0", "٣"):
-        cameras.write_text(f"7 PINHOLE 8 {word} 500 500 4 3\n", encoding="utf-8")
-        with pytest.raises(InputError) as caught:
-            read_views(folder)
-        check_fault(caught.value, cameras, ("HEIGHT", 0))
-    cameras.write_text("7 PINHOLE 8 6 500 x 4 3\n")
-    with pytest.raises(InputError) as caught:
-        read_views(folder)
-    check_fault(caught.value, cameras, ("PARAMS[1]", 0))
-    cameras.write_text("7 PINHOLE 8\n")
-    with pytest.raises(InputError) as caught:
-        read_views(folder)
-    check_fault(caught.value, cameras, ("HEIGHT", 0))
 
 
-def test_a_bad_row_of_a_text_table_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "text", "fault"),
+    [
+        ("cameras", "7 PINHOLE 8 six 500 500 4 3\n", ("HEIGHT", 0)),
+        ("cameras", "7 PINHOLE 8 1_0 500 500 4 3\n", ("HEIGHT", 0)),
+        ("cameras", "7 PINHOLE 8 ٣ 500 500 4 3\n", ("HEIGHT", 0)),
+        ("cameras", "7 PINHOLE 8 6 500 x 4 3\n", ("PARAMS[1]", 0)),
+        ("cameras", "7 PINHOLE 8\n", ("HEIGHT", 0)),
+        ("images", "1 1 0 0 0 0 0 4 7 a.png\n\n2 1 0 0 0 0 deep 4 7 b.png\n\n", ("TY", 1)),
+        ("images", "1 1 0 0 0 0 0 inf 7 a.png\n\n", ("TZ", 0)),
+        ("images", "1 1 0 0 0 0 0 4 7\n\n", ("NAME", 0)),
+    ],
+)
+def test_a_bad_column_of_a_text_table_is_named(tmp_path: Path, name: str, text: str, fault: Fault) -> None:
     folder = colmap(tmp_path / "project", orbit(2), text=True)
-    images = folder / "sparse" / "0" / "images.txt"
-    images.write_text("1 1 0 0 0 0 0 4 7 a.png\n\n2 1 0 0 0 0 deep 4 7 b.png\n\n")
-    with pytest.raises(InputError) as caught:
+    path = folder / "sparse" / "0" / f"{name}.txt"
+    path.write_text(text, encoding="utf-8")
+    with faulty(path, fault):
         read_views(folder)
-    check_fault(caught.value, images, ("TY", 1))
-    images.write_text("1 1 0 0 0 0 0 inf 7 a.png\n\n")
-    with pytest.raises(InputError) as caught:
-        read_views(folder)
-    check_fault(caught.value, images, ("TZ", 0))
-    images.write_text("1 1 0 0 0 0 0 4 7\n\n")
-    with pytest.raises(InputError) as caught:
-        read_views(folder)
-    check_fault(caught.value, images, ("NAME", 0))
-    points = folder / "sparse" / "0" / "points3D.txt"
-    points.write_text("1 0 0 0 9 9 9 0.1\n2 0 0 0 9 nine 9 0.1\n")
-    with pytest.raises(InputError) as caught:
-        read_points(points)
-    check_fault(caught.value, points, ("G", 1))
 
 
 @pytest.mark.parametrize(
     ("row", "column"),
     [
         ("2 0 0 0 -1 9 9 0.1", "R"),
+        ("2 0 0 0 9 nine 9 0.1", "G"),
         ("2 0 0 0 9 256 9 0.1", "G"),
         ("2 0 0 0 9 9 nan 0.1", "B"),
         ("2 0 0 0 9 9 1e308 0.1", "B"),
@@ -170,9 +141,8 @@ def test_a_bad_row_of_a_text_table_is_named(tmp_path: Path) -> None:
 def test_numbers_of_points3d_text(tmp_path: Path, row: str, column: str) -> None:
     points = tmp_path / "points3D.txt"
     points.write_text(f"1 0 0 0 0 255 9 0.1\n{row}\n", encoding="utf-8")
-    with pytest.raises(InputError) as caught:
+    with faulty(points, (column, 1)):
         read_points(points)
-    check_fault(caught.value, points, (column, 1))
     points.write_text("1 nan 0 0 0 255 9 0.1\n2 0 0 0 0 255 9 0.1\n")
     assert read_points(points).colors.tolist() == [[0, 1, np.float32(9 / 255)]]
 

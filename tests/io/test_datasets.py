@@ -1,7 +1,5 @@
 """Views of public data sets, on small files of their true form."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -11,7 +9,8 @@ import pytest
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.scene.images import load_image
-from helpers.dataset_files import POSES, cambridge, mip_nerf_360, opengl, photo
+from helpers.dataset_files import POSES, cambridge, mip_nerf_360, opengl
+from helpers.view_files import photo
 
 
 def test_matrix_citys_pose_folder_states_its_splits(tmp_path: Path) -> None:

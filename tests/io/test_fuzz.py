@@ -1,7 +1,5 @@
 """No damaged file ends in a traceback: every reader answers with its data or with one line of InputError."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -14,7 +12,7 @@ from helpers.reader_cases import MAKERS, READ
 
 
 def attempt(path: Path) -> str | None:
-    """Read a file; the error line, if there is one."""
+    """Read a file; return the error line, if any."""
     try:
         {"splats": read_scene, "points": read_cloud, "views": read_view_set}[kind(path)](path)
     except InputError as error:

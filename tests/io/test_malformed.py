@@ -1,7 +1,5 @@
 """Over fifty malformed files for each reader: each is read as data that make sense, or ends in one line."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -36,7 +34,7 @@ NAMED = ["transforms", "cameras.json", "views", "ns-export", "meta.json", "lod-m
 
 @pytest.mark.parametrize("what", NAMED)
 def test_a_property_of_another_kind_is_named(tmp_path: Path, what: str) -> None:
-    """Where a property becomes the word x, the line has its name, or its holder's, or the absent x's."""
+    """If a property becomes the word x, the error names the property, its holder or x."""
     path = MAKERS[what](tmp_path)
     for how, data in malformed(path.read_bytes()):
         name, is_word, _ = how.partition(" is 'x'")

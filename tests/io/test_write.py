@@ -1,7 +1,5 @@
 """Packed formats as written: read back within each attribute's quantum, by us and by other readers."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
@@ -22,12 +20,14 @@ from g2ard.scene.transform import transform
 from helpers.glb_files import glb_parts
 from helpers.peers import adobe_spz, gltf_report, splat_transform
 from helpers.realdata import real
+from helpers.scenes import assert_same_bits
+from helpers.threads import on_threads
 
 FORMATS = ("sog", "spz", "glb", "compressed.ply", "splat", "ply", "folder/meta.json")
 
 
 def scene(count: int = 700, degree: int = 2, seed: int = 0) -> Splats:
-    """Random attributes within what every format holds; quaternions of any sign and length."""
+    """Random attributes in the range of every format; quaternions of any sign and length."""
     rng = np.random.default_rng(seed)
     return Splats.create(
         rng.normal(0, 3, (count, 3)).astype(np.float32),
@@ -50,7 +50,7 @@ def in_order(splats: Splats) -> Splats:
 
 
 def turned(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N,) the largest difference of a component of two unit quaternions, up to their sign."""
+    """Return the largest difference of a component of two unit quaternions, up to their sign."""
     a, b = unit_quats(a), unit_quats(b)
     return np.abs(a - b * np.sign((a * b).sum(1, keepdims=True))).max(1)
 
@@ -60,18 +60,13 @@ def turned(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_equal_scenes_give_equal_bytes_on_any_threads(tmp_path: Path, name: str) -> None:
-    found = []
-    try:
-        for threads in (1, 2, 8):
-            _core.set_num_threads(threads)
-            folder = tmp_path / str(threads)
-            folder.mkdir()
-            path = saved(folder, name, scene(3000))
-            files = sorted(path.parent.iterdir()) if name.endswith("meta.json") else [path]
-            found.append([file.read_bytes() for file in files])
-    finally:
-        _core.set_num_threads(0)
-    assert found[0] == found[1] == found[2]
+    def written() -> list[bytes]:
+        path = saved(tmp_path, name, scene(3000), overwrite=True)
+        files = sorted(path.parent.iterdir()) if name.endswith("meta.json") else [path]
+        return [file.read_bytes() for file in files]
+
+    first, *others = on_threads(written)
+    assert others == [first] * 2
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -184,8 +179,7 @@ def test_spz_version_3_is_the_default_and_holds_what_version_4_does(tmp_path: Pa
     truth = scene(700, 3)
     three, four = saved(tmp_path, "spz", truth), saved(tmp_path, "4.spz", truth, spz_version=4)
     assert three.read_bytes()[:2] == b"\x1f\x8b"
-    for name in ("means", "quats", "scales", "logit_opacities", "sh0", "shN"):
-        np.testing.assert_array_equal(getattr(read_splats(three), name), getattr(read_splats(four), name))
+    assert_same_bits(read_splats(three), read_splats(four))
 
 
 def test_spz_bits_follow_the_extent(tmp_path: Path) -> None:
@@ -364,9 +358,8 @@ def covariances(splats: Splats) -> np.ndarray:
 
 
 def about_x(splats: Splats) -> Splats:
-    """Half a turn about x, which is how splat-transform 3.7 reads .spz: as it is stored, axes and all."""
-    turn = np.diag([1.0, -1, -1, 1])
-    return transform(splats, turn)
+    """Turn by 180° about x: splat-transform 3.7 reads .spz in the axes that it is stored in."""
+    return transform(splats, np.diag([1.0, -1, -1, 1]))
 
 
 def agree(ours: Splats, theirs: Splats, *, shape: float = 2e-3) -> None:
@@ -418,7 +411,7 @@ def test_khronos_validator_finds_no_error(tmp_path: Path) -> None:
 
 
 def test_a_real_scene_keeps_its_values(tmp_path: Path) -> None:
-    """What comes from a .compressed.ply: infinite logits, strays, thin scales."""
+    """A .compressed.ply holds infinite logits, outliers and thin scales."""
     truth = read_splats(real("format_samples", "biker.compressed.ply"))
     found = read_scene(saved(tmp_path, "sog", truth)).splats
     order = in_order(truth)

@@ -13,7 +13,8 @@ from g2ard.levels import Cut, Leaf, Node, cut, leaf_errors, save_levels
 from g2ard.policy.levels import lod
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import rotation_matrices
-from helpers.level_files import leaves_of, scattered
+from helpers.commands import refused, succeeds
+from helpers.level_files import files_of, leaves_of, scattered
 from helpers.scenes import checkered_ball
 
 
@@ -115,19 +116,8 @@ def test_files_of_an_earlier_call_go_and_others_stay(tmp_path: Path) -> None:
         file.write_text("{}")
     save_levels(tmp_path / "out", [scattered(100)], overwrite=True)
     save_levels(tmp_path / "clean", [scattered(100)])
-    files = {
-        str(file.relative_to(folder))
-        for folder in (tmp_path / "out", tmp_path / "clean")
-        for file in folder.rglob("*")
-        if file.is_file() and file not in own
-    }
-    clean = {
-        str(file.relative_to(tmp_path / "clean"))
-        for file in (tmp_path / "clean").rglob("*")
-        if file.is_file()
-    }
-    assert files == clean
-    assert all(file.exists() for file in own)
+    kept = {str(file.relative_to(tmp_path / "out")) for file in own}
+    assert set(files_of(tmp_path / "out")) == kept | set(files_of(tmp_path / "clean"))
     assert {folder.name for folder in (tmp_path / "out").iterdir()} == {
         *("lod-meta.json", "notes.txt", "0_0", "0_1", "0_9")
     }
@@ -137,11 +127,10 @@ def test_equal_levels_give_equal_bytes(tmp_path: Path) -> None:
     levels = [scattered(300), scattered(90, 1)]
     for name in ("a", "b"):
         save_levels(tmp_path / name, levels, cut=Cut(most=100))
-    for file in (tmp_path / "a").rglob("*.*"):
-        assert file.read_bytes() == (tmp_path / "b" / file.relative_to(tmp_path / "a")).read_bytes()
+    assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
 
 
-def test_a_stopped_lod_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+def test_an_interrupted_lod_resumes_to_the_same_bits(tmp_path: Path) -> None:
     ball = checkered_ball(1200)
     options = {"ratios": (1, 3, 9), "steps": 6, "size": 64}
     whole = lod(ball, **options)
@@ -169,26 +158,25 @@ def test_ratios_rise(ratios: tuple[float, ...]) -> None:
 def test_the_command(tmp_path: Path, command_line) -> None:
     io.write_splats(tmp_path / "ball.ply", checkered_ball(800))
     given = ("lod", "ball.ply", "-o", "deep/out", "-r", "1,4,8", "--merge-only", "--size", "48")
-    status, _, said = command_line(*given, "--json", "out.json", cwd=tmp_path)
-    assert status == 0, said
+    said = succeeds(command_line, tmp_path, *given, "--json", "out.json").err
     told = json.loads((tmp_path / "out.json").read_text())
     assert [level["count"] for level in told["levels"]] == [800, 200, 100]
     assert "level 2: 100 Gaussians" in said
     assert len(io.read_splats(tmp_path / "deep" / "out")) == 800
     assert not list(tmp_path.glob("deep/.*"))
-    status, _, said = command_line(*given, cwd=tmp_path)
-    assert (status, "exists" in said) == (1, True)
-    status, _, said = command_line(*given, "--resume", cwd=tmp_path)
-    assert (status, "already finished" in said) == (0, True)
+    assert "exists" in refused(command_line, tmp_path, *given, status=1)
+    assert "already finished" in succeeds(command_line, tmp_path, *given, "--resume").err
     for other in ("1,4", "1,4,16"):
-        status, _, said = command_line(*given[:5], other, *given[6:], "--resume", cwd=tmp_path)
-        assert (status, "was written with another -r" in said) == (1, True), said
-    status, _, said = command_line("lod", "ball.ply", "-o", "x", "-r", "4,2", cwd=tmp_path)
-    assert (status, "ratios: expected rising numbers" in said) == (2, True)
+        assert "was written with another -r" in refused(
+            command_line, tmp_path, *given[:5], other, *given[6:], "--resume", status=1
+        )
+    assert "ratios: expected rising numbers" in refused(
+        command_line, tmp_path, "lod", "ball.ply", "-o", "x", "-r", "4,2"
+    )
     assert not (tmp_path / "x").exists()
 
 
-def test_a_stopped_run_with_other_options_is_told(
+def test_a_stopped_run_with_other_options(
     tmp_path: Path, command_line, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     io.write_splats(tmp_path / "ball.ply", checkered_ball(800))
@@ -201,9 +189,9 @@ def test_a_stopped_run_with_other_options_is_told(
         patched.setattr("g2ard.levels.save_levels", stop)
         status, _, said = command_line(*given, cwd=tmp_path)
     assert (status, "to continue from" in said) == (130, True)
-    status, _, said = command_line(*given[:-1], "64", "--resume", cwd=tmp_path)
-    assert (status, "begun with other options (size); -w without --resume starts over" in said) == (1, True)
+    assert "begun with other options (size); -w without --resume starts over" in refused(
+        command_line, tmp_path, *given[:-1], "64", "--resume", status=1
+    )
     assert not (tmp_path / "out").exists()
-    status, _, said = command_line(*given, "--resume", "--no-errors", cwd=tmp_path)
-    assert status == 0, said
+    succeeds(command_line, tmp_path, *given, "--resume", "--no-errors")
     assert {path.name for path in tmp_path.iterdir()} == {"ball.ply", "out"}

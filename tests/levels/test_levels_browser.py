@@ -1,7 +1,5 @@
 """Streamed levels loaded by the viewer that they are for; see `browser.py`."""
 
-from __future__ import annotations
-
 import json
 import re
 import threading
@@ -32,7 +30,7 @@ class _Quiet(SimpleHTTPRequestHandler):
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str]]:
-    """A folder and the address that it is served at, for pages may not read the files beside them."""
+    """A folder and its address: pages may not read the files beside them."""
     folder = tmp_path_factory.mktemp("served")
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -68,7 +66,7 @@ def streaming(folder: Path, name: str, levels: tuple[Splats, ...], camera: Camer
 
 
 @pytest.mark.parametrize("finest", [0, 1, 2])
-def test_the_viewer_shows_each_level(
+def test_each_level(
     browser: Browser, served: tuple[Path, str], levels: tuple[Splats, ...], finest: int
 ) -> None:
     folder, address = served

@@ -1,7 +1,5 @@
 """How distillation chooses and weighs its views, and what it says of those it leaves out."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +18,7 @@ from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.schedule import TUNED
 from g2ard.stages.select import select
 from g2ard.stages.simplify import SimplifyConfig
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import ARRAYS, around, assert_same_bits, checkered_ball
 
 PRIOR = checkered_ball(1500)
@@ -113,7 +111,7 @@ def test_selects_once_unless_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     assert counts == [1500, 1125, 844, 633]
 
 
-def test_a_stopped_run_goes_on_with_the_same_views(tmp_path: Path) -> None:
+def test_an_interrupted_run_resumes_with_the_same_views(tmp_path: Path) -> None:
     config = changed(
         SHORT,
         {
@@ -145,10 +143,9 @@ def test_the_command_reports_what_it_left_out(command_line: CommandLine, tmp_pat
     write_splats(tmp_path / "ball.ply", PRIOR)
     write_views(tmp_path / "pool.json", crowded())
     ask = ("distill", "ball.ply", "-n", 200, "--views", "pool.json", "--method", "paper", "--steps", 20)
-    status, out, error = command_line(
-        *ask, "--set", "views_count=0.25", "-o", "run", "--json", "-", cwd=tmp_path
+    out, error = succeeds(
+        command_line, tmp_path, *ask, "--set", "views_count=0.25", "-o", "run", "--json", "-"
     )
-    assert status == 0, error
     report = json.loads(out)
     assert len(report["views"]["chosen"]) == 7  # of 28 that are not held out
     share = f"{100 * report['views']['left_out']:.1f} %"
@@ -156,7 +153,5 @@ def test_the_command_reports_what_it_left_out(command_line: CommandLine, tmp_pat
     stored = json.loads((tmp_path / "run" / "report.json").read_text())
     assert stored["views"] == report["views"]
     for wrong, words in (("views_count=0.0", "views_count"), ("select.policy=best", "best")):
-        status, _, error = command_line(*ask, "--set", wrong, "-o", "bad", cwd=tmp_path)
-        assert status == 2
-        assert words in error
+        assert words in refused(command_line, tmp_path, *ask, "--set", wrong, "-o", "bad")
         assert not (tmp_path / "bad").exists()

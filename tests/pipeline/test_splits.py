@@ -1,7 +1,5 @@
 """No held-out view ever trains: splits travel with views through every command that reads or writes them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,15 +14,13 @@ from benchmarks.kinds.select import Universe, pool_of
 from benchmarks.study import DEFINITIONS, SceneSpec, read_study
 from benchmarks.workspace import Workspace
 from g2ard.errors import InputError
-from g2ard.io import Points, read_points, read_view_set, write_points, write_splats, write_views
-from g2ard.rendering.renderer import render
-from g2ard.scene.images import write_png
+from g2ard.io import read_points, read_view_set, write_splats, write_views
 from g2ard.scene.splits import for_scores, for_training, not_held_out, split_mask, splits_of
 from g2ard.stages.lift import lift
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, refused, succeeds
+from helpers.photos import cloud_of, photos_of
 from helpers.realdata import real
 from helpers.scenes import around, checkered_ball
-from helpers.view_files import transforms
 
 Program = Callable[..., None]
 BALL = checkered_ball(1500)
@@ -39,17 +35,10 @@ def folder(tmp_path: Path) -> Path:
     """A scene, its photos with a split.json beside them, and a cloud."""
     write_splats(tmp_path / "ball.ply", BALL)
     write_splats(tmp_path / "small.ply", checkered_ball(200))
-    write_points(tmp_path / "cloud.ply", Points(BALL.means.astype(np.float64), np.full((1500, 3), 0.5, "f4")))
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    K = VIEWS.Ks[0]
-    size: dict[str, Any] = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": 64, "h": 48}
-    transforms(photos / "transforms.json", list(VIEWS.viewmats), **size)
-    (photos / "images").mkdir()
-    for i in range(16):
-        write_png(photos / "images" / f"{i:03d}.png", render(BALL, VIEWS[i]).image)
+    cloud_of(tmp_path / "cloud.ply", BALL)
+    photos_of(tmp_path / "photos", scene=BALL, count=16)
     split = {"train": sorted(TRAIN), "test": sorted(TEST)}
-    (photos / "split.json").write_text(json.dumps(split))
+    (tmp_path / "photos" / "split.json").write_text(json.dumps(split))
     return tmp_path
 
 
@@ -113,7 +102,6 @@ def test_select_takes_training_views_and_hands_the_others_on(folder: Path, g2ard
     assert set(found.cameras.names[6:]) == TEST
     assert found.splits == ("train",) * 6 + ("test",) * 4
     train = read_view_set(folder / "chosen.json", split="train")
-    assert train.weights is not None
     np.testing.assert_allclose(train.weights, [view["weight"] for view in said["views"]])
     written = json.loads((folder / "chosen.json").read_text())["views"]
     assert all("weight" not in view for view in written[6:])
@@ -155,29 +143,15 @@ def test_no_command_trains_on_what_a_selection_holds_out(folder: Path, g2ard: Pr
 
 def test_no_command_trains_on_what_a_split_file_holds_out(folder: Path, g2ard: Program, watch: Watch) -> None:
     g2ard("recover", "small.ply", "--views", "photos", "--steps", 4, "-o", "recovered.ply")
-    g2ard(
-        "distill",
-        "ball.ply",
-        "-n",
-        200,
-        "--views",
-        "photos",
-        "--steps",
-        4,
-        "-o",
-        "run",
-        "--set",
-        "views_count=5",
-    )
-    g2ard("distill", "cloud.ply", "-n", 200, "--views", "photos", "--steps", 4, "-o", "lifted")
+    few = ("-n", 200, "--views", "photos", "--steps", 4)
+    g2ard("distill", "ball.ply", *few, "-o", "run", "--set", "views_count=5")
+    g2ard("distill", "cloud.ply", *few, "-o", "lifted")
     assert len(watch.trained) == 3
     assert set().union(*watch.trained, *watch.looked) <= TRAIN
     assert set().union(*watch.scored) == TEST
 
 
-def test_views_beside_held_out_ones_train_without_their_own_test_views(
-    folder: Path, g2ard: Program, watch: Watch
-) -> None:
+def test_views_and_held_out_views_given_together(folder: Path, g2ard: Program, watch: Watch) -> None:
     g2ard("select", "ball.ply", "--views", "photos", "-k", 6, "-o", "chosen.json")
     chosen = set(read_view_set(folder / "chosen.json").cameras.names[:6])
     ask = ("distill", "ball.ply", "-n", 200, "--steps", 4)
@@ -196,9 +170,7 @@ def test_views_beside_held_out_ones_train_without_their_own_test_views(
     assert set(read_view_set(folder / "pool" / "views.json").splits) == {"train"}
 
 
-def test_a_view_that_is_held_out_never_trains_whatever_its_file_states(
-    folder: Path, g2ard: Program, watch: Watch
-) -> None:
+def test_a_held_out_view_never_trains(folder: Path, g2ard: Program, watch: Watch) -> None:
     whole = read_view_set(folder / "photos").cameras
     write_views(folder / "bare.json", whole)  # states no splits
     ask = ("distill", "ball.ply", "-n", 200, "--steps", 4, "--photos", "--held-out", "photos")
@@ -238,9 +210,7 @@ def test_a_split_that_is_not_stated_is_one_line(command_line: CommandLine, folde
         assert status == 1
         assert error.strip().splitlines()[-1] == "g2ard: train.json: no split 'test' (there are train)"
     ask = ("distill", "ball.ply", "-r", 10, "--views", "photos", "--held-out", "train.json", "-o", "run")
-    status, _, error = command_line(*ask, cwd=folder)
-    assert status == 1
-    assert "train.json: all of its 16 views are for training" in error
+    assert "train.json: all of its 16 views are for training" in refused(command_line, folder, *ask, status=1)
 
 
 def test_training_on_test_views_is_said(command_line: CommandLine, folder: Path) -> None:
@@ -248,8 +218,7 @@ def test_training_on_test_views_is_said(command_line: CommandLine, folder: Path)
     for command in ("recover", "adapt"):
         for split, words in (("all", "4 of the 16"), ("test", "4 of the 4"), ("train", None)):
             output = f"{command}-{split}.ply"
-            status, _, error = command_line(command, "small.ply", *look, output, "--split", split, cwd=folder)
-            assert status == 0, error
+            error = succeeds(command_line, folder, command, "small.ply", *look, output, "--split", split).err
             said = f"split {split}: {words} views trained on are test views"
             assert (said in error) if words else ("test views" not in error)
 
@@ -300,7 +269,6 @@ def test_simplifiers_are_given_training_views_alone(folder: Path) -> None:
     assert (written.cameras.names, set(written.splits)) == (tuple(names[:6]), {"train"})
     place = Workspace(folder / "work", study, SceneSpec("pool", ball))
     found = read_view_set(place.folder / "pool.json") if place.train else None
-    assert found is not None
     assert found.splits == splits_of(None, found.cameras.names)
     assert set(place.train_cameras.names).isdisjoint(place.scored["test"].names)
 

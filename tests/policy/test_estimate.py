@@ -1,9 +1,6 @@
 """What `distill --dry-run` says: counts exactly, seconds and bytes about."""
 
-from __future__ import annotations
-
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -17,9 +14,9 @@ from g2ard.policy.distill import prepare
 from g2ard.policy.distill_options import DistillOptions
 from g2ard.policy.estimate import estimate, total
 from g2ard.system.memory import peak_rss
-from helpers.commands import CommandLine, refused
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of
-from helpers.project import ROOT
+from helpers.project import environment
 
 
 def ball(count: int = 900) -> g2ard.Splats:
@@ -28,18 +25,14 @@ def ball(count: int = 900) -> g2ard.Splats:
     return g2ard.Splats.create(points, scales=np.full((count, 3), 0.05), logit_opacities=np.full(count, 4))
 
 
-def test_a_dry_run_counts_what_the_run_takes_and_writes_nothing(
-    tmp_path: Path, command_line: CommandLine
-) -> None:
+def test_a_dry_run_counts_and_writes_nothing(tmp_path: Path, command_line: CommandLine) -> None:
     g2ard.save(tmp_path / "ball.ply", ball())
     ask = ("distill", "ball.ply", "-r", "10", "-o", "run", "--steps", "12", "--size", "48", "--json", "-")
-    status, out, error = command_line(*ask, "--dry-run", cwd=tmp_path)
-    assert status == 0, error
+    out, error = succeeds(command_line, tmp_path, *ask, "--dry-run")
     assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]
     assert "nothing is written" in error
     (told,) = json.loads(out)["runs"]
-    status, out, error = command_line(*ask, cwd=tmp_path)
-    assert status == 0, error
+    out = succeeds(command_line, tmp_path, *ask).out
     ran = json.loads(out)
     assert told["count"] == ran["output_count"] == 90
     assert told["steps"] == ran["rounds"][-1]["recover"][-1]["steps"] == 12
@@ -52,14 +45,11 @@ def test_a_dry_run_counts_what_the_run_takes_and_writes_nothing(
 def test_several_budgets_have_a_total(tmp_path: Path, command_line: CommandLine) -> None:
     g2ard.save(tmp_path / "ball.ply", ball())
     ask = ("distill", "ball.ply", "-r", "5,10", "-o", "{ratio}", "--steps", "4", "--size", "48", "--dry-run")
-    status, _, error = command_line(*ask, cwd=tmp_path)
-    assert status == 0, error
+    error = succeeds(command_line, tmp_path, *ask).err
     assert "all 2 with shared targets: about" in error
 
 
-def test_memory_grows_by_views_and_gaussians_and_a_recovery_time_is_kept(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_memory_grows_with_views_and_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
     job = prepare(
         ball(), [Budget(90, None)], DistillOptions(size=48, settings={"steps": 3, "recovery_time": 7.0})
     )
@@ -81,8 +71,7 @@ def test_memory_grows_by_views_and_gaussians_and_a_recovery_time_is_kept(
 def test_a_dry_run_says_which_file_it_writes(tmp_path: Path, command_line: CommandLine) -> None:
     g2ard.save(tmp_path / "ball.ply", ball())
     ask = ("distill", "ball.ply", "-r", "10", "-o", "run", "--steps", "4", "--size", "48", "--dry-run")
-    status, _, error = command_line(*ask, "--json", "told.json", cwd=tmp_path)
-    assert status == 0, error
+    error = succeeds(command_line, tmp_path, *ask, "--json", "told.json").err
     assert error.endswith("only told.json is written\n"), error
     assert {path.name for path in tmp_path.iterdir()} == {"ball.ply", "told.json"}
 
@@ -90,7 +79,7 @@ def test_a_dry_run_says_which_file_it_writes(tmp_path: Path, command_line: Comma
 @pytest.mark.skipif(peak_rss() is None, reason="the system tells no memory")
 @pytest.mark.parametrize("source", ["scene", "photos"])
 def test_memory_is_about_what_the_run_takes(source: str, tmp_path: Path) -> None:
-    """The program itself included, which is most of it where the scene is small."""
+    """Includes the program itself, most of it for a small scene."""
     if source == "scene":
         g2ard.save(tmp_path / "ball.ply", ball(20_000))
         ask = ["distill", "ball.ply", "-r", "4", "--steps", "12", "--size", "320"]
@@ -104,10 +93,9 @@ def test_memory_is_about_what_the_run_takes(source: str, tmp_path: Path) -> None
 
 
 def peak_of(ask: list[str], folder: Path) -> int:
-    """The most bytes that were resident, of a run as a program."""
+    """Return the peak resident bytes of a run as a program."""
     program = [sys.executable, "-m", "g2ard", *ask, "-q"]
-    root = str(ROOT)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
+
     code = (
         "import resource, subprocess, sys; status = subprocess.run(sys.argv[1:]).returncode;"
         "print(status, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
@@ -115,7 +103,7 @@ def peak_of(ask: list[str], folder: Path) -> int:
     done = subprocess.run(
         [sys.executable, "-c", code, *program],
         cwd=folder,
-        env=environment,
+        env=environment(),
         capture_output=True,
         text=True,
         timeout=300,
@@ -131,8 +119,6 @@ def test_a_dry_run_is_in_nobodys_way(command_line: CommandLine, folder: Path) ->
     (folder / "run" / "kept.txt").write_text("")
     ask = ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 3, "--size", 32)
     assert "-w (--overwrite)" in refused(command_line, folder, *ask, status=1)
-    status, _, error = command_line(*ask, "--dry-run", cwd=folder)
-    assert (status, "nothing is written" in error) == (0, True), error
-    status, _, error = command_line("clean", "ball.ply", "-o", "views.json", "--dry-run", cwd=folder)
-    assert status == 0, error
+    assert "nothing is written" in succeeds(command_line, folder, *ask, "--dry-run").err
+    succeeds(command_line, folder, "clean", "ball.ply", "-o", "views.json", "--dry-run")
     assert [path.name for path in (folder / "run").iterdir()] == ["kept.txt"]

@@ -1,7 +1,5 @@
 """Cameras beside a scene: used where no views are given, said, and left where they do not fit."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +10,7 @@ import pytest
 
 from g2ard.io import read_splats, read_view_set, write_splats, write_views
 from g2ard.scene.cameras import Cameras, look_at
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, succeeds
 from helpers.scenes import around, checkered_ball
 from helpers.trainer_files import inria
 
@@ -46,22 +44,19 @@ def test_simplify_looks_from_the_cameras_beside_the_model(command_line: CommandL
         ("fast", ("--method", "fast"), ""),
         ("looking", ("--method", "fast", "--views", "made"), ""),
     ):
-        status, _, error = command_line(*SIMPLIFY, "-o", f"{name}.ply", *extra, cwd=folder)
-        assert status == 0, error
+        error = succeeds(command_line, folder, *SIMPLIFY, "-o", f"{name}.ply", *extra).err
         assert words in error
         assert ("views:" in error) == bool(words), name
     assert same(folder / "found.ply", folder / "given.ply")  # they are small already
     assert not same(folder / "found.ply", folder / "made.ply")
     assert not same(folder / "fast.ply", folder / "looking.ply")
     (folder / "model" / "cameras.json").rename(folder / "away.json")
-    status, _, error = command_line(*SIMPLIFY, "-o", "pool.ply", cwd=folder)
-    assert status == 0, error
+    succeeds(command_line, folder, *SIMPLIFY, "-o", "pool.ply")
     assert same(folder / "pool.ply", folder / "made.ply")
 
 
 def test_distill_trains_and_scores_on_them(command_line: CommandLine, folder: Path) -> None:
-    status, out, error = command_line(*DISTILL, "-o", "run", "--set", "views_count=14", cwd=folder)
-    assert status == 0, error
+    out, error = succeeds(command_line, folder, *DISTILL, "-o", "run", "--set", "views_count=14")
     assert SAID in error
     report = json.loads(out)
     assert report["against"] == "teacher renders"
@@ -69,8 +64,7 @@ def test_distill_trains_and_scores_on_them(command_line: CommandLine, folder: Pa
     assert held_out == {"000", "008"}  # every 8th by name
     assert set(report["views"]["chosen"]) == {f"{i:03d}" for i in range(16)} - held_out
     assert not (folder / "run" / "views.json").exists()
-    status, out, error = command_line(*DISTILL, "-o", "pool", "--size", 64, "--views", "made", cwd=folder)
-    assert status == 0, error
+    error = succeeds(command_line, folder, *DISTILL, "-o", "pool", "--size", 64, "--views", "made").err
     assert "views:" not in error
     assert len(read_view_set(folder / "pool" / "views.json").cameras) == 160
 
@@ -86,8 +80,7 @@ def test_large_cameras_without_photos_are_shrunk(command_line: CommandLine, fold
         ):
             if output == "full" and ask is DISTILL:
                 continue  # takes minutes
-            status, _, error = command_line(*ask, "-o", output + suffix, *extra, cwd=folder)
-            assert status == 0, error
+            succeeds(command_line, folder, *ask, "-o", output + suffix, *extra)
     assert same(folder / "found.ply", folder / "given.ply")
     assert not same(folder / "found.ply", folder / "full.ply")
     assert same(folder / "found" / "scene.ply", folder / "given" / "scene.ply")
@@ -97,7 +90,7 @@ def test_large_cameras_without_photos_are_shrunk(command_line: CommandLine, fold
     ("change", "words"),
     [
         (lambda c: c.update(position=[50, 0, 0]), "model/cameras.json: 0 of 16 cameras see it"),
-        (lambda c: c.pop("fx"), "model/cameras.json: camera 0: lacks 'fx'"),
+        (lambda c: c.pop("fx"), "model/cameras.json: property 'fx' of camera 0 is missing"),
     ],
 )
 def test_cameras_that_do_not_fit_are_left(
@@ -111,16 +104,14 @@ def test_cameras_that_do_not_fit_are_left(
         change(camera)
     path.write_text(json.dumps(content))
     for ask, output in ((SIMPLIFY, "out.ply"), ((*DISTILL, "--size", 64), "run")):
-        status, _, error = command_line(*ask, "-o", output, cwd=folder)
-        assert status == 0, error
+        error = succeeds(command_line, folder, *ask, "-o", output).err
         assert f"views beside the scene are not used: {words}" in error
     assert (folder / "run" / "views.json").exists()
 
 
 def test_too_few_cameras_are_left(command_line: CommandLine, folder: Path) -> None:
     inria(folder / "model" / "cameras.json", EYES[:1])
-    status, _, error = command_line(*SIMPLIFY, "-o", "out.ply", cwd=folder)
-    assert status == 0, error
+    error = succeeds(command_line, folder, *SIMPLIFY, "-o", "out.ply").err
     assert "not used: model/cameras.json: its only view is not in split 'train'" in error
 
 

@@ -1,7 +1,5 @@
 """Distillation from photos without a scene."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -10,7 +8,7 @@ import pytest
 
 import g2ard
 from g2ard.policy.photos import points_within_sight
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of
 
 
@@ -18,8 +16,7 @@ from helpers.photos import photos_of
 def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_path: Path) -> None:
     photos_of(tmp_path / "photos", points)
     ask = ("distill", "--views", "photos", "-o", "run", "--json", "-")
-    status, out, error = command_line(*ask, "-n", 500, "--steps", 150, cwd=tmp_path)
-    assert status == 0, error
+    out, error = succeeds(command_line, tmp_path, *ask, "-n", 500, "--steps", 150)
     found = json.loads(out)
     assert (found["output_count"], found["against"]) == (500, "photos")
     assert found["scores"]["recovered"]["psnr"] > max(17, found["scores"]["simplified"]["psnr"] + 1)
@@ -31,8 +28,7 @@ def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_pa
     status, _, error = command_line(*ask, "-r", 4, "--steps", 5, "-w", cwd=tmp_path)
     assert status == (0 if points else 1)
     assert points or "give --count COUNT" in error
-    status, _, error = command_line("distill", "-n", 500, "-o", "run", cwd=tmp_path)
-    assert (status, "give a SCENE, or photos" in error) == (2, True)
+    assert "give a SCENE, or photos" in refused(command_line, tmp_path, "distill", "-n", 500, "-o", "run")
 
 
 def test_a_result_that_outweighs_the_photos_points_says_so(command_line: CommandLine, tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """The lift, naively: brute-force neighbours, numpy's eigen-solver, float64 throughout."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

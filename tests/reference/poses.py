@@ -1,7 +1,5 @@
 """Naive twins of the occupancy grid's queries, and small scenes whose free space is known exactly."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from g2ard.scene.splats import Splats

@@ -1,7 +1,5 @@
 """The rasteriser once more, naively: every pixel against every Gaussian, float64, differentiated by torch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

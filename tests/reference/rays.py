@@ -1,7 +1,5 @@
 """Visibility by brute force: every Gaussian at every ray, in float64, with no culling and no image."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

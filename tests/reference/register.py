@@ -1,7 +1,5 @@
 """Naive float64 twin of direct alignment's normal equations: pixel by pixel, chain rule by matrices."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -1,7 +1,5 @@
 """View selection without shortcuts: dense float64 depths, the objective as written, greedy by trying all."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

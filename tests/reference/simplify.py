@@ -1,7 +1,5 @@
 """Simplification, naively: float64, one group at a time, sets and loops."""
 
-from __future__ import annotations
-
 import numpy as np
 
 C0 = 0.28209479177387814

@@ -1,7 +1,5 @@
 """SSIM naively, in float64 torch: one window at a time by convolution with a dense 11×11 kernel."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

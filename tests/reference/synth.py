@@ -1,7 +1,5 @@
 """A naive ray caster, one face at a time, float64: no intervals, no packets, no bounding boxes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from benchmarks.synth.shapes import Kind, Shapes

@@ -7,8 +7,6 @@ Python example writes other bytes than the command it stands for, if two package
 an installation takes over 150 MB. pip's own variables (PIP_NO_INDEX, PIP_FIND_LINKS) choose its sources.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -3,8 +3,6 @@
 python inputs.py FOLDER
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """LPIPS against a naive numpy twin, with weights of the true names and small random widths."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

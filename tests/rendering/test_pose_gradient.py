@@ -1,7 +1,5 @@
 """The gradient with respect to a camera's pose: against autograd of a float64 twin, and against renders."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +10,9 @@ from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.rendering.renderer import Renderer, arrays_of, view_of
 from g2ard.stages.register.pose import moved
-from helpers.raster_cases import NAMES, VARIANTS, camera, scene, splats_of
+from helpers.raster_cases import VARIANTS, camera, oracle, scene, splats_of
 from helpers.scenes import around, checkered_ball
-from reference import raster as reference
+from helpers.threads import on_threads
 
 BACKGROUND = [0.2, 0.5, 0.9]
 
@@ -36,22 +34,10 @@ def test_gradient_is_the_twins(variant: str, seed: int, size: float, degree: int
     cameras = camera(48, 40, off=0.1, seed=seed)
     p = scene(seed, 120, degree=degree, size=size)
     pose = torch.from_numpy(cameras.viewmats[0]).requires_grad_()
-    out = reference.render(
-        *(torch.from_numpy(p[k].astype(np.float64)) for k in NAMES),
-        viewmat=pose,
-        K=torch.from_numpy(cameras.Ks[0]),
-        width=48,
-        height=40,
-        near=settings.near_of(0),
-        background=tuple(BACKGROUND),
-        antialiased=settings.antialiased,
-        inria=settings.convention == "inria",
-        alpha_max=settings.alpha_max,
-    )
+    out, _ = oracle(p, cameras, settings, tuple(BACKGROUND), pose=pose)
     weight = torch.from_numpy(np.random.default_rng(seed).normal(size=(40, 48, 3)))
     weight[out.doubtful] = 0
     (out.image * weight).sum().backward()
-    assert pose.grad is not None
     want = torch.einsum("ij,kij->k", pose.grad, generators() @ pose.detach()).numpy()
     rasterizer = _core.Rasterizer()
     arrays = arrays_of(splats_of(p))
@@ -83,15 +69,12 @@ def test_gradient_is_how_renders_change(seed: int) -> None:
 def test_its_bits_do_not_depend_on_threads() -> None:
     renderer, at = Renderer(checkered_ball(2500)), around(5, (160, 120), 2.2)[1]
     weight = np.random.default_rng(0).normal(size=(120, 160, 3)).astype(np.float32)
-    found = set()
-    try:
-        for threads in (1, 2, 8):
-            _core.set_num_threads(threads)
-            renderer.image(at)
-            found.add(renderer.pose_gradient(weight).tobytes())
-    finally:
-        _core.set_num_threads(0)
-    assert len(found) == 1
+
+    def gradient() -> bytes:
+        renderer.image(at)
+        return renderer.pose_gradient(weight).tobytes()
+
+    assert len(set(on_threads(gradient))) == 1
 
 
 def test_it_follows_a_render_and_no_depth() -> None:

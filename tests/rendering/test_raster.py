@@ -1,7 +1,6 @@
 """The rasteriser against a naive float64 oracle, and its promises: determinism, no NaN, independent calls."""
 
-from __future__ import annotations
-
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,29 +12,9 @@ from g2ard.errors import InputError
 from g2ard.rendering.renderer import RasterSettings, render
 from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras, look_at
-from g2ard.scene.splats import Splats
 from g2ard.stages.recover.rasterize import rasterize
-from helpers.raster_cases import NAMES, VARIANTS, Params, camera, scene, splats_of, tensors_of
-from reference import raster as reference
-
-
-def oracle(
-    p: Params, cameras: Cameras, settings: RasterSettings, background: Any, *, grad: bool = False
-) -> tuple[reference.Oracle, list[torch.Tensor]]:
-    tensors = [torch.from_numpy(p[k].astype(np.float64)).requires_grad_(grad) for k in NAMES]
-    out = reference.render(
-        *tensors,
-        viewmat=torch.from_numpy(cameras.viewmats[0]),
-        K=torch.from_numpy(cameras.Ks[0]),
-        width=int(cameras.widths[0]),
-        height=int(cameras.heights[0]),
-        near=settings.near_of(0),
-        background=background,
-        antialiased=settings.antialiased,
-        inria=settings.convention == "inria",
-        alpha_max=settings.alpha_max,
-    )
-    return out, tensors
+from helpers.raster_cases import NAMES, VARIANTS, Params, camera, oracle, scene, splats_of, tensors_of
+from helpers.threads import on_threads
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -63,7 +42,6 @@ def test_median_depth_is_the_oracle_s() -> None:
     p = scene(5, 300, size=0.1)
     want, _ = oracle(p, cameras, RasterSettings(), (0, 0, 0))
     got = render(splats_of(p), cameras[0], median=True).median
-    assert got is not None
     same = np.abs(got - want.median.numpy()) < 1e-4
     assert (want.median > 0).double().mean() > 0.2
     assert same.mean() > 0.999
@@ -90,11 +68,9 @@ def test_gradients_are_the_oracle_s(variant: str, degree: int) -> None:
         w = w.float()
         ((image * w[..., :3]).sum() + (alpha * w[..., 3]).sum() + (depth * w[..., 4]).sum()).backward()
         for name, a, b in zip(NAMES, mine, tensors, strict=True):
-            assert a.grad is not None
             if not a.numel():
                 continue
             expected = b.grad
-            assert expected is not None
             error = (a.grad.double() - expected).norm() / expected.norm().clamp(min=1e-12)
             assert error < 2e-5, f"{name}: relative error {error:.2e}"
 
@@ -147,7 +123,6 @@ def test_degenerate_scenes(name: str, variant: str) -> None:
     image, alpha, depth = rasterize(*mine, cameras, 0, background=(1, 0, 0.5), settings=settings)
     (image.sum() + alpha.sum() + depth.square().sum()).backward()
     for value in (image, alpha, depth, *(m.grad for m in mine)):
-        assert value is not None
         assert torch.isfinite(value).all()
     if name == "vast":  # past what float32 can hold, such splats are left out
         assert not alpha.any()
@@ -161,8 +136,6 @@ def test_degenerate_scenes(name: str, variant: str) -> None:
     for planes in (again, (want.image, want.alpha, want.depth)):
         torch.stack([plane[sure].square().sum() for plane in planes]).sum().backward()
     for key, a, b in zip(NAMES, ours, theirs, strict=True):
-        assert a.grad is not None
-        assert b.grad is not None
         assert torch.isfinite(b.grad).all(), key
         scale = b.grad.norm() + 0.05 * len(p["means"])
         assert (a.grad - b.grad).norm() <= (5e-3 if name == "needles" else 1e-5) * scale, key
@@ -194,7 +167,6 @@ def test_finite_differences_agree_with_the_oracle() -> None:
     (out.image * w).sum().backward()
     checked = 0
     for name, tensor in zip(NAMES, tensors, strict=True):
-        assert tensor.grad is not None
         for _ in range(6):
             at = tuple(rng.integers(s) for s in tensor.shape)
             values = {k: v.astype(np.float64) for k, v in p.items()}
@@ -215,8 +187,6 @@ def everything(p: Params, cameras: Cameras) -> list[bytes]:
     r = _core.Rasterizer()
     settings = RasterSettings()
     image, alpha, depth, median = r.forward(arrays, view, settings, [0.1, 0.2, 0.3], 2)
-    assert depth is not None
-    assert median is not None
     g = np.random.default_rng(0).normal(size=(150, 200, 3)).astype(np.float32)
     sums = _core.accumulate(arrays, [view], settings)
     found = [image, alpha, depth, median, *r.backward(arrays, g, alpha, depth), *sums.values()]
@@ -226,16 +196,8 @@ def everything(p: Params, cameras: Cameras) -> list[bytes]:
 def test_bits_do_not_depend_on_threads_or_runs() -> None:
     p = scene(0, 20_000, 3, size=0.05)
     cameras = camera(200, 150)
-    before = _core.num_threads()
-    try:
-        results = []
-        for threads in (1, 2, 8, 8):
-            _core.set_num_threads(threads)
-            results.append(everything(p, cameras))
-    finally:
-        _core.set_num_threads(before)
-    for other in results[1:]:
-        assert other == results[0]
+    first, *others = on_threads(lambda: everything(p, cameras), (1, 2, 8, 8))
+    assert others == [first] * 3
 
 
 @pytest.mark.parametrize("isa", _core.instruction_sets())
@@ -297,14 +259,7 @@ def test_map_coordinates_render_like_centred_ones() -> None:
     cameras = camera(40, 30)
     here = render(splats_of(p), cameras[0]).image
     shift = np.array([500_000.0, 5_400_000.0, 120.0])
-    far = Splats(
-        means=p["means"].astype(np.float64) + shift,
-        quats=p["quats"],
-        scales=np.exp(p["log_scales"]),
-        logit_opacities=p["logit_opacities"],
-        sh0=p["sh0"],
-        shN=p["shN"],
-    )
+    far = replace(splats_of(p), means=p["means"].astype(np.float64) + shift)
     there = render(far, cameras.recentred(-shift)[0]).image
     assert np.quantile(np.abs(here - there), 0.99) < 1e-5
 

@@ -1,13 +1,11 @@
 """A slice of `make stress`: the same random cases, fewer of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest
 import torch
 
-from g2ard import _core
+from helpers.threads import on_threads
 from stress.gradients import Tally, check_problem
 from stress.results import lines, random_scene
 from stress.run import Outcome, stress
@@ -53,13 +51,7 @@ def test_an_image_off_by_a_little_fails() -> None:
 
 
 def test_the_record_of_results_is_the_same_at_any_number_of_threads() -> None:
-    before, found = _core.num_threads(), []
-    try:
-        for threads in (1, 3):
-            _core.set_num_threads(threads)
-            found.append(list(lines("discs", random_scene(4, 1_500))))
-    finally:
-        _core.set_num_threads(before)
+    found = on_threads(lambda: list(lines("discs", random_scene(4, 1_500))), (1, 3))
     assert found[0] == found[1]
     stages = {line.split("/")[1] for line in found[0]}
     assert stages == {"simplify", "select", "recover", "render", "visibility"}

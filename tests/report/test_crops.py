@@ -1,7 +1,5 @@
 """Regions of interest in reports: where a view is worst, or as asked for, at the images' own resolution."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re
@@ -16,14 +14,13 @@ from g2ard import io
 from g2ard.errors import InputError
 from g2ard.report.page import Comparison, Page, Shown, worst_windows
 from g2ard.report.window import Crop, Window
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, succeeds
 from helpers.scenes import around, checkered_ball
 from helpers.studies import check_page
 
 
 def images_of(html: str) -> list[np.ndarray]:
     found = re.search(r'id="images">(.*?)</script>', html)
-    assert found is not None
     pictures = [Image.open(BytesIO(base64.b64decode(text))) for text in json.loads(found[1])]
     return [np.asarray(picture) for picture in pictures]
 
@@ -69,7 +66,7 @@ def test_crops_are_cut_at_full_resolution() -> None:
 @pytest.mark.parametrize(
     "text", ["1,2", "0,0,0,1", "0.9,0,0.2,0.1", "-1,0,.5,.5", "a,b,c,d", "x:", "nan,0,1,1"]
 )
-def test_no_window(text: str) -> None:
+def test_invalid_crops_are_named(text: str) -> None:
     with pytest.raises(InputError, match="crop"):
         Crop.parse(text)
 
@@ -79,8 +76,7 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
     io.write_views(tmp_path / "views.json", around(16, size=(48, 36)))
     common = ["distill", "ball.ply", "-r", "4", "--views", "views.json", "--steps", "5"]
     crops = ["--crop", "view_008:0.25,0.25,0.5,0.5", "--crop", "0,0,0.5,0.25"]
-    status, _, err = command_line(*common, *crops, "-o", "run", cwd=tmp_path)
-    assert status == 0, err
+    succeeds(command_line, tmp_path, *common, *crops, "-o", "run")
     html = (tmp_path / "run" / "report.html").read_text()
     check_page(html)
     first, second = html.split('<section class="view">')[1:3]

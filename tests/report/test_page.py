@@ -1,7 +1,5 @@
 """Report pages: their charts, and that they work in a browser."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path
@@ -11,7 +9,7 @@ import pytest
 
 from g2ard.report.charts import Point, chart, pareto
 from g2ard.report.page import Comparison, Page, Shown
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, succeeds
 from helpers.studies import check_page, study
 
 
@@ -48,8 +46,7 @@ def test_pareto_is_what_no_other_beats() -> None:
 def test_distill_writes_a_report(command_line: CommandLine, tmp_path: Path) -> None:
     study(tmp_path)
     options = ["-r", "4", "--views", "views.json", "--steps", "5", "-o", "run"]
-    status, _, err = command_line("distill", "ball.ply", *options, cwd=tmp_path)
-    assert status == 0, err
+    succeeds(command_line, tmp_path, "distill", "ball.ply", *options)
     html = (tmp_path / "run" / "report.html").read_text()
     check_page(html)
     assert "Worst views first" in html

@@ -1,7 +1,5 @@
 """What simplification sees, painted on the scene, and the command that renders it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +10,17 @@ from g2ard import io
 from g2ard.errors import InputError
 from g2ard.report.paint import cell_labels, flag_colors, label_colors, painted
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import join
 from g2ard.stages.select.surfaces import surface
 from g2ard.stages.simplify import flag, simplify
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, succeeds
 from helpers.scenes import around, checkered_ball
 
 
 def test_cells_are_the_cores() -> None:
     ball = checkered_ball(4000)
     far = Splats.create([[9e6, 0, 0], [9e6, 1, 0]], scales=np.full((2, 3), 0.1)).with_sh_degree(1)
-    names = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
-    both = Splats(**{n: np.concatenate([getattr(ball, n), getattr(far, n)]) for n in names})
+    both = join([ball, far])
     for scene, count in ((ball, 300), (ball, 40), (both, 300), (ball.take([5]), 3)):
         cells, labels = surface(scene, count), cell_labels(scene, count)
         assert labels.shape == (len(scene),)
@@ -38,7 +36,7 @@ def test_cells_are_the_cores() -> None:
 
 
 def test_flags_are_constant_within_a_cell() -> None:
-    """They are decided cell by cell: cells that are not the core's would hold both kinds."""
+    """Flags are decided per cell: other cells than the core's would hold both kinds."""
     rng = np.random.default_rng(0)
     noise = rng.normal(size=(6000, 1, 3)) * (rng.random((6000, 1, 1)) < 0.5)
     points = rng.uniform(-1, 1, (6000, 3)) * [1, 1, 0.01]
@@ -86,19 +84,8 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
         assert f"{color}: " in said + err
     images = {name: pixels(tmp_path / name) for name in ("flags", "cells", "parents")}
     assert (np.abs(images["flags"] - images["cells"]).max(), np.ptp(images["cells"])) > (40, 40)
-    status, _, err = command_line(
-        "simplify",
-        "ball.ply",
-        "-r",
-        "10",
-        "--no-views",
-        "-o",
-        "small.ply",
-        "--parents",
-        "to.npy",
-        cwd=tmp_path,
-    )
-    assert status == 0, err
+    ask = ("simplify", "ball.ply", "-r", 10, "--no-views", "-o", "small.ply", "--parents", "to.npy")
+    succeeds(command_line, tmp_path, *ask)
     written = np.load(tmp_path / "to.npy")
     assert np.array_equal(written, simplify(io.read_splats(tmp_path / "ball.ply"), 150).parents)
     status, _, err = call("--color", "parents", "--parents", "to.npy", out="again")

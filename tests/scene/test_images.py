@@ -1,7 +1,5 @@
 """Photos become what their pinhole cameras would have taken; images come out as they went in."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -104,7 +102,7 @@ def bend(x: np.ndarray, y: np.ndarray, k: tuple[float, ...]) -> tuple[np.ndarray
 
 
 def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """A smooth picture of the plane z = 1, so that interpolation is all but exact."""
+    """A smooth picture of the plane z = 1, so that interpolation is almost exact."""
     return np.stack(
         [0.5 + 0.4 * np.sin(5 * x), 0.5 + 0.4 * np.cos(4 * y), 0.5 + 0.3 * np.sin(3 * (x + y))], -1
     )

@@ -1,7 +1,5 @@
 """A scene in a small unit is the same scene, through every stage that looks at it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +11,7 @@ from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
 from g2ard.stages.select import select
 from g2ard.stages.simplify import simplify
-from helpers.scenes import assert_same_bits
+from helpers.scenes import assert_same_bits, in_units
 
 
 def ball(count: int = 3000) -> Splats:
@@ -35,14 +33,6 @@ def around(count: int = 12) -> Cameras:
     poses = [look_at([3 * np.cos(a), 3 * np.sin(a), 1], [0, 0, 0]) for a in angles]
     K = [[90, 0, 40], [0, 90, 30], [0, 0, 1]]
     return Cameras.from_lists(poses, [K] * count, [(80, 60)] * count, [f"v{i}" for i in range(count)])
-
-
-def in_units(scene: Splats, cameras: Cameras, unit: float) -> tuple[Splats, Cameras]:
-    viewmats = cameras.viewmats.copy()
-    viewmats[:, :3, 3] *= unit
-    factor = scene.means.dtype.type(unit)
-    small = replace(scene, means=scene.means * factor, scales=scene.scales * np.float32(unit))
-    return small, replace(cameras, viewmats=viewmats)
 
 
 @pytest.mark.parametrize("method", ["default", "fast"])

@@ -1,7 +1,5 @@
 """Which views are for training and which are held out."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

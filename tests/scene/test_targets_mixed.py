@@ -1,7 +1,5 @@
 """Of each view its photo where there is one, else the dense scene's render: in training and in scores."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +11,7 @@ import g2ard
 from g2ard.io import write_splats, write_views
 from g2ard.rendering.renderer import render
 from g2ard.scene.images import write_png
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball
 
 PRIOR = checkered_ball()
@@ -34,8 +32,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def run(command_line: CommandLine, folder: Path, *arguments: object) -> tuple[dict[str, Any], str]:
-    status, out, error = command_line(*arguments, "-w", "--json", "-", cwd=folder)
-    assert status == 0, error
+    out, error = succeeds(command_line, folder, *arguments, "-w", "--json", "-")
     return json.loads(out), error
 
 
@@ -58,7 +55,6 @@ def test_distill_learns_from_photos_and_renders(folder: Path, command_line: Comm
 def test_a_distillation_in_python_has_both_targets(folder: Path) -> None:
     told: list[str] = []
     done = g2ard.distill(folder / "ball.ply", ratio=3, views=folder / "v.json", steps=4, say=told.append)
-    assert done.held_out is not None
     kinds = [done.held_out.against(view) for view in range(4)]  # type: ignore[attr-defined]
     assert kinds == ["photo", "teacher"] * 2
     assert done.held_out[0][..., 1:].max() == 0
@@ -73,9 +69,7 @@ def test_recover_takes_photos_beside_its_teacher(folder: Path, command_line: Com
     assert "8 views against 4 photos and 4 teacher renders" in told
     _, told = run(command_line, folder, *ask)
     assert "4 views against photos" in told
-    status, _, error = command_line(*ask, "--photos", "-w", cwd=folder)
-    assert status == 2
-    assert "--photos goes with --teacher" in error
+    assert "--photos goes with --teacher" in refused(command_line, folder, *ask, "--photos", "-w")
 
 
 def test_a_teacher_needs_no_photos(folder: Path, command_line: CommandLine) -> None:

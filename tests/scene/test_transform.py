@@ -1,6 +1,4 @@
-"""Moving, cropping and merging scenes, and the command that does it."""
-
-from __future__ import annotations
+"""Moving and cropping scenes."""
 
 from dataclasses import replace
 
@@ -61,7 +59,7 @@ def test_offsets_move_along() -> None:
         (np.diag([0, 0, 0, 1]), "flattens"),
     ],
 )
-def test_no_similarity(given: np.ndarray, message: str) -> None:
+def test_matrices_that_are_no_similarity(given: np.ndarray, message: str) -> None:
     with pytest.raises(InputError, match=message):
         similarity(given)
 
@@ -74,6 +72,3 @@ def test_crops_are_in_world_coordinates() -> None:
     np.testing.assert_array_equal(in_sphere(splats, [10, 0, 1], 0.5), near)
     with pytest.raises(InputError, match="holds nothing"):
         in_box(splats, [1, 0, 0], [0, 1, 1])
-
-
-# ── the command ──────────────────────────────────────────────────────────────────────────────────────

@@ -1,7 +1,5 @@
 """Appearance refitted on frozen geometry."""
 
-from __future__ import annotations
-
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +12,7 @@ from g2ard.errors import InputError
 from g2ard.pipeline.adapt import AdaptConfig, adapt
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball
 
 VIEWS = around(24)
@@ -22,7 +20,7 @@ TRAIN, OTHER = VIEWS.take(np.arange(24) % 3 > 0), VIEWS.take(np.arange(24) % 3 =
 
 
 def pale(splats):  # type: ignore[no-untyped-def]
-    """The same geometry, its colours lost."""
+    """Return the same geometry without its colours."""
     flat = replace(splats, sh0=np.full_like(splats.sh0, 0.4), shN=np.zeros_like(splats.shN))
     return replace(flat, logit_opacities=splats.logit_opacities - 1)
 
@@ -62,7 +60,7 @@ def test_gives_a_flat_scene_bands_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("stop", [7, 520])
-def test_ctrl_c_then_resume_is_never_having_stopped(stop: int, tmp_path: Path) -> None:
+def test_an_interrupted_run_resumes_to_the_same_bits(stop: int, tmp_path: Path) -> None:
     ball = checkered_ball(200)
     start, targets = pale(ball), TeacherRenders(ball, TRAIN.resized(24))
     config = AdaptConfig(steps=1500, tolerance=0)
@@ -86,7 +84,7 @@ def test_ctrl_c_then_resume_is_never_having_stopped(stop: int, tmp_path: Path) -
         adapt(start, targets, replace(config, seed=1), work=tmp_path)
 
 
-def test_refuses_what_makes_no_sense() -> None:
+def test_invalid_options_are_rejected() -> None:
     for wrong in ({"steps": 0}, {"tolerance": -1.0}, {"tolerance": float("nan")}, {"schedule": "best"}):
         with pytest.raises(InputError):
             AdaptConfig(**wrong)
@@ -98,12 +96,9 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
     io.write_splats(tmp_path / "pale.ply", pale(ball))
     io.write_views(tmp_path / "views.json", VIEWS)
     options = ["--views", "views.json", "--teacher", "teacher.ply", "-o", "out.ply", "--steps", "60"]
-    status, _, err = command_line("adapt", "pale.ply", *options, cwd=tmp_path)
-    assert status == 0, err
+    succeeds(command_line, tmp_path, "adapt", "pale.ply", *options)
     out, start = io.read_splats(tmp_path / "out.ply"), io.read_splats(tmp_path / "pale.ply")
     np.testing.assert_array_equal(out.means, start.means)
     np.testing.assert_allclose(out.scales, start.scales, rtol=1e-6)
     assert np.abs(out.sh0 - start.sh0).max() > 0.1
-    status, _, err = command_line("adapt", "pale.ply", *options, cwd=tmp_path)
-    assert status == 1
-    assert "out.ply" in err
+    assert "out.ply" in refused(command_line, tmp_path, "adapt", "pale.ply", *options, status=1)

@@ -1,7 +1,5 @@
 """Colours changed at once, Gaussians that few views have seen, and what adaptation makes of both."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -88,7 +86,7 @@ def test_a_blend_goes_its_share_of_the_way() -> None:
 
 
 def test_few_images_change_what_no_image_shows_too() -> None:
-    """Three photos of one side: the other side gets the light, and no noise."""
+    """Three photos of one side: the other side gets the light but no noise."""
     ball, lit = evening(1500)
     targets = TeacherRenders(lit, VIEWS)
     facing = VIEWS.positions @ VIEWS.positions[0]

@@ -1,7 +1,5 @@
 """What `g2ard clean` takes, and what it leaves."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,12 +15,12 @@ from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.clean import KINDS, find_clutter, within_reach
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, succeeds
 from helpers.scenes import around, checkered_ball
 
 
 def junk() -> tuple[Splats, np.ndarray]:
-    """A ball with some of every kind, and which kind each row is; −1 for the ball."""
+    """Return a ball with clutter of every kind, and the kind of each row; −1 for the ball."""
     ball = checkered_ball(2500)
     shells = [replace(ball, means=ball.means * np.float32(1 - 0.02 * i)) for i in range(3)]
     ball = join([replace(shell, logit_opacities=np.full(2500, 5, np.float32)) for shell in shells])
@@ -32,9 +30,8 @@ def junk() -> tuple[Splats, np.ndarray]:
     giant = Splats.create([[0.5, 0, 0]], scales=[[40, 40, 40]], logit_opacities=[-4])
     ends = rng.normal(size=(10, 3))
     ends /= np.linalg.norm(ends, axis=1, keepdims=True)
-    up = np.cross(ends, [0, 0, 1])
     quats = np.concatenate([1 + ends[:, 2:], np.cross([0, 0, 1], ends)], axis=1)
-    assert np.abs(up).max() > 0
+
     needles = Splats.create(2 * ends, quats=quats, scales=np.tile([0.002, 0.002, 0.1], (10, 1)))
     floaters = Splats.create(
         [[1.8, 0, 0], [1.81, 0, 0], [0, -2, 0.5]], scales=np.full((3, 3), 0.01), logit_opacities=[2, 2, 2]
@@ -45,7 +42,7 @@ def junk() -> tuple[Splats, np.ndarray]:
 
 
 def find(splats: Splats, **options: object):
-    """What is found if views could see all of it."""
+    """Find clutter as if views could see all of the scene."""
     views = around(24)
     pixels = int((views.widths * views.heights).sum())
     return find_clutter(splats, visibility(splats, views), np.ones(len(splats), bool), pixels, **options)
@@ -82,7 +79,7 @@ def test_what_no_view_looks_at_stays() -> None:
 
 
 def test_what_lies_behind_a_wall_stays() -> None:
-    """A view sees a wall alone: what stands behind it is in its frame, and no other view tells more."""
+    """What stands behind the wall is in the frame, but no view sees it."""
     x, z = np.meshgrid(np.linspace(-3, 3, 61), np.linspace(-3, 3, 61))
     means = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], 1)
     wall = Splats.create(means, scales=np.full((x.size, 3), 0.1), logit_opacities=np.full(x.size, 9.0))
@@ -102,7 +99,7 @@ def test_what_lies_behind_a_wall_stays() -> None:
 
 
 def test_a_chain_of_thin_ones_is_no_needle() -> None:
-    """A string: each end lies in the next one."""
+    """A string: each end lies inside the next Gaussian."""
     along = np.linspace(-1, 1, 21)[:, None] * [1, 0, 0]
     string = Splats.create(along, scales=np.tile([0.05, 0.001, 0.001], (21, 1)), logit_opacities=[3] * 21)
     scene = join([checkered_ball(500), replace(string, means=string.means + np.float32([0, 0, 2]))])
@@ -110,7 +107,7 @@ def test_a_chain_of_thin_ones_is_no_needle() -> None:
     assert found.counts["needle"] <= 2  # the string's own ends
 
 
-def test_bad_words() -> None:
+def test_unknown_kinds_are_rejected() -> None:
     splats, _ = junk()
     with pytest.raises(InputError, match="kinds: expected"):
         find(splats, kinds=("dust",))
@@ -119,8 +116,7 @@ def test_bad_words() -> None:
 def test_the_command(tmp_path: Path, command_line: CommandLine) -> None:
     splats, _ = junk()
     write_splats(tmp_path / "a.ply", splats)
-    code, _, told = command_line("clean", "a.ply", "--dry-run", "--preview", "p.png", cwd=tmp_path)
-    assert code == 0, told
+    told = succeeds(command_line, tmp_path, "clean", "a.ply", "--dry-run", "--preview", "p.png").err
     assert "are clutter" in told
     assert (tmp_path / "p.png").stat().st_size > 1000
     assert not (tmp_path / "b.ply").exists()

@@ -1,16 +1,15 @@
 """The lift against its float64 twin, and on the clouds that break lifts."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
 import pytest
 
-from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.scene.splats import SH_C0
 from g2ard.stages.lift import lift
+from helpers.commands import succeeds
+from helpers.threads import on_threads
 from reference.lift import discs
 
 
@@ -36,12 +35,6 @@ def test_equals_the_naive_twin():
     assert got.sh_degree == 0
 
 
-def test_map_coordinates_keep_their_precision():
-    points = surface() + np.array([637_000.0, 5_400_000.0, 120.0])
-    got = lift(points, np.full_like(points, 0.5))
-    np.testing.assert_allclose(got.means + got.offset, points, atol=1e-6)
-
-
 def test_translation_and_scale_by_powers_of_two_are_exact():
     points = np.round(surface() * 2**20) / 2**20
     colors = np.full_like(points, 0.5)
@@ -55,14 +48,8 @@ def test_translation_and_scale_by_powers_of_two_are_exact():
 
 def test_threads_do_not_matter():
     points = surface(20_000)
-    found = []
-    for threads in (1, 2, 8):
-        _core.set_num_threads(threads)
-        found.append(lift(points, np.full_like(points, 0.5)))
-    _core.set_num_threads(0)
-    for other in found[1:]:
-        np.testing.assert_array_equal(found[0].quats, other.quats)
-        np.testing.assert_array_equal(found[0].scales, other.scales)
+    found = on_threads(lambda: lift(points, np.full_like(points, 0.5)).fingerprint())
+    assert len(set(found)) == 1
 
 
 @pytest.mark.parametrize(
@@ -115,8 +102,7 @@ def test_command_line(tmp_path, command_line):
 
     points = surface(300) + np.array([500_000.0, 4_000_000.0, 0.0])
     write_points(tmp_path / "cloud.ply", Points(points, np.full((300, 3), 0.5, np.float32)))
-    status, out, err = command_line("lift", "cloud.ply", "-o", "prior.ply", "--json", "-", cwd=tmp_path)
-    assert status == 0, err
+    out = succeeds(command_line, tmp_path, "lift", "cloud.ply", "-o", "prior.ply", "--json", "-").out
     assert json.loads(out)["output_count"] == 300
     prior = read_splats(tmp_path / "prior.ply")
     np.testing.assert_allclose(prior.means + prior.offset, points, atol=0.01)
@@ -125,11 +111,8 @@ def test_command_line(tmp_path, command_line):
     assert "absent.ply" in err
 
 
-def test_near_coordinates_stay_the_caller_s_own():
-    rng = np.random.default_rng(3)
-    points, shift = rng.uniform(-100, 100, (500, 3)), np.array([5e5, 4e6, 0])
-    near, far = lift(points, np.full((500, 3), 0.5)), lift(points + shift, np.full((500, 3), 0.5))
+def test_near_coordinates_get_no_offset():
+    points = np.random.default_rng(3).uniform(-100, 100, (500, 3))
+    near = lift(points, np.full((500, 3), 0.5))
     np.testing.assert_array_equal(near.offset, 0)
     np.testing.assert_array_equal(near.means, points.astype(np.float32))
-    assert far.offset.any()
-    np.testing.assert_allclose(far.means + far.offset, points + shift, atol=1e-3)

@@ -1,11 +1,8 @@
 """The recovery loop: it recovers, both engines agree, it resumes to the same bits, it holds the anchors."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
-import signal
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,7 +14,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.rendering.visibility import visibility
 from g2ard.scene.splats import Splats
@@ -30,7 +26,9 @@ from g2ard.stages.recover.guard import Guard, blended
 from g2ard.stages.recover.report import outcome
 from g2ard.stages.recover.schedule import PAPER, TUNED
 from g2ard.stages.simplify import simplify
+from helpers.interruptions import press_ctrl_c_at
 from helpers.scenes import around, assert_same_bits, checkered_ball, under_a_sky
+from helpers.threads import on_threads
 
 VIEWS = around()
 TEACHER = checkered_ball()
@@ -59,7 +57,7 @@ def test_recovery_lifts_unseen_views(student: Splats, targets: TeacherRenders, e
     assert result.report.regularizers.steps == 1
 
 
-def test_both_engines_take_the_same_way(student: Splats, targets: TeacherRenders) -> None:
+def test_both_engines_take_the_same_steps(student: Splats, targets: TeacherRenders) -> None:
     fused, torch = (recover(student, targets, RecoverConfig(steps=60, engine=e)) for e in ("fused", "torch"))
     assert abs(fused.report.psnr.after - torch.report.psnr.after) < 0.005
     for name in ("means", "scales", "logit_opacities", "sh0", "shN"):
@@ -70,38 +68,20 @@ def test_both_engines_take_the_same_way(student: Splats, targets: TeacherRenders
 
 def test_same_bits_from_run_to_run_and_for_any_threads(student: Splats, targets: TeacherRenders) -> None:
     config = RecoverConfig(steps=25, regularizers=replace(PRESETS["noisy"], period=10))
-    before = _core.num_threads()
-    try:
-        results = []
-        for threads in (1, 2, 8):
-            _core.set_num_threads(threads)
-            results.append(recover(student, targets, config).splats)
-    finally:
-        _core.set_num_threads(before)
-    assert_same_bits(results[0], results[1])
-    assert_same_bits(results[0], results[2])
-
-
-class _StopAt:
-    """A progress callback that presses Ctrl-C at a step."""
-
-    def __init__(self, step: int) -> None:
-        self.step = step
-
-    def __call__(self, stage: str, done: int, total: int, info: Any = None) -> None:
-        if stage == "recover" and done == self.step:
-            signal.raise_signal(signal.SIGINT)
+    first, *others = on_threads(lambda: recover(student, targets, config).splats)
+    for other in others:
+        assert_same_bits(first, other)
 
 
 @pytest.mark.parametrize(("engine", "steps"), [("fused", 40), ("torch", 40), ("fused", 110)])
-def test_ctrl_c_then_resume_is_never_having_stopped(
+def test_an_interrupted_run_resumes_to_the_same_bits(
     student: Splats, targets: TeacherRenders, engine: Any, steps: int, tmp_path: Path
 ) -> None:
     config = RecoverConfig(steps=steps, engine=engine, regularizers=replace(PRESETS["lift"], period=10))
     whole = recover(student, targets, config)
     checkpoint = tmp_path / "c.npz"
     with pytest.raises(KeyboardInterrupt):
-        recover(student, targets, config, checkpoint=checkpoint, progress=_StopAt(17))
+        recover(student, targets, config, checkpoint=checkpoint, progress=press_ctrl_c_at("recover", 17))
     assert checkpoint.exists()
     resumed = recover(student, targets, config, checkpoint=checkpoint)
     assert_same_bits(whole.splats, resumed.splats)
@@ -115,7 +95,7 @@ def test_ctrl_c_then_resume_is_never_having_stopped(
     assert whole.report.geometry == resumed.report.geometry
 
 
-def test_a_run_that_was_killed_goes_on_from_the_last_minute(
+def test_a_killed_run_resumes_from_the_last_checkpoint(
     student: Splats, targets: TeacherRenders, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = RecoverConfig(steps=30, regularizers=replace(PRESETS["lift"], period=10))
@@ -141,7 +121,7 @@ def test_resume_refuses_other_options(student: Splats, targets: TeacherRenders, 
     config = RecoverConfig(steps=40)
     moved = replace(student, means=student.means + 1)
     with pytest.raises(KeyboardInterrupt):
-        recover(student, targets, config, checkpoint=checkpoint, progress=_StopAt(5))
+        recover(student, targets, config, checkpoint=checkpoint, progress=press_ctrl_c_at("recover", 5))
     with pytest.raises(InputError, match="other options"):
         recover(student, targets, replace(config, seed=1), checkpoint=checkpoint)
     with pytest.raises(InputError, match="other options"):  # another teacher, the same views
@@ -247,7 +227,7 @@ def test_masked_gaussians_are_left_alone(student: Splats, engine: Any) -> None:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A clock by which every look at it takes a hundredth of a second, on any machine."""
+    """A clock that advances by 10 ms per call on any machine."""
     ticks = itertools.count()
     monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic=lambda: next(ticks) / 100))
 
@@ -267,9 +247,7 @@ def test_a_recovery_time_sets_the_horizon(student: Splats, targets: TeacherRende
     assert report.psnr.after > report.psnr.before + 1
 
 
-def test_progress_shows_loss_psnr_and_speed(
-    student: Splats, targets: TeacherRenders, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_progress_figures(student: Splats, targets: TeacherRenders, monkeypatch: pytest.MonkeyPatch) -> None:
     for share in ("_SHARE", "_FIRST_SHARE"):  # these steps are too short for honest ones
         monkeypatch.setattr(probe, share, 0.5)
     seen: list[Any] = []
@@ -315,7 +293,7 @@ def test_a_far_offset_changes_nothing_but_the_offset(student: Splats, targets: T
     assert there == pytest.approx(here, abs=0.05)
 
 
-def test_nothing_to_do_is_said(student: Splats, targets: TeacherRenders) -> None:
+def test_an_empty_scene_and_an_unknown_engine_are_rejected(student: Splats, targets: TeacherRenders) -> None:
     with pytest.raises(InputError, match="0 Gaussians"):
         recover(student.take(slice(0, 0)), targets)
     with pytest.raises(InputError, match="engine"):
@@ -340,7 +318,7 @@ WILD = replace(TUNED, multiplier=20.0, reach=math.inf)
 """Rates that no scene bears."""
 
 
-def test_what_loses_goes_back_and_on_with_smaller_steps(targets: TeacherRenders) -> None:
+def test_steps_that_lose_are_undone_and_made_smaller(targets: TeacherRenders) -> None:
     start = simplify(TEACHER, 1500).splats
     done = recover(start, targets, RecoverConfig(schedule=WILD, steps=100)).report
     assert [found.step for found in done.backed_off][:2] == [10, 30]
@@ -348,11 +326,10 @@ def test_what_loses_goes_back_and_on_with_smaller_steps(targets: TeacherRenders)
     assert done.psnr.after > done.psnr.before + 1
     assert not done.kept_start
     told = outcome(done)
-    assert told is not None
     assert told.startswith(f"recovery fell to {done.backed_off[0].psnr:.2f} dB (start ")
 
 
-def test_a_resume_after_going_back_is_never_having_stopped(targets: TeacherRenders, tmp_path: Path) -> None:
+def test_a_resume_after_undone_steps_gives_the_same_bits(targets: TeacherRenders, tmp_path: Path) -> None:
     start = simplify(TEACHER, 1500).splats
     config = RecoverConfig(schedule=replace(WILD, multiplier=6.0), steps=60)
     whole = recover(start, targets, config)
@@ -360,7 +337,7 @@ def test_a_resume_after_going_back_is_never_having_stopped(targets: TeacherRende
     for step in (9, 35, 58):
         checkpoint = tmp_path / f"{step}.npz"
         with pytest.raises(KeyboardInterrupt):
-            recover(start, targets, config, checkpoint=checkpoint, progress=_StopAt(step))
+            recover(start, targets, config, checkpoint=checkpoint, progress=press_ctrl_c_at("recover", step))
         resumed = recover(start, targets, config, checkpoint=checkpoint)
         assert_same_bits(whole.splats, resumed.splats)
         for key in ("backed_off", "multiplier", "psnr", "stopped", "blend"):
@@ -375,12 +352,11 @@ def test_a_hopeless_recovery_stops_early_and_says_so(targets: TeacherRenders) ->
     assert done.report.steps == done.report.stopped == 75
     assert_same_bits(done.splats, start)
     told = outcome(done.report)
-    assert told is not None
     assert told.startswith("kept the simplified scene: recovery fell to ")
     assert told.endswith("given up at step 75")
 
 
-def test_of_a_way_that_ends_too_low_the_first_part_is_gone() -> None:
+def test_a_change_that_ends_too_low_is_cut_back() -> None:
     ball = checkered_ball(50)
     end = replace(ball, means=ball.means + 4, quats=-ball.quats, scales=ball.scales * 16)
     half = blended(ball, end, 0.5)
@@ -430,8 +406,8 @@ def test_views_of_another_kind_decide_what_stays() -> None:
     assert alone.settle(end, views, 9) == (end, 0.0)
 
 
-def test_a_recovery_that_other_views_only_lose_by_ends_at_half(targets: TeacherRenders) -> None:
-    """The other views ask for another scene: whatever is learned, they lose."""
+def test_a_recovery_that_only_harms_validation_views_stops_at_half(targets: TeacherRenders) -> None:
+    """The validation views show another scene."""
     start = simplify(TEACHER, 1500).splats
     elsewhere = TeacherRenders(start, around(5, (64, 48), 2.0))
     done = recover(start, targets, RecoverConfig(steps=100), validation=elsewhere)
@@ -441,7 +417,6 @@ def test_a_recovery_that_other_views_only_lose_by_ends_at_half(targets: TeacherR
     looks = done.report.validation.looks
     assert [found.step for found in looks] == [0, 10, 30, 50, 50, 50]
     told = outcome(done.report)
-    assert told is not None
     assert told.startswith("kept the simplified scene: every step made views of another kind worse (")
 
 
@@ -457,7 +432,14 @@ def test_other_views_gain_where_training_views_can_spare_it(student: Splats, tmp
     assert held.report.validation.looks[-1].psnr == pytest.approx(evaluate(held.splats, near).psnr, abs=1e-3)
     checkpoint = tmp_path / "c.npz"
     with pytest.raises(KeyboardInterrupt):
-        recover(student, targets, config, validation=near, checkpoint=checkpoint, progress=_StopAt(60))
+        recover(
+            student,
+            targets,
+            config,
+            validation=near,
+            checkpoint=checkpoint,
+            progress=press_ctrl_c_at("recover", 60),
+        )
     with pytest.raises(InputError, match="other options"):
         recover(student, targets, config, checkpoint=checkpoint)
     resumed = recover(student, targets, config, validation=near, checkpoint=checkpoint)
@@ -486,7 +468,7 @@ def test_both_engines_count_the_same_steps(student: Splats, targets: TeacherRend
         {"ssim_weight": 2.0},
     ],
 )
-def test_refuses_a_horizon_that_is_none(wrong: dict[str, Any]) -> None:
+def test_invalid_options_are_named(wrong: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=next(iter(wrong))):
         RecoverConfig(**wrong)
 

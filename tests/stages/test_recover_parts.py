@@ -1,7 +1,5 @@
 """Schedules, anchors, regularisers, presets and checkpoints, against the paper or a naive twin."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -193,8 +191,6 @@ def test_views_that_see_through_each_other_s_surfaces_make_a_prior_noisy() -> No
     strewn[rows] = rng.normal(0, 0.8, (1200, 3))
     foggy = replace(ball, means=strewn, logit_opacities=np.full(len(ball), 3, np.float32))
     sound, loose = view_consistency(ball, views), view_consistency(foggy, views)
-    assert sound is not None
-    assert loose is not None
     assert loose < 0.92 < 0.97 < sound
     assert preset_for("auto", ball, views)[0] == PRESETS["trained"]
     weights, why, _ = preset_for("auto", foggy, views)

@@ -1,7 +1,5 @@
 """The fused trainer does what rasterize + l1_ssim + torch's Adam do, to rounding; sparse and resumable."""
 
-from __future__ import annotations
-
 import copy
 import math
 from typing import Any
@@ -15,14 +13,14 @@ from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.rendering.renderer import RasterSettings, view_of
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, Regularizers
 from g2ard.stages.recover.engine import Photometric
 from g2ard.stages.recover.extent import extents, share_of_rate
 from g2ard.stages.recover.losses import TorchAnchors, l1_ssim, regularization
 from g2ard.stages.recover.rasterize import rasterize
 from g2ard.stages.recover.schedule import Rates
-from helpers.raster_cases import NAMES, Params, camera, scene, tensors_of
+from helpers.raster_cases import NAMES, Params, camera, scene, splats_of, tensors_of
+from helpers.threads import on_threads
 
 RATES = {"means": 2e-3, "quats": 1e-2, "log_scales": 2e-2, "logit_opacities": 5e-2, "sh0": 2e-2, "shN": 2e-3}
 BACKGROUND = (0.1, 0.2, 0.3)
@@ -228,17 +226,14 @@ def test_resume_is_bitwise() -> None:
 
 def test_bits_do_not_depend_on_threads() -> None:
     p, cameras, targets = problem(n=5000)
-    before = _core.num_threads()
-    try:
-        states = []
-        for threads in (1, 2, 8):
-            _core.set_num_threads(threads)
-            trainer = trainer_of(p)
-            losses = [step(trainer, cameras[i], targets[i])[0] for i in range(3)]
-            states.append((losses, {k: v.tobytes() for k, v in trainer.state().items()}))
-    finally:
-        _core.set_num_threads(before)
-    assert states[0] == states[1] == states[2]
+
+    def trained() -> tuple[list[float], dict[str, bytes]]:
+        trainer = trainer_of(p)
+        losses = [step(trainer, cameras[i], targets[i])[0] for i in range(3)]
+        return losses, {k: v.tobytes() for k, v in trainer.state().items()}
+
+    first, *others = on_threads(trained)
+    assert others == [first] * 2
 
 
 @pytest.mark.parametrize(
@@ -253,17 +248,9 @@ def test_bits_do_not_depend_on_threads() -> None:
     ],
 )
 def test_regularizers_are_torch_s(weights: Regularizers) -> None:
-    """From a scene that has left its anchors, needles among it: the step is that of the summed gradient."""
+    """From a scene that has left its anchors, with needles: the step follows the summed gradient."""
     p, cameras, targets = problem(n=100, degree=0)
-    splats = Splats(
-        means=p["means"],
-        quats=p["quats"],
-        scales=np.exp(p["log_scales"]),
-        logit_opacities=p["logit_opacities"],
-        sh0=p["sh0"],
-        shN=p["shN"],
-    )
-    anchors = Anchors.of(splats)
+    anchors = Anchors.of(splats_of(p))
     rng = np.random.default_rng(3)
     p["means"] += (0.3 * rng.normal(size=p["means"].shape)).astype(np.float32)
     p["log_scales"] += rng.normal(size=p["log_scales"].shape).astype(np.float32)

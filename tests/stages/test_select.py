@@ -1,7 +1,5 @@
 """View selection: depths and greedy choices against naive twins; every policy on pools of all shapes."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -26,7 +24,10 @@ from g2ard.stages.select import (
     surfaces,
     visible_cells,
 )
+from helpers.commands import refused
 from helpers.realdata import real
+from helpers.scenes import in_units
+from helpers.threads import on_threads
 from reference import rays
 from reference import select as naive
 
@@ -88,7 +89,7 @@ def test_depths_are_the_naive_renderers(offset):
 
 
 def smooth_depth(scene, cameras, i):
-    """The oracle's depth image, and where it differs from its four neighbours by less than 1 %."""
+    """Return the oracle's depth, and where it differs from all four neighbours by less than 1 %."""
     grid = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)
     depth = naive.median_depth(scene, cameras.viewmats[i], K, grid).reshape(SIZE[::-1])
     smooth = np.ones_like(depth, bool)
@@ -233,7 +234,7 @@ def test_auto_reaches_every_pose_and_then_represents(count):
 
 
 def test_auto_reaches_first():
-    """Two poses far from a crowd: both are chosen before any second one of the crowd."""
+    """Two poses far from a crowd are chosen before a second one of the crowd."""
     rng = np.random.default_rng(8)
     crowd = np.array([4.0, 0, 0]) + 0.3 * rng.standard_normal((30, 3))
     far = np.array([[-4.0, 0, 0], [0, 0, 4.0]])
@@ -242,16 +243,11 @@ def test_auto_reaches_first():
     unreached = poses.facility_location(
         np.eye(5), np.full(5, 0.2), np.array([1, 1, 0, 1, 1], bool), np.ones(5)
     )
-    assert unreached[0].tolist() == [
-        0,
-        1,
-        3,
-        4,
-    ]  # nothing like anything: in the order given, usable ones only
+    assert unreached[0].tolist() == [0, 1, 3, 4]  # nothing like anything: usable ones in the order given
 
 
 def test_of_views_alike_the_one_that_sees_more_is_taken():
-    """Five pairs of twins, of which the second sees more."""
+    """Five pairs of twins; the second of each sees more."""
     alike = np.kron(np.eye(5), np.ones((2, 2)))
     shares = np.tile([0.2, 0.3], 5)
     order, _ = poses.facility_location(alike, np.full(10, 0.1), np.ones(10, bool), shares)
@@ -302,6 +298,7 @@ def test_every_policy_on_every_pool(policy):
     assert sorted(everything.order.tolist()) == list(range(12))
     assert everything.left_out == 0
     assert everything.gains.sum() == pytest.approx(1.0)
+    np.testing.assert_array_equal(np.cumsum(everything.gains), everything.curve)
     few = run(pool, 5)
     assert len(set(few.order.tolist())) == 5
     if policy != "uniform":
@@ -347,16 +344,10 @@ def test_auto_k_stops_at_the_bend():
 def test_neither_threads_nor_runs_change_anything():
     scene, pool = ball(), around(25)
     options = CoverageOptions(cells=800)
-    results = []
-    try:
-        for threads in (1, 2, 8):
-            _core.set_num_threads(threads)
-            results.append(select(scene, pool, 10, policy="directional", options=options))
-    finally:
-        _core.set_num_threads(0)
-    for other in results[1:]:
-        np.testing.assert_array_equal(other.order, results[0].order)
-        np.testing.assert_array_equal(other.gains, results[0].gains)
+    first, *others = on_threads(lambda: select(scene, pool, 10, policy="directional", options=options))
+    for other in others:
+        np.testing.assert_array_equal(other.order, first.order)
+        np.testing.assert_array_equal(other.gains, first.gains)
 
 
 def test_offset_and_scale_change_nothing():
@@ -365,18 +356,14 @@ def test_offset_and_scale_change_nothing():
     offset = np.array([4.4e5, 4.4e6, 1e3])
     moved = select(ball(offset=tuple(offset)), pool.recentred(-offset), 8)
     np.testing.assert_array_equal(moved.order, base.order)
-    scene = ball()
-    large = replace(scene, means=scene.means * 8, scales=scene.scales * 8)
-    far = pool.viewmats.copy()
-    far[:, :3, 3] *= 8
-    np.testing.assert_array_equal(select(large, replace(pool, viewmats=far), 8).order, base.order)
+    np.testing.assert_array_equal(select(*in_units(ball(), pool, 8), 8).order, base.order)
 
 
 @pytest.mark.parametrize(
     ("k", "policy", "words"),
     [(0, "auto", "k"), (2.5, "auto", "k"), (3, "best", "policy"), ("auto", "random", "auto")],
 )
-def test_refuses_nonsense(k, policy, words):
+def test_invalid_arguments_are_named(k, policy, words):
     with pytest.raises(InputError, match=words):
         select(ball(200), around(5), k, policy=policy)
 
@@ -410,14 +397,7 @@ def test_command_line(tmp_path, command_line):
         np.testing.assert_allclose(back.weights, [view["weight"] for view in said["views"]])
         assert said["policy"] == policy
         assert set(said) >= {"policy", "views", "seconds", "evaluations"}
-    status, _, err = command_line(
-        "select", "scene.ply", "--views", "pool.json", "-k", "4", "-o", "auto.json", cwd=tmp_path
-    )
-    assert status == 1
-    assert "exists" in err
+    ask = ("select", "scene.ply", "--views", "pool.json")
+    assert "exists" in refused(command_line, tmp_path, *ask, "-k", 4, "-o", "auto.json", status=1)
     for wrong in (["-k", "0"], ["-k", "4", "--policy", "best"]):
-        status, _, err = command_line(
-            "select", "scene.ply", "--views", "pool.json", *wrong, "-o", "x.json", cwd=tmp_path
-        )
-        assert status == 2
-        assert len(err.strip().splitlines()) == 1
+        refused(command_line, tmp_path, *ask, *wrong, "-o", "x.json")

@@ -1,7 +1,5 @@
 """Pools that no one would make on purpose: through the function and through the command."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -42,7 +40,7 @@ def balls(count: int) -> Splats:
 
 
 @pytest.mark.parametrize("policy", MEASURING)
-def test_views_without_overlap_are_worth_the_same_and_none_is_left_out(policy: str) -> None:
+def test_views_without_overlap_are_worth_the_same(policy: str) -> None:
     scene = balls(4)
     pool = cameras([look_at([50 * i, -4, 0], [50 * i, 0, 0]) for i in range(4)])
     chosen = select(scene, pool, 4, policy=policy, options=OPTIONS)
@@ -77,14 +75,6 @@ def test_only_duplicates() -> None:
         np.testing.assert_allclose(chosen.weights.sum(), 3)
 
 
-def test_more_than_there_are_is_all_and_leaves_nothing_out() -> None:
-    for policy in POLICIES:
-        chosen = select(BALL, around(7), 10**9, policy=policy, options=OPTIONS)
-        assert sorted(chosen.order.tolist()) == list(range(7))
-        assert chosen.left_out == 0
-        np.testing.assert_array_equal(np.cumsum(chosen.gains), chosen.curve)
-
-
 def test_the_curve_is_where_k_can_be_read_off() -> None:
     whole = select(BALL, around(12), 12)
     few = select(BALL, around(12), 4)
@@ -116,48 +106,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def ask(command_line: CommandLine, folder: Path, k: object, *more: object) -> tuple[int, str, str]:
-    return command_line(
-        "select",
-        "ball.ply",
-        "--views",
-        "pool.json",
-        "-k",
-        k,
-        "-o",
-        "out.json",
-        "--json",
-        "-",
-        *more,
-        cwd=folder,
-    )
-
-
-def edit(folder: Path, **changes: Any) -> None:
-    """Changes fields of the pool's second view, in its file."""
-    write_views(folder / "pool.json", around(4), overwrite=True)
-    content = json.loads((folder / "pool.json").read_text())
-    content["views"][1].update(changes)
-    (folder / "pool.json").write_text(json.dumps(content))
-
-
-def test_the_command_refuses_nonsense_in_one_line(command_line: CommandLine, folder: Path) -> None:
-    pose = around(4).viewmats[1].tolist()
-    pose[0][3] = float("nan")
-    for changes, words in (
-        ({"camera_from_world": pose}, "finite"),
-        ({"width": 0}, "0×48"),
-        ({"height": -3}, "'height' of view 1 is -3"),
-        ({"name": "view_000"}, "view_000"),
-    ):
-        edit(folder, **changes)
-        status, out, error = ask(command_line, folder, 2)
-        assert (status, out) == (1, ""), changes
-        last = error.strip().splitlines()[-1]
-        assert last.startswith("g2ard: ")
-        assert "pool.json" in last
-        assert words in last
-        assert "Traceback" not in error
-        assert not (folder / "out.json").exists()
+    words = ["select", "ball.ply", "--views", "pool.json", "-o", "out.json", "--json", "-"]
+    return command_line(*words, "-k", k, *more, cwd=folder)
 
 
 def test_the_command_on_pools_of_all_shapes(command_line: CommandLine, folder: Path) -> None:
@@ -192,7 +142,3 @@ def test_the_command_reads_k_off_the_curve(command_line: CommandLine, folder: Pa
     said = json.loads(out)
     assert len({int(view["name"][1:]) // 8 for view in said["views"]}) == len(said["views"]) == 5
     assert said["left_out"] < 0.1
-    for policy in ("random", "uniform"):
-        status, _, error = ask(command_line, folder, "auto", "-w", "--policy", policy)
-        assert status == 2
-        assert policy in error

@@ -1,7 +1,5 @@
 """The same bits for 1, 2 and 8 threads: renders, gradients and whole recovery steps."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from g2ard import _core

@@ -1,7 +1,5 @@
 """Gradients of the rasteriser and of its float64 twin against finite differences, case by random case."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, field, replace
 

@@ -8,8 +8,6 @@ The lines hold for one processor: instruction sets differ in their last bits. Re
 names them, are subsampled; an argument names the scenes to run.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import sys

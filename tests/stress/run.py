@@ -5,8 +5,6 @@
 Ends with a table of counts and worst errors per parameter class; exit status 1 if anything is out of bounds.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -1,7 +1,5 @@
 """Random small scenes, cameras and conventions: each seed is one problem for the gradient check."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """--device: the GPU twins make the same scene and see the same cells; whatever fails, the CPU goes on."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -23,7 +21,7 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.select import surface, visible_cells
 from g2ard.stages.simplify import Simplified, flag, simplify
 from g2ard.system import devices
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.project import ROOT
 from helpers.realdata import real
 from helpers.scenes import around, checkered_ball
@@ -46,7 +44,7 @@ def gpu() -> Iterator[None]:
 
 
 def served() -> int:
-    """How many kernels ran on the GPU; none of them failed."""
+    """Return how many kernels ran on the GPU; check that none failed."""
     assert devices.notes() == []
     return devices.state().served
 
@@ -165,28 +163,13 @@ def test_command_line(tmp_path: Path, command_line: CommandLine, gpu: None) -> N
     write_splats(tmp_path / "a.ply", checkered_ball(1000))
     write_views(tmp_path / "v.json", around(6))
     paper = ("simplify", "a.ply", "-r", "10", "--method", "paper", "-w", "--json", "-")
-    chosen = (
-        "select",
-        "a.ply",
-        "--views",
-        "v.json",
-        "-k",
-        "3",
-        "--policy",
-        "coverage",
-        "--set",
-        "cells=300",
-        "-w",
-    )
+    chosen = ("select", "a.ply", "--views", "v.json", "-k", 3, "--policy", "coverage", "-w")
+    chosen = (*chosen, "--set", "cells=300")
     made = {}
     for device in ("cpu", "gpu"):
-        status, _, told = command_line(*paper, "-o", f"{device}.ply", "--device", device, "-v", cwd=tmp_path)
-        assert status == 0, told
+        told = succeeds(command_line, tmp_path, *paper, "-o", f"{device}.ply", "--device", device, "-v").err
         assert ("kernels on" in told) == (device == "gpu")
-        status, _, told = command_line(
-            *chosen, "-o", f"{device}.json", "--device", device, "-v", cwd=tmp_path
-        )
-        assert status == 0, told
+        told = succeeds(command_line, tmp_path, *chosen, "-o", f"{device}.json", "--device", device, "-v").err
         assert ("kernels on" in told) == (device == "gpu")
         made[device] = [(tmp_path / f"{device}.{kind}").read_bytes() for kind in ("ply", "json")]
     assert made["cpu"] == made["gpu"]
@@ -243,8 +226,7 @@ def test_little_address_space_ends_on_the_cpu(kilobytes: int, tmp_path: Path, gp
 
 
 def test_lists_devices(tmp_path: Path, command_line: CommandLine) -> None:
-    status, out, told = command_line("info", "--devices", "--json", "-", cwd=tmp_path)
-    assert status == 0, told
+    out, told = succeeds(command_line, tmp_path, "info", "--devices", "--json", "-")
     assert told.splitlines()[0].strip() == "Devices"
     assert "--device gpu" in told
     assert "┡" not in told  # what ends a header
@@ -252,13 +234,10 @@ def test_lists_devices(tmp_path: Path, command_line: CommandLine) -> None:
     names = [a["name"] for a in found["adapters"]]
     assert found["used"]["gpu"] == (names[0] if names else None)
     assert all(a["kind"] != "cpu" or a["name"] != found["used"]["auto"] for a in found["adapters"])
-    status, out, _ = command_line("info", "--devices", cwd=tmp_path)
-    assert status == 0
+    out = succeeds(command_line, tmp_path, "info", "--devices").out
     assert all(name in out for name in names or ["the CPU"])
     for wrong in ((), ("a.ply", "--devices")):
-        status, _, told = command_line("info", *wrong, cwd=tmp_path)
-        assert status == 2
-        assert "give a file, or --devices" in told
+        assert "give a file, or --devices" in refused(command_line, tmp_path, "info", *wrong)
 
 
 def test_without_an_adapter_one_line_and_the_cpu(
@@ -277,20 +256,17 @@ def test_without_an_adapter_one_line_and_the_cpu(
     lines = told.splitlines()
     assert [line for line in lines if "goes on on the CPU" in line] == [lines[0]]  # before the summary
     assert lines[1].startswith("gpu.ply")
-    status, _, told = command_line(*paper, "-o", "cpu.ply", "--device", "auto", cwd=tmp_path)
-    assert status == 0
+    told = succeeds(command_line, tmp_path, *paper, "-o", "cpu.ply", "--device", "auto").err
     assert "GPU" not in told
     assert (tmp_path / "cpu.ply").read_bytes() == (tmp_path / "gpu.ply").read_bytes()
-    status, out, _ = command_line("info", "--devices", "--json", "-", cwd=tmp_path)
-    assert status == 0
+    out = succeeds(command_line, tmp_path, "info", "--devices", "--json", "-").out
     assert json.loads(out) == {**json.loads(out), "adapters": []}
 
 
 def test_nothing_to_do_is_said(tmp_path: Path, command_line: CommandLine) -> None:
     write_splats(tmp_path / "a.ply", checkered_ball(500))
     fast = ("simplify", "a.ply", "-r", "5", "--method", "fast", "-o", "b.ply", "--device", "gpu")
-    status, _, told = command_line(*fast, cwd=tmp_path)
-    assert status == 0
+    told = succeeds(command_line, tmp_path, *fast).err
     assert "use one; all ran on the CPU" in told
 
 
@@ -323,8 +299,7 @@ def test_a_gpu_in_software_is_told(command_line: CommandLine, folder: Path, gpu:
     if found[0].kind != "cpu":
         pytest.skip("a real GPU comes first")
     ask = ("simplify", "ball.ply", "-r", 2, "--method", "paper", "-o", "s.ply", "--device", "gpu")
-    status, _, error = command_line(*ask, cwd=folder)
-    assert status == 0, error
+    error = succeeds(command_line, folder, *ask).err
     assert error.count(f"--device gpu: {found[0].name} is a software renderer") == 1
 
 

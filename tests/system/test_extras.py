@@ -1,7 +1,5 @@
 """Optional packages that are not installed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -14,7 +12,7 @@ from helpers.commands import CommandLine, refused
 from helpers.scenes import around, checkered_ball
 
 
-def test_features_that_need_torch_name_the_extra(
+def test_features_need_torch(
     command_line: CommandLine, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(extras, "find_spec", lambda name: None)

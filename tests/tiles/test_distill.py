@@ -1,7 +1,5 @@
 """Commands on scenes in tiles: files, refusals, and recovery with frozen surroundings."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -17,7 +15,7 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
-from g2ard.policy.tiling import Tiling, bytes_of, check_memory, is_tiled, workers_for
+from g2ard.policy.tiling import Tiling, bytes_of, is_tiled, workers_for
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
@@ -25,9 +23,8 @@ from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.schedule import Schedule
 from g2ard.stages.simplify import simplify
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.store import TileStore
-from helpers.commands import CommandLine
-from helpers.project import ROOT
+from helpers.commands import CommandLine, succeeds
+from helpers.project import environment
 from helpers.systems import is_worker, needs_proc
 from helpers.tiled_scenes import ring, town
 
@@ -38,11 +35,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_splats(folder / "town.ply", town())
     write_views(folder / "views.json", ring(8), splits=["train"] * 6 + ["test"] * 2)
     return folder
-
-
-def good(command_line: CommandLine, cwd: Path, *arguments: object) -> None:
-    code, _, said = command_line(*arguments, cwd=cwd)
-    assert code == 0, said
 
 
 def test_frozen_rows_stay_and_the_others_learn() -> None:
@@ -60,12 +52,12 @@ def test_frozen_rows_stay_and_the_others_learn() -> None:
         recover(small, TeacherRenders(dense, ring()), config, frozen=frozen[:5])
 
 
-def test_simplify_works_in_tiles_and_forgets_them(
-    command_line: CommandLine, folder: Path, tmp_path: Path
-) -> None:
+def test_simplify_removes_its_tiles(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
     out, views = tmp_path / "small_{ratio}x.ply", folder / "views.json"
     args = ["simplify", folder / "town.ply", "-r", "10,20", "-o", out, "--tile-rows", "2500"]
-    good(command_line, tmp_path, *args, "--views", views, "--workers", "1", "--json", tmp_path / "told.json")
+    succeeds(
+        command_line, tmp_path, *args, "--views", views, "--workers", "1", "--json", tmp_path / "told.json"
+    )
     told = json.loads((tmp_path / "told.json").read_text())["runs"]
     for ratio, report in zip((10, 20), told, strict=True):
         small = read_splats(tmp_path / f"small_{ratio}x.ply")
@@ -73,56 +65,34 @@ def test_simplify_works_in_tiles_and_forgets_them(
     assert {path.name for path in tmp_path.iterdir()} == {"small_10x.ply", "small_20x.ply", "told.json"}
 
 
-def test_what_lies_hidden_beside_the_output_of_another_run_is_replaced(
-    command_line: CommandLine, folder: Path, tmp_path: Path
-) -> None:
+def test_files_of_another_run_are_replaced(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
     args = ["-n", "300", "--no-views", "--workers", "1", "--tile-rows", "700"]
     write_splats(tmp_path / "other.ply", town(1500, seed=4))
     write_splats(tmp_path / "own.ply", town(1600))
-    good(command_line, tmp_path, "simplify", "own.ply", "-o", "clean.ply", *args)
+    succeeds(command_line, tmp_path, "simplify", "own.ply", "-o", "clean.ply", *args)
     stale = tmp_path / ".x.ply.tiles"
     ingest(tmp_path / "other.ply", stale / "tiles", tile_rows=700)
     (stale / "steps").mkdir()
     (stale / "steps" / "coarse-00000-0123456789abcdef.npz").write_bytes(b"of another run")
     (stale / "steps" / ".coarse-00000.0123.npz").write_bytes(b"begun")
-    good(command_line, tmp_path, "simplify", "own.ply", "-o", "x.ply", *args)
+    succeeds(command_line, tmp_path, "simplify", "own.ply", "-o", "x.ply", *args)
     assert (tmp_path / "x.ply").read_bytes() == (tmp_path / "clean.ply").read_bytes()
     assert not stale.exists()
 
 
-def test_a_device_that_all_fit_takes_them_all(
-    command_line: CommandLine, folder: Path, tmp_path: Path
-) -> None:
+def test_a_device_that_all_rows_fit(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
     args = ["simplify", folder / "town.ply", "--fit", "web", "-o", "all.ply", "--tile-rows", "2500"]
-    good(command_line, tmp_path, *args, "--workers", "1")
+    succeeds(command_line, tmp_path, *args, "--workers", "1")
     assert len(read_splats(tmp_path / "all.ply")) == 9000
 
 
 def test_a_folder_of_tiles_is_a_scene(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
     store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
     common = ["-n", "900", "--no-views", "--workers", "1"]
-    good(
-        command_line,
-        tmp_path,
-        "simplify",
-        store.folder,
-        *common,
-        "-o",
-        tmp_path / "a.ply",
-        "--work",
-        tmp_path / "work",
-    )
-    good(
-        command_line,
-        tmp_path,
-        "simplify",
-        folder / "town.ply",
-        *common,
-        "-o",
-        tmp_path / "b.ply",
-        "--tile-rows",
-        "2500",
-    )
+    work = ("--work", tmp_path / "work")
+    succeeds(command_line, tmp_path, "simplify", store.folder, *common, "-o", "a.ply", *work)
+    rows = ("--tile-rows", "2500")
+    succeeds(command_line, tmp_path, "simplify", folder / "town.ply", *common, "-o", "b.ply", *rows)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
     assert (tmp_path / "work" / "steps").is_dir()  # named by the user, so it stays
 
@@ -139,23 +109,16 @@ def test_tiles_are_read_as_one_scene(command_line: CommandLine, folder: Path, tm
     whole = ingest(folder / "town.ply", tmp_path / "whole", tile_rows=4000)
     assert [tile.rows for tile in again.tiles] == [tile.rows for tile in whole.tiles]
     args = ("simplify", tmp_path / "9000", "-n", 300, "--no-views", "-o", "one.ply")
-    good(command_line, tmp_path, *args)
-    good(command_line, tmp_path, "simplify", folder / "town.ply", *args[2:-1], "two.ply")
+    succeeds(command_line, tmp_path, *args)
+    succeeds(command_line, tmp_path, "simplify", folder / "town.ply", *args[2:-1], "two.ply")
     assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "two.ply").read_bytes()
-
-
-def own_path() -> dict[str, str]:
-    """The environment of a process that runs these sources."""
-    paths = filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def test_a_killed_command_leaves_no_workers_and_goes_on(folder: Path, tmp_path: Path) -> None:
     words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
     command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
-    env = own_path()
     steps = tmp_path / ".x.ply.tiles" / "steps"
-    with subprocess.Popen(command, env=env, stderr=subprocess.PIPE) as running:
+    with subprocess.Popen(command, env=environment(), stderr=subprocess.PIPE) as running:
         children: list[int] = []
         until = time.monotonic() + 120
         while running.poll() is None and time.monotonic() < until and len(list(steps.glob("[!.]*.npz"))) < 3:
@@ -169,19 +132,18 @@ def test_a_killed_command_leaves_no_workers_and_goes_on(folder: Path, tmp_path: 
     while any(Path(f"/proc/{pid}").exists() for pid in children) and time.monotonic() < until:
         time.sleep(0.1)
     assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]
-    assert subprocess.run([*command, "--work", str(steps.parent)], env=env, check=False).returncode == 0
+    again = subprocess.run([*command, "--work", str(steps.parent)], env=environment(), check=False)
+    assert again.returncode == 0
     assert len(read_splats(tmp_path / "x.ply")) == 900
     assert all((steps / name).stat().st_mtime_ns == at for name, at in done.items())
 
 
 @needs_proc
 @pytest.mark.parametrize("seconds", [0.0, 0.2, 0.5])
-def test_workers_that_have_just_begun_end_with_a_killed_command(
-    folder: Path, tmp_path: Path, seconds: float
-) -> None:
+def test_new_workers_end_with_a_killed_command(folder: Path, tmp_path: Path, seconds: float) -> None:
     words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
     command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
-    with subprocess.Popen(command, env=own_path(), stderr=subprocess.DEVNULL) as running:
+    with subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL) as running:
         until = time.monotonic() + 60
         while not (workers := _workers(running.pid)) and time.monotonic() < until:
             time.sleep(0.005)
@@ -198,7 +160,7 @@ def test_workers_that_have_just_begun_end_with_a_killed_command(
 
 
 def _workers(parent: int) -> set[int]:
-    """Its processes that work on tiles."""
+    """Return its child processes that work on tiles."""
     listed = Path(f"/proc/{parent}/task/{parent}/children")
     with suppress(OSError):
         return {int(pid) for pid in listed.read_text().split() if is_worker(int(pid))}
@@ -213,16 +175,7 @@ def test_memory_is_a_size(command_line: CommandLine, folder: Path, tmp_path: Pat
 
 
 def test_distill_in_one_piece_heeds_memory(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
-    call = (
-        "distill",
-        folder / "town.ply",
-        "-r",
-        10,
-        "-o",
-        tmp_path / "run",
-        "--views",
-        folder / "views.json",
-    )
+    call = ("distill", folder / "town.ply", "-r", 10, "-o", "run", "--views", folder / "views.json")
     status, _, said = command_line(*call, "--memory", "120MB", cwd=tmp_path)
     assert status == 1
     said = " ".join(said.split())
@@ -241,18 +194,14 @@ def test_memory_decides_how_many_work_and_nothing_else(folder: Path, tmp_path: P
         InputError, match=r"--workers 9 take about .* GB, more than --memory .*; --workers \d fit"
     ):
         workers_for(store, Tiling(memory=need, workers=9))
-    check_memory(folder / "town.ply", Tiling(), 7)
-    check_memory(folder / "town.ply", Tiling(memory=300_000_000), 7)
-    with pytest.raises(InputError, match=r"town.ply: 9,000 Gaussians in one piece take about"):
-        check_memory(folder / "town.ply", Tiling(memory=1_000_000), 7)
+
     assert bytes_of("4GB") == 4 * 10**9
     assert not is_tiled(folder / "town.ply", Tiling())
     assert is_tiled(folder / "town.ply", Tiling(tile_rows=8999))
-    assert len(TileStore.open(tmp_path / "tiles").tiles) > 1
 
 
 def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
-    good(
+    succeeds(
         command_line,
         tmp_path,
         *("distill", folder / "town.ply", "-r", 10, "-o", tmp_path / "run", "--views", folder / "views.json"),
@@ -281,7 +230,7 @@ def test_recovery_in_tiles_takes_its_options(command_line: CommandLine, folder: 
     def distilled(name: str, *options: object) -> Splats:
         args = ("distill", tmp_path / "town.ply", "-r", 10, "-o", tmp_path / name, "--steps", 12)
         tiled = ("--views", folder / "views.json", "--tile-rows", 800, "--workers", 1)
-        good(command_line, tmp_path, *args, *tiled, *options)
+        succeeds(command_line, tmp_path, *args, *tiled, *options)
         return read_splats(tmp_path / name / "scene.ply")
 
     usual = distilled("usual")

@@ -1,7 +1,5 @@
 """Folders of tiles and of work: one process at a time, damage found or mended, nothing of the user's lost."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +13,8 @@ from g2ard.levels import Cut, save_levels
 from g2ard.tiles import ingest as ingest_module
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.store import StoredScene, TileStore
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, refused, succeeds
+from helpers.interruptions import interrupt_at
 from helpers.level_files import files_of, scattered
 from helpers.project import ROOT
 from helpers.tiled_scenes import reduced, ring, town
@@ -33,7 +32,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def flipped(path: Path) -> None:
-    """One byte changed, none added."""
+    """Flip one bit of a file."""
     content = bytearray(path.read_bytes())
     content[100] ^= 1
     path.write_bytes(content)
@@ -46,7 +45,6 @@ def test_a_folder_has_one_holder_and_a_dead_one_is_none(tmp_path: Path) -> None:
     )
     with subprocess.Popen([sys.executable, "-c", holds, tmp_path], stdout=subprocess.PIPE) as holder:
         try:
-            assert holder.stdout is not None
             assert holder.stdout.readline().strip() == b"held"
             with pytest.raises(OutputError, match=f"in use by process {holder.pid};"), locked(tmp_path):
                 pass
@@ -67,16 +65,13 @@ def test_two_ingests_do_not_meet(place: Path, tmp_path: Path) -> None:
     assert not (folder / LOCK).exists()
 
 
-def test_two_commands_in_one_work_folder_do_not_meet(
-    command_line: CommandLine, place: Path, tmp_path: Path
-) -> None:
+def test_a_work_folder_takes_one_command(command_line: CommandLine, place: Path, tmp_path: Path) -> None:
     simplify = ("simplify", place / "town.ply", "-n", 300, *BLIND, "-o", "a.ply", "--work", "work")
     (tmp_path / "work").mkdir()
     with locked(tmp_path / "work"):
         status, _, said = command_line(*simplify, cwd=tmp_path)
     assert (status, "work: in use by process" in said, said.count("\n")) == (1, True, 1), said
-    status, _, said = command_line(*simplify, cwd=tmp_path)
-    assert status == 0, said
+    succeeds(command_line, tmp_path, *simplify)
 
 
 @pytest.mark.parametrize("length", [100, 10_000_000])
@@ -126,9 +121,7 @@ def test_levels_are_not_written_from_damaged_tiles(place: Path, tmp_path: Path) 
     store, work = ingest(place / "town.ply", tmp_path / "tiles", tile_rows=700), tmp_path / "work"
     work.mkdir()
 
-    def stop(stage: str, number: int, total: int, info: object = None) -> None:
-        if stage == "write" and number == 2:
-            raise KeyboardInterrupt
+    stop = interrupt_at("write", 2)
 
     with pytest.raises(KeyboardInterrupt):
         save_levels(tmp_path / "out", [StoredScene(store)], cut=Cut(most=200), work=work, progress=stop)
@@ -194,14 +187,11 @@ def test_what_can_be_refused_first_is(
         monkeypatch.setattr(distributed, "Client", hasty)
     monkeypatch.setattr(ingest_module, "pour", lambda *_: pytest.fail("poured"))
     tiled = ("simplify", place / "town.ply", "-n", 300, "--tile-rows", "700", "-o", "deep/a.ply")
-    status, _, said = command_line(*tiled, *options, cwd=tmp_path)
-    assert (status, told in said, said.count("\n")) == (1, True, 1), said
+    assert told in refused(command_line, tmp_path, *tiled, *options, status=1)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_refusal_leaves_no_copy_of_the_scene_or_says_so(
-    command_line: CommandLine, place: Path, tmp_path: Path
-) -> None:
+def test_errors_leave_no_copy_of_the_scene(command_line: CommandLine, place: Path, tmp_path: Path) -> None:
     tiled = ("simplify", place / "town.ply", *BLIND, "-o", "a.ply", "-n")
     status, _, said = command_line(*tiled, 9999, cwd=tmp_path)
     assert status == 1, said
@@ -209,14 +199,11 @@ def test_a_refusal_leaves_no_copy_of_the_scene_or_says_so(
     status, _, said = command_line(*tiled, 2, cwd=tmp_path)  # known once the steps are done
     assert (status, "keep at least" in said, "kept in .a.ply.tiles" in said) == (1, True, True)
     assert (tmp_path / ".a.ply.tiles" / "steps").is_dir()
-    status, _, said = command_line(*tiled, 300, cwd=tmp_path)
-    assert status == 0, said
+    succeeds(command_line, tmp_path, *tiled, 300)
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
-def test_work_takes_no_folder_of_the_users_own(
-    command_line: CommandLine, place: Path, tmp_path: Path
-) -> None:
+def test_work_takes_no_folder_of_the_user(command_line: CommandLine, place: Path, tmp_path: Path) -> None:
     tiled = ("simplify", place / "town.ply", "-n", 300, *BLIND)
     own, tiles = tmp_path / "own", tmp_path / "tiles"
     own.mkdir()
@@ -224,27 +211,24 @@ def test_work_takes_no_folder_of_the_users_own(
     ingest(place / "town.ply", tiles, tile_rows=800)
     for folder, held in ((own, "letter.txt"), (tiles, "halo-00000.f32")):
         before = files_of(folder)
-        status, _, said = command_line(*tiled, "-o", "a.ply", "--work", folder, cwd=tmp_path)
-        assert (status, f"{folder.name}: holds {held}" in said, said.count("\n")) == (1, True, 1), said
+        assert f"{folder.name}: holds {held}" in refused(
+            command_line, tmp_path, *tiled, "-o", "a.ply", "--work", folder, status=1
+        )
         assert files_of(folder) == before
     status, _, said = command_line(*tiled, "-o", "b", "--work", "b", cwd=tmp_path)
     said = " ".join(said.split())
     assert (status, "--work: b is an output" in said, "is an input" in said) == (2, True, False), said
     for _ in range(2):  # one that was made so is taken again
-        status, _, said = command_line(*tiled, "-o", "a.ply", "-w", "--work", "work", cwd=tmp_path)
-        assert status == 0, said
+        succeeds(command_line, tmp_path, *tiled, "-o", "a.ply", "-w", "--work", "work")
 
 
 def test_an_unfinished_ingest_is_named(command_line: CommandLine, place: Path, tmp_path: Path) -> None:
-    def stop(stage: str, *_: object) -> None:
-        if stage == "tiles":
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        ingest(place / "town.ply", tmp_path / "begun", tile_rows=700, progress=stop)
+        ingest(place / "town.ply", tmp_path / "begun", tile_rows=700, progress=interrupt_at("tiles"))
     for call in (("info", "begun"), ("simplify", "begun", "-n", 300, "-o", "a.ply")):
-        status, _, said = command_line(*call, cwd=tmp_path)
-        assert (status, "begun: tiles that `g2ard ingest` has not finished" in said) == (1, True), said
+        assert "begun: tiles that `g2ard ingest` has not finished" in refused(
+            command_line, tmp_path, *call, status=1
+        )
     (tmp_path / "empty").mkdir()
     assert "tiles.json" in command_line("info", "empty", cwd=tmp_path)[2]
     before = files_of(tmp_path / "begun")

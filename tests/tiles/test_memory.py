@@ -1,7 +1,5 @@
 """Memory of tiles: what is refused says what it takes, and what it advises is accepted."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -78,7 +76,7 @@ def test_tiles_of_a_folder_are_not_cut_anew(scene: Path, tmp_path: Path) -> None
         workers_for(store, Tiling(memory=bytes_of("202MB"), folder=tmp_path / ".x.tiles"))
 
 
-def test_memory_that_nobody_gave_is_the_machine_s(
+def test_the_machines_memory_is_the_default(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store, tiling = tiles(scene, tmp_path, 6000)

@@ -1,7 +1,5 @@
 """Clouds in blocks, and lifted tile by tile: what `lift` gives of the whole cloud."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -13,13 +11,16 @@ from g2ard.io import Points, open_point_stream, read_cloud, write_points
 from g2ard.stages.lift import LiftConfig, lift
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.store import TileStore, packed
+from helpers import cloud_files
 from helpers.ingested import as_set, halos_of, saved, tiles_of, town
+from helpers.interruptions import interrupt_at
+from helpers.ply_files import save
 
 UTM = (636_337.8, 5_427_319.25, 40.0)
 
 
 def streets(count: int = 8000, seed: int = 0, offset: tuple[float, ...] = (0, 0, 0)) -> Points:
-    """A ground and two walls, a survey's noise on them."""
+    """A ground and two walls with a survey's noise."""
     rng = np.random.default_rng(seed)
     at = rng.uniform(0, 1, (count, 3)) * [60, 25, 0]
     wall = rng.integers(0, 4, count)
@@ -31,16 +32,8 @@ def streets(count: int = 8000, seed: int = 0, offset: tuple[float, ...] = (0, 0,
     )
 
 
-def las(path: Path, points: Points, top: int = 65535, scale: float = 1e-3) -> Path:
-    laspy = pytest.importorskip("laspy")
-    pytest.importorskip("lazrs")
-    header = laspy.LasHeader(point_format=7, version="1.4")
-    header.scales, header.offsets = [scale] * 3, np.floor(points.positions.min(0))
-    content = laspy.LasData(header)
-    content.x, content.y, content.z = points.positions.T
-    content.red, content.green, content.blue = np.rint(points.colors * top).astype(np.uint16).T
-    content.write(str(path))
-    return path
+def las(path: Path, points: Points, top: int = 65535) -> Path:
+    return cloud_files.las(path, points.positions, np.rint(points.colors * top).astype(np.uint16))
 
 
 def ply(path: Path, points: Points) -> Path:
@@ -126,12 +119,10 @@ def test_an_interruption_costs_a_block_or_a_tile(tmp_path: Path, stage: str) -> 
     path, folder = ply(tmp_path / "cloud.ply", streets(3000)), tmp_path / "tiles"
     whole = ingest(path, tmp_path / "whole", tile_rows=800)
 
-    def interrupt(now: str, done: int, total: int, info: object = None) -> None:
-        if now == stage and done >= 1200:
-            raise KeyboardInterrupt
+    stop = interrupt_at(stage, 1200)
 
     with pytest.raises(KeyboardInterrupt):
-        ingest(path, folder, tile_rows=800, block_rows=300, progress=interrupt)
+        ingest(path, folder, tile_rows=800, block_rows=300, progress=stop)
     with pytest.raises(InputError, match="no finished tiles"):
         TileStore.open(folder)
     if stage != "sample":
@@ -151,7 +142,6 @@ def test_an_interruption_costs_a_block_or_a_tile(tmp_path: Path, stage: str) -> 
 
 
 def test_bad_points_are_dropped_and_told(tmp_path: Path) -> None:
-    from helpers.ply_files import save
 
     points = streets(500)
     properties = {axis: points.positions[:, i].copy() for i, axis in enumerate("xyz")}

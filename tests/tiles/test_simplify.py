@@ -1,7 +1,5 @@
 """Simplification in tiles: one exact budget, the same bits wherever tasks run, and one tile is the whole."""
 
-from __future__ import annotations
-
 import os
 import random
 import signal
@@ -108,9 +106,7 @@ def test_the_cheapest_of_several_arrays_are_those_of_all() -> None:
 
 
 @pytest.mark.parametrize("blind", [False, True])
-def test_an_exact_count_about_as_good_as_in_one_piece(
-    store: TileStore, scene: Path, tmp_path: Path, blind: bool
-) -> None:
+def test_exact_count_and_quality(store: TileStore, scene: Path, tmp_path: Path, blind: bool) -> None:
     views = ring(8)
     small = reduced(store, tmp_path, blind=blind, views=views)
     assert len(store.tiles) >= 4
@@ -134,7 +130,7 @@ def test_tiles_that_no_view_sees_keep_their_share(store: TileStore, tmp_path: Pa
     assert min(rows) > 20
 
 
-def test_neither_workers_nor_the_order_of_rows_change_a_bit(
+def test_workers_and_row_order_change_no_bit(
     store: TileStore, scene: Path, tmp_path: Path, fingerprint: str
 ) -> None:
     assert reduced(store, tmp_path / "two", views=ring(), workers=2).fingerprint() == fingerprint
@@ -178,7 +174,7 @@ def test_workers_killed_at_random_cost_time_alone(
 
 
 def _children() -> list[int]:
-    """Worker processes of this one. Threads and processes may end while they are listed."""
+    """Return the worker processes of this one. Threads and processes may end while they are listed."""
     pids = []
     for task in Path("/proc/self/task").iterdir():
         with suppress(OSError):
@@ -231,7 +227,7 @@ def test_budgets_out_of_reach_are_refused(store: TileStore, tmp_path: Path) -> N
     faint.logit_opacities[::6] = -9
     write_splats(tmp_path / "faint.ply", faint)
     some = ingest(tmp_path / "faint.ply", tmp_path / "faint", tile_rows=250)
-    with pytest.raises(InputError, match="expected at most 500 "):
+    with pytest.raises(InputError, match=r"expected at most 500 "):
         reduced(some, tmp_path, budget=550, blind=True)
     with pytest.raises(InputError, match=r"the 4 tiles keep at least 4 Gaussians \(one per tile\), got 2"):
         reduced(store, tmp_path, budget=2, blind=True)

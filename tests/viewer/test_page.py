@@ -3,8 +3,6 @@
 `test_view_browser.py` opens them.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import hashlib
@@ -25,7 +23,7 @@ from g2ard.policy.viewer_frame import frame_of, frame_with
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.viewer import Start, check_page_output, page, write_page
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball
 
 BUNDLE = Path(viewer.__file__).parent / "supersplat"
@@ -115,9 +113,7 @@ def test_equal_scenes_give_equal_bytes_and_two_scenes_two_scripts(tmp_path: Path
     assert json.loads(parts.scripts["view"])["start"] is None
 
 
-def test_outputs_are_checked_and_nothing_half_is_left(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failures_leave_no_half_written_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ball = checkered_ball(20)
     with pytest.raises(OutputError, match=r"a\.txt: expected a file name that ends in \.html"):
         check_page_output(tmp_path / "a.txt")
@@ -212,10 +208,9 @@ def test_the_command_shows_a_scene_and_a_run(command_line: CommandLine, tmp_path
     write_splats(tmp_path / "run" / "scene.spz", ball.take(slice(0, 200)))
     (tmp_path / "run" / "report.json").write_text("{}")
     write_views(tmp_path / "run" / "views.json", around(6))
-    status, out, err = command_line(
-        "view", "run", "dense.ply", "-o", "pages/two.html", "--json", "-", cwd=tmp_path
-    )
-    assert status == 0, err
+    out = succeeds(
+        command_line, tmp_path, "view", "run", "dense.ply", "-o", "pages/two.html", "--json", "-"
+    ).out
     told = json.loads(out)
     assert [scene["count"] for scene in told["scenes"]] == [200, 300]
     assert told["start"].startswith("view_")
@@ -226,17 +221,13 @@ def test_the_command_shows_a_scene_and_a_run(command_line: CommandLine, tmp_path
         "dense.ply: 300 Gaussians",
     ]
     before = (tmp_path / "pages" / "two.html").read_bytes()
-    status, _, err = command_line("view", "dense.ply", "-o", "pages/two.html", cwd=tmp_path)
-    assert status == 1
-    assert "exists" in err
+    assert "exists" in refused(command_line, tmp_path, "view", "dense.ply", "-o", "pages/two.html", status=1)
     assert (tmp_path / "pages" / "two.html").read_bytes() == before
     assert command_line("view", "dense.ply", "-o", "pages/two.html", "-w", "-q", cwd=tmp_path)[0] == 0
     assert len(Parts(tmp_path / "pages" / "two.html").labels) == 1
 
 
-def test_a_run_has_a_page_unless_its_scene_is_too_large(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_has_a_page_unless_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ball, path = checkered_ball(300), tmp_path / "view.html"
     size, line = run_view(path, tmp_path / "scene.sog", ball, around(6), (1.0, 1.0, 1.0))
     assert size == path.stat().st_size
@@ -266,8 +257,5 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     write_splats(tmp_path / "dense.ply", checkered_ball(50))
     write_views(tmp_path / "v.json", around(2))
     (tmp_path / "empty").mkdir()
-    status, _, err = command_line("view", *arguments, cwd=tmp_path)
-    assert status == 1
-    assert len(err.strip().splitlines()) == 1
-    assert words in err
+    assert words in refused(command_line, tmp_path, "view", *arguments, status=1)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["dense.ply", "empty", "v.json"]

@@ -1,7 +1,5 @@
 """Pages opened in a real browser, and what they show held against our own rasteriser; see `browser.py`."""
 
-from __future__ import annotations
-
 import base64
 import re
 from collections.abc import Iterator
