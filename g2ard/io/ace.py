@@ -33,7 +33,7 @@ def read(path: Path) -> dict[str, NDArray[np.float64]]:
             pose = np.zeros(0)
         if len(pose) != 7 or not np.isfinite(pose).all() or not np.linalg.norm(pose[:4]) > 0:
             raise InputError(
-                "expected a name, a quaternion wxyz and a translation", path=path, index=number, item="line"
+                "is not a name, a quaternion wxyz and a translation", path=path, index=number, item="line"
             )
         if words[0] in out:
             raise InputError(f"repeats the name {words[0]!r}", path=path, index=number, item="line")

@@ -96,7 +96,7 @@ def _poses(path: Path) -> list[tuple[str, list[float]]]:
                 continue
             if len(words) != 8:
                 raise InputError(
-                    f"expected a name and 7 numbers, got {len(words)} words",
+                    f"has {len(words)} words, expected a name and 7 numbers",
                     path=path,
                     index=number,
                     item="line",

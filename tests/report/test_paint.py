@@ -100,7 +100,7 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
         (["-r", "10"], 2, "go with --color"),
         (["--color", "cells", "--parents", "to.npy"], 2, "--parents goes with"),
         (["--color", "parents", "--parents", "nowhere.npy"], 1, "nowhere.npy"),
-        (["--color", "parents", "--parents", "views.json"], 1, "not an array"),
+        (["--color", "parents", "--parents", "views.json"], 1, "not a NumPy array"),
         (["--color", "parents", "--parents", "few.npy"], 1, "expected 90 whole numbers"),
         (["--color", "flags", "-n", "91"], 1, "at most its 90 Gaussians, got 91"),
     ],

@@ -371,7 +371,7 @@ def test_the_command(tmp_path: Path, command_line) -> None:
     assert report["halo_rows"] == sum(tile.halo for tile in store.tiles) > 0
     assert 0 < report["seconds"] < 60
     assert report["peak_rss"] is None or report["peak_rss"] > 1e6
-    assert f"4,000 Gaussians in {len(store.tiles)} tile(s)" in said
+    assert f"4,000 Gaussians in {len(store.tiles)} tiles" in said
 
     assert "skipped" in succeeds(command_line, tmp_path, *given, "again.json").err
     status, _, said = command_line("ingest", "a.ply", "-o", "deep/tiles", cwd=tmp_path)

@@ -76,7 +76,7 @@ def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
 
 
 def _scores(report: dict[str, Any]) -> tuple[str, dict[str, dict[str, float]]]:
-    """Return a run's targets, in words, and its scores; tiled runs have only PSNR."""
+    """Return the name of a run's targets and its scores; tiled runs have only PSNR."""
     scores = report["scores"]
     if "tiles" in report:
         return "the scene's renders", {name: {"psnr": scores[name]} for name in ("simplified", "recovered")}
