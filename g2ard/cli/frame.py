@@ -359,7 +359,7 @@ def _device(run: Run) -> Iterator[None]:
         run.tell_notes()
         state = devices.state()
         if ended and run.device == "gpu" and not (state.served or run.noted):
-            run.say("--device gpu: not used; only `simplify --method paper` and `select` use it")
+            run.say("--device gpu: not used, because nothing in this run has a GPU kernel")
         elif state.served and run.verbose:
             longest = sorted(state.seconds.items(), key=lambda item: -item[1])[:6]
             took = "".join(f", {name} {seconds:.3f} s" for name, seconds in longest)

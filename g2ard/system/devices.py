@@ -1,4 +1,4 @@
-"""The device that kernels run on. It affects the running time, never the results."""
+"""The device that kernels run on. A GPU's results are the CPU's within rounding, and repeatable."""
 
 from __future__ import annotations
 
@@ -61,8 +61,9 @@ def adapters() -> list[Adapter] | None:
 def use(device: str, *, timed: bool = False) -> None:
     """Select the device for all kernels of this process.
 
-    Only `simplify` with the paper's method and the visibility pass of `select` have GPU kernels; the rest
-    always runs on the CPU. If the device fails, the CPU takes over for good and `notes()` says so.
+    GPU kernels exist for what views see of a scene (`select`, `simplify` by the default method) and for
+    `simplify` by the paper's method; all others run on the CPU. If the device fails, the CPU takes
+    over for good and `notes()` says so.
 
     Args:
         device: "cpu" (the initial device); "gpu", the best adapter, even a software one; or "auto", a

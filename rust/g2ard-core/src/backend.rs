@@ -1,13 +1,15 @@
-//! Where the heavy kernels of simplification and selection run: on the CPU, or on a device that computes the same.
+//! Where the heavy kernels of simplification and selection run: on the CPU, or on a device.
 //!
 //! Stages know only the traits of their own kernels; this module alone knows both.
 
 use crate::Cpu;
 use crate::select::ViewKernels;
 use crate::simplify::GroupKernels;
+use crate::visibility::VisibilityKernels;
 
-/// All kernels that have more than one implementation. One may be faster than [`Cpu`]'s; it may not differ from it.
-pub trait Backend: ViewKernels {
+/// All kernels that have more than one implementation. Those of a device may differ from [`Cpu`]'s within a stated
+/// tolerance, and are the same from run to run.
+pub trait Backend: ViewKernels + VisibilityKernels {
     /// The kernels for one run of simplification, which may keep the run's rows between calls.
     fn group_kernels(&self) -> Box<dyn GroupKernels + '_>;
 }

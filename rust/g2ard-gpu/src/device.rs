@@ -3,14 +3,16 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use g2ard_core::raster::Camera;
+use g2ard_core::raster::{Camera, Settings};
 use g2ard_core::select::{Gaussians, Surface, ViewKernels};
 use g2ard_core::simplify::{Group, GroupKernels, Merged};
 use g2ard_core::spatial::{Cells, RobustBounds};
+use g2ard_core::visibility::{VisibilityAccumulator, VisibilityKernels};
 use g2ard_core::{Backend, Control, Cpu, Result, Splats};
 
 use crate::rows::{Numbered, Numbers, Rows};
 use crate::runtime::{Adapter, Error, Gpu, Options, guarded};
+use crate::two::Frame;
 use crate::{groups, probe, visibility, voxels};
 
 /// Which device to use.
@@ -135,6 +137,31 @@ impl Device {
         }
     }
 
+    /// `twin` on the device; None if the CPU must answer.
+    fn attempt<T>(
+        &self,
+        rows: usize,
+        twin: impl FnOnce(&Gpu) -> crate::runtime::Result<T>,
+    ) -> Result<Option<T>> {
+        let Some(gpu) = self.ready(rows) else {
+            return Ok(None);
+        };
+        match guarded(|| twin(&gpu)) {
+            Ok(found) => {
+                self.served.fetch_add(1, Ordering::Relaxed);
+                Ok(Some(found))
+            }
+            Err(Error::Interrupted) => Err(g2ard_core::Error::Interrupted),
+            Err(error) => {
+                self.note(&error);
+                if !error.is_of_size() {
+                    *lock(&self.state) = State::Off;
+                }
+                Ok(None)
+            }
+        }
+    }
+
     /// `twin` on the device, else `cpu`.
     fn either<T>(
         &self,
@@ -142,23 +169,10 @@ impl Device {
         twin: impl FnOnce(&Gpu) -> crate::runtime::Result<T>,
         cpu: impl FnOnce() -> Result<T>,
     ) -> Result<T> {
-        let Some(gpu) = self.ready(rows) else {
-            return cpu();
-        };
-        match guarded(|| twin(&gpu)) {
-            Ok(found) => {
-                self.served.fetch_add(1, Ordering::Relaxed);
-                return Ok(found);
-            }
-            Err(Error::Interrupted) => return Err(g2ard_core::Error::Interrupted),
-            Err(error) => {
-                self.note(&error);
-                if !error.is_of_size() {
-                    *lock(&self.state) = State::Off;
-                }
-            }
+        match self.attempt(rows, twin)? {
+            Some(found) => Ok(found),
+            None => cpu(),
         }
-        cpu()
     }
 }
 
@@ -204,6 +218,30 @@ impl ViewKernels for Device {
     }
 }
 
+impl VisibilityKernels for Device {
+    fn add_views(
+        &self,
+        sums: &mut VisibilityAccumulator,
+        cameras: &[Camera],
+        settings: &Settings,
+        control: &Control,
+    ) -> Result<()> {
+        for camera in cameras {
+            camera.validate()?;
+        }
+        settings.validate()?;
+        if visibility::serves(settings) && !sums.is_empty() {
+            let count = sums.len();
+            let twin = |gpu: &Gpu| visibility::weights(gpu, sums, cameras, settings, control);
+            if let Some(weights) = self.attempt(count, twin)? {
+                sums.add_sums(cameras, &weights);
+                return Ok(());
+            }
+        }
+        Cpu.add_views(sums, cameras, settings, control)
+    }
+}
+
 impl Backend for Device {
     fn group_kernels(&self) -> Box<dyn GroupKernels + '_> {
         Box::new(RunOnDevice {
@@ -226,7 +264,7 @@ impl RunOnDevice<'_> {
     fn either<T>(
         &self,
         splats: &Splats,
-        twin: impl FnOnce(&Gpu, &Rows, Numbered<'_>) -> crate::runtime::Result<T>,
+        twin: impl FnOnce(&Gpu, &Rows, Frame, Numbered<'_>) -> crate::runtime::Result<T>,
         cpu: impl FnOnce() -> Result<T>,
     ) -> Result<T> {
         let mut numbers = lock(&self.numbers);
@@ -236,8 +274,8 @@ impl RunOnDevice<'_> {
         };
         let with_rows = |gpu: &Gpu| {
             let mut uploaded = lock(&self.uploaded);
-            uploaded.follow(gpu, rows)?;
-            twin(gpu, &uploaded, rows)
+            let frame = uploaded.follow(gpu, rows)?;
+            twin(gpu, &uploaded, frame, rows)
         };
         let without = || {
             if self.device.gpu().is_none() {
@@ -253,7 +291,7 @@ impl GroupKernels for RunOnDevice<'_> {
     fn cells(&self, splats: &Splats, kept: &[u32], target: usize) -> Result<Cells> {
         self.either(
             splats,
-            |gpu, uploaded, rows| voxels::of_rows(gpu, uploaded, rows, kept, target),
+            |gpu, uploaded, frame, rows| voxels::of_rows(gpu, uploaded, frame, rows, kept, target),
             || GroupKernels::cells(&Cpu, splats, kept, target),
         )
     }
@@ -267,7 +305,7 @@ impl GroupKernels for RunOnDevice<'_> {
     ) -> Result<Vec<f64>> {
         self.either(
             splats,
-            |gpu, uploaded, rows| groups::energies(gpu, uploaded, rows, count, group, control),
+            |gpu, uploaded, _, rows| groups::energies(gpu, uploaded, rows, count, group, control),
             || Cpu.energies(splats, count, group, control),
         )
     }
@@ -281,7 +319,9 @@ impl GroupKernels for RunOnDevice<'_> {
     ) -> Result<Vec<(Merged, f64)>> {
         self.either(
             splats,
-            |gpu, uploaded, rows| groups::merges(gpu, uploaded, rows, groups, support, control),
+            |gpu, uploaded, frame, rows| {
+                groups::merges(gpu, uploaded, frame, rows, groups, support, control)
+            },
             || Cpu.merges(splats, groups, support, control),
         )
     }
@@ -294,6 +334,7 @@ impl GroupKernels for RunOnDevice<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::no_adapter;
 
     #[test]
     fn whatever_a_twin_ends_in_the_cpu_answers_and_one_line_says_why() {
@@ -314,8 +355,7 @@ mod tests {
         for failure in failures {
             let device = Device::new(Choice::Gpu, Options::default());
             if device.ready(1).is_none() {
-                eprintln!("skipped: no adapter on this machine");
-                return;
+                return no_adapter("failures");
             }
             let why = failure.to_string();
             let twin = |_: &Gpu| -> crate::runtime::Result<u8> { Err(failure) };
@@ -330,8 +370,7 @@ mod tests {
     fn a_panic_of_a_driver_s_stays_within() {
         let device = Device::new(Choice::Gpu, Options::default());
         if device.ready(1).is_none() {
-            eprintln!("skipped: no adapter on this machine");
-            return;
+            return no_adapter("failures");
         }
         let twin = |_: &Gpu| -> crate::runtime::Result<u8> { panic!("a driver's") };
         assert_eq!(device.either(1, twin, || Ok(7)).unwrap(), 7);
@@ -356,8 +395,7 @@ mod tests {
         for failure in [large, many] {
             let device = Device::new(Choice::Gpu, Options::default());
             if device.ready(1).is_none() {
-                eprintln!("skipped: no adapter on this machine");
-                return;
+                return no_adapter("failures");
             }
             let twin = |_: &Gpu| -> crate::runtime::Result<u8> { Err(failure) };
             assert_eq!(device.either(1, twin, || Ok(7)).unwrap(), 7);
@@ -370,8 +408,7 @@ mod tests {
     fn a_stop_is_no_failure() {
         let device = Device::new(Choice::Gpu, Options::default());
         if device.ready(1).is_none() {
-            eprintln!("skipped: no adapter on this machine");
-            return;
+            return no_adapter("failures");
         }
         let twin = |_: &Gpu| -> crate::runtime::Result<u8> { Err(Error::Interrupted) };
         let found = device.either(1, twin, || Ok(7));

@@ -1,6 +1,6 @@
 //! Compute-shader twins of g2ard-core's kernels, for any GPU that speaks Vulkan, Metal or DirectX 12.
 //!
-//! [`Device`] is a [`g2ard_core::Backend`]: policies call it as they call the CPU, and get the same results. Each
+//! [`Device`] is a [`g2ard_core::Backend`]: policies call it as they call the CPU, and get the same results within rounding. Each
 //! twin has a folder of its own, WGSL beside Rust; only `runtime` calls wgpu.
 
 mod device;
@@ -9,16 +9,11 @@ mod probe;
 mod rows;
 pub mod runtime;
 mod scan;
-mod soft64;
 mod sort;
 #[cfg(test)]
 mod testing;
+mod two;
 mod visibility;
 mod voxels;
 
 pub use device::{Choice, Device};
-
-/// Doubles as kernels take them.
-fn words(values: &[f64]) -> Vec<u32> {
-    bytemuck::pod_collect_to_vec(values)
-}

@@ -5,7 +5,16 @@ use g2ard_core::random::Lcg;
 
 use crate::runtime::{Error, Gpu, Options};
 
-/// Any adapter, software too; says that a test skips where there is none.
+/// Ends a test that no adapter serves: it fails, unless the environment says that this machine tests no GPU.
+pub fn no_adapter(what: &str) {
+    let skipped = std::env::var_os("G2ARD_NO_GPU_TESTS").is_some_and(|v| v == "1");
+    assert!(
+        skipped,
+        "{what}: no adapter on this machine; install Mesa's lavapipe, or set G2ARD_NO_GPU_TESTS=1"
+    );
+}
+
+/// Any adapter, software too; None where tests of GPUs are off.
 pub fn gpu(what: &str) -> Option<Gpu> {
     gpu_with(what, Options::default())
 }
@@ -14,18 +23,11 @@ pub fn gpu_with(what: &str, options: Options) -> Option<Gpu> {
     match Gpu::open(true, options) {
         Ok(gpu) => Some(gpu),
         Err(Error::NoAdapter) => {
-            eprintln!("skipped: {what}: no adapter on this machine");
+            no_adapter(what);
             None
         }
         Err(other) => panic!("{what}: {other}"),
     }
-}
-
-/// Share of entries that are equal.
-pub fn share<T: PartialEq>(a: &[T], b: &[T]) -> f64 {
-    assert_eq!(a.len(), b.len());
-    let equal = a.iter().zip(b).filter(|(x, y)| x == y).count();
-    equal as f64 / a.len().max(1) as f64
 }
 
 /// Discs on two wavy sheets with noise, of a few large and many small ones.

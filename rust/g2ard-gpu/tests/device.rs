@@ -73,25 +73,47 @@ fn simplify(scene: &Scene, backend: &dyn Backend) -> Outcome<PaperRound> {
 
 fn adapter(what: &str) -> bool {
     let found = !list().is_empty();
-    if !found {
-        eprintln!("skipped: {what}: no adapter on this machine");
-    }
+    let skipped = std::env::var_os("G2ARD_NO_GPU_TESTS").is_some_and(|v| v == "1");
+    assert!(
+        found || skipped,
+        "{what}: no adapter on this machine; install Mesa's lavapipe, or set G2ARD_NO_GPU_TESTS=1"
+    );
     found
 }
 
+/// The budget exactly, and rows that come of the same rows: a group whose energy or coverage lies within rounding of its
+/// limit may be decided otherwise, and others then take its place.
+fn assert_close(got: &Outcome<PaperRound>, want: &Outcome<PaperRound>) {
+    assert_eq!(got.splats.means.len(), want.splats.means.len());
+    let firsts = |parents: &[i64]| {
+        let mut first = std::collections::HashMap::new();
+        let rows = parents.iter().enumerate();
+        rows.map(|(i, &p)| {
+            if p < 0 {
+                None
+            } else {
+                Some(*first.entry(p).or_insert(i))
+            }
+        })
+        .collect::<Vec<_>>()
+    };
+    let (a, b) = (firsts(&got.parents), firsts(&want.parents));
+    let alike = a.iter().zip(&b).filter(|(a, b)| a == b).count();
+    eprintln!("paper: {alike} of {} rows go where the CPU's do", a.len());
+    assert!(alike * 100 >= 99 * a.len());
+}
+
 #[test]
-fn the_papers_policy_is_the_same_scene() {
+fn the_papers_policy_comes_to_nearly_the_same_scene() {
     if !adapter("the paper's policy") {
         return;
     }
     let scene = scene(5000);
-    let device = Device::new(
-        Choice::Gpu,
-        Options {
-            timed: true,
-            ..Options::default()
-        },
-    );
+    let options = Options {
+        timed: true,
+        ..Options::default()
+    };
+    let device = Device::new(Choice::Gpu, options);
     let (want, got) = (simplify(&scene, &Cpu), simplify(&scene, &device));
     let gpu = device.gpu().expect("an open device");
     let seconds = gpu.timings();
@@ -108,9 +130,9 @@ fn the_papers_policy_is_the_same_scene() {
         .map(|r| r.refused_energy + r.refused_coverage)
         .sum();
     let merged: usize = want.rounds.iter().map(|r| r.merged_groups).sum();
-    eprintln!("paper: {merged} groups merged and {refused} refused, all alike");
     assert!(merged > 100 && refused > 100);
-    assert_eq!(want, got);
+    assert_close(&got, &want);
+    assert_eq!(got, simplify(&scene, &device), "the same bits twice");
 }
 
 #[test]
@@ -121,7 +143,7 @@ fn a_lost_device_costs_one_line() {
     let scene = scene(3000);
     let device = Device::new(Choice::Gpu, Options::default());
     let want = simplify(&scene, &Cpu);
-    assert_eq!(simplify(&scene, &device), want);
+    assert_close(&simplify(&scene, &device), &want);
     device.gpu().expect("an open device").lose();
     assert_eq!(simplify(&scene, &device), want);
     let notes = device.notes();
@@ -138,8 +160,8 @@ fn tiny_buffers_work_in_pieces_or_go_to_the_cpu() {
     if !adapter("tiny buffers") {
         return;
     }
-    // The second is too small for the disc that coverage is measured on.
-    for (rows, bytes, refused) in [(700, 1 << 14, false), (60, 1 << 7, true)] {
+    // The second is too small for a row.
+    for (rows, bytes, refused) in [(700, 1 << 14, false), (60, 1 << 6, true)] {
         let scene = scene(rows);
         let want = simplify(&scene, &Cpu);
         let device = Device::new(
@@ -149,11 +171,11 @@ fn tiny_buffers_work_in_pieces_or_go_to_the_cpu() {
                 ..Options::default()
             },
         );
-        assert_eq!(simplify(&scene, &device), want);
+        assert_close(&simplify(&scene, &device), &want);
         let notes = device.notes();
         assert_eq!(!notes.is_empty(), refused, "{bytes}: {notes:?}");
         assert!(
-            notes.iter().all(|n| n.contains("binds 128 at most")),
+            notes.iter().all(|n| n.contains("binds 64 at most")),
             "{notes:?}"
         );
     }

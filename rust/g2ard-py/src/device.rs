@@ -15,9 +15,9 @@ use pyo3::types::PyDict;
 use crate::work::quick;
 
 #[cfg(feature = "gpu")]
-type Kernels = Device;
+pub type Kernels = Device;
 #[cfg(not(feature = "gpu"))]
-type Kernels = Cpu;
+pub type Kernels = Cpu;
 
 static KERNELS: RwLock<Option<Arc<Kernels>>> = RwLock::new(None);
 

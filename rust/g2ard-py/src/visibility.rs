@@ -1,15 +1,22 @@
 //! `_core.VisibilityAccumulator`: what views see of a scene, view by view.
 
-use g2ard_core::visibility::VisibilityAccumulator;
+use std::sync::Arc;
+
+use g2ard_core::visibility::{VisibilityAccumulator, VisibilityKernels};
 use numpy::PyArray1;
 use pyo3::prelude::*;
 
+use crate::device::{Kernels, kernels};
 use crate::scene::PyScene;
 use crate::views::{RasterOptions, View};
 use crate::work::long;
 
 #[pyclass(name = "VisibilityAccumulator", module = "g2ard._core")]
-struct PyVisibilityAccumulator(VisibilityAccumulator);
+struct PyVisibilityAccumulator {
+    sums: VisibilityAccumulator,
+    /// Those chosen when it was made.
+    kernels: Arc<Kernels>,
+}
 
 #[pymethods]
 impl PyVisibilityAccumulator {
@@ -17,7 +24,9 @@ impl PyVisibilityAccumulator {
     fn new(py: Python<'_>, scene: &PyScene) -> PyResult<Self> {
         let splats = scene.splats(py)?;
         let (rows, ordered) = (splats.borrow()?, scene.ordered.clone());
-        long(py, None, |_| VisibilityAccumulator::new(&rows, ordered)).map(Self)
+        let sums = long(py, None, |_| VisibilityAccumulator::new(&rows, ordered))?;
+        let kernels = kernels();
+        Ok(Self { sums, kernels })
     }
 
     /// Adds views; returns how many rows have been seen so far.
@@ -30,15 +39,11 @@ impl PyVisibilityAccumulator {
         progress: Option<&Bound<'_, PyAny>>,
     ) -> PyResult<usize> {
         let settings = options.settings()?;
-        let accumulator = &mut self.0;
+        let Self { sums, kernels } = self;
+        let cameras: Vec<_> = views.iter().map(View::camera).collect();
         long(py, progress, |control| {
-            control.begin(views.len() as u64);
-            for view in &views {
-                control.check()?;
-                accumulator.add(&view.camera(), &settings)?;
-                control.advance(1);
-            }
-            Ok(accumulator.seen())
+            kernels.add_views(sums, &cameras, &settings, control)?;
+            Ok(sums.seen())
         })
     }
 
@@ -47,7 +52,7 @@ impl PyVisibilityAccumulator {
         &self,
         py: Python<'py>,
     ) -> (Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<f32>>) {
-        let (weight, pixel_size) = self.0.by_row();
+        let (weight, pixel_size) = self.sums.by_row();
         (
             PyArray1::from_vec(py, weight),
             PyArray1::from_vec(py, pixel_size),

@@ -5,7 +5,7 @@ use crate::raster::Camera;
 use crate::spatial::{Cells, RobustBounds};
 use crate::{Control, Cpu, Result};
 
-/// Kernels over a scene and its views. An implementation may be faster than [`Cpu`]'s; it may not differ from it.
+/// Kernels over a scene and its views. An implementation may differ from [`Cpu`]'s within a stated tolerance.
 pub trait ViewKernels: Sync {
     /// See [`Cells::adaptive`].
     fn cells(&self, points: &[[f64; 3]], bounds: &RobustBounds, target: usize) -> Result<Cells>;

@@ -14,7 +14,7 @@ use crate::{Control, Cpu, Result, Splats};
 /// it.
 pub type Group<'a> = dyn Fn(usize, &mut Vec<u32>) -> usize + Sync + 'a;
 
-/// Kernels over the rows of one run. An implementation may be faster than [`Cpu`]'s; it may not differ from it.
+/// Kernels over the rows of one run. An implementation may differ from [`Cpu`]'s within a stated tolerance.
 pub trait GroupKernels: Sync {
     /// About `target` cells of the rows in `kept`, each there once; members count along `kept`.
     fn cells(&self, splats: &Splats, kept: &[u32], target: usize) -> Result<Cells>;

@@ -86,6 +86,11 @@ impl Group {
         (Self { values }, Bounds::of_box(low, high, scale))
     }
 
+    /// All values of a row.
+    pub fn row(&self, lane: usize) -> [f32; 11] {
+        self.values.map(|value| value.0[lane])
+    }
+
     /// The mean of a row.
     pub fn mean(&self, lane: usize) -> [f64; 3] {
         [0, 1, 2].map(|k| f64::from(self.values[k].0[lane]))

@@ -1,7 +1,9 @@
 //! What views see of a whole scene, in little memory: each view projects only the groups of rows about its frustum.
 
 mod groups;
+mod kernels;
 
+use std::any::Any;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -15,6 +17,7 @@ use crate::raster::simd::LANES;
 use crate::raster::{Camera, Frustum, Rasterizer, Settings, TileGrid};
 use crate::scene::{Means, Ordered, SceneRef};
 use groups::{Bounds, CulledGroups, Group, LiveGroup};
+pub use kernels::VisibilityKernels;
 
 /// Σ αT and the smallest pixel of each of N Gaussians over the views added so far. The result depends neither on the
 /// order of the rows nor on the number of threads: equal depths are drawn in the order of the scene's content.
@@ -33,6 +36,8 @@ pub struct VisibilityAccumulator {
     rasterizer: Rasterizer,
     /// Groups that a band of the image may meet.
     band: usize,
+    /// What a device keeps of the scene between calls.
+    pub held: Option<Box<dyn Any + Send + Sync>>,
 }
 
 impl VisibilityAccumulator {
@@ -55,17 +60,51 @@ impl VisibilityAccumulator {
             shift,
             rasterizer: Rasterizer::default(),
             band: BAND,
+            held: None,
         })
+    }
+
+    /// How many Gaussians there are.
+    pub fn len(&self) -> usize {
+        self.weight.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.weight.is_empty()
+    }
+
+    /// Mean, quaternion, scales and logit of a Gaussian, numbered in the order of the scene's content.
+    pub fn row(&self, number: usize) -> [f32; 11] {
+        self.groups[number / LANES].row(number % LANES)
+    }
+
+    /// A camera in the coordinates of those means.
+    pub fn relative(&self, camera: &Camera) -> Camera {
+        let mut camera = *camera;
+        for r in &mut camera.viewmat {
+            r[3] += r[0] * self.shift[0] + r[1] * self.shift[1] + r[2] * self.shift[2];
+        }
+        camera
+    }
+
+    /// Adds views whose Σ αT of each Gaussian was found elsewhere.
+    pub fn add_sums(&mut self, cameras: &[Camera], weights: &[f32]) {
+        for (sum, &weight) in self.weight.iter_mut().zip(weights) {
+            *sum += f64::from(weight);
+        }
+        for camera in cameras {
+            let camera = self.relative(camera);
+            let frustum = Frustum::of(&camera);
+            let live = self.live(&frustum);
+            self.find_pixels(&camera, &frustum, &live);
+        }
     }
 
     /// Adds a view in the scene's coordinates.
     pub fn add(&mut self, camera: &Camera, settings: &Settings) -> Result<()> {
         camera.validate()?;
         settings.validate()?;
-        let mut camera = *camera;
-        for r in &mut camera.viewmat {
-            r[3] += r[0] * self.shift[0] + r[1] * self.shift[1] + r[2] * self.shift[2];
-        }
+        let camera = self.relative(camera);
         let frustum = Frustum::of(&camera);
         let live = self.live(&frustum);
         self.find_pixels(&camera, &frustum, &live);

@@ -4,14 +4,14 @@ use g2ard_core::Control;
 use g2ard_core::simplify::Group;
 use rayon::prelude::*;
 
-use crate::rows::{Gather, Rows};
+use crate::rows::{Part, Rows};
 use crate::runtime::{Buffer, Gpu, Kernel, Pending, Result, Work};
 
 /// A kernel with one thread for each group.
 pub struct Twin {
     pub kernel: Kernel,
     /// What it reads of the members.
-    pub gather: Gather,
+    pub part: Part,
     /// Words of an answer.
     pub answer: usize,
 }
@@ -22,8 +22,8 @@ pub struct Source<'a> {
     pub rows: &'a Rows,
     pub numbers: &'a [u32],
     pub extra: Option<&'a Buffer>,
-    /// One number that a kernel reads beside them.
-    pub constant: f64,
+    /// What a kernel reads beside them.
+    pub constants: [u32; 2],
 }
 
 pub struct Found {
@@ -39,8 +39,8 @@ const SEGMENT: usize = 2;
 /// More rows than this would keep one thread busy while all others are idle: such groups are rare and go to the CPU.
 const LARGEST: usize = 1024;
 
-/// Rounds of loops that a row takes at most, all fits without a row of leverage 1 counted.
-const ROUNDS: usize = 375;
+/// Rounds of loops that a row takes at most.
+const ROUNDS: usize = 160;
 
 /// Rows of a batch: enough to fill a device, few enough that drivers do not time out.
 const ROWS: usize = 1 << 19;
@@ -76,7 +76,7 @@ pub fn run(
     group: &Group<'_>,
     control: &Control,
 ) -> Result<Found> {
-    let most_rows = (gpu.max_words() / twin.gather.words).min(ROWS);
+    let most_rows = (gpu.max_words() / twin.part.words).min(ROWS);
     let most_groups = gpu.max_words() / twin.answer.max(SEGMENT);
     let largest = LARGEST.min(most_rows).min(gpu.max_rounds() / ROUNDS);
     let mut found = Found {
@@ -159,13 +159,13 @@ impl Batch {
             .collect();
         let numbers: Vec<u32> = rows.iter().map(|&i| source.numbers[i as usize]).collect();
         let mut work = Work::new(gpu);
-        let members = source.rows.gather(gpu, &mut work, &twin.gather, &numbers)?;
+        let members = source.rows.gather(gpu, &mut work, twin.part, &numbers)?;
         let segments = gpu.upload("groups", segments.as_flattened())?;
         let answers = gpu.buffer("answers", groups.len() * twin.answer)?;
         let mut buffers = vec![&members, &segments, &answers];
         buffers.extend(source.extra);
-        let bits = source.constant.to_bits();
-        let constants = [groups.len() as u32, bits as u32, (bits >> 32) as u32, 0];
+        let [a, b] = source.constants;
+        let constants = [groups.len() as u32, a, b, 0];
         work.run(
             &twin.kernel,
             groups.len().div_ceil(THREADS),

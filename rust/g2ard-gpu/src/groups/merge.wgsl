@@ -1,48 +1,45 @@
 // Moments of a group (pool and Gaussian::from_moments of g2ard_core::simplify) and the share of it that the
 // merged Gaussian covers (guards). A thread takes one group; rows lie group by group, sums run in their order.
+// Lengths are times 2^-e, so that the group's largest is at most about 1.
 
 struct Member {
-    mean: array<F64, 3>,
-    weight: F64,
-    quat: array<u32, 4>, // wxyz, bits of f32
-    scales: array<u32, 3>,
-    spare: u32,
+    mean: array<u32, 6>, // 64-bit integers, low words first
+    mass: f32, // times 2^power
+    power: i32,
+    scales: array<f32, 3>,
+    quat: array<f32, 4>, // wxyz
 }
 
 struct Merged {
-    mean: array<F64, 3>,
-    axes: array<array<F64, 3>, 3>, // in order of descending scale
-    scales: array<F64, 3>,
-    covered: F64,
+    mean: array<Two, 3>, // less that of the first row
+    axes: array<array<Two, 3>, 3>, // in order of descending scale
+    scales: array<Two, 3>,
+    covered: f32,
+    e: i32,
 }
 
-@group(0) @binding(0) var<uniform> groups: vec4<u32>; // how many; then the support, a double
-@group(0) @binding(1) var<storage, read> members: array<Member>;
-@group(0) @binding(2) var<storage, read> segments: array<vec2<u32>>;
 @group(0) @binding(3) var<storage, read_write> merged: array<Merged>;
-@group(0) @binding(4) var<storage, read> disc: array<array<F64, 2>, 16>;
+@group(0) @binding(4) var<storage, read> disc: array<vec2<f32>, 16>;
 
-const VARIANCE_FLOOR = F64(0x86a12b9bu, 0x3d06849bu); // 1e-14
-const LEAST_VARIANCE = F64(0u, 0x30300000u); // the least normal f32, squared
-const SIXTEENTH = F64(0u, 0x3fb00000u);
+const VARIANCE_FLOOR = Two(1e-14, 0.0);
 
 // 1 − 2(a·a + b·b).
-fn diagonal(a: F64, b: F64) -> F64 { return sub(ONE, mul(TWO, add(mul(a, a), mul(b, b)))); }
+fn diagonal(a: Two, b: Two) -> Two { return sub(ONE, 2.0 * add(mul(a, a), mul(b, b))); }
 
 // Rows of the rotation of a quaternion of any length.
-fn rotation(bits: array<u32, 4>) -> array<array<F64, 3>, 3> {
-    var q: array<F64, 4>;
+fn rotation(given: array<f32, 4>) -> array<array<Two, 3>, 3> {
+    var q: array<Two, 4>;
     var largest = ZERO;
     for (var k = 0; k < 4; k++) {
-        q[k] = widen(bits[k]);
+        q[k] = single(given[k]);
         largest = larger(largest, mag(q[k]));
     }
-    var r = array<array<F64, 3>, 3>(
-        array<F64, 3>(ONE, ZERO, ZERO),
-        array<F64, 3>(ZERO, ONE, ZERO),
-        array<F64, 3>(ZERO, ZERO, ONE),
+    var r = array<array<Two, 3>, 3>(
+        array<Two, 3>(ONE, ZERO, ZERO),
+        array<Two, 3>(ZERO, ONE, ZERO),
+        array<Two, 3>(ZERO, ZERO, ONE),
     );
-    if is_zero(largest) { return r; }
+    if largest.x == 0.0 { return r; }
     var by = largest;
     for (var round = 0; round < 2; round++) {
         var squares = ZERO;
@@ -59,16 +56,16 @@ fn rotation(bits: array<u32, 4>) -> array<array<F64, 3>, 3> {
         // r[1][0], r[2][1], r[0][2] add w·axis; their mirror images subtract it.
         let across = mul(q[1 + min(i, j)], q[1 + max(i, j)]);
         let along = mul(q[0], q[1 + k]);
-        r[j][i] = mul(TWO, add(across, along));
-        r[i][j] = mul(TWO, sub(across, along));
+        r[j][i] = 2.0 * add(across, along);
+        r[i][j] = 2.0 * sub(across, along);
     }
     return r;
 }
 
-fn covariance(r: array<array<F64, 3>, 3>, scales: array<F64, 3>) -> array<F64, 6> {
-    var v: array<F64, 3>;
+fn covariance(r: array<array<Two, 3>, 3>, scales: array<Two, 3>) -> array<Two, 6> {
+    var v: array<Two, 3>;
     for (var k = 0; k < 3; k++) { v[k] = mul(scales[k], scales[k]); }
-    var c: array<F64, 6>;
+    var c: array<Two, 6>;
     for (var n = 0; n < 6; n++) {
         let i = select(select(0, 1, n > 2), 2, n > 4);
         let j = select(select(n, n - 2, n > 2), 2, n > 4);
@@ -82,139 +79,99 @@ fn covariance(r: array<array<F64, 3>, 3>, scales: array<F64, 3>) -> array<F64, 6
     return c;
 }
 
-// Axes in order of descending scale; all scales are positive or zero.
-fn by_scale(scales: array<F64, 3>) -> array<i32, 3> {
-    var order = array<i32, 3>(0, 1, 2);
-    for (var round = 0; round < 3; round++) {
-        let at = round % 2;
-        let x = order[at];
-        if total_lt(scales[x], scales[order[at + 1]]) {
-            order[at] = order[at + 1];
-            order[at + 1] = x;
-        }
-    }
-    return order;
-}
-
-// How much more than 1 u² + v² is, in f32: −1, 1, or 0 where only doubles can tell.
-fn roughly(u: vec3<f32>, v: vec3<f32>, at: vec3<f32>) -> i32 {
-    let x = dot(u, at);
-    let y = dot(v, at);
-    let size = dot(abs(u), vec3(1.0)) + dot(abs(v), vec3(1.0));
-    let over = x * x + y * y - 1.0;
-    let doubt = 1e-5 * (1.0 + size * size);
-    if over > doubt { return 1; }
-    if over < -doubt { return -1; }
-    return 0;
-}
-
-fn single(a: F64) -> f32 { return bitcast<f32>(narrow(a)); }
-
-fn along_disc(w: array<F64, 3>, x: F64, y: F64) -> F64 {
-    return add(add(w[0], mul(x, w[1])), mul(y, w[2]));
-}
-
-// Of 16 points that divide a member's footprint evenly, those within the merged footprint: `w` are the
-// footprint's centre and half axes along the merged ones, in units of theirs.
-fn hits(w: array<array<F64, 3>, 2>) -> u32 {
-    let u = vec3(single(w[0][0]), single(w[0][1]), single(w[0][2]));
-    let v = vec3(single(w[1][0]), single(w[1][1]), single(w[1][2]));
-    var count = 0u;
+// Of 16 points that divide a member's footprint evenly, those within the merged footprint: the footprint's centre and
+// half axes along each of the merged ones, in units of theirs.
+fn hits(u: vec3<f32>, v: vec3<f32>) -> f32 {
+    var count = 0.0;
     for (var s = 0; s < 16; s++) {
-        let x = disc[s][0];
-        let y = disc[s][1];
-        var over = roughly(u, v, vec3(1.0, single(x), single(y)));
-        if over == 0 {
-            var squares = ZERO;
-            for (var t = 0; t < 2; t++) {
-                let a = along_disc(w[t], x, y);
-                squares = add(squares, mul(a, a));
-            }
-            over = select(-1, 1, lt(ONE, squares));
-        }
-        count += u32(over < 0);
+        let at = vec3(1.0, disc[s]);
+        let x = dot(u, at);
+        let y = dot(v, at);
+        count += select(0.0, 1.0, x * x + y * y <= 1.0);
     }
     return count;
 }
 
 // Σn·n, not below 0.
-fn along(c: array<F64, 6>, n: array<F64, 3>) -> F64 {
-    let rows = array<F64, 3>(
-        dot3(array<F64, 3>(c[0], c[1], c[2]), n),
-        dot3(array<F64, 3>(c[1], c[3], c[4]), n),
-        dot3(array<F64, 3>(c[2], c[4], c[5]), n),
+fn along(c: array<Two, 6>, n: array<Two, 3>) -> Two {
+    let rows = array<Two, 3>(
+        dot3(array<Two, 3>(c[0], c[1], c[2]), n),
+        dot3(array<Two, 3>(c[1], c[3], c[4]), n),
+        dot3(array<Two, 3>(c[2], c[4], c[5]), n),
     );
     return larger(dot3(n, rows), ZERO);
 }
 
-// Shadow::of: L of the covariance that a Gaussian has in the plane of the first two axes.
-fn shadow(
-    r: array<array<F64, 3>, 3>,
-    scales: array<F64, 3>,
-    axes: array<array<F64, 3>, 3>,
-) -> array<array<F64, 2>, 2> {
-    var p: array<F64, 3>;
-    var q: array<F64, 3>;
+// Shadow::of: (l₁₁, l₂₁, l₂₂) of the covariance that a Gaussian has in the plane of two axes. The area l₁₁·l₂₂ is that of
+// a cross product, whose parts no needle makes cancel.
+fn shadow(r: array<array<Two, 3>, 3>, scales: array<Two, 3>, x: vec3<f32>, y: vec3<f32>) -> vec3<f32> {
+    var p: vec3<f32>;
+    var q: vec3<f32>;
     for (var k = 0; k < 3; k++) {
-        let axis = array<F64, 3>(r[0][k], r[1][k], r[2][k]);
-        p[k] = mul(scales[k], dot3(axes[0], axis));
-        q[k] = mul(scales[k], dot3(axes[1], axis));
+        let axis = vec3(r[0][k].x, r[1][k].x, r[2][k].x);
+        p[k] = scales[k].x * dot(x, axis);
+        q[k] = scales[k].x * dot(y, axis);
     }
-    let first = root(dot3(p, p));
-    var second = ZERO;
-    var lean = ZERO;
-    if !is_zero(first) {
-        second = div(dot3(p, q), first);
-        lean = div(second, first);
-    }
-    for (var k = 0; k < 3; k++) { q[k] = sub(q[k], mul(p[k], lean)); }
-    return array<array<F64, 2>, 2>(
-        array<F64, 2>(first, ZERO),
-        array<F64, 2>(second, root(dot3(q, q))),
-    );
+    let first = length(p);
+    if first == 0.0 { return vec3(0.0, 0.0, length(q)); }
+    return vec3(first, dot(p, q) / first, length(cross(p, q)) / first);
 }
+
+fn rounded(v: array<Two, 3>) -> vec3<f32> { return vec3(v[0].x, v[1].x, v[2].x); }
+
+// The power of two above a length.
+fn power_above(x: f32) -> i32 { return i32((bitcast<u32>(x) >> 23u) & 255u) - 126; }
 
 @compute @workgroup_size(64)
 fn merge(
     @builtin(global_invocation_id) id: vec3<u32>,
     @builtin(num_workgroups) size: vec3<u32>,
 ) {
+    hidden = groups.w;
     let at = thread_of(id, size, 64u);
     if at >= groups.x { return; }
     let g = group_of(segments[at]);
     let end = g.first + g.count;
+    let support = bitcast<f32>(groups.y);
+    let unit = bitcast<i32>(groups.z);
     var m: Merged;
-    let base = members[g.first].mean;
-    var total = ZERO;
-    for (var i = g.first; i < end; i++) { total = add(total, members[i].weight); }
-    let massless = is_zero(total); // averaged evenly
-    if massless { total = from_count(g.count); }
-    var shift: array<F64, 3>;
+    m.e = -126;
+    var power = -0x8000;
     for (var i = g.first; i < end; i++) {
-        let w = select(members[i].weight, ONE, massless);
-        let d = sub3(members[i].mean, base);
-        for (var k = 0; k < 3; k++) { shift[k] = add(shift[k], mul(w, d[k])); }
+        let far = extent(i, g.first);
+        if far > 0 { m.e = max(m.e, far + unit); }
+        for (var k = 0; k < 3; k++) { m.e = max(m.e, power_above(members[i].scales[k])); }
+        power = max(power, members[i].power);
     }
-    for (var k = 0; k < 3; k++) { m.mean[k] = add(base[k], div(shift[k], total)); }
-    var cov: array<F64, 6>;
-    var covered = ZERO;
+    m.e = min(m.e, 126);
+    var total = ZERO;
+    for (var i = g.first; i < end; i++) { total = add(total, weight(i, power)); }
+    let massless = total.x == 0.0; // averaged evenly
+    if massless { total = single(f32(g.count)); }
+    for (var i = g.first; i < end; i++) {
+        let w = select(weight(i, power), ONE, massless);
+        let d = offset(i, g.first, m.e - unit);
+        for (var k = 0; k < 3; k++) { m.mean[k] = add(m.mean[k], mul(w, d[k])); }
+    }
+    for (var k = 0; k < 3; k++) { m.mean[k] = div(m.mean[k], total); }
+    var cov: array<Two, 6>;
+    var covered = 0.0;
     var area_sum = ZERO;
-    var within: array<F64, 6>;
+    var within: array<Two, 6>;
     var reach = ZERO;
-    let support = F64(groups.y, groups.z);
     // First over the members' moments, then over their footprints: both need their rotations, and compilers
     // inline every call.
     for (var phase = 0; phase < 2; phase++) {
         for (var i = g.first; i < end; i++) {
             let r = rotation(members[i].quat);
-            var scales: array<F64, 3>;
-            for (var k = 0; k < 3; k++) { scales[k] = widen(members[i].scales[k]); }
-            let offset = sub3(members[i].mean, m.mean);
+            var scales: array<Two, 3>;
+            for (var k = 0; k < 3; k++) { scales[k] = single(members[i].scales[k] * power_of_two(-m.e)); }
+            let away = sub3(offset(i, g.first, m.e - unit), m.mean);
             if phase == 0 {
                 let c = covariance(r, scales);
-                let o = outer(offset);
-                let w = select(members[i].weight, ONE, massless);
-                let axes = by_scale(scales);
+                let o = outer(away);
+                let w = select(weight(i, power), ONE, massless);
+                let axes = descending(scales);
                 let area = mul(scales[axes[0]], scales[axes[1]]);
                 area_sum = add(area_sum, area);
                 for (var k = 0; k < 6; k++) {
@@ -223,27 +180,30 @@ fn merge(
                 }
                 continue;
             }
-            if lt(reach, mag(dot3(m.axes[2], offset))) { continue; }
-            let l = shadow(r, scales, m.axes);
-            var w: array<array<F64, 3>, 2>;
-            for (var t = 0; t < 2; t++) {
-                w[t][0] = div(dot3(m.axes[t], offset), mul(support, m.scales[t]));
-                for (var k = 0; k < 2; k++) { w[t][1 + k] = div(l[t][k], m.scales[t]); }
-            }
-            let area = mul(l[0][0], l[1][1]);
-            covered = add(covered, mul(mul(area, from_count(hits(w))), SIXTEENTH));
+            if lt(reach, mag(dot3(m.axes[2], away))) { continue; }
+            let l = shadow(r, scales, rounded(m.axes[0]), rounded(m.axes[1]));
+            let x = div(dot3(m.axes[0], away), support * m.scales[0]).x;
+            let y = div(dot3(m.axes[1], away), support * m.scales[1]).x;
+            let u = vec3(x, l.x / m.scales[0].x, 0.0);
+            let v = vec3(y, l.yz / m.scales[1].x);
+            covered += l.x * l.z * hits(u, v) / 16.0;
         }
         if phase == 0 {
             for (var k = 0; k < 6; k++) { cov[k] = div(cov[k], total); }
             let e = symmetric_eigen(cov);
-            let floor = larger(mul(VARIANCE_FLOOR, e.values[0]), LEAST_VARIANCE);
-            for (var k = 0; k < 3; k++) { m.scales[k] = root(larger(e.values[k], floor)); }
+            let least = mul(VARIANCE_FLOOR, e.values[0]);
+            for (var k = 0; k < 3; k++) { m.scales[k] = root(larger(e.values[k], least)); }
             m.axes = e.vectors;
-            if is_zero(area_sum) { break; }
-            reach = mul(support, root(div(along(within, m.axes[2]), area_sum)));
+            if area_sum.x == 0.0 { break; }
+            reach = mul(single(support), root(div(along(within, m.axes[2]), area_sum)));
         }
     }
-    m.covered = ONE;
-    if !is_zero(area_sum) { m.covered = div(covered, area_sum); }
+    m.covered = 1.0;
+    if area_sum.x > 0.0 { m.covered = covered / area_sum.x; }
     merged[at] = m;
+}
+
+// A member's weight beside the heaviest.
+fn weight(i: u32, power: i32) -> Two {
+    return single(members[i].mass * power_of_two(members[i].power - power));
 }

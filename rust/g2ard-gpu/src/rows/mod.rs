@@ -3,57 +3,32 @@
 
 use g2ard_core::Splats;
 use g2ard_core::simplify::{GONE, optical_mass};
+use g2ard_core::spatial::RobustBounds;
 use rayon::prelude::*;
 
 use crate::runtime::{Buffer, Gpu, Kernel, Result, Work};
-use crate::soft64::SOFT64;
+use crate::two::Frame;
 
-const SOURCES: &[&str] = &[SOFT64, include_str!("gather.wgsl")];
+const GATHER: Kernel = Kernel {
+    name: "rows.gather",
+    sources: &[include_str!("gather.wgsl")],
+    entry: "gather",
+};
 
-/// A kernel that gathers rows in some form.
-pub struct Gather {
-    kernel: Kernel,
-    /// Whether it reads more than means.
-    reads_attributes: bool,
-    binding: u32,
-    /// Words of a member.
+/// Words of a row: SH of band 0 (3), mean (6), optical mass (2), scales (3), quaternion (4).
+const ROW: usize = 18;
+
+/// Some of a row's words.
+#[derive(Debug, Clone, Copy)]
+pub struct Part {
+    from: usize,
     pub words: usize,
 }
 
-pub const POINTS: Gather = Gather {
-    kernel: Kernel {
-        name: "rows.points",
-        sources: SOURCES,
-        entry: "gather_points",
-    },
-    reads_attributes: false,
-    binding: 4,
-    words: MEAN,
-};
-pub const COLORED: Gather = Gather {
-    kernel: Kernel {
-        name: "rows.colored",
-        sources: SOURCES,
-        entry: "gather_colored",
-    },
-    reads_attributes: true,
-    binding: 5,
-    words: 12,
-};
-pub const WEIGHED: Gather = Gather {
-    kernel: Kernel {
-        name: "rows.weighed",
-        sources: SOURCES,
-        entry: "gather_weighed",
-    },
-    reads_attributes: true,
-    binding: 6,
-    words: 16,
-};
+pub const POINTS: Part = Part { from: 3, words: 6 };
+pub const COLORED: Part = Part { from: 0, words: 9 };
+pub const WEIGHED: Part = Part { from: 3, words: 15 };
 
-/// Words of a mean, and of the other attributes of a row.
-const MEAN: usize = 6;
-const ATTRIBUTES: usize = 12;
 const THREADS: usize = 64;
 
 /// Rows with the numbers that the device knows them by.
@@ -97,6 +72,8 @@ impl Numbers {
 /// Rows that the device has, in pieces that each fit into a buffer.
 #[derive(Debug, Default)]
 pub struct Rows {
+    /// That of the first rows: later ones are merged from them.
+    frame: Option<Frame>,
     count: usize,
     pieces: Vec<Piece>,
 }
@@ -105,13 +82,15 @@ pub struct Rows {
 struct Piece {
     first: usize,
     count: usize,
-    means: Buffer,
-    attributes: Buffer,
+    rows: Buffer,
 }
 
 impl Rows {
-    /// Uploads the rows that are new: those whose numbers follow on the last.
-    pub fn follow(&mut self, gpu: &Gpu, rows: Numbered<'_>) -> Result<()> {
+    /// Uploads the rows that are new: those whose numbers follow on the last. Returns the frame of all.
+    pub fn follow(&mut self, gpu: &Gpu, rows: Numbered<'_>) -> Result<Frame> {
+        let means = &rows.splats.means;
+        let around = || Frame::around(means, &RobustBounds::of(means));
+        let frame = *self.frame.get_or_insert_with(around);
         let known = self.count as u32;
         let fresh: Vec<u32> = (0..rows.numbers.len() as u32)
             .filter(|&i| rows.numbers[i as usize] >= known)
@@ -125,73 +104,72 @@ impl Rows {
         );
         let mut first = self.count;
         let mut pieces = Vec::new();
-        for part in fresh.chunks((gpu.max_words() / ATTRIBUTES).max(1)) {
-            let attributes: Vec<_> = part
+        for part in fresh.chunks((gpu.max_words() / ROW).max(1)) {
+            let words: Vec<_> = part
                 .par_iter()
-                .map(|&i| attributes(rows.splats, i as usize))
-                .collect();
-            let means: Vec<_> = part
-                .iter()
-                .map(|&i| rows.splats.means[i as usize])
+                .map(|&i| words(rows.splats, i as usize, frame))
                 .collect();
             pieces.push(Piece {
                 first,
                 count: part.len(),
-                means: gpu.upload("means", &means)?,
-                attributes: gpu.upload("rows", &attributes)?,
+                rows: gpu.upload("rows", &words)?,
             });
             first += part.len();
         }
         self.pieces.extend(pieces);
         self.count = first;
-        Ok(())
+        Ok(frame)
     }
 
-    /// The means of all rows in order, if these are their numbers.
-    pub fn all_means(&self, numbers: &[u32]) -> Option<Vec<Buffer>> {
-        let all = numbers.len() == self.count && numbers.is_sorted();
-        all.then(|| self.pieces.iter().map(|p| p.means.clone()).collect())
-    }
-
-    /// The rows of these numbers, in their order.
+    /// A part of the rows of these numbers, in their order.
     pub fn gather(
         &self,
         gpu: &Gpu,
         work: &mut Work,
-        how: &Gather,
+        part: Part,
         numbers: &[u32],
     ) -> Result<Buffer> {
-        let members = gpu.buffer("members", how.words * numbers.len())?;
+        let members = gpu.buffer("members", part.words * numbers.len())?;
         let order = gpu.upload("order", numbers)?;
         for piece in &self.pieces {
-            let constants = [
-                piece.first as u32,
-                piece.count as u32,
-                numbers.len() as u32,
-                0,
-            ];
-            let mut bound = vec![(1, &piece.means), (3, &order), (how.binding, &members)];
-            if how.reads_attributes {
-                bound.push((2, &piece.attributes));
-            }
+            let shape = [piece.first, piece.count, numbers.len()];
+            let words = [ROW, part.from, part.words, 0, 0];
+            let constants: Vec<u32> = shape.iter().chain(&words).map(|&n| n as u32).collect();
             let groups = numbers.len().div_ceil(THREADS);
-            work.run_at(&how.kernel, groups, &constants, &bound)?;
+            work.run(
+                &GATHER,
+                groups,
+                &constants,
+                &[&piece.rows, &order, &members],
+            )?;
         }
         Ok(members)
     }
 }
 
-/// `Attributes` of gather.wgsl.
-fn attributes(splats: &Splats, i: usize) -> [u32; ATTRIBUTES] {
-    let mass = optical_mass(
-        f64::from(splats.logit_opacities[i]),
-        splats.scales[i].map(f64::from),
-    );
-    let [low, high] = [mass.to_bits() as u32, (mass.to_bits() >> 32) as u32];
+/// A row as kernels read it.
+fn words(splats: &Splats, i: usize, frame: Frame) -> [u32; ROW] {
     let [r, g, b] = splats.sh_of(i)[0].map(f32::to_bits);
-    let [x, y, z] = splats.scales[i].map(f32::to_bits);
+    let mean = frame.fixed(splats.means[i]);
+    let [[xl, xh], [yl, yh], [zl, zh]] = mean.map(|v| [v as u32, (v >> 32) as u32]);
+    let [part, power] = mass(splats, i);
+    let [u, v, w] = splats.scales[i].map(f32::to_bits);
     let [p, q, s, t] = splats.quats[i].map(f32::to_bits);
-    [low, high, r, g, b, x, y, z, p, q, s, t]
+    [
+        r, g, b, xl, xh, yl, yh, zl, zh, part, power, u, v, w, p, q, s, t,
+    ]
+}
+
+/// An optical mass as an f32 in [1, 2] and a power of two: masses span more than f32 does.
+fn mass(splats: &Splats, i: usize) -> [u32; 2] {
+    let scales = splats.scales[i].map(f64::from);
+    let mass = optical_mass(f64::from(splats.logit_opacities[i]), scales);
+    if mass <= 0.0 {
+        return [0, i16::MIN as u32];
+    }
+    let power = mass.log2().floor();
+    let part = (mass / power.exp2()) as f32;
+    [part.to_bits(), power as i32 as u32]
 }
 
 #[cfg(test)]
@@ -209,7 +187,6 @@ mod tests {
     }
     use crate::runtime::Options;
     use crate::testing::{gpu_with, scenes};
-    use g2ard_core::simplify::{color, weights};
 
     /// Rows of a scene, in any order, under other numbers.
     fn some(splats: &Splats, rows: &[usize]) -> Splats {
@@ -244,40 +221,27 @@ mod tests {
                 held.follow(&gpu, Numbered { splats, numbers }).unwrap();
                 (gpu.sent() - before) as usize
             };
-            let bytes = 4 * (MEAN + ATTRIBUTES);
             let first: Vec<usize> = (0..700).collect();
             let numbers: Vec<u32> = (0..700).collect();
             let splats = some(&scene, &first);
-            assert_eq!(sent(&splats, &numbers), 700 * bytes);
+            assert_eq!(sent(&splats, &numbers), 700 * 4 * ROW);
             assert_eq!(sent(&splats, &numbers), 0);
             // A few stay, two come into being.
             let numbers = [699, 700, 3, 701, 42];
             let splats = some(&scene, &[699, 800, 3, 801, 42]);
-            assert_eq!(sent(&splats, &numbers), 2 * bytes);
+            assert_eq!(sent(&splats, &numbers), 2 * 4 * ROW);
             assert_eq!(sent(&splats, &numbers), 0);
-            assert!(held.all_means(&numbers).is_none());
 
+            let frame = held.frame.unwrap();
             let wanted = [42, 701, 3, 3, 700];
             let sources = [42, 801, 3, 3, 800];
-            let read = |how: &Gather| {
+            for part in [POINTS, COLORED, WEIGHED] {
                 let mut work = Work::new(&gpu);
-                let found = held.gather(&gpu, &mut work, how, &wanted).unwrap();
-                let words = work.submit(&[(&found, found.words())]).unwrap().take();
-                words.unwrap().swap_remove(0)
-            };
-            let (points, colored, weighed) = (read(&POINTS), read(&COLORED), read(&WEIGHED));
-            for (at, &row) in sources.iter().enumerate() {
-                let words = |numbers: &[f64]| -> Vec<u32> { bytemuck::pod_collect_to_vec(numbers) };
-                let part = |all: &[u32], how: &Gather| all[at * how.words..][..how.words].to_vec();
-                let mean = words(&scene.means[row]);
-                assert_eq!(part(&points, &POINTS), mean);
-                let color = words(&color(&scene, row));
-                assert_eq!(part(&colored, &COLORED), [mean.clone(), color].concat());
-                let mass = words(&weights(&scene, &[row as u32]).0);
-                let quat = scene.quats[row].map(f32::to_bits);
-                let scales = scene.scales[row].map(f32::to_bits);
-                let want = [&mean[..], &mass, &quat, &scales, &[0]].concat();
-                assert_eq!(part(&weighed, &WEIGHED), want);
+                let found = held.gather(&gpu, &mut work, part, &wanted).unwrap();
+                let found = work.submit(&[(&found, found.words())]).unwrap().take();
+                let want = sources.map(|row| words(&scene, row, frame));
+                let want = want.iter().flat_map(|w| &w[part.from..][..part.words]);
+                assert!(want.eq(&found.unwrap()[0]));
             }
         }
     }

@@ -1,22 +1,20 @@
 // Rows as splats. `mark`: a thread marks a row that the image may show; a workgroup sums the tiles of its 256.
-// `depths`: the marked rows by the upper bits of their depth. `gather`: marked rows, in order, become splats with
-// their depth as sorting key.
+// `gather`: marked rows, in order, become splats with their depth as sorting key.
 
 struct Row {
     mean: array<f32, 3>,
     opacity: f32,
-    covariance: array<f32, 6>,
-    trace: f32,
-    reach: f32,
+    axes: array<array<f32, 3>, 3>, // each a standard deviation long
 }
 
 @group(0) @binding(1) var<storage, read> rows: array<Row>;
 @group(0) @binding(2) var<storage, read_write> marks: array<u32>;
 @group(0) @binding(3) var<storage, read_write> tiles: array<u32>;
-@group(0) @binding(4) var<storage, read_write> histogram: array<atomic<u32>>;
-@group(0) @binding(5) var<storage, read_write> splats: array<Splat>;
-@group(0) @binding(6) var<storage, read_write> keys: array<vec2<u32>>;
-@group(0) @binding(7) var<storage, read_write> order: array<u32>;
+@group(0) @binding(4) var<storage, read_write> splats: array<Splat>;
+@group(0) @binding(5) var<storage, read_write> keys: array<vec2<u32>>;
+@group(0) @binding(6) var<storage, read_write> order: array<u32>;
+
+const HALF_LOG2_E = 0.72134752;
 
 var<workgroup> sum: atomic<u32>;
 
@@ -30,47 +28,40 @@ fn span(at: f32, reach: f32, count: u32) -> u32 {
     return select(0u, start | (end << 16u), start < end);
 }
 
-fn beyond(at: f32, size: u32, scale: f32, t: f32, row: Row) -> bool {
-    let d = at - clamp(at, 0.0, f32(size));
-    return d * d > row.reach * (row.trace * scale * scale * (1.0 + t * t) + DILATION);
-}
-
-fn apply(s: array<f32, 6>, j: vec3<f32>) -> vec3<f32> {
-    return vec3(
-        s[0] * j.x + s[1] * j.y + s[2] * j.z,
-        s[1] * j.x + s[3] * j.y + s[4] * j.z,
-        s[2] * j.x + s[4] * j.y + s[5] * j.z,
-    );
-}
+fn vector(v: array<f32, 3>) -> vec3<f32> { return vec3(v[0], v[1], v[2]); }
 
 // A splat that no pixel shows has no rows.
-fn project(row: Row) -> Splat {
+fn project(i: u32) -> Splat {
     var s: Splat;
-    let t = to_camera(vec3(row.mean[0], row.mean[1], row.mean[2]));
+    let row = rows[i];
+    let t = to_camera(vector(row.mean));
     if t.z <= view.near { return s; }
+    let reach = 2.0 * log(row.opacity * 255.0);
     let at = view.focal * t.xy / t.z + view.center;
     let u = clamp(t.x / t.z, view.limits.x, view.limits.y);
     let v = clamp(t.y / t.z, view.limits.z, view.limits.w);
-    let a = view.focal.x / t.z;
-    let b = view.focal.y / t.z;
-    if beyond(at.x, view.size.x, a, u, row) || beyond(at.y, view.size.y, b, v, row) { return s; }
-    let jx = a * (view.rotation[0].xyz - u * view.rotation[2].xyz);
-    let jy = b * (view.rotation[1].xyz - v * view.rotation[2].xyz);
-    let sx = apply(row.covariance, jx);
-    let sy = apply(row.covariance, jy);
-    let xx = sx.x * jx.x + sx.y * jx.y + sx.z * jx.z + DILATION;
-    let xy = sx.x * jy.x + sx.y * jy.y + sx.z * jy.z;
-    let yy = sy.x * jy.x + sy.y * jy.y + sy.z * jy.z + DILATION;
-    let det = xx * yy - xy * xy;
-    if !(det > 0.0 && det < 3.0e38) { return s; }
-    s.columns = span(at.x, sqrt(row.reach * xx), view.size.x);
-    s.rows = span(at.y, sqrt(row.reach * yy), view.size.y);
+    let jx = view.focal.x / t.z * (view.rotation[0].xyz - u * view.rotation[2].xyz);
+    let jy = view.focal.y / t.z * (view.rotation[1].xyz - v * view.rotation[2].xyz);
+    let axes = mat3x3(vector(row.axes[0]), vector(row.axes[1]), vector(row.axes[2]));
+    let mx = jx * axes;
+    let my = jy * axes;
+    let minors = cross(mx, my);
+    let xx = dot(mx, mx);
+    let yy = dot(my, my);
+    // Cauchy–Binet: xx·yy − xy² would lose every digit on a needle.
+    let det = dot(minors, minors) + DILATION * (xx + yy) + DILATION * DILATION;
+    if !(reach >= 0.0 && det < 1e33) { return s; }
+    s.columns = span(at.x, sqrt(reach * (xx + DILATION)), view.size.x);
+    s.rows = span(at.y, sqrt(reach * (yy + DILATION)), view.size.y);
     if s.columns == 0u { s.rows = 0u; }
     s.x = at.x;
     s.y = at.y;
-    s.conic = array<f32, 3>(yy / det, -xy / det, xx / det);
+    s.a = sqrt(HALF_LOG2_E * (yy + DILATION) / det);
+    s.b = -dot(mx, my) / (yy + DILATION) * s.a;
+    s.c = sqrt(HALF_LOG2_E / (yy + DILATION));
     s.opacity = row.opacity;
     s.z = t.z;
+    s.row = i;
     return s;
 }
 
@@ -85,25 +76,12 @@ fn mark(
     if t == 0u { atomicStore(&sum, 0u); }
     workgroupBarrier();
     if i < view.count {
-        let s = project(rows[i]);
-        let depth = bitcast<u32>(s.z);
-        let shown = s.rows != 0u && depth >= view.start && depth < view.end;
-        marks[view.first + i] = u32(shown);
-        if shown { atomicAdd(&sum, tile_count(s)); }
+        let s = project(i);
+        marks[i] = u32(s.rows != 0u);
+        if s.rows != 0u { atomicAdd(&sum, tile_count(s)); }
     }
     workgroupBarrier();
-    if t == 0u && 256u * block < view.count { tiles[view.first / 256u + block] = atomicLoad(&sum); }
-}
-
-@compute @workgroup_size(256)
-fn depths(
-    @builtin(global_invocation_id) id: vec3<u32>,
-    @builtin(num_workgroups) groups: vec3<u32>,
-) {
-    let i = thread_of(id, groups, 256u);
-    if i >= view.count { return; }
-    let s = project(rows[i]);
-    if s.rows != 0u { atomicAdd(&histogram[bitcast<u32>(s.z) >> 19u], 1u); }
+    if t == 0u && 256u * block < view.count { tiles[block] = atomicLoad(&sum); }
 }
 
 // `marks` are summed by now: a row's is its place, and it is marked if the next row's differs.
@@ -114,10 +92,9 @@ fn gather(
 ) {
     let i = thread_of(id, groups, 256u);
     if i >= view.count { return; }
-    let at = view.first + i;
-    let to = marks[at];
-    if marks[at + 1u] == to { return; }
-    let s = project(rows[i]);
+    let to = marks[i];
+    if marks[i + 1u] == to { return; }
+    let s = project(i);
     splats[to] = s;
     keys[to] = vec2(bitcast<u32>(s.z), 0u);
     order[to] = to;

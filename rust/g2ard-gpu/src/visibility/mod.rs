@@ -1,35 +1,28 @@
-//! Twin of `g2ard_core::select`'s visibility: the median depth of a view, and what it shows.
+//! Twins of what views see: the median depths and cells of `g2ard_core::select`, and each Gaussian's Σ αT of
+//! `g2ard_core::visibility`.
 //!
 //! A view takes two trips. The first projects all rows, marks those that the image may show and counts the tiles
-//! they touch (`marks`). With the counts known, the second sorts the marked ones by depth, spreads them over their
-//! tiles and draws (`tiles`). While one view is drawn the next is projected. Arithmetic is f32, as on the CPU;
-//! drivers may fuse operations and round divisions and exponentials otherwise, so ties within that rounding may
-//! fall elsewhere.
+//! they touch. With the counts known, the second sorts the marked ones by depth, spreads them over their tiles and
+//! draws. While one view is drawn the next is projected. Arithmetic is f32; drivers may fuse operations and round
+//! divisions and exponentials otherwise, so ties within that rounding may fall elsewhere.
 
 mod cells;
-mod marks;
+mod raster;
 mod scene;
 #[cfg(test)]
 mod tests;
-mod tiles;
 mod view;
 
 use g2ard_core::Control;
-use g2ard_core::raster::Camera;
-use g2ard_core::select::{Gaussians, Pinhole, Surface, statistics_of};
+use g2ard_core::raster::{Camera, Convention, Settings};
+use g2ard_core::select::{Gaussians, Surface, statistics_of};
+use g2ard_core::visibility::VisibilityAccumulator;
 
 use crate::runtime::{Buffer, Gpu, Pending, Result, Work};
 use cells::Cells;
-use marks::Marked;
+use raster::{Goal, Marked};
 use scene::Scene;
-
-/// Rows of a workgroup that projects them, and threads of all others.
-const BLOCK: usize = 256;
-const THREADS: usize = 64;
-/// Words of a splat.
-const SPLAT: usize = 9;
-/// Beyond every depth.
-const FAR: u32 = f32::INFINITY.to_bits();
+use view::View;
 
 /// See [`g2ard_core::select::view_statistics`].
 pub fn view_statistics(
@@ -38,9 +31,9 @@ pub fn view_statistics(
     cameras: &[Camera],
     control: &Control,
 ) -> Result<Vec<[f32; 2]>> {
-    let scene = Scene::upload(gpu, scene)?;
+    let scene = Scene::of_gaussians(gpu, scene)?;
     let read = |words: &[u32]| statistics_of(bytemuck::cast_slice(words));
-    each(&scene, cameras, None, control, read)
+    each(gpu, &scene, cameras, &MEDIAN, &Look::Depths, control, read)
 }
 
 /// See [`g2ard_core::select::visible_cells`].
@@ -52,62 +45,110 @@ pub fn visible_cells(
     cameras: &[Camera],
     control: &Control,
 ) -> Result<Vec<Vec<u32>>> {
-    let scene = Scene::upload(gpu, scene)?;
+    let scene = Scene::of_gaussians(gpu, scene)?;
     let cells = Cells::upload(gpu, surface, tolerance)?;
-    each(&scene, cameras, Some(&cells), control, |bits| {
-        cells.set(bits)
-    })
+    let read = |bits: &[u32]| cells.set(bits);
+    let look = Look::Cells(&cells);
+    each(gpu, &scene, cameras, &MEDIAN, &look, control, read)
+}
+
+/// Whether there is a twin of what these settings draw.
+pub fn serves(settings: &Settings) -> bool {
+    settings.convention == Convention::Gsplat && !settings.antialiased
+}
+
+/// Σ αT of every row over these views, in the order of `sums`. The device keeps the scene from call to call.
+pub fn weights(
+    gpu: &Gpu,
+    sums: &mut VisibilityAccumulator,
+    cameras: &[Camera],
+    settings: &Settings,
+    control: &Control,
+) -> Result<Vec<f32>> {
+    let held = sums.held.take().and_then(|held| held.downcast().ok());
+    let scene: Box<Scene> = match held {
+        Some(scene) => scene,
+        None => Box::new(Scene::of_sums(gpu, sums)?),
+    };
+    let weights = gpu.buffer("weights", scene.count)?;
+    let cameras: Vec<Camera> = cameras.iter().map(|c| sums.relative(c)).collect();
+    let look = Look::Weights(&weights);
+    each(gpu, &scene, &cameras, settings, &look, control, |_| ())?;
+    let found = Work::new(gpu).submit(&[(&weights, scene.count)])?.take()?;
+    sums.held = Some(scene);
+    Ok(found[0][..sums.len()]
+        .iter()
+        .map(|&w| f32::from_bits(w))
+        .collect())
+}
+
+/// A pixel ends at its median depth.
+const MEDIAN: Settings = Settings {
+    convention: Convention::Gsplat,
+    antialiased: false,
+    alpha_max: 0.99,
+    transmittance_min: 0.5,
+};
+
+/// What is looked for in each view.
+enum Look<'a> {
+    Depths,
+    Cells(&'a Cells),
+    Weights(&'a Buffer),
 }
 
 /// A view whose rows are being marked.
 struct Begun<'a> {
-    view: Pinhole,
+    view: View,
     light: Buffer,
     marked: Marked<'a>,
 }
 
-/// What `read` makes of each view's answer: its depths, or with `cells` a bit for each.
+/// What `read` makes of each view's answer: its depths, a bit for each cell, or nothing.
 fn each<T>(
-    scene: &Scene<'_>,
+    gpu: &Gpu,
+    scene: &Scene,
     cameras: &[Camera],
-    cells: Option<&Cells>,
+    settings: &Settings,
+    look: &Look<'_>,
     control: &Control,
     read: impl Fn(&[u32]) -> T,
 ) -> Result<Vec<T>> {
     control.begin(cameras.len() as u64);
     let mut found = Vec::with_capacity(cameras.len());
-    let mut begun = None;
-    let mut drawn: Option<Pending> = None;
-    for camera in cameras.iter().map(Some).chain([None]) {
-        control.check()?;
-        let next = camera.map(|c| begin(scene, c, cells)).transpose()?;
-        let drawing = match begun.take() {
-            Some(view) => Some(finish(scene, view, cells)?),
-            None => None,
-        };
-        if let Some(done) = std::mem::replace(&mut drawn, drawing) {
-            found.push(read(&done.take()?.concat()));
+    let mut take = |drawn: Option<Pending>| -> Result<()> {
+        if let Some(drawn) = drawn {
+            found.push(read(&drawn.take()?.concat()));
             control.advance(1);
         }
+        Ok(())
+    };
+    let (mut begun, mut drawn): (Option<Begun>, Option<Pending>) = (None, None);
+    for camera in cameras.iter().map(Some).chain([None]) {
+        control.check()?;
+        let next = match camera {
+            Some(camera) => Some(begin(gpu, scene, View::of(camera, settings)?, look)?),
+            None => None,
+        };
+        let drawing = match begun.take() {
+            Some(view) => Some(finish(gpu, scene, view, look)?),
+            None => None,
+        };
+        take(std::mem::replace(&mut drawn, drawing))?;
         begun = next;
     }
-    if let Some(done) = drawn {
-        found.push(read(&done.take()?.concat()));
-        control.advance(1);
-    }
+    take(drawn)?;
     Ok(found)
 }
 
 /// The first trip.
-fn begin<'a>(scene: &Scene<'a>, camera: &Camera, cells: Option<&Cells>) -> Result<Begun<'a>> {
-    let view = view::of(camera)?;
-    let pixels = view.width * view.height;
-    let mut work = Work::new(scene.gpu);
-    let light = match cells {
-        Some(cells) => cells.light(scene.gpu, &mut work, &view)?,
-        None => scene.gpu.upload("light", &vec![1f32; pixels])?,
+fn begin<'a>(gpu: &'a Gpu, scene: &Scene, view: View, look: &Look<'_>) -> Result<Begun<'a>> {
+    let mut work = Work::new(gpu);
+    let light = match look {
+        Look::Cells(cells) => cells.light(gpu, &mut work, &view)?,
+        _ => gpu.upload("light", &vec![1f32; view.pixels()])?,
     };
-    let marked = scene.mark(work, &view, 0..FAR)?;
+    let marked = Marked::begin(gpu, work, scene, &view)?;
     Ok(Begun {
         view,
         light,
@@ -116,27 +157,29 @@ fn begin<'a>(scene: &Scene<'a>, camera: &Camera, cells: Option<&Cells>) -> Resul
 }
 
 /// The second.
-fn finish<'a>(scene: &Scene<'a>, begun: Begun<'a>, cells: Option<&Cells>) -> Result<Pending<'a>> {
+fn finish<'a>(
+    gpu: &'a Gpu,
+    scene: &Scene,
+    begun: Begun<'a>,
+    look: &Look<'_>,
+) -> Result<Pending<'a>> {
     let Begun {
         view,
         light,
         marked,
     } = begun;
-    let depth = scene.gpu.buffer("depth", view.width * view.height)?;
-    let image = [&light, &depth];
-    let marks = marked.counted()?;
-    let mut work = Work::new(scene.gpu);
-    if scene.fits(&marks) {
-        scene.draw(&mut work, &view, &marks, image)?;
-    } else {
-        for range in scene.slabs(&view)? {
-            let marks = scene.mark(Work::new(scene.gpu), &view, range)?.counted()?;
-            scene.check_pairs(&marks)?;
-            scene.draw(&mut work, &view, &marks, image)?;
-        }
+    let mut work = Work::new(gpu);
+    if let Look::Weights(weights) = look {
+        let goal = Goal::Weights(weights);
+        marked.draw(gpu, &mut work, scene, &view, &light, goal)?;
+        return work.submit(&[]);
     }
-    match cells {
-        Some(cells) => cells.seen(scene.gpu, work, &view, &depth),
-        None => work.submit(&[(&depth, depth.words())]),
-    }
+    let depths = gpu.buffer("depth", view.pixels())?;
+    let goal = Goal::Depths(&depths);
+    marked.draw(gpu, &mut work, scene, &view, &light, goal)?;
+    let answer = match look {
+        Look::Cells(cells) => cells.seen(gpu, &mut work, &view, &depths)?,
+        _ => depths,
+    };
+    work.submit(&[(&answer, answer.words())])
 }

@@ -1,18 +1,21 @@
-// One camera, and Gaussians as it sees them: g2ard_core::select::Pinhole, step by step.
+// One camera, and Gaussians as it sees them, by the formulas of g2ard_core::raster.
 
 struct View {
-    rotation: array<vec4<f32>, 3>, // rows; the fourth is the translation
+    rotation: array<vec4<f32>, 3>, // rows; the fourth is what `eye` lacks of the camera's position
+    eye: vec4<f32>,
     focal: vec2<f32>,
     center: vec2<f32>,
     limits: vec4<f32>, // of x/z: low, high; of y/z: low, high
     size: vec2<u32>, // of the image
     near: f32,
-    count: u32, // rows or cells there are
-    first: u32, // of this piece's rows among all
-    start: u32, // range of depths, as bits: start … end − 1
-    end: u32,
+    count: u32, // rows, cells or splats there are
+    first: u32, // of the pairs of splat and tile
+    pairs: u32, // how many from there on
+    all_pairs: u32,
     cell: f32, // edge of a cell
     tolerance: f32, // share of its depth that a cell may lie off the depths
+    alpha_max: f32,
+    light_min: f32, // a pixel ends before its light would fall to this
 }
 
 @group(0) @binding(0) var<uniform> view: View;
@@ -23,20 +26,22 @@ const TILE = 16u;
 struct Splat {
     x: f32,
     y: f32,
-    conic: array<f32, 3>,
+    // α = opacity · 2^−(u² + v²), u = a·dx + b·dy, v = c·dy
+    a: f32,
+    b: f32,
+    c: f32,
     opacity: f32,
     z: f32,
-    columns: u32, // from in the low half, to in the high
+    columns: u32, // start in the low half, end in the high
     rows: u32,
+    row: u32,
 }
 
+// About the camera first, so that a far origin costs no digits.
 fn to_camera(p: vec3<f32>) -> vec3<f32> {
-    var t: vec3<f32>;
-    for (var r = 0; r < 3; r++) {
-        let a = view.rotation[r];
-        t[r] = a.x * p.x + a.y * p.y + a.z * p.z + a.w;
-    }
-    return t;
+    let r = view.rotation;
+    let d = (p - view.eye.xyz) - vec3(r[0].w, r[1].w, r[2].w);
+    return vec3(dot(r[0].xyz, d), dot(r[1].xyz, d), dot(r[2].xyz, d));
 }
 
 // The pixel a point falls into; no pixel has the last number.

@@ -1,72 +1,91 @@
 //! A camera as kernels are handed it.
 
-use std::ops::Range;
-
-use g2ard_core::raster::Camera;
+use g2ard_core::raster::{Camera, Settings};
 use g2ard_core::select::Pinhole;
 
-use super::FAR;
 use crate::runtime::{Error, Result};
 
 /// Spans of pixels are 16 bits.
 const MAX_SIDE: usize = u16::MAX as usize;
 
-/// A camera whose image kernels can draw.
-pub fn of(camera: &Camera) -> Result<Pinhole> {
-    let view = Pinhole::of(camera);
-    let side = view.width.max(view.height);
-    if side > MAX_SIDE {
-        return Err(Error::TooMany {
-            what: "pixels along a side of a view",
-            count: side as u64,
-            limit: MAX_SIDE as u64,
-        });
-    }
-    Ok(view)
+/// `View` of pinhole.wgsl, but for what changes from kernel to kernel.
+pub struct View {
+    pinhole: Pinhole,
+    eye: [f64; 3],
+    /// α is clipped here, and pixels end before their light would fall to this.
+    alpha_max: f32,
+    light_min: f32,
 }
 
-/// `View` of pinhole.wgsl.
-pub struct Constants<'a> {
-    pub view: &'a Pinhole,
+impl View {
+    /// A camera whose image kernels can draw.
+    pub fn of(camera: &Camera, settings: &Settings) -> Result<Self> {
+        let side = camera.width.max(camera.height);
+        if side > MAX_SIDE {
+            return Err(Error::TooMany {
+                what: "pixels along a side of a view",
+                count: side as u64,
+                limit: MAX_SIDE as u64,
+            });
+        }
+        Ok(Self {
+            pinhole: Pinhole::of(camera),
+            eye: camera.position(),
+            alpha_max: settings.alpha_max,
+            light_min: settings.transmittance_min,
+        })
+    }
+
+    pub fn pixels(&self) -> usize {
+        self.pinhole.width * self.pinhole.height
+    }
+
+    pub fn tiles(&self, side: usize) -> usize {
+        self.pinhole.width.div_ceil(side) * self.pinhole.height.div_ceil(side)
+    }
+}
+
+/// What one kernel is told of a view.
+#[derive(Default, Clone, Copy)]
+pub struct Constants {
     /// Rows, cells or splats there are.
     pub count: usize,
-    /// The first of them among all.
+    /// The first pair of splat and tile, how many from there on, and how many in all.
     pub first: usize,
-    /// The range of depths, as bits; or of pairs of splat and tile.
-    pub range: Range<u32>,
-    /// Edge of a cell.
+    pub pairs: usize,
+    pub all_pairs: usize,
+    /// Edge of a cell, and the share of its depth that it may lie off the depths.
     pub cell: f32,
-    /// Share of its depth that a cell may lie off the depths.
     pub tolerance: f32,
 }
 
-impl<'a> Constants<'a> {
-    pub fn new(view: &'a Pinhole, count: usize) -> Self {
+impl Constants {
+    pub fn of(count: usize) -> Self {
         Self {
-            view,
             count,
-            first: 0,
-            range: 0..FAR,
-            cell: 0.0,
-            tolerance: 0.0,
+            ..Self::default()
         }
     }
 
-    pub fn words(&self) -> Vec<u32> {
-        let v = self.view;
-        let mut numbers = Vec::with_capacity(32);
-        for (row, shift) in v.rotation.iter().zip(v.translation) {
+    pub fn words(&self, view: &View) -> Vec<u32> {
+        let v = &view.pinhole;
+        let mut numbers = Vec::with_capacity(36);
+        for (row, eye) in v.rotation.iter().zip(view.eye) {
             numbers.extend(row);
-            numbers.push(shift);
+            numbers.push((eye - f64::from(eye as f32)) as f32);
         }
+        numbers.extend(view.eye.map(|v| v as f32));
+        numbers.push(0.0);
         numbers.extend(v.focal);
         numbers.extend(v.center);
         numbers.extend(v.limits.as_flattened());
         let mut words: Vec<u32> = numbers.into_iter().map(f32::to_bits).collect();
         words.extend([v.width as u32, v.height as u32, v.near.to_bits()]);
-        words.extend([self.count as u32, self.first as u32]);
-        words.extend([self.range.start, self.range.end, self.cell.to_bits()]);
-        words.extend([self.tolerance.to_bits(), 0, 0, 0]); // a uniform's size is a multiple of four words
+        let counts = [self.count, self.first, self.pairs, self.all_pairs];
+        words.extend(counts.map(|n| n as u32));
+        let limits = [self.cell, self.tolerance, view.alpha_max, view.light_min];
+        words.extend(limits.map(f32::to_bits));
+        words.push(0); // a uniform's size is a multiple of four words
         words
     }
 }

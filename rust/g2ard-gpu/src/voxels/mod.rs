@@ -1,20 +1,19 @@
-//! Twin of `g2ard_core::spatial::Cells::adaptive`: the same cells, bit for bit.
+//! Twin of `g2ard_core::spatial::Cells::adaptive`. Cells are found in integers, the same on every device; points within
+//! rounding of a border may fall into the cell beside the CPU's.
 
 use g2ard_core::simplify::means_of;
-use g2ard_core::spatial::{
-    BITS, Cells, OCTAVES, RobustBounds, first_apart, octave_counts, search_size, unit,
-};
+use g2ard_core::spatial::{BITS, Cells, OCTAVES, RobustBounds, octave_counts, search_size, unit};
 use rayon::prelude::*;
 
 use crate::rows::{Numbered, POINTS, Rows};
 use crate::runtime::{Buffer, Gpu, Kernel, Result, Work};
-use crate::soft64::SOFT64;
+use crate::scan;
 use crate::sort::{Keyed, sort};
-use crate::{scan, words};
+use crate::two::Frame;
 
 const KEYS: Kernel = Kernel {
     name: "voxels.keys",
-    sources: &[SOFT64, include_str!("voxels.wgsl")],
+    sources: &[include_str!("voxels.wgsl")],
     entry: "find_keys",
 };
 const NEIGHBOURS: &[&str] = &[include_str!("edges.wgsl")];
@@ -52,36 +51,34 @@ pub fn adaptive(
     bounds: &RobustBounds,
     target: usize,
 ) -> Result<Cells> {
-    let pieces = points
-        .chunks(most_points(gpu))
-        .map(|piece| gpu.upload("positions", piece));
+    let frame = Frame::around(points, bounds);
+    let pieces = points.chunks(most_points(gpu)).map(|piece| {
+        let fixed: Vec<_> = piece.par_iter().map(|&p| frame.fixed(p)).collect();
+        gpu.upload("positions", &fixed)
+    });
     let pieces = pieces.collect::<Result<_>>()?;
-    cells(gpu, pieces, points, bounds, target)
+    Lattice::new(gpu, pieces, frame, points, *bounds).adaptive(target)
 }
 
 /// See [`g2ard_core::simplify::GroupKernels::cells`].
 pub fn of_rows(
     gpu: &Gpu,
     held: &Rows,
+    frame: Frame,
     rows: Numbered<'_>,
     kept: &[u32],
     target: usize,
 ) -> Result<Cells> {
     let points = means_of(rows.splats, kept);
     let numbers: Vec<u32> = kept.iter().map(|&i| rows.numbers[i as usize]).collect();
-    let pieces = match held.all_means(&numbers) {
-        Some(pieces) => pieces,
-        None => {
-            let mut work = Work::new(gpu);
-            let pieces = numbers
-                .chunks(most_points(gpu))
-                .map(|numbers| held.gather(gpu, &mut work, &POINTS, numbers))
-                .collect::<Result<_>>()?;
-            work.submit(&[])?;
-            pieces
-        }
-    };
-    cells(gpu, pieces, &points, &RobustBounds::of(&points), target)
+    let bounds = RobustBounds::of(&points);
+    let mut work = Work::new(gpu);
+    let pieces = numbers
+        .chunks(most_points(gpu))
+        .map(|numbers| held.gather(gpu, &mut work, POINTS, numbers))
+        .collect::<Result<_>>()?;
+    work.submit(&[])?;
+    Lattice::new(gpu, pieces, frame, &points, bounds).adaptive(target)
 }
 
 /// Points that one buffer may hold.
@@ -89,84 +86,74 @@ fn most_points(gpu: &Gpu) -> usize {
     (gpu.max_words() / POINT).max(1)
 }
 
-/// The cells of points that the device has.
-fn cells(
-    gpu: &Gpu,
-    pieces: Vec<Buffer>,
-    points: &[[f64; 3]],
-    bounds: &RobustBounds,
-    target: usize,
-) -> Result<Cells> {
-    if points.is_empty() {
-        return Ok(Cells::with_size(points, bounds, bounds.radius));
-    }
-    let lattice = Lattice::new(gpu, pieces, points, *bounds);
-    let octaves = octave_counts(&lattice.apart()?);
-    let size = search_size(bounds, &octaves, target, |size| lattice.count(size))?;
-    lattice.cells(size)
-}
-
-/// Positions on the device: in runs of rows whose keys fit into one buffer, each run in pieces that do.
+/// Positions on the device, in pieces. Their keys must fit into one buffer.
 struct Lattice<'a> {
     gpu: &'a Gpu,
+    frame: Frame,
     bounds: RobustBounds,
     /// The largest coordinate from the lattice's corner; floaters lie beyond the bounds.
     reach: f64,
-    runs: Vec<Run>,
-}
-
-struct Run {
-    /// Its first row among all.
-    first: usize,
     count: usize,
     pieces: Vec<Buffer>,
 }
 
 impl<'a> Lattice<'a> {
-    fn new(gpu: &'a Gpu, pieces: Vec<Buffer>, points: &[[f64; 3]], bounds: RobustBounds) -> Self {
-        let mut runs: Vec<Run> = Vec::new();
-        let mut first = 0;
-        for piece in pieces {
-            let count = piece.words() / POINT;
-            match runs.last_mut() {
-                Some(run) if KEY * (run.count + count) <= gpu.max_words() => {
-                    run.count += count;
-                    run.pieces.push(piece);
-                }
-                _ => runs.push(Run {
-                    first,
-                    count,
-                    pieces: vec![piece],
-                }),
-            }
-            first += count;
-        }
+    fn new(
+        gpu: &'a Gpu,
+        pieces: Vec<Buffer>,
+        frame: Frame,
+        points: &[[f64; 3]],
+        bounds: RobustBounds,
+    ) -> Self {
         let reach = |p: &[f64; 3]| {
             let from_corner = [0, 1, 2].map(|k| p[k] - bounds.origin[k] + bounds.radius);
             from_corner.into_iter().fold(0.0, f64::max)
         };
         Self {
             gpu,
+            frame,
             bounds,
             reach: points.par_iter().map(reach).reduce(|| 0.0, f64::max),
-            runs,
+            count: points.len(),
+            pieces,
         }
     }
 
-    /// A run's keys, sorted, with its rows (counted from the run's first).
-    fn sorted(&self, work: &mut Work, run: &Run, size: f64, clamped: bool) -> Result<Keyed> {
-        let keyed = Keyed::new(self.gpu, run.count)?;
+    /// About `target` cells.
+    fn adaptive(&self, target: usize) -> Result<Cells> {
+        if self.count == 0 {
+            return Ok(Cells::with_size(&[], &self.bounds, self.bounds.radius));
+        }
+        let octaves = octave_counts(&self.apart()?);
+        let size = search_size(&self.bounds, &octaves, target, |size| self.occupied(size))?;
+        self.cells(size)
+    }
+
+    /// The lattice's words in voxels.wgsl but for those of a piece. Rounded so that points on a border, as those are that
+    /// the bounds were picked from, fall into the upper cell.
+    fn words(&self, size: f64) -> [u32; 8] {
+        let RobustBounds { origin, radius } = self.bounds;
+        let corner = self.frame.fixed(origin.map(|v| v - radius)).map(|v| v - 2);
+        let [[xl, xh], [yl, yh], [zl, zh]] = corner.map(|v| [v as u32, (v >> 32) as u32]);
+        let units = size / self.frame.unit(); // 2¹⁵ at least: the frame ends 2²⁴ radii out
+        let shift = units.log2().floor() + 31.0;
+        let per_unit = (shift.exp2() / units).ceil() as u32;
+        [xl, xh, yl, yh, zl, zh, per_unit, shift as u32]
+    }
+
+    /// Sorted keys with their rows.
+    fn sorted(&self, work: &mut Work, size: f64, clamped: bool) -> Result<Keyed> {
+        let keyed = Keyed::new(self.gpu, self.count)?;
         let mut first = 0;
-        for piece in &run.pieces {
+        for piece in &self.pieces {
             let rows = piece.words() / POINT;
-            let [x, y, z] = self.bounds.origin;
-            let mut lattice = words(&[x, y, z, self.bounds.radius, size]);
+            let mut lattice = self.words(size).to_vec();
             lattice.extend([first as u32, rows as u32, u32::from(clamped), u32::MAX]);
             let buffers = [piece, &keyed.keys, &keyed.words];
             work.run(&KEYS, rows.div_ceil(THREADS), &lattice, &buffers)?;
             first += rows;
         }
-        sort(self.gpu, work, keyed, run.count, 0..self.bits(size))
+        sort(self.gpu, work, keyed, self.count, 0..self.bits(size))
     }
 
     /// Bits in which keys at this size differ, and one more, which only the outside has.
@@ -177,132 +164,76 @@ impl<'a> Lattice<'a> {
 
     /// How many neighbours in Morton order first fall apart at each octave.
     fn apart(&self) -> Result<[usize; OCTAVES]> {
-        let size = unit(&self.bounds);
+        let mut work = Work::new(self.gpu);
+        let sorted = self.sorted(&mut work, unit(&self.bounds), true)?;
+        let blocks = self.count.div_ceil(BLOCK);
+        let counts = self.gpu.buffer("octaves", OCTAVES * blocks)?;
+        let constants = [self.count as u32, 0, 0, 0];
+        work.run(&APART, blocks, &constants, &[&sorted.keys, &counts])?;
+        let found = work.submit(&[(&counts, OCTAVES * blocks)])?.take()?;
         let mut apart = [0; OCTAVES];
-        if let [run] = &self.runs[..] {
-            let mut work = Work::new(self.gpu);
-            let sorted = self.sorted(&mut work, run, size, true)?;
-            let blocks = run.count.div_ceil(BLOCK);
-            let counts = self.gpu.buffer("octaves", OCTAVES * blocks)?;
-            let constants = [run.count as u32, 0, 0, 0];
-            work.run(&APART, blocks, &constants, &[&sorted.keys, &counts])?;
-            let found = work.submit(&[(&counts, OCTAVES * blocks)])?.take()?;
-            for block in found[0].chunks(OCTAVES) {
-                apart
-                    .iter_mut()
-                    .zip(block)
-                    .for_each(|(a, &b)| *a += b as usize);
-            }
-            return Ok(apart);
-        }
-        let merged = self.merged(size, true)?;
-        for w in merged.windows(2).filter(|w| w[0].0 != w[1].0) {
-            apart[first_apart(w[0].0, w[1].0)] += 1;
+        for block in found[0].chunks(OCTAVES) {
+            let octaves = apart.iter_mut().zip(block);
+            octaves.for_each(|(sum, &count)| *sum += count as usize);
         }
         Ok(apart)
     }
 
     /// Occupied cells of a size.
-    fn count(&self, size: f64) -> Result<usize> {
-        if let [run] = &self.runs[..] {
-            let mut work = Work::new(self.gpu);
-            let (.., total) = self.edges(&mut work, run, size)?;
-            return Ok(work.submit(&[(&total, 1)])?.take()?[0][0] as usize);
-        }
-        let merged = self.merged(size, false)?;
-        Ok(begins(&merged).count())
+    fn occupied(&self, size: f64) -> Result<usize> {
+        let mut work = Work::new(self.gpu);
+        let (.., total) = self.edges(&mut work, size)?;
+        Ok(work.submit(&[(&total, 1)])?.take()?[0][0] as usize)
     }
 
     /// Sorted keys, the number of cells before each, and the number of all.
-    fn edges(&self, work: &mut Work, run: &Run, size: f64) -> Result<(Keyed, Buffer, Buffer)> {
-        let sorted = self.sorted(work, run, size, false)?;
-        let ranks = self.gpu.buffer("ranks", run.count)?;
-        let constants = [run.count as u32, 0, 0, 0];
-        let groups = run.count.div_ceil(THREADS);
+    fn edges(&self, work: &mut Work, size: f64) -> Result<(Keyed, Buffer, Buffer)> {
+        let sorted = self.sorted(work, size, false)?;
+        let ranks = self.gpu.buffer("ranks", self.count)?;
+        let constants = [self.count as u32, 0, 0, 0];
+        let groups = self.count.div_ceil(THREADS);
         // Bindings are numbered: `ranks` stands behind `counts`, which this kernel does not use.
-        work.run_at(
-            &EDGES,
-            groups,
-            &constants,
-            &[(1, &sorted.keys), (3, &ranks)],
-        )?;
-        let total = scan::exclusive(self.gpu, work, &ranks, run.count)?;
+        let bound = [(1, &sorted.keys), (3, &ranks)];
+        work.run_at(&EDGES, groups, &constants, &bound)?;
+        let total = scan::exclusive(self.gpu, work, &ranks, self.count)?;
         Ok((sorted, ranks, total))
     }
 
     /// The cells of a size.
     fn cells(&self, size: f64) -> Result<Cells> {
-        let rows: usize = self.runs.iter().map(|r| r.count).sum();
-        if let [run] = &self.runs[..] {
-            let mut work = Work::new(self.gpu);
-            let (sorted, ranks, total) = self.edges(&mut work, run, size)?;
-            let found = work.submit(&[(&total, 1), (&sorted.words, rows)])?;
-            let [total, members] = <[_; 2]>::try_from(found.take()?).unwrap_or_default();
-            let cells = total.first().map_or(0, |&t| t as usize);
-            let starts = self.gpu.buffer("cells", cells)?;
-            let codes = self.gpu.buffer("codes", KEY * cells)?;
-            let mut work = Work::new(self.gpu);
-            let bound = [(1, &sorted.keys), (3, &ranks), (4, &starts), (5, &codes)];
-            let groups = rows.div_ceil(THREADS);
-            work.run_at(&COMPACT, groups, &[rows as u32, 0, 0, 0], &bound)?;
-            let found = work.submit(&[(&starts, cells), (&codes, KEY * cells)])?;
-            let [mut starts, codes] = <[_; 2]>::try_from(found.take()?).unwrap_or_default();
-            starts.push(rows as u32);
-            let codes = codes
-                .chunks(KEY)
-                .map(|w| u64::from(w[1]) << 32 | u64::from(w[0]));
-            return Ok(Cells::from_parts(
-                size,
-                starts,
-                members,
-                codes.map(inside).collect(),
-            ));
-        }
-        let merged = self.merged(size, false)?;
-        let mut starts: Vec<u32> = begins(&merged).map(|i| i as u32).collect();
-        let keys = starts
-            .iter()
-            .map(|&i| inside(merged[i as usize].0))
-            .collect();
+        let rows = self.count;
+        let mut work = Work::new(self.gpu);
+        let (sorted, ranks, total) = self.edges(&mut work, size)?;
+        let found = work.submit(&[(&total, 1), (&sorted.words, rows)])?;
+        let [total, members] = <[_; 2]>::try_from(found.take()?).unwrap_or_default();
+        let cells = total.first().map_or(0, |&t| t as usize);
+        let starts = self.gpu.buffer("cells", cells)?;
+        let codes = self.gpu.buffer("codes", KEY * cells)?;
+        let mut work = Work::new(self.gpu);
+        let bound = [(1, &sorted.keys), (3, &ranks), (4, &starts), (5, &codes)];
+        let groups = rows.div_ceil(THREADS);
+        work.run_at(&COMPACT, groups, &[rows as u32, 0, 0, 0], &bound)?;
+        let found = work.submit(&[(&starts, cells), (&codes, KEY * cells)])?;
+        let [mut starts, codes] = <[_; 2]>::try_from(found.take()?).unwrap_or_default();
         starts.push(rows as u32);
-        let members = merged.into_par_iter().map(|(_, row)| row).collect();
-        Ok(Cells::from_parts(size, starts, members, keys))
+        let code = |words: &[u32]| u64::from(words[1]) << 32 | u64::from(words[0]);
+        let codes = codes.chunks(KEY).map(code);
+        let inside = codes.map(|code| (code != OUTSIDE).then_some(code));
+        Ok(Cells::from_parts(size, starts, members, inside.collect()))
     }
-
-    /// The keys of all runs in one order, with their rows.
-    fn merged(&self, size: f64, clamped: bool) -> Result<Vec<(u64, u32)>> {
-        let mut all = Vec::with_capacity(self.runs.iter().map(|r| r.count).sum());
-        for run in &self.runs {
-            let mut work = Work::new(self.gpu);
-            let sorted = self.sorted(&mut work, run, size, clamped)?;
-            let reads = [(&sorted.keys, KEY * run.count), (&sorted.words, run.count)];
-            let found = work.submit(&reads)?.take()?;
-            let keys = found[0]
-                .chunks(KEY)
-                .map(|w| u64::from(w[1]) << 32 | u64::from(w[0]));
-            all.extend(keys.zip(found[1].iter().map(|&row| run.first as u32 + row)));
-        }
-        all.par_sort(); // runs are found and merged, not sorted anew
-        Ok(all)
-    }
-}
-
-fn inside(key: u64) -> Option<u64> {
-    (key != OUTSIDE).then_some(key)
-}
-
-/// Where cells begin in sorted order.
-fn begins(sorted: &[(u64, u32)]) -> impl Iterator<Item = usize> + '_ {
-    (0..sorted.len())
-        .filter(|&i| i == 0 || sorted[i].0 != sorted[i - 1].0 || sorted[i].0 == OUTSIDE)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::runtime::Options;
-    use crate::testing::{gpu_with, scenes, share};
+    use crate::testing::{gpu_with, scenes};
+    use std::collections::HashMap;
 
+    /// Points nearer than this share of a cell to its border may fall into the one beside.
+    const BORDER: f64 = 1e-6;
+
+    /// Cells of one size hold the same rows as the CPU's, but for rows on a border; about as many are found.
     fn compare(gpu: &Gpu, what: &str) {
         for (name, splats) in scenes(12_000) {
             let points = &splats.means;
@@ -310,28 +241,46 @@ mod tests {
             for target in [1, 3000] {
                 let want = Cells::adaptive(points, &bounds, target);
                 let got = adaptive(gpu, points, &bounds, target).unwrap();
-                let ids = |cells: &Cells| {
-                    let mut ids = vec![0; points.len()];
-                    for c in 0..cells.len() {
-                        cells
-                            .members_of(c)
-                            .iter()
-                            .for_each(|&i| ids[i as usize] = c);
+                let off = (got.len() as f64 / want.len() as f64 - 1.0).abs();
+                assert!(off < 0.04, "{name}: {} of {} cells", got.len(), want.len());
+                let same = Cells::with_size(points, &bounds, got.size);
+                let (mut moved, of_cpu) = (0, ids(&same, points.len()));
+                let mut cells = HashMap::new();
+                for (i, id) in ids(&got, points.len()).into_iter().enumerate() {
+                    if on_border(points[i], &bounds, got.size) {
+                        moved += 1;
+                    } else {
+                        assert_eq!(*cells.entry(id).or_insert(of_cpu[i]), of_cpu[i], "{name}");
                     }
-                    ids
-                };
-                let equal = share(&ids(&want), &ids(&got));
+                }
                 eprintln!(
-                    "{what} {name}, {target} cells: {:.4} % of ids equal",
-                    100.0 * equal
+                    "{what} {name}: {} cells, {moved} rows on borders",
+                    got.len()
                 );
-                assert_eq!(got, want, "{name}");
+                let few = moved * 1000 <= points.len() + 3000;
+                assert!(few || name == "identical", "{name}: {moved} on borders");
             }
         }
     }
 
+    fn ids(cells: &Cells, count: usize) -> Vec<usize> {
+        let mut ids = vec![0; count];
+        for c in 0..cells.len() {
+            let members = cells.members_of(c);
+            members.iter().for_each(|&i| ids[i as usize] = c);
+        }
+        ids
+    }
+
+    fn on_border(point: [f64; 3], bounds: &RobustBounds, size: f64) -> bool {
+        (0..3).any(|k| {
+            let at = (point[k] - bounds.origin[k] + bounds.radius) / size;
+            (at - at.round()).abs() < BORDER
+        })
+    }
+
     #[test]
-    fn cells_are_the_cpus() {
+    fn cells_are_the_cpus_but_on_borders() {
         let Some(gpu) = gpu_with("voxels", Options::default()) else {
             return;
         };
@@ -339,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn cells_are_the_cpus_in_pieces() {
+    fn cells_are_the_cpus_but_on_borders_in_pieces() {
         let max_binding = Some(1 << 17);
         let Some(gpu) = gpu_with(
             "voxels in pieces",
