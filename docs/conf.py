@@ -10,7 +10,7 @@ project = "g2ard"
 author = "the authors of g2ard"
 version = release = g2ard.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_parser", "sphinx_design", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "docs/index"
 include_patterns = ["*.md", "docs/**", "benchmarks/record/**"]
 exclude_patterns = ["docs/conf.py"]
@@ -21,6 +21,7 @@ html_copy_source = False
 html_show_copyright = False
 
 myst_heading_anchors = 3
+myst_enable_extensions = ["colon_fence"]
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # signatures would repeat what Args say

@@ -150,6 +150,7 @@ def test_the_api_page_has_every_public_name_once() -> None:
         ("docs/decisions.md", "docs/decisions"),
         ("docs/methods/index.md", "docs/methods"),
         ("benchmarks/record/README.md", "benchmarks/record"),
+        ("docs/how-to/index.md", "docs/how-to"),
     ],
 )
 def test_an_index_lists_every_page_of_its_folder(index: str, folder: str) -> None:
@@ -180,7 +181,7 @@ def test_the_readme_names_every_command_and_scene_format() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     table = "\n".join(line for line in text.splitlines() if line.startswith("| `"))
     assert [name for name in COMMANDS if f"`{name}`" not in table] == []
-    (scenes,) = re.findall(r"Scenes: ([^:]*)\. Clouds:", text)
+    scenes = text.split("\n## Formats\n")[1].split("\n## ")[0]
     names = {"sog": "SOG", "compressed_ply": ".compressed.ply", "tiles": "folders of tiles"}
     kinds = [name for name, kind in KINDS.items() if kind == "splats"]
     assert [name for name in kinds if names.get(name, f".{name}") not in scenes] == []
