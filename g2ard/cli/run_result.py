@@ -85,7 +85,7 @@ def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
                 f"{lost} of {len(report[kind]['recovered']['views'])} {what} lost PSNR; their mean gained"
             )
     if report["unseen"] and report["unseen"] > _FEW:
-        found.append(f"no view sees {report['unseen']:.0%} of the scene; it is simplified but not recovered")
+        found.append(f"{report['unseen']:.0%} of the scene is in no view: simplified but not recovered")
     return found
 
 

@@ -35,7 +35,7 @@ SchedulerOption = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Dask scheduler for tiles: tcp://HOST:PORT or local (needs g2ard[distributed]).",
+        help="Dask scheduler for tiles: tcp://HOST:PORT or local (needs the extra `distributed`).",
         hidden=True,
     ),
 ]

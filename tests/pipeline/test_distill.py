@@ -130,7 +130,7 @@ def test_a_loss_in_any_kind_of_views_is_told() -> None:
     assert said(0.0, None, 0.0, ssim=-0.004)[0].startswith("warning: recovery lost 0.004 SSIM")
     lines = said(-0.2, -0.3, 0.25)
     assert "lost 0.20 dB in held-out views" in lines[0]
-    assert "no view sees 25% of the scene" in lines[2]
+    assert "25% of the scene is in no view" in lines[2]
 
 
 def test_steps_by_need_are_for_teachers() -> None:

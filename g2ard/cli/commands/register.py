@@ -60,7 +60,7 @@ def register(
         typer.Option(
             metavar="auto|sift|direct|MODULE:FUNCTION",
             help="Feature matcher: SIFT, none (direct alignment only), or your own function. "
-            "All but direct need g2ard[register]; auto, the default, uses SIFT if it is installed.",
+            "All but direct need the extra `register`; auto, the default, uses SIFT if it is installed.",
         ),
     ] = None,
     refine: Annotated[
@@ -82,7 +82,7 @@ def register(
         Literal["gs-cpr"] | None,
         typer.Option(
             help="gs-cpr: one pass of matches, no refinement and no fallback. Photos with fewer than "
-            "6 matches keep their initial pose. Needs g2ard[register]."
+            "6 matches keep their initial pose. Needs the extra `register`."
         ),
     ] = None,
     truth: Annotated[
