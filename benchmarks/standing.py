@@ -1,4 +1,4 @@
-"""Views of other kinds than a pool's, that no method sees: from near, and from where people stand."""
+"""Views of other kinds than a pool's, unseen by every method: close up, and from where people stand."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from g2ard.scene.targets import TeacherRenders
 __all__ = ["given_views", "standing_targets", "standing_views"]
 
 _SEED = 7919
-"""Added to the seed of a pool: these poses are of another sequence than any that a method looks from."""
+"""Added to the seed of a pool, so that these poses differ from all poses that methods use."""
 
 _POOL, _NEAR, _STANDING = 128, 16, 24
 _FOV = 70.0
 """Degrees; a pool's poses have 50."""
 
 _BETWEEN = (0.35, 0.8)
-"""Share of the way to an object's surface that is left to those who stand between near and far."""
+"""Range of the remaining share of the way to an object's surface, for poses between near and far."""
 
 
 def given_views(scene: Path) -> Cameras | None:
-    """The views of a standing.json in the scene's folder, or in the one above; None without.
+    """Return the views of a standing.json in the scene's folder or its parent; None without one.
 
     Raises:
-        InputError: it is broken.
+        InputError: the file is invalid.
     """
     folder = scene.absolute() if scene.is_dir() else scene.absolute().parent
     path = next((p for place in (folder, folder.parent) if (p := place / "standing.json").is_file()), None)
@@ -48,14 +48,15 @@ def given_views(scene: Path) -> Cameras | None:
 
 
 def standing_views(splats: Splats, scene: Path, seed: int = 0) -> dict[str, Cameras]:
-    """Views by kind, "near" and "standing"; a kind for which there is no place is missing.
+    """Return views by kind, "near" and "standing"; kinds without room are missing.
 
-    near: at most 16 on the way from poses of a pool to what those see. standing: of a standing.json beside
-    the scene; without, 24 poses 70° wide: between near and far for an object, at eye level for a landscape,
-    else a pool of its own. All are of another seed than the pools that methods make.
+    near: at most 16 views between poses of a pool and what those see. standing: the views of a standing.json
+    beside the scene, otherwise 24 poses 70° wide. These lie between near and far for an object, at eye level
+    for a landscape, and in a pool of their own for other scenes. All use another seed than the pools of
+    methods.
 
     Raises:
-        InputError: nothing visible in the scene, or a broken standing.json.
+        InputError: nothing is visible in the scene, or a standing.json is invalid.
     """
     pool = plan_pool(splats, _POOL, seed=seed + _SEED, apart=_NEAR)
     found = {} if pool.apart is None else {"near": pool.apart}
@@ -72,7 +73,7 @@ def standing_targets(
     size: int | None = None,
     background: Colour = BLACK,
 ) -> dict[str, TeacherRenders]:
-    """What `standing_views` show of the scene, shrunk to `size`; views that show nothing of it are left out.
+    """Return renders of `standing_views`, shrunk to `size`, without views that show nothing of the scene.
 
     Raises:
         InputError: as `standing_views`.
@@ -103,7 +104,7 @@ def _standing(splats: Splats, kind: str, seed: int) -> Cameras | None:
 
 
 def _between(splats: Splats, seed: int) -> Cameras:
-    """Around an object, nearer than a pool stands and farther than near views do, in free space."""
+    """Return views in free space around an object, nearer than a pool and farther than near views."""
     site, lens = Site.of(splats), Lens(fov=_FOV)
     far = plan_orbit(site, 4 * _STANDING, lens, seed, lambda done, total: None)
     met = site.grid.cast(far.eyes, far.gazes)

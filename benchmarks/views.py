@@ -18,7 +18,8 @@ _SIZE, _TRIED, _FOV = (800, 600), (200, 150), 70.0
 """Pixels of a view and of the render that tests it, and degrees across."""
 
 _DISTANCES, _RISES = (0.04, 0.4), (-5.0, 35.0)
-"""Of the eye from its aim: shares of the scene's diagonal, log-uniform, and degrees above the horizon."""
+"""Ranges of the eye's position around its aim: distance in scene diagonals (log-uniform), and degrees above
+the horizon."""
 
 _CLOSE = 0.02
 """Share of the diagonal within which nothing may give more than `_MURK` of the picture's light."""

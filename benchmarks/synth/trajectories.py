@@ -13,7 +13,7 @@ __all__ = ["SPLITS", "split_counts", "trajectories"]
 
 SPLITS = ("train", "val", "adapt", "ood")
 _SHARES = (0.70, 0.10, 0.08, 0.12)
-"""Of all views; in the paper's MatrixCity 4,075 · 510 · 341 · 495."""
+"""Share of all views per split; the paper's MatrixCity has 4,075 · 510 · 341 · 495."""
 
 _LANE = 1.6
 """Metres from the street's centre line at which a car drives."""
@@ -21,7 +21,7 @@ _YAWS = (0.0, 55.0, -55.0, 25.0, -90.0, 90.0)
 
 
 def split_counts(views: int) -> dict[str, int]:
-    """How many of `views` each split gets: at least one, the train pool whatever is left.
+    """Return the number of views per split: at least one each, and the rest for the train pool.
 
     >>> split_counts(40)
     {'train': 28, 'val': 4, 'adapt': 3, 'ood': 5}
@@ -37,7 +37,7 @@ def _pose(at: Float, yaw: float, pitch: float) -> Float:
 
 
 def _drives(layout: Layout, parity: int, lane: float) -> list[tuple[Float, Float]]:
-    """Start and end of a drive along every second street each way; odd ones run through the middle."""
+    """Return start and end of a drive along every second street each way; odd ones run through the middle."""
     out = []
     for axis in (0, 1):
         end = layout.reach[1 - axis] - 2.0

@@ -128,7 +128,7 @@ def check_same_options(run: Run, work: Path, besides: Sequence[str] = ()) -> Non
 
 
 def stopped_run(folder: Path) -> dict[str, Any] | None:
-    """Describe an interrupted run (checkpoints, counts, options), or return None if there is none."""
+    """Describe an interrupted run (checkpoints, counts, options), or return None without one."""
     from g2ard.io.jsonfile import read_json
 
     work = folder / WORK

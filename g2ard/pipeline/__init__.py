@@ -308,7 +308,7 @@ class _Rounds:
         checkpoints.save(self.work / f"{name}.npz", self.key, {"entry": entry}, arrays)
 
     def _restore(self, name: str, entry: dict[str, Any]) -> bool:
-        """Restore a finished stage of an earlier run; return False if there is none."""
+        """Restore a finished stage of an earlier run, and return whether it was found."""
         path = self.work / f"{name}.npz" if self.work else None
         if path is None or not path.exists():
             return False

@@ -66,7 +66,7 @@ class DistillJob:
 
     @property
     def against(self) -> str:
-        """Kind of the scoring targets, in words."""
+        """Kinds of the scoring targets, as text for summaries."""
         return kinds_of(self.held_out)
 
     @cached_property

@@ -83,7 +83,7 @@ class Tiling:
 
     @property
     def memory_limit(self) -> str:
-        """`usable_memory` in words, with its origin."""
+        """`usable_memory` with its origin, as text for messages."""
         size = amount(self.usable_memory)
         return f"--memory {size}" if self.memory else f"the {size} used of the machine's memory"
 

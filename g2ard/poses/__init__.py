@@ -1,9 +1,9 @@
-"""Cameras for a scene that comes without any: around objects, through rooms and streets, from the air.
+"""Cameras for a scene without views: around objects, through rooms and streets, from the air.
 
-The scene is stood upright (`up`), weighed without its floaters and sky (`matter`), its free space mapped
-(`grid`, `site`), its shape named (`shape`); then planners (`orbit`, `walk`, `aerial`, `inside`, `focus`)
-propose poses from endless even sequences and keep those that stand free and see enough (`sight`, `gather`).
-`auto` joins them; `near` steps nearer to what a pool sees and tells what it does not.
+A scene is turned upright (`up`), freed of floaters and sky (`volume`), its free space mapped (`grid`, `site`)
+and its kind classified (`shape`). Planners (`orbit`, `walk`, `aerial`, `inside`, `focus`) propose poses from
+endless even sequences. They keep poses that stand in free space and see enough (`sight`, `gather`). `auto`
+combines the planners; `near` steps nearer to what a pool sees and measures what it misses.
 """
 
 from __future__ import annotations
@@ -30,29 +30,30 @@ def make_pool(
     rows: int | None = None,
     progress: Progress = silent,
 ) -> Cameras:
-    """Poses that see the scene well from free space, evenly spread.
+    """Plan poses that see the scene well from free space, evenly spread.
 
     Args:
-        splats: the scene, any unit, origin and orientation.
-        count: how many.
-        kind: "orbit" (around an object, elevations −5° to 50°), "walk" (in free space at eye height, through
-            rooms and streets), "aerial" (straight down and oblique), "inside" (where matter is all around),
-            "focus" (free places whose image is full and fine), or "auto": within rooms as far as the
-            scene lies within such; orbit for an object, three quarters aerial and a quarter walk for a
-            landscape, as far as it is in focus from there; the rest walks or stands where it is in focus.
+        splats: the scene, in any unit, origin and orientation.
+        count: number of poses.
+        kind: "orbit" (around an object, elevations −5° to 50°), "walk" (at eye height in free space, through
+            rooms and streets), "aerial" (straight down and oblique), "inside" (surrounded by matter), "focus"
+            (free places whose image is full and sharp), or "auto". "auto" places poses within rooms in
+            proportion to their share of the scene. Outside rooms, poses orbit an object, or view a landscape
+            from the air (three quarters) and from the ground (one quarter), where that is in focus. The
+            remaining poses walk, or stand where the scene is in focus.
         size: width and height in pixels.
         fov: horizontal field of view, degrees; None means 50, and 70 for a pool within rooms.
         up: (3,) direction away from the ground; None to estimate it.
-        seed: of the placement; the same seed gives the same poses.
-        rows: of more Gaussians than this only a fair sample is looked at, on a coarser grid: less sure of
-            narrow places, several times as fast. None for all.
-        progress: told of each step.
+        seed: seed of the placement; the same seed gives the same poses.
+        rows: largest number of Gaussians to use, as a fair sample on a coarser grid. A sample is several
+            times as fast, but less reliable in narrow places. None uses all.
+        progress: called at each step.
 
     Returns:
         `count` cameras in world coordinates; by name, every 8th is a fair sample of all.
 
     Raises:
-        InputError: nothing visible in the scene, no free place with a view, or an argument out of range.
+        InputError: nothing in the scene is visible, no free place has a view, or an argument is out of range.
 
     >>> import numpy as np
     >>> ball = np.random.default_rng(0).normal(size=(500, 3))

@@ -1,4 +1,4 @@
-"""Poses over a wide scene: a grid looking straight down, and obliques from all sides."""
+"""Poses over a wide scene: a grid looking straight down, and oblique views from all sides."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ _NADIR = 0.4
 """Share of the poses that look straight down."""
 
 _PITCHES = (30.0, 65.0)
-"""Degrees below the horizon of the others."""
+"""Range of pitches of the other poses, in degrees below the horizon."""
 
 _OVERLAP = 5.0
-"""Nadir images that show the same spot of ground, as drone surveys fly it."""
+"""Nadir images that show the same spot of ground, as in drone surveys."""
 
 _INSET = 0.1
-"""Share of the scene's sides along its edges that no pose aims at: frames there would show what is out."""
+"""Margin that no pose aims at, as a share of the scene's sides: frames there would show the outside."""
 
 _LOWEST, _SPREAD = 0.85, 0.3
-"""Each pose's own share of the height, from the lowest on, so that not all see at one scale."""
+"""Smallest factor on the height of a pose, and the range above it, so that poses see at several scales."""
 
 _CLEAR = 0.3
-"""Share of the height over the ground that is free in front of a pose."""
+"""Share of the height that must be free in front of a pose."""
 
 _COVERED = 0.75
-"""Share of the frame that is filled in poses that are as good as any."""
+"""Share of the frame that is covered in a pose with the full score."""
 
 _ABOVE = 1.3
-"""Poses stand at least so many times as high as what stands on the ground."""
+"""Least height of the poses, as a multiple of the height of what stands on the ground."""
 
 
 def plan_aerial(
@@ -48,10 +48,11 @@ def plan_aerial(
     *,
     first: int | None = None,
 ) -> Poses:
-    """At most `count` poses above everything, their footprints spread evenly over the scene.
+    """Plan at most `count` poses above everything, their footprints spread evenly over the scene.
 
-    The height follows from the count: few poses see much each, many see detail. Poses in or close to
-    matter, or with a quarter of their frame empty, are left out. `first` asks for so many of them only.
+    The height follows from `count`: few poses see much each, many see detail. Poses in matter or close to it
+    are dropped, and poses with at least three quarters of the frame covered are preferred. `first` limits the
+    number of poses without changing their height.
     """
     height = _height(site, count, lens)
 
@@ -77,7 +78,10 @@ def plan_aerial(
 
 
 def _height(site: Site, count: int, lens: Lens) -> Floats | float:
-    """Over the ground: each spot in `_OVERLAP` nadir frames, above all that stands, below what fits all."""
+    """Return the height above the ground at which each spot lies in `_OVERLAP` nadir frames.
+
+    It is at most the height from which one frame spans the scene, and always above what stands on the ground.
+    """
     sides = (site.box[1] - site.box[0])[:2]
     wide, tall = lens.tangents
     by_count = np.sqrt(_OVERLAP * sides[0] * sides[1] / (max(1.0, _NADIR * count) * 4 * wide * tall))

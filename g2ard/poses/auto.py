@@ -1,4 +1,4 @@
-"""Poses for a scene of any kind: from within, from around and above, from where it is in focus."""
+"""Poses for a scene of any kind: within rooms, around and above, and wherever it is in focus."""
 
 from __future__ import annotations
 
@@ -22,20 +22,21 @@ _STREET = 0.25
 """Share of a landscape's poses that stand on its ground, where there is room."""
 
 _SHARP = 0.04
-"""Radians: a pose from around or above is in focus while `Focus.coarse`, the 90th percentile of the angular
-standard deviations it sees, is below. Measured: objects .007–.01, a park .012, an open scene seen through its
-own sky .1 and more."""
+"""Radians: a pose from around or above is in focus if `Focus.coarse`, the 90th percentile of the angular
+standard deviations it sees, is smaller. Measured: objects .007–.01, a park .012, an open scene seen through
+its own sky .1 and more."""
 
 _SHARP_IN_SCALES = 12.0
-"""The same limit as a multiple of the median Gaussian's angular standard deviation, if that is larger: few
-Gaussians are large ones. Measured without fog: 4 in an object, 9 and 12 in it at 12,500 and 3,000 rows."""
+"""The same limit as a multiple of the median Gaussian's angular standard deviation. The larger limit applies,
+because a scene of few Gaussians has large ones. Measured without fog: 4 in an object, 9 and 12 in it at
+12,500 and 3,000 rows."""
 
 _SAMPLED = 16
 """Poses from around or above that are rendered first."""
 
 _FEW, _MOST = 0.5, 0.9
-"""Of those poses that are in focus: below the first share none from there is taken, above the second all are;
-between them each is rendered and decided on."""
+"""Shares of sharp poses among those sampled: below the first, no pose from around or above is used; above the
+second, all are. Between the two, each pose is rendered and judged."""
 
 
 def plan_auto(
@@ -47,11 +48,11 @@ def plan_auto(
     seed: int,
     tell: Callable[[int, int], None],
 ) -> tuple[Poses, list[str], str]:
-    """At most `count` poses, the kinds they are of, and why.
+    """Plan at most `count` poses, and return them with their kinds and the reasons.
 
-    Nothing is decided for the scene as a whole: what lies within rooms is seen from within, in proportion;
-    the others stand around or above the scene as its shape allows, as far as it is in focus from there; what
-    is then missing stands on the ground and wherever the scene is in focus.
+    No decision covers the scene as a whole. Rooms are seen from within, in proportion to their size. The
+    other poses stand around or above the scene as its shape allows, where it is in focus. The remaining poses
+    stand on the ground and wherever the scene is in focus.
     """
     parts: dict[str, Poses] = {}
     why = [f"{inside.share:.1%} of its box lies within rooms"]
@@ -80,7 +81,7 @@ def plan_auto(
             add("focus", plan_focus(site, glance, missing(), lens, seed, tell, also=ground))
         if missing() and not far.sharp:
             add("walk", plan_walk(site, missing(), lens, seed + 2, tell, indoors=False))
-    for kind, plan in (("aerial", plan_aerial), ("orbit", plan_orbit)):  # better a view through fog than none
+    for kind, plan in (("aerial", plan_aerial), ("orbit", plan_orbit)):  # better foggy views than none
         if missing() and (not parts or kind in parts):
             add(kind, plan(site, missing(), lens, seed + 1, tell))
     for kind, plan in (("aerial", plan_aerial), ("orbit", plan_orbit)):  # or than too few
@@ -92,7 +93,7 @@ def plan_auto(
 
 @dataclass(frozen=True, eq=False)
 class _Far:
-    """Poses around or above that are in focus; `share` is of those looked through."""
+    """Poses from around or above that are in focus, and the share of sampled poses that are."""
 
     kind: str
     poses: Poses
@@ -100,7 +101,7 @@ class _Far:
 
     @property
     def sharp(self) -> bool:
-        """Whether there are enough of them to rely on."""
+        """Whether enough poses are in focus to rely on them."""
         return self.share >= _FEW
 
 
@@ -123,9 +124,9 @@ def _far(
 def _sharp(
     site: Site, glance: Glance, poses: Poses, lens: Lens, tell: Callable[[int, int], None]
 ) -> NDArray[np.bool_]:
-    """Whether poses see the scene in focus; what stands behind all of it does not count."""
+    """Return whether each pose sees the scene in focus; matter behind the scene does not count."""
     away = norms(poses.eyes - site.box.mean(axis=0))
     reach = away + norms(site.box[1:] - site.box[:1]) / 2
-    usual = middle(site.grid.scale_at(site.points))  # by count: a sky is few rows and much area
+    usual = middle(site.grid.scale_at(site.points))  # unweighted: a sky has few rows and much area
     coarse = glance.of(poses.cameras(site, lens), tell, site.size * reach).coarse
     return coarse < np.maximum(_SHARP, _SHARP_IN_SCALES * usual / np.maximum(away, np.finfo(float).tiny))

@@ -1,4 +1,4 @@
-"""Poses from where an open scene is in focus: a trained scene is sharp from where its photos were taken."""
+"""Poses where an open scene is in focus: a trained scene is sharp from where its photos were taken."""
 
 from __future__ import annotations
 
@@ -20,41 +20,40 @@ from g2ard.scene.splats import Splats
 Floats = NDArray[np.float64]
 
 _ROWS = 12_000
-"""Gaussians that a glance renders."""
+"""Gaussians rendered per glance."""
 
 _LONGEST = 96
-"""Longer side of its image, pixels."""
+"""Longer side of a glance's image, in pixels."""
 
 _MOST_WIDENED = 4.0
-"""A sample's Gaussians grow to cover what the others did, along the two longer axes, at most so much."""
+"""Largest factor by which a sample's Gaussians grow along their two longer axes, to cover for the rest."""
 
 _TRIED = 8
-"""Candidates looked at for each pose wanted, at most."""
+"""Candidates tried per requested pose, at most."""
 
 _FINE = 0.03
-"""Radians: light from Gaussians of a smaller standard deviation is what a picture shows; the rest is fog and
-sky."""
+"""Radians: Gaussians with a smaller angular standard deviation are detail; the rest is fog and sky."""
 
 _GOOD = ((0.8, 0.3), (0.7, 0.2), (0.5, 0.1))
-"""Least share of the image that the scene covers, and that something fine does: of good poses first, then of
-worse ones where those are too few."""
+"""Least shares of the image that the scene covers, and that detail covers. Poses that pass the first pair
+come first; the later pairs fill up if those are too few."""
 
 _COARSEST = 0.9
-"""Quantile of the angular sizes of what is seen that `Focus.coarse` is: one part in ten may be fog."""
+"""Quantile of the angular sizes seen that `Focus.coarse` reports: one tenth may be fog."""
 
 _PITCHES = (-35.0, 20.0)
-"""Degrees above the horizon of the gazes tried."""
+"""Range of gaze pitches, in degrees above the horizon."""
 
 
 @dataclass(frozen=True, eq=False)
 class Focus:
-    """What glances show, per camera (C,).
+    """Statistics of glances, per camera (C,).
 
     Args:
         covered: mean α of the image.
-        fine: the part of it from Gaussians whose standard deviation is under 0.03 rad.
-        coarse: 90th percentile, weighed by αT, of the standard deviations of what is seen, in radians: fog,
-            sky and what is too near are coarse.
+        fine: the part of it from Gaussians whose angular standard deviation is under 0.03 rad.
+        coarse: 90th percentile, weighted by αT, of the angular standard deviations seen, in radians. Fog, sky
+            and matter too close to the camera are coarse.
     """
 
     covered: Floats
@@ -62,12 +61,12 @@ class Focus:
     coarse: Floats
 
     def good(self, covered: float, fine: float) -> NDArray[np.int64]:
-        """Cameras with at least so much of both."""
+        """Return the cameras whose shares exceed both limits."""
         return np.flatnonzero((self.covered > covered) & (self.fine > fine))
 
 
 class Glance:
-    """Small renders of a sample of a scene, sky and floaters included, that tell what is in focus."""
+    """Small renders of a sample of a scene, sky and floaters included, that measure focus."""
 
     def __init__(self, splats: Splats, represents: float = 1.0) -> None:
         rows = np.flatnonzero(splats.opacities > 1 / 255)
@@ -91,7 +90,7 @@ class Glance:
         )
 
     def of(self, cameras: Cameras, tell: Callable[[int, int], None], reach: Floats | None = None) -> Focus:
-        """Look through each camera; what is farther than `reach`, (C,), is a backdrop and does not count."""
+        """Look through each camera; matter beyond `reach`, (C,), counts only towards `covered`."""
         from g2ard.rendering.renderer import RasterSettings, view_of
 
         if not len(cameras):
@@ -127,16 +126,16 @@ def plan_focus(
     *,
     also: Poses | None = None,
 ) -> Poses:
-    """At most `count` poses in free space whose image the scene fills, much of it with something fine.
+    """Plan at most `count` poses in free space whose image is full and shows detail.
 
     Args:
         site: the scene, upright.
-        glance: of it.
-        count: how many.
-        lens: of the poses.
-        seed: of the placement.
-        tell: told of the poses looked through.
-        also: poses to try before those in free space anywhere.
+        glance: renders of the scene.
+        count: number of poses.
+        lens: lens of the poses.
+        seed: seed of the placement.
+        tell: called with the number of poses rendered.
+        also: poses to try before those anywhere in free space.
     """
     poses = Poses(np.zeros((0, 3)), np.zeros((0, 3))) if also is None else also
     found = glance.of(poses.cameras(site, lens), tell) if len(poses) else Focus(*np.zeros((3, 0)))
@@ -158,8 +157,7 @@ def plan_focus(
 
 
 def _anywhere(site: Site, start: int, stop: int, lens: Lens, seed: int) -> Poses:
-    """Part of an endless even sequence: what stands in free space and gazes about the horizon, at nothing
-    close."""
+    """Return part of an endless even sequence of poses in free space with nothing close in front."""
     *at, turn, pitch = halton(2 * start, 2 * stop, 5, seed + 2).T
     points = site.box[0] + (site.box[1] - site.box[0]) * np.stack(at, axis=1)
     around = 2 * np.pi * turn

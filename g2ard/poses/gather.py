@@ -1,4 +1,4 @@
-"""Asking for candidates until enough are good."""
+"""Collection of candidate poses until enough are good."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from g2ard.poses.sight import Poses
 
 _PATIENCE = 12
-"""Candidates judged per pose wanted, at most."""
+"""Candidates judged per requested pose, at most."""
 
 _TOLERABLE = 0.5
-"""Scores of 1 are good; below this one a pose is refused."""
+"""Least score of a usable pose; poses with a score of 1 are good."""
 
 
 def gather(
@@ -22,16 +22,16 @@ def gather(
     judge: Callable[[Poses], NDArray[np.float64]],
     tell: Callable[[int, int], None],
 ) -> Poses:
-    """The first `count` good poses of an endless even sequence; the best tolerable ones where it lacks good.
+    """Return the first `count` good poses of an endless even sequence, topped up with usable ones.
 
     Args:
-        count: poses wanted.
-        propose: candidates from one index of the sequence to another.
-        judge: (P,) scores; at least 1 is good.
-        tell: told of good poses so far.
+        count: number of poses requested.
+        propose: returns the candidates from one index of the sequence to another.
+        judge: returns (P,) scores; a score of at least 1 is good.
+        tell: called with the number of good poses so far.
 
     Returns:
-        At most `count`, in the order of the sequence.
+        At most `count` poses, in the order of the sequence.
     """
     parts, scores = [propose(0, 0)], [np.zeros(0)]
     asked = 0

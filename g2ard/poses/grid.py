@@ -1,4 +1,4 @@
-"""Which cells of a box are opaque, how far the nearest opaque one is, and what a ray meets first."""
+"""Occupancy grid of a box: opaque cells, distances to the nearest one, and ray casting."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from g2ard.poses.volume import OccupiedVolume
 Floats = NDArray[np.float64]
 
 _CELLS = (2_000_000, 6_000_000)
-"""Cells in all, one for each Gaussian between these: a large scene is looked at more finely."""
+"""Least and most cells, with one per Gaussian in between: larger scenes get finer grids."""
 
 _CELLS_A_ROW = 5
-"""For each Gaussian of a sample: 100,000 rows fill as fine a grid as plans an overview."""
+"""Cells per row if the rows are a sample of a larger scene."""
 
 _OPAQUE = 0.3
-"""Opacity × area, summed, per face of a cell: above it light hardly passes."""
+"""Opacity × area per face of a cell, summed: above it, hardly any light passes."""
 
 _MURKY = 0.04
-"""Above it a cell has something in it: leaves, glass, haze. No place for a camera."""
+"""The same sum above which a cell holds leaves, glass or haze, and no camera may stand."""
 
 _LEAST_SIDE = 1 / 256
-"""Of the box, over its longest side: a sheet is no thinner."""
+"""Least side of the box as a share of its longest side, so that a flat scene has a thickness."""
 
 _HALF_WIDTH = 1.6
-"""Standard deviations to either side of its middle in which a Gaussian fills cells, 89 % of it."""
+"""Standard deviations from its centre within which a Gaussian fills cells, 89 % of it."""
 
 _PARTS = 9
-"""Most places along an axis that stand for a Gaussian wider than a cell."""
+"""Most sample points along an axis for a Gaussian wider than a cell."""
 
 _BATCH = 2_000_000
 """Points counted at once."""
 
 _REACH = 12
-"""Distances are known up to this many cells, enough for rays to stride through free space."""
+"""Largest distance stored, in cells: enough for rays to stride through free space."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +50,9 @@ class Grid:
         low: (3,) corner.
         cell: side.
         opaque: (X, Y, Z) int8 king's moves to the nearest cell that stops light, at most `_REACH`.
-        murky: likewise to the nearest cell that is not quite empty.
-        scale: (X, Y, Z) float32, geometric mean of the two longer standard deviations of what fills a cell;
-            0 where nothing does.
+        murky: the same, to the nearest cell that is not almost empty.
+        scale: (X, Y, Z) float32, geometric mean of the two longer standard deviations of the Gaussians in a
+            cell; 0 in empty cells.
     """
 
     low: Floats
@@ -63,7 +63,7 @@ class Grid:
 
     @classmethod
     def of(cls, low: Floats, high: Floats, volume: OccupiedVolume, axes: Floats, *, cells: int = 0) -> Grid:
-        """Fill the box from `low` to `high`, along the rows of `axes`; 0 cells means by the matter's rows."""
+        """Fill the box from `low` to `high`, along the rows of `axes`; `cells` of 0 follows the rows."""
         if volume.represents > 1:
             cells = cells or _CELLS_A_ROW * len(volume.points)
         cells = cells or int(np.clip(len(volume.points), *_CELLS))
@@ -96,9 +96,9 @@ class Grid:
         return cls(low, cell, opaque, murky, scale.reshape(shape))
 
     def distance(self, points: Floats) -> Floats:
-        """(M,) from points to the nearest cell with something in it, or from outside to the box if farther.
+        """Return (M,) distances to the nearest murky cell, or to the box if that is farther.
 
-        Within the box what lies farther than `_REACH` cells is not looked for.
+        Distances within the box are at most `_REACH` − 1 cells.
         """
         index, inside = _index(points, self.low, self.cell, np.array(self.murky.shape))
         found = np.maximum(self.murky.ravel()[index].astype(np.float64) - 1, 0) * self.cell
@@ -107,12 +107,12 @@ class Grid:
         return np.where(inside, found, np.maximum(outside, found))
 
     def scale_at(self, points: Floats) -> Floats:
-        """(M,) `scale` of the cells that points lie in, 0 outside the box."""
+        """Return (M,) values of `scale` in the cells of points, 0 outside the box."""
         index, inside = _index(points, self.low, self.cell, np.array(self.murky.shape))
         return np.where(inside, self.scale.ravel()[index], 0.0)
 
     def cast(self, eyes: Floats, directions: Floats, *, murky: bool = False) -> Floats:
-        """(M,) distances at which unit rays first meet an opaque cell, or a murky one; inf if they do not."""
+        """Return (M,) distances at which unit rays meet an opaque or a murky cell; inf without one."""
         steps = self.murky if murky else self.opaque
         return _core.cast_rays(
             steps.ravel(),
@@ -125,13 +125,13 @@ class Grid:
 
 
 def _lattice(count: int) -> Floats:
-    """(count², 2) offsets in standard deviations that stand for a Gaussian too wide for one cell."""
+    """Return (count², 2) offsets, in standard deviations, that sample a Gaussian wider than a cell."""
     line = _HALF_WIDTH * ((np.arange(count) + 0.5) / count * 2 - 1)
     return np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def _index(points: Floats, low: Floats, cell: float, shape: NDArray[Any]) -> tuple[Any, NDArray[np.bool_]]:
-    """Flat cell indices, clamped into the box, and whether the points were in it."""
+    """Return flat cell indices, clamped into the box, and whether each point was in it."""
     flat, inside = np.zeros(len(points), np.int64), np.ones(len(points), bool)
     for axis in range(3):
         place = np.floor((points[:, axis] - low[axis]) / cell)
@@ -151,7 +151,7 @@ def _steps(opaque: NDArray[np.bool_]) -> NDArray[np.int8]:
 
 
 def _grown(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The cells and their 26 neighbours."""
+    """Return the cells and their 26 neighbours."""
     for axis in range(3):
         wider = cells.copy()
         ahead, behind = [slice(None)] * 3, [slice(None)] * 3

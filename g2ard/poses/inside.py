@@ -1,4 +1,4 @@
-"""Poses within rooms and other places that matter surrounds."""
+"""Poses within rooms and other enclosed places."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _TRIES = 4096
 """Places tried."""
 
 _DIRECTIONS = 64
-"""Rays that tell how much of the sphere around a place is matter."""
+"""Rays cast from a place to measure how much of the sphere around it is matter."""
 
 _ENCLOSED = 0.7
-"""Share of the sphere that matter covers around a place within a room; a path under open sky has half. With
-places from 0.55 or 0.35 on, at the edges of rooms, the showroom loses .2 and .4 dB: some lie behind walls."""
+"""Least share of the sphere around a place within a room that is matter; a path under open sky has half. With
+0.55 or 0.35, the showroom loses .2 and .4 dB, because some places at the edges of rooms lie behind walls."""
 
 _SHARP = 0.05
-"""Radians: within a room three quarters of what is seen have a standard deviation below this. Measured
+"""Radians: within a room, three quarters of the matter seen has a smaller standard deviation. Measured
 .013–.026; in the hollow of an object .13 and more."""
 
 _SOME_INSIDE, _ALL_INSIDE = 0.005, 0.025
@@ -34,25 +34,30 @@ _SOME_INSIDE, _ALL_INSIDE = 0.005, 0.025
 Measured: showroom .026–.079, objects and open scenes 0.000."""
 
 _MOSTLY = 0.75
-"""The share of what is seen that has to be below that."""
+"""Share of the matter seen that must have a standard deviation below `_SHARP`."""
 
 _COVERED, _CLEAR_CELLS = 0.8, 4
-"""A gaze is as good as any where matter fills this share of its frame and begins so many cells away."""
+"""Share of the frame that is matter, and free cells in front, at which a gaze gets the full score."""
 
 _SHELL = 0.5
-"""At most so much of a pool stands within what has no ground."""
+"""Largest share of a pool that stands within a scene without ground."""
 
 _PITCHES = (-0.3, 0.2)
-"""Radians above the horizon that people gaze at."""
+"""Range of gaze pitches, in radians above the horizon."""
 
 _WIDE = 0.25
-"""Half of the poses stand in this share of the places, those with most room around; the others anywhere."""
+"""Share of the places, those with most clearance, for half of the poses; the others stand anywhere."""
 
 
 @dataclass(frozen=True, eq=False)
 class Inside:
-    """Places (K, 3) within rooms, those with most clearance first, their share of the scene's box, and
-    whether the scene has a ground."""
+    """Places within the rooms of a scene.
+
+    Args:
+        places: (K, 3) places, those with most clearance first.
+        share: share of the scene's box that lies within rooms.
+        grounded: whether the scene has a ground.
+    """
 
     places: Floats
     share: float
@@ -60,13 +65,13 @@ class Inside:
 
     @property
     def weight(self) -> float:
-        """How much of a pool stands within: up to 1, or ½ without a ground: a shell may be an object."""
+        """Share of a pool that stands within: up to 1, or ½ without a ground (a shell may be an object)."""
         most = 1.0 if self.grounded else _SHELL
         return most * float(np.clip((self.share - _SOME_INSIDE) / (_ALL_INSIDE - _SOME_INSIDE), 0, 1))
 
 
 def find_inside(site: Site, seed: int) -> Inside:
-    """Free places around which matter covers most of the sphere, and near enough to be seen sharply."""
+    """Find free places around which matter covers most of the sphere and is near enough to look sharp."""
     grid = site.grid
     points = site.box[0] + (site.box[1] - site.box[0]) * halton(0, _TRIES, 3, seed)
     clearance = grid.distance(points)
@@ -91,10 +96,10 @@ def find_inside(site: Site, seed: int) -> Inside:
 def plan_inside(
     site: Site, inside: Inside, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None]
 ) -> Poses:
-    """At most `count` poses at the places found, gazing all around and near the horizon.
+    """Plan at most `count` poses at the places found, gazing all around and near the horizon.
 
-    Every second one stands where there is most room. Gazes into a near wall, or out of the scene, are left
-    out.
+    Every second pose stands where there is most clearance. Gazes into a near wall, or out of the scene, are
+    dropped.
     """
     places = inside.places
     if not len(places):

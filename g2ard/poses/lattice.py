@@ -13,8 +13,9 @@ _GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 def fibonacci(count: int, turn: float = 0.0, low: float = -1.0, high: float = 1.0) -> Floats:
-    """(count, 3) unit vectors, each standing for the same area of the sphere between heights z of `low`
-    and `high`, from `high` down; the spiral begins at `turn` of a full circle.
+    """Return (count, 3) unit vectors, each representing the same area of the sphere.
+
+    They cover the heights z from `high` down to `low`; the spiral begins at `turn` of a full circle.
 
     >>> bool(np.abs(fibonacci(1000).mean(axis=0)).max() < 0.01)
     True
@@ -27,8 +28,9 @@ def fibonacci(count: int, turn: float = 0.0, low: float = -1.0, high: float = 1.
 
 
 def halton(start: int, stop: int, dimensions: int, seed: int) -> Floats:
-    """(stop − start, dimensions ≤ 6) points of the unit cube from Halton's endless sequence, moved on the
-    torus by `seed`.
+    """Return (stop − start, dimensions) points of Halton's endless sequence in the unit cube.
+
+    `dimensions` is at most 6. The points are shifted on the torus by `seed`.
 
     >>> bool(np.abs(halton(0, 1000, 3, seed=0).mean(axis=0) - 0.5).max() < 0.01)
     True
@@ -46,10 +48,10 @@ def halton(start: int, stop: int, dimensions: int, seed: int) -> Floats:
 
 
 def strata(features: Floats, size: int, seed: int) -> NDArray[Any]:
-    """An order in which every `size`-th row is a fair sample of all.
+    """Return an order in which every `size`-th row is a fair sample of all.
 
-    The rows are halved along the widest feature until `size` near ones are left together; of each such
-    group, one that chance picks comes first and the others follow.
+    The rows are halved along the widest feature into groups of at most `size` similar rows. In each group, a
+    random row comes first and the others follow.
 
     >>> order = strata(np.arange(16.0)[:, None], 8, seed=0)
     >>> sorted(order[:8].tolist()), sorted(order[8:].tolist()) == list(range(8, 16))

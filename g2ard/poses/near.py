@@ -1,4 +1,4 @@
-"""Poses nearer than the others, to what they see, and what a pool shows of a scene's matter."""
+"""Poses nearer to what other poses see, and a measure of how much of a scene a pool shows."""
 
 from __future__ import annotations
 
@@ -15,30 +15,31 @@ from g2ard.poses.site import Site
 Floats = NDArray[np.float64]
 
 _POINTS = 512
-"""Points of the scene's matter that stand for all of it."""
+"""Sample points that represent the scene's matter."""
 
 _PIXELS = 1.5
-"""A near pose shows what it aims at with this standard deviation."""
+"""Standard deviation, in pixels, at which a near pose shows its target."""
 
 _JITTER = 0.2
-"""By how much gazes miss the point they aim at, as a tangent: not every image has its point in the middle."""
+"""Scale of the random offset between a gaze and its target, as a tangent, so that not every image has the
+target in the middle."""
 
 _ABOVE = 0.01
-"""Least height of a pose over the ground, in sizes of the scene."""
+"""Least height of a pose above the ground, in scene sizes."""
 
 _STEP = (0.25, 0.6)
-"""Share of the way that is left, at least and at most."""
+"""Least and most of the original distance to the target that remains."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """How poses see a sample of a scene's points.
+    """Visibility of a sample of a scene's points.
 
     Args:
         points: (K, 3) in the site's coordinates.
         scales: (K,) typical standard deviation of the Gaussians there.
-        best: (K,) the pose that sees a point from nearest; −1 where none does.
-        distance: (K,) from that pose; inf where there is none.
+        best: (K,) index of the nearest pose that sees a point; −1 if no pose does.
+        distance: (K,) distance from that pose; inf if no pose sees the point.
     """
 
     points: Floats
@@ -47,16 +48,16 @@ class Reach:
     distance: Floats
 
     def unseen(self) -> float:
-        """Share of the points that no pose sees."""
+        """Return the share of the points that no pose sees."""
         return float((self.best < 0).mean())
 
     def coarse(self, lens: Lens) -> NDArray[np.bool_]:
-        """(K,) points that are seen, but with a standard deviation below a pixel."""
+        """Return (K,) whether points are seen, but with a standard deviation below a pixel."""
         return (self.best >= 0) & (self.scales * float(lens.matrix[0, 0]) < self.distance)
 
 
 def reach_of(site: Site, poses: Poses, lens: Lens) -> Reach:
-    """Cast a ray from every pose to every point of a sample that lies within its frame."""
+    """Cast a ray from every pose to each sample point within its frame."""
     points = site.points[:_POINTS]
     best, nearest = np.full(len(points), -1), np.full(len(points), np.inf)
     wide, tall = lens.tangents
@@ -75,10 +76,10 @@ def reach_of(site: Site, poses: Poses, lens: Lens) -> Reach:
 
 
 def plan_near(site: Site, poses: Poses, reach: Reach, count: int, lens: Lens, seed: int) -> Poses:
-    """At most `count` poses on the way from the given ones to points that they see.
+    """Plan at most `count` poses between the given ones and points that they see.
 
-    They stand where the points have a standard deviation of 1.5 pixels, within 0.25–0.6 of the way; half of
-    them look at points that the given poses show smaller than a pixel, as far as there are any.
+    Each pose stands where its point has a standard deviation of 1.5 pixels, at 0.25–0.6 of the original
+    distance. Up to half of the poses look at points that the given poses show smaller than a pixel.
     """
     if not count:
         return poses.take(slice(0))

@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 
 
 def quantile(values: Floats, weights: Floats, shares: Any) -> Floats:
-    """The values below which the given shares of the weight lie.
+    """Return the values below which the given shares of the weight lie.
 
     >>> quantile(np.array([3.0, 1.0, 2.0]), np.array([1.0, 1.0, 2.0]), [0.2, 0.5, 1.0]).tolist()
     [1.0, 2.0, 3.0]
@@ -25,35 +25,36 @@ def quantile(values: Floats, weights: Floats, shares: Any) -> Floats:
 
 
 def middle(values: Floats) -> float:
-    """The lower median: one of the values."""
+    """Return the lower median, which is always one of the values."""
     rank = (len(values) - 1) // 2
     return float(np.partition(values, rank)[rank])
 
 
 def along(vectors: Floats, axis: Floats) -> Floats:
-    """(M,) dot products with one axis. (Matrix products may change bits with the number of threads.)"""
+    """Return (M,) dot products with one axis. A matrix product may change bits with the number of threads."""
     return vectors[:, 0] * axis[0] + vectors[:, 1] * axis[1] + vectors[:, 2] * axis[2]
 
 
 def norms(vectors: Floats) -> Floats:
-    """(M,) lengths of rows."""
+    """Return (M,) lengths of rows."""
     return np.sqrt(sum(column * column for column in vectors.T))
 
 
 def turned(vectors: Floats, axes: Floats) -> Floats:
-    """(M, 3) coordinates along the three rows of `axes`."""
+    """Return (M, 3) coordinates along the three rows of `axes`."""
     return np.stack([along(vectors, axis) for axis in axes], axis=1)
 
 
 def moments(vectors: Floats, weights: Floats) -> Floats:
-    """(D, D) weighted sum of outer products of (M, D) rows."""
+    """Return the (D, D) weighted sum of outer products of (M, D) rows."""
     return np.array([[(weights * a * b).sum() for b in vectors.T] for a in vectors.T])
 
 
 def canonical_order(splats: Splats, rows: NDArray[Any]) -> NDArray[Any]:
-    """An order of rows by a hash of what moving and scaling a scene leaves alone; ties by place and size.
+    """Return an order of rows by a hash of opacity, rotation and colour; ties by place and size.
 
-    Sums taken in it do not show in which order a file holds its rows, and a prefix is a random sample.
+    Moving or scaling a scene keeps the order. Sums in it do not depend on the file's row order, and a prefix
+    is a random sample.
     """
     key = np.zeros(len(rows), np.uint64)
     for block in (splats.logit_opacities[:, None], splats.quats, splats.sh0[:, 0]):

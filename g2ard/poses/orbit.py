@@ -1,4 +1,4 @@
-"""Poses on a dome around a thing, each as near as the thing fits the frame."""
+"""Poses on a dome around an object, each as near as the object fits the frame."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from g2ard.poses.site import Site
 Floats = NDArray[np.float64]
 
 _ELEVATIONS = (-5.0, 50.0)
-"""Degrees above the horizon of the thing's middle."""
+"""Range of elevations, in degrees above the horizon of the object's centre."""
 
 _DISTANCES = (0.9, 1.25)
-"""Each pose's own share of the distance at which the thing just fits."""
+"""Range of distances, as multiples of the distance at which the object just fits."""
 
 _FITTING = 0.97
-"""Share of the matter that is in frame where the thing just fits."""
+"""Share of the matter in frame when the object just fits."""
 
 _OUTSIDE = 1.2
-"""Least distance from the middle: everything lies within about 1 of it."""
+"""Least distance from the centre: everything lies within about 1 of it."""
 
 _ABOVE, _CLEAR_CELLS = 0.02, 4
-"""Height over the ground of a pose, in sizes of the scene, and free cells before it, at least."""
+"""Least height of a pose above the ground, in scene sizes, and least number of free cells in front of it."""
 
 _OUTLINE = 8_000
-"""Points that stand for the thing's outline."""
+"""Points that represent the object's outline."""
 
 
 def plan_orbit(
@@ -43,10 +43,10 @@ def plan_orbit(
     *,
     first: int | None = None,
 ) -> Poses:
-    """At most `count` poses around the middle of the matter, evenly over the dome.
+    """Plan at most `count` poses around the centre of the matter, spread evenly over the dome.
 
-    Poses below the ground, in or close to matter are left out; the rest see it, for it fills their frame.
-    `first` asks for so many of them only.
+    Poses below the ground, in matter or close to it are dropped. The others see the object, because it fills
+    their frame. `first` is a second limit on the number of poses.
     """
     target = site.box.mean(axis=0)
     low, high = np.sin(np.radians(_ELEVATIONS))
@@ -70,7 +70,7 @@ def plan_orbit(
 
 
 def _fitting(site: Site, target: Floats, outward: Floats, lens: Lens) -> Floats:
-    """(P,) distances at which `_FITTING` of the matter is in frame, and all of it ahead."""
+    """Return (P,) distances at which `_FITTING` of the matter is in frame, and all of it ahead."""
     points, weights = site.points[:_OUTLINE] - target, site.weights[:_OUTLINE]
     wide, tall = lens.tangents
     distances = np.empty(len(outward))

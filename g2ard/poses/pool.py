@@ -1,4 +1,4 @@
-"""Candidate pools: which kind a scene asks for, and its poses in an order that splits fairly."""
+"""Candidate pools: the kind of poses that suits a scene, in an order that splits fairly."""
 
 from __future__ import annotations
 
@@ -28,34 +28,34 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.splits import HOLD_OUT
 
 _WORTH = 1.1
-"""Times as many poses for which planning begins anew."""
+"""Factor by which the number of poses must grow before they are planned again."""
 
 _COARSE = (0.2, 0.4)
-"""Share of the matter seen only under a pixel: between these ever more poses step nearer. Measured: objects
-.06–.17, whole scenes .01–.06, two chunks cut from a room, seen from outside, .44 and .55."""
+"""Shares of the matter seen only below a pixel between which more and more poses step nearer. Measured:
+objects .06–.17, whole scenes .01–.06, two chunks cut from a room, seen from outside, .44 and .55."""
 
 _POINTS = 4096
-"""Of the scene's matter, looked for in the views."""
+"""Points of the scene's matter that are projected into the views."""
 
 _FOV, _FOV_INSIDE = 50.0, 70.0
-"""Degrees: within rooms people take wider lenses."""
+"""Horizontal fields of view in degrees: within rooms people use wider lenses."""
 
 _MOSTLY_INSIDE = 0.5
-"""Share of a pool within rooms above which all of it has that lens."""
+"""Share of a pool within rooms above which the whole pool uses the wider lens."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pool:
-    """A pool and how it came about.
+    """A pool of cameras, and how it was planned.
 
     Args:
         cameras: in world coordinates; every 8th is a fair sample of all.
         kind: "orbit", "walk", "aerial", "near", …, or several joined by " + ".
-        why: what in the scene decided it.
-        up: (3,) unit vector in the world.
+        why: the reasons for the kind and the up direction.
+        up: (3,) unit vector in world coordinates.
         unseen: share of a sample of the matter that no pose sees.
         coarse: share that is seen, but nowhere with a standard deviation of a pixel.
-        apart: views of another kind than `cameras`, nearer to what those see; None unless asked for.
+        apart: additional views nearer to what `cameras` see; None unless requested.
     """
 
     cameras: Cameras
@@ -84,22 +84,23 @@ def plan_pool(
     represents: float = 1.0,
     progress: Progress = silent,
 ) -> Pool:
-    """As `make_pool` (see there for all but the result), and what was found out about the scene.
+    """Plan a pool like `make_pool`, and return it with the reasons and statistics.
+
+    Arguments not listed here are those of `make_pool`.
 
     Args:
-        splats: as `make_pool`, which has what is not here; or a fair sample of the scene, see `represents`.
-        count: poses, where a view holds the whole scene.
-        apart: views of another kind to make beside, nearer ones; at most so many.
-        grow: where a view holds a share h of the scene there are 1/√h times as many poses, at most this
-            many times.
-        near: share of the poses, at most, that step nearer to what the others see: near·max(s, 1 − h), where
-            s rises from 0 to 1 with the share of the matter that is only seen under a pixel. 1 − h counts in
-            pools for `looks` alone.
-        looks: a pool to weigh Gaussians by, not to learn from.
-        represents: how many of the scene's Gaussians a row of `splats` stands for.
+        splats: the scene, or a fair sample of it (see `represents`).
+        count: number of poses if a view holds the whole scene.
+        apart: largest number of nearer views to plan in addition, as a separate set.
+        grow: largest factor on `count`; if a view holds a share h of the scene, the factor is 1/√h.
+        near: largest share of the poses that step nearer to what the others see. The actual share is near·s,
+            where s rises from 0 to 1 with the share of the matter that is only seen below a pixel. With
+            `looks`, s is at least 1−h.
+        looks: whether the pool is for weighing Gaussians rather than for training.
+        represents: Gaussians of the scene per row of `splats`.
 
     Raises:
-        InputError: as `make_pool`.
+        InputError: as for `make_pool`.
     """
     lens = _lens(size, _FOV if fov is None else fov)
     if count < 1:
@@ -122,7 +123,7 @@ def plan_pool(
     def plan(count: int) -> tuple[Poses, list[str], str]:
         if inside is not None:
             return plan_auto(site, glance, inside, count, lens, seed, tell)
-        return _planned(site, glance, kind, count, lens, seed, tell), [kind], "as asked"
+        return _planned(site, glance, kind, count, lens, seed, tell), [kind], "as requested"
 
     poses, used, why = plan(count)
     held = _held(site, poses, lens)
@@ -131,12 +132,12 @@ def plan_pool(
         poses, used, why = plan(wanted)
     if len(poses) < count:
         raise InputError(
-            f"{len(poses)} of {count} poses found a free place with a view ({kind}: {why}): "
-            f"ask for {'fewer, or for ' if len(poses) else ''}another kind (`g2ard poses --kind`), "
-            "or give views"
+            f"{len(poses)} of {count} poses found a free place with a view ({kind}: {why}); "
+            f"request {'fewer, or ' if len(poses) else ''}another kind (`g2ard poses --kind`), "
+            "or give views of the scene"
         )
     reach = reach_of(site, poses, lens)
-    # Of the pool as planned, before any of its poses steps nearer, and with another seed than those.
+    # Based on the pool before any pose steps nearer, and on another seed than the near poses.
     apart_views = _apart(site, poses, reach, apart, lens, seed)
     coarse = float(reach.coarse(lens).mean())
     need = max(float(np.interp(coarse, _COARSE, (0, 1))), 1 - held if looks else 0.0)
@@ -158,7 +159,7 @@ def plan_pool(
 
 
 def _held(site: Site, poses: Poses, lens: Lens) -> float:
-    """Share of the scene's matter that a pose has in its frame."""
+    """Return the share of the scene's matter that a typical pose has in its frame."""
     if not len(poses):
         return 1.0
     points = site.origin + site.size * (site.points[:_POINTS] @ site.axes)
@@ -166,7 +167,7 @@ def _held(site: Site, poses: Poses, lens: Lens) -> float:
 
 
 def _apart(site: Site, poses: Poses, reach: Reach, count: int, lens: Lens, seed: int) -> Cameras | None:
-    """Views of another kind; None where none is asked for or has room."""
+    """Return nearer views as a separate set, or None if none is requested or none has room."""
     nearer = plan_near(site, poses, reach, count, lens, seed)
     if not len(nearer):
         return None
@@ -183,7 +184,7 @@ def _planned(
     seed: int,
     tell: Callable[[int, int], None],
 ) -> Poses:
-    """Poses of a kind that was asked for."""
+    """Plan poses of a given kind."""
     if kind == "inside":
         return plan_inside(site, find_inside(site, seed), count, lens, seed, tell)
     if kind == "focus":
@@ -202,6 +203,6 @@ def _lens(size: tuple[int, int], fov: float) -> Lens:
 
 
 def _features(poses: Poses) -> Any:
-    """What makes two poses alike: where they stand and where they look."""
+    """Return features that are close for poses with similar positions and gazes."""
     spread = max(float(np.ptp(poses.eyes, axis=0).max()), np.finfo(float).tiny)
     return np.concatenate([poses.eyes / spread, poses.gazes / 4], axis=1)

@@ -1,4 +1,4 @@
-"""What kind of scene it is, for planners to choose by."""
+"""Kind of a scene, by which planners are chosen."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _TRIES = 400
 
 _ROOM = (0.5, 0.75)
 """Share of the box that is free and enclosed, above which a scene is a room: with a ground, and without one,
-where a hollow object encloses much as well."""
+where a hollow object also encloses much."""
 
 _ENCLOSED = 0.8
 """Share of the directions below and around a place that meet matter, above which it is enclosed."""
@@ -23,10 +23,10 @@ _FLAT = 0.25
 
 
 def shape_of(site: Site) -> tuple[str, str]:
-    """One of "object", "room", "landscape", and why.
+    """Classify a site as "object", "room" or "landscape", and return the reason.
 
-    A room holds free space that matter surrounds; a landscape is much wider than high; all else is an object,
-    on its own or on a piece of ground.
+    A room has free space that matter surrounds, and a landscape is much wider than high. Anything else is an
+    object, with or without a piece of ground.
     """
     inside = _surrounded(site)
     if inside > _ROOM[site.terrain is None]:
@@ -39,7 +39,7 @@ def shape_of(site: Site) -> tuple[str, str]:
 
 
 def _surrounded(site: Site) -> float:
-    """Share of the scene's box that is free and enclosed from below and around."""
+    """Return the share of the scene's box that is free and enclosed from below and around."""
     points = site.box[0] + (site.box[1] - site.box[0]) * halton(0, _TRIES, 3, seed=0)
     free = site.grid.distance(points) > site.grid.cell
     if not free.any():

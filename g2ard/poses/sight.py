@@ -1,4 +1,4 @@
-"""Cameras made of eyes and gazes, what each sees of a site, and which are worth keeping."""
+"""Cameras built from eyes and gazes, and statistics of what each sees of a site."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from g2ard.scene.cameras import Cameras
 Floats = NDArray[np.float64]
 
 _RAYS = (24, 18)
-"""Columns and rows of rays that stand for a frame."""
+"""Columns and rows of the rays that represent a frame."""
 
 _RAISED = 0.1
-"""Of the scene's height: what is higher over the ground stands on it."""
+"""Share of `Site.tallness`: matter higher above the ground stands on it."""
 
 _BATCH = 16
 """Poses whose rays are cast together."""
@@ -25,7 +25,7 @@ _BATCH = 16
 
 @dataclass(frozen=True)
 class Lens:
-    """Image size in pixels, horizontal field of view in degrees."""
+    """Image size in pixels and horizontal field of view in degrees."""
 
     size: tuple[int, int] = (800, 600)
     fov: float = 50.0
@@ -55,16 +55,16 @@ class Poses:
         return len(self.eyes)
 
     def take(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Poses:
-        """The poses `index` selects, in its order."""
+        """Return the poses that `index` selects, in its order."""
         return Poses(self.eyes[index], self.gazes[index])
 
     @classmethod
     def joined(cls, parts: list[Poses]) -> Poses:
-        """All poses of the parts, one part after the other."""
+        """Concatenate the poses of all parts, in order."""
         return cls(np.concatenate([p.eyes for p in parts]), np.concatenate([p.gazes for p in parts]))
 
     def frames(self) -> Floats:
-        """(P, 3, 3) rows are right, down and ahead, in the site's coordinates."""
+        """Return (P, 3, 3) rotations whose rows are right, down and ahead, in the site's coordinates."""
         level = np.cross(self.gazes, [0.0, 0.0, 1.0])
         steep = np.linalg.norm(level, axis=1) < 1e-6  # straight down: the top of the image is the site's y
         level[steep] = (1.0, 0.0, 0.0)
@@ -72,7 +72,7 @@ class Poses:
         return np.stack([right, np.cross(self.gazes, right), self.gazes], axis=1)
 
     def cameras(self, site: Site, lens: Lens) -> Cameras:
-        """World cameras named in order."""
+        """Return cameras in world coordinates, named in order."""
         digits = max(4, len(str(len(self) - 1)))
         turned = self.frames() @ site.axes
         eyes = site.origin + site.size * (self.eyes @ site.axes)
@@ -89,13 +89,13 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class ViewStatistics:
-    """Per pose (P,): the share of the frame that meets matter, and how far the view is open.
+    """Share of the frame that meets matter and how far the view is open, per pose (P,).
 
     Args:
         covered: share of the rays that opaque matter stops.
-        standing: share of the rays that meet things which stand on the ground, if there is one.
-        close: the distance at which a tenth of the rays have met something, if only leaves or haze.
-        median: the distance at which half of those that meet anything have; inf where none does.
+        standing: share of the rays stopped by matter that stands on the ground; all of it without a ground.
+        close: distance at which a tenth of the rays have met something, even if only leaves or haze.
+        median: median distance of the rays that meet anything; inf if none does.
     """
 
     covered: Floats
@@ -107,7 +107,7 @@ class ViewStatistics:
 def view_statistics(
     site: Site, poses: Poses, lens: Lens, wanted: NDArray[np.bool_] | None = None
 ) -> ViewStatistics:
-    """Cast a coarse frame of rays from each pose into the site's opaque cells; zeros where not wanted."""
+    """Cast a coarse frame of rays from each pose into the site's grid; zeros for poses not in `wanted`."""
     covered, standing, close, median = (np.zeros(len(poses)) for _ in range(4))
     asked = np.arange(len(poses)) if wanted is None else np.flatnonzero(wanted)
     for some, eyes, directions in _frames_of_rays(poses, lens, asked):
@@ -125,7 +125,7 @@ def view_statistics(
 
 
 def clearance(site: Site, poses: Poses, lens: Lens) -> Floats:
-    """(P,) `ViewStatistics.close` alone, for half the rays."""
+    """Return (P,) `ViewStatistics.close` alone, casting half as many rays."""
     close = np.zeros(len(poses))
     for some, eyes, directions in _frames_of_rays(poses, lens, np.arange(len(poses))):
         met = site.grid.cast(eyes, directions, murky=True).reshape(len(some), -1)
@@ -137,7 +137,7 @@ def clearance(site: Site, poses: Poses, lens: Lens) -> Floats:
 def _frames_of_rays(
     poses: Poses, lens: Lens, asked: NDArray[np.int64]
 ) -> Iterator[tuple[NDArray[np.int64], Floats, Floats]]:
-    """Some poses at a time, with the origins and unit directions of their rays."""
+    """Yield batches of poses with the origins and unit directions of their rays."""
     if not len(asked):
         return
     columns, rows = _RAYS

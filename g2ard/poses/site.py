@@ -1,4 +1,4 @@
-"""A scene stood upright, with what planners ask of it: extents, ground, free space, sight."""
+"""An upright scene with the properties that planners need: extents, ground, free space, sight."""
 
 from __future__ import annotations
 
@@ -21,34 +21,35 @@ _EXTENT = (0.01, 0.99)
 """Quantiles of the matter along each axis that bound the scene: floaters lie outside."""
 
 _BODY = 1.5
-"""Standard deviations of a usual Gaussian that the box has to each side at least: some scenes are one."""
+"""Least half side of the box, in standard deviations of a typical Gaussian: some scenes are only one."""
 
 _ROOM = (0.1, 0.02)
-"""Room around the box in the grid: share of its sides, and sizes of the scene."""
+"""Margin of the grid around the box: a share of its sides, plus a length in scene sizes."""
 
 _FACING = np.cos(np.radians(35))
-"""Least cosine between the normals of what may be ground and the vertical."""
+"""Least cosine between the vertical and the normals of possible ground."""
 
 _TALL = 0.98
-"""Quantile of the heights over the ground that is the height of what stands there."""
+"""Quantile of the heights above the ground that is the height of what stands there."""
 
 _LONG = 1.5
-"""Ratio of the variances along and across above which a scene has a direction of its own."""
+"""Ratio of the variances along and across, above which a scene has a direction of its own."""
 
 
 @dataclass(frozen=True, eq=False)
 class Site:
-    """Coordinates here are upright (z up) and of unit size: world = origin + size · axesᵀ · here.
+    """A scene in upright coordinates (z up) of unit size: world = origin + size · axesᵀ · here.
 
     Args:
-        points: (K, 3) a sample of the matter, and `weights` (K,).
+        points: (K, 3) a sample of the matter.
+        weights: (K,) weights of the points.
         box: (2, 3) low and high corner of the robust extents.
-        terrain: height of the ground; None where there is none.
-        grid: opaque cells of the box and some room around it.
-        axes: (3, 3) rows are this frame's axes in the world.
-        origin: (3,) world.
+        terrain: height of the ground; None without a ground.
+        grid: opaque cells of the box and a margin around it.
+        axes: (3, 3) rows are this frame's axes in world coordinates.
+        origin: (3,) in world coordinates.
         size: scene units per unit here.
-        up: what was found, and why.
+        up: the up direction, and the reason for it.
     """
 
     points: Floats
@@ -65,10 +66,10 @@ class Site:
     def of(
         cls, splats: Splats, up: ArrayLike | None = None, rows: int | None = None, represents: float = 1.0
     ) -> Site:
-        """ViewerFrame a scene upright, looking at `rows` of its Gaussians at most; each represents so many.
+        """Turn a scene upright, using at most `rows` of its Gaussians, each representing `represents`.
 
         Raises:
-            InputError: nothing visible, or an `up` that is no direction.
+            InputError: nothing is visible, or `up` is not a direction.
         """
         volume = OccupiedVolume.of(splats, rows, represents)
         some = volume.sample()
@@ -76,7 +77,7 @@ class Site:
         axes = _axes(some, found.axis)
         points = turned(some.points, axes)
         box = np.array([quantile(points[:, a], some.weights, _EXTENT) for a in range(3)]).T
-        body = _BODY * middle(volume.scales[:, 2])  # of a scene no larger than its Gaussians
+        body = _BODY * middle(volume.scales[:, 2])  # for a scene no larger than its Gaussians
         box += np.maximum(0, body - (box[1] - box[0]) / 2) * np.array([[-1.0], [1.0]])
         room = _ROOM[0] * (box[1] - box[0]) + _ROOM[1]
         grid = Grid.of(box[0] - room, box[1] + room, volume, axes)
@@ -86,23 +87,23 @@ class Site:
         return cls(points, some.weights, box, terrain, grid, axes, origin, volume.size, found)
 
     def ground(self, points: Floats) -> Floats:
-        """(M,) heights of the ground under points; the matter's lowest where there is no ground."""
+        """Return (M,) heights of the ground under points, or of the box's bottom without a ground."""
         if self.terrain is None:
             return np.full(len(points), self.box[0, 2])
         return self.terrain.height(points)
 
     def above_ground(self, points: Floats) -> Floats:
-        """(M,) heights over the ground; infinite where there is none."""
+        """Return (M,) heights above the ground, infinite without a ground."""
         return points[:, 2] - self.ground(points) if self.terrain else np.full(len(points), np.inf)
 
     @cached_property
     def tallness(self) -> float:
-        """How high things stand over the ground: `_TALL` of the matter is lower."""
+        """Height of what stands on the ground: the `_TALL` quantile of the matter's height above it."""
         return max(float(quantile(self.points[:, 2] - self.ground(self.points), self.weights, _TALL)), 0.0)
 
 
 def _axes(some: Sample, up: Floats) -> Floats:
-    """Rows: along the scene if it is long, else along a coordinate axis; to its left; up."""
+    """Return rows: along the scene if it is long, otherwise along a coordinate axis; to its left; up."""
     ahead = np.eye(3)[int(np.argmin(np.round(np.abs(up), 3)))]
     ahead = ahead - (ahead @ up) * up
     ahead /= np.linalg.norm(ahead)

@@ -1,4 +1,4 @@
-"""The height of the ground as a coarse map."""
+"""Coarse height map of the ground."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 _BLOCKS = 24
-"""Blocks along the longer side; each knows one height."""
+"""Blocks along the longer side, each with one height."""
 
 _LOW = 0.25
 """Quantile of the heights in a block that is its ground: plants stand on it, noise lies below."""
@@ -18,7 +18,7 @@ _LOW = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Heights at the middles of square blocks from `low`."""
+    """Heights at the centres of square blocks, from the corner `low`."""
 
     low: Floats
     block: float
@@ -26,7 +26,7 @@ class Terrain:
 
     @classmethod
     def of(cls, points: Floats, weights: Floats, box: Floats) -> Terrain:
-        """From upward-facing matter: a low quantile in each block, roofs and canopies opened away.
+        """Estimate the ground as a low quantile of the heights per block, with roofs and canopies cut off.
 
         Args:
             points: (M, 3) matter that faces up or down, z up.
@@ -43,7 +43,7 @@ class Terrain:
         return cls(box[0, :2], block, _opened(_filled(heights, box[0, 2])))
 
     def height(self, points: Floats) -> Floats:
-        """(M,) ground under points, bilinear between blocks; beyond the map its edge goes on."""
+        """Return (M,) ground heights under points: bilinear within the map, constant beyond its edge."""
         top = np.array(self.heights.shape) - 1
         place = np.clip((points[:, :2] - self.low) / self.block - 0.5, 0, top)
         base = np.minimum(np.floor(place).astype(int), np.maximum(top - 1, 0))
@@ -61,7 +61,7 @@ class Terrain:
 
 
 def _low(cell: NDArray[np.int64], heights: Floats, weights: Floats, count: int) -> Floats:
-    """(count,) the height under which a quarter of each cell's weight lies; NaN where there is none."""
+    """Return (count,) heights below which a quarter of each cell's weight lies; NaN in empty cells."""
     order = np.lexsort((heights, cell))
     cell, heights, weights = cell[order], heights[order], weights[order]
     total = np.bincount(cell, weights, count)
@@ -74,7 +74,7 @@ def _low(cell: NDArray[np.int64], heights: Floats, weights: Floats, count: int) 
 
 
 def _filled(heights: Floats, default: float) -> Floats:
-    """Gaps take the mean of their neighbours, ring by ring."""
+    """Fill gaps with the mean of their neighbours, ring by ring."""
     if np.isnan(heights).all():
         return np.full_like(heights, default)
     while (gaps := np.isnan(heights)).any():
@@ -87,14 +87,14 @@ def _filled(heights: Floats, default: float) -> Floats:
 
 
 def _opened(heights: Floats) -> Floats:
-    """Bumps narrower than three blocks cut off, then smoothed."""
+    """Cut off bumps narrower than three blocks, then smooth."""
     lowest = _around(heights, np.inf).min(axis=0)
     opened = _around(lowest, -np.inf).max(axis=0)
     return _around(opened, None).mean(axis=0)
 
 
 def _around(heights: Floats, outside: float | None) -> Floats:
-    """(9, X, Y): each cell's neighbourhood; outside the map `outside`, or None to repeat the edge."""
+    """Return (9, X, Y), each cell's neighbourhood, padded with `outside`; None repeats the edge."""
     if outside is None:
         wide = np.pad(heights, 1, mode="edge")
     else:

@@ -1,4 +1,4 @@
-"""Which way is up: the normal of the ground where there is one, else a guess that says so."""
+"""Estimate of the up direction: the normal of the ground if there is one, otherwise a guess."""
 
 from __future__ import annotations
 
@@ -16,35 +16,36 @@ from g2ard.poses.volume import Sample
 Floats = NDArray[np.float64]
 
 _FACING = np.cos(np.radians(20))
-"""Least cosine between a normal and an axis that it faces."""
+"""Least cosine between an axis and the normals that face it."""
 
 _TILTED = np.cos(np.radians(35))
-"""The same of the ground of a flat scene, which may have slopes."""
+"""The same for the ground of a flat scene, which may have slopes."""
 
 _SHEET = 0.08
-"""Smallest over middle eigenvalue of the scene's covariance below which it is flat: as terrain is."""
+"""Smallest over middle eigenvalue of the scene's covariance, below which it is flat like terrain."""
 
 _ROD = 3
-"""Largest over middle eigenvalue above which a scene is long."""
+"""Largest over middle eigenvalue, above which a scene is long."""
 
 _GROUND_GIVEN, _GROUND = 0.1, 0.12
-"""Share of all matter in a layer above which it is the ground, along an axis that is given, or found; then
-what lies on its other side counts against it (`_edge`)."""
+"""Share of all matter in a layer above which it is the ground: along a given axis, and along an estimated
+one, where matter beyond the layer counts against it (`_edge`)."""
 
 _SLAB = 0.04
-"""Half the thickness of a layer that counts as a plane, in sizes of the scene."""
+"""Half the thickness of a layer that counts as a plane, in scene sizes."""
 
 _LAYERED = 1.8
-"""The strongest layer of a floor or path with matter on both sides holds this many times what any layer
-across it does. Measured: a room 2.2, a path 4.4; objects 1.2 and 2.2, the latter along no usual axis."""
+"""Contrast above which the strongest layer is a floor or path with matter on both sides: its share over that
+of any layer across it. Measured: a room 2.2, a path 4.4; objects 1.2 and 2.2, the latter along an unusual
+axis."""
 
 _SEARCHED = 20_000
-"""Rows that the search over directions looks at; the winner is refined on all."""
+"""Rows used to search over directions; the winner is refined on all rows."""
 
 
 @dataclass(frozen=True, eq=False)
 class Up:
-    """The unit vector away from the ground, whether there is a ground, and why we think so."""
+    """Unit vector away from the ground, whether there is a ground, and the reason."""
 
     axis: Floats
     grounded: bool
@@ -52,7 +53,7 @@ class Up:
 
 
 def given_up(sample: Sample, up: ArrayLike) -> Up:
-    """The user's own answer; only whether there is a ground is looked up.
+    """Return the axis given by the user, and check only whether there is a ground.
 
     Raises:
         InputError: not three finite numbers, or all zero.
@@ -66,11 +67,11 @@ def given_up(sample: Sample, up: ArrayLike) -> Up:
 
 
 def estimate_up(sample: Sample) -> Up:
-    """The axis from planes or the scene's shape, its sign from where the matter lies.
+    """Estimate the axis from planes or the scene's shape, and its sign from where the matter lies.
 
-    In turn: a scene much flatter than wide lies on its ground; else the strongest plane at the edge of the
-    matter is the ground; else (an object cut out of its surroundings) the axis of something long, or
-    the axis that capture software usually calls up.
+    The first of these that applies decides: a flat scene lies on its ground; the strongest plane at the edge
+    of the matter is the ground; layers that are much stronger than those across them are floors; a long
+    object stands on its end. Otherwise the axis is y, as in most capture software.
     """
     flat, thin, long = _is_flat(sample)
     if flat:
@@ -91,7 +92,7 @@ def estimate_up(sample: Sample) -> Up:
 
 
 def _is_flat(sample: Sample) -> tuple[bool, Floats, Floats | None]:
-    """Whether the scene is a sheet; its thinnest axis; its longest if it sticks out."""
+    """Return whether the scene is flat, its thinnest axis, and its longest axis if the scene is long."""
     w = sample.weights / sample.weights.sum()
     centred = sample.points - (w[:, None] * sample.points).sum(axis=0)
     values, vectors = np.linalg.eigh(moments(centred, w))
@@ -100,7 +101,7 @@ def _is_flat(sample: Sample) -> tuple[bool, Floats, Floats | None]:
 
 
 def _layer(sample: Sample, axis: Floats) -> tuple[float, float]:
-    """Share of all matter in the strongest layer that faces `axis`, and the layer's height."""
+    """Return the share of all matter in the strongest layer that faces `axis`, and the layer's height."""
     facing = np.abs(along(sample.normals, axis)) > _FACING
     if not facing.any():
         return 0.0, 0.0
@@ -116,9 +117,9 @@ def _layer(sample: Sample, axis: Floats) -> tuple[float, float]:
 def _best_plane(
     sample: Sample, few: Sample, directions: Floats, layers: list[tuple[float, float]]
 ) -> tuple[Floats, float]:
-    """The direction whose strongest layer holds most and has matter on one side only, refined.
+    """Find and refine the direction whose strongest layer is largest, with matter on one side only.
 
-    `layers` are those of `few` rows along the directions.
+    `layers` are the strongest layers of `few` along `directions`.
     """
     scores = [
         _edge(few, axis, *layer) * _habit(axis) if layer[0] else 0.0
@@ -133,8 +134,11 @@ def _best_plane(
 
 
 def _layered(sample: Sample, directions: Floats, shares: Floats) -> tuple[Floats, float]:
-    """The direction whose strongest layer holds most, refined, and how many times what the strongest layer
-    that faces away from it (by 60° or more) holds: a floor under noise, a path among reeds."""
+    """Refine the direction with the strongest layer, and return it with its contrast.
+
+    The contrast is the layer's share over that of the strongest layer at 60° or more to it. It is high for a
+    floor under noise or a path among reeds.
+    """
     axis = directions[int(np.argmax(shares))]
     across = np.abs(directions @ axis) < 0.5
     contrast = shares.max() / max(shares[across].max(), np.finfo(float).tiny)
@@ -143,7 +147,7 @@ def _layered(sample: Sample, directions: Floats, shares: Floats) -> tuple[Floats
 
 
 def _edge(sample: Sample, axis: Floats, share: float, height: float) -> float:
-    """The strongest layer's share, less what lies on both its sides: ground and walls have one side."""
+    """Return the layer's share, reduced by matter on both sides: ground and walls have it on one side."""
     beside = along(sample.points, axis) - height
     above = sample.weights[beside > 2 * _SLAB].sum()
     below = sample.weights[beside < -2 * _SLAB].sum()
@@ -151,7 +155,7 @@ def _edge(sample: Sample, axis: Floats, share: float, height: float) -> float:
 
 
 def _habit(axis: Floats) -> float:
-    """Between a floor and a wall alike: y or z is up in nearly every file."""
+    """Return a factor that favours y and z, the up axes of nearly every file, over other directions."""
     return 1.2 if np.abs(axis[1:]).max() > np.cos(np.radians(15)) else 1.0
 
 
@@ -164,7 +168,7 @@ def _mean_normal(sample: Sample, axis: Floats, rows: NDArray[np.bool_]) -> Float
 
 
 def _snapped(axis: Floats) -> Floats:
-    """The coordinate axis if it is within 15°: a long thing leans, files are upright."""
+    """Return the coordinate axis within 15°, otherwise `axis`: long objects lean, files are upright."""
     best = int(np.argmax(np.abs(axis)))
     return np.eye(3)[best] if abs(axis[best]) > np.cos(np.radians(15)) else axis
 
@@ -180,10 +184,10 @@ def _signed(sample: Sample, axis: Floats, grounded: bool, why: str) -> Up:
 
 
 def _lean(sample: Sample, axis: Floats) -> float:
-    """−1…1: how far the matter stands on the side of `axis`, seen from what faces it.
+    """Return how far the matter stands on the side of `axis`, from −1 to 1, relative to what faces it.
 
-    Heights are taken from the median of the facing matter in each of 6×6 columns, so that slopes do not
-    count. Between a floor and a ceiling, what is neither decides: furniture stands on floors.
+    Heights are relative to the median of the facing matter in each of 6×6 columns, so that slopes do not
+    count. Between a floor and a ceiling, the matter in between decides: furniture stands on floors.
     """
     heights = along(sample.points, axis)
     facing = np.abs(along(sample.normals, axis)) > _FACING
@@ -216,7 +220,7 @@ def _columns(sample: Sample, axis: Floats) -> NDArray[Any]:
 
 
 def _two_layers(sample: Sample, heights: Floats, facing: NDArray[np.bool_]) -> tuple[float, float] | None:
-    """Heights of a floor and a ceiling: both ends of what faces the axis are strong layers."""
+    """Return the heights of a floor and a ceiling if both ends of the facing matter are strong layers."""
     if not facing.any():
         return None
     weights = (sample.weights * sample.flatness)[facing]
@@ -229,7 +233,7 @@ def _two_layers(sample: Sample, heights: Floats, facing: NDArray[np.bool_]) -> t
 
 
 def _balance(sample: Sample, axis: Floats) -> float:
-    """−1…1: which half of its height a thing's matter leans to."""
+    """Return the half of its height to which an object's matter leans, from −1 to 1."""
     heights = along(sample.points, axis)
     low, high = quantile(heights, sample.weights, [0.01, 0.99])
     mean = (sample.weights * heights).sum() / sample.weights.sum()

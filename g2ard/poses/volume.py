@@ -1,4 +1,4 @@
-"""What poses are planned on: where a scene's opaque matter is, free of outliers, in units of its own size."""
+"""Opaque matter of a scene, free of outliers, in units of the scene's own size."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from g2ard.scene.splats import Splats
 Floats = NDArray[np.float64]
 
 _FAR = 7.0
-"""Floaters and sky: farther from the middle than this many times the radius of two thirds of the rows."""
+"""Distance of floaters and sky from the centre, as a multiple of the radius of two thirds of the opacity."""
 
 _WIDEST = 16.0
-"""No Gaussian weighs more than this many median ones, or a sky of a few hundred would outweigh the rest."""
+"""Largest area that counts, in median areas; otherwise a sky of a few hundred rows outweighs the rest."""
 
 _SAMPLE = 200_000
-"""Rows that statistics look at; the occupancy grid takes all."""
+"""Rows used for statistics; the occupancy grid uses all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,25 +44,26 @@ class Sample:
         return len(self.points)
 
     def take(self, rows: Any) -> Sample:
-        """The rows that a mask, a slice or indices select."""
+        """Return the rows that a mask, a slice or indices select."""
         return Sample(self.points[rows], self.weights[rows], self.normals[rows], self.flatness[rows])
 
 
 @dataclass(frozen=True, eq=False)
 class OccupiedVolume:
-    """Opaque Gaussians: scene = origin + size·points.
+    """Opaque Gaussians of a scene: scene = origin + size·points.
 
-    The rows stand in an order that depends on their values alone, and each prefix is a fair sample.
+    The order of the rows depends on their values alone, and each prefix is a fair sample.
 
     Args:
         points: (M, 3) means.
         weights: (M,) mass: opacity × area of the two largest scales, capped; the median area counts as 1.
         scales: (M, 3) standard deviations, ascending.
-        quats: (M, 4) and `order`, (M, 3), which axis of the rotation each scale belongs to.
+        quats: (M, 4) rotations.
+        order: (M, 3) the axis of the rotation that each scale belongs to.
         opacities: (M,) in (0, 1].
         origin: (3,) relative to the scene's offset.
         size: scene units per unit here: half the diagonal of the box that holds 98 % along each axis.
-        represents: how many Gaussians each row stands for: more than 1 in a sample.
+        represents: Gaussians per row, more than 1 in a sample.
     """
 
     points: Floats
@@ -77,10 +78,12 @@ class OccupiedVolume:
 
     @classmethod
     def of(cls, splats: Splats, limit: int | None = None, represents: float = 1.0) -> OccupiedVolume:
-        """Weigh a scene's rows, leave out what is invisible or far off, and normalise the rest.
+        """Weigh a scene's rows, drop invisible and distant ones, and normalise the rest.
 
-        Of more than `limit` rows only a fair sample is looked at; the scene itself may be one, of which every
-        row represents so many.
+        Args:
+            splats: the scene, or a fair sample of it.
+            limit: largest number of rows, taken as a fair sample; None means all.
+            represents: Gaussians per row of `splats`.
 
         Raises:
             InputError: nothing is visible.
@@ -100,7 +103,7 @@ class OccupiedVolume:
         areas = scales[:, 1] * scales[:, 2]
         if not (areas > 0).any():
             raise InputError(
-                "the scene has nothing to look at: no visible Gaussian with a surface; give views of it"
+                "the scene has no visible Gaussian with a surface, so no poses can be planned; give views"
             )
         weights = opacities * np.minimum(areas / middle(areas[areas > 0]), _WIDEST)
         near = _near(means, opacities)
@@ -118,18 +121,18 @@ class OccupiedVolume:
         )
 
     def sample(self) -> Sample:
-        """The first rows, with their normals."""
+        """Return the first rows with their normals."""
         some = slice(_SAMPLE)
         thick = np.maximum(self.scales[some, 1], np.finfo(float).tiny)
         normals = self._axis(some, 0)
         return Sample(self.points[some], self.weights[some], normals, 1 - self.scales[some, 0] / thick)
 
     def spans(self, rows: Any) -> Floats:
-        """(m, 2, 3) the two largest axes of some rows, times their scales."""
+        """Return (m, 2, 3) the two longest axes of some rows, times their scales."""
         return np.stack([self._axis(rows, k) * self.scales[rows, k, None] for k in (1, 2)], axis=1)
 
     def _axis(self, rows: Any, rank: int) -> Floats:
-        """Unit axes of the `rank`-th scales: columns of the rotations."""
+        """Return the unit axes of the `rank`-th smallest scales: columns of the rotations."""
         q, column = self.quats[rows].astype(np.float64), self.order[rows, rank]
         length = norms(q)
         q[length == 0] = (1, 0, 0, 0)
@@ -148,9 +151,9 @@ class OccupiedVolume:
 
 
 def _near(means: Floats, weights: Floats) -> NDArray[np.bool_]:
-    """Rows within `_FAR` usual distances of the middle, found again once the farthest are out.
+    """Return the rows within `_FAR` typical distances of the centre, repeated after dropping the farthest.
 
-    Weighed by opacity alone: a sky is few rows and much area.
+    Rows are weighed by opacity alone, because a sky has few rows and much area.
     """
     near = np.ones(len(means), bool)
     for _ in range(4):
@@ -167,4 +170,4 @@ def _near(means: Floats, weights: Floats) -> NDArray[np.bool_]:
 def _frame(means: Floats, weights: Floats, scales: Floats) -> tuple[Floats, float]:
     box = np.array([quantile(means[:, a], weights, [0.01, 0.99]) for a in range(3)])
     size = float(norms((box[:, 1] - box[:, 0])[None])[0]) / 2
-    return box.mean(axis=1), max(size, 2 * middle(scales[:, 2]))  # one Gaussian is as large as its body
+    return box.mean(axis=1), max(size, 2 * middle(scales[:, 2]))  # a single Gaussian also needs a size

@@ -15,30 +15,30 @@ from g2ard.poses.site import Site
 Floats = NDArray[np.float64]
 
 _PITCHES = (-25.0, 10.0)
-"""Degrees above the horizon that eyes gaze at."""
+"""Range of gaze pitches, in degrees above the horizon."""
 
 _HEIGHTS = {True: (0.35, 0.75), False: (0.2, 0.6)}
-"""Of eyes over the ground, in heights of the room indoors, of what stands around outdoors."""
+"""Range of eye heights above the ground: indoors in heights of the room, outdoors in `Site.tallness`."""
 
 _SKY = 0.25
-"""Outdoors at least this share of the sky is open: else the place is inside a hollow building."""
+"""Least share of the sky that is open outdoors; with less, the place is inside a hollow building."""
 
 _TRIES = (512, 2048)
-"""Places tried; more poses than are free share places and look elsewhere."""
+"""Least and most places tried; if poses outnumber the free places, they share them and look elsewhere."""
 
 _THINGS = 0.12
-"""Outdoors at least this share of the frame shows what stands on the ground, not bare ground alone."""
+"""Least share of the frame outdoors that shows what stands on the ground, for the full score."""
 
 _HALLS = 0.15
-"""Places that at least this share of all can be walked to from are kept; fewer are hollows."""
+"""Least share of all places in a connected group that is kept; smaller groups are hollows."""
 
 
 def plan_walk(
     site: Site, count: int, lens: Lens, seed: int, tell: Callable[[int, int], None], *, indoors: bool
 ) -> Poses:
-    """At most `count` poses at eye height in free space that hangs together, gazing all around.
+    """Plan at most `count` poses at eye height in connected free space, gazing all around.
 
-    Gazes into a near wall or leaves, or out of the scene, are left out.
+    Gazes into a near wall or leaves, or out of the scene, are dropped.
     """
     room = _clearance(site, indoors)
     far = 0.4 * min(site.box[1, :2] - site.box[0, :2]) if indoors else 0.6 * site.tallness
@@ -63,7 +63,7 @@ def plan_walk(
 
 
 def enclosed(site: Site, points: Floats) -> Floats:
-    """(M,) share of the directions from straight down to 30° above the horizon in which matter is met."""
+    """Return (M,) shares of the directions, from straight down to 30° above the horizon, that meet matter."""
     return _met(site, points, fibonacci(64, low=-1.0, high=0.5))
 
 
@@ -79,7 +79,7 @@ def _clearance(site: Site, indoors: bool) -> float:
 
 
 def _places(site: Site, tries: int, seed: int, room: float, indoors: bool) -> Floats:
-    """(K, 3) free places at eye height from which the rest of the free space is in sight, step by step."""
+    """Return (K, 3) free places at eye height that lines of sight connect to many others, step by step."""
     box = site.box
     at = halton(0, tries, 3, seed)
     points = box[0] + (box[1] - box[0]) * at
@@ -98,7 +98,7 @@ def _places(site: Site, tries: int, seed: int, room: float, indoors: bool) -> Fl
 
 
 def _together(site: Site, points: Floats) -> NDArray[np.bool_]:
-    """Which points belong to a large part of the graph of points in sight of their neighbours."""
+    """Return whether each point belongs to a large part of the graph that joins neighbours in sight."""
     count = len(points)
     apart = sum((column[:, None] - column) ** 2 for column in points.T)
     near = np.argsort(apart, axis=1, kind="stable")[:, 1:13]

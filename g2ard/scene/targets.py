@@ -267,7 +267,7 @@ class TeacherRenders(_Cached):
 
 
 class PhotosOrRenders:
-    """The photo of each view, or a render of the dense scene if it has none.
+    """Photo of each view, or a render of the dense scene for views without a photo.
 
     As in sec. 3.1: "real images are used when available, otherwise teacher renders".
 

@@ -91,7 +91,7 @@ class Journal:
 
     @classmethod
     def open(cls, folder: Path, row_bytes: int, tally: type) -> Journal | None:
-        """Read the journal of a folder, or return None if there is none.
+        """Read the journal of a folder, or return None without one.
 
         Raises:
             InputError: it is malformed.

@@ -1,4 +1,4 @@
-"""The order in which recovery draws its views: each in turn, or as often as its weight says."""
+"""Order in which recovery draws its views: evenly, or in proportion to their weights."""
 
 from __future__ import annotations
 
@@ -9,37 +9,38 @@ from g2ard.errors import InputError
 
 
 def checked_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64] | None:
-    """Weights of `count` views, mean 1; None where there are none.
+    """Check the weights of `count` views and return them with mean 1; None stays None.
 
     Raises:
-        InputError: of another length, negative, not finite, or all zero.
+        InputError: another length, or values that are negative, not finite, or all zero.
     """
     if weights is None:
         return None
     values = np.asarray(weights, np.float64)
     if values.shape != (count,):
         raise InputError(
-            f"expected {count} of them, one a view, got shape {values.shape}", parameter="weights"
+            f"expected {count} weights, one per view, got shape {values.shape}", parameter="weights"
         )
     bad = np.flatnonzero(~(np.isfinite(values) & (values >= 0)))
     if len(bad):
         raise InputError(f"view {bad[0]}: {values[bad[0]]} is not a number ≥ 0", parameter="weights")
     if not values.any():
-        raise InputError("all are zero, so that no view could be drawn", parameter="weights")
+        raise InputError("all are zero, so no view can be drawn", parameter="weights")
     values = values / values.max()  # their sum must not overflow
     return values / values.mean()
 
 
 def drawn(seed: int, epoch: int, count: int, weights: NDArray[np.float64] | None = None) -> NDArray[np.int64]:
-    """The `count` views of an epoch, in a random order that depends on the arguments alone.
+    """Return the `count` views of an epoch, in a random order that depends only on the arguments.
 
-    Without weights every view comes once. With weights w of mean 1 view v comes ⌊w_v⌋ or ⌈w_v⌉ times, w_v
-    on average (systematic sampling): far less noise than independent draws, and equal weights change no bit.
+    Without weights, every view appears once. With weights w of mean 1, view v appears ⌊w_v⌋ or ⌈w_v⌉ times,
+    w_v on average (systematic sampling). This is far less noisy than independent draws, and equal weights
+    change no bit.
 
     Args:
-        seed: of the recovery.
-        epoch: from 0.
-        count: C views.
+        seed: seed of the recovery.
+        epoch: number of the epoch, from 0.
+        count: number of views, C.
         weights: (C,) of mean 1, see `checked_weights`.
 
     Returns:

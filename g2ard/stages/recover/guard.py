@@ -1,4 +1,4 @@
-"""Whether the steps improve a scene: scores at some steps, steps back, and blends of start and result."""
+"""Protection against steps that worsen a scene: scores, rollbacks, and blends of start and result."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from g2ard.rendering.renderer import arrays_of
 from g2ard.scene.splats import Splats
 
 LOOKS = (0.1, 0.3, 0.5, 0.75)
-"""Shares of the horizon at which the scene is looked at."""
+"""Shares of the horizon at which the scene is scored."""
 
 _LOST = (5.0, 3.0, 1.0, 0.0)
-"""dB under the start at each of them from which nothing comes back: good runs dip by up to 3.6 dB under full
-rates and are level again at half of the horizon; one that went on to lose was 9 dB down at a tenth of it."""
+"""Loss in dB against the start, at each of these shares, from which a run does not recover. Good runs dip by
+up to 3.6 dB under full rates and are level again at half of the horizon; one that ended worse was 9 dB down
+at a tenth of it."""
 
 _BLENDS = (0.5, 0.25)
-"""Weights of a result that is worse than the start, in blends of the two."""
+"""Weights of the result in blends with the start, tried if the result is worse than the start."""
 
 _PRIOR_VIEWS = (2.0, 5.0, 10.0, 20.0)
-"""k of the shrinkage v/(v + k): views that must have touched a Gaussian for half of its change to stay."""
+"""Values of k in the shrinkage v/(v + k): views that must have touched a Gaussian to keep half its change."""
 _TIE = 0.1
-"""dB of the other views that are no loss yet."""
+"""Loss in dB on the other views that is tolerated."""
 _HALF, _HOPELESS = 0.5, 0.5
-"""At which share of the horizon other views decide whether to go on, and how many dB they must have lost."""
+"""Share of the horizon from which the other views can stop a run, and the loss in dB above which they do."""
 
 
 _ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
@@ -37,14 +38,15 @@ _BEST = "best."
 
 @dataclass
 class Guard:
-    """The best scene so far, and what to do about the present one.
+    """The best scene so far, and decisions about the current one.
 
     Args:
-        score: dB of a scene, the higher the better.
-        best: the start at first.
-        before: the start's score.
-        others: dB of a scene in views of another kind than those that are learned from; None without any.
-        active: whether anything is done about a loss; else the steps are taken as they come.
+        score: returns the score of a scene in dB; higher is better.
+        best: the best scene, initially the start.
+        before: score of the start.
+        others: returns the score of a scene on views of another kind than the training views; None without
+            such views.
+        active: whether to look for losses; otherwise `due` is never true and `judge` keeps the result.
     """
 
     score: Callable[[Splats], float]
@@ -64,11 +66,11 @@ class Guard:
             self.validation.append({"step": 0, "psnr": self.others(self.start)})
 
     def due(self, share: float) -> bool:
-        """Whether the scene is to be looked at."""
+        """Return whether the scene should be scored at this share of the horizon."""
         return self.active and self.looked < len(LOOKS) and LOOKS[self.looked] <= share < 1
 
     def look(self, scene: Splats, share: float, step: int) -> Literal["on", "back", "stop"]:
-        """What to do about the scene of a step: go on, go back to the best with smaller steps, or stop."""
+        """Score a scene, and decide to go on, to go back to the best one with smaller steps, or to stop."""
         while self.due(share):
             self.looked += 1
         value = self.score(scene)
@@ -89,23 +91,24 @@ class Guard:
 
     @property
     def lost(self) -> float:
-        """dB that the other views have lost against the start, as they were last looked at."""
+        """Loss in dB against the start on the other views, at their latest score."""
         return self.validation[0]["psnr"] - self.validation[-1]["psnr"] if self.validation else 0.0
 
     def settle(self, result: Splats, views: NDArray[np.float64], step: int) -> tuple[Splats, float | None]:
-        """What of a result's changes stays, by the views of another kind; all of them where there are none.
+        """Decide how much of a result's changes to keep, by the views of another kind.
 
-        While they gain against the start, or lose under 0.1 dB, everything stays. Else they choose: a
-        Gaussian that v views touched keeps v/(v + k) of its change (shrinkage towards the start), or all keep
-        the same part of it, or none.
+        Everything is kept without such views, or if they lose at most 0.1 dB against the start. Otherwise the
+        candidate that scores best on them is kept: each Gaussian's change times v/(v + k), where v views
+        touched it (shrinkage towards the start); the same share of every change; or the start.
 
         Args:
-            result: where the steps ended.
-            views: (N,) how many touched each Gaussian.
-            step: its number, for the log.
+            result: the scene after the last step.
+            views: (N,) number of views that touched each Gaussian.
+            step: number of the last step, for the log.
 
         Returns:
-            The scene, and its k: 0 keeps all of the change, ∞ none of it, None a part of it for all alike.
+            The scene and its k: 0 keeps the whole change, ∞ none of it, None the same share for all
+                Gaussians.
         """
         if self.others is None:
             return result, 0.0
@@ -128,12 +131,15 @@ class Guard:
         return best, chosen
 
     def judge(self, result: Splats) -> tuple[Splats, float, float]:
-        """The best of three: the result; the best scene looked at before it; and where both are worse than
-        the start, the first blend of start and result that is better than it, or the start.
+        """Choose between the result, the best earlier scene, and blends of start and result.
+
+        A result that is at least as good as all earlier scenes is kept. Otherwise the best earlier scene is
+        returned if it beats the start. If nothing beats the start, the first blend that does is returned, or
+        the start itself.
 
         Returns:
-            The scene, its score, and the weight of where steps ended in it: 1, also for an earlier best
-            scene; ½ or ¼ in a blend; 0 for the start.
+            The scene, its score, and the weight of the last step's scene in it: 1, also for an earlier best
+                scene; ½ or ¼ for a blend; 0 for the start.
         """
         value = self.score(result)
         if value >= self.best_score or not self.active:
@@ -148,13 +154,13 @@ class Guard:
         return self.start, self.before, 0.0
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The best scene, as a checkpoint holds it; nothing where that is the start."""
+        """Return the best scene's arrays for a checkpoint; empty if it is the start."""
         if self.best is self.start:
             return {}
         return {f"{_BEST}{name}": getattr(self.best, name) for name in _ARRAYS}
 
     def load(self, meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-        """Take up `meta` and `arrays` again; what is taken from `arrays` is gone from there."""
+        """Restore the state from `meta` and `arrays`, and remove the best scene's arrays from `arrays`."""
         self.looked, self.backed_off = int(meta["looked"]), list(meta["backed_off"])
         self.stopped, self.best_score = meta["stopped"], float(meta["best_score"])
         self.validation = list(meta["validation"])
@@ -163,7 +169,7 @@ class Guard:
             self.best = replace(self.start, **found)
 
     def meta(self) -> dict[str, Any]:
-        """What a checkpoint must remember besides the best scene."""
+        """Return the state that a checkpoint stores besides the best scene."""
         return {
             "looked": self.looked,
             "backed_off": self.backed_off,
@@ -174,11 +180,11 @@ class Guard:
 
 
 def blended(start: Splats, end: Splats, share: ArrayLike) -> Splats:
-    """A scene between two of the same Gaussians, each attribute in the space it is optimised in.
+    """Blend two scenes of the same Gaussians, each attribute in the space it is optimised in.
 
     Args:
-        start: where `share` is 0.
-        end: where it is 1.
+        start: the scene at a share of 0.
+        end: the scene at a share of 1.
         share: weight of `end`, one for all or (N,).
 
     >>> a = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]])

@@ -17,26 +17,26 @@ if TYPE_CHECKING:
     from g2ard.rendering.renderer import Renderer
 
 MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
-"""Of all rates; trained scenes want 1 or less, lifts more."""
+"""Multipliers of all rates; trained scenes need 1 or less, lifts more."""
 
 _TIE = 0.04
-"""Gains that differ from the best by less than this share of it are nearly the same."""
+"""Share of the best gain within which other gains count as equal to it."""
 _CALMEST = 0.01
-"""Smaller ones change nothing that 8 bits show."""
+"""Multiplier below which no smaller one is tried: they change nothing visible in 8 bits."""
 _VIEWS = 8
 """Training views that are scored."""
 _SHARE = 0.01
 """Share of the time that scoring the views may take while progress is shown."""
 _FIRST_SHARE = 0.1
-"""The same of the first look, where short runs would end before the second."""
+"""The same after the first score, because short runs would otherwise end before the second."""
 _FEWEST, _MOST, _PART = 10, 60, 50
-"""Steps of a trial: the least, the most, and which part of the horizon between them."""
+"""Steps of a trial: the least, the most, and the divisor of the horizon between them."""
 _SHORTEST_HORIZON = 100
-"""Steps of a horizon under which trials would take too much of it."""
+"""Steps of the shortest horizon with trials; in a shorter one they would take too large a part."""
 
 
 def trial_steps(horizon: int) -> int:
-    """Steps of one trial: a fiftieth of the horizon, 10 to 60; 0 where trials would not pay.
+    """Return the steps of one trial: a fiftieth of the horizon, from 10 to 60; 0 if trials do not pay.
 
     >>> trial_steps(50), trial_steps(300), trial_steps(1000), trial_steps(6000)
     (0, 10, 20, 60)
@@ -47,15 +47,15 @@ def trial_steps(horizon: int) -> int:
 def search_multiplier(
     score: Callable[[float], float], guess: float, start: float
 ) -> tuple[float, dict[float, float]]:
-    """The best of `MULTIPLIERS`, walking both ways from the one nearest to `guess`, and all scores seen.
+    """Search `MULTIPLIERS` both ways from the one nearest to `guess`; return the best and all scores.
 
-    Of those whose gain is within 4 % of the best the largest is taken: a long run decays in the end, a trial
-    is too short for what the larger would reach.
+    The largest multiplier whose gain is within 4 % of the best is chosen. Trials are too short to show the
+    benefit of larger rates, and a long run decays its rates towards the end.
 
     Args:
-        score: PSNR that a trial with a multiplier ends at.
-        guess: where to begin.
-        start: PSNR before.
+        score: returns the PSNR after a trial with a multiplier.
+        guess: multiplier to begin at.
+        start: PSNR before the trial.
 
     >>> search_multiplier(lambda m: -abs(m - 1), 0.2, start=0)[0]
     1.0
@@ -83,7 +83,7 @@ def search_multiplier(
 def calm(
     score: Callable[[float], float], best: float, seen: dict[float, float], start: float
 ) -> tuple[float, dict[float, float]]:
-    """A third of the multiplier, again and again, while the best only makes the start worse.
+    """Divide the best multiplier by three for as long as it worsens the start and dividing helps.
 
     >>> calm(lambda m: 50 - 9 * m, 1 / 3, {1 / 3: 47.0}, start=49.5)[0] < 0.06
     True
@@ -109,19 +109,19 @@ class Probe:
         self._latest = (float("nan"), 0)
 
     def all_of(self, splats: Splats) -> float:
-        """Mean over all of the views."""
+        """Return the mean PSNR over the views."""
         from g2ard.rendering.renderer import Renderer
 
         renderer = Renderer(splats, background=self._background)
         return float(np.mean([self._score(renderer, view) for view in self._views]))
 
     def latest(self, splats: Callable[[], Splats], step: int, seconds: float) -> tuple[float, int]:
-        """The mean, and the step it is of: an earlier one where looking has had its share of the time.
+        """Return the mean PSNR and its step; the previous ones if scoring has used its share of the time.
 
         Args:
-            splats: gives the scene as it stands.
-            step: how many have been taken.
-            seconds: since recovery began.
+            splats: returns the current scene.
+            step: number of steps taken.
+            seconds: time since recovery began.
         """
         if seconds >= self._next:
             began = time.monotonic()
