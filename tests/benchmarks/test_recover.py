@@ -83,7 +83,7 @@ def test_standing_views_are_scored_beside_the_pools(scene: SceneSpec, tmp_path: 
     before = (tmp_path / "rows.csv").read_text()
     ask(scene, tmp_path, "curves", **options, protocol="standing")
     assert (tmp_path / "rows.csv").read_text() == before  # nothing was run again
-    with pytest.raises(InputError, match="trained scene is needed"):
+    with pytest.raises(InputError, match="need a trained scene"):
         ask(replace(scene, targets="photos"), tmp_path, "curves", protocol="both")
 
 

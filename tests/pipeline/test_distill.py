@@ -248,4 +248,4 @@ def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp
     assert (status, moved in error) == (1, True), error
     las(tmp_path / "plain.las", cloud.positions, None)
     error = refused(command_line, tmp_path, "lift", "plain.las", "-o", "p.ply", status=1)
-    assert "points must be coloured (as by PDAL's filters.colorization)" in error
+    assert "has no colours ('red', 'green', 'blue'); add colours" in error

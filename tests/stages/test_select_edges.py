@@ -125,7 +125,7 @@ def test_the_command_on_pools_of_all_shapes(command_line: CommandLine, folder: P
         said = json.loads(out)
         assert len(said["views"]) == count == len(read_view_set(folder / "out.json").cameras)
         assert len(said["refused"]) == refused
-        assert (f"{plural(refused, 'view')} refused" in error) == bool(refused)
+        assert (f"{plural(refused, 'view')} not used" in error) == bool(refused)
         assert len(said["curve"]) == len(poses) - refused
     write_views(folder / "pool.json", cameras([away]), overwrite=True)
     status, _, error = ask(command_line, folder, 1, "-w", "--split", "all")

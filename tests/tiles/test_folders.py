@@ -226,7 +226,7 @@ def test_an_unfinished_ingest_is_named(command_line: CommandLine, place: Path, t
     with pytest.raises(KeyboardInterrupt):
         ingest(place / "town.ply", tmp_path / "begun", tile_rows=700, progress=interrupt_at("tiles"))
     for call in (("info", "begun"), ("simplify", "begun", "-n", 300, "-o", "a.ply")):
-        assert "begun: tiles that `g2ard ingest` has not finished" in refused(
+        assert "begun: has unfinished tiles; run the same `g2ard ingest` to continue" in refused(
             command_line, tmp_path, *call, status=1
         )
     (tmp_path / "empty").mkdir()
