@@ -48,14 +48,14 @@ if TYPE_CHECKING:
     from g2ard.io import read_views as load_views
     from g2ard.io import write_splats as save
     from g2ard.io import write_views as save_views
+    from g2ard.jobs.distill import distill
+    from g2ard.jobs.distill_options import DistillOptions
+    from g2ard.jobs.levels import lod
+    from g2ard.jobs.simplify import simplify
     from g2ard.levels import save_levels
     from g2ard.pipeline import DistillConfig, Distilled, SelectConfig
     from g2ard.pipeline import distill as distill_against
     from g2ard.pipeline.adapt import AdaptConfig, Adapted, adapt
-    from g2ard.policy.distill import distill
-    from g2ard.policy.distill_options import DistillOptions
-    from g2ard.policy.levels import lod
-    from g2ard.policy.simplify import simplify
     from g2ard.poses import make_pool
     from g2ard.rendering.renderer import RasterSettings, Rendered, Renderer, render
     from g2ard.scene.cameras import Camera, Cameras, look_at
@@ -133,10 +133,10 @@ _HOMES = {
     "io.types": ("Points",),
     "pipeline": ("DistillConfig", "Distilled", "SelectConfig"),
     "levels": ("save_levels",),
-    "policy.distill": ("distill",),
-    "policy.distill_options": ("DistillOptions",),
-    "policy.levels": ("lod",),
-    "policy.simplify": ("simplify",),
+    "jobs.distill": ("distill",),
+    "jobs.distill_options": ("DistillOptions",),
+    "jobs.levels": ("lod",),
+    "jobs.simplify": ("simplify",),
     "poses": ("make_pool",),
     "config.presets": ("preset",),
     "scene.splats": ("Splats",),

@@ -18,7 +18,7 @@ from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import Workspace, reduced
 from g2ard.errors import InputError
 from g2ard.io import read_view_set
-from g2ard.policy.register import photos_of
+from g2ard.jobs.register import photos_of
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats

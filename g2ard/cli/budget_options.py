@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from g2ard.policy.budget import Budget
+    from g2ard.jobs.budget import Budget
 
 _COUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmM%]?)")
 _GROUPED = re.compile(r"\d{1,3}(?:,\d{3})+|\d{1,3}(?:_\d{3})+")
@@ -85,7 +85,7 @@ class Count:
         return float(self.value) if self.is_share else int(self.value)
 
     def budget(self) -> Budget:
-        from g2ard.policy.budget import Budget
+        from g2ard.jobs.budget import Budget
 
         return Budget(share=self.value) if self.is_share else Budget(count=int(self.value))
 
@@ -184,7 +184,7 @@ MinSsimOption = Annotated[
 
 def one_budget(count: Count | None, ratio: float | None) -> Budget:
     """Return the budget of -n or -r, and check that exactly one is given."""
-    from g2ard.policy.budget import Budget
+    from g2ard.jobs.budget import Budget
 
     if (count is None) == (ratio is None):
         raise typer.BadParameter("give the budget as either -n COUNT or -r RATIO")

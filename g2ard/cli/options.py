@@ -315,7 +315,7 @@ def can_be_made(views: Path | None, teacher: Path | None) -> None:
 
 def views_or_teacher(run: Run, views: Path | None, teacher: Path | None, dense: Splats | None) -> Any:
     """Return the given views, or those found beside the teacher, or generated ones."""
-    from g2ard.policy.views import views_or_pool
+    from g2ard.jobs.views import views_or_pool
 
     if dense is None:
         return views

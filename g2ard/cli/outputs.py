@@ -14,7 +14,7 @@ from g2ard.cli.usage import in_flags
 
 if TYPE_CHECKING:
     from g2ard.cli.budget_options import Counts, Ratios
-    from g2ard.policy.budget import Budget
+    from g2ard.jobs.budget import Budget
 
 
 def budgets_of(
@@ -26,7 +26,7 @@ def budgets_of(
 ) -> list[Budget]:
     """Return the budgets of the options, and check that exactly one kind is given."""
     from g2ard.errors import InputError
-    from g2ard.policy.budget import Budget
+    from g2ard.jobs.budget import Budget
 
     quality = min_psnr is not None or min_ssim is not None
     if [bool(counts), bool(ratios), fit is not None, quality].count(True) != 1:

@@ -14,7 +14,7 @@ from g2ard.cli.frame import Run
 from g2ard.cli.resume import OPTIONS, check_stopped, left_at
 
 if TYPE_CHECKING:
-    from g2ard.policy.budget import Budget
+    from g2ard.jobs.budget import Budget
 
 WORK = ".unfinished"
 """Folder in a run's folder for finished rounds and checkpoints."""

@@ -9,7 +9,7 @@ from g2ard.cli.frame import Run
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
-    from g2ard.policy.fit import Aim
+    from g2ard.jobs.fit import Aim
     from g2ard.scene.splats import Splats
 
 _LOSS, _SSIM_LOSS = 0.05, 0.001

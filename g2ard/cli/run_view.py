@@ -27,8 +27,8 @@ def run_view(
     Returns:
         Size of the page in bytes, None if it was not written, and a line to print.
     """
-    from g2ard.policy.budget import DEVICES
-    from g2ard.policy.viewer_frame import frame_with
+    from g2ard.jobs.budget import DEVICES
+    from g2ard.jobs.viewer_frame import frame_with
     from g2ard.viewer import write_page
 
     count, most = len(splats), DEVICES["web"]

@@ -12,7 +12,7 @@ from g2ard.cli.usage import in_flags
 
 if TYPE_CHECKING:
     from g2ard.cli.frame import Run
-    from g2ard.policy.tiling import Tiling
+    from g2ard.jobs.tiling import Tiling
 
 TileRowsOption = Annotated[
     Count | None,
@@ -62,7 +62,7 @@ def tiling_of(
 ) -> Tiling:
     """Check the options and return them as a `Tiling`."""
     from g2ard.errors import InputError
-    from g2ard.policy.tiling import Tiling, bytes_of
+    from g2ard.jobs.tiling import Tiling, bytes_of
 
     if tile_rows is not None and scene is not None:
         _check_rows(scene, tile_rows.of(0))
@@ -99,7 +99,7 @@ def _beside(output: Path) -> Path:
 
 def _check_rows(scene: Path, rows: int) -> None:
     """Raise a usage error if a folder of tiles was written with another --tile-rows."""
-    from g2ard.policy.tiling import cut_into
+    from g2ard.jobs.tiling import cut_into
     from g2ard.tiles.store import MANIFEST, TileStore
 
     if (scene / MANIFEST).is_file() and (made := TileStore.open(scene).settings.get("tile_rows")) != rows:

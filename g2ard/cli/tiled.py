@@ -13,9 +13,9 @@ from g2ard.cli.run_folder import is_done, tell_finished, write_report
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
-    from g2ard.policy.budget import Budget
-    from g2ard.policy.distill_options import DistillOptions
-    from g2ard.policy.tiling import Tiling
+    from g2ard.jobs.budget import Budget
+    from g2ard.jobs.distill_options import DistillOptions
+    from g2ard.jobs.tiling import Tiling
     from g2ard.stages.simplify import SimplifyConfig
     from g2ard.tiles.merging import TiledScene
     from g2ard.tiles.store import TileStore
@@ -36,7 +36,7 @@ class TiledCommand:
     def simplify(self, config: SimplifyConfig, views: Any, blind: bool, up: Sequence[float] | None) -> None:
         """Run `g2ard simplify`."""
         from g2ard.config.paths import listed
-        from g2ard.policy.tiled import simplify_in_tiles, working
+        from g2ard.jobs.tiled import simplify_in_tiles, working
 
         run, began, reports = self.run, time.perf_counter(), []
         with working(self.tiling, views):
@@ -76,8 +76,8 @@ class TiledCommand:
         from dataclasses import asdict
 
         from g2ard import io
-        from g2ard.policy.tiled import distill_in_tiles, working
-        from g2ard.policy.tiling import refuse_whole, whole_budgets, whole_options
+        from g2ard.jobs.tiled import distill_in_tiles, working
+        from g2ard.jobs.tiling import refuse_whole, whole_budgets, whole_options
         from g2ard.report.distilled import tiled_report
 
         run, began = self.run, time.perf_counter()

@@ -39,7 +39,7 @@ from g2ard.tiles.tasks import (
 )
 
 if TYPE_CHECKING:
-    from g2ard.policy.views import RunViews
+    from g2ard.jobs.views import RunViews
 
 _MARGIN = 16
 """Margin in pixels around a tile in its images, because SSIM's windows reach over its edge."""

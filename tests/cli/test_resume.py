@@ -15,8 +15,8 @@ from g2ard.cli.resume import rows_kept, stoppable
 from g2ard.cli.run_folder import work_folder
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
+from g2ard.jobs.job import DistillJob
 from g2ard.pipeline import Distilled
-from g2ard.policy.job import DistillJob
 from g2ard.stages.recover import checkpoint
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball

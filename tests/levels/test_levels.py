@@ -9,8 +9,8 @@ import pytest
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io import sog
+from g2ard.jobs.levels import lod
 from g2ard.levels import Cut, Leaf, Node, cut, leaf_errors, save_levels
-from g2ard.policy.levels import lod
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import rotation_matrices
 from helpers.commands import refused, succeeds

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from g2ard.jobs.levels import lod
+from g2ard.jobs.viewer_frame import frame_with
 from g2ard.levels import Cut, save_levels
-from g2ard.policy.levels import lod
-from g2ard.policy.viewer_frame import frame_with
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.viewer import write_page

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import g2ard
-from g2ard.policy.budget import Budget
-from g2ard.policy.distill import prepare
-from g2ard.policy.distill_options import DistillOptions
-from g2ard.policy.estimate import estimate, total
+from g2ard.jobs.budget import Budget
+from g2ard.jobs.distill import prepare
+from g2ard.jobs.distill_options import DistillOptions
+from g2ard.jobs.estimate import estimate, total
 from g2ard.system.memory import peak_rss
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of
@@ -53,7 +53,7 @@ def test_memory_grows_with_views_and_gaussians(monkeypatch: pytest.MonkeyPatch) 
     job = prepare(
         ball(), [Budget(90, None)], DistillOptions(size=48, settings={"steps": 3, "recovery_time": 7.0})
     )
-    monkeypatch.setattr("g2ard.policy.estimate.peak_rss", lambda: 10**9)
+    monkeypatch.setattr("g2ard.jobs.estimate.peak_rss", lambda: 10**9)
     few, many = estimate(job, 90), estimate(job, 450)
     assert few.bytes > 10**9 + 12 * few.views * few.pixels
     assert few.seconds["recover"] == 7.0
@@ -63,7 +63,7 @@ def test_memory_grows_with_views_and_gaussians(monkeypatch: pytest.MonkeyPatch) 
     assert seconds == pytest.approx(
         few.total + many.total - many.seconds["prepare"] - many.seconds["targets"]
     )
-    monkeypatch.setattr("g2ard.policy.estimate.peak_rss", lambda: None)  # a system that does not tell
+    monkeypatch.setattr("g2ard.jobs.estimate.peak_rss", lambda: None)  # a system that does not tell
     few, many = estimate(job, 90), estimate(job, 900)
     assert many.bytes - few.bytes >= (983 - 192) * 900
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import g2ard
-from g2ard.policy.photos import points_within_sight
+from g2ard.jobs.photos import points_within_sight
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of
 

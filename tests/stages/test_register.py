@@ -10,7 +10,7 @@ import pytest
 import g2ard
 from g2ard.errors import InputError
 from g2ard.io import ace, read_views, write_splats, write_views
-from g2ard.policy.register import matched, photos_of, read_poses
+from g2ard.jobs.register import matched, photos_of, read_poses
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.images import write_png
 from g2ard.stages.register import PhotoReport, PoseError, RegisterConfig, pose_error, register

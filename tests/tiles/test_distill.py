@@ -15,7 +15,7 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
-from g2ard.policy.tiling import Tiling, bytes_of, is_tiled, workers_for
+from g2ard.jobs.tiling import Tiling, bytes_of, is_tiled, workers_for
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate

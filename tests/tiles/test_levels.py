@@ -9,10 +9,10 @@ import pytest
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io import sog
+from g2ard.jobs.distill_options import DistillOptions
+from g2ard.jobs.tiled import TiledLevels, lod_in_tiles
+from g2ard.jobs.tiling import Tiling
 from g2ard.levels import Cut, cut, save_levels, tree
-from g2ard.policy.distill_options import DistillOptions
-from g2ard.policy.tiled import TiledLevels, lod_in_tiles
-from g2ard.policy.tiling import Tiling
 from g2ard.scene.splats import Splats
 from g2ard.system.memory import peak_rss
 from g2ard.tiles.ingest import ingest

@@ -7,8 +7,8 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import write_splats
-from g2ard.policy import tiling as policy
-from g2ard.policy.tiling import (
+from g2ard.jobs import tiling as policy
+from g2ard.jobs.tiling import (
     LEVELS_TIMES,
     RECOVERY_TIMES,
     TileMemory,

@@ -6,9 +6,9 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
+from g2ard.jobs.distill_options import DistillOptions
+from g2ard.jobs.tiling import whole_options
 from g2ard.levels import Cut
-from g2ard.policy.distill_options import DistillOptions
-from g2ard.policy.tiling import whole_options
 from g2ard.tiles.ingest import ingest
 from helpers.commands import CommandLine, succeeds
 from helpers.tiled_scenes import ring, town

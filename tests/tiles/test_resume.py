@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from g2ard.io import read_splats, write_splats, write_views
-from g2ard.policy.tiling import Tiling, is_tiled
+from g2ard.jobs.tiling import Tiling, is_tiled
 from helpers.cloud_files import columns, ply
 from helpers.commands import CommandLine, succeeds
 from helpers.tiled_scenes import ring, town

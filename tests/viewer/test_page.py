@@ -18,8 +18,8 @@ from g2ard import viewer
 from g2ard.cli.run_view import run_view
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_splats, write_splats, write_views
-from g2ard.policy import budget
-from g2ard.policy.viewer_frame import frame_of, frame_with
+from g2ard.jobs import budget
+from g2ard.jobs.viewer_frame import frame_of, frame_with
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.viewer import Start, check_page_output, page, write_page

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from g2ard.io import read_splats, write_splats
-from g2ard.policy.viewer_frame import frame_with
+from g2ard.jobs.viewer_frame import frame_with
 from g2ard.rendering.metrics import psnr
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats

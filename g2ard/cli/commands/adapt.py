@@ -60,10 +60,10 @@ def adapt(
     from g2ard.config.paths import listed
     from g2ard.config.presets import PRESETS, configured
     from g2ard.io import check_scene_output, write_splats
+    from g2ard.jobs.inputs import load_scene, load_trained, make_targets
+    from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.pipeline.adapt import AdaptConfig
     from g2ard.pipeline.adapt import adapt as refit
-    from g2ard.policy.inputs import load_scene, load_trained, make_targets
-    from g2ard.policy.view_checks import warn_of_sight
 
     schedule = schedule or PRESETS[preset or "auto"].get("adapt.schedule", "default")
     if schedule == "paper" and prior_views:

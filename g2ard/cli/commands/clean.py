@@ -54,7 +54,7 @@ def clean(
     """
     from g2ard import io
     from g2ard.errors import InputError
-    from g2ard.policy.inputs import clutter_seen, load_scene
+    from g2ard.jobs.inputs import clutter_seen, load_scene
     from g2ard.stages.clean import KINDS
 
     kinds = KINDS if only is None else tuple(word.strip() for word in only.split(","))

@@ -60,7 +60,7 @@ def convert(
 
     from g2ard import io
     from g2ard.io.scene_formats import check_options
-    from g2ard.policy.inputs import load_scene
+    from g2ard.jobs.inputs import load_scene
     from g2ard.scene.transform import in_box, in_sphere, join
     from g2ard.scene.transform import transform as moved
 

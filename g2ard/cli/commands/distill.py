@@ -60,9 +60,9 @@ from g2ard.cli.tiled import TiledCommand
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    from g2ard.jobs.budget import Budget
+    from g2ard.jobs.job import DistillJob
     from g2ard.pipeline import Distilled
-    from g2ard.policy.budget import Budget
-    from g2ard.policy.job import DistillJob
     from g2ard.report.window import Crop
     from g2ard.scene.splats import Splats
     from g2ard.scene.targets import Targets
@@ -166,10 +166,10 @@ def distill(
     if scene is None and photos is False:
         raise typer.BadParameter("--renders needs a SCENE to render; give one or remove --renders")
     from g2ard.io import kind
-    from g2ard.policy.distill import prepare
-    from g2ard.policy.distill_options import DistillOptions
-    from g2ard.policy.estimate import check_memory
-    from g2ard.policy.tiling import is_tiled
+    from g2ard.jobs.distill import prepare
+    from g2ard.jobs.distill_options import DistillOptions
+    from g2ard.jobs.estimate import check_memory
+    from g2ard.jobs.tiling import is_tiled
     from g2ard.report.distilled import check_crops
 
     began = time.monotonic()
@@ -249,7 +249,7 @@ def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[Path], *, page:
     """Print the estimated time and memory of each budget, and the total of several."""
     from dataclasses import asdict
 
-    from g2ard.policy.estimate import estimate, total
+    from g2ard.jobs.estimate import estimate, total
 
     found, told = [], []
     for folder, budget in zip(folders, job.budgets, strict=True):
@@ -287,7 +287,7 @@ def _distil(
     began: float,
 ) -> tuple[Distilled, dict[str, Any]]:
     """Distil to one budget and write the run's folder; `place` is the scene's file."""
-    from g2ard.policy.score import report_of
+    from g2ard.jobs.score import report_of
     from g2ard.report.distilled import distill_report
 
     output, colour = place.parent, job.config.recover.background

@@ -58,8 +58,8 @@ def evaluate(
     from g2ard.errors import InputError
     from g2ard.io import check_scene
     from g2ard.io.describe import bytes_of
-    from g2ard.policy.inputs import load_scene, load_views, make_targets
-    from g2ard.policy.view_checks import warn_of_sight
+    from g2ard.jobs.inputs import load_scene, load_views, make_targets
+    from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.rendering.lpips import load_lpips
     from g2ard.rendering.renderer import RasterSettings
     from g2ard.stages.evaluate import evaluate as score

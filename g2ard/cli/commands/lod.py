@@ -24,11 +24,11 @@ from g2ard.config.choices import BLACK
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    from g2ard.jobs.distill_options import DistillOptions
+    from g2ard.jobs.levels import Levels
+    from g2ard.jobs.tiled import TiledLevels
+    from g2ard.jobs.tiling import Tiling
     from g2ard.levels import Cut
-    from g2ard.policy.distill_options import DistillOptions
-    from g2ard.policy.levels import Levels
-    from g2ard.policy.tiled import TiledLevels
-    from g2ard.policy.tiling import Tiling
 
 
 @command("lod", example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/")
@@ -111,12 +111,12 @@ def lod(
     from g2ard.errors import InputError
     from g2ard.io import kind
     from g2ard.io.atomic import check_output
+    from g2ard.jobs.distill_options import DistillOptions
+    from g2ard.jobs.levels import check_ratios, recovery_settings
+    from g2ard.jobs.levels import lod as levels_of
+    from g2ard.jobs.tiled import working
+    from g2ard.jobs.tiling import LEVELS_TIMES, RECOVERY_TIMES, check_memory, is_tiled
     from g2ard.levels import Cut, save_levels
-    from g2ard.policy.distill_options import DistillOptions
-    from g2ard.policy.levels import check_ratios, recovery_settings
-    from g2ard.policy.levels import lod as levels_of
-    from g2ard.policy.tiled import working
-    from g2ard.policy.tiling import LEVELS_TIMES, RECOVERY_TIMES, check_memory, is_tiled
 
     if kind(scene) == "points":
         raise typer.BadParameter(
@@ -184,8 +184,8 @@ def _in_tiles(
     errors: bool,
 ) -> None:
     """Write levels tile by tile; finished steps stay in the tiling's folder until the command succeeds."""
+    from g2ard.jobs.tiled import lod_in_tiles
     from g2ard.levels import save_levels
-    from g2ard.policy.tiled import lod_in_tiles
     from g2ard.system.memory import peak_rss_of_all
 
     assert tiling.folder is not None

@@ -58,7 +58,7 @@ def poses(
 ) -> None:
     """Generate views for a scene: poses in free space that see it well."""
     from g2ard.io import check_views_output, write_views
-    from g2ard.policy.inputs import load_scene
+    from g2ard.jobs.inputs import load_scene
     from g2ard.poses import plan_pool
     from g2ard.scene.splits import splits_of
 

@@ -75,12 +75,12 @@ def recover(
     from g2ard.config.paths import listed
     from g2ard.config.presets import PRESETS, configured
     from g2ard.io import check_scene_output, write_splats
-    from g2ard.policy.inputs import (
+    from g2ard.jobs.inputs import (
         load_scene,
         load_trained,
         make_targets,
     )
-    from g2ard.policy.view_checks import warn_of_sight
+    from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.scene.targets import kinds_of
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover import recover as optimize
@@ -151,7 +151,7 @@ def recover(
 def _anchors(run: Run, path: Path, student: Splats, in_plane: float) -> Anchors:
     """Read anchors for the rows of `student`, in its coordinates."""
     from g2ard.errors import InputError
-    from g2ard.policy.inputs import load_scene
+    from g2ard.jobs.inputs import load_scene
     from g2ard.stages.recover.anchors import Anchors
 
     scene = load_scene(path, run.say)

@@ -109,8 +109,8 @@ def register(
     from g2ard.errors import InputError
     from g2ard.io import check_views_output, write_views
     from g2ard.io.atomic import check_output
-    from g2ard.policy.inputs import load_scene
-    from g2ard.policy.register import photos_of, pool_of, poses_for
+    from g2ard.jobs.inputs import load_scene
+    from g2ard.jobs.register import photos_of, pool_of, poses_for
     from g2ard.stages.register import RegisterConfig
     from g2ard.stages.register import register as find
     from g2ard.stages.register.report import summarize

@@ -69,9 +69,9 @@ def render(
 
     from g2ard.io.atomic import check_output
     from g2ard.io.paths import output_names
-    from g2ard.policy.inputs import load_scene, load_views
-    from g2ard.policy.view_checks import warn_of_sight
-    from g2ard.policy.views import views_or_pool
+    from g2ard.jobs.inputs import load_scene, load_views
+    from g2ard.jobs.view_checks import warn_of_sight
+    from g2ard.jobs.views import views_or_pool
     from g2ard.rendering.renderer import RasterSettings, Renderer
     from g2ard.scene.images import write_png
 

@@ -51,9 +51,9 @@ def select(
     from g2ard.config.presets import configured
     from g2ard.errors import InputError
     from g2ard.io import check_views_output
+    from g2ard.jobs.inputs import load_scene, load_split_views
+    from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.pipeline import SelectConfig
-    from g2ard.policy.inputs import load_scene, load_split_views
-    from g2ard.policy.view_checks import warn_of_sight
     from g2ard.stages.select import select as choose
 
     settings = run.settings(SelectConfig(), "policy", preset=preset)

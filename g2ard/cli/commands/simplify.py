@@ -86,10 +86,10 @@ def simplify(
         raise typer.BadParameter("--keep-region needs views; remove --no-views or --method paper")
     tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)
     from g2ard import io
-    from g2ard.policy.fit import aim_of
-    from g2ard.policy.inputs import say_notes
-    from g2ard.policy.simplify import Reduction
-    from g2ard.policy.tiling import (
+    from g2ard.jobs.fit import aim_of
+    from g2ard.jobs.inputs import say_notes
+    from g2ard.jobs.simplify import Reduction
+    from g2ard.jobs.tiling import (
         WHOLE_TIMES,
         check_memory,
         is_tiled,

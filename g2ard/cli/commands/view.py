@@ -37,8 +37,8 @@ def view(
 ) -> None:
     """Write an HTML page that shows one scene, or compares two, in any browser."""
     from g2ard.io.detect import run_scene
-    from g2ard.policy.inputs import load_scene
-    from g2ard.policy.viewer_frame import frame_of
+    from g2ard.jobs.inputs import load_scene
+    from g2ard.jobs.viewer_frame import frame_of
     from g2ard.viewer import check_page_output, write_page
 
     check_page_output(output, run.overwrite)

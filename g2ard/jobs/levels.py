@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from g2ard.config.choices import BLACK, Colour
-from g2ard.policy.budget import Budget
-from g2ard.policy.inputs import make_targets
+from g2ard.jobs.budget import Budget
+from g2ard.jobs.inputs import make_targets
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.report.base import Report
 from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:
-    from g2ard.policy.inputs import Views
-    from g2ard.policy.job import DistillJob
+    from g2ard.jobs.inputs import Views
+    from g2ard.jobs.job import DistillJob
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.targets import Targets
 
@@ -111,8 +111,8 @@ def lod(
     >>> [len(level) for level in lod(ball, ratios=(1, 4, 8), steps=3, size=48).splats]
     [800, 200, 100]
     """
-    from g2ard.policy.distill import prepare
-    from g2ard.policy.distill_options import DistillOptions
+    from g2ard.jobs.distill import prepare
+    from g2ard.jobs.distill_options import DistillOptions
 
     check_ratios(ratios)
     job = prepare(

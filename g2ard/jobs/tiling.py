@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 from g2ard.errors import InputError
 
 if TYPE_CHECKING:
-    from g2ard.policy.budget import Budget
-    from g2ard.policy.distill_options import DistillOptions
+    from g2ard.jobs.budget import Budget
+    from g2ard.jobs.distill_options import DistillOptions
     from g2ard.tiles.store import TileStore
 
 _SMALLEST_ROW = 4
@@ -312,7 +312,7 @@ def refuse_whole(scene: Path, options: Sequence[str]) -> None:
 def whole_budgets(budgets: Sequence[Budget]) -> list[str]:
     """Return the budgets that need the whole scene, as options: bytes and qualities.
 
-    >>> from g2ard.policy.budget import Budget
+    >>> from g2ard.jobs.budget import Budget
     >>> whole_budgets([Budget(fit="web")]), whole_budgets([Budget(min_psnr=30, min_ssim=0.9)])
     ([], ['--min-psnr 30', '--min-ssim 0.9'])
     """

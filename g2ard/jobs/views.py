@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g2ard.policy.inputs import drop_held_out, load_for_training, load_held_out, load_view_sets, load_views
-from g2ard.policy.view_checks import as_pool, check_sight, found_views, warn_of_sight
+from g2ard.jobs.inputs import drop_held_out, load_for_training, load_held_out, load_view_sets, load_views
+from g2ard.jobs.view_checks import as_pool, check_sight, found_views, warn_of_sight
 from g2ard.progress import Progress, Say, silent, unsaid
 
 if TYPE_CHECKING:
     from g2ard.io import ViewSet
-    from g2ard.policy.inputs import Views
+    from g2ard.jobs.inputs import Views
     from g2ard.poses import Pool
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats

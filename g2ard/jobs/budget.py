@@ -86,7 +86,7 @@ class Budget:
 
     @property
     def is_measured(self) -> bool:
-        """Return whether the count depends on the scene, not only on its size (`g2ard.policy.fit`)."""
+        """Return whether the count depends on the scene, not only on its size (`g2ard.jobs.fit`)."""
         return self.bytes is not None or self.min_psnr is not None or self.min_ssim is not None
 
     def of(self, total: int, name: str = "scene") -> int:

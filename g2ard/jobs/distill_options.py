@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from g2ard.jobs.inputs import Views
     from g2ard.pipeline import DistillConfig
-    from g2ard.policy.inputs import Views
     from g2ard.stages.recover.anchors import Regularizers
 
 

@@ -7,15 +7,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from g2ard.policy.inputs import make_targets
-from g2ard.policy.views import RunViews
+from g2ard.jobs.inputs import make_targets
+from g2ard.jobs.views import RunViews
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import kinds_of
 
 if TYPE_CHECKING:
+    from g2ard.jobs.fit import Aim
     from g2ard.pipeline import DistillConfig, Distilled
-    from g2ard.policy.fit import Aim
     from g2ard.rendering.renderer import Renderer
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.targets import Targets

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.policy.inputs import load_views
-from g2ard.policy.view_checks import opaque_points
-from g2ard.policy.views import is_made, views_or_pool
+from g2ard.jobs.inputs import load_views
+from g2ard.jobs.view_checks import opaque_points
+from g2ard.jobs.views import is_made, views_or_pool
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.viewer import Start
 
 if TYPE_CHECKING:
-    from g2ard.policy.inputs import Views
+    from g2ard.jobs.inputs import Views
     from g2ard.scene.cameras import Camera, Cameras
     from g2ard.scene.splats import Splats
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.policy.budget import Budget
+from g2ard.jobs.budget import Budget
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import Renderer

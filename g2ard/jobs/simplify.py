@@ -7,14 +7,14 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from g2ard.policy.budget import Budget
-from g2ard.policy.inputs import load_scene, say_regions
-from g2ard.policy.views import cameras_for_looks
+from g2ard.jobs.budget import Budget
+from g2ard.jobs.inputs import load_scene, say_regions
+from g2ard.jobs.views import cameras_for_looks
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:
-    from g2ard.policy.inputs import Views
+    from g2ard.jobs.inputs import Views
     from g2ard.stages.simplify import Simplified, SimplifyConfig, Visibility, VisibilitySource
 
 
@@ -82,7 +82,7 @@ def simplify(
     (90, (900,), 90)
     """
     from g2ard.config.presets import configured
-    from g2ard.policy.fit import aim_of
+    from g2ard.jobs.fit import aim_of
     from g2ard.stages.simplify import SimplifyConfig
 
     fields = {"method": method, "keep_region": keep_region}

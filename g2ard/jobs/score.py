@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from g2ard.progress import Progress
 
 if TYPE_CHECKING:
+    from g2ard.jobs.job import DistillJob
     from g2ard.pipeline import Distilled
-    from g2ard.policy.job import DistillJob
     from g2ard.scene.splats import Splats
     from g2ard.scene.targets import Targets
 

@@ -12,17 +12,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g2ard.errors import G2ardError, OutputError
-from g2ard.policy.budget import Budget
-from g2ard.policy.levels import LevelReport, check_ratios, level_size
-from g2ard.policy.tiling import RECOVERY_TIMES, Tiling, refuse_whole, whole_options, workers_for
+from g2ard.jobs.budget import Budget
+from g2ard.jobs.levels import LevelReport, check_ratios, level_size
+from g2ard.jobs.tiling import RECOVERY_TIMES, Tiling, refuse_whole, whole_options, workers_for
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 
 if TYPE_CHECKING:
+    from g2ard.jobs.distill_options import DistillOptions
+    from g2ard.jobs.inputs import Views
+    from g2ard.jobs.views import RunViews
     from g2ard.levels import Cut
     from g2ard.pipeline import DistillConfig
-    from g2ard.policy.distill_options import DistillOptions
-    from g2ard.policy.inputs import Views
-    from g2ard.policy.views import RunViews
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
     from g2ard.stages.simplify import SimplifyConfig
@@ -101,8 +101,8 @@ def _check_folder(folder: Path) -> None:
 
 
 def _check_given(tiling: Tiling, views: tuple[Views | None, ...]) -> None:
-    from g2ard.policy.inputs import load_view_sets
-    from g2ard.policy.views import is_made
+    from g2ard.jobs.inputs import load_view_sets
+    from g2ard.jobs.views import is_made
 
     for given in views:
         if given is not None and not is_made(given):
@@ -206,16 +206,16 @@ def simplify_in_tiles(
 
 
 def _given(views: Views | None, say: Say) -> Cameras | None:
-    from g2ard.policy.inputs import load_views
-    from g2ard.policy.views import is_made
+    from g2ard.jobs.inputs import load_views
+    from g2ard.jobs.views import is_made
 
     return None if views is None or is_made(views) else load_views(views, "train", None, say)
 
 
 def _found(scene: Path, sample: Splats, say: Say) -> Cameras | None:
     """Return the cameras beside the scene that see the sample of it."""
-    from g2ard.policy.inputs import load_views
-    from g2ard.policy.view_checks import as_pool, found_views
+    from g2ard.jobs.inputs import load_views
+    from g2ard.jobs.view_checks import as_pool, found_views
 
     found = found_views(scene, sample, ["train"], say)
     return as_pool(load_views(found, "train", None, say)) if found else None
@@ -382,7 +382,7 @@ class _Job:
         self, small: TiledScene, around: Surroundings, views: RunViews
     ) -> tuple[TiledScene, TiledScores]:
         """Recover a simplified scene, unless nothing is to be learned, and score it."""
-        from g2ard.policy.views import pool_times
+        from g2ard.jobs.views import pool_times
         from g2ard.stages.recover.schedule import steps_for
         from g2ard.tiles.recover import recover_tiles
 
@@ -411,7 +411,7 @@ def _job(
     scene: Path, tiling: Tiling, options: DistillOptions, learn: bool, progress: Progress, say: Say
 ) -> Iterator[_Job]:
     """Open the tiles, start workers, and decide views and constants of a distillation."""
-    from g2ard.policy.views import views_of
+    from g2ard.jobs.views import views_of
     from g2ard.stages.recover.presets import preset_for
     from g2ard.tiles.merging import sample_of
 

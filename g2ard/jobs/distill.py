@@ -9,20 +9,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from g2ard.errors import InputError
-from g2ard.policy.budget import Budget
-from g2ard.policy.distill_options import DistillOptions
-from g2ard.policy.inputs import load_scene, say_regions
-from g2ard.policy.job import DistillJob
-from g2ard.policy.view_checks import warn_of_photos
-from g2ard.policy.views import is_made, views_of
+from g2ard.jobs.budget import Budget
+from g2ard.jobs.distill_options import DistillOptions
+from g2ard.jobs.inputs import load_scene, say_regions
+from g2ard.jobs.job import DistillJob
+from g2ard.jobs.view_checks import warn_of_photos
+from g2ard.jobs.views import is_made, views_of
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:
     from g2ard.io.types import Points
+    from g2ard.jobs.fit import Aim
+    from g2ard.jobs.inputs import Views
     from g2ard.pipeline import Distilled
-    from g2ard.policy.fit import Aim
-    from g2ard.policy.inputs import Views
 
     Scene = Splats | Points | str | Path | None
 
@@ -59,7 +59,7 @@ def distill(
     Args:
         scene: the dense scene, a coloured point cloud, or the path of either. None starts from photos alone:
             from COLMAP's sparse points, or as a fallback from points along camera rays
-            (`g2ard.policy.photos`).
+            (`g2ard.jobs.photos`).
         count: Gaussians of the result, at most those of the scene.
         ratio: reduction factor, at least 1.
         fit: largest file, such as "5MB", or a device: quest3, mobile or web.
@@ -124,7 +124,7 @@ def prepare(
     `counted` is called with the number of Gaussians to reduce, before budgets and views are computed; its
     exceptions propagate. Other arguments and errors are those of `distill`.
     """
-    from g2ard.policy.inputs import clutter_seen
+    from g2ard.jobs.inputs import clutter_seen
     from g2ard.stages.recover.presets import preset_for
 
     began = time.monotonic()
@@ -214,8 +214,8 @@ def _aims(
     say: Say,
 ) -> tuple[Aim, ...]:
     """Resolve the budgets; bytes are measured at the result's SH degree."""
-    from g2ard.policy.fit import aim_of
-    from g2ard.policy.simplify import Reduction
+    from g2ard.jobs.fit import aim_of
+    from g2ard.jobs.simplify import Reduction
 
     seed = options.config.recover.seed
     written = prior if degree is None else prior.with_sh_degree(degree)
@@ -249,7 +249,7 @@ def _points(budgets: Sequence[Budget], options: DistillOptions, progress: Progre
     """Create starting points from photos alone."""
     if options.views is None or is_made(options.views):
         raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
-    from g2ard.policy.photos import points_of_photos
+    from g2ard.jobs.photos import points_of_photos
 
     wanted = max((budget.count for budget in budgets if budget.count is not None), default=None)
     return points_of_photos(

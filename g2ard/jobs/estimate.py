@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from g2ard.errors import InputError
-from g2ard.policy.tiling import RECOVERY_TIMES, TileMemory, amount
+from g2ard.jobs.tiling import RECOVERY_TIMES, TileMemory, amount
 from g2ard.progress import plural
 from g2ard.scene.targets import CACHE_BYTES
 from g2ard.system.memory import peak_rss
@@ -18,7 +18,7 @@ from g2ard.tiles.pour import foretold
 from g2ard.tiles.store import row_width
 
 if TYPE_CHECKING:
-    from g2ard.policy.job import DistillJob
+    from g2ard.jobs.job import DistillJob
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
     from g2ard.scene.targets import Targets
@@ -72,7 +72,7 @@ def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
     """Estimate a job at one budget from a few renders and steps and one fast merge.
 
     Args:
-        job: a job from `g2ard.policy.distill.prepare`.
+        job: a job from `g2ard.jobs.distill.prepare`.
         budget: Gaussians of the result.
         page: whether a viewer page is written too.
     """

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.types import Points
-from g2ard.policy.inputs import load_for_training, load_view_sets
+from g2ard.jobs.inputs import load_for_training, load_view_sets
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.images import load_image
 
 if TYPE_CHECKING:
-    from g2ard.policy.inputs import Views
+    from g2ard.jobs.inputs import Views
 
 _SIDE = 240
 """Longer side in pixels of the photos used to place points."""
