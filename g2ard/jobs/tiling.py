@@ -26,7 +26,7 @@ WHOLE_TIMES, LEVELS_TIMES = 3.6, 7.0
 _TASK_BYTES, _ROW_BYTES, _ROW_TIMES = 200_000_000, 290, 0.8
 """Peak memory of a task: bytes of the program, bytes per Gaussian (halo included), and a multiple of its
 arrays. Measured: 1.95 GB for 5.5 million of SH 0, 0.98 GB for 1.8 million of SH 3
-(`benchmarks/record/tiles.md`)."""
+(`docs/benchmarks.md`)."""
 
 RECOVERY_TIMES = 1.5
 """Memory of recovering or scoring a tile, renders included, relative to merging it."""
