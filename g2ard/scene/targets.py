@@ -61,9 +61,10 @@ def kinds_told(photos: int, renders: int) -> str:
 
 
 def fingerprint_of(targets: Targets) -> str:
-    """Return a hash of the views and the source of their images, for checkpoints."""
+    """Return a hash of the views, their names and the source of their images, for checkpoints."""
     cameras = targets.cameras
-    digest = hashlib.sha256(str(getattr(targets, "source", type(targets).__name__)).encode())
+    source = getattr(targets, "source", type(targets).__name__)
+    digest = hashlib.sha256(f"{source} {cameras.names}".encode())
     for array in (cameras.viewmats, cameras.Ks, cameras.widths, cameras.heights):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

@@ -27,9 +27,9 @@ _BLENDS = (0.5, 0.25)
 _PRIOR_VIEWS = (2.0, 5.0, 10.0, 20.0)
 """Values of k in the shrinkage v/(v + k): views that must have touched a Gaussian to keep half its change."""
 _TIE = 0.1
-"""Loss in dB on the other views that is tolerated."""
+"""Loss in dB that is tolerated in a kind of validation views."""
 _HALF, _HOPELESS = 0.5, 0.5
-"""Share of the horizon from which the other views can stop a run, and the loss in dB above which they do."""
+"""Share of the horizon from which validation views can stop a run, and the loss in dB above which they do."""
 
 
 _ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
@@ -44,20 +44,20 @@ class Guard:
         score: returns the score of a scene in dB; higher is better.
         best: the best scene, initially the start.
         before: score of the start.
-        others: returns the score of a scene on views of another kind than the training views; None without
-            such views.
+        others: returns the score of a scene by kind of validation view; None without such views. The kind
+            that loses most decides.
         active: whether to look for losses; otherwise `due` is never true and `judge` keeps the result.
     """
 
     score: Callable[[Splats], float]
     best: Splats
     before: float
-    others: Callable[[Splats], float] | None = None
+    others: Callable[[Splats], dict[str, float]] | None = None
     active: bool = True
     looked: int = 0
     backed_off: list[dict[str, float]] = field(default_factory=list)
     stopped: int | None = None
-    validation: list[dict[str, float]] = field(default_factory=list)
+    validation: list[dict[str, Any]] = field(default_factory=list)
     best_score: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -91,15 +91,21 @@ class Guard:
 
     @property
     def lost(self) -> float:
-        """Loss in dB against the start on the other views, at their latest score."""
-        return self.validation[0]["psnr"] - self.validation[-1]["psnr"] if self.validation else 0.0
+        """Loss in dB against the start at the latest look, in the kind of validation view that lost most."""
+        return -self._gain(self.validation[-1]["psnr"]) if self.validation else 0.0
+
+    def _gain(self, scores: dict[str, float]) -> float:
+        """Return the least gain of a kind of validation view against the start."""
+        before = self.validation[0]["psnr"]
+        return min(scores[kind] - before[kind] for kind in before)
 
     def settle(self, result: Splats, views: NDArray[np.float64], step: int) -> tuple[Splats, float | None]:
-        """Decide how much of a result's changes to keep, by the views of another kind.
+        """Decide how much of a result's changes to keep, by the validation views.
 
-        Everything is kept without such views, or if they lose at most 0.1 dB against the start. Otherwise the
-        candidate that scores best on them is kept: each Gaussian's change times v/(v + k), where v views
-        touched it (shrinkage towards the start); the same share of every change; or the start.
+        Everything is kept without such views, or if every kind of them loses at most 0.1 dB against the
+        start. Otherwise the candidate is kept whose worst kind gains most: each Gaussian's change times
+        v/(v + k), where v views touched it (shrinkage towards the start); the same share of every change; or
+        the start.
 
         Args:
             result: the scene after the last step.
@@ -115,7 +121,7 @@ class Guard:
         self.validation.append({"step": step, "psnr": self.others(result)})
         if self.lost <= _TIE:
             return result, 0.0
-        best, most = self.start, self.validation[0]["psnr"]
+        best, scores, most = self.start, self.validation[0]["psnr"], 0.0
         chosen: float | None = math.inf
         shares: list[tuple[float | None, NDArray[np.float64] | float]] = [
             (0.0, 1.0),
@@ -124,10 +130,10 @@ class Guard:
         ]
         for k, share in shares:
             part = blended(self.start, result, share)
-            value = self.others(part)
-            if value > most:
-                best, chosen, most = part, k, value
-        self.validation.append({"step": step, "psnr": most})
+            found = self.others(part)
+            if self._gain(found) > most:
+                best, chosen, scores, most = part, k, found, self._gain(found)
+        self.validation.append({"step": step, "psnr": scores})
         return best, chosen
 
     def judge(self, result: Splats) -> tuple[Splats, float, float]:

@@ -18,10 +18,11 @@ from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import checked_weights
 from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.loop import Loop, Watch, finite
-from g2ard.stages.recover.probe import Probe
+from g2ard.stages.recover.probe import Probe, score_by_kind
 from g2ard.stages.recover.report import (
     Gain,
     Geometry,
+    KindLook,
     Look,
     RecoverReport,
     Regularized,
@@ -73,9 +74,10 @@ def recover(
         weights: (C,) sampling weight of each view; None draws all equally often.
         anchors: frozen geometry; None takes the student's. For a student that was recovered before, pass the
             anchors of its construction.
-        validation: views of another kind than `targets`, such as nearer ones, not trained on. If they lose
-            quality, changes are scaled back per Gaussian by how often it was seen (`recover.guard`), and a
-            recovery that only harms them ends early. At most eight are used.
+        validation: views of other kinds than `targets`, such as near ones, not trained on. Names state their
+            kinds (`g2ard.scene.splits.kind_of`). If a kind loses quality, changes are scaled back per
+            Gaussian by how often it was seen (`recover.guard`), and a recovery that only harms a kind ends
+            early. At most eight views per kind are used.
         frozen: (N,) bool, mask of Gaussians that stay unchanged, such as those of another tile; requires the
             engine `fused`. None freezes none.
         checkpoint: a file written every minute and at Ctrl-C. If it exists, recovery resumes from it, with a
@@ -108,7 +110,7 @@ def recover(
     probe = Probe(targets, config.background)
     before = probe.all_of(student)
     often = checked_weights(weights, len(targets.cameras))
-    others = None if validation is None else Probe(validation, config.background).all_of
+    others = None if validation is None else score_by_kind(validation, config.background)
     guard = Guard(probe.all_of, student, before, others, config.schedule.guarded)
     judged_by = None if validation is None else fingerprint_of(validation)
     loop = Loop(student, targets, config, often, anchors, probe, guard, judged_by, frozen)
@@ -144,7 +146,8 @@ def recover(
             validation=None
             if validation is None
             else Validation(
-                tuple(map(Look.of, guard.validation)), None if prior_views is None else finite(prior_views)
+                tuple(map(KindLook.of, guard.validation)),
+                None if prior_views is None else finite(prior_views),
             ),
             skipped={"non_finite": loop.skipped},
             resumed=loop.resumed,

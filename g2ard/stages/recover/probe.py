@@ -11,7 +11,8 @@ import numpy as np
 
 from g2ard.rendering.metrics import psnr
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Targets, mask_of
+from g2ard.scene.splits import rows_by_kind
+from g2ard.scene.targets import Subset, Targets, mask_of
 
 if TYPE_CHECKING:
     from g2ard.rendering.renderer import Renderer
@@ -24,7 +25,7 @@ _TIE = 0.04
 _CALMEST = 0.01
 """Multiplier below which no smaller one is tried: they change nothing visible in 8 bits."""
 _VIEWS = 8
-"""Training views that are scored."""
+"""Views that are scored, of training and of each kind of validation views."""
 _SHARE = 0.01
 """Share of the time that scoring the views may take while progress is shown."""
 _FIRST_SHARE = 0.1
@@ -98,7 +99,7 @@ def calm(
 
 
 class Probe:
-    """PSNR of a few evenly spaced training views."""
+    """PSNR of a few evenly spaced views."""
 
     def __init__(self, targets: Targets, background: tuple[float, float, float]) -> None:
         count = len(targets.cameras)
@@ -133,3 +134,12 @@ class Probe:
     def _score(self, renderer: Renderer, view: int) -> float:
         image = renderer.clipped(self._targets.cameras[view])
         return psnr(image, self._targets[view], mask_of(self._targets, view))
+
+
+def score_by_kind(
+    targets: Targets, background: tuple[float, float, float]
+) -> Callable[[Splats], dict[str, float]]:
+    """Return a function that scores a scene: kind of view → mean PSNR of up to eight views of that kind."""
+    rows = rows_by_kind(targets.cameras.names)
+    probes = {kind: Probe(Subset(targets, found), background) for kind, found in rows.items()}
+    return lambda splats: {kind: probe.all_of(splats) for kind, probe in probes.items()}

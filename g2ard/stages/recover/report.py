@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from g2ard.report.base import LEFT_OUT, Report
+from g2ard.scene.splits import USUAL
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,14 @@ class Look(Report):
 
 
 @dataclass(frozen=True)
+class KindLook(Report):
+    """PSNR by kind of validation view at a step, dB."""
+
+    step: int
+    psnr: dict[str, float]
+
+
+@dataclass(frozen=True)
 class Geometry(Report):
     """Drift95 and the share of needles at a step."""
 
@@ -53,15 +62,15 @@ class Regularized(Report):
 
 @dataclass(frozen=True)
 class Validation(Report):
-    """Validation on views of another kind.
+    """Validation on views of other kinds.
 
     Args:
-        looks: PSNR at some steps; the last is the result's.
+        looks: PSNR by kind at some steps; the last is the result's.
         prior_views: k of the shrinkage towards the student: a Gaussian seen by v views keeps v/(v + k) of its
             change; None if all keep the same share, or none.
     """
 
-    looks: tuple[Look, ...]
+    looks: tuple[KindLook, ...]
     prior_views: float | None
 
 
@@ -131,8 +140,10 @@ def outcome(report: RecoverReport) -> str | None:
         why = "every step made the training views worse"
         looks = report.validation.looks if report.validation else ()
         if len(looks) > 2 and looks[-1].psnr == looks[0].psnr:
-            first, worst = looks[0].psnr, looks[-2].psnr
-            why = f"every step made views of another kind worse ({first:.2f} → {worst:.2f} dB)"
+            first, end = looks[0].psnr, looks[-2].psnr
+            kind = min(first, key=lambda kind: end[kind] - first[kind])
+            name = "validation" if kind == USUAL else kind
+            why = f"every step made {name} views worse ({first[kind]:.2f} → {end[kind]:.2f} dB)"
         if lines:
             why = f"recovery fell to {', '.join(lines)}, and slower rates gained nothing"
         given_up = "" if report.stopped is None else f"; given up at step {report.stopped}"
