@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import load_scene, say_regions
 from g2ard.jobs.job import DistillJob
 from g2ard.jobs.view_checks import warn_of_photos
-from g2ard.jobs.views import is_made, views_of
+from g2ard.jobs.views import RunViews, is_made, views_of
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.splats import Splats
 
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from g2ard.jobs.fit import Aim
     from g2ard.jobs.inputs import Views
     from g2ard.pipeline import Distilled
+    from g2ard.stages.recover.anchors import Regularizers
+    from g2ard.stages.recover.presets import PriorMeasures
 
     Scene = Splats | Points | str | Path | None
 
@@ -124,68 +126,48 @@ def prepare(
     `counted` is called with the number of Gaussians to reduce, before budgets and views are computed; its
     exceptions propagate. Other arguments and errors are those of `distill`.
     """
-    from g2ard.jobs.inputs import clutter_seen
-    from g2ard.stages.recover.presets import preset_for
-
     began = time.monotonic()
-    seed, background = options.config.recover.seed, options.config.recover.background
+    recover = options.config.recover  # rejects invalid settings before anything is read
     if scene is None:
         scene = _points(budgets, options, progress, say)
-    prior, lifted, beside, name = _prior(scene, options, progress, say)
-    if lifted and (options.views is None or is_made(options.views)):
-        raise InputError(
-            "a point cloud cannot render training images", path=name, hint="give its photos with {views}"
-        )
-    cleaned = None
+    read = _read(scene, options, progress, say)
+    prior, cleaned = read.prior, None
     if options.clean:
-        found, _ = clutter_seen(prior, seed=seed, progress=progress, say=say)
-        prior, cleaned = prior.take(found.keep), found.counts
+        prior, cleaned = _cleaned(prior, options, progress, say)
     if counted is not None:
         counted(len(prior))
-    lift_degree = 3 if lifted else None
+    lift_degree = 3 if read.lifted else None
     degree = options.configured(sh_degree=lift_degree).recover.sh_degree
-    aims = _aims(prior, budgets, options, degree, name, progress, say)
+    aims = _aims(prior, budgets, options, degree, read.name, progress, say)
     views = views_of(
         prior,
         options.views,
         options.held_out,
-        beside=beside,
+        beside=read.beside,
         size=options.size,
         up=options.up,
-        seed=seed,
-        teach=not lifted and options.photos is not True,
+        seed=recover.seed,
+        teach=not read.lifted and options.photos is not True,
         progress=progress,
         say=say,
     )
-    train = views.train.cameras
-    pictured = [path is not None for path in (*train.image_paths, *views.test.image_paths)]
-    if lifted or options.photos:
-        _all_pictured(pictured, (*train.names, *views.test.names), lifted)
-    use_photos = lifted or (any(pictured) if options.photos is None else options.photos)
-    needs_teacher = not (use_photos and all(pictured))
-    kind = options.named("recover.regularizers") or "auto"
-    regularizers, why, measured = preset_for(
-        "paper-lift" if lifted and kind == "paper" else kind,
-        prior,
-        train if use_photos else None,
-        paper=options.named("recover.schedule") == "paper",
-    )
-    if use_photos and not lifted:
-        warn_of_photos(prior, train, background, say)
-    shown = sum(pictured[: len(train)]) if use_photos else 0
-    say(_task(prior, aims, shown, len(train) - shown))
+    sources = _sources(views, options.photos, read.lifted)
+    regularizers, why, measured = _regularizers(prior, views, options, sources, read.lifted)
+    if sources.photos and not read.lifted:
+        warn_of_photos(prior, views.train.cameras, recover.background, say)
+    say(_task(prior, aims, views, sources))
     say(f"regularisers: {why}")
     config = options.configured(regularizers, lift_degree)
-    say_regions(prior, config.simplify, name, say)
+    say_regions(prior, config.simplify, read.name, say)
     return DistillJob(
         prior=prior,
         aims=aims,
-        views=replace(views, apart=None) if use_photos else views,  # photos exist only for given poses
-        teacher=prior if needs_teacher else None,
-        photos_over_renders=use_photos and needs_teacher,
+        views=replace(views, apart=None) if sources.photos else views,  # photos exist only for given poses
+        teacher=prior if sources.renders else None,
+        photos_over_renders=sources.photos and sources.renders,
         config=config,
         weights=views.train.weights if config.select.weighted else None,
-        lifted=lifted,
+        lifted=read.lifted,
         preset=why,
         measured=measured,
         seconds=time.monotonic() - began,
@@ -195,13 +177,60 @@ def prepare(
     )
 
 
-def _task(prior: Splats, aims: Sequence[Aim], photos: int, renders: int) -> str:
+@dataclass(frozen=True)
+class _Sources:
+    """Sources of targets: photos where views have them, renders of the dense scene elsewhere, or one of the
+    two."""
+
+    photos: bool
+    renders: bool
+
+
+def _sources(views: RunViews, photos: bool | None, lifted: bool) -> _Sources:
+    """Decide the sources of the targets.
+
+    Args:
+        views: views for training and scoring.
+        photos: the option: True allows only photos, False only renders, None both.
+        lifted: whether the scene is a lifted point cloud, which cannot be rendered for targets.
+
+    Raises:
+        InputError: a view without a photo, if targets must be photos.
+    """
+    train = views.train.cameras
+    pictured = [path is not None for path in (*train.image_paths, *views.test.image_paths)]
+    if (lifted or photos) and not all(pictured):
+        name = (*train.names, *views.test.names)[pictured.index(False)]
+        scene = "a trained scene" if lifted else "leave out {photos} to render the scene there"
+        raise InputError(f"view {name} has no photo", hint=f"give views with photos, or {scene}")
+    use_photos = lifted or (any(pictured) if photos is None else photos)
+    return _Sources(photos=use_photos, renders=not (use_photos and all(pictured)))
+
+
+def _regularizers(
+    prior: Splats, views: RunViews, options: DistillOptions, sources: _Sources, lifted: bool
+) -> tuple[Regularizers, str, PriorMeasures]:
+    """Choose regularisers with `preset_for`; view consistency is measured only for photos."""
+    from g2ard.stages.recover.presets import preset_for
+
+    kind = options.named("recover.regularizers") or "auto"
+    return preset_for(
+        "paper-lift" if lifted and kind == "paper" else kind,
+        prior,
+        views.train.cameras if sources.photos else None,
+        paper=options.named("recover.schedule") == "paper",
+    )
+
+
+def _task(prior: Splats, aims: Sequence[Aim], views: RunViews, sources: _Sources) -> str:
     """Describe the task in one line."""
     from g2ard.scene.targets import kinds_told
 
+    paths = views.train.cameras.image_paths
+    photos = sum(path is not None for path in paths) if sources.photos else 0
     counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
-    views = plural(photos + renders, "view")
-    return f"{len(prior):,} → {counts}; {views} against {kinds_told(photos, renders)}"
+    against = kinds_told(photos, len(paths) - photos)
+    return f"{len(prior):,} → {counts}; {plural(len(paths), 'view')} against {against}"
 
 
 def _aims(
@@ -235,16 +264,6 @@ def _aims(
     )
 
 
-def _all_pictured(pictured: Sequence[bool], names: Sequence[str], lifted: bool) -> None:
-    """Reject views without a photo if targets must be photos."""
-    if not all(pictured):
-        scene = "a trained scene" if lifted else "leave out {photos} to render the scene there"
-        raise InputError(
-            f"view {names[list(pictured).index(False)]} has no photo",
-            hint=f"give views with photos, or {scene}",
-        )
-
-
 def _points(budgets: Sequence[Budget], options: DistillOptions, progress: Progress, say: Say) -> Points:
     """Create starting points from photos alone."""
     if options.views is None or is_made(options.views):
@@ -264,25 +283,53 @@ def _points(budgets: Sequence[Budget], options: DistillOptions, progress: Progre
     )
 
 
-def _prior(
-    scene: Splats | Points | str | Path,
-    options: DistillOptions,
-    progress: Progress,
-    say: Say,
-) -> tuple[Splats, bool, str | Path | None, str]:
-    """Return the dense scene, whether it was lifted, where to look for cameras, and its name in errors."""
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """The dense scene as read or lifted.
+
+    Args:
+        prior: the dense scene.
+        lifted: whether it was lifted from a point cloud.
+        beside: path beside which to look for cameras.
+        name: its name in errors.
+    """
+
+    prior: Splats
+    lifted: bool
+    beside: str | Path | None
+    name: str
+
+
+def _read(
+    scene: Splats | Points | str | Path, options: DistillOptions, progress: Progress, say: Say
+) -> _Read:
+    """Read the dense scene, or lift a point cloud, which needs views with photos."""
     from g2ard.io import kind, read_cloud
     from g2ard.stages.lift import lift
 
     if isinstance(scene, Splats):
-        return scene, False, options.beside, "scene"
-    name, beside = "cloud", options.beside
+        return _Read(scene, False, options.beside, "scene")
+    name = "cloud"
     if isinstance(scene, str | Path):
         if kind(scene) == "splats":
-            return load_scene(scene, say), False, beside or scene, str(scene)
+            return _Read(load_scene(scene, say), False, options.beside or scene, str(scene))
         name, cloud = str(scene), read_cloud(scene)
         for note in cloud.notes:
             say(f"{scene}: {note}")
         scene = cloud.points
+    if options.views is None or is_made(options.views):
+        raise InputError(
+            "a point cloud cannot render training images", path=name, hint="give its photos with {views}"
+        )
     lifted = lift(scene.positions, scene.colors, **vars(options.config.lift), progress=progress)
-    return lifted, True, beside, name
+    return _Read(lifted, True, options.beside, name)
+
+
+def _cleaned(
+    prior: Splats, options: DistillOptions, progress: Progress, say: Say
+) -> tuple[Splats, dict[str, int]]:
+    """Remove clutter; return the rest and the number of Gaussians removed by kind."""
+    from g2ard.jobs.inputs import clutter_seen
+
+    found, _ = clutter_seen(prior, seed=options.config.recover.seed, progress=progress, say=say)
+    return prior.take(found.keep), found.counts
