@@ -153,10 +153,10 @@ class _Processes:
 
 
 def _sweep(tasks: Sequence[Task]) -> None:
-    """Remove partial files of killed workers."""
+    """Remove what killed workers left: partial files, or the empty folder of `check_output`."""
     for task in tasks:
         for begun in task.folder.glob(f".{task.output.stem}.*"):
-            begun.unlink(missing_ok=True)
+            begun.rmdir() if begun.is_dir() else begun.unlink(missing_ok=True)
 
 
 def _run_noted(task: Task) -> tuple[int, int | None]:
