@@ -96,13 +96,11 @@ def simplify_tiles(
 
     1. Each tile is merged to a few coarse Gaussians that represent it in views of other tiles.
     2. Poses are planned on these. Each tile is rendered from the views that see it, amid its halo and the
-    coarse
-       Gaussians of all other tiles.
+       coarse Gaussians of all other tiles (`Sights`).
     3. Each tile computes the costs of merging along Morton order. The cheapest merges of all tiles are done,
-    down to
-       three times the budget. Then each tile plans more merges of pairs than needed, and the cheapest of all
-       plans are done, down to the budget.
-    4. Opacities are fitted to what the same views see of the result.
+       down to three times the budget. Then each tile plans more merges of pairs than needed, and the cheapest
+       of all plans are done, down to the budget (`_merged`).
+    4. Opacities are fitted to what the same views see of the result (`_fitted`).
 
     Every step is a task with a file in the folder of `workers`, so the same call resumes. The result depends
     only on the scene, the tiles and the seed, not on where, in which order or how often tasks ran.
@@ -129,19 +127,27 @@ def simplify_tiles(
     run = TiledRun(store, workers, config or SimplifyConfig())
     coarse = run.begin()
     frame = run.sampled_frame()
-    everything = budget == store.count
+    unchanged = budget == store.count
     sights: Sights | None = None
-    if not (blind or (everything and views is None)):
+    if not blind and (views is not None or not unchanged):
         sample = join([scene_of(path, "sample") for path in coarse])
         _check_regions(sample, run.config["keep_region"])
         cameras = views or beside(sample) or _planned(run, sample, up, seed, say)
         sights = None if cameras is None else Sights(run, coarse, cameras, frame)
-        frame = frame if sights is None else sights.frame
-    if everything:
+    if unchanged:
         return _as_it_is(store, sights)
-    looks: list[dict[str, Any]] = (
-        [{"look": path} for path in sights.looks] if sights else [{} for _ in coarse]
-    )
+    merged, counts = _merged(run, budget, frame if sights is None else sights.frame, sights)
+    if sights is None:
+        return _scene(store, counts, [{"merged": path} for path in merged], None)
+    return _fitted(store, counts, merged, sights)
+
+
+def _merged(
+    run: TiledRun, budget: int, frame: tuple[float, ...], sights: Sights | None
+) -> tuple[list[Path], tuple[int, ...]]:
+    """Merge all tiles to exactly `budget` Gaussians; return the results of `merge` and their counts."""
+    tiles = len(run.sizes)
+    looks: list[dict[str, Any]] = [{"look": path} for path in sights.looks] if sights else [{}] * tiles
     costs = run.each("run_costs", "costs", frame=frame, inputs=looks)
     runs_left = _runs(run, costs, budget)
     share_kept = budget / sum(runs_left)
@@ -153,24 +159,29 @@ def simplify_tiles(
         inputs=[{"costs": path, **seen} for path, seen in zip(costs, looks, strict=True)],
     )
     merges = cheapest([_costs_of(path) for path in plans], sum(runs_left) - budget)
-    _check_reached(sum(runs_left) - sum(merges), budget, len(coarse))
-    per_tile = [{"runs": n, "merges": m} for n, m in zip(runs_left, merges, strict=True)]
+    counts = tuple(n - m for n, m in zip(runs_left, merges, strict=True))
+    _check_reached(sum(counts), budget, tiles)
     merged = run.each(
         "merge",
         "merge",
         frame=frame,
-        per_tile=per_tile,
+        per_tile=[{"runs": n, "merges": m} for n, m in zip(runs_left, merges, strict=True)],
         inputs=[{"plan": path, **seen} for path, seen in zip(plans, looks, strict=True)],
     )
-    counts = tuple(n - m for n, m in zip(runs_left, merges, strict=True))
-    if sights is None:
-        return _scene(store, counts, [{"merged": path} for path in merged], None)
+    return merged, counts
+
+
+def _fitted(store: TileStore, counts: tuple[int, ...], merged: list[Path], sights: Sights) -> TiledScene:
+    """Return the scene with opacities fitted to what the views see of the merged tiles."""
     again = sights.again(merged)
     mean = sum(float(load(path, "wanted")[0].sum()) for path in merged) / sum(counts)
     files = [{"merged": one, "again": other} for one, other in zip(merged, again, strict=True)]
-    unseen = sum(int(load(path, "unseen")[0]) for path in merged)
-    scene = _scene(store, counts, files, mean)
-    return replace(scene, views=len(sights.cameras), unseen=unseen, surroundings=sights.surroundings)
+    return replace(
+        _scene(store, counts, files, mean),
+        views=len(sights.cameras),
+        unseen=sum(int(load(path, "unseen")[0]) for path in merged),
+        surroundings=sights.surroundings,
+    )
 
 
 def sample_of(store: TileStore, workers: Workers) -> Splats:

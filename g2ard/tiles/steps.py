@@ -32,7 +32,7 @@ from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
-from g2ard.stages.simplify.pairs import RowVisibility, emphasised
+from g2ard.stages.simplify.pairs import RowVisibility, emphasised, splats_of
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.tasks import (
@@ -236,15 +236,7 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     dropped = of == GONE
     of = np.where(dropped, GONE, name[np.where(dropped, 0, of)]).astype(np.uint32)
     out = _seen_tile(scene, arguments, inputs).assemble(of, len(clusters))
-    small = Splats(
-        means=out["means"].astype(np.float32),
-        quats=out["quats"],
-        scales=out["scales"],
-        logit_opacities=out["logit_opacities"],
-        sh0=np.ascontiguousarray(out["sh"][:, :1]),
-        shN=np.ascontiguousarray(out["sh"][:, 1:]),
-        offset=scene.offset,
-    )
+    small = splats_of(scene, out)
     kept, made = ~dropped, arrays_of(small, "scene")
     made["members"] = np.bincount(of[kept], minlength=len(small))
     if "look" in inputs:

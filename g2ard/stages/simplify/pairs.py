@@ -111,14 +111,17 @@ def merge_and_fit(
     config: SimplifyConfig,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Merge by visibility, then fit each opacity to the visibility of the result."""
+    """Merge by visibility, then fit each merged Gaussian's opacity so that views see as much of it as of its
+    members."""
     visibility = rows_of(source(scene), len(scene), slice(None))
     out = merge(scene, budget, method, visibility, flags, config, counter(progress, "simplify"))
     merged, parents = splats_of(scene, out), out["parents"]
-    order = scene.core.order  # fixed order, so that sums do not depend on the order of the rows
-    of, wanted = parents[order], visibility.weight[order]
-    members, target = (np.bincount(of[of >= 0], w, len(merged)) for w in (None, wanted[of >= 0]))
-    fitted = fit_opacities(merged, members, target, source(merged).weight, target.mean())
+    order = scene.core.order  # sums in this order do not depend on the order of the scene's rows
+    row, weight = parents[order], visibility.weight[order]
+    kept = row >= 0
+    members = np.bincount(row[kept], minlength=len(merged))
+    wanted = np.bincount(row[kept], weight[kept], len(merged))
+    fitted = fit_opacities(merged, members, wanted, source(merged).weight, wanted.mean())
     changed = fitted.logit_opacities != merged.logit_opacities
     changed |= (fitted.scales != merged.scales).any(axis=1)
     return {
