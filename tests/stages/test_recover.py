@@ -19,7 +19,7 @@ from g2ard.rendering.visibility import visibility
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.recover import RecoverConfig, loop, probe, recover
+from g2ard.stages.recover import RecoverConfig, loop, probe, recover, trials
 from g2ard.stages.recover import checkpoint as checkpoint_module
 from g2ard.stages.recover.anchors import PRESETS, Anchors, Regularizers
 from g2ard.stages.recover.guard import Guard, blended
@@ -229,7 +229,8 @@ def test_masked_gaussians_are_left_alone(student: Splats, engine: Any) -> None:
 def clock(monkeypatch: pytest.MonkeyPatch) -> None:
     """A clock that advances by 10 ms per call on any machine."""
     ticks = itertools.count()
-    monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic=lambda: next(ticks) / 100))
+    for module in (loop, trials):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(ticks) / 100))
 
 
 @pytest.mark.usefixtures("clock")

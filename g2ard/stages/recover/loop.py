@@ -1,4 +1,4 @@
-"""Steps of one recovery, the trials of rates before them, and checkpoints."""
+"""Steps of one recovery, the choice of rates before them, and checkpoints."""
 
 from __future__ import annotations
 
@@ -24,16 +24,11 @@ from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import drawn
 from g2ard.stages.recover.engine import Engine, Objective
 from g2ard.stages.recover.guard import Guard
-from g2ard.stages.recover.probe import MULTIPLIERS, Probe, calm, search_multiplier, trial_steps
+from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.schedule import multiplier_for, reach_for
 from g2ard.stages.recover.sizes import typical_share
+from g2ard.stages.recover.trials import MULTIPLIERS, Trials, trial_steps
 from g2ard.system.extras import require_torch
-
-_TRIAL_STEPS = 20
-_TRIAL_SHARE, _CALM_SHARE = 0.1, 0.3
-"""Under a time limit: steps per trial, and share of the limit for all trials; the second share applies if
-rates are too large.
-"""
 
 _SHORT = 20
 """Fewest steps for going back to an earlier scene; shorter recoveries have no steps left to repeat."""
@@ -127,51 +122,47 @@ class Loop:
         The time of the trials counts. `start` is the PSNR before recovery; for short horizons it alone
         decides.
         """
+        schedule, limit = self.config.schedule, self.config.recovery_time
         rmse = 10 ** (-start / 20)
         typical = typical_share(self.student, self.targets.cameras)
-        reach = self.config.schedule.reach
-        self.reach = reach_for(rmse, typical) if reach is None else reach
-        if self.config.schedule.multiplier is not None:
-            self.multiplier = self.config.schedule.multiplier
+        self.reach = reach_for(rmse, typical) if schedule.reach is None else schedule.reach
+        if schedule.multiplier is not None:
+            self.multiplier = schedule.multiplier
             return
-        guess = multiplier_for(rmse)
-        limit = self.config.recovery_time
-        steps = trial_steps(self.config.horizon) if limit is None else _TRIAL_STEPS
-        self.multiplier = guess
-        if not steps:
-            return
-        began, share = time.monotonic(), _TRIAL_SHARE
-        seen: dict[float, float] = {}
+        self.multiplier = multiplier_for(rmse)
+        if steps := trial_steps(self.config.horizon, limit):
+            trials = Trials(lambda multiplier, end: self._trial(multiplier, steps, end), start, limit)
+            tight = reach_for(0.0, typical) if schedule.reach is None else self.reach
+            self._choose_by_trials(trials, rmse, tight)
+            self.trials = [{"multiplier": m, "psnr": value} for m, value in sorted(trials.scores.items())]
+            self.seconds = trials.seconds
 
-        def score(multiplier: float) -> float:
-            engine = self._new_engine()
-            for step in range(steps):
-                if limit is not None and time.monotonic() - began > share * limit:
-                    raise TimeoutError
-                self._learn(engine, step, step / steps, multiplier)
-            seen[multiplier] = self.probe.all_of(engine.splats())
-            return seen[multiplier]
-
-        nearly_there = guess <= min(MULTIPLIERS)
+    def _choose_by_trials(self, trials: Trials, rmse: float, tight: float) -> None:
+        """Choose the multiplier, and the reach `tight` if all trials lose quality with the present one."""
+        guess = self.multiplier
+        nearly_fitted = guess <= min(MULTIPLIERS)
         try:
-            self.multiplier, _ = search_multiplier(score, guess, start)
-            tight = reach_for(0.0, typical)
-            if seen[self.multiplier] < start and self.config.schedule.reach is None and tight < self.reach:
+            self.multiplier = trials.search(guess)
+            if trials.worsens(self.multiplier) and tight < self.reach:
                 self.reach = tight  # better trained than its error suggested
-                seen.clear()
-                self.multiplier, _ = search_multiplier(score, guess, start)
-            if seen[self.multiplier] < start:  # on nearly fitted photos a few steps say nothing
-                self.multiplier, share = guess, _CALM_SHARE
-                if nearly_there:
-                    self.multiplier, _ = calm(score, min(MULTIPLIERS), seen, start)
+                self.multiplier = trials.search(guess)
+            if trials.worsens(self.multiplier):  # on nearly fitted photos a few steps say nothing
+                self.multiplier = trials.calm() if nearly_fitted else guess
         except TimeoutError:  # take the best multiplier tried, or a calmer one
-            best = max(seen, key=lambda m: seen[m], default=guess)
-            if seen.get(best, -math.inf) >= start:
+            best = trials.best(guess)
+            if trials.scores.get(best, -math.inf) >= trials.start:
                 self.multiplier = best
-            elif nearly_there:
+            elif nearly_fitted:
                 self.multiplier = min(best / 3, multiplier_for(rmse, 0.01))
-        self.trials = [{"multiplier": m, "psnr": value} for m, value in sorted(seen.items())]
-        self.seconds = time.monotonic() - began
+
+    def _trial(self, multiplier: float, steps: int, end: float) -> float:
+        """Return the PSNR after a few steps from the start; raise TimeoutError at `end` (monotonic)."""
+        engine = self._new_engine()
+        for step in range(steps):
+            if time.monotonic() > end:
+                raise TimeoutError
+            self._learn(engine, step, step / steps, multiplier)
+        return self.probe.all_of(engine.splats())
 
     def _learn(
         self, engine: Engine, step: int, share: float, multiplier: float, *, regularize: bool = False

@@ -1,8 +1,7 @@
-"""PSNR of a few views during recovery, and the rate multiplier that short trials choose."""
+"""PSNR of a few views during recovery."""
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -17,85 +16,12 @@ from g2ard.scene.targets import Subset, Targets, mask_of
 if TYPE_CHECKING:
     from g2ard.rendering.renderer import Renderer
 
-MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
-"""Multipliers of all rates; trained scenes need 1 or less, lifts more."""
-
-_TIE = 0.04
-"""Share of the best gain within which other gains count as equal to it."""
-_CALMEST = 0.01
-"""Multiplier below which no smaller one is tried: they change nothing visible in 8 bits."""
 _VIEWS = 8
 """Views that are scored, of training and of each kind of validation views."""
 _SHARE = 0.01
 """Share of the time that scoring the views may take while progress is shown."""
 _FIRST_SHARE = 0.1
 """The same after the first score, because short runs would otherwise end before the second."""
-_FEWEST, _MOST, _PART = 10, 60, 50
-"""Steps of a trial: the least, the most, and the divisor of the horizon between them."""
-_SHORTEST_HORIZON = 100
-"""Steps of the shortest horizon with trials; in a shorter one they would take too large a part."""
-
-
-def trial_steps(horizon: int) -> int:
-    """Return the steps of one trial: a fiftieth of the horizon, from 10 to 60; 0 if trials do not pay.
-
-    >>> trial_steps(50), trial_steps(300), trial_steps(1000), trial_steps(6000)
-    (0, 10, 20, 60)
-    """
-    return 0 if horizon < _SHORTEST_HORIZON else min(_MOST, max(_FEWEST, horizon // _PART))
-
-
-def search_multiplier(
-    score: Callable[[float], float], guess: float, start: float
-) -> tuple[float, dict[float, float]]:
-    """Search `MULTIPLIERS` both ways from the one nearest to `guess`; return the best and all scores.
-
-    The largest multiplier whose gain is within 4 % of the best is chosen. Trials are too short to show the
-    benefit of larger rates, and a long run decays its rates towards the end.
-
-    Args:
-        score: returns the PSNR after a trial with a multiplier.
-        guess: multiplier to begin at.
-        start: PSNR before the trial.
-
-    >>> search_multiplier(lambda m: -abs(m - 1), 0.2, start=0)[0]
-    1.0
-    >>> round(search_multiplier(lambda m: {1 / 3: 32.0, 3**-0.5: 31.95}.get(m, 30.0), 1 / 3, start=30)[0], 3)
-    0.577
-    """
-    seen: dict[int, float] = {}
-
-    def good(i: int) -> bool:
-        best = max(seen.values())
-        return seen[i] >= best - _TIE * max(best - start, 0.0)
-
-    at = min(range(len(MULTIPLIERS)), key=lambda i: abs(math.log(MULTIPLIERS[i] / guess)))
-    for neighbours in (range(at, -1, -1), range(at + 1, len(MULTIPLIERS))):
-        for i in neighbours:
-            value = score(MULTIPLIERS[i])
-            seen[i] = value if math.isfinite(value) else -math.inf
-            if not good(i):
-                break
-    best = max(seen, key=lambda i: (seen[i], -i))
-    chosen = max(filter(good, seen)) if seen[best] > start else best
-    return MULTIPLIERS[chosen], {MULTIPLIERS[i]: value for i, value in sorted(seen.items())}
-
-
-def calm(
-    score: Callable[[float], float], best: float, seen: dict[float, float], start: float
-) -> tuple[float, dict[float, float]]:
-    """Divide the best multiplier by three for as long as it worsens the start and dividing helps.
-
-    >>> calm(lambda m: 50 - 9 * m, 1 / 3, {1 / 3: 47.0}, start=49.5)[0] < 0.06
-    True
-    """
-    seen = dict(seen)
-    while seen[best] < start and best > _CALMEST:
-        seen[best / 3] = score(best / 3)
-        if seen[best / 3] <= seen[best]:
-            break
-        best /= 3
-    return best, seen
 
 
 class Probe:

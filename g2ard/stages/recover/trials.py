@@ -1,0 +1,132 @@
+"""Short trials that choose the multiplier of all rates."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
+"""Multipliers of all rates; trained scenes need 1 or less, lifts more."""
+
+_TIE = 0.04
+"""Share of the best gain within which other gains count as equal to it."""
+_CALMEST = 0.01
+"""Multiplier below which no smaller one is tried: they change nothing visible in 8 bits."""
+_STEPS, _LIMITED_STEPS, _SHORTEST_HORIZON = (10, 60), 20, 100
+"""Steps of a trial: fewest and most, and under a time limit; and the shortest horizon with trials."""
+_PART = 50
+"""Share of the horizon that one trial takes, as a divisor."""
+_TIME, _CALM_TIME = 0.1, 0.3
+"""Shares of a time limit for all trials: usually, and if rates are too large."""
+
+
+class Trials:
+    """Trials from one start; `scores` has the PSNR after each, by its multiplier.
+
+    Args:
+        run: runs a trial with a multiplier until a moment (monotonic seconds) and returns the PSNR; raises
+            TimeoutError at that moment.
+        start: PSNR before the trials.
+        limit: time limit of the whole recovery, seconds; None is unlimited.
+    """
+
+    def __init__(self, run: Callable[[float, float], float], start: float, limit: float | None) -> None:
+        self.scores: dict[float, float] = {}
+        self.start = start
+        self._run, self._limit = run, math.inf if limit is None else limit
+        self._began = time.monotonic()
+
+    def search(self, guess: float) -> float:
+        """Return the best multiplier near `guess`, see `search_multiplier`; forgets earlier trials."""
+        self.scores.clear()
+        return search_multiplier(lambda m: self._score(m, _TIME), guess, self.start)
+
+    def calm(self) -> float:
+        """Return a multiplier below all of `MULTIPLIERS`, see `calm`."""
+        return calm(lambda m: self._score(m, _CALM_TIME), min(MULTIPLIERS), self.scores, self.start)
+
+    def worsens(self, multiplier: float) -> bool:
+        """Return whether the trial with this multiplier lost quality."""
+        return self.scores[multiplier] < self.start
+
+    def best(self, default: float) -> float:
+        """Return the multiplier with the best score so far."""
+        return max(self.scores, key=lambda m: self.scores[m], default=default)
+
+    @property
+    def seconds(self) -> float:
+        """Time since the first trial began."""
+        return time.monotonic() - self._began
+
+    def _score(self, multiplier: float, share: float) -> float:
+        self.scores[multiplier] = self._run(multiplier, self._began + share * self._limit)
+        return self.scores[multiplier]
+
+
+def trial_steps(horizon: int, limit: float | None) -> int:
+    """Return the steps of one trial: 20 under a time limit, otherwise 10 to 60, a fiftieth of the horizon.
+
+    0 means no trials, because they would take too large a part of a horizon below 100.
+
+    >>> [trial_steps(horizon, None) for horizon in (50, 300, 1000, 6000)]
+    [0, 10, 20, 60]
+    """
+    if limit is not None:
+        return _LIMITED_STEPS
+    fewest, most = _STEPS
+    return 0 if horizon < _SHORTEST_HORIZON else min(most, max(fewest, horizon // _PART))
+
+
+def search_multiplier(score: Callable[[float], float], guess: float, start: float) -> float:
+    """Search `MULTIPLIERS` both ways from the one nearest to `guess`.
+
+    The largest multiplier whose gain is within 4 % of the best is chosen. Trials are too short to show the
+    benefit of larger rates, and a long run decays its rates towards the end.
+
+    Args:
+        score: returns the PSNR after a trial with a multiplier.
+        guess: multiplier to begin at.
+        start: PSNR before the trial.
+
+    >>> search_multiplier(lambda m: -abs(m - 1), 0.2, start=0)
+    1.0
+    >>> round(search_multiplier(lambda m: {1 / 3: 32.0, 3**-0.5: 31.95}.get(m, 30.0), 1 / 3, start=30), 3)
+    0.577
+    """
+    seen: dict[int, float] = {}
+
+    def good(i: int) -> bool:
+        best = max(seen.values())
+        return seen[i] >= best - _TIE * max(best - start, 0.0)
+
+    at = min(range(len(MULTIPLIERS)), key=lambda i: abs(math.log(MULTIPLIERS[i] / guess)))
+    for neighbours in (range(at, -1, -1), range(at + 1, len(MULTIPLIERS))):
+        for i in neighbours:
+            value = score(MULTIPLIERS[i])
+            seen[i] = value if math.isfinite(value) else -math.inf
+            if not good(i):
+                break
+    best = max(seen, key=lambda i: (seen[i], -i))
+    chosen = max(filter(good, seen)) if seen[best] > start else best
+    return MULTIPLIERS[chosen]
+
+
+def calm(score: Callable[[float], float], best: float, scores: dict[float, float], start: float) -> float:
+    """Divide the best multiplier by three for as long as it worsens the start and dividing helps.
+
+    Args:
+        score: returns the PSNR after a trial with a multiplier, and adds it to `scores`.
+        best: multiplier to begin at, already in `scores`.
+        scores: PSNR of earlier trials by multiplier.
+        start: PSNR before the trial.
+
+    >>> scores = {1 / 3: 47.0}
+    >>> calm(lambda m: scores.setdefault(m, 50 - 9 * m), 1 / 3, scores, start=49.5) < 0.06
+    True
+    """
+    while scores[best] < start and best > _CALMEST:
+        if score(best / 3) <= scores[best]:
+            break
+        best /= 3
+    return best
