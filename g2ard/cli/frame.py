@@ -270,12 +270,8 @@ def command(
                     _check_settings(run, fn, values)
                 typer.echo(printed(ctx, {**values, **shared}), nl=False)
                 return
-            ours = interrupt.raises()
-            try:
+            with interrupt.RaisesInterrupt():
                 _execute(run, fn, values, cuda)
-            finally:
-                if ours:
-                    interrupt.ends_the_program()
 
         context = inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
         parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (context, *own, *common)]

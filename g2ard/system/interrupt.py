@@ -44,23 +44,26 @@ def terminate(number: int, frame: FrameType | None) -> NoReturn:
 
 def ends_the_program() -> None:
     """Make both signals end the process with one line, unless another handler is installed."""
-    for number, ours in (
-        (signal.SIGINT, (signal.default_int_handler,)),
-        (signal.SIGTERM, (signal.SIG_DFL, terminate)),
-    ):
-        if signal.getsignal(number) in ours:
+    for number, default in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
+        if signal.getsignal(number) is default:
             signal.signal(number, _end)
 
 
-def raises() -> bool:
-    """Make both signals raise KeyboardInterrupt; return False if `ends_the_program` had not replaced Ctrl-C's
-    handler."""
-    if signal.getsignal(signal.SIGTERM) is _end:
-        signal.signal(signal.SIGTERM, terminate)
-    if signal.getsignal(signal.SIGINT) is not _end:
-        return False
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    return True
+class RaisesInterrupt:
+    """Context in which both signals raise KeyboardInterrupt instead of ending the process.
+
+    It changes only handlers that `ends_the_program` installed, and restores them at its end. In other
+    programs, which call commands as functions, signals stay as they are.
+    """
+
+    def __enter__(self) -> None:
+        self._replaced = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) is _end]
+        for number in self._replaced:
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else terminate)
+
+    def __exit__(self, *_: object) -> None:
+        for number in self._replaced:
+            signal.signal(number, _end)
 
 
 def leave() -> NoReturn:
