@@ -77,6 +77,9 @@ class SceneSpec:
         background: RGB behind the scene.
         indoor: whether Mini-Splatting uses its importance for rooms.
         train_prior: steps that turn a lift into a "trained" prior of the same count.
+        regularizers: kind of a prior given as a scene, which decides its row of the paper's `tab:s_recovery`;
+            auto measures it.
+        starts: views whose poses photos are registered from, by name (start "given").
         synth: options of `python -m benchmarks synth city`, which then generates the scene.
     """
 
@@ -90,6 +93,8 @@ class SceneSpec:
     background: tuple[float, float, float] = key((0.0, 0.0, 0.0))
     indoor: bool = key(False)
     train_prior: int = key(0, least=0)
+    regularizers: str = key("auto", choices=("auto", "trained", "lift", "noisy"))
+    starts: str | None = key(None)
     synth: Mapping[str, Any] | None = key(None)
 
     def __post_init__(self) -> None:

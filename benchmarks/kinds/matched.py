@@ -436,7 +436,7 @@ class _Pipeline:
         """Return the method's weights of regularisers: the paper's for this kind of prior, or ours."""
         method = self.method
         papers = method.lambdas == "paper"
-        known = self.prior if papers and self.prior != "given" else "auto"
+        known = {"given": self.place.scene.regularizers}.get(self.prior, self.prior) if papers else "auto"
         chosen, _, _ = preset_for(known if method.preset == "auto" else method.preset, prior, paper=papers)
         if method.anchor is not None:
             chosen = replace(chosen, anchor=method.anchor)

@@ -16,9 +16,12 @@ from benchmarks.rows import Row
 from benchmarks.runner import Cell
 from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import Workspace, reduced
+from g2ard.config.choices import Keep
+from g2ard.config.paths import changed
+from g2ard.config.presets import GS_CPR
 from g2ard.errors import InputError
 from g2ard.io import read_view_set
-from g2ard.jobs.register import photos_of
+from g2ard.jobs.register import photos_of, poses_for
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -33,8 +36,10 @@ STARTS: dict[str, tuple[float, float] | None] = {
     "B": (0.05, 5.0),
     "C": (0.15, 15.0),
     "D": None,
+    "given": None,
 }
-"""Errors of starts: share of the view's median depth, and degrees. D starts from a pool of other views."""
+"""Errors of starts: share of the view's median depth, and degrees. D starts from a pool of other views, given
+from the scene's `starts`."""
 _NEAR, _NEARER = 1, 0
 """Indices of 10 cm/5° and 5 cm/5° in the report's recalls."""
 
@@ -48,19 +53,25 @@ class Register(Study):
         ratios: ratios of maps simplified without recovery; 1 is the original map.
         seeds: seeds of the starts.
         starts: names of `STARTS`.
+        protocol: "g2ard", or "gs-cpr" as `g2ard register --protocol gs-cpr`: one pass of matches, and photos
+            without a pose count where they start.
         metres_per_unit: scale of the scene, for errors in cm and recalls.
     """
 
     METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in ("auto", "sift", "direct")}
 
     starts: tuple[str, ...] = key(("A", "B", "C", "D"), choices=tuple(STARTS), axis=True)
+    protocol: str = key("g2ard", choices=("g2ard", "gs-cpr"))
     metres_per_unit: float | None = key(None, least=1e-9)
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
         """Yield a cell per ratio, matcher, start and seed; the pool (D) has no seeds."""
         if scene.train is None:
             raise InputError(f"scene {scene.name}: needs photos with true poses; give --views")
+        if "given" in self.starts and scene.starts is None:
+            raise InputError(f"scene {scene.name}: start `given` needs the scene's `starts`")
         place, views = Workspace(work, self, scene), self.folder / scene.train
+        given = None if scene.starts is None else self.folder / scene.starts
         pool = cache(lambda: read_view_set(views, split="train", unpictured=True).cameras)
         photos = cache(lambda: photos_of(views, split="test", say=lambda text: None))
         small = cache(lambda ratio: reduced(place.splats, ratio, pool()))
@@ -69,18 +80,25 @@ class Register(Study):
                 for name in self.starts:
                     for seed in self.seeds if STARTS[name] else self.seeds[:1]:
                         names = {"ratio": ratio, "matcher": matcher, "start": name, "seed": seed}
-                        yield Cell(names, partial(self._measured, partial(small, ratio), photos, pool, names))
+                        yield Cell(
+                            names, partial(self._measured, partial(small, ratio), photos, pool, given, names)
+                        )
 
     def _measured(
         self,
         small: partial[Splats],
         photos_: Callable[[], Cameras],
         pool: Callable[[], Cameras],
+        given: Path | None,
         names: dict[str, object],
     ) -> list[Row]:
         splats, photos, off = small(), photos_(), STARTS[str(names["start"])]
-        truth, starts = dict(zip(photos.names, photos.viewmats, strict=True)), None
-        if off is not None:
+        truth = dict(zip(photos.names, photos.viewmats, strict=True))
+        starts: dict[str, NDArray[np.float64]] | None = None
+        if names["start"] == "given":
+            assert given is not None
+            starts = poses_for(given, photos.names)
+        elif off is not None:
             seed = 1000 * int(str(names["seed"]))
             starts = {
                 photo: displaced(pose, off[0] * depth, off[1], seed + i)
@@ -89,13 +107,22 @@ class Register(Study):
                 )
             }
         config = RegisterConfig(size=self.size or 1000, matcher=str(names["matcher"]))
+        keep: Keep = "registered"
+        if self.protocol == "gs-cpr":
+            config, keep = changed(config, GS_CPR), "all"
         began = time.perf_counter()
         found = register(
-            splats, photos, starts=starts, pool=None if starts else pool(), truth=truth, config=config
+            splats,
+            photos,
+            starts=starts,
+            pool=None if starts else pool(),
+            truth=truth,
+            config=config,
+            keep=keep,
         )
         seconds = (time.perf_counter() - began) / len(photos)
         metres = self.metres_per_unit
-        summary = summarize(found.report.photos, true=len(truth), metres_per_unit=metres)
+        summary = summarize(found.report.photos, keep=keep, true=len(truth), metres_per_unit=metres)
         assert summary.start is not None
         assert summary.found is not None
         scale = 1.0 if metres is None else 100 * metres

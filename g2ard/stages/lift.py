@@ -24,6 +24,7 @@ class LiftConfig:
     """Constants of `lift`, for callers that keep them together: `lift(points, colors, **vars(config))`."""
 
     neighbors: int = _CORE["neighbors"]
+    spread: float = _CORE["spread"]
     normal_ratio: float = _CORE["normal_ratio"]
     max_anisotropy: float = _CORE["max_anisotropy"]
     opacity: float = 0.5
@@ -34,6 +35,7 @@ def lift(
     colors: ArrayLike,
     *,
     neighbors: int = LiftConfig.neighbors,
+    spread: float = LiftConfig.spread,
     normal_ratio: float = LiftConfig.normal_ratio,
     max_anisotropy: float = LiftConfig.max_anisotropy,
     opacity: float = LiftConfig.opacity,
@@ -42,14 +44,15 @@ def lift(
     """Turn each coloured point into a flat disc (supplement, "Dense Prior Construction").
 
     A PCA of the point and its nearest neighbours gives two tangents and the normal. With the
-    neighbourhood's variances λ₁ ≥ λ₂ along the tangents, s₁ = 0.94·√λ₁, s₂ = max(0.94·√λ₂, s₁/max_anisotropy)
-    and the normal scale s₃ = normal_ratio·√(s₁s₂), in the points' unit. If all neighbours coincide, the disc
-    gets the median size around it.
+    neighbourhood's variances λ₁ ≥ λ₂ along the tangents, s₁ = spread·√λ₁,
+    s₂ = max(spread·√λ₂, s₁/max_anisotropy) and the normal scale s₃ = normal_ratio·√(s₁s₂), in the points'
+    unit. If all neighbours coincide, the disc gets the median size around it.
 
     Args:
         points: (N, 3), any unit and origin; pass float64 to keep map coordinates exact.
         colors: (N, 3) in [0, 1].
         neighbors: number of neighbours for the PCA (10 in the paper).
+        spread: tangential scale over the neighbourhood's standard deviation (not stated in the paper).
         normal_ratio: normal over tangential scale (0.1 in the paper).
         max_anisotropy: largest ratio of the tangential scales (4 in the paper, to avoid needles).
         opacity: opacity of every disc, in (0, 1) (0.5 in the paper).
@@ -83,7 +86,7 @@ def lift(
         xyz, rgb = xyz[finite], rgb[finite]
     middle = _middle(xyz)
     centered = xyz - middle
-    config = LiftConfig(neighbors, normal_ratio, max_anisotropy, opacity)
+    config = LiftConfig(neighbors, spread, normal_ratio, max_anisotropy, opacity)
     quats, scales = _core.lift_points(centered, config, counter(progress, "lift"))
     n = len(centered)
     near = _fits_float32(xyz, scales)

@@ -198,6 +198,15 @@ def test_the_papers_method_has_the_papers_weights_of_each_prior(tmp_path: Path) 
     assert all(weights in found for weights in as_dicts)
 
 
+def test_a_given_prior_has_the_weights_of_the_kind_that_its_scene_states(tmp_path: Path) -> None:
+    text = HEAD.replace("12", "6") + 'methods = ["a"]\n[method.a]\nbase = "g2ard-paper"\nrounds = "one"\n'
+    for kind in ("noisy", "trained"):
+        (folder := tmp_path / kind).mkdir()
+        _, _, out = run(folder, f'{text}{SCENE}regularizers = "{kind}"\n')
+        weights = [job["regularizers"] for job in jobs(out, "recover")]
+        assert vars(PAPER_PRESETS[kind]) in weights
+
+
 @needs_processes
 def test_policies_continue_from_one_checkpoint(tmp_path: Path) -> None:
     text = HEAD + 'seeds = [0, 1]\nmethods = ["random", "directional", "own"]\n'

@@ -1,6 +1,7 @@
 """The study of registration: starts are as far off as they say, rows hold what was found."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,9 +54,27 @@ def test_rows_say_what_was_found_and_from_where(tmp_path: Path, command_line: Co
     assert dense["position"] < 1
     assert dense["found_5"] == 1
     assert dense["worst"] >= dense["position"]
-    assert "starts: expected one of A, B, C, D, got 'Z'" in refused(
+    assert "starts: expected one of A, B, C, D, given, got 'Z'" in refused(
         command_line, tmp_path, *call, "--set", "starts=Z", status=1
     )
     assert "needs photos with true poses" in refused(
         command_line, tmp_path, "benchmarks", "run", "register", "ball.ply", status=1
     )
+
+
+def test_given_starts_and_the_protocol_of_gs_cpr(tmp_path: Path, command_line: CommandLine) -> None:
+    views = _site(tmp_path)
+    write_views(tmp_path / "views.json", views)
+    moved = np.stack([displaced(pose, 0.02, 1, i) for i, pose in enumerate(views.viewmats)])
+    write_views(tmp_path / "starts.json", replace(views, viewmats=moved))
+    text = 'kind = "register"\nratios = [1]\nstarts = ["given"]\nprotocol = "gs-cpr"\nmethods = ["sift"]\n'
+    scene = '[[scene]]\nname = "ball"\nprior = "ball.ply"\ntrain = "views.json"\n'
+    (tmp_path / "a.toml").write_text(f'size = 128\n{text}{scene}starts = "starts.json"\n')
+    out = succeeds(command_line, tmp_path, "benchmarks", "run", "a.toml", "--json", "-").out
+    (row,) = json.loads(out)["rows"]
+    assert row["start_position"] == pytest.approx(0.02, rel=1e-4)
+    assert row["start_rotation"] == pytest.approx(1, rel=1e-4)
+    assert row["position"] < 0.1
+    (tmp_path / "b.toml").write_text(text + scene)
+    told = refused(command_line, tmp_path, "benchmarks", "run", "b.toml", status=1)
+    assert "needs the scene's `starts`" in told

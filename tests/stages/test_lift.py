@@ -35,6 +35,13 @@ def test_equals_the_naive_twin():
     assert got.sh_degree == 0
 
 
+def test_spread_is_an_option():
+    points = surface(100)
+    got = lift(points, np.full_like(points, 0.25), spread=0.6)
+    _, want_scales = discs(points - np.median(points, 0), spread=0.6)
+    np.testing.assert_allclose(got.scales, want_scales, rtol=1e-5)
+
+
 def test_translation_and_scale_by_powers_of_two_are_exact():
     points = np.round(surface() * 2**20) / 2**20
     colors = np.full_like(points, 0.5)
@@ -88,6 +95,7 @@ def test_non_finite_points_are_left_out():
         (np.full((3, 3), np.nan), np.zeros((3, 3)), {}, "none of the 3 points is finite"),
         (np.zeros((3, 3)), np.zeros((3, 3)), {"opacity": 1.0}, "opacity: expected"),
         (np.zeros((3, 3)), np.zeros((3, 3)), {"neighbors": 1}, "neighbors: expected at least 3"),
+        (np.zeros((3, 3)), np.zeros((3, 3)), {"spread": 0.0}, "spread: expected"),
         (np.zeros((3, 3)), np.zeros((3, 3)), {"max_anisotropy": 0.5}, "max_anisotropy: expected"),
     ],
 )

@@ -21,6 +21,9 @@ def lift(
     ],
     output: OutputOption,
     neighbors: Annotated[int, typer.Option(help="Nearest points to fit each disc's plane to.")] = 10,
+    spread: Annotated[
+        float, typer.Option(help="Width of a disc relative to the standard deviation of its nearest points.")
+    ] = 0.94,
     normal_ratio: Annotated[float, typer.Option(help="Thickness of a disc relative to its width.")] = 0.1,
     max_anisotropy: Annotated[float, typer.Option(help="Largest ratio of a disc's two widths.")] = 4.0,
     opacity: Annotated[float, typer.Option(help="Opacity of every disc, between 0 and 1.")] = 0.5,
@@ -41,6 +44,7 @@ def lift(
         found.points.positions,
         found.points.colors,
         neighbors=neighbors,
+        spread=spread,
         normal_ratio=normal_ratio,
         max_anisotropy=max_anisotropy,
         opacity=opacity,

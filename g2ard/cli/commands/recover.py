@@ -30,7 +30,6 @@ from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
-    from g2ard.stages.recover.anchors import Anchors
 
 
 @command(
@@ -84,6 +83,7 @@ def recover(
     from g2ard.scene.targets import kinds_of
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover import recover as optimize
+    from g2ard.stages.recover.anchors import Anchors
     from g2ard.stages.recover.presets import preset_for
     from g2ard.stages.recover.report import outcome, unregularized
 
@@ -117,15 +117,16 @@ def recover(
     weights = chosen.weights if weighted else None
     if weights is not None:
         run.say(f"sampling {plural(len(weights), 'view')} by weight")
+    built = _built(run, anchors, splats) if anchors else None
     settings["recover.regularizers"], why, measured = preset_for(
         named.get("recover.regularizers", "auto"),
-        dense or splats,
+        dense or built or splats,
         None if dense else chosen.cameras,
         paper=named.get("recover.schedule") == "paper",
     )
-    run.say(f"regularisers: {why}")
+    run.say(f"regularisers: {why}" + ("" if dense else "; measured on the student, as there is no teacher"))
     config = configured(RecoverConfig(), preset, settings)
-    frozen = _anchors(run, anchors, splats, config.regularizers.in_plane) if anchors else None
+    frozen = Anchors.of(built, config.regularizers.in_plane) if built else None
     with stoppable(run, checkpoint, resume):
         result = optimize(
             splats,
@@ -148,11 +149,10 @@ def recover(
     run.result({**report, "output": str(output)})
 
 
-def _anchors(run: Run, path: Path, student: Splats, in_plane: float) -> Anchors:
-    """Read anchors for the rows of `student`, in its coordinates."""
+def _built(run: Run, path: Path, student: Splats) -> Splats:
+    """Read the student as it was built, in its present coordinates."""
     from g2ard.errors import InputError
     from g2ard.jobs.inputs import load_scene
-    from g2ard.stages.recover.anchors import Anchors
 
     scene = load_scene(path, run.say)
     if len(scene) != len(student):
@@ -161,4 +161,4 @@ def _anchors(run: Run, path: Path, student: Splats, in_plane: float) -> Anchors:
             path=path,
             hint="anchors are the student before any recovery",
         )
-    return Anchors.of(scene.recentred(student.offset), in_plane)
+    return scene.recentred(student.offset)

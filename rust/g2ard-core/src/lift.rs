@@ -12,6 +12,8 @@ constants! {
     pub struct LiftConfig {
         /// Nearest others that PCA takes in.
         pub neighbors: usize = 10,
+        /// Tangential scale over the neighbourhood's standard deviation along that axis; the paper does not state it.
+        pub spread: f64 = 0.94,
         /// Normal scale over the geometric mean of the tangential ones.
         pub normal_ratio: f64 = 0.1,
         /// Largest ratio of the two tangential scales.
@@ -25,6 +27,7 @@ impl LiftConfig {
             return Err(Error::invalid("neighbors", "at least 3", self.neighbors));
         }
         for (name, value, least) in [
+            ("spread", self.spread, 0.0),
             ("normal_ratio", self.normal_ratio, 0.0),
             ("max_anisotropy", self.max_anisotropy, 1.0),
         ] {
@@ -55,9 +58,6 @@ struct Patch {
     tangential: [f64; 2],
     quat: [f64; 4],
 }
-
-/// Tangential scale over the neighbourhood's standard deviation along that axis.
-const SPREAD: f64 = 0.94;
 
 /// Rows between two checks of the control.
 const CHUNK: usize = 4096;
@@ -99,8 +99,8 @@ fn patch(points: &[[f64; 3]], row: u32, near: &[Neighbor<f64>], config: &LiftCon
     }
     let e = symmetric_eigen(&cov);
     let [t1, t2, n] = e.vectors;
-    let wide = SPREAD * e.values[0].max(0.0).sqrt();
-    let narrow = SPREAD * e.values[1].max(0.0).sqrt();
+    let wide = config.spread * e.values[0].max(0.0).sqrt();
+    let narrow = config.spread * e.values[1].max(0.0).sqrt();
     Patch {
         tangential: [wide, narrow.max(wide / config.max_anisotropy)],
         quat: quat_from_rotation(&[0, 1, 2].map(|r| [t1[r], t2[r], n[r]])),
