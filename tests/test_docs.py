@@ -182,7 +182,7 @@ def test_the_readme_names_every_command_and_scene_format() -> None:
     table = "\n".join(line for line in text.splitlines() if line.startswith("| `"))
     assert [name for name in COMMANDS if f"`{name}`" not in table] == []
     scenes = text.split("\n## Formats\n")[1].split("\n## ")[0]
-    names = {"sog": "SOG", "compressed_ply": ".compressed.ply", "tiles": "folders of tiles"}
+    names = {"sog": "SOG", "compressed_ply": ".compressed.ply", "usd": "OpenUSD", "tiles": "folders of tiles"}
     kinds = [name for name, kind in KINDS.items() if kind == "splats"]
     assert [name for name in kinds if names.get(name, f".{name}") not in scenes] == []
 

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 
 SceneArgument = Annotated[
     Path,
-    typer.Argument(metavar="SCENE", help="Scene: .ply (3DGS), SOG, .spz, .glb, .splat or .compressed.ply."),
+    typer.Argument(
+        metavar="SCENE", help="Scene: .ply (3DGS), SOG, .spz, .glb, .splat, .compressed.ply or OpenUSD."
+    ),
 ]
 Protocol = Literal["pool", "standing", "both"]
 ProtocolOption = Annotated[

@@ -59,5 +59,5 @@ LpipsInput = Literal["scaled", "unscaled"]
 """Value range of the images passed to LPIPS's networks (`g2ard.rendering.lpips`)."""
 LPIPS_INPUTS: tuple[LpipsInput, ...] = get_args(LpipsInput)
 
-FormatName = Literal["ply", "sog", "spz", "glb", "compressed.ply", "splat"]
+FormatName = Literal["ply", "sog", "spz", "glb", "compressed.ply", "splat", "usda", "usdc"]
 """Formats that scenes can be written to (`g2ard.io.scene_formats`)."""

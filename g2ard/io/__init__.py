@@ -2,7 +2,7 @@
 
 | reads | from |
 |---|---|
-| `read_splats`, `read_scene` | 3DGS .ply, .compressed.ply, SOG folder or .sog, .spz, .glb, .splat |
+| `read_splats`, `read_scene` | 3DGS .ply, .compressed.ply, SOG folder or .sog, .spz, .glb, .splat, OpenUSD |
 | `read_points`, `read_cloud` | .ply, .las, .laz, COLMAP points3D |
 | `read_views`, `read_view_set` | COLMAP, transforms.json, INRIA, nerfstudio, gsplat, Cambridge, g2ard |
 
@@ -71,8 +71,8 @@ def read_splats(path: str | Path) -> Splats:
     """Read a Gaussian scene.
 
     Args:
-        path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .glb, .splat; or a folder written by
-            `distill` or `ingest`.
+        path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .glb, .splat, OpenUSD (.usda,
+            .usdc); or a folder written by `distill` or `ingest`.
 
     Returns:
         The scene: linear scales, logit opacities, means relative to `offset`.
@@ -173,8 +173,8 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
     """Write a Gaussian scene atomically.
 
     Args:
-        path: .ply (3DGS), .compressed.ply, .sog, .spz, .glb (KHR_gaussian_splatting) or .splat;
-            NAME/meta.json for a SOG folder.
+        path: .ply (3DGS), .compressed.ply, .sog, .spz, .glb (KHR_gaussian_splatting), .splat, .usda,
+            .usdc; NAME/meta.json for a SOG folder.
         splats: the scene.
         overwrite: whether to replace an existing file.
         **options: format options: `normals=True` adds nx ny nz to a .ply, `spz_version=4` writes .spz

@@ -18,6 +18,7 @@ Format = Literal[
     "spz",
     "glb",
     "splat",
+    "usd",
     "tiles",
     "cloud_ply",
     "las",
@@ -34,7 +35,7 @@ Format = Literal[
 Kind = Literal["splats", "points", "views"]
 
 KINDS: dict[str, Kind] = {
-    **dict.fromkeys(("ply", "compressed_ply", "sog", "spz", "glb", "splat", "tiles"), "splats"),
+    **dict.fromkeys(("ply", "compressed_ply", "sog", "spz", "glb", "splat", "usd", "tiles"), "splats"),
     **dict.fromkeys(("cloud_ply", "las", "points3d"), "points"),
     **dict.fromkeys(("colmap", "transforms", "cambridge", "views"), "views"),
     **dict.fromkeys(("inria", "nerfstudio", "nerfstudio_export", "gsplat_run"), "views"),
@@ -45,7 +46,7 @@ MANIFEST, JOURNAL, POINTS = "tiles.json", "journal.json", ".points"
 
 _LOOKED_INTO = 64
 """Maximum files of a folder to inspect for suggestions."""
-_READ = (".ply", ".sog", ".spz", ".glb", ".splat", ".las", ".laz", ".json")
+_READ = (".ply", ".sog", ".spz", ".glb", ".splat", ".usda", ".usdc", ".las", ".laz", ".json")
 
 
 def kind(path: str | Path) -> Kind:
@@ -80,6 +81,7 @@ def file_format(path: str | Path) -> Format:
         ".spz": "spz",
         ".glb": "glb",
         ".splat": "splat",
+        **dict.fromkeys((".usda", ".usdc", ".usd", ".usdz"), "usd"),
         ".las": "las",
         ".laz": "las",
     }
@@ -90,8 +92,8 @@ def file_format(path: str | Path) -> Format:
     if suffix == ".json":
         return _json_format(path)
     raise InputError(
-        f"unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .splat; point clouds: .ply .las "
-        ".laz; views: a COLMAP folder, a .json, or a training run)",
+        f"unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .splat .usda .usdc; point clouds: "
+        ".ply .las .laz; views: a COLMAP folder, a .json, or a training run)",
         path=path,
     )
 

@@ -32,6 +32,8 @@ FORMATS: dict[FormatName, SceneFormat] = {
     "spz": SceneFormat(".spz", "spz", options=("spz_version",)),
     "glb": SceneFormat(".glb", "glb"),
     "splat": SceneFormat(".splat", "splat"),
+    "usda": SceneFormat(".usda", "usd"),
+    "usdc": SceneFormat(".usdc", "usd"),
 }
 """Formats by name, longer suffixes first."""
 

@@ -29,7 +29,7 @@ class DistillOptions:
         up: (3,) direction away from the ground for generated views; None estimates it.
         size: longer side of the views in pixels, if they are larger.
         clean: remove clutter first (`g2ard.stages.clean`).
-        format: file format for a budget in bytes: ply, compressed.ply, sog, spz, glb or splat.
+        format: file format for a budget in bytes: ply, compressed.ply, sog, spz, glb, splat, usda or usdc.
         preset: settings by name, see `g2ard.config.presets`.
         settings: values of `DistillConfig` by path, which override the preset.
     """

@@ -76,7 +76,7 @@ def as_file(splats: Splats, name: str) -> Splats:
     from g2ard.io import read_splats
     from g2ard.io.scene_formats import scene_format
 
-    if scene_format(name).suffix == ".ply":
+    if scene_format(name).suffix in (".ply", ".usda", ".usdc"):
         return splats
     with _written(splats, name) as path:
         return read_splats(path)

@@ -51,7 +51,7 @@ def simplify(
         fit: largest file, such as "5MB", or a device: quest3, mobile or web.
         min_psnr: PSNR (dB) to keep against the scene, in generated views.
         min_ssim: SSIM to keep; with `min_psnr` both hold. `say` receives the result's quality.
-        format: file format for `fit`: ply, compressed.ply, sog, spz, glb or splat.
+        format: file format for `fit`: ply, compressed.ply, sog, spz, glb, splat, usda or usdc.
         views: cameras in world coordinates, or their path; the training split is used. "made" always
             generates views.
         blind: use no cameras at all.

@@ -54,6 +54,13 @@ def transform(splats: Splats, matrix: ArrayLike) -> Splats:
     )
 
 
+def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
+    """Apply a 4×4 similarity like `transform`; a mere translation only changes `offset`."""
+    if (matrix[:3, :3] == np.eye(3)).all():
+        return replace(splats, offset=splats.offset + matrix[:3, 3])
+    return transform(splats, matrix)
+
+
 def similarity(matrix: ArrayLike) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """Decompose a 4×4 matrix into s, R (3, 3) and t (3,).
 

@@ -30,7 +30,7 @@ def convert(
             "-o",
             "--output",
             metavar="OUT",
-            help="Output: .ply, .compressed.ply, .sog, .spz, .glb, .splat or NAME/meta.json.",
+            help="Output: .ply, .compressed.ply, .sog, .spz, .glb, .splat, .usda, .usdc or NAME/meta.json.",
         ),
     ] = None,
     box: Annotated[

@@ -1,0 +1,177 @@
+"""Reader and writer for OpenUSD's ParticleField3DGaussianSplat: .usda as text, .usdc through usd-core.
+
+The written stage has y up and z back, as SPZ: y and z change sign, as do the quaternion's y and z and every
+harmonic odd in them. Scales and opacities are linear. Band 0 precedes the other bands, as in a .ply.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError, missing
+from g2ard.io.atomic import atomic_output
+from g2ard.io.packing import unit_quats, writable
+from g2ard.io.sanitize import Raw, cleaned
+from g2ard.io.spz import FLIPS
+from g2ard.io.types import Scene
+from g2ard.scene.splats import Splats
+from g2ard.scene.transform import placed
+
+_SCHEMA = "ParticleField3DGaussianSplat"
+_NAME = "Splats"
+_SH = "radiance:sphericalHarmonics"
+_TURN, _QUAT_TURN = np.array([1.0, -1, -1]), np.array([1.0, 1, -1, -1])
+_BLOCK = 8192
+"""Rows formatted together as text."""
+_SIGMAS = 3.0
+"""Extent of a Gaussian, as a multiple of its largest scale."""
+
+
+def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
+    """Write a .usda, or a .usdc if usd-core is installed; equal scenes give equal text.
+
+    `offset` becomes the prim's translation. Units are metres.
+    """
+    splats = writable(path, splats)
+    binary = path.suffix.lower() != ".usda"
+    pxr = _pxr(path) if binary else None
+    with atomic_output(path, overwrite) as temporary:
+        if pxr is not None:
+            _save(pxr, temporary, splats)
+        else:
+            with temporary.open("w", encoding="utf-8", newline="\n") as file:
+                _print(file, splats)
+
+
+def _attributes(splats: Splats) -> dict[str, tuple[str, NDArray[np.float32]]]:
+    """Return the type and the values of each array attribute; quaternions are w x y z."""
+    means = (splats.means * _TURN).astype(np.float32)
+    reach = _SIGMAS * splats.scales.max(axis=1, keepdims=True)
+    extent = np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)])
+    rest = splats.shN * FLIPS[: splats.shN.shape[1], None]
+    return {
+        "extent": ("float3[]", extent),
+        "positions": ("point3f[]", means),
+        "orientations": ("quatf[]", (unit_quats(splats.quats) * _QUAT_TURN).astype(np.float32)),
+        "scales": ("float3[]", splats.scales.astype(np.float32)),
+        "opacities": ("float[]", splats.opacities[:, None]),
+        f"{_SH}Coefficients": ("float3[]", np.concatenate([splats.sh0, rest], axis=1).reshape(-1, 3)),
+    }
+
+
+def _print(file: TextIO, splats: Splats) -> None:
+    file.write(
+        f'#usda 1.0\n(\n    defaultPrim = "{_NAME}"\n    metersPerUnit = 1\n    upAxis = "Y"\n)\n\n'
+        f'def {_SCHEMA} "{_NAME}"\n{{\n'
+        f"    uniform int {_SH}Degree = {splats.sh_degree}\n"
+        '    uniform token projectionModeHint = "perspective"\n'
+        '    uniform token sortingModeHint = "zDepth"\n'
+    )
+    for name, (kind, values) in _attributes(splats).items():
+        row = ", ".join(["%.9g"] * values.shape[1])
+        row = row if values.shape[1] == 1 else f"({row})"
+        file.write(f"    {kind} {name} = [")
+        for start in range(0, len(values), _BLOCK):
+            block = values[start : start + _BLOCK]
+            file.write(
+                (", " if start else "") + ", ".join([row] * len(block)) % tuple(block.ravel().tolist())
+            )
+        file.write("]\n")
+    if splats.offset.any():
+        shift = ", ".join(repr(float(v)) for v in splats.offset * _TURN)
+        file.write(
+            f"    double3 xformOp:translate = ({shift})\n"
+            '    uniform token[] xformOpOrder = ["xformOp:translate"]\n'
+        )
+    file.write("}\n")
+
+
+def _save(pxr: Any, path: Path, splats: Splats) -> None:
+    stage = pxr.Usd.Stage.CreateNew(str(path))
+    pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
+    pxr.UsdGeom.SetStageMetersPerUnit(stage, 1)
+    field = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/{_NAME}")
+    prim = field.GetPrim()
+    stage.SetDefaultPrim(prim)
+    prim.GetAttribute(f"{_SH}Degree").Set(splats.sh_degree)
+    prim.GetAttribute("projectionModeHint").Set("perspective")
+    prim.GetAttribute("sortingModeHint").Set("zDepth")
+    arrays = {"float[]": pxr.Vt.FloatArray, "quatf[]": pxr.Vt.QuatfArray}
+    for name, (kind, values) in _attributes(splats).items():
+        if kind == "quatf[]":
+            values = values[:, [1, 2, 3, 0]]  # usd-core's memory order
+        values = np.ascontiguousarray(values[:, 0] if kind == "float[]" else values)
+        prim.GetAttribute(name).Set(arrays.get(kind, pxr.Vt.Vec3fArray).FromNumpy(values))
+    if splats.offset.any():
+        field.AddTranslateOp().Set(pxr.Gf.Vec3d(*(splats.offset * _TURN).tolist()))
+    stage.GetRootLayer().Save()
+
+
+def read(path: Path) -> Scene:
+    """Read the only ParticleField3DGaussianSplat of a stage, in the axes of a .ply; needs usd-core."""
+    pxr = _pxr(path)
+    try:
+        stage = pxr.Usd.Stage.Open(str(path))
+    except pxr.Tf.ErrorException as error:
+        raise InputError(
+            f"not an OpenUSD stage ({str(error).strip().splitlines()[-1]})", path=path
+        ) from error
+    prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == _SCHEMA]
+    if len(prims) != 1:
+        raise InputError(f"has {len(prims)} prims of type {_SCHEMA}, expected 1", path=path)
+    means = _values(path, prims[0], "positions", 3, None)
+    count = len(means)
+    degree = int(prims[0].GetAttribute(f"{_SH}Degree").Get())
+    if not 0 <= degree <= 3:
+        raise InputError(f"unsupported SH degree {degree}; expected 0 to 3", path=path)
+    size = (degree + 1) ** 2
+    raw = Raw.empty(count, size - 1)
+    raw.means[:] = means * _TURN
+    raw.quats[:] = _values(path, prims[0], "orientations", 4, count)[:, [3, 0, 1, 2]] * _QUAT_TURN
+    alphas = _values(path, prims[0], "opacities", 1, count)[:, 0].astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        raw.log_scales[:] = np.log(_values(path, prims[0], "scales", 3, count).astype(np.float64))
+        raw.logit_opacities[:] = np.log(alphas) - np.log1p(-alphas)
+    bands = _values(path, prims[0], f"{_SH}Coefficients", 3, count * size).reshape(count, size, 3)
+    raw.sh0[:] = bands[:, :1]
+    raw.shN[:] = bands[:, 1:] * FLIPS[: size - 1, None]
+    scene = cleaned(path, raw)
+    splats = placed(scene.splats, _to_ply(pxr, stage, prims[0]))
+    return replace(scene, splats=splats)
+
+
+def _values(path: Path, prim: Any, name: str, width: int, count: int | None) -> NDArray[np.float32]:
+    """Return the (count, width) values of an attribute in float, or in half with an h after its name."""
+    for found in (prim.GetAttribute(name), prim.GetAttribute(f"{name}h")):
+        values = found.Get() if found else None
+        if values is not None and len(values):
+            rows = np.asarray(values, np.float32).reshape(-1, width)
+            if count is not None and len(rows) != count:
+                raise InputError(f"has {len(rows):,} values, expected {count:,}", path=path, property=name)
+            return rows
+    raise InputError(f"attribute {name!r} is missing or empty", path=path)
+
+
+def _to_ply(pxr: Any, stage: Any, prim: Any) -> NDArray[np.float64]:
+    """Return the (4, 4) matrix from the prim's flipped axes to the axes of a .ply."""
+    world = np.array(pxr.UsdGeom.XformCache().GetLocalToWorldTransform(prim)).T  # USD multiplies rows
+    flip = np.diag([*_TURN, 1.0])
+    upright = np.eye(4)
+    if pxr.UsdGeom.GetStageUpAxis(stage) == pxr.UsdGeom.Tokens.z:
+        upright[1:3, 1:3] = [[0, 1], [-1, 0]]
+    return flip @ upright @ world @ flip
+
+
+def _pxr(path: Path) -> Any:
+    """Return the package of OpenUSD, with the modules used here."""
+    try:
+        import pxr
+        from pxr import Gf, Tf, Usd, UsdGeom, UsdVol, Vt  # noqa: F401
+    except ImportError as error:
+        raise missing("reading OpenUSD, or writing .usdc,", "g2ard[usd]", path=path) from error
+    return pxr
