@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.jobs.fit import Aim
+    from g2ard.report.kinds import KindScore
     from g2ard.scene.splats import Splats
 
 _LOSS, _SSIM_LOSS = 0.05, 0.001
@@ -20,73 +22,66 @@ _FEW = 0.005
 
 
 def write_table(run: Run, report: dict[str, Any]) -> None:
-    """Print counts, sizes and scores of the dense, the simplified and the recovered scene."""
-    kinds = [report["scores"]] + ([report["apart"]] if report["apart"] else [])
+    """Print the scores by kind of view, under counts, sizes and times."""
+    from g2ard.report.kinds import KindScore
 
-    def row(name: str, count: int, size: int) -> list[str]:
-        figures = []
-        for scores in kinds:
-            score = scores.get(name)
-            figures += [f"{score['psnr']:.2f}", f"{score['ssim']:.4f}"] if score else ["–", "–"]
-        return [name, f"{count:,}", f"{size / 1e6:.2f}", f"{size / count:.0f}", *figures]
-
-    given = "start" if run.config.get("scene", "") is None else "dense"  # started from photos alone
     size = report["bytes"]
     seconds = {name: value for name, value in report["seconds"].items() if name != "resumed"}
     times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
-    counts = [len(scores["recovered"]["views"]) for scores in kinds]
-    apart = f" and {counts[1]:,} near views" if len(kinds) > 1 else ""
+    before = plural(report["input_count"], "point" if report["lifted"] else "Gaussian")
+    write_kinds(
+        run,
+        f"{before} → {plural(report['output_count'], 'Gaussian')}, "
+        f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply; {times}\n"
+        f"held-out views against {report['against']}, simplified → recovered:",
+        [KindScore.of(kind) for kind in report["kinds"]],
+    )
+
+
+def write_kinds(run: Run, title: str, kinds: Sequence[KindScore]) -> None:
+    """Print a row for each kind of view."""
     run.console.table(
-        f"{plural(counts[0], 'held-out view')}{apart} against {report['against']}; {times}",
+        title,
+        ["kind of view", "views", "PSNR, dB", "SSIM", "worst view"],
         [
-            "scene",
-            "Gaussians",
-            "MB as .ply",
-            "bytes each",
-            "PSNR",
-            "SSIM",
-            *["PSNR near", "SSIM near"][: 2 * (len(kinds) - 1)],
-        ],
-        [
-            row(given, report["input_count"], size["input"]),
-            row("simplified", report["output_count"], size["output"]),
-            row("recovered", report["output_count"], size["output"]),
+            [
+                kind.kind,
+                str(kind.views),
+                f"{kind.psnr.before:.2f} → {kind.psnr.after:.2f}",
+                f"{kind.ssim.before:.4f} → {kind.ssim.after:.4f}",
+                f"{kind.worst} {kind.worst_psnr.after:.2f}",
+            ]
+            for kind in kinds
         ],
     )
 
 
 def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
     """Return lines on recovery's outcome, losses and unseen parts; `verbose` adds idle regularisers."""
+    from g2ard.report.kinds import KindScore
     from g2ard.stages.recover.report import RecoverReport, outcome, unregularized_rounds
 
     rounds = [[RecoverReport.of(done) for done in entry.get("recover", [])] for entry in report["rounds"]]
     lines = [outcome(one) for entry in rounds for one in entry]
     lines += [unregularized_rounds(rounds)] if verbose else []
-    found = [line for line in lines if line is not None]
-    for kind, what in (("scores", "held-out views"), ("apart", "near views")):
-        if not report[kind]:
-            continue
-        before, after = (report[kind][name] for name in ("simplified", "recovered"))
-        lost_db, lost_ssim = before["psnr"] - after["psnr"], before["ssim"] - after["ssim"]
-        if lost_ssim > _SSIM_LOSS and lost_db < 0:  # neither scene is better
-            found.append(f"recovery lost {lost_ssim:.3f} SSIM and gained {-lost_db:.2f} dB in {what}")
-            continue
-        if lost_db > _LOSS or lost_ssim > _SSIM_LOSS:
-            how = f"{lost_db:.2f} dB" if lost_db > _LOSS else f"{lost_ssim:.3f} SSIM"
-            found.append(
-                f"warning: recovery lost {how} in {what}; the simplified scene is better there"
-                " (--keep writes it too)"
-            )
-            continue
-        pairs = zip(*(report[kind][name]["views"] for name in ("simplified", "recovered")), strict=True)
-        lost = sum(b["psnr"] < a["psnr"] - _LOSS for a, b in pairs)
-        if lost:
-            found.append(
-                f"{lost} of {len(report[kind]['recovered']['views'])} {what} lost PSNR; their mean gained"
-            )
+    lines += [loss(KindScore.of(kind)) for kind in report["kinds"]]
     if report["unseen"] and report["unseen"] > _FEW:
-        found.append(f"{report['unseen']:.0%} of the scene is in no view: simplified but not recovered")
-    return found
+        lines.append(f"{report['unseen']:.0%} of the scene is in no view: simplified but not recovered")
+    return [line for line in lines if line is not None]
+
+
+def loss(
+    kind: KindScore, hint: str = "the simplified scene is better there (--keep writes it too)"
+) -> str | None:
+    """Describe what recovery lost in the views of a kind, if anything; `hint` ends a warning."""
+    what = f"{kind.kind} views"
+    if kind.ssim.gain < -_SSIM_LOSS and kind.psnr.gain > 0:  # neither scene is better
+        return f"recovery lost {-kind.ssim.gain:.3f} SSIM and gained {kind.psnr.gain:.2f} dB in {what}"
+    if kind.psnr.gain < -_LOSS or kind.ssim.gain < -_SSIM_LOSS:
+        how = f"{-kind.psnr.gain:.2f} dB" if kind.psnr.gain < -_LOSS else f"{-kind.ssim.gain:.3f} SSIM"
+        worst = f"{kind.worst}: {kind.worst_psnr.before:.2f} → {kind.worst_psnr.after:.2f} dB"
+        return f"warning: recovery lost {how} in {what} (worst view {worst}); {hint}"
+    return f"{kind.lost} of {kind.views} {what} lost PSNR; their mean gained" if kind.lost else None
 
 
 def say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:

@@ -1,15 +1,17 @@
-"""Scores of a distillation, as `g2ard distill` writes them to report.json."""
+"""Scores of a distillation, as `g2ard distill` writes them to report.json, and of a recovery."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from g2ard.config.choices import Colour
 from g2ard.progress import Progress
 
 if TYPE_CHECKING:
     from g2ard.jobs.job import DistillJob
     from g2ard.pipeline import Distilled
+    from g2ard.report.kinds import KindScore
     from g2ard.scene.splats import Splats
     from g2ard.scene.targets import Targets
 
@@ -22,20 +24,31 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         done: its result.
 
     Returns:
-        Counts, bytes, scores in each kind of views (or None), rounds, seconds by stage, and every setting by
-        path.
+        Counts, bytes, scores in held-out views (`scores`) and in views of other kinds (`apart`, or None),
+        their summary by kind (`kinds`), rounds, seconds by stage, and every setting by path.
     """
     from g2ard.config.paths import listed
+    from g2ard.report.kinds import by_kind
+    from g2ard.scene.splits import USUAL
 
-    kinds = {"scores": job.held_out, "apart": job.apart[1]}
+    scores = _scores(job, done, job.held_out, job.progress)
+    apart = None if job.apart[1] is None else _scores(job, done, job.apart[1], job.progress)
+    before, after = (
+        [*scores[name]["views"], *(apart[name]["views"] if apart else [])]
+        for name in ("simplified", "recovered")
+    )
+    made = job.views.pool is not None and "test" in job.views.pool.splits
     config = replace(job.config, simplify=job.config.simplify.resolved())
     found = done.report.as_dict()
     return {
         "input_count": len(job.prior),
         "output_count": len(done.splats),
+        "lifted": job.lifted,
         "cleaned": job.cleaned,
         "bytes": {"input": job.prior.nbytes, "output": done.splats.nbytes},
-        **{kind: _scores(job, done, targets, job.progress) for kind, targets in kinds.items()},
+        "scores": scores,
+        "apart": apart,
+        "kinds": [kind.as_dict() for kind in by_kind(before, after, USUAL if made else "given")],
         "unseen": _unseen(job, done),
         "against": job.against,
         "preset": job.preset,
@@ -47,14 +60,10 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
     }
 
 
-def _scores(
-    job: DistillJob, done: Distilled, targets: Targets | None, progress: Progress
-) -> dict[str, Any] | None:
-    """Score both scenes in one kind of views."""
+def _scores(job: DistillJob, done: Distilled, targets: Targets, progress: Progress) -> dict[str, Any]:
+    """Score both scenes in some views."""
     from g2ard.stages.evaluate import evaluate
 
-    if targets is None:
-        return None
     scenes: dict[str, Splats] = {"simplified": done.simplified, "recovered": done.splats}
     return {
         name: evaluate(
@@ -66,6 +75,20 @@ def _scores(
         ).as_dict()
         for name, splats in scenes.items()
     }
+
+
+def scores_by_kind(
+    before: Splats, after: Splats, targets: Targets, background: Colour, progress: Progress
+) -> tuple[KindScore, ...]:
+    """Score a scene before and after recovery in held-out views, by kind of view."""
+    from g2ard.report.kinds import by_kind
+    from g2ard.stages.evaluate import evaluate
+
+    first, second = (
+        evaluate(splats, targets, background=background, progress=progress, stage="score").as_dict()["views"]
+        for splats in (before, after)
+    )
+    return by_kind(first, second, "given")
 
 
 def _unseen(job: DistillJob, done: Distilled) -> float | None:

@@ -13,6 +13,7 @@ import g2ard
 from g2ard.cli.frame import Run
 from g2ard.cli.run_result import told, write_table
 from g2ard.io import write_views
+from g2ard.report.kinds import by_kind
 from helpers.commands import CommandLine, succeeds
 from helpers.photos import BALL, cloud_of, photos_of
 from helpers.scenes import around, checkered_ball
@@ -114,25 +115,32 @@ def test_photos_of_another_world_are_told(command_line: CommandLine, folder: Pat
         assert ("warning: the scene does not look like the photos (correlation" in error) == warned, error
 
 
-def test_the_table_has_a_start_where_there_are_photos_alone() -> None:
-    rows: list[list[str]] = []
+def test_the_table_has_a_row_per_kind_of_view() -> None:
+    names = ("near_0", "a", "near_1")
+    views = [{"name": name, "psnr": 30.0 + i, "ssim": 0.9} for i, name in enumerate(names)]
+    kinds = by_kind(views, [view | {"psnr": view["psnr"] + 1} for view in views], "given")
     report: dict[str, Any] = {
-        "scores": {"recovered": {"views": [], "psnr": 30.0, "ssim": 0.9}},
-        "apart": None,
-        "bytes": {"input": 9, "output": 9},
-        "seconds": {},
-        "input_count": 9,
-        "output_count": 9,
+        "kinds": [kind.as_dict() for kind in kinds],
+        "bytes": {"input": 9e6, "output": 1e6},
+        "seconds": {"total": 2.0},
+        "input_count": 9000,
+        "output_count": 90,
         "against": "photos",
     }
-    console = SimpleNamespace(table=lambda title, head, found: rows.extend(found))
-    for scene in (None, Path("a.ply")):
-        write_table(cast("Run", SimpleNamespace(config={"scene": scene}, console=console)), report)
-    others = ["simplified", "recovered"]
-    assert [row[0] for row in rows] == ["start", *others, "dense", *others]
+    tables: list[Any] = []
+    run = cast("Run", SimpleNamespace(console=SimpleNamespace(table=lambda *parts: tables.append(parts))))
+    for lifted in (False, True):
+        write_table(run, report | {"lifted": lifted})
+    (title, _, rows), (of_points, _, _) = tables
+    assert title.startswith("9,000 Gaussians → 90 Gaussians, 9.00 → 1.00 MB as .ply; total 2.0 s")
+    assert of_points.startswith("9,000 points → 90 Gaussians")
+    assert rows == [
+        ["given", "1", "31.00 → 32.00", "0.9000 → 0.9000", "a 32.00"],
+        ["near", "2", "31.00 → 32.00", "0.9000 → 0.9000", "near_0 31.00"],
+    ]
 
 
 @pytest.mark.parametrize(("unseen", "lines"), [(0.004, 0), (0.005, 0), (0.02, 1)])
 def test_what_no_view_sees_is_told_if_it_is_not_nothing(unseen: float, lines: int) -> None:
-    found = told({"rounds": [], "scores": None, "apart": None, "unseen": unseen})
+    found = told({"rounds": [], "kinds": [], "unseen": unseen})
     assert (len(found), any("0%" in line for line in found)) == (lines, False)

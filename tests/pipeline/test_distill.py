@@ -1,6 +1,7 @@
 """The pipeline: exact budgets, one shot and rounds, resumable; and its command as a user types it."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -96,7 +97,13 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
         view["name"] for view in apart["recovered"]["views"]
     }
     assert 0 <= report["unseen"] < 0.5
-    assert "near views" in error
+    assert [row["kind"] for row in report["kinds"]] == ["usual", "near"]
+    worst = min(apart["recovered"]["views"], key=lambda view: view["psnr"])
+    assert (report["kinds"][1]["worst"], report["kinds"][1]["worst_psnr"]["after"]) == (
+        worst["name"],
+        worst["psnr"],
+    )
+    assert re.search(r"│ near +│", error)
     left = sorted(p.name for p in (tmp_path / "run").iterdir())
     assert left == ["preview.png", "report.html", "report.json", "scene.ply", "view.html", "views.json"]
     assert report["bytes"]["view"] == (tmp_path / "run" / "view.html").stat().st_size
@@ -109,27 +116,26 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
 
 def test_a_loss_in_any_kind_of_views_is_told() -> None:
     from g2ard.cli.run_result import told
+    from g2ard.report.kinds import by_kind
 
-    def said(pool: float, near: float | None, unseen: float | None, ssim: float = 0.0) -> list[str]:
-        def scores(gain: float) -> dict[str, dict[str, Any]]:
-            views = [[{"psnr": 30.0 + share * gain} for share in part] for part in ((0, 0), (2.5, -0.5))]
-            return {
-                "simplified": {"psnr": 30.0, "ssim": 0.9, "views": views[0]},
-                "recovered": {"psnr": 30.0 + gain, "ssim": 0.9 + ssim, "views": views[1]},
-            }
+    def said(usual: float, near: float | None, unseen: float | None, ssim: float = 0.0) -> list[str]:
+        before, after = [], []
+        for name, gain in (("pose", usual), ("near", near)):
+            for i, share in enumerate((2.5, -0.5) if gain is not None else ()):
+                before.append({"name": f"{name}_{i}", "psnr": 30.0, "ssim": 0.9})
+                after.append({"name": f"{name}_{i}", "psnr": 30.0 + share * gain, "ssim": 0.9 + ssim})
+        kinds = [kind.as_dict() for kind in by_kind(before, after)]
+        return told({"rounds": [], "kinds": kinds, "unseen": unseen})
 
-        apart = None if near is None else scores(near)
-        return told({"rounds": [], "scores": scores(pool), "apart": apart, "unseen": unseen})
-
-    assert said(1.0, None, None) == ["1 of 2 held-out views lost PSNR; their mean gained"]
+    assert said(1.0, None, None) == ["1 of 2 usual views lost PSNR; their mean gained"]
     assert said(0.02, 0.02, 0.0) == []
     line = said(0.02, -0.5, 0.0)[0]
-    assert "lost 0.50 dB in near views" in line
+    assert line.startswith("warning: recovery lost 0.50 dB in near views (worst view near_0: 30.00 → 28.75")
     mixed = said(0.3, 0.3, 0.0, ssim=-0.004)[0]
-    assert mixed == "recovery lost 0.004 SSIM and gained 0.30 dB in held-out views"
+    assert mixed == "recovery lost 0.004 SSIM and gained 0.30 dB in usual views"
     assert said(0.0, None, 0.0, ssim=-0.004)[0].startswith("warning: recovery lost 0.004 SSIM")
     lines = said(-0.2, -0.3, 0.25)
-    assert "lost 0.20 dB in held-out views" in lines[0]
+    assert "lost 0.20 dB in usual views" in lines[0]
     assert "25% of the scene is in no view" in lines[2]
 
 

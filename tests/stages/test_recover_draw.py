@@ -1,5 +1,7 @@
 """Recovery that draws views by weight: as often as they say, the same for a seed, exact across a resume."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,11 @@ from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import TeacherRenders
+from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.draw import checked_weights, drawn
 from g2ard.stages.simplify import simplify
+from helpers.commands import succeeds
 from helpers.interruptions import press_ctrl_c_at
 from helpers.scenes import ARRAYS, around, checkered_ball
 
@@ -115,6 +119,23 @@ def test_invalid_weights_are_rejected(
 ) -> None:
     with pytest.raises(InputError, match=words):
         recover(student, targets, RecoverConfig(steps=1), weights=weights)
+
+
+def test_the_command_scores_held_out_views_by_kind(
+    student: Splats, tmp_path: Path, command_line: Any
+) -> None:
+    write_splats(tmp_path / "teacher.ply", TEACHER)
+    write_splats(tmp_path / "student.ply", student)
+    views = replace(around(8), names=tuple(f"{i}_{'anywhere' if i % 4 else 'pose'}" for i in range(8)))
+    write_views(tmp_path / "views.json", views, splits=("train", "test") * 4)
+    ask = ("recover", "student.ply", "--views", "views.json", "--teacher", "teacher.ply", "--steps", 20)
+    ask = (*ask, "-o", "out.ply", "--json", "-")
+    (kind,) = json.loads(succeeds(command_line, tmp_path, *ask).out)["kinds"]
+    held_out = TeacherRenders(TEACHER, views.take([1, 3, 5, 7]))
+    assert (kind["kind"], kind["views"]) == ("anywhere", 4)
+    recovered = evaluate(read_splats(tmp_path / "out.ply"), held_out)
+    assert kind["psnr"]["after"] == pytest.approx(recovered.psnr, abs=1e-3)
+    assert json.loads(succeeds(command_line, tmp_path, *ask, "--split", "all", "-w").out)["kinds"] == []
 
 
 def test_the_command_draws_by_weights_of_views(student: Splats, tmp_path: Path, command_line: Any) -> None:

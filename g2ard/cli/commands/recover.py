@@ -29,6 +29,7 @@ from g2ard.cli.options import (
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    from g2ard.report.kinds import KindScore
     from g2ard.scene.splats import Splats
 
 
@@ -71,14 +72,12 @@ def recover(
 ) -> None:
     """Optimise a fixed set of Gaussians against photos or a teacher's renders."""
     from g2ard.cli.resume import check_stopped, left_at, stoppable
+    from g2ard.cli.run_result import loss, write_kinds
     from g2ard.config.paths import listed
     from g2ard.config.presets import PRESETS, configured
     from g2ard.io import check_scene_output, write_splats
-    from g2ard.jobs.inputs import (
-        load_scene,
-        load_trained,
-        make_targets,
-    )
+    from g2ard.jobs.inputs import load_scene, load_split_views, load_trained, make_targets
+    from g2ard.jobs.score import scores_by_kind
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.scene.targets import kinds_of
     from g2ard.stages.recover import RecoverConfig
@@ -142,10 +141,21 @@ def recover(
         run.say(told)
     if run.verbose and (told := unregularized(result.report)) is not None:
         run.say(told)
+    kinds: tuple[KindScore, ...] = ()
+    pool, _ = load_split_views(views, "all", unpictured=dense is not None)
+    tested = [i for i, found in enumerate(pool.splits) if found == "test" and split == "train"]
+    if tested:
+        held_out = make_targets(
+            pool.cameras.take(tested).resized(size), dense, config.background, photos=photos, lazy=True
+        )
+        kinds = scores_by_kind(splats, result.splats, held_out, config.background, run.progress)
+        write_kinds(run, f"held-out views against {kinds_of(held_out)}, before → after:", kinds)
+        for line in filter(None, (loss(kind, "the student is better there") for kind in kinds)):
+            run.say(line)
     gain, count = result.report.psnr, plural(len(splats), "Gaussian")
     run.say(f"{output}: {count}, {trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB")
     report = {**result.report.as_dict(), "preset": why, "prior": measured.as_dict()}
-    report["settings"] = listed(config)
+    report |= {"kinds": [kind.as_dict() for kind in kinds], "settings": listed(config)}
     run.result({**report, "output": str(output)})
 
 

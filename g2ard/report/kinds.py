@@ -1,0 +1,92 @@
+"""Scores of a scene before and after recovery, by kind of view."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Any
+
+from g2ard.report.base import Report
+from g2ard.scene.splits import USUAL, rows_by_kind
+
+_LOST = 0.05
+"""Loss of a view in dB that counts."""
+
+
+@dataclass(frozen=True)
+class Change(Report):
+    """A score of the simplified and of the recovered scene."""
+
+    before: float
+    after: float
+
+    @property
+    def gain(self) -> float:
+        """Return the score that recovery gained."""
+        return self.after - self.before
+
+
+@dataclass(frozen=True)
+class KindScore(Report):
+    """Scores in the views of one kind, none of them used for training.
+
+    Args:
+        kind: far, middle, near, standing or anywhere; `usual` for other generated views, `given` for the
+            user's.
+        views: number of views.
+        psnr: mean PSNR, dB.
+        ssim: mean SSIM.
+        worst: name of the view with the lowest PSNR after recovery.
+        worst_psnr: PSNR of that view, dB.
+        lost: number of views that lost over 0.05 dB.
+    """
+
+    kind: str
+    views: int
+    psnr: Change
+    ssim: Change
+    worst: str
+    worst_psnr: Change
+    lost: int
+
+
+def by_kind(
+    before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]], usual: str = USUAL
+) -> tuple[KindScore, ...]:
+    """Summarise scores by kind of view.
+
+    Args:
+        before: `name`, `psnr` and `ssim` of each view with the simplified scene.
+        after: the same with the recovered scene.
+        usual: name of the kind of views whose name states none.
+
+    >>> view = {"name": "near_0000", "psnr": 30.0, "ssim": 0.9}
+    >>> found, = by_kind([view], [view | {"psnr": 31.0}])
+    >>> found.kind, found.psnr.gain, found.worst
+    ('near', 1.0, 'near_0000')
+    """
+    names = [view["name"] for view in after]
+
+    def changes(score: str, rows: Sequence[int]) -> list[Change]:
+        return [Change(before[row][score], after[row][score]) for row in rows]
+
+    def mean(found: Sequence[Change]) -> Change:
+        return Change(fmean(change.before for change in found), fmean(change.after for change in found))
+
+    scores = []
+    for kind, rows in rows_by_kind(names).items():
+        psnr = changes("psnr", rows)
+        worst = min(range(len(rows)), key=lambda i: psnr[i].after)
+        scores.append(
+            KindScore(
+                usual if kind == USUAL else kind,
+                len(rows),
+                mean(psnr),
+                mean(changes("ssim", rows)),
+                names[rows[worst]],
+                psnr[worst],
+                sum(change.gain < -_LOST for change in psnr),
+            )
+        )
+    return tuple(scores)
